@@ -1,0 +1,49 @@
+"""Errors raised by kissgs. Every error that a user's input can cause is in this tree.
+
+KissgsError
+├─ InvalidSceneError        a scene file, or the arrays handed in, are not a usable Gaussian scene
+├─ InvalidContainerError    the bytes are not a valid SOG-XT container
+├─ UnsupportedError         valid input beyond a limit or a feature that kissgs does not have
+├─ OutputError              the result could not be written: it exists already, no space, no permission
+└─ Cancelled                the caller stopped the work through its progress callback
+
+The message is one sentence for the user: what is wrong, where, and how to mend it.
+``code`` is stable: the command line's ``--json`` output and the service use it.
+Any other exception that leaves kissgs is a bug.
+"""
+
+
+class KissgsError(Exception):
+    """Base class of all errors above."""
+
+    code = "kissgs-error"
+
+
+class InvalidSceneError(KissgsError):
+    """A scene file, or the arrays handed in, are not a usable Gaussian scene."""
+
+    code = "invalid-scene"
+
+
+class InvalidContainerError(KissgsError):
+    """The bytes are not a valid SOG-XT container."""
+
+    code = "invalid-container"
+
+
+class UnsupportedError(KissgsError):
+    """Valid input beyond a limit, or a feature that kissgs does not have."""
+
+    code = "unsupported"
+
+
+class OutputError(KissgsError):
+    """The result could not be written."""
+
+    code = "output"
+
+
+class Cancelled(KissgsError):
+    """The caller stopped the work; nothing was written."""
+
+    code = "cancelled"
