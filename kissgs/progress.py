@@ -1,8 +1,9 @@
 """How long work reports itself: one callback, used alike by the command line, the service and tests."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 
+@runtime_checkable
 class Progress(Protocol):
     """Receives progress events. To stop the work, raise :class:`kissgs.Cancelled` from the call."""
 

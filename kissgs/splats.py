@@ -55,7 +55,14 @@ class Splats:
             raise InvalidSceneError(
                 f"shN has shape {self.shN.shape}; it must be (N, K, 3) with K one of {SH_REST_COUNTS}"
             )
-        expected = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 3), "shN": (n, k, 3)}
+        expected = {
+            "means": (n, 3),
+            "quats": (n, 4),
+            "scales": (n, 3),
+            "opacities": (n,),
+            "sh0": (n, 3),
+            "shN": (n, k, 3),
+        }
         for name, shape in expected.items():
             array = getattr(self, name)
             if array.shape != shape or array.dtype != np.float32:

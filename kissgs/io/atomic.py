@@ -17,7 +17,7 @@ def atomic_file(path: Path, *, overwrite: bool = False) -> Iterator[BinaryIO]:
     """A binary file that replaces ``path`` when the block ends well, and vanishes when it does not.
 
     Raises:
-        OutputError: ``path`` exists and ``overwrite`` is false, or the file system refuses (space, permission, no folder).
+        OutputError: ``path`` exists and ``overwrite`` is false, or the file system refuses.
     """
     refuse_existing(path, overwrite=overwrite)
     temporary: Path | None = None

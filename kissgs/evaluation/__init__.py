@@ -1,0 +1,1 @@
+"""What a compressed scene lost: errors of its stored values, and the same for other tools."""

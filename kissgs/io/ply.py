@@ -1,0 +1,183 @@
+"""The field's ``.ply``: scenes as INRIA's trainer and its followers store them, read from any tool and written."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float32
+
+from kissgs.errors import InvalidSceneError, UnsupportedError
+from kissgs.io.compressed_ply import check_compressed, is_compressed, read_compressed
+from kissgs.io.ply_body import check_complete, rows
+from kissgs.io.ply_header import Element, Encoding, PlyFile, open_ply, sh_degree
+from kissgs.progress import Progress, silent
+from kissgs.splats import SH_C0, SH_REST_COUNTS, Splats
+
+_POSITION = ("x", "y", "z")
+_NORMAL = ("nx", "ny", "nz")
+_ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+_SCALE = ("scale_0", "scale_1", "scale_2")
+_OPACITY = ("opacity",)
+_COLOUR = ("f_dc_0", "f_dc_1", "f_dc_2")
+_RGB = ("red", "green", "blue")
+
+_WRITE_ROWS = 4096
+
+
+@runtime_checkable
+class BinaryWriter(Protocol):
+    """Any binary stream, a file or not: nothing but its ``write`` is called."""
+
+    def write(self, data: bytes | memoryview, /) -> object:
+        """Take all of ``data``."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlyInfo:
+    """What the header tells of a scene."""
+
+    count: int
+    """Number of Gaussians."""
+    sh_degree: int
+    """0 to 3."""
+    encoding: Encoding
+    """Encoding of the body, as the header names it."""
+    compressed: bool
+    """Whether it is PlayCanvas' compressed ``.ply``."""
+
+
+def read_ply_info(source: Path | bytes) -> PlyInfo:
+    """What a ``.ply`` holds, from its header and its size: the body is not read.
+
+    Raises:
+        InvalidSceneError: as :func:`read_ply`, except for what only the body shows.
+        UnsupportedError: as :func:`read_ply`.
+    """
+    with open_ply(source) as ply:
+        return _check(ply)
+
+
+def read_ply(source: Path | bytes, *, max_gaussians: int | None = None, progress: Progress = silent) -> Splats:
+    """Read a scene as it is, not cleaned: NaN, infinities and rotations of any length pass through.
+
+    Reads binary and ascii files, their properties in any order and of any type, and PlayCanvas' compressed ``.ply``.
+    Elements and properties that Gaussians do not need are ignored, as are bytes after the end. 8-bit ``red``,
+    ``green``, ``blue``, which nerfstudio may write instead of ``f_dc_*``, become the constant SH coefficients.
+    Beside the scene itself, some megabytes of memory are needed.
+
+    Args:
+        source: A file, or the bytes of one.
+        max_gaussians: Scenes with more are refused before memory is allocated; None leaves that to the file's size.
+        progress: Hears of stage ``read``.
+
+    Raises:
+        InvalidSceneError: the file cannot be read, is no PLY file, is damaged or cut short, or holds no Gaussians.
+        UnsupportedError: 2D Gaussians, an SH degree above 3, lists before or among the Gaussians, or more Gaussians
+            than ``max_gaussians``.
+    """
+    with open_ply(source) as ply:
+        info = _check(ply)
+        if max_gaussians is not None and info.count > max_gaussians:
+            raise UnsupportedError(f"{ply.name} has {info.count:,} Gaussians; the limit is {max_gaussians:,}")
+        progress("read", 0.0)
+        if info.compressed:
+            return read_compressed(ply, info.sh_degree, progress)
+        return _read_columns(ply, info.sh_degree, progress)
+
+
+def write_ply(file: BinaryWriter, splats: Splats, *, progress: Progress = silent) -> None:
+    """Write ``splats`` in INRIA's layout: float32, little-endian, normals zero, as many ``f_rest_*`` as the degree has.
+
+    Args:
+        file: The stream; it is not flushed or closed, and its own OSErrors pass through.
+        splats: The scene; float32 values arrive bit by bit.
+        progress: Hears of stage ``write``.
+    """
+    n, k = len(splats), splats.shN.shape[1]
+    names = (*_POSITION, *_NORMAL, *_COLOUR, *_rest(k), *_OPACITY, *_SCALE, *_ROTATION)
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
+    header += [f"property float {name}" for name in names]
+    file.write("\n".join([*header, "end_header\n"]).encode("ascii"))
+    for start in range(0, n, _WRITE_ROWS):
+        part = splats.select(slice(start, start + _WRITE_ROWS))
+        rest = part.shN.transpose(0, 2, 1).reshape(len(part), 3 * k)  # all of R, then G, then B
+        normals, opacities = np.zeros_like(part.means), part.opacities[:, None]
+        table = np.concatenate([part.means, normals, part.sh0, rest, opacities, part.scales, part.quats], axis=1)
+        file.write(table.astype("<f4", copy=False).data)
+        progress("write", min(1.0, (start + _WRITE_ROWS) / n))
+
+
+def _check(ply: PlyFile) -> PlyInfo:
+    """Everything that can be checked without reading the body."""
+    vertex = ply.header.elements.get("vertex")
+    if vertex is None:
+        raise InvalidSceneError(f"{ply.name} has no element 'vertex', so no Gaussians; name a trained splat scene")
+    compressed = is_compressed(ply.header)
+    if compressed:
+        degree = check_compressed(ply)
+    else:
+        _require_gaussians(vertex, ply.name)
+        degree = sh_degree(vertex, ply.name)
+        check_complete(ply, vertex)
+    return PlyInfo(count=vertex.count, sh_degree=degree, encoding=ply.header.encoding, compressed=compressed)
+
+
+def _require_gaussians(vertex: Element, name: str) -> None:
+    present = {p.name for p in vertex.properties}
+    colour = () if _has_rgb(vertex) else _COLOUR
+    missing = [p for p in (*_POSITION, *_OPACITY, *_SCALE, *_ROTATION, *colour) if p not in present]
+    if not missing:
+        return
+    if present.isdisjoint({*_OPACITY, *_SCALE, *_ROTATION}):
+        raise InvalidSceneError(
+            f"{name} is a point cloud or a mesh, not a trained splat scene: it has no {', '.join(missing)}; "
+            "train Gaussians on it, or name the trainer's result"
+        )
+    if missing == ["scale_2"]:
+        raise UnsupportedError(f"{name} holds 2D Gaussians (no scale_2), which are not supported; train 3D Gaussians")
+    raise InvalidSceneError(f"{name} has no {', '.join(missing)}; export the scene with all its properties")
+
+
+def _has_rgb(vertex: Element) -> bool:
+    """Whether the colour stands in 8-bit red, green, blue and nowhere else."""
+    codes = {p.name: p.code for p in vertex.properties}
+    return codes.keys().isdisjoint(_COLOUR) and all(codes.get(name) == "u1" for name in _RGB)
+
+
+def _rest(k: int) -> tuple[str, ...]:
+    return tuple(f"f_rest_{i}" for i in range(3 * k))
+
+
+def _read_columns(ply: PlyFile, degree: int, progress: Progress) -> Splats:
+    vertex = ply.header.elements["vertex"]
+    n, k = vertex.count, SH_REST_COUNTS[degree]
+    rgb = _has_rgb(vertex)
+    # f_rest_* has all coefficients of R, then G, then B; shN has R, G, B of the first, then of the second…
+    rest = tuple(f"f_rest_{channel * k + i}" for i in range(k) for channel in range(3))
+    names = (_POSITION, _ROTATION, _SCALE, _OPACITY, _RGB if rgb else _COLOUR, rest)
+    arrays = [np.empty((n, len(group)), np.float32) for group in names]
+    start = 0
+    for block in rows(ply, vertex):
+        part = slice(start, start + len(block))
+        with np.errstate(over="ignore", invalid="ignore"):  # float64 beyond float32 becomes infinite, as it should
+            for group, array in zip(names, arrays, strict=True):
+                for i, name in enumerate(group):
+                    array[part, i] = block[name]
+        start = part.stop
+        progress("read", start / n)
+    means, quats, scales, opacities, sh0, shN = arrays
+    if rgb:
+        _colour_to_sh(sh0)
+    return Splats(
+        means=means, quats=quats, scales=scales, opacities=opacities.reshape(n), sh0=sh0, shN=shN.reshape(n, k, 3)
+    )
+
+
+def _colour_to_sh(colour: Float32[np.ndarray, "N 3"]) -> None:
+    """8-bit colour to the constant SH coefficient, in place."""
+    colour /= 255
+    colour -= 0.5
+    colour /= np.float32(SH_C0)

@@ -1,0 +1,238 @@
+"""PLY files up to their ``end_header``: opening one, the header's grammar, and what the header alone tells."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import itertools
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from kissgs.errors import InvalidSceneError, UnsupportedError
+from kissgs.splats import SH_REST_COUNTS
+
+Encoding = Literal["ascii", "binary_little_endian", "binary_big_endian"]
+
+MAX_HEADER_BYTES = 1 << 20
+"""A degree-3 header takes 1.5 kB; a megabyte leaves room for tools that keep metadata in comments."""
+
+MAX_PROPERTIES = 4096
+"""Per element. A degree-3 scene has 62; scenes with semantic features have some hundred more."""
+
+_TYPES = {
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "half": "f2",
+    "float": "f4",
+    "double": "f8",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "float16": "f2",
+    "float32": "f4",
+    "float64": "f8",
+}
+"""Numpy's code of every type name: both PLY families, and the half floats that some splat tools write."""
+
+_LOOKALIKES = {
+    b"version https://git-lfs.github.com/spec/": "this is a Git LFS pointer, fetch the real file (git lfs pull)",
+    b"<!doctype": "this is an HTML page, download the file that it links to",
+    b"<html": "this is an HTML page, download the file that it links to",
+    b"\x1f\x8b": "this is compressed with gzip, unpack it first",
+    b"pk\x03\x04": "this is a ZIP archive, unpack it or name the scene by its real extension",
+}
+"""What is often found under the name of a scene, by its first bytes in lower case."""
+
+
+@dataclass(frozen=True, slots=True)
+class Property:
+    """One property of an element: its numpy type code without byte order, such as ``f4``."""
+
+    name: str
+    code: str
+    is_list: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Element:
+    """One element: ``count`` rows of ``properties``, whose names are all different."""
+
+    name: str
+    count: int
+    properties: tuple[Property, ...]
+
+    def dtype(self, encoding: Encoding) -> np.dtype:
+        """Of one row: as it lies in a binary file, or all float64 once ascii is parsed."""
+        if encoding == "ascii":
+            return np.dtype([(p.name, "f8") for p in self.properties])
+        order = ">" if encoding == "binary_big_endian" else "<"
+        return np.dtype([(p.name, order + p.code) for p in self.properties])
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """A parsed header. ``nbytes`` and ``lines`` are its own size, so the body begins right after them."""
+
+    encoding: Encoding
+    elements: dict[str, Element]
+    nbytes: int
+    lines: int
+
+
+@dataclass(frozen=True, slots=True)
+class PlyFile:
+    """An open PLY file: ``name`` for messages, the seekable ``file``, its ``size`` in bytes, and its header."""
+
+    name: str
+    file: io.BufferedIOBase
+    size: int
+    header: Header
+
+
+@contextlib.contextmanager
+def open_ply(source: Path | bytes) -> Iterator[PlyFile]:
+    """Open a file, or bytes that are one, and parse the header. The body is not read.
+
+    Raises:
+        InvalidSceneError: the file cannot be read, or its header is not one of a PLY file.
+    """
+    if isinstance(source, bytes):
+        yield _opened("the data", io.BytesIO(source))
+        return
+    try:
+        if not source.is_file():  # asked first, because opening a named pipe would wait for its writer
+            reason = "it is a folder or a device" if source.exists() else "there is no such file"
+            raise InvalidSceneError(f"cannot read {source}: {reason}; name a .ply file")
+        with source.open("rb") as file:
+            yield _opened(source.name, file)
+    except OSError as error:
+        raise InvalidSceneError(f"cannot read {source}: {(error.strerror or str(error)).lower()}") from error
+
+
+def sh_degree(element: Element, name: str) -> int:
+    """SH degree that the ``f_rest_*`` properties of ``element`` make; ``name`` is the file's, for messages.
+
+    Raises:
+        UnsupportedError: the degree is above 3.
+        InvalidSceneError: their number is that of no degree, or one is missing.
+    """
+    rest = {p.name for p in element.properties if re.fullmatch(r"f_rest_[0-9]+", p.name)}
+    count = len(rest)
+    missing = [f"f_rest_{i}" for i in range(count) if f"f_rest_{i}" not in rest]
+    if missing:
+        raise InvalidSceneError(f"{name} has {count} f_rest properties but no {missing[0]}; export the scene again")
+    if count % 3 == 0 and count // 3 in SH_REST_COUNTS:
+        return SH_REST_COUNTS.index(count // 3)
+    degree = round((count / 3 + 1) ** 0.5) - 1
+    if degree > 3 and 3 * ((degree + 1) ** 2 - 1) == count:
+        raise UnsupportedError(f"{name} has SH degree {degree}; export it with degree 3 or lower")
+    raise InvalidSceneError(f"{name} has {count} f_rest properties; SH degrees 0 to 3 have 0, 9, 24 or 45")
+
+
+def _opened(name: str, file: io.BufferedIOBase) -> PlyFile:
+    size = file.seek(0, io.SEEK_END)
+    file.seek(0)
+    return PlyFile(name, file, size, _read_header(file, name))
+
+
+def _read_header(file: io.BufferedIOBase, name: str) -> Header:
+    _recognise(file.read(64), name)
+    file.seek(0)
+    encoding: Encoding | None = None
+    counts: dict[str, int] = {}
+    properties: dict[str, dict[str, Property]] = {}
+    for number, words in _header_lines(file, name):
+        where = f"{name}, header line {number}"
+        match words:
+            case ["ply"] if number == 1:
+                continue
+            case [] | ["comment" | "obj_info", *_]:
+                continue
+            case ["format", ("ascii" | "binary_little_endian" | "binary_big_endian") as encoding, *_]:
+                continue
+            case ["format", other, *_]:
+                raise InvalidSceneError(
+                    f"{where}: unknown format {_quote(other)}; it is ascii, binary_little_endian or binary_big_endian"
+                )
+            case ["element", element, count]:
+                if element in counts:
+                    raise InvalidSceneError(f"{where}: a second element {_quote(element)}; each may stand once")
+                counts[element] = _count(count, where)
+                properties[element] = {}
+            case ["property", *definition] if counts:
+                _add_property(properties[next(reversed(counts))], definition, where)
+            case ["end_header"]:
+                if encoding is None:
+                    raise InvalidSceneError(f"{name} has no format line in its header; export the scene again")
+                elements = {key: Element(key, counts[key], tuple(properties[key].values())) for key in counts}
+                return Header(encoding, elements, file.tell(), number)
+            case _:
+                raise InvalidSceneError(f"{where}: {_quote(' '.join(words))} is not a line of a PLY header")
+    raise InvalidSceneError(f"{name} has no end_header line; it is cut short or not a PLY file")
+
+
+def _recognise(head: bytes, name: str) -> None:
+    """Refuse what is no PLY file, and say what it is instead."""
+    if not head:
+        raise InvalidSceneError(f"{name} is empty; export or download it again")
+    start = head.removeprefix(b"\xef\xbb\xbf").lstrip().lower()
+    for magic, hint in _LOOKALIKES.items():
+        if start.startswith(magic):
+            raise InvalidSceneError(f"{name} is not a PLY file: {hint}")
+    if not re.match(rb"ply[ \t\r]*\n", head):
+        raise InvalidSceneError(f"{name} is not a PLY file: its first line is not 'ply'")
+
+
+def _header_lines(file: io.BufferedIOBase, name: str) -> Iterator[tuple[int, list[str]]]:
+    """Numbered lines, from 1, as words; ends where the file does, even amid a line."""
+    left = MAX_HEADER_BYTES
+    for number in itertools.count(1):
+        line = file.readline(left + 1)
+        left -= len(line)
+        if left < 0:
+            raise InvalidSceneError(f"{name} has no end_header line within {MAX_HEADER_BYTES} bytes; it is damaged")
+        if not line.endswith(b"\n") and line.strip() != b"end_header":
+            return
+        yield number, line.decode("utf-8", errors="replace").split()
+
+
+def _count(word: str, where: str) -> int:
+    # 18 digits fit 64 bits. Whether so many rows are there is checked against the file's size, before they are read.
+    if not re.fullmatch(r"[0-9]{1,18}", word):
+        raise InvalidSceneError(f"{where}: the count is {_quote(word)}, not a whole number from 0 to 10^18")
+    return int(word)
+
+
+def _add_property(properties: dict[str, Property], definition: list[str], where: str) -> None:
+    match definition:
+        case ["list", length_type, item_type, name]:
+            types = [length_type, item_type]
+        case [scalar_type, name]:
+            types = [scalar_type]
+        case _:
+            raise InvalidSceneError(f"{where}: a property needs a type and a name")
+    unknown = next((kind for kind in types if kind not in _TYPES), None)
+    if unknown is not None:
+        raise InvalidSceneError(f"{where}: unknown type {_quote(unknown)}; known are {', '.join(_TYPES)}")
+    if name in properties:
+        raise InvalidSceneError(f"{where}: a second property {_quote(name)}; each may stand once")
+    if len(properties) == MAX_PROPERTIES:
+        raise UnsupportedError(f"{where}: more than {MAX_PROPERTIES} properties in one element; remove some")
+    properties[name] = Property(name, _TYPES[types[-1]], is_list=len(types) == 2)
+
+
+def _quote(word: str) -> str:
+    """``word`` in quotes, unprintable characters escaped, cut to what fits a sentence."""
+    return repr(word if len(word) <= 40 else word[:39] + "…")

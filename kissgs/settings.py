@@ -1,0 +1,159 @@
+"""What the user may choose: one model per stage, and the presets. Every setting says what it trades."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from kissgs.errors import UnsupportedError
+
+Step = Annotated[float, Field(gt=0, le=10)]
+
+
+class Preset(StrEnum):
+    """Named points on the curve of speed, size and quality."""
+
+    FAST = "fast"
+    BALANCED = "balanced"
+    SMALL = "small"
+    PAPER = "paper"
+
+
+class EncodeSettings(BaseModel):
+    """How Gaussians become images. A decoder needs none of this."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    order: Literal["hilbert", "plas"] = Field(
+        "hilbert",
+        description="Which Gaussian sits where: along a 3D Hilbert curve (fast, smallest) or sorted by PLAS (the paper).",
+    )
+    forms: Literal["upright", "smooth"] = Field(
+        "upright",
+        description="Which of 48 equivalent rotations is stored: the one nearest to none (fast, smallest), or the one "
+        "most like its neighbours (the paper's PRAS). The shape is the same in all.",
+    )
+    shared_steps: bool = Field(
+        True,
+        description="One step for all channels of an attribute, of the size given below. If false, each channel spreads "
+        "the full number of levels over its own range (the paper): the steps below are then ignored.",
+    )
+    means_bits: int | None = Field(
+        None,
+        ge=8,
+        le=16,
+        description="Precision of positions; by default what means_tolerance asks for. 1 bit costs 0.37 bytes a Gaussian.",
+    )
+    means_tolerance: float = Field(
+        0.04,
+        gt=0,
+        le=1,
+        description="Largest error of a position, as a share of the size of the scene's median Gaussian. Used unless "
+        "means_bits is set.",
+    )
+    opacity_step: Step = Field(0.15, description="Step of opacity logits; half of it is the largest error.")
+    scale_step: Step = Field(0.11, description="Step of log-scales: 0.11 means sizes right to within 5.5 %.")
+    quat_step: Annotated[float, Field(gt=0, le=0.5)] = Field(
+        0.023, description="Step of quaternion components: 0.02 turns a Gaussian by 1 degree on average."
+    )
+    sh0_step: Step = Field(0.04, description="Step of base colours: 0.04 is an error of up to 1.4 levels of 255.")
+    sh_ratio: float = Field(
+        8, ge=1, le=4096, description="Gaussians per codebook entry: fewer entries are fewer bytes and a rougher gloss."
+    )
+    sh_tolerance: float = Field(
+        0.001,
+        ge=0,
+        le=1,
+        description="Error of SH coefficients that nobody sees: the codebook does not grow to get below it.",
+    )
+    sh_step: Annotated[float, Field(gt=0, le=4)] = Field(
+        0.9, description="Step of the codebook's entries, in units of the error that the codebook leaves anyway."
+    )
+    sh_weight_power: float = Field(
+        0.25,
+        ge=0,
+        le=1,
+        description="How much the codebook favours what is seen: weights are (opacity x projected area) to this power. "
+        "0 treats all alike; 1 gives up on small and faint Gaussians.",
+    )
+    sh_rounds: int = Field(
+        4, ge=1, le=50, description="Rounds of codebook refinement: more are slower and a little better."
+    )
+    sh_reach: int = Field(
+        16, ge=1, le=512, description="How far a Gaussian may look for its codebook entry; slower, better."
+    )
+    plas_decay: float = Field(
+        0.8, ge=0.5, le=0.99, description="How slowly PLAS and PRAS narrow their filters: 0.95 is slow and smoothest."
+    )
+    drop_invisible: bool = Field(
+        True,
+        description="Leave out Gaussians of opacity 1/255 and less: no renderer draws them. The count is reported.",
+    )
+    webp_quality: int = Field(50, ge=0, le=100, description="Effort of libwebp; always lossless.")
+    webp_method: int = Field(2, ge=0, le=6, description="Methods of libwebp; always lossless.")
+    codebook_effort: bool = Field(
+        True, description="Spend libwebp's highest effort on the codebook image: some seconds for 8 % of it."
+    )
+    seed: int = Field(
+        0, ge=0, lt=2**31, description="Of all random choices. Same input, settings and seed: same bytes."
+    )
+
+
+PRESETS: dict[Preset, dict[str, Any]] = {
+    Preset.FAST: {"sh_rounds": 1, "sh_reach": 6, "plas_decay": 0.6, "codebook_effort": False},
+    Preset.BALANCED: {},
+    Preset.SMALL: {
+        "means_tolerance": 0.08,
+        "opacity_step": 0.25,
+        "scale_step": 0.16,
+        "quat_step": 0.035,
+        "sh0_step": 0.06,
+        "sh_ratio": 20,
+        "sh_rounds": 8,
+        "sh_reach": 32,
+        "plas_decay": 0.95,
+    },
+    Preset.PAPER: {
+        "order": "plas",
+        "forms": "smooth",
+        "shared_steps": False,
+        "means_bits": 16,
+        "sh_weight_power": 0,
+        "sh_tolerance": 0,
+        "sh_rounds": 8,
+        "sh_reach": 32,
+        "plas_decay": 0.95,
+        "webp_quality": 75,
+        "webp_method": 4,
+        "codebook_effort": False,
+    },
+}
+
+
+class Settings(BaseModel):
+    """All settings of a compression: one group per stage."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    preset: Preset = Field(Preset.BALANCED, description="Where unset settings come from.")
+    encode: EncodeSettings = Field(default_factory=EncodeSettings)
+
+    @classmethod
+    def from_preset(cls, preset: Preset | str = Preset.BALANCED, **encode: Any) -> Self:  # noqa: ANN401
+        """Settings of a preset, with single ones of the encoder replaced.
+
+        Raises:
+            UnsupportedError: no such preset or setting, or a value that is not possible.
+        """
+        if preset not in set(Preset):
+            raise UnsupportedError(f"there is no preset {preset!r}; choose one of {', '.join(Preset)}")
+        try:
+            return cls(preset=Preset(preset), encode=EncodeSettings(**{**PRESETS[Preset(preset)], **encode}))
+        except ValidationError as error:
+            problem = error.errors()[0]
+            name = ".".join(map(str, problem["loc"]))
+            known = ", ".join(EncodeSettings.model_fields)
+            hint = f"; there are {known}" if problem["type"] == "extra_forbidden" else ""
+            raise UnsupportedError(f"setting {name!r}: {problem['msg'].lower()}{hint}") from error

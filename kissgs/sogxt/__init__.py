@@ -1,0 +1,1 @@
+"""The SOG-XT codec: Gaussians as nine lossless images and a small metadata file. Needs no camera and no renderer."""

@@ -1,0 +1,133 @@
+"""The SH codebook: how many entries a scene needs, what they are, and where they lie in their image."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Int, UInt8
+
+from kissgs.errors import InvalidSceneError
+from kissgs.progress import Progress
+from kissgs.settings import EncodeSettings
+from kissgs.sogxt import kmeans
+from kissgs.sogxt.metadata import MAX_CODEBOOK_SIDE, TILE_COLUMNS, TILE_ROWS
+from kissgs.sogxt.parallel import Workers
+from kissgs.sogxt.plas import plas
+from kissgs.sogxt.quantize import Quantized, quantize
+from kissgs.splats import Splats
+
+COEFFICIENTS = TILE_ROWS * TILE_COLUMNS
+MIN_SIDE = 8
+
+WEIGHT_FLOOR, WEIGHT_CEILING = 0.1, 20.0
+"""Bounds of weights, in units of the median: no Gaussian is given up, none rules alone."""
+
+PAPER_TOP = 99
+"""The paper's codebook has 100 levels in every channel."""
+
+
+@dataclass(frozen=True, slots=True)
+class Codebook:
+    """S × S entries, and the one that stands for each Gaussian.
+
+    Attributes:
+        side: S.
+        centroids: ``(S*S, 45)`` levels, channel-major (15 of red, 15 of green, 15 of blue), entries row-major.
+        labels: ``(M,)`` entry of each Gaussian.
+    """
+
+    side: int
+    centroids: Quantized
+    labels: Int[np.ndarray, " M"]
+
+    def tiles(self) -> UInt8[np.ndarray, "3*S 5*S 3"]:
+        """The image: one tile of S × S pixels per coefficient, three rows of five."""
+        levels = self.centroids.levels.reshape(self.side, self.side, 3, TILE_ROWS, TILE_COLUMNS)
+        tiled = levels.transpose(3, 0, 4, 1, 2)
+        return np.ascontiguousarray(tiled.reshape(TILE_ROWS * self.side, TILE_COLUMNS * self.side, 3))
+
+
+def fit_codebook(
+    splats: Splats,
+    chosen: Int[np.ndarray, " M"],
+    importance: Float32[np.ndarray, " N"] | None,
+    settings: EncodeSettings,
+    pool: Workers,
+    progress: Progress,
+) -> Codebook:
+    """Build the codebook for the Gaussians ``chosen``.
+
+    A scene without SH, or with bands that are zero throughout, pays nothing for them: their tiles are constant.
+
+    Raises:
+        InvalidSceneError: ``importance`` does not fit the scene.
+    """
+    weights = _weights(splats, importance, settings.sh_weight_power)[chosen]
+    dimensions = splats.shN.shape[1] * 3
+    if dimensions == 0 or len(chosen) == 0:
+        nothing = quantize(np.zeros((MIN_SIDE**2, 3 * COEFFICIENTS)), step=1)
+        return Codebook(MIN_SIDE, nothing, np.zeros(len(chosen), dtype=np.int32))
+    progress("codebook", 0.0)
+    clusters = kmeans.fit(
+        splats.shN[chosen].reshape(len(chosen), dimensions),
+        weights,
+        codebook_side(len(chosen), settings.sh_ratio) ** 2,
+        pool,
+        seed=settings.seed,
+        rounds=settings.sh_rounds,
+        reach=settings.sh_reach,
+        tolerance=settings.sh_tolerance,
+        lattice=settings.sh_step if settings.shared_steps else 0.0,
+        report=lambda fraction: progress("codebook", fraction),
+    )
+    # The smallest image that holds the entries found; what is left of it repeats some of them.
+    side = next(s for s in range(MIN_SIDE, MAX_CODEBOOK_SIDE + 1, 8) if s * s >= len(clusters.centroids))
+    entries = clusters.centroids[np.arange(side * side) % len(clusters.centroids)]
+    progress("sort codebook", 0.0)
+    placed = _sort(entries, settings, pool, lambda fraction: progress("sort codebook", fraction))
+    position = np.empty(side * side, dtype=np.int32)
+    position[placed] = np.arange(side * side, dtype=np.int32)
+    full = np.zeros((side * side, 3, COEFFICIENTS), dtype=np.float32)
+    full[:, :, : dimensions // 3] = entries[placed].reshape(side * side, -1, 3).transpose(0, 2, 1)
+    full = full.reshape(side * side, 3 * COEFFICIENTS)
+    if settings.shared_steps:
+        levels = quantize(full, step=max(clusters.step, 1e-30))
+    else:
+        levels = quantize(full, step=1, shared=False, max_top=PAPER_TOP)
+    return Codebook(side, levels, position[clusters.labels])
+
+
+def codebook_side(count: int, ratio: float) -> int:
+    """S for ``count`` Gaussians, ``ratio`` of them per entry: a multiple of 8 from 8 to 256, rounded down."""
+    side = int((count / ratio) ** 0.5) // 8 * 8
+    return min(max(side, MIN_SIDE), MAX_CODEBOOK_SIDE)
+
+
+def _sort(
+    entries: Float32[np.ndarray, "S*S D"],
+    settings: EncodeSettings,
+    pool: Workers,
+    report: Callable[[float], None],
+) -> Int[np.ndarray, " S*S"]:
+    """Entry for each place of the image: neighbours alike, so that the image compresses."""
+    if (entries == entries[0]).all():
+        return np.arange(len(entries), dtype=np.int32)
+    return plas(np.ascontiguousarray(entries), pool, seed=settings.seed, decay=settings.plas_decay, report=report)
+
+
+def _weights(splats: Splats, importance: Float32[np.ndarray, " N"] | None, power: float) -> Float32[np.ndarray, " N"]:
+    """How much each Gaussian's SH counts: as given, or (opacity × area of its two longest axes) to ``power``."""
+    if importance is None:
+        area = np.sort(splats.scales, axis=1)[:, 1:].sum(axis=1, dtype=np.float64)
+        logs = area - np.logaddexp(0, -splats.opacities.astype(np.float64))
+        logs = power * (logs - np.median(logs)) if len(logs) else logs
+    else:
+        if importance.shape != (len(splats),) or not (np.isfinite(importance) & (importance > 0)).all():
+            raise InvalidSceneError(
+                f"importance must be {len(splats)} positive numbers, one per Gaussian; it has shape {importance.shape}"
+            )
+        logs = np.log(importance.astype(np.float64))
+        logs -= np.median(logs) if len(logs) else 0
+    return np.exp(np.clip(logs, np.log(WEIGHT_FLOOR), np.log(WEIGHT_CEILING))).astype(np.float32)

@@ -1,0 +1,191 @@
+"""A set of named byte strings, as a directory, a stored zip or in memory. Names and sizes are checked before reading."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import shutil
+import tempfile
+import zipfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import BinaryIO, Protocol
+
+from kissgs.errors import InvalidContainerError, OutputError
+from kissgs.io.atomic import atomic_file
+
+MAX_ZIP_ENTRIES = 1000
+"""A container has 12 files; people may add notes and previews, not thousands of entries."""
+
+
+class Source(Protocol):
+    """Where a container's files are read from."""
+
+    def names(self) -> frozenset[str]:
+        """Names of the files that are there."""
+
+    def read(self, name: str, limit: int) -> bytes:
+        """The bytes of one file; InvalidContainerError if it is missing or has more than ``limit``."""
+
+
+class MemorySource:
+    """Files in memory."""
+
+    def __init__(self, files: Mapping[str, bytes]) -> None:
+        self._files = files
+
+    def names(self) -> frozenset[str]:
+        """See :class:`Source`."""
+        return frozenset(self._files)
+
+    def read(self, name: str, limit: int) -> bytes:
+        """See :class:`Source`."""
+        _check(name, name in self._files, len(self._files.get(name, b"")), limit)
+        return self._files[name]
+
+
+class DirectorySource:
+    """Files in a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def names(self) -> frozenset[str]:
+        """See :class:`Source`."""
+        return frozenset(entry.name for entry in self._folder.iterdir() if entry.is_file())
+
+    def read(self, name: str, limit: int) -> bytes:
+        """See :class:`Source`."""
+        path = self._folder / name
+        _check(name, path.is_file(), path.stat().st_size if path.is_file() else 0, limit)
+        try:
+            return path.read_bytes()
+        except OSError as error:
+            raise InvalidContainerError(f"cannot read {path}: {error.strerror}") from error
+
+
+class ZipSource:
+    """Files in a zip, at its top or together in one folder of it. Nothing is ever extracted to disk."""
+
+    def __init__(self, file: BinaryIO, label: str) -> None:
+        try:
+            self._zip = zipfile.ZipFile(file)
+            entries = self._zip.infolist()
+        except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, EOFError) as error:
+            raise InvalidContainerError(f"{label} is not a readable zip file") from error
+        if len(entries) > MAX_ZIP_ENTRIES:
+            raise InvalidContainerError(f"{label} has {len(entries)} entries; a container has 12 files")
+        self._entries: dict[str, zipfile.ZipInfo] = {}
+        for entry in entries:
+            if entry.is_dir():
+                continue
+            name = entry.filename.replace("\\", "/").rsplit("/", 1)[-1]
+            if name in self._entries:
+                raise InvalidContainerError(f"{label} holds two files named {name!r}")
+            self._entries[name] = entry
+
+    def names(self) -> frozenset[str]:
+        """See :class:`Source`."""
+        return frozenset(self._entries)
+
+    def read(self, name: str, limit: int) -> bytes:
+        """See :class:`Source`."""
+        entry = self._entries.get(name)
+        _check(name, entry is not None, entry.file_size if entry else 0, limit)
+        try:
+            with self._zip.open(entry or name) as file:
+                data = file.read(limit + 1)  # never trust the declared size of a deflated entry
+        except Exception as error:  # noqa: BLE001  zipfile raises a dozen kinds, zlib.error and RuntimeError among them
+            raise InvalidContainerError(f"{name} cannot be read from the zip: it is damaged or encrypted") from error
+        _check(name, True, len(data), limit)
+        return data
+
+
+@contextlib.contextmanager
+def open_source(source: Path | bytes | Mapping[str, bytes]) -> Iterator[Source]:
+    """Open a container for reading: a folder, a zip file, the bytes of one, or files in memory.
+
+    Raises:
+        InvalidContainerError: there is nothing of that kind.
+    """
+    if isinstance(source, bytes):
+        yield ZipSource(io.BytesIO(source), "the input")
+    elif not isinstance(source, Path):
+        yield MemorySource(source)
+    elif source.is_dir():
+        yield DirectorySource(source)
+    else:
+        try:
+            file = source.open("rb")
+        except OSError as error:
+            raise InvalidContainerError(f"cannot read {source}: {(error.strerror or str(error)).lower()}") from error
+        with file:
+            yield ZipSource(file, str(source))
+
+
+def zip_bytes(files: Mapping[str, bytes]) -> bytes:
+    """The files as one stored zip; equal files give equal bytes (no time, no system)."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+        for name, data in files.items():
+            entry = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
+            entry.create_system = 3
+            entry.external_attr = 0o644 << 16
+            archive.writestr(entry, data)
+    return buffer.getvalue()
+
+
+def write_container(files: Mapping[str, bytes], path: Path, *, overwrite: bool = False) -> int:
+    """Write a container whole or not at all: a zip if the name ends in ``.zip``, else a folder.
+
+    Returns:
+        Bytes written.
+
+    Raises:
+        OutputError: it exists and ``overwrite`` is false, or the file system refuses. A folder is only ever replaced
+            if it holds a container and nothing else.
+    """
+    if path.suffix.lower() == ".zip":
+        data = zip_bytes(files)
+        with atomic_file(path, overwrite=overwrite) as file:
+            file.write(data)
+        return len(data)
+    _write_directory(files, path, overwrite=overwrite)
+    return sum(map(len, files.values()))
+
+
+def _write_directory(files: Mapping[str, bytes], path: Path, *, overwrite: bool) -> None:
+    if path.exists():
+        if not overwrite:
+            raise OutputError(f"{path} exists already; choose another name or allow overwriting (--force)")
+        if not path.is_dir() or {entry.name for entry in path.iterdir()} - set(files):
+            raise OutputError(f"{path} holds more than a container; name an empty or a new folder, or a .zip file")
+    temporary: Path | None = None
+    try:
+        temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part"))
+        for name, data in files.items():
+            with (temporary / name).open("wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+        temporary.chmod(0o755)
+        if path.exists():
+            old = temporary.with_suffix(".old")
+            path.rename(old)
+            temporary.rename(path)
+            shutil.rmtree(old)
+        else:
+            temporary.rename(path)
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {(error.strerror or str(error)).lower()}") from error
+    finally:
+        if temporary is not None and temporary.exists():
+            shutil.rmtree(temporary)
+
+
+def _check(name: str, present: bool, size: int, limit: int) -> None:
+    if not present:
+        raise InvalidContainerError(f"the container has no file {name!r}")
+    if size > limit:
+        raise InvalidContainerError(f"{name} has {size} bytes; at most {limit} are possible here")

@@ -1,0 +1,106 @@
+"""Image planes <-> lossless WebP bytes."""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from kissgs.errors import InvalidContainerError
+from kissgs.settings import EncodeSettings
+from kissgs.sogxt.parallel import Workers
+
+
+HIGHEST_EFFORT = (100, 6)
+
+
+def compress_images(
+    images: Mapping[str, UInt8[np.ndarray, "H W C"]],
+    settings: EncodeSettings,
+    pool: Workers,
+    report: Callable[[float], None],
+) -> dict[str, bytes]:
+    """Compress all images of a container in parallel, the slowest first."""
+
+    def work(name: str) -> bytes:
+        slow = settings.codebook_effort and name.startswith("f_rest_centroids")
+        quality, method = HIGHEST_EFFORT if slow else (settings.webp_quality, settings.webp_method)
+        return encode_plane(images[name], quality=quality, method=method)
+
+    names = sorted(images, key=lambda name: (not name.startswith("f_rest_centroids"), -images[name].size))
+    files = dict(zip(names, pool.map(work, names, report), strict=True))
+    return {name: files[name] for name in images}
+
+
+def encode_plane(image: UInt8[np.ndarray, "H W C"], *, quality: int, method: int) -> bytes:
+    """Compress one image of 1, 3 or 4 channels; ``quality`` and ``method`` are only effort.
+
+    Lossless and ``exact``: without it, libwebp blackens the colour of pixels whose fourth channel is 0.
+    """
+    picture = Image.fromarray(image[:, :, 0] if image.shape[2] == 1 else image)
+    buffer = io.BytesIO()
+    picture.save(buffer, "WEBP", lossless=True, exact=True, quality=quality, method=method)
+    return buffer.getvalue()
+
+
+def decode_plane(data: bytes, name: str, *, width: int, height: int, channels: int) -> UInt8[np.ndarray, "H W C"]:
+    """Decompress one image.
+
+    Args:
+        data: a WebP file.
+        name: of the file, for error messages.
+        width: that the image must have; it is checked before memory is taken.
+        height: likewise.
+        channels: how many to return: 1 (the first), 3, or 4 (the fourth is 255 where the file has none).
+
+    Raises:
+        InvalidContainerError: it is no lossless WebP, of another size, or damaged.
+    """
+    found = probe_webp(data, name)
+    if found != (width, height):
+        raise InvalidContainerError(
+            f"{name} is {found[0]} x {found[1]} pixels; the metadata asks for {width} x {height}"
+        )
+    try:
+        with Image.open(io.BytesIO(data), formats=["WEBP"]) as picture:
+            picture.load()
+            pixels = np.asarray(picture)
+    except (OSError, ValueError, SyntaxError, EOFError, MemoryError) as error:
+        raise InvalidContainerError(f"{name} is damaged: its WebP data cannot be decoded") from error
+    if channels == 4 and pixels.shape[2] == 3:
+        opaque = np.full((height, width, 1), 255, dtype=np.uint8)
+        return np.concatenate([pixels, opaque], axis=2)
+    return pixels[:, :, :channels]
+
+
+def probe_webp(data: bytes, name: str) -> tuple[int, int]:
+    """Width and height in pixels, from the header alone.
+
+    Raises:
+        InvalidContainerError: it is no WebP, lossy, animated, or cut off.
+    """
+    if len(data) < 30 or data[:4] != b"RIFF" or data[8:12] != b"WEBP":
+        raise InvalidContainerError(f"{name} is not a WebP image")
+    if struct.unpack_from("<I", data, 4)[0] + 8 > len(data):
+        raise InvalidContainerError(f"{name} is cut off: its header announces more bytes than there are")
+    position, size = 12, None
+    while position + 8 <= len(data):
+        kind, length = data[position : position + 4], struct.unpack_from("<I", data, position + 4)[0]
+        body = position + 8
+        if kind == b"VP8L" and body + 5 <= len(data) and data[body] == 0x2F:
+            bits = struct.unpack_from("<I", data, body + 1)[0]
+            found = (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+            if size not in (None, found):
+                break
+            return found
+        if kind == b"VP8X" and body + 10 <= len(data):
+            wide, high = data[body + 4 : body + 7] + b"\0", data[body + 7 : body + 10] + b"\0"
+            size = struct.unpack("<I", wide)[0] + 1, struct.unpack("<I", high)[0] + 1
+        if kind in (b"VP8 ", b"ANIM", b"ANMF"):
+            raise InvalidContainerError(f"{name} is a lossy or animated WebP; planes must be lossless")
+        position = body + length + (length & 1)
+    raise InvalidContainerError(f"{name} is damaged: it has no lossless WebP image inside")

@@ -1,0 +1,200 @@
+"""Oracle: known perturbations, SciPy's rotations and octahedral group, and loops over single Gaussians."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from kissgs.errors import InvalidSceneError
+from kissgs.evaluation import attributes
+from kissgs.evaluation.attributes import attribute_errors
+from kissgs.sample import sample_scene
+from kissgs.splats import SH_C0
+
+OCTAHEDRAL = Rotation.create_group("O")
+seeds = st.integers(0, 2**32)
+
+
+def test_a_scene_against_itself_has_no_errors():
+    scene = sample_scene(300)
+    errors = attribute_errors(scene, scene)
+    assert errors.gaussians == 300
+    for name in ("means", "means_relative", "scales", "opacity_logits", "opacities", "sh0", "sh0_levels"):
+        assert getattr(errors, name).max == 0
+    assert errors.rotation_degrees.max < 1e-5
+    assert errors.covariance_relative_max == 0
+    assert errors.shN.rmse == 0
+    assert [band.energy_kept for band in errors.bands] == [1, 1, 1]
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=seeds)
+def test_equivalent_forms_are_no_error(seed):
+    scene = sample_scene(60, sh_degree=0, seed=seed)
+    errors = attribute_errors(scene, in_other_forms(scene, np.random.default_rng(seed)))
+    assert errors.rotation_degrees.max < 1e-4
+    assert errors.scales.max == 0
+    assert errors.covariance_relative_max < 1e-5
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=seeds, degrees=st.floats(0.01, 15))
+def test_a_known_turn_is_found_in_any_form(seed, degrees):
+    rng = np.random.default_rng(seed)
+    scene = sample_scene(60, sh_degree=0, seed=seed)
+    # Three clearly different axes: otherwise exchanging two of them may be the smaller error.
+    scene = replace(scene, scales=rng.permuted(np.tile(np.float32([-6, -4, -2]), (60, 1)), axis=1))
+    axes = rng.normal(size=(60, 3))
+    turn = Rotation.from_rotvec(np.radians(degrees) * axes / np.linalg.norm(axes, axis=1, keepdims=True))
+    errors = attribute_errors(scene, in_other_forms(with_rotations(scene, turn * rotations(scene)), rng))
+    assert errors.rotation_degrees.rmse == pytest.approx(degrees, abs=1e-4)
+    assert errors.rotation_degrees.max == pytest.approx(degrees, abs=1e-4)
+    assert errors.scales.max == 0
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=seeds)
+def test_the_nearest_form_is_that_of_a_search_over_all(seed):
+    rng = np.random.default_rng(seed)
+    reference, candidate = sample_scene(12, sh_degree=0, seed=seed), sample_scene(12, sh_degree=0, seed=seed + 1)
+    candidate = replace(candidate, scales=(reference.scales + rng.normal(0, 1, (12, 3))).astype(np.float32))
+    angles, differences = [], []
+    for row in range(12):
+        ours, theirs = rotations(reference)[row], rotations(candidate)[row]
+        forms = []
+        for form in OCTAHEDRAL:
+            renaming = np.abs(form.as_matrix()).argmax(axis=0)
+            angle = ((theirs * form).inv() * ours).magnitude()
+            difference = candidate.scales[row, renaming].astype(float) - reference.scales[row]
+            forms.append((angle**2 + (difference**2).sum(), angle, difference))
+        _, angle, difference = min(forms, key=lambda form: form[0])
+        angles.append(angle)
+        differences.append(difference)
+    errors = attribute_errors(reference, candidate)
+    assert errors.rotation_degrees.rmse == pytest.approx(np.degrees(np.sqrt(np.mean(np.square(angles)))), rel=1e-6)
+    assert errors.rotation_degrees.max == pytest.approx(np.degrees(max(angles)), rel=1e-6)
+    assert errors.scales.rmse == pytest.approx(np.sqrt(np.mean(np.square(differences))), rel=1e-9)
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=seeds)
+def test_covariance_errors_are_those_of_the_matrices(seed):
+    reference, candidate = sample_scene(15, sh_degree=0, seed=seed), sample_scene(15, sh_degree=0, seed=seed + 1)
+    relative = []
+    for row in range(15):
+        ours, theirs = covariance(reference, row), covariance(candidate, row)
+        relative.append(np.linalg.norm(theirs - ours) / np.linalg.norm(ours))
+    errors = attribute_errors(reference, candidate)
+    assert errors.covariance_relative_median == pytest.approx(np.median(relative), rel=1e-6)
+    assert errors.covariance_relative_max == pytest.approx(max(relative), rel=1e-6)
+
+
+def test_each_unit():
+    scene = sample_scene(4, sh_degree=0)
+    means, opacities, sh0 = (np.zeros_like(array) for array in (scene.means, scene.opacities, scene.sh0))
+    reference = replace(scene, means=means + 3, opacities=opacities, sh0=sh0)
+    means[2, 1], opacities[3], sh0[0, 2] = 0.5, np.log(3), 0.1
+    errors = attribute_errors(
+        reference,
+        replace(reference, means=means + 3, opacities=opacities, scales=scene.scales + np.float32(0.25), sh0=sh0),
+    )
+    assert (errors.means.rmse, errors.means.max) == pytest.approx((0.5 / np.sqrt(12), 0.5))
+    assert (errors.means_relative.rmse, errors.means_relative.max) == pytest.approx((0.125 / np.sqrt(12), 0.125))
+    assert (errors.opacity_logits.rmse, errors.opacity_logits.max) == pytest.approx((np.log(3) / 2, np.log(3)))
+    assert (errors.opacities.rmse, errors.opacities.max) == pytest.approx((0.125, 0.25))
+    assert (errors.sh0.rmse, errors.sh0.max) == pytest.approx((0.1 / np.sqrt(12), 0.1))
+    assert errors.sh0_levels.max == pytest.approx(25.5 * SH_C0)
+    assert (errors.scales.rmse, errors.scales.max) == pytest.approx((0.25, 0.25), rel=1e-5)
+    assert errors.covariance_relative_median == pytest.approx(np.exp(0.5) - 1, rel=1e-5)
+    assert errors.rotation_degrees.max < 1e-5
+
+
+def test_sh_energy_band_by_band():
+    scene = sample_scene(200)
+    shN = scene.shN.copy()
+    shN[:, :3] *= np.float32(0.5)
+    shN[:, 8:] = 0
+    errors = attribute_errors(scene, replace(scene, shN=shN))
+    assert [band.energy_kept for band in errors.bands] == pytest.approx([0.75, 1, 0])
+    assert errors.bands[0].signal == pytest.approx(np.sqrt((scene.shN[:, :3].astype(float) ** 2).mean()))
+    assert errors.bands[2].rmse == errors.bands[2].signal
+    assert errors.shN.rmse == pytest.approx(np.sqrt(((scene.shN - shN).astype(float) ** 2).mean()), rel=1e-6)
+    signal = (scene.shN.astype(float) ** 2).sum()
+    assert errors.shN.energy_kept == pytest.approx(1 - ((scene.shN - shN).astype(float) ** 2).sum() / signal, rel=1e-6)
+
+
+def test_bands_that_the_candidate_lacks_are_zeros():
+    scene = sample_scene(50)
+    short = attribute_errors(scene, replace(scene, shN=scene.shN[:, :3]))
+    padded = np.where(np.arange(15)[:, None] < 3, scene.shN, np.float32(0))
+    assert short == attribute_errors(scene, replace(scene, shN=padded))
+    assert [band.energy_kept for band in short.bands] == [1, 0, 0]
+
+
+def test_no_sh_energy_is_no_number():
+    scene = sample_scene(5, sh_degree=1)
+    errors = attribute_errors(replace(scene, shN=np.zeros_like(scene.shN)), scene)
+    assert errors.shN.energy_kept is None
+    assert errors.shN.rmse > 0
+
+
+def test_an_empty_scene_has_no_errors():
+    errors = attribute_errors(sample_scene(0), sample_scene(0))
+    assert (errors.gaussians, errors.means.rmse, errors.rotation_degrees.max, errors.covariance_relative_median) == (
+        0,
+    ) * 4
+    assert errors.shN.energy_kept is None
+
+
+def test_chunks_change_nothing(monkeypatch):
+    reference, candidate = sample_scene(100, seed=1), sample_scene(100, seed=2)
+    whole = attribute_errors(reference, candidate).as_dict()
+    monkeypatch.setattr(attributes, "CHUNK", 7)
+    parts = attribute_errors(reference, candidate).as_dict()
+    assert flatten(parts) == pytest.approx(flatten(whole), rel=1e-9)
+
+
+def test_the_numbers_fit_into_json():
+    errors = attribute_errors(sample_scene(20, seed=1), sample_scene(20, seed=2)).as_dict()
+    read = json.loads(json.dumps(errors, allow_nan=False))
+    assert read["means"] == errors["means"]
+    assert len(read["bands"]) == 3
+
+
+def test_scenes_that_cannot_be_compared_are_refused():
+    with pytest.raises(InvalidSceneError, match="4 and 3 Gaussians"):
+        attribute_errors(sample_scene(4), sample_scene(3))
+    with pytest.raises(InvalidSceneError, match="SH degree, 2, is above the reference's, 1"):
+        attribute_errors(sample_scene(4, sh_degree=1), sample_scene(4, sh_degree=2))
+
+
+def rotations(splats):
+    return Rotation.from_quat(splats.quats, scalar_first=True)
+
+
+def with_rotations(splats, turned):
+    return replace(splats, quats=turned.as_quat(scalar_first=True).astype(np.float32))
+
+
+def in_other_forms(splats, rng):
+    """Each Gaussian in a random one of its 48 equivalent forms."""
+    forms = OCTAHEDRAL[rng.integers(24, size=len(splats))]
+    renaming = np.abs(forms.as_matrix()).argmax(axis=1)
+    scene = with_rotations(splats, rotations(splats) * forms)
+    signs = rng.choice(np.float32([-1, 1]), (len(splats), 1))
+    return replace(scene, quats=scene.quats * signs, scales=np.take_along_axis(splats.scales, renaming, axis=1))
+
+
+def covariance(splats, row):
+    axes = rotations(splats)[row].as_matrix() @ np.diag(np.exp(splats.scales[row].astype(float)))
+    return axes @ axes.T
+
+
+def flatten(tree):
+    if isinstance(tree, dict):
+        tree = list(tree.values())
+    return [leaf for branch in tree for leaf in flatten(branch)] if isinstance(tree, list | tuple) else [tree]
