@@ -1,0 +1,86 @@
+"""kissgs: 3D Gaussian Splatting scenes as SOG-XT containers of a few megabytes that any browser can open.
+
+>>> import kissgs
+>>> result = kissgs.compress("scene.ply", "scene.zip")
+>>> splats = kissgs.decompress("scene.zip")
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+from kissgs._version import __version__
+
+if TYPE_CHECKING:
+    from kissgs.errors import (
+        Cancelled,
+        InvalidContainerError,
+        InvalidSceneError,
+        KissgsError,
+        OutputError,
+        UnsupportedError,
+    )
+    from kissgs.pipeline import Compressed, Report, compress, decompress, load, save
+    from kissgs.progress import Progress
+    from kissgs.sample import sample_scene
+    from kissgs.settings import EncodeSettings, Preset, Settings
+    from kissgs.splats import Splats, clean
+
+_HOMES = {
+    "Cancelled": "errors",
+    "Compressed": "pipeline",
+    "EncodeSettings": "settings",
+    "InvalidContainerError": "errors",
+    "InvalidSceneError": "errors",
+    "KissgsError": "errors",
+    "OutputError": "errors",
+    "Preset": "settings",
+    "Progress": "progress",
+    "Report": "pipeline",
+    "Settings": "settings",
+    "Splats": "splats",
+    "UnsupportedError": "errors",
+    "clean": "splats",
+    "compress": "pipeline",
+    "decompress": "pipeline",
+    "load": "pipeline",
+    "sample_scene": "sample",
+    "save": "pipeline",
+}
+
+__all__ = [
+    "Cancelled",
+    "Compressed",
+    "EncodeSettings",
+    "InvalidContainerError",
+    "InvalidSceneError",
+    "KissgsError",
+    "OutputError",
+    "Preset",
+    "Progress",
+    "Report",
+    "Settings",
+    "Splats",
+    "UnsupportedError",
+    "__version__",
+    "clean",
+    "compress",
+    "decompress",
+    "load",
+    "sample_scene",
+    "save",
+]
+
+
+def __getattr__(name: str) -> object:
+    """Import a public name when it is first used, so that ``import kissgs`` costs nothing."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'kissgs' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"kissgs.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

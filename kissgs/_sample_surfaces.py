@@ -5,12 +5,12 @@ Axes as in COLMAP, y pointing down: the ground is y = 0, the camera looks along 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
-from numpy.typing import ArrayLike
 
 UV = Float32[np.ndarray, "M 2"]
 Rows = Float32[np.ndarray, "M 3"]
@@ -19,7 +19,7 @@ Patch = tuple[Rows, Rows, Column]
 """Points, unit normals, and the area of the surface per unit of the square."""
 
 
-def f32(values: ArrayLike) -> Float32[np.ndarray, "..."]:
+def f32(values: Sequence[Any] | np.ndarray) -> Float32[np.ndarray, "..."]:
     """``values`` as a float32 array."""
     return np.asarray(values, np.float32)
 
@@ -162,8 +162,8 @@ def landscape(points: Rows) -> Rows:
     height = -direction[:, 1]
     blue = _mix((0.80, 0.88, 0.94), (0.22, 0.46, 0.82), 2.4 * height)
     heavens = _mix(blue, (0.98, 0.97, 0.96), 1.6 * _noise(direction * f32([1, 3, 1]), 1.1) - 0.6)
-    hills = _mix((0.42, 0.54, 0.38), (0.20, 0.36, 0.20), 0.5 + 0.4 * _noise(direction, 3) - 2 * height)
-    crest = 0.08 + 0.05 * _noise(direction * f32([1, 0, 1]), 2)
+    hills = _mix((0.42, 0.54, 0.38), (0.20, 0.36, 0.20), 0.5 + 0.4 * _noise(direction, 3.0) - 2 * height)
+    crest = 0.08 + 0.05 * _noise(direction * f32([1, 0, 1]), 2.0)
     return _mix(hills, heavens, 40 * (height - crest))
 
 

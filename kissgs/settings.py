@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from kissgs.errors import UnsupportedError
 
@@ -28,7 +28,7 @@ class EncodeSettings(BaseModel):
 
     order: Literal["hilbert", "plas"] = Field(
         "hilbert",
-        description="Which Gaussian sits where: along a 3D Hilbert curve (fast, smallest) or sorted by PLAS (the paper).",
+        description="Which Gaussian sits where: along a 3D Hilbert curve (fast, smallest) or by PLAS (the paper).",
     )
     forms: Literal["upright", "smooth"] = Field(
         "upright",
@@ -37,14 +37,14 @@ class EncodeSettings(BaseModel):
     )
     shared_steps: bool = Field(
         True,
-        description="One step for all channels of an attribute, of the size given below. If false, each channel spreads "
+        description="One step for all channels of an attribute, of the size given below. If false, each spreads "
         "the full number of levels over its own range (the paper): the steps below are then ignored.",
     )
     means_bits: int | None = Field(
         None,
         ge=8,
         le=16,
-        description="Precision of positions; by default what means_tolerance asks for. 1 bit costs 0.37 bytes a Gaussian.",
+        description="Precision of positions; by default what means_tolerance asks for. A bit is 0.37 bytes a Gaussian.",
     )
     means_tolerance: float = Field(
         0.04,
@@ -137,8 +137,17 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    preset: Preset = Field(Preset.BALANCED, description="Where unset settings come from.")
-    encode: EncodeSettings = Field(default_factory=EncodeSettings)
+    preset: Preset = Field(Preset.BALANCED, description="Where settings that are not given come from.")
+    encode: EncodeSettings = EncodeSettings()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_from_preset(cls, given: Any) -> Any:  # noqa: ANN401
+        if not isinstance(given, dict) or given.get("preset", Preset.BALANCED) not in set(Preset):
+            return given  # not ours to judge: validation says what is wrong with it
+        chosen = PRESETS[Preset(given.get("preset", Preset.BALANCED))]
+        encode = given.get("encode", {})
+        return {**given, "encode": {**chosen, **encode} if isinstance(encode, dict) else encode}
 
     @classmethod
     def from_preset(cls, preset: Preset | str = Preset.BALANCED, **encode: Any) -> Self:  # noqa: ANN401
@@ -150,10 +159,11 @@ class Settings(BaseModel):
         if preset not in set(Preset):
             raise UnsupportedError(f"there is no preset {preset!r}; choose one of {', '.join(Preset)}")
         try:
-            return cls(preset=Preset(preset), encode=EncodeSettings(**{**PRESETS[Preset(preset)], **encode}))
+            return cls.model_validate({"preset": preset, "encode": encode})
         except ValidationError as error:
             problem = error.errors()[0]
-            name = ".".join(map(str, problem["loc"]))
-            known = ", ".join(EncodeSettings.model_fields)
-            hint = f"; there are {known}" if problem["type"] == "extra_forbidden" else ""
-            raise UnsupportedError(f"setting {name!r}: {problem['msg'].lower()}{hint}") from error
+            name = str(problem["loc"][-1])
+            if problem["type"] == "extra_forbidden":
+                known = ", ".join(EncodeSettings.model_fields)
+                raise UnsupportedError(f"there is no setting {name!r}; there are {known}") from error
+            raise UnsupportedError(f"setting {name}: {problem['msg'].lower()}, not {problem['input']!r}") from error

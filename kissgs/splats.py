@@ -17,7 +17,7 @@ SH_C0 = 0.28209479177387814
 
 OPACITY_LOGIT_MIN = float(np.float32(-13.815509796142578))
 OPACITY_LOGIT_MAX = float(np.float32(13.80231761932373))
-"""float32 logits of the opacities 1e-6 and 1 - 1e-6: beyond them no 8-bit picture changes, and float32 sigmoids break."""
+"""float32 logits of the opacities 1e-6 and 1 - 1e-6: further out no 8-bit picture changes and float32 sigmoids fail."""
 
 LOG_SCALE_LIMIT = 30.0
 MEAN_LIMIT = 1e15

@@ -91,11 +91,11 @@ def fit_codebook(
     position[placed] = np.arange(side * side, dtype=np.int32)
     full = np.zeros((side * side, 3, COEFFICIENTS), dtype=np.float32)
     full[:, :, : dimensions // 3] = entries[placed].reshape(side * side, -1, 3).transpose(0, 2, 1)
-    full = full.reshape(side * side, 3 * COEFFICIENTS)
+    rows = full.reshape(side * side, 3 * COEFFICIENTS)
     if settings.shared_steps:
-        levels = quantize(full, step=max(clusters.step, 1e-30))
+        levels = quantize(rows, step=max(clusters.step, 1e-30))
     else:
-        levels = quantize(full, step=1, shared=False, max_top=PAPER_TOP)
+        levels = quantize(rows, step=1, shared=False, max_top=PAPER_TOP)
     return Codebook(side, levels, position[clusters.labels])
 
 

@@ -1,4 +1,4 @@
-"""A set of named byte strings, as a directory, a stored zip or in memory. Names and sizes are checked before reading."""
+"""A set of named byte strings: a directory, a stored zip, in memory. Names and sizes are checked before reading."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ class ZipSource:
         try:
             with self._zip.open(entry or name) as file:
                 data = file.read(limit + 1)  # never trust the declared size of a deflated entry
-        except Exception as error:  # noqa: BLE001  zipfile raises a dozen kinds, zlib.error and RuntimeError among them
+        except Exception as error:
             raise InvalidContainerError(f"{name} cannot be read from the zip: it is damaged or encrypted") from error
         _check(name, True, len(data), limit)
         return data

@@ -34,8 +34,8 @@ class Encoded:
         order: ``(M,)`` for every Gaussian of the container, in its order, the index in the scene that was encoded.
         form_error: largest relative change of a covariance by the choice of its equivalent form.
         dropped: number of Gaussians left out because they are invisible.
-        half_steps: largest error that quantisation may cause, per field and channel, in the field's own unit (positions:
-            of their signed logarithm; f_rest_centroids: of the codebook's entries).
+        half_steps: largest error that quantisation may cause, per field and channel, in the field's own unit
+            (positions: of their signed logarithm; f_rest_centroids: of the codebook's entries).
     """
 
     files: dict[str, bytes]

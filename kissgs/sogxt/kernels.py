@@ -247,7 +247,7 @@ def nearest_forms(
         w, x, y, z = quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3]
         t = target[n]
         best = np.float32(np.inf)
-        chosen = np.int64(forms[n])
+        chosen = int(forms[n])
         for k in range(24):
             a, b, c, d = rotations[k, 0], rotations[k, 1], rotations[k, 2], rotations[k, 3]
             qw = w * a - x * b - y * c - z * d

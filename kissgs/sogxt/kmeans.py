@@ -222,7 +222,7 @@ def _reassign(
     near: list[Int[np.ndarray, " R"]],
     pool: Workers,
 ) -> Float32[np.ndarray, " N"]:
-    """Move every vector to the nearest centroid around its coarse cluster. Changes ``labels``; returns the distances."""
+    """Move every vector to the nearest centroid near its coarse cluster. Changes ``labels``; returns distances."""
     distances = np.zeros(len(vectors), dtype=np.float32)
 
     def work(j: int) -> None:

@@ -99,7 +99,7 @@ class Layout(BaseModel):
     def limits(self, field: str) -> tuple[np.ndarray, np.ndarray]:
         """``low`` and ``high`` of a field, one number per channel: float32 numbers, as float64."""
         low, high = self.ranges[field]
-        return np.float32(low).astype(np.float64), np.float32(high).astype(np.float64)
+        return np.array(low, dtype=np.float32).astype(np.float64), np.array(high, dtype=np.float32).astype(np.float64)
 
     @property
     def sh_degree(self) -> int:
@@ -238,7 +238,7 @@ def _from_yaml(data: bytes) -> dict[str, Any]:
     """The fields of :class:`Layout` out of the YAML, as forgiving as the reference decoder."""
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
-        document = yaml.load(data, Loader=loader)  # noqa: S506  a safe loader
+        document = yaml.load(data, Loader=loader)
         sides = document["meta"]
         ops = document["ops"]
         ranges = dict(found for op in ops if (found := _range_of(op)))

@@ -14,7 +14,6 @@ from kissgs.errors import InvalidContainerError
 from kissgs.settings import EncodeSettings
 from kissgs.sogxt.parallel import Workers
 
-
 HIGHEST_EFFORT = (100, 6)
 
 

@@ -1,0 +1,301 @@
+"""``compress`` and ``decompress``: the stages put together, and the report of what each took and gave."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Int
+
+from kissgs.errors import InvalidContainerError, OutputError
+from kissgs.io.atomic import atomic_file, refuse_existing
+from kissgs.io.ply import read_ply, write_ply
+from kissgs.progress import Progress, silent
+from kissgs.settings import Settings
+from kissgs.sogxt.container import write_container, zip_bytes
+from kissgs.sogxt.decode import decode
+from kissgs.splats import Cleaned, Splats, clean
+
+AnyPath = str | PathLike[str]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Report:
+    """What a compression took and gave.
+
+    Attributes:
+        source_count: Gaussians in the scene.
+        count: Gaussians in the container.
+        sh_degree: 0 to 3.
+        source_bytes: of the scene file; of the arrays if there was none.
+        container_bytes: of the zip.
+        file_bytes: per file of the container.
+        cleaned: what was wrong with the input (:class:`kissgs.splats.Cleaned`).
+        invisible: Gaussians left out because no renderer would draw them.
+        form_error: largest relative change of a covariance by the choice of its equivalent form.
+        half_steps: largest error that quantisation may cause, per field and channel.
+        seconds: wall time per stage.
+        cpu_seconds: processor time of all stages, over all threads.
+        peak_memory: bytes, the largest this process has ever had resident.
+        settings: all of them, as used.
+    """
+
+    source_count: int
+    count: int
+    sh_degree: int
+    source_bytes: int
+    container_bytes: int
+    file_bytes: dict[str, int]
+    cleaned: Cleaned
+    invisible: int
+    form_error: float
+    half_steps: dict[str, list[float]]
+    seconds: dict[str, float]
+    cpu_seconds: float
+    peak_memory: int
+    settings: dict[str, Any]
+
+    @property
+    def ratio(self) -> float:
+        """How many times smaller the container is than the scene file."""
+        return self.source_bytes / self.container_bytes
+
+    @property
+    def bytes_per_gaussian(self) -> float:
+        """Of the whole zip, per Gaussian of the scene."""
+        return self.container_bytes / max(self.source_count, 1)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For machines."""
+        derived = {"ratio": self.ratio, "bytes_per_gaussian": self.bytes_per_gaussian}
+        return {**asdict(self), **derived}
+
+
+@dataclass(frozen=True, slots=True)
+class Compressed:
+    """A container in memory.
+
+    Attributes:
+        files: name -> bytes.
+        order: ``(M,)`` for every Gaussian of the container, in its order, the index it has in the cleaned scene.
+        report: what it took and gave.
+    """
+
+    files: Mapping[str, bytes]
+    order: Int[np.ndarray, " M"]
+    report: Report
+
+    def to_zip(self) -> bytes:
+        """The container as one stored zip."""
+        return zip_bytes(self.files)
+
+    def save(self, path: AnyPath, *, overwrite: bool = False) -> None:
+        """Write a zip (if the name ends in ``.zip``) or a folder, whole or not at all.
+
+        Raises:
+            OutputError: it exists and ``overwrite`` is false, or the file system refuses.
+        """
+        write_container(self.files, Path(path), overwrite=overwrite)
+
+
+def load(path: AnyPath, *, threads: int = 0, progress: Progress = silent) -> Splats:
+    """Read a scene: a ``.ply`` of any of the field's tools, or a SOG-XT container (zip or folder); cleaned.
+
+    Raises:
+        InvalidSceneError: the ``.ply`` is not a usable scene.
+        InvalidContainerError: the container is damaged.
+        UnsupportedError: something valid that kissgs does not read.
+    """
+    return clean(_read(Path(path), threads, progress))[0]
+
+
+def save(splats: Splats, path: AnyPath, *, overwrite: bool = False, progress: Progress = silent) -> None:
+    """Write a scene as ``.ply`` (binary, INRIA layout, at its own SH degree), whole or not at all.
+
+    For containers there is :func:`compress`.
+
+    Raises:
+        OutputError: it exists and ``overwrite`` is false, its name does not end in ``.ply``, or the disk refuses.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".ply":
+        raise OutputError(f"{path}: only .ply files are written here; use compress for containers")
+    with atomic_file(path, overwrite=overwrite) as file:
+        write_ply(file, splats, progress=progress)
+
+
+def compress(
+    source: Splats | AnyPath,
+    destination: AnyPath | None = None,
+    *,
+    settings: Settings | None = None,
+    importance: Float32[np.ndarray, " N"] | None = None,
+    overwrite: bool = False,
+    threads: int = 0,
+    progress: Progress = silent,
+) -> Compressed:
+    """Compress a scene into a SOG-XT container.
+
+    Args:
+        source: a scene, or the path of a ``.ply`` (a container is decoded and encoded anew).
+        destination: ``.zip`` or folder to write; by default nothing is written.
+        settings: by default those of the preset ``balanced``.
+        importance: ``(N,)`` positive numbers for the Gaussians of a clean ``source``, see :func:`kissgs.sogxt.encode`.
+        overwrite: replace ``destination`` if it exists.
+        threads: 0 means one per processor; the bytes do not depend on it.
+        progress: receives events; raise :class:`kissgs.Cancelled` from it to stop. Nothing is written then.
+
+    Returns:
+        The container in memory, and the report.
+
+    Raises:
+        KissgsError: one of its children, with a sentence for the user.
+    """
+    from kissgs.sogxt.encode import encode
+
+    settings = settings or Settings()
+    target = Path(destination) if destination is not None else None
+    if target is not None:
+        _refuse_existing(target, overwrite=overwrite)
+    clock = _Clock(progress)
+    splats, cleaned, source_bytes = _open(source, threads, clock)
+    encoded = encode(splats, settings.encode, importance=importance, threads=threads, progress=clock)
+    archive_bytes = len(zip_bytes(encoded.files))
+    if target is not None:
+        clock("write", 0.0)
+        write_container(encoded.files, target, overwrite=overwrite)
+    clock.stop()
+    report = Report(
+        source_count=len(splats) + cleaned.removed,
+        count=len(encoded.order),
+        sh_degree=splats.sh_degree,
+        source_bytes=source_bytes,
+        container_bytes=archive_bytes,
+        file_bytes={name: len(data) for name, data in encoded.files.items()},
+        cleaned=cleaned,
+        invisible=encoded.dropped,
+        form_error=encoded.form_error,
+        half_steps=encoded.half_steps,
+        seconds=clock.seconds,
+        cpu_seconds=clock.cpu_seconds,
+        peak_memory=peak_memory(),
+        settings=settings.model_dump(mode="json"),
+    )
+    return Compressed(encoded.files, encoded.order, report)
+
+
+def decompress(
+    source: AnyPath | bytes | Mapping[str, bytes],
+    destination: AnyPath | None = None,
+    *,
+    overwrite: bool = False,
+    threads: int = 0,
+    progress: Progress = silent,
+) -> Splats:
+    """Decode a SOG-XT container.
+
+    Args:
+        source: path of a zip or a folder, the bytes of a zip, or the files in memory.
+        destination: ``.ply`` to write; by default nothing is written.
+        overwrite: replace ``destination`` if it exists.
+        threads: 0 means one per processor.
+        progress: receives events.
+
+    Returns:
+        The scene exactly as stored: quaternions as quantised, their length within a few per cent of 1.
+
+    Raises:
+        InvalidContainerError: the container is damaged.
+        UnsupportedError: it has a feature that kissgs does not read.
+        OutputError: ``destination`` cannot be written.
+    """
+    if destination is not None:
+        refuse_existing(Path(destination), overwrite=overwrite)
+    splats = decode(source if isinstance(source, bytes | Mapping) else Path(source), threads=threads, progress=progress)
+    if destination is not None:
+        save(splats, destination, overwrite=overwrite, progress=progress)
+    return splats
+
+
+def is_container(path: Path) -> bool:
+    """Whether ``path`` looks like a container rather than a ``.ply``: a folder, or a file that begins as a zip."""
+    if path.is_dir():
+        return True
+    try:
+        with path.open("rb") as file:
+            return file.read(4) in (b"PK\x03\x04", b"PK\x05\x06")
+    except OSError:
+        return path.suffix.lower() == ".zip"
+
+
+def peak_memory() -> int:
+    """Bytes, the largest resident set this process has had."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def _open(source: Splats | AnyPath, threads: int, progress: Progress) -> tuple[Splats, Cleaned, int]:
+    if isinstance(source, Splats):
+        splats, cleaned = clean(source)
+        return splats, cleaned, source.nbytes
+    path = Path(source)
+    progress("read", 0.0)
+    splats, cleaned = clean(_read(path, threads, progress))
+    return splats, cleaned, _size(path)
+
+
+def _read(path: Path, threads: int, progress: Progress) -> Splats:
+    """As it stands in the file."""
+    if is_container(path):
+        return decode(path, threads=threads, progress=progress)
+    return read_ply(path, progress=progress)
+
+
+def _size(path: Path) -> int:
+    try:
+        return sum(entry.stat().st_size for entry in path.iterdir()) if path.is_dir() else path.stat().st_size
+    except OSError as error:
+        raise InvalidContainerError(f"cannot read {path}: {(error.strerror or str(error)).lower()}") from error
+
+
+def _refuse_existing(target: Path, *, overwrite: bool) -> None:
+    """Before the work starts rather than after it."""
+    if target.suffix.lower() == ".zip":
+        refuse_existing(target, overwrite=overwrite)
+    elif target.exists() and not overwrite:
+        raise OutputError(f"{target} exists already; choose another name or allow overwriting (--force)")
+    if not target.absolute().parent.is_dir():
+        raise OutputError(f"cannot write {target}: there is no folder {target.parent}")
+
+
+@dataclass
+class _Clock:
+    """Passes progress on, and takes the time of each stage on the way."""
+
+    receiver: Progress
+    seconds: dict[str, float] = field(default_factory=dict)
+    cpu_seconds: float = 0.0
+    _stage: str | None = None
+    _since: float = 0.0
+    _cpu_since: float = field(default_factory=time.process_time)
+
+    def __call__(self, stage: str, fraction: float) -> None:
+        if stage != self._stage:
+            self.stop()
+            self._stage, self._since = stage, time.perf_counter()
+        self.receiver(stage, fraction)
+
+    def stop(self) -> None:
+        """End the current stage."""
+        if self._stage is not None:
+            spent = time.perf_counter() - self._since
+            self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + spent
+            self._stage = None
+        self.cpu_seconds = time.process_time() - self._cpu_since
