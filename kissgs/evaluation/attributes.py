@@ -231,7 +231,7 @@ def _sh_sums(reference: Splats, candidate: Splats, degree: int) -> _ShSums:
 
 
 def _sh_errors(bands: list[_ShSums]) -> ShErrors:
-    error, signal = sum(band.error for band in bands), sum(band.signal for band in bands)
+    error, signal = sum((band.error for band in bands), 0.0), sum((band.signal for band in bands), 0.0)
     count = sum(band.count for band in bands)
     return ShErrors(
         rmse=_root(error, count), signal=_root(signal, count), energy_kept=1 - error / signal if signal else None

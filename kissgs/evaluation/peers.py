@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 from kissgs.errors import InvalidSceneError, UnsupportedError
 from kissgs.evaluation.attributes import AttributeErrors, attribute_errors, sigmoid
@@ -16,7 +16,7 @@ from kissgs.evaluation.pairing import pair
 from kissgs.io.ply import read_ply
 from kissgs.splats import Splats, clean
 
-PeerFormat = Literal["sog", "spz"]
+PEER_FORMATS = ("sog", "spz")
 
 SPLAT_TRANSFORM = ("splat-transform",)
 """PlayCanvas' converter, as ``npm install -g @playcanvas/splat-transform`` puts it on the PATH."""
@@ -26,7 +26,7 @@ SPLAT_TRANSFORM = ("splat-transform",)
 class PeerResult:
     """One scene through one format of another tool, and back."""
 
-    format: PeerFormat
+    format: str
     gaussians: int
     """in the scene, once cleaned"""
     kept: int
@@ -50,7 +50,7 @@ class PeerResult:
 
 def measure_peer(
     scene: Path,
-    format: PeerFormat,
+    format: str,
     *,
     command: Sequence[str] = SPLAT_TRANSFORM,
     sh_iterations: int | None = None,
@@ -70,8 +70,8 @@ def measure_peer(
         InvalidSceneError: ``scene``, or what the tool made of it, cannot be read or has no usable Gaussian.
         UnsupportedError: unknown format; the tool is missing or failed; SciPy is not installed.
     """
-    if format not in get_args(PeerFormat):
-        raise UnsupportedError(f"unknown peer format {format!r}; there are {', '.join(get_args(PeerFormat))}")
+    if format not in PEER_FORMATS:
+        raise UnsupportedError(f"unknown peer format {format!r}; there are {', '.join(PEER_FORMATS)}")
     reference, _ = clean(read_ply(scene))
     if not len(reference):
         raise InvalidSceneError(f"{scene} has no usable Gaussian")

@@ -94,14 +94,23 @@ def test_covariance_errors_are_those_of_the_matrices(seed):
 
 
 def test_each_unit():
+    def one_changed(array, index, value):
+        changed = array.copy()
+        changed[index] += value
+        return changed
+
     scene = sample_scene(4, sh_degree=0)
-    means, opacities, sh0 = (np.zeros_like(array) for array in (scene.means, scene.opacities, scene.sh0))
-    reference = replace(scene, means=means + 3, opacities=opacities, sh0=sh0)
-    means[2, 1], opacities[3], sh0[0, 2] = 0.5, np.log(3), 0.1
-    errors = attribute_errors(
-        reference,
-        replace(reference, means=means + 3, opacities=opacities, scales=scene.scales + np.float32(0.25), sh0=sh0),
+    reference = replace(
+        scene, means=np.full_like(scene.means, 3), opacities=np.zeros(4, np.float32), sh0=np.zeros_like(scene.sh0)
     )
+    candidate = replace(
+        reference,
+        means=one_changed(reference.means, (2, 1), 0.5),
+        scales=reference.scales + np.float32(0.25),
+        opacities=one_changed(reference.opacities, 3, np.log(3)),
+        sh0=one_changed(reference.sh0, (0, 2), 0.1),
+    )
+    errors = attribute_errors(reference, candidate)
     assert (errors.means.rmse, errors.means.max) == pytest.approx((0.5 / np.sqrt(12), 0.5))
     assert (errors.means_relative.rmse, errors.means_relative.max) == pytest.approx((0.125 / np.sqrt(12), 0.125))
     assert (errors.opacity_logits.rmse, errors.opacity_logits.max) == pytest.approx((np.log(3) / 2, np.log(3)))
