@@ -25,6 +25,8 @@ from kissgs.splats import Cleaned, Splats, clean
 
 AnyPath = str | PathLike[str]
 
+ZIP_BEGINNINGS = (b"PK\x03\x04", b"PK\x05\x06")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Report:
@@ -132,7 +134,7 @@ def save(splats: Splats, path: AnyPath, *, overwrite: bool = False, progress: Pr
 
 
 def compress(
-    source: Splats | AnyPath,
+    source: Splats | AnyPath | bytes,
     destination: AnyPath | None = None,
     *,
     settings: Settings | None = None,
@@ -144,7 +146,7 @@ def compress(
     """Compress a scene into a SOG-XT container.
 
     Args:
-        source: a scene, or the path of a ``.ply`` (a container is decoded and encoded anew).
+        source: a scene, or the path or the bytes of a ``.ply`` (a container is decoded and encoded anew).
         destination: ``.zip`` or folder to write; by default nothing is written.
         settings: by default those of the preset ``balanced``.
         importance: ``(N,)`` positive numbers for the Gaussians of a clean ``source``, see :func:`kissgs.sogxt.encode`.
@@ -166,7 +168,7 @@ def compress(
         _refuse_existing(target, overwrite=overwrite)
     clock = _Clock(progress)
     splats, cleaned, source_bytes = _open(source, threads, clock)
-    encoded = encode(splats, settings.encode, importance=importance, threads=threads, progress=clock)
+    encoded = encode(splats, settings.encode, importance=importance, cleaned=cleaned, threads=threads, progress=clock)
     archive_bytes = len(zip_bytes(encoded.files))
     if target is not None:
         clock("write", 0.0)
@@ -224,15 +226,17 @@ def decompress(
     return splats
 
 
-def is_container(path: Path) -> bool:
-    """Whether ``path`` looks like a container rather than a ``.ply``: a folder, or a file that begins as a zip."""
-    if path.is_dir():
+def is_container(source: Path | bytes) -> bool:
+    """Whether this looks like a container rather than a ``.ply``: a folder, or something that begins as a zip."""
+    if isinstance(source, bytes):
+        return source[:4] in ZIP_BEGINNINGS
+    if source.is_dir():
         return True
     try:
-        with path.open("rb") as file:
-            return file.read(4) in (b"PK\x03\x04", b"PK\x05\x06")
+        with source.open("rb") as file:
+            return file.read(4) in ZIP_BEGINNINGS
     except OSError:
-        return path.suffix.lower() == ".zip"
+        return source.suffix.lower() == ".zip"
 
 
 def peak_memory() -> int:
@@ -241,21 +245,21 @@ def peak_memory() -> int:
     return peak if sys.platform == "darwin" else peak * 1024
 
 
-def _open(source: Splats | AnyPath, threads: int, progress: Progress) -> tuple[Splats, Cleaned, int]:
+def _open(source: Splats | AnyPath | bytes, threads: int, progress: Progress) -> tuple[Splats, Cleaned, int]:
     if isinstance(source, Splats):
         splats, cleaned = clean(source)
         return splats, cleaned, source.nbytes
-    path = Path(source)
     progress("read", 0.0)
-    splats, cleaned = clean(_read(path, threads, progress))
-    return splats, cleaned, _size(path)
+    scene = source if isinstance(source, bytes) else Path(source)
+    splats, cleaned = clean(_read(scene, threads, progress))
+    return splats, cleaned, len(scene) if isinstance(scene, bytes) else _size(scene)
 
 
-def _read(path: Path, threads: int, progress: Progress) -> Splats:
+def _read(source: Path | bytes, threads: int, progress: Progress) -> Splats:
     """As it stands in the file."""
-    if is_container(path):
-        return decode(path, threads=threads, progress=progress)
-    return read_ply(path, progress=progress)
+    if is_container(source):
+        return decode(source, threads=threads, progress=progress)
+    return read_ply(source, progress=progress)
 
 
 def _size(path: Path) -> int:

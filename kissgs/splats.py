@@ -122,6 +122,9 @@ class Cleaned:
         return asdict(self)
 
 
+NOTHING_CLEANED = Cleaned()
+
+
 def clean(splats: Splats) -> tuple[Splats, Cleaned]:
     """Bring a scene into canonical form: finite, bounded, rotations of unit length.
 

@@ -25,6 +25,9 @@ class Source(Protocol):
     def names(self) -> frozenset[str]:
         """Names of the files that are there."""
 
+    def size(self, name: str) -> int:
+        """Bytes of one file of :meth:`names`."""
+
     def read(self, name: str, limit: int) -> bytes:
         """The bytes of one file; InvalidContainerError if it is missing or has more than ``limit``."""
 
@@ -38,6 +41,10 @@ class MemorySource:
     def names(self) -> frozenset[str]:
         """See :class:`Source`."""
         return frozenset(self._files)
+
+    def size(self, name: str) -> int:
+        """See :class:`Source`."""
+        return len(self._files[name])
 
     def read(self, name: str, limit: int) -> bytes:
         """See :class:`Source`."""
@@ -54,6 +61,10 @@ class DirectorySource:
     def names(self) -> frozenset[str]:
         """See :class:`Source`."""
         return frozenset(entry.name for entry in self._folder.iterdir() if entry.is_file())
+
+    def size(self, name: str) -> int:
+        """See :class:`Source`."""
+        return (self._folder / name).stat().st_size
 
     def read(self, name: str, limit: int) -> bytes:
         """See :class:`Source`."""
@@ -88,6 +99,10 @@ class ZipSource:
     def names(self) -> frozenset[str]:
         """See :class:`Source`."""
         return frozenset(self._entries)
+
+    def size(self, name: str) -> int:
+        """See :class:`Source`; as stored."""
+        return self._entries[name].compress_size
 
     def read(self, name: str, limit: int) -> bytes:
         """See :class:`Source`."""

@@ -19,7 +19,7 @@ from kissgs.sogxt.parallel import workers
 from kissgs.sogxt.planes import compress_images
 from kissgs.sogxt.pras import choose_forms
 from kissgs.sogxt.quantize import Quantized, anchor, means_bits, quantize, quantize_means
-from kissgs.splats import SH_REST_COUNTS, Splats
+from kissgs.splats import NOTHING_CLEANED, SH_REST_COUNTS, Cleaned, Splats
 
 INVISIBLE_LOGIT = -5.5373
 """Logit of opacity 1/255, rounded up: no renderer draws what is this faint or fainter."""
@@ -50,6 +50,7 @@ def encode(
     settings: EncodeSettings,
     *,
     importance: Float32[np.ndarray, " N"] | None = None,
+    cleaned: Cleaned = NOTHING_CLEANED,
     threads: int = 0,
     progress: Progress = silent,
 ) -> Encoded:
@@ -60,6 +61,7 @@ def encode(
         settings: see :class:`EncodeSettings`.
         importance: ``(N,)``, positive: how much an error in the colour of each Gaussian counts when the SH codebook is
             built; by default from opacity and size.
+        cleaned: what was mended before, for the metadata.
         threads: to use; 0 means one per processor. The bytes do not depend on it.
         progress: receives "kernels", "order", "forms", "codebook", "sort codebook" and "images" events.
 
@@ -97,8 +99,8 @@ def encode(
             version=__version__,
             sh_degree=splats.sh_degree,
             count=len(kept),
-            source_count=len(splats),
-            dropped={"invisible": len(splats) - len(kept)},
+            source_count=len(splats) + cleaned.removed,
+            changed={"invisible": len(splats) - len(kept), **cleaned.as_dict()},
             settings=settings.model_dump(),
             sha256={name: hashlib.sha256(data).hexdigest() for name, data in files.items()},
         ),

@@ -45,7 +45,7 @@ class Provenance(BaseModel):
     sh_degree: int = Field(ge=0, le=3, description="SH degree of the scene; coefficients of higher bands are zero.")
     count: int = Field(ge=0, description="Number of Gaussians: active cells of the mask.")
     source_count: int = Field(ge=0, description="Number of Gaussians in the scene that was encoded.")
-    dropped: dict[str, int] = Field(default_factory=dict, description="Gaussians left out or mended, by reason.")
+    changed: dict[str, int] = Field(default_factory=dict, description="Gaussians left out or mended, by reason.")
     settings: dict[str, Any] = Field(default_factory=dict, description="Encoder settings.")
     sha256: dict[str, str] = Field(default_factory=dict, description="SHA-256 of each image file, hexadecimal.")
 

@@ -1,0 +1,53 @@
+"""The terminal: where tables go, and the progress bar."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Iterator
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from kissgs.progress import Progress as Receiver
+from kissgs.progress import silent
+
+SLOW_START_SECONDS = 1.5
+"""Kernels load from numba's cache in less; what takes longer is compiling."""
+
+
+def output() -> Console:
+    """Where results go: standard output, as wide as the terminal, or as wide as it takes in a pipe."""
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console.width = 200
+    return console
+
+
+@contextlib.contextmanager
+def progress_bar(quiet: bool) -> Iterator[Receiver]:
+    """A receiver of progress events that draws a bar on standard error, if that is a terminal."""
+    console = Console(stderr=True)
+    if quiet:
+        yield silent
+        return
+    notice = threading.Timer(SLOW_START_SECONDS, console.print, ["compiling kernels (once; cached from then on) …"])
+    notice.daemon = True
+    columns = (
+        TextColumn("{task.description:>14}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", total=1.0)
+
+        def receive(stage: str, fraction: float) -> None:
+            if stage == "kernels":
+                notice.start() if fraction == 0 else notice.cancel()
+            bar.update(task, description=stage, completed=fraction)
+
+        try:
+            yield receive
+        finally:
+            notice.cancel()

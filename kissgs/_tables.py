@@ -1,0 +1,146 @@
+"""What the command line prints: reports as tables. Nothing here computes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from rich.console import Group, RenderableType
+from rich.table import Column, Table
+from rich.text import Text
+
+from kissgs.evaluation.attributes import AttributeErrors, Spread
+from kissgs.evaluation.peers import PeerResult
+from kissgs.evaluation.roundtrip import RoundTrip
+from kissgs.info import Info
+from kissgs.pipeline import Report
+
+CHANGES = {
+    "invisible": "left out: opacity 1/255 or less, which no renderer draws",
+    "non_finite": "removed: NaN or infinite",
+    "far_away": "removed: further away than 1e15",
+    "infinite_opacities": "opacity logit infinite, set to that of 1e-6 or 1 - 1e-6",
+    "saturated_opacities": "opacity logit beyond that of 1e-6 or 1 - 1e-6, set to it",
+    "zero_quats": "rotation of length zero, set to none",
+    "unnormalised_quats": "rotation normalised",
+    "clamped_scales": "log-scale beyond 30, clamped",
+    "clamped_sh": "SH coefficient beyond 1e6, clamped",
+}
+
+
+def size(count: float) -> str:
+    """Bytes as people read them."""
+    for unit in ("B", "kB", "MB"):
+        if count < 1000:
+            return f"{count:.0f} B" if unit == "B" else f"{count:.{2 if count < 10 else 1}f} {unit}"
+        count /= 1000
+    return f"{count:.2f} GB"
+
+
+def report_table(report: Report, target: str) -> RenderableType:
+    """The report of one compression."""
+    head = Text.assemble(
+        (f"{target}", "bold"),
+        f"  {size(report.source_bytes)} -> {size(report.container_bytes)}, ",
+        (f"{report.ratio:.1f}x smaller", "bold green"),
+        f", {report.bytes_per_gaussian:.2f} bytes per Gaussian",
+    )
+    took = f"{sum(report.seconds.values()):.1f} s ({report.cpu_seconds:.1f} CPU s), {size(report.peak_memory)} at most"
+    body = f"{report.count:,} of {report.source_count:,} Gaussians, SH degree {report.sh_degree}; {took}"
+    changed = {"invisible": report.invisible, **report.cleaned.as_dict()}
+    return Group(head, Text(body), parts_table(report.file_bytes, report.count), *_changes(changed))
+
+
+def parts_table(parts: Mapping[str, int], count: int) -> Table:
+    """Bytes per file or attribute, and what that is per Gaussian."""
+    table = Table("part", _right("bytes"), _right("share"), _right("bits/Gaussian"), box=None, pad_edge=False)
+    total = sum(parts.values())
+    for name, value in parts.items():
+        table.add_row(name, f"{value:,}", f"{value / max(total, 1):.1%}", f"{8 * value / max(count, 1):.2f}")
+    table.add_row("total", f"{total:,}", "", f"{8 * total / max(count, 1):.2f}", style="bold")
+    return table
+
+
+def info_table(info: Info) -> RenderableType:
+    """What ``kissgs info`` shows."""
+    kind = {"ply": "3DGS scene", "sog-xt": "SOG-XT container"}[info.kind]
+    head = Text.assemble((info.path, "bold"), f"  {kind}, {size(info.bytes)}")
+    body = f"{info.count:,} Gaussians, SH degree {info.sh_degree}, {info.bits_per_gaussian:.1f} bits each"
+    ranges = Table("attribute", _right("lowest"), _right("highest"), box=None, pad_edge=False)
+    for name, (low, high) in info.ranges.items():
+        ranges.add_row(name, f"{low:.5g}", f"{high:.5g}")
+    blocks: list[RenderableType] = [head, Text(body), parts_table(info.parts, info.count), ranges]
+    if info.kind == "sog-xt":
+        made = info.details
+        origin = f"kissgs {made['version']} from {made['source_count']:,} Gaussians" if made["version"] else "unknown"
+        grid, book = made["grid_side"], made["codebook_side"]
+        blocks.append(Text(f"grid {grid} x {grid}, codebook {book} x {book}; encoder: {origin}"))
+    return Group(*blocks, *_changes(info.changed))
+
+
+def roundtrip_table(result: RoundTrip) -> RenderableType:
+    """What ``kissgs demo`` shows: the cost of one scene, there and back."""
+    report = result.report
+    lost = error_table({"error": result.errors})
+    back = f"decoded in {result.decode_seconds:.2f} s ({result.decode_cpu_seconds:.2f} CPU s)"
+    return Group(report_table(report, report.settings["preset"]), Text(back), Text(), lost)
+
+
+def bench_table(rows: Iterable[tuple[str, str, RoundTrip | PeerResult]]) -> Table:
+    """Scenes × presets and peers."""
+    right = (
+        "B/Gaussian",
+        "bytes",
+        "encode CPU s",
+        "wall s",
+        "decode CPU s",
+        "peak MB",
+        "rotation °",
+        "log-scale",
+        "SH RMSE",
+    )
+    table = Table("scene", "encoder", *map(_right, right), box=None, pad_edge=False)
+    for scene, name, result in rows:
+        errors = result.errors
+        lost = f"{errors.rotation_degrees.rmse:.2f}", f"{errors.scales.rmse:.3f}", f"{errors.shN.rmse:.4f}"
+        if isinstance(result, RoundTrip):
+            report = result.report
+            cells = (
+                f"{report.bytes_per_gaussian:.2f}",
+                f"{report.container_bytes:,}",
+                f"{report.cpu_seconds:.1f}",
+                f"{sum(report.seconds.values()):.1f}",
+                f"{result.decode_cpu_seconds:.2f}",
+                f"{result.peak_memory / 1e6:.0f}",
+            )
+        else:
+            encode, decode = f"{result.encode_cpu_seconds:.1f}", f"{result.decode_cpu_seconds:.2f}"
+            cells = f"{result.bytes_per_gaussian:.2f}", f"{result.bytes:,}", encode, "", decode, ""
+        table.add_row(scene, name, *cells, *lost)
+    return table
+
+
+def error_table(columns: Mapping[str, AttributeErrors]) -> Table:
+    """Root mean square and largest error of each attribute."""
+    table = Table("attribute", *(_right(f"{name} {kind}") for name in columns for kind in ("RMS", "max")), box=None)
+    rows: dict[str, list[Spread]] = {
+        "position, share of 1 + |x|": [e.means_relative for e in columns.values()],
+        "rotation, degrees": [e.rotation_degrees for e in columns.values()],
+        "log-scale": [e.scales for e in columns.values()],
+        "opacity": [e.opacities for e in columns.values()],
+        "base colour, of 255": [e.sh0_levels for e in columns.values()],
+    }
+    for name, spreads in rows.items():
+        table.add_row(name, *(f"{value:.3g}" for spread in spreads for value in (spread.rmse, spread.max)))
+    if any(e.shN.energy_kept is not None for e in columns.values()):
+        kept = [f"{e.shN.energy_kept or 0:.0%} kept" for e in columns.values()]
+        cells = (cell for e, share in zip(columns.values(), kept, strict=True) for cell in (f"{e.shN.rmse:.3g}", share))
+        table.add_row("SH bands 1-3", *cells)
+    return table
+
+
+def _changes(changed: Mapping[str, int]) -> list[Text]:
+    return [Text(f"{count:,} {CHANGES.get(name, name)}", style="yellow") for name, count in changed.items() if count]
+
+
+def _right(title: str) -> Column:
+    return Column(title, justify="right")

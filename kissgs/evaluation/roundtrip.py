@@ -1,0 +1,94 @@
+"""A scene through the codec and back: what it took, what it weighs, what it lost."""
+
+from __future__ import annotations
+
+import multiprocessing
+import time
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from kissgs.errors import UnsupportedError
+from kissgs.evaluation.attributes import AttributeErrors, attribute_errors
+from kissgs.pipeline import Report, compress, decompress, load, peak_memory
+from kissgs.progress import Progress, silent
+from kissgs.settings import Settings
+from kissgs.splats import Splats
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RoundTrip:
+    """One scene, compressed and decompressed.
+
+    Attributes:
+        report: of the compression.
+        decode_seconds: wall time of decoding, from the zip's bytes to arrays.
+        decode_cpu_seconds: processor time of that, over all threads.
+        peak_memory: bytes, the largest the process had resident before errors were computed.
+        errors: of the Gaussians that are in the container.
+    """
+
+    report: Report
+    decode_seconds: float
+    decode_cpu_seconds: float
+    peak_memory: int
+    errors: AttributeErrors
+
+    def as_dict(self) -> dict[str, Any]:
+        """For machines."""
+        return {**asdict(self), "report": self.report.as_dict(), "errors": self.errors.as_dict()}
+
+
+def roundtrip(
+    source: Splats | Path,
+    settings: Settings,
+    *,
+    container: Path | None = None,
+    back: Path | None = None,
+    overwrite: bool = False,
+    threads: int = 0,
+    progress: Progress = silent,
+) -> RoundTrip:
+    """Compress a scene, decompress it, and compare.
+
+    Args:
+        source: a scene, or the path of a ``.ply``.
+        settings: of the compression.
+        container: where to write the container, if wanted.
+        back: where to write the decompressed ``.ply``, if wanted.
+        overwrite: replace those files.
+        threads: 0 means one per processor.
+        progress: receives the events of both directions.
+    """
+    result = compress(source, container, settings=settings, overwrite=overwrite, threads=threads, progress=progress)
+    archive = result.to_zip()
+    wall, cpu = time.perf_counter(), time.process_time()
+    decoded = decompress(archive, threads=threads, progress=progress)
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    peak = peak_memory()
+    if back is not None:
+        decompress(archive, back, overwrite=overwrite, threads=threads)
+    scene = source if isinstance(source, Splats) else load(source)
+    return RoundTrip(
+        report=result.report,
+        decode_seconds=wall,
+        decode_cpu_seconds=cpu,
+        peak_memory=peak,
+        errors=attribute_errors(scene.select(result.order), decoded),
+    )
+
+
+def isolated_roundtrip(source: Path, settings: Settings, *, threads: int = 0) -> RoundTrip:
+    """:func:`roundtrip` in a process of its own, so that times and peak memory are those of this scene alone.
+
+    Raises:
+        UnsupportedError: the process was killed, most likely for want of memory.
+    """
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        try:
+            return pool.submit(roundtrip, source, settings, threads=threads).result()
+        except BrokenProcessPool as error:
+            raise UnsupportedError(f"{source}: the measurement was killed, most likely for want of memory") from error

@@ -1,0 +1,63 @@
+"""Small scenes for the codec's tests, made by hand rather than by the library."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kissgs.splats import ATTRIBUTES, SH_REST_COUNTS, Splats
+
+PRESETS = ("fast", "balanced", "small", "paper")
+
+PLANES = (
+    "active_mask",
+    "means_bytes_0",
+    "means_bytes_1",
+    "opacities",
+    "scales",
+    "quaternions",
+    "f_dc",
+    "f_rest_labels",
+    "f_rest_centroids",
+)
+
+
+def unit(quats):
+    """Float32 quaternions of unit length."""
+    wide = np.asarray(quats, dtype=np.float64)
+    return (wide / np.linalg.norm(wide, axis=1, keepdims=True)).astype(np.float32)
+
+
+def random_scene(count, degree=0, seed=0):
+    """A clean scene with heavy tails: every attribute drawn on its own, so that nothing helps an encoder."""
+    rng = np.random.default_rng(seed)
+    coefficients = SH_REST_COUNTS[degree]
+    return Splats(
+        means=(rng.standard_t(3, (count, 3)) * 3).astype(np.float32),
+        quats=unit(rng.normal(size=(count, 4))),
+        scales=rng.normal(-4, 1.2, (count, 3)).astype(np.float32),
+        opacities=np.clip(rng.normal(1, 3, count), -5.5, 13).astype(np.float32),
+        sh0=rng.normal(0, 1, (count, 3)).astype(np.float32),
+        shN=(rng.normal(0, 0.1, (count, coefficients, 3)) * rng.exponential(1, (count, 1, 1))).astype(np.float32),
+    )
+
+
+def constant_scene(count, degree=0):
+    """Gaussians that are all the same."""
+    return random_scene(1, degree, seed=9).select(np.zeros(count, dtype=np.int64))
+
+
+def replaced(splats, **arrays):
+    """The scene with some arrays exchanged; they are cast to float32."""
+    new = {name: np.asarray(array, dtype=np.float32) for name, array in arrays.items()}
+    return Splats(**{name: new.get(name, getattr(splats, name)) for name in ATTRIBUTES})
+
+
+def covariances(quats, scales):
+    """R diag(s^2) R^T of every Gaussian by the textbook formula of R, in float64; quaternions are normalised first."""
+    w, x, y, z = (np.asarray(quats, np.float64) / np.linalg.norm(np.asarray(quats, np.float64), axis=1)[:, None]).T
+    rotation = np.empty((len(w), 3, 3))
+    rotation[:, 0] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=1)
+    rotation[:, 1] = np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=1)
+    rotation[:, 2] = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    squares = np.exp(2 * np.asarray(scales, np.float64))
+    return np.einsum("nij,nj,nkj->nik", rotation, squares, rotation)
