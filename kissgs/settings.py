@@ -79,10 +79,10 @@ class EncodeSettings(BaseModel):
         "0 treats all alike; 1 gives up on small and faint Gaussians.",
     )
     sh_rounds: int = Field(
-        4, ge=1, le=50, description="Rounds of codebook refinement: more are slower and a little better."
+        6, ge=1, le=50, description="Rounds of codebook refinement: more are slower and a little better."
     )
     sh_reach: int = Field(
-        16, ge=1, le=512, description="How far a Gaussian may look for its codebook entry; slower, better."
+        24, ge=1, le=512, description="How far a Gaussian may look for its codebook entry; slower, better."
     )
     plas_decay: float = Field(
         0.8, ge=0.5, le=0.99, description="How slowly PLAS and PRAS narrow their filters: 0.95 is slow and smoothest."
@@ -125,6 +125,7 @@ PRESETS: dict[Preset, dict[str, Any]] = {
         "sh_rounds": 8,
         "sh_reach": 32,
         "plas_decay": 0.95,
+        "drop_invisible": False,
         "webp_quality": 75,
         "webp_method": 4,
         "codebook_effort": False,

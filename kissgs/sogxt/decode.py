@@ -7,23 +7,26 @@ through activated opacities and scales.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int, UInt8
+from jaxtyping import Float32, Float64, Int, UInt8, UInt16
 
 from kissgs.errors import InvalidContainerError
 from kissgs.progress import Progress, silent
 from kissgs.sogxt.container import Source, open_source
 from kissgs.sogxt.metadata import TILE_COLUMNS, TILE_ROWS, Layout, read_layout
-from kissgs.sogxt.parallel import Workers, workers
+from kissgs.sogxt.parallel import Workers
 from kissgs.sogxt.planes import decode_plane
 from kissgs.sogxt.quantize import signed_exp
 from kissgs.splats import SH_REST_COUNTS, Splats
 
 CHUNK = 1 << 14
-"""Gaussians per lookup: small enough that indices stay in the processor's cache."""
+"""Gaussians per task of lookups."""
+
+CHANNELS_OF_PLAIN = {"quaternions": 4, "scales": 3, "f_dc": 3, "opacities": 1}
+"""Attributes that are one image of 8-bit levels each."""
 
 
 def decode(source: Path | bytes | Mapping[str, bytes], *, threads: int = 0, progress: Progress = silent) -> Splats:
@@ -41,113 +44,133 @@ def decode(source: Path | bytes | Mapping[str, bytes], *, threads: int = 0, prog
         InvalidContainerError: something in it is missing, damaged or impossible.
         UnsupportedError: it uses images other than WebP.
     """
-    with open_source(source) as files, workers(threads) as pool:
-        return _Decoder(files, read_layout(files), pool, progress).run()
-
-
-class _Decoder:
-    """One container being decoded: what all steps need."""
-
-    def __init__(self, files: Source, layout: Layout, pool: Workers, progress: Progress) -> None:
-        self.files, self.layout, self.pool, self.progress = files, layout, pool, progress
-        mask = self.grid_plane("active_mask", 1)[:, 0] > 0
-        self.count = int(np.count_nonzero(mask))
-        prefix = bool(mask[: self.count].all())  # no cell number is needed where all padding is at the end
-        self.cells: Int[np.ndarray, " N"] | None = None if prefix else np.flatnonzero(mask)
-
-    def run(self) -> Splats:
-        """All planes in parallel."""
-        n, coefficients = self.count, SH_REST_COUNTS[self.layout.sh_degree]
-        declared = self.layout.provenance
-        if declared and declared.count != n:
-            raise InvalidContainerError(f"active_mask.webp marks {n} Gaussians; the metadata declares {declared.count}")
-        splats = Splats(
-            means=np.empty((n, 3), np.float32),
-            quats=np.empty((n, 4), np.float32),
-            scales=np.empty((n, 3), np.float32),
-            opacities=np.empty(n, np.float32),
-            sh0=np.empty((n, 3), np.float32),
-            shN=np.empty((n, coefficients, 3), np.float32),
-        )
-        jobs: list[Callable[[], None]] = [
-            lambda: self.means(splats.means),
-            lambda: self.shN(splats.shN),
-            lambda: self.plain("quaternions", splats.quats),
-            lambda: self.plain("scales", splats.scales),
-            lambda: self.plain("f_dc", splats.sh0),
-            lambda: self.plain("opacities", splats.opacities[:, None]),
-        ]
-        self.progress("decode", 0.0)
-        self.pool.map(lambda job: job(), jobs)
-        self.progress("decode", 1.0)
+    with open_source(source) as files, Workers(threads) as pool:
+        progress("decode", 0.0)
+        planes = _Planes(files, read_layout(files))
+        planes.load(pool)
+        progress("decode", 0.5)
+        splats = planes.look_up(pool)
+        progress("decode", 1.0)
         return splats
 
-    def plain(self, field: str, out: Float32[np.ndarray, "N C"]) -> None:
+
+class _Planes:
+    """The images of one container as rows of levels, with the table of values that belongs to each."""
+
+    mask: UInt8[np.ndarray, "cells 1"]
+    means: UInt16[np.ndarray, "cells 3"]
+    means_table: Float32[np.ndarray, " levels"]
+    labels: UInt8[np.ndarray, "cells 2"]
+    codebook: Float32[np.ndarray, "S*S 3*K"]
+
+    def __init__(self, files: Source, layout: Layout) -> None:
+        self.files, self.layout = files, layout
+        self.coefficients = SH_REST_COUNTS[layout.sh_degree]
+        self.plain: dict[str, tuple[UInt8[np.ndarray, "cells C"], _Lookup]] = {}
+
+    def load(self, pool: Workers) -> None:
+        """Decode all images in parallel, the slowest first."""
+        jobs = [
+            self.load_means,
+            self.load_codebook,
+            self.load_labels,
+            *(lambda field=field: self.load_plain(*field) for field in CHANNELS_OF_PLAIN.items()),
+            self.load_mask,
+        ]
+        pool.map(lambda job: job(), jobs)
+
+    def load_mask(self) -> None:
+        """Which cells hold a Gaussian."""
+        self.mask = self.grid_plane("active_mask", 1)
+
+    def load_plain(self, field: str, channels: int) -> None:
         """An attribute of one 8-bit image."""
-        levels = self.grid_plane(field, out.shape[1])
-        lookup = _Lookup(levels, *self.layout.limits(field))
-        for rows, some in self.chunks(levels):
-            lookup(some, out[rows])
+        levels = self.grid_plane(field, channels)
+        self.plain[field] = levels, _Lookup(levels, *self.layout.limits(field))
 
-    def means(self, out: Float32[np.ndarray, "N 3"]) -> None:
+    def load_means(self) -> None:
         """Positions: two images, one table for all axes."""
-        levels = self.grid_plane("means_bytes_1", 3).astype(np.uint16)
-        levels <<= 8
-        levels |= self.grid_plane("means_bytes_0", 3)
-        low, high = self.layout.limits("means")
-        table = signed_exp(_table(levels, low, high)[0]).astype(np.float32)
-        for rows, some in self.chunks(levels):
-            np.take(table, some, out=out[rows], mode="clip")
+        self.means = self.grid_plane("means_bytes_1", 3).astype(np.uint16)
+        self.means <<= 8
+        self.means |= self.grid_plane("means_bytes_0", 3)
+        logs = _table(self.means, *self.layout.limits("means"))[0]
+        self.means_table = signed_exp(logs).astype(np.float32)
 
-    def shN(self, out: Float32[np.ndarray, "N K 3"]) -> None:
-        """SH: a codebook, and the index into it of every Gaussian."""
-        side = self.layout.codebook_side
-        labels = self.grid_plane("f_rest_labels", 2)
-        if int(labels.max()) >= side and int(self.index(labels).max()) >= side * side:
+    def load_labels(self) -> None:
+        """The codebook entry of every cell, as its column and row."""
+        self.labels, side = self.grid_plane("f_rest_labels", 2), self.layout.codebook_side
+        if int(self.labels.max()) >= side and int(_entry(self.labels, side).max()) >= side * side:
             raise InvalidContainerError(f"f_rest_labels.webp points outside the codebook of {side} x {side} entries")
-        codebook = self.codebook()[:, : out.shape[1]]
-        flat = np.ascontiguousarray(codebook.reshape(side * side, out.shape[1] * 3))
-        for rows, some in self.chunks(labels):
-            target = out[rows].reshape(len(some), out.shape[1] * 3)
-            np.take(flat, self.index(some), axis=0, out=target, mode="clip")
 
-    def codebook(self) -> Float32[np.ndarray, "S*S 15 3"]:
-        """The entries: 15 tiles of S × S pixels, three rows of five; tile = coefficient, pixel = entry."""
+    def load_codebook(self) -> None:
+        """The entries, coefficient by coefficient, R, G and B of each.
+
+        The image has 15 tiles of S × S pixels, three rows of five; tile = coefficient, pixel = entry.
+        """
         side = self.layout.codebook_side
         image = self.plane("f_rest_centroids", TILE_COLUMNS * side, TILE_ROWS * side, 3)
-        tiles = (
-            image.reshape(TILE_ROWS, side, TILE_COLUMNS, side, 3).transpose(1, 3, 0, 2, 4).reshape(side * side, 15, 3)
-        )
+        tiles = image.reshape(TILE_ROWS, side, TILE_COLUMNS, side, 3).transpose(1, 3, 0, 2, 4).reshape(side * side, 45)
         low, high = (limit.reshape(3, 15).T.reshape(45) for limit in self.layout.limits("f_rest_centroids"))
         entries = np.empty((side * side, 45), dtype=np.float32)
-        _Lookup(tiles, low, high)(tiles.reshape(side * side, 45), entries)
-        return entries.reshape(side * side, 15, 3)
+        _Lookup(tiles, low, high)(tiles, entries)
+        self.codebook = np.ascontiguousarray(entries[:, : 3 * self.coefficients])
 
-    def index(self, labels: UInt8[np.ndarray, "N 2"]) -> Int[np.ndarray, " N"]:
-        """Number of the codebook entry: row (green) × S + column (red)."""
-        return labels[:, 1].astype(np.int64) * self.layout.codebook_side + labels[:, 0]
-
-    def chunks(self, levels: np.ndarray) -> list[tuple[slice, np.ndarray]]:
-        """The active cells' levels in pieces, with the rows of the output that they belong to."""
-        pieces = []
-        for first in range(0, self.count, CHUNK):
-            rows = slice(first, min(first + CHUNK, self.count))
-            pieces.append((rows, levels[rows] if self.cells is None else levels[self.cells[rows]]))
-        return pieces
-
-    def grid_plane(self, name: str, channels: int) -> UInt8[np.ndarray, "G*G C"]:
+    def grid_plane(self, name: str, channels: int) -> UInt8[np.ndarray, "cells C"]:
         """An image on the grid, as one row per cell."""
-        side = self.layout.grid_side
-        return self.plane(name, side, side, channels).reshape(side * side, -1)[:, :channels]
+        return self.plane(name, self.layout.grid_side, self.layout.grid_side, channels)
 
-    def plane(self, name: str, width: int, height: int, channels: int) -> UInt8[np.ndarray, "H W C"]:
+    def plane(self, name: str, width: int, height: int, channels: int) -> UInt8[np.ndarray, "pixels C"]:
         """An image, its checksum compared with the metadata if that has one."""
         file = f"{name}.webp"
-        data = self.files.read(file, 4096 + 5 * width * height)  # lossless WebP never needs more than about 4 bytes
+        data = self.files.read(file, 4096 + 5 * width * height)  # lossless WebP never needs more than 4 bytes a pixel
         expected = self.layout.provenance.sha256.get(file) if self.layout.provenance else None
         if expected and hashlib.sha256(data).hexdigest() != expected:
             raise InvalidContainerError(f"{file} is damaged: its SHA-256 is not the one in the metadata")
         return decode_plane(data, file, width=width, height=height, channels=channels)
+
+    def look_up(self, pool: Workers) -> Splats:
+        """Levels to values, some thousand Gaussians at a time, so that everything in between stays in the cache."""
+        mask = self.mask[:, 0] > 0
+        count = int(np.count_nonzero(mask))
+        made = self.layout.provenance
+        if made and made.count != count:
+            raise InvalidContainerError(f"active_mask.webp marks {count} Gaussians; the metadata declares {made.count}")
+        # No cell numbers are needed where all padding is at the end.
+        cells = None if mask[:count].all() else np.flatnonzero(mask)
+        splats = _empty(count, self.coefficients)
+        outputs = (splats.quats, splats.scales, splats.sh0, splats.opacities[:, None])
+        plain = [(*self.plain[field], out) for field, out in zip(CHANNELS_OF_PLAIN, outputs, strict=True)]
+        shN = splats.shN.reshape(count, 3 * self.coefficients)
+
+        def work(first: int) -> None:
+            rows = slice(first, min(first + CHUNK, count))
+            source = rows if cells is None else cells[rows]
+            np.take(self.means_table, self.means[source], out=splats.means[rows], mode="clip")
+            for levels, lookup, out in plain:
+                lookup(levels[source], out[rows])
+            if self.coefficients:
+                entries = _entry(self.labels[source], self.layout.codebook_side)
+                np.take(self.codebook, entries, axis=0, out=shN[rows], mode="clip")
+
+        pool.map(work, range(0, count, CHUNK))
+        return splats
+
+
+def _entry(labels: UInt8[np.ndarray, "N C"], side: int) -> Int[np.ndarray, " N"]:
+    """Number of the codebook entry: row (green) × S + column (red)."""
+    return labels[:, 1].astype(np.int64) * side + labels[:, 0]
+
+
+def _empty(count: int, coefficients: int) -> Splats:
+    """Memory for a scene, not yet filled."""
+    return Splats(
+        means=np.empty((count, 3), np.float32),
+        quats=np.empty((count, 4), np.float32),
+        scales=np.empty((count, 3), np.float32),
+        opacities=np.empty(count, np.float32),
+        sh0=np.empty((count, 3), np.float32),
+        shN=np.empty((count, coefficients, 3), np.float32),
+    )
 
 
 class _Lookup:
@@ -156,10 +179,13 @@ class _Lookup:
     def __init__(self, image: UInt8[np.ndarray, "..."], low: np.ndarray, high: np.ndarray) -> None:
         table = _table(image, low, high).astype(np.float32)
         self._table = table.reshape(-1)
-        self._offsets = np.arange(len(table), dtype=np.int64) * table.shape[1]
+        # As large as a chunk of levels: NumPy adds two long rows faster than many short ones.
+        self._offsets = np.tile(np.arange(len(table), dtype=np.uint16) * table.shape[1], (CHUNK, 1))
 
     def __call__(self, levels: UInt8[np.ndarray, "N C"], out: Float32[np.ndarray, "N C"]) -> None:
-        np.take(self._table, levels + self._offsets, out=out, mode="clip")
+        for first in range(0, len(levels), CHUNK):
+            some = levels[first : first + CHUNK]
+            np.take(self._table, some + self._offsets[: len(some)], out=out[first : first + CHUNK], mode="clip")
 
 
 def _table(image: np.ndarray, low: np.ndarray, high: np.ndarray) -> Float64[np.ndarray, "C levels"]:

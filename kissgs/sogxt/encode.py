@@ -15,7 +15,7 @@ from kissgs.settings import EncodeSettings
 from kissgs.sogxt import metadata
 from kissgs.sogxt.codebook import Codebook, fit_codebook
 from kissgs.sogxt.order import Grid, place
-from kissgs.sogxt.parallel import workers
+from kissgs.sogxt.parallel import blas_workers
 from kissgs.sogxt.planes import compress_images
 from kissgs.sogxt.pras import choose_forms
 from kissgs.sogxt.quantize import Quantized, anchor, means_bits, quantize, quantize_means
@@ -74,7 +74,7 @@ def encode(
     if settings.drop_invisible:
         kept = np.flatnonzero(splats.opacities > np.float32(INVISIBLE_LOGIT))
     bits = settings.means_bits or means_bits(splats, kept, settings.means_tolerance)
-    with workers(threads) as pool:
+    with blas_workers(threads) as pool:
         grid = place(splats.means, kept, bits, settings, pool, _stage(progress, "order"))
         # Padding repeats Gaussians of the scene; a scene without any lends it a neutral one.
         shown, cells = (splats, grid.cells) if len(kept) else (_neutral(splats.sh_degree), grid.cells * 0)

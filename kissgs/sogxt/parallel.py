@@ -6,20 +6,14 @@ import contextlib
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
-
-from threadpoolctl import threadpool_limits
+from typing import Self, TypeVar
 
 T = TypeVar("T")
 R = TypeVar("R")
 
 
 class Workers:
-    """A thread pool whose work releases the GIL: compiled kernels, BLAS, libwebp.
-
-    While it is open, BLAS runs single-threaded in this process: each call is then one task of the pool, and its
-    result the same whatever the number of threads.
-    """
+    """A thread pool for work that releases the GIL: compiled kernels, BLAS, libwebp, NumPy on large arrays."""
 
     def __init__(self, threads: int) -> None:
         """``threads`` below 1 means all the processors this process may use."""
@@ -39,17 +33,21 @@ class Workers:
             report(len(results) / len(items))
         return results
 
-    def close(self) -> None:
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *reason: object) -> None:
         """Drop what has not started, without waiting for what has: a long libwebp call cannot be interrupted."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
 
 @contextlib.contextmanager
-def workers(threads: int = 0) -> Iterator[Workers]:
-    """A pool of ``threads`` workers (0: as many as there are processors) for the time of the block."""
-    with threadpool_limits(1, user_api="blas"):
-        pool = Workers(threads)
-        try:
-            yield pool
-        finally:
-            pool.close()
+def blas_workers(threads: int) -> Iterator[Workers]:
+    """Workers during whose time BLAS runs single-threaded in this process.
+
+    Each call is then one task of the pool, and its result the same whatever the number of threads.
+    """
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(1, user_api="blas"), Workers(threads) as pool:
+        yield pool

@@ -46,8 +46,8 @@ def encode_plane(image: UInt8[np.ndarray, "H W C"], *, quality: int, method: int
     return buffer.getvalue()
 
 
-def decode_plane(data: bytes, name: str, *, width: int, height: int, channels: int) -> UInt8[np.ndarray, "H W C"]:
-    """Decompress one image.
+def decode_plane(data: bytes, name: str, *, width: int, height: int, channels: int) -> UInt8[np.ndarray, "H*W C"]:
+    """Decompress one image, as rows of pixels.
 
     Args:
         data: a WebP file.
@@ -71,9 +71,8 @@ def decode_plane(data: bytes, name: str, *, width: int, height: int, channels: i
     except (OSError, ValueError, SyntaxError, EOFError, MemoryError) as error:
         raise InvalidContainerError(f"{name} is damaged: its WebP data cannot be decoded") from error
     if channels == 4 and pixels.shape[2] == 3:
-        opaque = np.full((height, width, 1), 255, dtype=np.uint8)
-        return np.concatenate([pixels, opaque], axis=2)
-    return pixels[:, :, :channels]
+        pixels = np.concatenate([pixels, np.full((height, width, 1), 255, dtype=np.uint8)], axis=2)
+    return pixels.reshape(width * height, -1)[:, :channels]
 
 
 def probe_webp(data: bytes, name: str) -> tuple[int, int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from kissgs.splats import ATTRIBUTES, SH_REST_COUNTS, Splats
 
@@ -61,3 +62,27 @@ def covariances(quats, scales):
     rotation[:, 2] = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1)
     squares = np.exp(2 * np.asarray(scales, np.float64))
     return np.einsum("nij,nj,nkj->nik", rotation, squares, rotation)
+
+
+def product(p, q):
+    """Hamilton product of w, x, y, z quaternions, as SciPy multiplies rotations. Signs are those of p q."""
+    w, x, y, z = np.moveaxis(np.asarray(p, np.float64), -1, 0)
+    a, b, c, d = np.moveaxis(np.asarray(q, np.float64), -1, 0)
+    parts = [w * a - x * b - y * c - z * d, w * b + x * a + y * d - z * c]
+    return np.stack([*parts, w * c - x * d + y * a + z * b, w * d + x * c - y * b + z * a], axis=-1)
+
+
+def equivalents(quats, scales):
+    """All 48 ways to write each Gaussian, (48, N, 4) and (48, N, 3), from SciPy's list of the cube's rotations.
+
+    A rotation M of the cube takes axis i to ± axis p: R M has the old column p as its column i, up to its sign, so the
+    new scale i is the old scale p.
+    """
+    turns = Rotation.create_group("O")
+    new_quats, new_scales = [], []
+    for turn, matrix in zip(turns.as_quat(scalar_first=True), turns.as_matrix(), strict=True):
+        source = np.abs(matrix).argmax(axis=0)
+        turned = product(quats, turn)
+        new_quats += [turned, -turned]
+        new_scales += [scales[:, source]] * 2
+    return np.stack(new_quats), np.stack(new_scales)

@@ -1,7 +1,7 @@
 """Two naive decoders written from the description of the format alone (docs/format.md), as oracles for ours.
 
-``decode`` does what the paper's Python decoder does: whole arrays, float32, activated values and back. ``decode_browser``
-does what viewers and other tools do: it looks at ``meta.json`` only, and checks what they check.
+``decode`` does what the paper's Python decoder does: whole arrays, float32, activated values and back.
+``decode_browser`` does what viewers and other tools do: it looks at ``meta.json`` only, and checks what they check.
 """
 
 from __future__ import annotations

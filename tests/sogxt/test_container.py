@@ -1,0 +1,284 @@
+"""Oracle: the zipfile module, which writes friendly and hostile archives, and the file system."""
+
+import errno
+import io
+import os
+import tempfile
+import tracemalloc
+import zipfile
+from pathlib import Path
+
+import pytest
+from codec_scenes import random_scene
+
+from kissgs import compress, decompress
+from kissgs.errors import InvalidContainerError, OutputError
+from kissgs.sogxt.container import MAX_ZIP_ENTRIES, open_source, write_container, zip_bytes
+
+FILES = {"container_meta.yaml": b"meta", "meta.json": b"{}", "a.webp": bytes(range(256)) * 4, "empty.webp": b""}
+
+
+def archive(entries, compression=zipfile.ZIP_STORED):
+    """A zip of (name, bytes) pairs, as anybody might make it."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", compression) as file:
+        for name, data in entries:
+            file.writestr(name, data)
+    return buffer.getvalue()
+
+
+def contents(source):
+    """All files of a container, by way of the library."""
+    with open_source(source) as files:
+        return {name: files.read(name, 1 << 20) for name in files.names()}
+
+
+def refusal(source, name="a.webp", limit=1 << 20):
+    """The sentence with which reading is refused."""
+    with pytest.raises(InvalidContainerError) as caught, open_source(source) as files:
+        files.read(name, limit)
+    return str(caught.value)
+
+
+def test_zip_has_the_same_bytes_at_any_time_and_place(monkeypatch):
+    first = zip_bytes(FILES)
+    monkeypatch.setattr("time.time", lambda: 2e9)
+    monkeypatch.setattr("sys.platform", "win32")
+    assert zip_bytes(dict(FILES)) == first
+    with zipfile.ZipFile(io.BytesIO(first)) as file:
+        assert {entry.filename: file.read(entry) for entry in file.infolist()} == FILES
+        assert file.testzip() is None
+        for entry in file.infolist():
+            assert entry.compress_type == zipfile.ZIP_STORED
+            assert entry.date_time == (1980, 1, 1, 0, 0, 0)
+            assert entry.external_attr >> 16 == 0o644
+
+
+@pytest.mark.parametrize("compression", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+@pytest.mark.parametrize("folder", ["", "scene/", "a/b/c/", "a\\b\\", "/abs/", "../../", "C:\\"])
+def test_zips_of_other_tools_are_read(folder, compression):
+    """Deflated, or packed with their folder; a path is only ever a name here, so it leads nowhere."""
+    data = archive([(f"{folder}{name}", content) for name, content in FILES.items()], compression)
+    assert contents(data) == FILES
+
+
+def test_folder_entries_and_notes_are_ignored():
+    entries = [("scene/", b""), *((f"scene/{name}", data) for name, data in FILES.items())]
+    found = contents(archive([*entries, ("__MACOSX/._a.webp", b"x"), ("scene/README.txt", b"hello")]))
+    assert {name: found[name] for name in FILES} == FILES
+
+
+def test_a_container_is_read_from_anything(tmp_path):
+    write_container(FILES, tmp_path / "folder")
+    write_container(FILES, tmp_path / "file.zip")
+    sources = [FILES, tmp_path / "folder", tmp_path / "file.zip", (tmp_path / "file.zip").read_bytes()]
+    assert all(contents(source) == FILES for source in sources)
+    (tmp_path / "folder" / "subfolder").mkdir()
+    assert contents(tmp_path / "folder") == FILES
+
+
+@pytest.mark.parametrize("kind", ["memory", "folder", "zip"])
+def test_sizes_are_told_without_reading(kind, tmp_path):
+    source = {"memory": FILES, "folder": tmp_path / "folder", "zip": tmp_path / "file.zip"}[kind]
+    if kind != "memory":
+        write_container(FILES, source)
+    with open_source(source) as files:
+        assert {name: files.size(name) for name in files.names()} == {name: len(data) for name, data in FILES.items()}
+
+
+@pytest.mark.parametrize("kind", ["memory", "folder", "zip"])
+def test_missing_and_oversized_files_are_refused(kind, tmp_path):
+    source = {"memory": FILES, "folder": tmp_path / "folder", "zip": tmp_path / "file.zip"}[kind]
+    if kind != "memory":
+        write_container(FILES, source)
+    assert refusal(source, "b.webp") == "the container has no file 'b.webp'"
+    assert refusal(source, "a.webp", 1023) == "a.webp has 1024 bytes; at most 1023 are possible here"
+    with open_source(source) as files:
+        assert len(files.read("a.webp", 1024)) == 1024
+
+
+@pytest.mark.parametrize("data", [b"", b"PK\x05\x06", b"PK\x03\x04" + bytes(50), b"no zip", zip_bytes(FILES)[:-30]])
+def test_what_is_no_zip_is_refused(data, tmp_path):
+    assert refusal(data) == "the input is not a readable zip file"
+    path = tmp_path / "file.zip"
+    path.write_bytes(data)
+    assert refusal(path) == f"{path} is not a readable zip file"
+
+
+def test_no_such_file(tmp_path):
+    path = tmp_path / "none.zip"
+    assert refusal(path) == f"cannot read {path}: no such file or directory"
+
+
+@pytest.mark.parametrize("name", ["x" * 300 + ".zip", "x" * 300, "nul\0.zip"])
+def test_paths_that_no_file_system_has_are_refused_in_a_sentence(tmp_path, name):
+    """Asking whether such a path is a folder once raised a bare OSError or ValueError."""
+    assert refusal(tmp_path / name).startswith("cannot read")
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+@pytest.mark.parametrize("second", ["a.webp", "other/a.webp"])
+def test_two_files_of_one_name_are_refused(second):
+    """Which of them counts? Readers differ, so a checked file could be another than the one that is used."""
+    data = archive([("a.webp", b"one"), (second, b"two")])
+    assert refusal(data) == "the input holds two files named 'a.webp'"
+
+
+def test_thousands_of_entries_are_refused():
+    data = archive([(f"{i}.txt", b"") for i in range(MAX_ZIP_ENTRIES + 1)])
+    assert refusal(data) == f"the input has {MAX_ZIP_ENTRIES + 1} entries; a container has 12 files"
+
+
+@pytest.mark.parametrize("honest", [True, False])
+def test_a_zip_bomb_takes_no_memory(honest):
+    """64 MB of zeros in 64 kB; the declared size may be the true one, or a lie."""
+    data = archive([("a.webp", bytes(64 << 20))], zipfile.ZIP_DEFLATED)
+    if not honest:
+        size = (64 << 20).to_bytes(4, "little")
+        assert data.count(size) == 2
+        data = data.replace(size, (1000).to_bytes(4, "little"))
+    tracemalloc.start()
+    try:
+        sentence = refusal(data)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 8 << 20
+    assert "at most 1048576 are possible here" in sentence or "it is damaged or encrypted" in sentence
+
+
+def damaged(data, old, new, times):
+    assert data.count(old) == times
+    return data.replace(old, new)
+
+
+def test_damaged_encrypted_and_exotic_entries_are_refused():
+    sentence = "a.webp cannot be read from the zip: it is damaged or encrypted"
+    good = archive([("a.webp", b"hello world")])
+    assert refusal(damaged(good, b"hello world", b"hellO world", 1)) == sentence  # its CRC is wrong
+    encrypted = bytearray(good)
+    encrypted[6] |= 1  # the flags of the local header,
+    encrypted[good.index(b"PK\x01\x02") + 8] |= 1  # and of the directory
+    assert refusal(bytes(encrypted)) == sentence
+    exotic = bytearray(good)
+    exotic[8] = exotic[good.index(b"PK\x01\x02") + 10] = 99  # a compression that nobody has
+    assert refusal(bytes(exotic)) == sentence
+    astray = bytearray(good)
+    offset = good.index(b"PK\x01\x02") + 42
+    astray[offset : offset + 4] = (1 << 30).to_bytes(4, "little")  # far behind the end
+    assert refusal(bytes(astray)) == sentence
+
+
+@pytest.mark.parametrize("name", ["new", "new.zip", "NEW.ZIP"])
+def test_nothing_is_overwritten_unless_asked_for(tmp_path, name):
+    path = tmp_path / name
+    assert write_container(FILES, path) == (path.stat().st_size if path.is_file() else 1030)
+    with pytest.raises(OutputError, match="exists already; choose another name or allow overwriting"):
+        write_container({"a.webp": b""}, path)
+    assert contents(path) == FILES
+    less = {name: data for name, data in FILES.items() if name != "empty.webp"}
+    if path.is_file():
+        write_container(less, path, overwrite=True)
+        assert contents(path) == less
+    else:
+        write_container({**FILES, "a.webp": b"new"}, path, overwrite=True)
+        assert contents(path)["a.webp"] == b"new"
+    assert [entry.name for entry in tmp_path.iterdir()] == [name], "something was left over"
+
+
+@pytest.mark.parametrize("stranger", ["thesis.txt", "b.webp", ".hidden", "subfolder"])
+def test_a_folder_that_holds_more_than_a_container_is_never_replaced(tmp_path, stranger):
+    folder = tmp_path / "home"
+    write_container(FILES, folder)
+    (folder / stranger).mkdir() if stranger == "subfolder" else (folder / stranger).write_text("years of work")
+    before = sorted(folder.iterdir())
+    with pytest.raises(
+        OutputError, match=r"holds more than a container; name an empty or a new folder, or a \.zip file"
+    ):
+        write_container(FILES, folder, overwrite=True)
+    assert sorted(folder.iterdir()) == before
+
+
+def test_a_file_is_not_replaced_by_a_folder(tmp_path):
+    (tmp_path / "file").write_text("text")
+    with pytest.raises(OutputError):
+        write_container(FILES, tmp_path / "file", overwrite=True)
+    assert (tmp_path / "file").read_text() == "text"
+
+
+def test_a_folder_is_not_replaced_by_a_zip(tmp_path):
+    (tmp_path / "x.zip").mkdir()
+    with pytest.raises(OutputError, match="is a folder; name a file"):
+        write_container(FILES, tmp_path / "x.zip", overwrite=True)
+
+
+@pytest.mark.parametrize("name", ["missing/new", "missing/new.zip"])
+def test_a_missing_folder_above_is_an_output_error(tmp_path, name):
+    with pytest.raises(OutputError, match=f"cannot write .*{name}: no such file or directory"):
+        write_container(FILES, tmp_path / name)
+
+
+@pytest.mark.parametrize("existing", [False, True])
+def test_a_disk_that_fills_up_leaves_what_was_there(tmp_path, monkeypatch, existing):
+    """A folder is swapped in when all files are written, so a failure amid them changes nothing."""
+    folder = tmp_path / "folder"
+    if existing:
+        write_container(FILES, folder)
+    calls = []
+
+    def fsync(descriptor):
+        calls.append(descriptor)
+        if len(calls) == 3:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    with pytest.raises(OutputError, match=r"cannot write .*folder: no space left on device"):
+        write_container(dict.fromkeys(FILES, b"new"), folder, overwrite=True)
+    assert [entry.name for entry in tmp_path.iterdir()] == (["folder"] if existing else [])
+    if existing:
+        assert contents(folder) == FILES
+
+
+def test_a_swap_that_fails_puts_the_old_folder_back(tmp_path, monkeypatch):
+    """Between the two renames the old container has another name; a failure then must not leave it there."""
+    folder, rename = tmp_path / "folder", Path.rename
+    write_container(FILES, folder)
+
+    def failing(self, target):
+        if Path(target) == folder and ".part" in self.name:
+            raise OSError(errno.EIO, "Input/output error")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", failing)
+    with pytest.raises(OutputError, match="cannot write"):
+        write_container(dict.fromkeys(FILES, b"new"), folder, overwrite=True)
+    assert contents(folder) == FILES
+    assert [entry.name for entry in tmp_path.iterdir()] == ["folder"]
+
+
+@pytest.fixture
+def unreadable_folder():
+    """A folder that this process may not list: as root, by being somebody else for a while."""
+    with tempfile.TemporaryDirectory() as above:
+        Path(above).chmod(0o755)
+        folder = Path(above, "secret")
+        write_container(FILES, folder)
+        folder.chmod(0)
+        user = os.geteuid()
+        if user == 0:
+            os.seteuid(65534)
+        yield folder
+        os.seteuid(user)
+        folder.chmod(0o755)
+
+
+def test_a_folder_that_may_not_be_listed_is_refused_in_a_sentence(unreadable_folder):
+    """Listing it once raised a bare PermissionError."""
+    assert refusal(unreadable_folder) == f"cannot read {unreadable_folder}: permission denied"
+
+
+def test_a_whole_container_survives_repacking():
+    """What a person does to a container: unpack, pack again with another tool, deflated and in a folder."""
+    compressed = compress(random_scene(50, 1))
+    repacked = archive([(f"my scene/{name}", data) for name, data in compressed.files.items()], zipfile.ZIP_DEFLATED)
+    assert (decompress(repacked).means == decompress(compressed.files).means).all()

@@ -1,0 +1,298 @@
+"""Oracle: the scene that went in, Pillow's view of the images, PyYAML's of the metadata, and SciPy's cube rotations."""
+
+import hashlib
+import io
+import json
+
+import numpy as np
+import oracle
+import pytest
+import yaml
+from codec_scenes import PLANES, PRESETS, constant_scene, covariances, equivalents, random_scene, replaced, unit
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from kissgs import InvalidSceneError, Settings, compress, decompress
+from kissgs.sogxt.encode import encode
+from kissgs.splats import clean
+
+IMAGES = [f"{name}.webp" for name in PLANES]
+SLACK = 1e-6
+"""For the rounding of values, ranges and steps to float32, relative to values."""
+
+
+def encoded(splats, preset="fast", **changes):
+    return compress(splats, settings=Settings.from_preset(preset, **changes))
+
+
+def signed_log(x):
+    wide = np.asarray(x, np.float64)
+    return np.sign(wide) * np.log1p(np.abs(wide))
+
+
+def assert_within(found, wanted, half_steps):
+    allowed = np.asarray(half_steps) * (1 + 1e-6) + SLACK * (1 + np.abs(wanted))
+    assert (np.abs(np.asarray(found, np.float64) - wanted) - allowed).max() <= 0
+
+
+def check_round_trip(splats, result):
+    """Each Gaussian comes back within the half steps that the report states, in one of its equivalent forms."""
+    found, wanted, half = decompress(result.files), splats.select(result.order), result.report.half_steps
+    assert_within(signed_log(found.means), signed_log(wanted.means), half["means"])
+    assert_within(found.opacities, wanted.opacities, half["opacities"][0])
+    assert_within(found.sh0, wanted.sh0, half["f_dc"])
+    quats, scales = equivalents(wanted.quats, wanted.scales)
+    fits = (np.abs(quats - found.quats) <= np.array(half["quaternions"]) + 2 * SLACK).all(axis=2)
+    fits &= (np.abs(scales - found.scales) <= np.array(half["scales"]) + SLACK * (1 + np.abs(scales))).all(axis=2)
+    assert fits.any(axis=0).all()
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("count", [1, 9, 300])
+def test_round_trip_is_within_the_half_steps_that_are_reported(count, preset):
+    splats = random_scene(count, 1, seed=count)
+    result = encoded(splats, preset)
+    check_round_trip(splats, result)
+    assert sorted(result.order) == list(range(count))
+
+
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(
+    st.integers(1, 40),
+    st.integers(0, 1000),
+    st.floats(1e-3, 10),
+    st.floats(1e-3, 10),
+    st.floats(1e-3, 0.5),
+    st.integers(8, 16),
+    st.booleans(),
+)
+def test_round_trip_for_any_steps(count, seed, coarse, fine, quat_step, bits, shared):
+    splats = random_scene(count, 0, seed=seed)
+    steps = {"opacity_step": coarse, "scale_step": fine, "sh0_step": coarse, "quat_step": quat_step}
+    check_round_trip(splats, encoded(splats, "fast", means_bits=bits, shared_steps=shared, **steps))
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_sh_of_scenes_below_the_codebook_size_is_within_its_half_steps(preset):
+    splats = random_scene(50, 3, seed=2)
+    result = encoded(splats, preset, sh_ratio=1)
+    half = np.array(result.report.half_steps["f_rest_centroids"]).reshape(3, 15).T
+    assert_within(decompress(result.files).shN, splats.select(result.order).shN, half)
+
+
+def test_the_steps_asked_for_are_kept():
+    splats = random_scene(500, 0, seed=1)
+    half = encoded(splats).report.half_steps
+    given = {"opacities": 0.15, "scales": 0.11, "quaternions": 0.023, "f_dc": 0.04}
+    for field, step in given.items():
+        assert max(half[field]) <= step / 2 * (1 + 1e-5)
+        assert max(half[field]) > step / 2 * 0.95, "a smaller step than needed costs bytes"
+
+
+@pytest.mark.parametrize("preset", ["fast", "paper"])
+def test_the_chosen_form_is_the_same_ellipsoid(preset):
+    """Also where ``clean`` left a quaternion a millionth longer than 1, as it may."""
+    splats = random_scene(200, 0, seed=6)
+    splats = replaced(splats, quats=splats.quats * np.float32(1 + 7e-7))
+    assert clean(splats)[0].quats is splats.quats, "near enough to 1"
+    result = encoded(splats, preset, quat_step=1e-3, scale_step=1e-3)
+    assert result.report.form_error < 1e-6
+    found, wanted = decompress(result.files), splats.select(result.order)
+    before, after = covariances(wanted.quats, wanted.scales), covariances(found.quats, found.scales)
+    error = np.linalg.norm(after - before, axis=(1, 2)) / np.linalg.norm(before, axis=(1, 2))
+    assert error.max() < (0.02 if preset == "fast" else 0.2)
+
+
+def test_upright_forms_leave_no_rotation_of_more_than_63_degrees():
+    """The claim of the module: the cube's rotations cover all with balls of 62.8 degrees around them."""
+    found = decompress(encoded(random_scene(2000, 0), quat_step=1e-3).files)
+    assert found.quats[:, 0].min() > np.cos(np.deg2rad(62.8) / 2) - 1e-3
+
+
+def test_invisible_gaussians_are_left_out_and_counted():
+    splats = random_scene(100, 0)
+    faint = np.full(100, -5.6)
+    faint[::3] = np.float32(-np.log(254)) + 1e-3  # opacity just above 1/255
+    splats = replaced(splats, opacities=faint)
+    result = encoded(splats)
+    assert (result.report.count, result.report.invisible, result.report.source_count) == (34, 66, 100)
+    assert sorted(result.order) == list(range(0, 100, 3))
+    everything = encoded(splats, drop_invisible=False)
+    assert (everything.report.count, everything.report.invisible) == (100, 0)
+
+
+@pytest.mark.parametrize("count", [0, 5])
+def test_scenes_without_a_visible_gaussian_give_an_empty_container(count):
+    """A labels lookup without any entry once raised IndexError; a neutral Gaussian lends the padding its values."""
+    splats = replaced(random_scene(count, 2), opacities=np.full(count, -9))
+    result = compress(splats, importance=np.ones(count, np.float32))
+    assert (result.report.count, result.report.invisible) == (0, count)
+    found = decompress(result.files)
+    assert (len(found), found.sh_degree) == (0, 2)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_ranges_are_those_of_the_data_to_the_last_bit(preset):
+    """The smallest level that occurs stands for the minimum, whatever the steps; the largest of the widest channel
+    for the maximum, within half a step."""
+    splats = random_scene(333, 0, seed=7)
+    result = encoded(splats, preset)
+    ranges = oracle.ranges_of(yaml.safe_load(result.files["container_meta.yaml"]))
+    for field, data in (("opacities", splats.opacities[:, None]), ("f_dc", splats.sh0)):
+        low, high = (np.ravel(limit).astype(np.float32) for limit in ranges[field])
+        half = np.array(result.report.half_steps[field])
+        assert (low == data.min(axis=0)).all()
+        if preset == "paper":
+            assert (high == data.max(axis=0)).all()
+        widest = np.ptp(data, axis=0).argmax()
+        assert (data.max(axis=0) <= high + half).all()
+        assert abs(high[widest] - data.max(axis=0)[widest]) <= half[widest]
+    logs = signed_log(splats.means)
+    assert np.float32(ranges["means"][0]) == np.float32(logs.min())
+    assert np.float32(ranges["means"][1]) == np.float32(logs.max())
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("count", [1, 9, 65, 300])
+def test_every_image_spans_its_levels(count, preset):
+    """A decoder takes the levels that it sees for the ends of the ranges: no range may end where no level lies."""
+    files = encoded(random_scene(count, 1, seed=3), preset).files
+    ranges = oracle.ranges_of(yaml.safe_load(files["container_meta.yaml"]))
+    tops = {"quaternions": 99, "f_rest_centroids": 99} if preset == "paper" else {}
+    for field, (low, high) in ranges.items():
+        if field == "means":
+            levels = oracle.levels(files, "means_bytes_0", 3) + 256 * oracle.levels(files, "means_bytes_1", 3)
+            assert (levels.min(), levels.max()) == (0, 65535), "some readers divide by 65535"
+            continue
+        levels = oracle.pixels(files, f"{field}.webp")
+        if np.max(np.subtract(high, low)) > 0:
+            assert levels.min() == 0
+            if preset == "paper":
+                assert levels.max() == tops.get(field, 255)
+        else:
+            assert levels.min() == levels.max()
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("count", [1, 9, 100])
+def test_padding_repeats_cells_that_are_active(count, preset):
+    """In the paper's order padding may take another form of its Gaussian, to suit its neighbours."""
+    files = encoded(random_scene(count, 2), preset).files
+    free = ("scales", "quaternions") if preset == "paper" else ()
+    cells = [oracle.pixels(files, f"{name}.webp") for name in PLANES[1:8] if name not in free]
+    cells = np.concatenate([image.reshape(len(image) ** 2, -1) for image in cells], axis=1)
+    active = oracle.pixels(files, "active_mask.webp")[:, :, 0].reshape(-1) > 0
+    assert active.sum() == count
+    known = {tuple(cell) for cell in cells[active]}
+    assert {tuple(cell) for cell in cells[~active]} <= known
+
+
+@pytest.mark.parametrize("count", [1, 500])
+def test_images_have_the_modes_that_decoders_expect(count):
+    files = encoded(random_scene(count, 3), "balanced").files
+    for name in IMAGES:
+        with Image.open(io.BytesIO(files[name])) as image:
+            assert image.format == "WEBP"
+            assert image.mode == ("RGBA" if name == "quaternions.webp" else "RGB"), name
+    labels = oracle.pixels(files, "f_rest_labels.webp")
+    side = yaml.safe_load(files["container_meta.yaml"])["meta"]["f_rest_centroids_side"]
+    assert labels[:, :, :2].max() < side
+    assert (labels[:, :, 2] == 0).all()
+    assert set(np.unique(oracle.pixels(files, "active_mask.webp"))) <= {0, 1}
+
+
+def test_quaternion_images_never_lose_their_fourth_channel():
+    """Where every alpha is 255, libwebp drops the channel and the paper's decoder fails: z is constant here."""
+    splats = replaced(random_scene(40, 0), quats=np.tile(unit([[0.9, 0.3, 0.1, 0.2]]), (40, 1)))
+    for preset in PRESETS:
+        assert oracle.levels(encoded(splats, preset).files, "quaternions", 4).shape[1] == 4
+
+
+def numbers(value):
+    """All numbers below ``value``, and whatever else stands where a number should."""
+    return [leaf for item in value for leaf in numbers(item)] if isinstance(value, list) else [value]
+
+
+def test_files_and_metadata_are_complete():
+    splats = random_scene(90, 3)
+    files = encoded(splats).files
+    assert sorted(files) == sorted(["container_meta.yaml", "meta.json", "scene.json", *IMAGES])
+    text = files["container_meta.yaml"].decode("ascii")
+    document = yaml.safe_load(text)
+    assert document["meta"] == {"grid_side": 16, "f_rest_centroids_side": 8, "image_codec": "webp"}
+    ranges = oracle.ranges_of(document)
+    lengths = {"opacities": 0, "means": 0, "scales": 3, "quaternions": 4, "f_dc": 3, "f_rest_centroids": 45}
+    assert ranges.keys() == lengths.keys()
+    for field, limits in ranges.items():
+        for limit in limits:
+            assert isinstance(limit, list) == (lengths[field] > 0)
+            assert {type(number) for number in numbers(limit)} == {float}
+            assert len(numbers(limit)) == max(lengths[field], 1)
+    ours = document["kissgs"]
+    assert (ours["count"], ours["source_count"], ours["sh_degree"]) == (90, 90, 3)
+    assert ours["sha256"] == {name: hashlib.sha256(files[name]).hexdigest() for name in IMAGES}
+    scene = json.loads(files["scene.json"])
+    entries = [scene["metadata"], *scene["planes"].values()]
+    assert {entry["url"]: entry["bytes"] for entry in entries} == {
+        name: len(files[name]) for name in ["meta.json", *IMAGES]
+    }
+
+
+def test_both_spellings_of_the_metadata_agree():
+    files = encoded(random_scene(90, 3)).files
+    ranges = oracle.ranges_of(yaml.safe_load(files["container_meta.yaml"]))
+    meta = json.loads(files["meta.json"])
+    for key, field in (("quats", "quaternions"), ("sh0", "f_dc"), ("means",) * 2, ("scales",) * 2, ("opacities",) * 2):
+        assert (meta[key]["mins"], meta[key]["maxs"]) == ranges[field]
+    assert (meta["shN"]["centroidsMins"], meta["shN"]["centroidsMaxs"]) == ranges["f_rest_centroids"]
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_sh_bands_of_zeros_cost_next_to_nothing(preset):
+    without = random_scene(400, 0)
+    zeros = replaced(without, shN=np.zeros((400, 15, 3)))
+    sizes = [encoded(splats, preset).report.container_bytes for splats in (zeros, without)]
+    assert sizes[0] - sizes[1] < 300
+
+
+def test_bands_that_are_zero_are_constant_in_the_image():
+    half_zero = random_scene(1000, 3)
+    half_zero.shN[:, 3:] = 0
+    files = encoded(half_zero).files
+    entries = oracle.untiled(oracle.pixels(files, "f_rest_centroids.webp"), 8).reshape(64, 3, 15)
+    assert (entries[:, :, 3:] == entries[0, 0, 14]).all()
+
+
+def test_constant_scenes_cost_next_to_nothing():
+    sizes = encoded(constant_scene(4000, 3)).report.file_bytes
+    assert all(sizes[name] < 150 for name in IMAGES)
+
+
+def test_importance_moves_the_error_to_where_it_matters_less():
+    splats = random_scene(3000, 1, seed=5)
+    favoured = np.arange(3000) < 1000
+    errors = {}
+    for name, mask in (("first", favoured), ("last", ~favoured)):
+        result = compress(splats, importance=np.where(mask, 20, 0.1).astype(np.float32))
+        difference = decompress(result.files).shN - splats.select(result.order).shN
+        errors[name] = np.square(difference[favoured[result.order]]).mean()
+    assert errors["first"] < 0.7 * errors["last"]
+
+
+@pytest.mark.parametrize(
+    "importance", [np.ones(9), np.ones((10, 1)), np.zeros(10), -np.ones(10), np.full(10, np.nan), np.full(10, np.inf)]
+)
+def test_impossible_importance_is_refused(importance):
+    scene = random_scene(10, 1)
+    with pytest.raises(InvalidSceneError, match="importance must be 10 positive numbers, one per Gaussian"):
+        encode(scene, Settings().encode, importance=importance.astype(np.float32))
+
+
+def test_progress_names_every_stage_and_ends_at_one():
+    events = []
+    encode(random_scene(300, 3), Settings().encode, progress=lambda stage, fraction: events.append((stage, fraction)))
+    stages = list(dict.fromkeys(stage for stage, _ in events))
+    assert stages == ["kernels", "order", "forms", "codebook", "sort codebook", "images"]
+    assert all(0 <= fraction <= 1 for _, fraction in events)
+    assert events[-1] == ("images", 1.0)
