@@ -58,9 +58,9 @@ class EncodeSettings(BaseModel):
     quat_step: Annotated[float, Field(gt=0, le=0.5)] = Field(
         0.023, description="Step of quaternion components: 0.02 turns a Gaussian by 1 degree on average."
     )
-    sh0_step: Step = Field(0.04, description="Step of base colours: 0.04 is an error of up to 1.4 levels of 255.")
+    sh0_step: Step = Field(0.055, description="Step of base colours: 0.055 is an error of up to 2 levels of 255.")
     sh_ratio: float = Field(
-        8, ge=1, le=4096, description="Gaussians per codebook entry: fewer entries are fewer bytes and a rougher gloss."
+        7, ge=1, le=4096, description="Gaussians per codebook entry: fewer entries are fewer bytes and a rougher gloss."
     )
     sh_tolerance: float = Field(
         0.001,
@@ -69,10 +69,10 @@ class EncodeSettings(BaseModel):
         description="Error of SH coefficients that nobody sees: the codebook does not grow to get below it.",
     )
     sh_step: Annotated[float, Field(gt=0, le=4)] = Field(
-        0.9, description="Step of the codebook's entries, in units of the error that the codebook leaves anyway."
+        1.15, description="Step of the codebook's entries, in units of the error that the codebook leaves anyway."
     )
     sh_weight_power: float = Field(
-        0.25,
+        0.4,
         ge=0,
         le=1,
         description="How much the codebook favours what is seen: weights are (opacity x projected area) to this power. "
@@ -106,11 +106,12 @@ PRESETS: dict[Preset, dict[str, Any]] = {
     Preset.BALANCED: {},
     Preset.SMALL: {
         "means_tolerance": 0.08,
-        "opacity_step": 0.25,
-        "scale_step": 0.16,
-        "quat_step": 0.035,
-        "sh0_step": 0.06,
-        "sh_ratio": 20,
+        "opacity_step": 0.2,
+        "scale_step": 0.15,
+        "quat_step": 0.033,
+        "sh0_step": 0.08,
+        "sh_ratio": 16,
+        "sh_step": 1.4,
         "sh_rounds": 8,
         "sh_reach": 32,
         "plas_decay": 0.95,
@@ -120,6 +121,7 @@ PRESETS: dict[Preset, dict[str, Any]] = {
         "forms": "smooth",
         "shared_steps": False,
         "means_bits": 16,
+        "sh_ratio": 8,
         "sh_weight_power": 0,
         "sh_tolerance": 0,
         "sh_rounds": 8,
