@@ -207,10 +207,7 @@ def demo(
     from kissgs.sample import sample_scene
 
     settings = _settings(preset, None, None)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot make the folder {folder}: {(error.strerror or str(error)).lower()}") from error
+    _make_folder(folder)
     with _progress(False) as progress:
         if scene is None:
             scene = folder / "sample.ply"
@@ -291,7 +288,7 @@ def _pairs(names: list[str], output: Path | None, suffix: str) -> Iterator[tuple
     if len(inputs) > 1 and output is not None:
         if output.suffix.lower() in (".zip", ".ply") or str(output) == "-":
             raise OutputError(f"{len(inputs)} inputs cannot all become {output}; name a folder with -o")
-        output.mkdir(parents=True, exist_ok=True)
+        _make_folder(output)
         named = [output / (Path(name).stem + suffix) for name in inputs]
         if len(set(named)) < len(named):
             raise OutputError("two inputs have the same name and would become one file; compress them one by one")
@@ -301,6 +298,15 @@ def _pairs(names: list[str], output: Path | None, suffix: str) -> Iterator[tuple
         if name == "-" and output is None:
             raise OutputError("standard input has no name; say where to write with -o")
         yield name, output or Path(name).with_suffix(suffix)
+
+
+def _make_folder(folder: Path) -> None:
+    from kissgs.io.atomic import reason_of
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        raise OutputError(f"cannot make the folder {folder}: {reason_of(error)}") from error
 
 
 def _expand(names: list[str]) -> list[str]:

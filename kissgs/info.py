@@ -12,22 +12,12 @@ from kissgs.errors import InvalidContainerError
 from kissgs.io.ply import read_ply
 from kissgs.pipeline import is_container
 from kissgs.sogxt.container import Source, open_source
-from kissgs.sogxt.metadata import CHANNELS, JSON_NAME, SCENE_NAME, YAML_NAME, Layout, read_layout
+from kissgs.sogxt.metadata import CHANNELS, Layout, read_layout
+from kissgs.sogxt.names import FILES, PLANES
 from kissgs.sogxt.planes import decode_plane
 from kissgs.sogxt.quantize import signed_exp
 from kissgs.splats import ATTRIBUTES, clean
 
-PLANES = (
-    "active_mask.webp",
-    "means_bytes_0.webp",
-    "means_bytes_1.webp",
-    "opacities.webp",
-    "scales.webp",
-    "quaternions.webp",
-    "f_dc.webp",
-    "f_rest_labels.webp",
-    "f_rest_centroids.webp",
-)
 NAMES = {"quaternions": "quats", "f_dc": "sh0", "f_rest_centroids": "shN"}
 MAX_PLANE_BYTES = 1 << 30
 
@@ -107,8 +97,7 @@ def _describe_container(path: Path) -> Info:
         missing = [name for name in PLANES if name not in present]
         if missing:
             raise InvalidContainerError(f"{path} lacks {', '.join(missing)}")
-        metadata = [name for name in (YAML_NAME, JSON_NAME, SCENE_NAME) if name in present]
-        parts = {name: files.size(name) for name in (*metadata, *PLANES)}
+        parts = {name: files.size(name) for name in FILES if name in present}
         count = layout.provenance.count if layout.provenance else _count_mask(files, layout)
     made = layout.provenance
     return Info(

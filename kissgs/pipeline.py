@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Float32, Int
 
 from kissgs.errors import InvalidContainerError, OutputError
-from kissgs.io.atomic import atomic_file, refuse_existing
+from kissgs.io.atomic import atomic_file, reason_of, refuse_existing
 from kissgs.io.ply import read_ply, write_ply
 from kissgs.progress import Progress, silent
 from kissgs.settings import Settings
-from kissgs.sogxt.container import write_container, zip_bytes
+from kissgs.sogxt.container import check_destination, write_container, zip_bytes
 from kissgs.sogxt.decode import decode
 from kissgs.splats import Cleaned, Splats, clean
 
@@ -127,8 +127,7 @@ def save(splats: Splats, path: AnyPath, *, overwrite: bool = False, progress: Pr
         OutputError: it exists and ``overwrite`` is false, its name does not end in ``.ply``, or the disk refuses.
     """
     path = Path(path)
-    if path.suffix.lower() != ".ply":
-        raise OutputError(f"{path}: only .ply files are written here; use compress for containers")
+    _check_ply(path, overwrite=overwrite)
     with atomic_file(path, overwrite=overwrite) as file:
         write_ply(file, splats, progress=progress)
 
@@ -165,7 +164,7 @@ def compress(
     settings = settings or Settings()
     target = Path(destination) if destination is not None else None
     if target is not None:
-        _refuse_existing(target, overwrite=overwrite)
+        check_destination(target, overwrite=overwrite)
     clock = _Clock(progress)
     splats, cleaned, source_bytes = _open(source, threads, clock)
     encoded = encode(splats, settings.encode, importance=importance, cleaned=cleaned, threads=threads, progress=clock)
@@ -219,7 +218,7 @@ def decompress(
         OutputError: ``destination`` cannot be written.
     """
     if destination is not None:
-        refuse_existing(Path(destination), overwrite=overwrite)
+        _check_ply(Path(destination), overwrite=overwrite)
     splats = decode(source if isinstance(source, bytes | Mapping) else Path(source), threads=threads, progress=progress)
     if destination is not None:
         save(splats, destination, overwrite=overwrite, progress=progress)
@@ -230,13 +229,19 @@ def is_container(source: Path | bytes) -> bool:
     """Whether this looks like a container rather than a ``.ply``: a folder, or something that begins as a zip."""
     if isinstance(source, bytes):
         return source[:4] in ZIP_BEGINNINGS
-    if source.is_dir():
-        return True
     try:
+        if source.is_dir():
+            return True
         with source.open("rb") as file:
             return file.read(4) in ZIP_BEGINNINGS
-    except OSError:
+    except (OSError, ValueError):
         return source.suffix.lower() == ".zip"
+
+
+def _check_ply(path: Path, *, overwrite: bool) -> None:
+    if path.suffix.lower() != ".ply":
+        raise OutputError(f"{path}: only .ply files are written here; use compress for containers")
+    refuse_existing(path, overwrite=overwrite)
 
 
 def peak_memory() -> int:
@@ -266,17 +271,7 @@ def _size(path: Path) -> int:
     try:
         return sum(entry.stat().st_size for entry in path.iterdir()) if path.is_dir() else path.stat().st_size
     except OSError as error:
-        raise InvalidContainerError(f"cannot read {path}: {(error.strerror or str(error)).lower()}") from error
-
-
-def _refuse_existing(target: Path, *, overwrite: bool) -> None:
-    """Before the work starts rather than after it."""
-    if target.suffix.lower() == ".zip":
-        refuse_existing(target, overwrite=overwrite)
-    elif target.exists() and not overwrite:
-        raise OutputError(f"{target} exists already; choose another name or allow overwriting (--force)")
-    if not target.absolute().parent.is_dir():
-        raise OutputError(f"cannot write {target}: there is no folder {target.parent}")
+        raise InvalidContainerError(f"cannot read {path}: {reason_of(error)}") from error
 
 
 @dataclass

@@ -146,7 +146,7 @@ class Settings(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _fill_from_preset(cls, given: Any) -> Any:  # noqa: ANN401
-        if not isinstance(given, dict) or given.get("preset", Preset.BALANCED) not in set(Preset):
+        if not isinstance(given, dict) or given.get("preset", Preset.BALANCED) not in list(Preset):
             return given  # not ours to judge: validation says what is wrong with it
         chosen = PRESETS[Preset(given.get("preset", Preset.BALANCED))]
         encode = given.get("encode", {})
@@ -159,7 +159,7 @@ class Settings(BaseModel):
         Raises:
             UnsupportedError: no such preset or setting, or a value that is not possible.
         """
-        if preset not in set(Preset):
+        if preset not in list(Preset):
             raise UnsupportedError(f"there is no preset {preset!r}; choose one of {', '.join(Preset)}")
         try:
             return cls.model_validate({"preset": preset, "encode": encode})

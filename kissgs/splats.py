@@ -49,7 +49,7 @@ class Splats:
     shN: Float32[np.ndarray, "N K 3"]
 
     def __post_init__(self) -> None:
-        n = len(self.means)
+        n = len(self.means) if self.means.ndim else -1
         k = self.shN.shape[1] if self.shN.ndim == 3 else -1
         if k not in SH_REST_COUNTS:
             raise InvalidSceneError(
@@ -164,8 +164,9 @@ def _finite_rows(splats: Splats) -> Bool[np.ndarray, " N"]:
     rows = np.isfinite(splats.means).all(axis=1) & np.isfinite(splats.quats).all(axis=1)
     rows &= ~np.isnan(splats.scales).any(axis=1) & ~np.isnan(splats.opacities)
     # A sum is finite exactly when no term is NaN or infinite (float64 cannot overflow here): no (N, K, 3) temporary.
-    for sh in (splats.sh0, splats.shN.reshape(n, splats.shN.shape[1] * 3)):
-        rows &= np.isfinite(sh.sum(axis=1, dtype=np.float64))
+    with np.errstate(invalid="ignore"):  # inf - inf
+        for sh in (splats.sh0, splats.shN.reshape(n, splats.shN.shape[1] * 3)):
+            rows &= np.isfinite(sh.sum(axis=1, dtype=np.float64))
     return rows
 
 

@@ -28,24 +28,50 @@ def atomic_file(path: Path, *, overwrite: bool = False) -> Iterator[BinaryIO]:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        temporary.chmod(0o666 & ~_umask())
+        temporary.chmod(0o666 & ~umask())
         temporary.replace(path)
     except OSError as error:
-        raise OutputError(f"cannot write {path}: {(error.strerror or str(error)).lower()}") from error
+        raise OutputError(f"cannot write {path}: {reason_of(error)}") from error
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
 
 
 def refuse_existing(path: Path, *, overwrite: bool) -> None:
-    """Raise OutputError if ``path`` is there and may not be replaced."""
-    if path.is_dir():
+    """Raise OutputError if ``path`` cannot become a file: before the work starts, rather than after it."""
+    present, folder = look(path)
+    if folder:
         raise OutputError(f"{path} is a folder; name a file")
-    if path.exists() and not overwrite:
+    if present and not overwrite:
         raise OutputError(f"{path} exists already; choose another name or allow overwriting (--force)")
 
 
-def _umask() -> int:
+def look(path: Path) -> tuple[bool, bool]:
+    """Whether there is something at ``path``, and whether it is a folder.
+
+    Raises:
+        OutputError: there is no folder to put it in, or no file system would take the name.
+    """
+    try:
+        path.lstat()
+    except FileNotFoundError:
+        pass
+    except (OSError, ValueError) as error:
+        raise OutputError(f"cannot write {path!s:.100}: {reason_of(error)}") from error
+    present, folder, above = path.exists(), path.is_dir(), path.absolute().parent.is_dir()
+    if not above:
+        raise OutputError(f"cannot write {path}: there is no folder {path.parent}")
+    return present, folder
+
+
+def umask() -> int:
+    """The permission bits that new files of this process do not get."""
     current = os.umask(0)
     os.umask(current)
     return current
+
+
+def reason_of(error: OSError | ValueError) -> str:
+    """Why the system refused, as the end of a sentence; ValueError is a name that it cannot even be asked about."""
+    reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    return reason.lower()

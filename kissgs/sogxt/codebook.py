@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Int, UInt8
 
-from kissgs.errors import InvalidSceneError
 from kissgs.progress import Progress
 from kissgs.settings import EncodeSettings
 from kissgs.sogxt import kmeans
@@ -35,7 +34,7 @@ class Codebook:
     Attributes:
         side: S.
         centroids: ``(S*S, 45)`` levels, channel-major (15 of red, 15 of green, 15 of blue), entries row-major.
-        labels: ``(M,)`` entry of each Gaussian.
+        labels: ``(M,)`` entry of each Gaussian; one, for the padding, if there is none.
     """
 
     side: int
@@ -60,16 +59,13 @@ def fit_codebook(
     """Build the codebook for the Gaussians ``chosen``.
 
     A scene without SH, or with bands that are zero throughout, pays nothing for them: their tiles are constant.
-
-    Raises:
-        InvalidSceneError: ``importance`` does not fit the scene.
     """
-    weights = _weights(splats, importance, settings.sh_weight_power)[chosen]
     dimensions = splats.shN.shape[1] * 3
     if dimensions == 0 or len(chosen) == 0:
         nothing = quantize(np.zeros((MIN_SIDE**2, 3 * COEFFICIENTS)), step=1)
-        return Codebook(MIN_SIDE, nothing, np.zeros(len(chosen), dtype=np.int32))
+        return Codebook(MIN_SIDE, nothing, np.zeros(max(len(chosen), 1), dtype=np.int32))
     progress("codebook", 0.0)
+    weights = _weights(splats, importance, settings.sh_weight_power)[chosen]
     clusters = kmeans.fit(
         splats.shN[chosen].reshape(len(chosen), dimensions),
         weights,
@@ -122,12 +118,8 @@ def _weights(splats: Splats, importance: Float32[np.ndarray, " N"] | None, power
     if importance is None:
         area = np.sort(splats.scales, axis=1)[:, 1:].sum(axis=1, dtype=np.float64)
         logs = area - np.logaddexp(0, -splats.opacities.astype(np.float64))
-        logs = power * (logs - np.median(logs)) if len(logs) else logs
+        logs = power * (logs - np.median(logs))
     else:
-        if importance.shape != (len(splats),) or not (np.isfinite(importance) & (importance > 0)).all():
-            raise InvalidSceneError(
-                f"importance must be {len(splats)} positive numbers, one per Gaussian; it has shape {importance.shape}"
-            )
         logs = np.log(importance.astype(np.float64))
-        logs -= np.median(logs) if len(logs) else 0
+        logs -= np.median(logs)
     return np.exp(np.clip(logs, np.log(WEIGHT_FLOOR), np.log(WEIGHT_CEILING))).astype(np.float32)

@@ -8,12 +8,13 @@ import os
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
 from kissgs.errors import InvalidContainerError, OutputError
-from kissgs.io.atomic import atomic_file
+from kissgs.io.atomic import atomic_file, look, reason_of, refuse_existing, umask
+from kissgs.sogxt.names import FILES
 
 MAX_ZIP_ENTRIES = 1000
 """A container has 12 files; people may add notes and previews, not thousands of entries."""
@@ -57,10 +58,14 @@ class DirectorySource:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
+        try:
+            self._names = frozenset(entry.name for entry in folder.iterdir() if entry.is_file())
+        except OSError as error:
+            raise InvalidContainerError(f"cannot read {folder}: {reason_of(error)}") from error
 
     def names(self) -> frozenset[str]:
         """See :class:`Source`."""
-        return frozenset(entry.name for entry in self._folder.iterdir() if entry.is_file())
+        return self._names
 
     def size(self, name: str) -> int:
         """See :class:`Source`."""
@@ -68,12 +73,11 @@ class DirectorySource:
 
     def read(self, name: str, limit: int) -> bytes:
         """See :class:`Source`."""
-        path = self._folder / name
-        _check(name, path.is_file(), path.stat().st_size if path.is_file() else 0, limit)
         try:
-            return path.read_bytes()
+            _check(name, name in self._names, self.size(name) if name in self._names else 0, limit)
+            return (self._folder / name).read_bytes()
         except OSError as error:
-            raise InvalidContainerError(f"cannot read {path}: {error.strerror}") from error
+            raise InvalidContainerError(f"cannot read {self._folder / name}: {reason_of(error)}") from error
 
 
 class ZipSource:
@@ -89,7 +93,7 @@ class ZipSource:
             raise InvalidContainerError(f"{label} has {len(entries)} entries; a container has 12 files")
         self._entries: dict[str, zipfile.ZipInfo] = {}
         for entry in entries:
-            if entry.is_dir():
+            if not entry.filename or entry.is_dir():
                 continue
             name = entry.filename.replace("\\", "/").rsplit("/", 1)[-1]
             if name in self._entries:
@@ -128,13 +132,14 @@ def open_source(source: Path | bytes | Mapping[str, bytes]) -> Iterator[Source]:
         yield ZipSource(io.BytesIO(source), "the input")
     elif not isinstance(source, Path):
         yield MemorySource(source)
-    elif source.is_dir():
-        yield DirectorySource(source)
     else:
         try:
-            file = source.open("rb")
-        except OSError as error:
-            raise InvalidContainerError(f"cannot read {source}: {(error.strerror or str(error)).lower()}") from error
+            file = None if source.is_dir() else source.open("rb")
+        except (OSError, ValueError) as error:
+            raise InvalidContainerError(f"cannot read {source}: {reason_of(error)}") from error
+        if file is None:
+            yield DirectorySource(source)
+            return
         with file:
             yield ZipSource(file, str(source))
 
@@ -161,22 +166,34 @@ def write_container(files: Mapping[str, bytes], path: Path, *, overwrite: bool =
         OutputError: it exists and ``overwrite`` is false, or the file system refuses. A folder is only ever replaced
             if it holds a container and nothing else.
     """
+    check_destination(path, overwrite=overwrite, names=files.keys())
     if path.suffix.lower() == ".zip":
         data = zip_bytes(files)
         with atomic_file(path, overwrite=overwrite) as file:
             file.write(data)
         return len(data)
-    _write_directory(files, path, overwrite=overwrite)
+    _write_directory(files, path)
     return sum(map(len, files.values()))
 
 
-def _write_directory(files: Mapping[str, bytes], path: Path, *, overwrite: bool) -> None:
-    if path.exists():
-        if not overwrite:
-            raise OutputError(f"{path} exists already; choose another name or allow overwriting (--force)")
-        if not path.is_dir() or {entry.name for entry in path.iterdir()} - set(files):
-            raise OutputError(f"{path} holds more than a container; name an empty or a new folder, or a .zip file")
+def check_destination(path: Path, *, overwrite: bool, names: Collection[str] = FILES) -> None:
+    """Raise OutputError if a container may not be written to ``path``: to be called before the work, not after it.
+
+    ``names`` are the files that a folder may hold and still be replaced.
+    """
+    if path.suffix.lower() == ".zip":
+        refuse_existing(path, overwrite=overwrite)
+        return
+    present, folder = look(path)
+    if present and not overwrite:
+        raise OutputError(f"{path} exists already; choose another name or allow overwriting (--force)")
+    if present and (not folder or {entry.name for entry in path.iterdir()} - set(names)):
+        raise OutputError(f"{path} holds more than a container; name an empty or a new folder, or a .zip file")
+
+
+def _write_directory(files: Mapping[str, bytes], path: Path) -> None:
     temporary: Path | None = None
+    old: Path | None = None
     try:
         temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part"))
         for name, data in files.items():
@@ -184,19 +201,19 @@ def _write_directory(files: Mapping[str, bytes], path: Path, *, overwrite: bool)
                 file.write(data)
                 file.flush()
                 os.fsync(file.fileno())
-        temporary.chmod(0o755)
+        temporary.chmod(0o777 & ~umask())
         if path.exists():
-            old = temporary.with_suffix(".old")
-            path.rename(old)
-            temporary.rename(path)
-            shutil.rmtree(old)
-        else:
-            temporary.rename(path)
+            old = path.rename(temporary.with_suffix(".old"))
+        temporary.rename(path)
     except OSError as error:
-        raise OutputError(f"cannot write {path}: {(error.strerror or str(error)).lower()}") from error
+        if old is not None:
+            old.rename(path)
+            old = None
+        raise OutputError(f"cannot write {path}: {reason_of(error)}") from error
     finally:
-        if temporary is not None and temporary.exists():
-            shutil.rmtree(temporary)
+        for leftover in (temporary, old):
+            if leftover is not None and leftover.exists():
+                shutil.rmtree(leftover)
 
 
 def _check(name: str, present: bool, size: int, limit: int) -> None:

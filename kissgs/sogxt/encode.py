@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Float32, Int, UInt8
 
 from kissgs._version import __version__
+from kissgs.errors import InvalidSceneError
 from kissgs.progress import Progress, silent
 from kissgs.settings import EncodeSettings
-from kissgs.sogxt import metadata
+from kissgs.sogxt import metadata, names
 from kissgs.sogxt.codebook import Codebook, fit_codebook
 from kissgs.sogxt.order import Grid, place
 from kissgs.sogxt.parallel import blas_workers
@@ -69,6 +70,7 @@ def encode(
         InvalidSceneError: ``importance`` does not fit the scene.
         UnsupportedError: the scene is too large for one container.
     """
+    _check_importance(importance, len(splats))
     load_kernels(progress)
     kept = np.arange(len(splats))
     if settings.drop_invisible:
@@ -105,9 +107,9 @@ def encode(
             sha256={name: hashlib.sha256(data).hexdigest() for name, data in files.items()},
         ),
     )
-    files = {metadata.JSON_NAME: layout.to_meta_json(len(kept)), **files}
+    files = {names.JSON_NAME: layout.to_meta_json(len(kept)), **files}
     return Encoded(
-        files={metadata.YAML_NAME: layout.to_yaml(), metadata.SCENE_NAME: metadata.scene_json(files), **files},
+        files={names.YAML_NAME: layout.to_yaml(), names.SCENE_NAME: metadata.scene_json(files), **files},
         order=grid.cells[grid.mask],
         form_error=form_error,
         dropped=len(splats) - len(kept),
@@ -121,6 +123,15 @@ def load_kernels(progress: Progress = silent) -> None:
     from kissgs.sogxt import kernels  # noqa: F401
 
     progress("kernels", 1.0)
+
+
+def _check_importance(importance: Float32[np.ndarray, " N"] | None, count: int) -> None:
+    if importance is None:
+        return
+    if importance.shape != (count,) or not (np.isfinite(importance) & (importance > 0)).all():
+        raise InvalidSceneError(
+            f"importance must be {count} positive numbers, one per Gaussian; it has shape {importance.shape}"
+        )
 
 
 def _neutral(sh_degree: int) -> Splats:

@@ -259,7 +259,7 @@ def _round_to_lattice(centroids: np.ndarray, step: float, tolerance: float) -> f
     widest = float(np.ptp(centroids.astype(np.float64), axis=0).max())
     step = max(step, 2 * tolerance, widest / 254)
     if step > 0:
-        centroids[:] = np.rint(centroids / step) * step
+        centroids[:] = np.rint(centroids.astype(np.float64) / step) * step
     return step
 
 

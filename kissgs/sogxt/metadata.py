@@ -7,7 +7,7 @@ browsers read. Reading takes the YAML if it is there, else ``meta.json``, and to
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -16,12 +16,15 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from kissgs.errors import InvalidContainerError, UnsupportedError
 from kissgs.sogxt.container import Source
+from kissgs.sogxt.names import JSON_NAME, YAML_NAME
 from kissgs.sogxt.order import MAX_GRID_SIDE
 from kissgs.splats import SH_REST_COUNTS
 
-YAML_NAME, JSON_NAME, SCENE_NAME = "container_meta.yaml", "meta.json", "scene.json"
 MAX_METADATA_BYTES = 1 << 20
 """The three metadata files have about 4 kB each."""
+
+MAX_YAML_DEPTH = 50
+"""Ours is nested 6 deep. libyaml composes by recursion, which no limit of Python's stops before the stack ends."""
 
 TILE_ROWS, TILE_COLUMNS = 3, 5
 MAX_CODEBOOK_SIDE = 256
@@ -238,10 +241,11 @@ def _from_yaml(data: bytes) -> dict[str, Any]:
     """The fields of :class:`Layout` out of the YAML, as forgiving as the reference decoder."""
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
+        _check_nesting(yaml.parse(data, Loader=loader))
         document = yaml.load(data, Loader=loader)
         sides = document["meta"]
         ops = document["ops"]
-        ranges = dict(found for op in ops if (found := _range_of(op)))
+        ranges = dict(found for op in ops for found in _ranges_of(op) if found[0] in CHANNELS)
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise InvalidContainerError(f"{YAML_NAME} is not readable YAML") from error
     except (KeyError, TypeError, AttributeError, ValueError, IndexError) as error:
@@ -257,16 +261,27 @@ def _from_yaml(data: bytes) -> dict[str, Any]:
     }
 
 
-def _range_of(op: Mapping[str, Any]) -> tuple[str, tuple[list[Any], list[Any]]] | None:
-    """Field and range of one op; None for ops that describe something else."""
+def _check_nesting(events: Iterable[yaml.Event]) -> None:
+    """Raise YAMLError for documents that a few bytes make deep, or, by merge keys that double, endless."""
+    depth = 0
+    for event in events:
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        if depth > MAX_YAML_DEPTH or (isinstance(event, yaml.ScalarEvent) and event.value == "<<"):
+            raise yaml.YAMLError("nested too deep, or with merge keys")
+
+
+def _ranges_of(op: Mapping[str, Any]) -> Iterator[tuple[str, tuple[list[Any], list[Any]]]]:
+    """Field and range of one op, as often as it gives one (the last counts); nothing for ops on several fields."""
     fields = op["input_fields"]
     if len(fields) != 1:
-        return None
+        return
     for transform in op.get("transforms", ()):
         quantize = transform.get("simple_quantize")
         if quantize and "min_values" in quantize:
-            return fields[0], (_flat(quantize["min_values"]), _flat(quantize["max_values"]))
-    return None
+            yield fields[0], (_flat(quantize["min_values"]), _flat(quantize["max_values"]))
 
 
 def _from_json(data: bytes) -> dict[str, Any]:

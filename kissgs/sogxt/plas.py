@@ -106,10 +106,10 @@ def box_blur(image: Float32[np.ndarray, "H W C"], radius: int, pool: Workers) ->
 
     def work(first: int) -> np.ndarray:
         part = np.ascontiguousarray(image[:, :, first : first + CHANNELS_PER_TASK])
-        rows = np.empty_like(part)
+        rows, blurred = np.empty_like(part), np.empty_like(part)
         kernels.box_blur_rows(part, radius, rows, np.empty((1, part.shape[2])))
-        kernels.box_blur_columns(rows, radius, part, np.empty((part.shape[1], part.shape[2])))
-        return part
+        kernels.box_blur_columns(rows, radius, blurred, np.empty((part.shape[1], part.shape[2])))
+        return blurred
 
     parts = pool.map(work, range(0, image.shape[2], CHANNELS_PER_TASK))
     return np.concatenate(parts, axis=2)

@@ -55,6 +55,7 @@ def choose_forms(
         Quaternions, log-scales, and the largest relative change of a covariance (rounding only).
     """
     quats, scales = splats.quats[cells].astype(np.float64), splats.scales[cells]
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)  # float32 knows a unit only to 1e-7
     if settings.forms == "upright":
         forms = upright_forms(quats)
     else:

@@ -56,7 +56,7 @@ def quantize(values: Float[np.ndarray, "N C"], *, step: float, shared: bool = Tr
     widest = float(extent.max(initial=0.0))
     top = max_top
     if shared and widest > 0:
-        top = int(min(max(ceil(widest / step - 1e-6), 1), max_top))  # a whole number of steps stays one
+        top = int(min(max(ceil(widest / step - 1e-3), 1), max_top))  # a whole number of steps stays one
         high = np.where(extent > 0, (low + widest).astype(np.float32), low)
     return Quantized(_levels(wide, low, high, top).astype(np.uint8), low, high, top)
 
@@ -77,6 +77,8 @@ def quantize_means(means: Float32[np.ndarray, "N 3"], *, bits: int) -> Quantized
     low, high = np.repeat(low32, 3), np.repeat(high32, 3)
     spacing = 1 << (16 - bits)
     levels = _levels(wide, low, high, MEANS_TOP, spacing)
+    if high[0] > low[0]:
+        levels[wide == wide.max()] = MEANS_TOP  # rounding, to even or of the range, could stop just short of it
     return Quantized(levels.astype(np.uint16), low, high, MEANS_TOP)
 
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import threading
+import tracemalloc
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+import kissgs
 from kissgs.splats import ATTRIBUTES, SH_REST_COUNTS, Splats
 
 PRESETS = ("fast", "balanced", "small", "paper")
@@ -86,3 +90,46 @@ def equivalents(quats, scales):
         new_quats += [turned, -turned]
         new_scales += [scales[:, source]] * 2
     return np.stack(new_quats), np.stack(new_scales)
+
+
+def peak_memory(call):
+    """Bytes that Python and NumPy held at most while ``call`` ran."""
+    tracemalloc.start()
+    try:
+        call()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        # After an error, a task that had begun may still run; stopping amid it can crash Python 3.11 (gh-128679).
+        for thread in threading.enumerate():
+            if thread.name.startswith("ThreadPoolExecutor"):
+                thread.join()
+        tracemalloc.stop()
+
+
+def signed_log(x):
+    """In float64."""
+    wide = np.asarray(x, np.float64)
+    return np.sign(wide) * np.log1p(np.abs(wide))
+
+
+def rounding(values):
+    """What the rounding of values, ranges and steps to float32 may cost, by the largest of the values."""
+    return 1e-6 * np.abs(values).max(initial=0) + 1e-44
+
+
+def assert_within(found, wanted, half_steps):
+    """No value is further off than half its step."""
+    excess = np.abs(np.asarray(found, np.float64) - wanted) - np.asarray(half_steps) * (1 + 1e-6)
+    assert excess.max(initial=0) <= rounding(wanted)
+
+
+def assert_round_trip(splats, result):
+    """Each Gaussian comes back within the half steps that the report states, in one of its equivalent forms."""
+    found, wanted, half = kissgs.decompress(result.files), splats.select(result.order), result.report.half_steps
+    assert_within(signed_log(found.means), signed_log(wanted.means), half["means"])
+    assert_within(found.opacities, wanted.opacities, half["opacities"][0])
+    assert_within(found.sh0, wanted.sh0, half["f_dc"])
+    quats, scales = equivalents(wanted.quats, wanted.scales)
+    fits = (np.abs(quats - found.quats) <= np.array(half["quaternions"]) + rounding(quats)).all(axis=2)
+    fits &= (np.abs(scales - found.scales) <= np.array(half["scales"]) + rounding(scales)).all(axis=2)
+    assert fits.any(axis=0).all()

@@ -3,13 +3,13 @@
 import errno
 import io
 import os
+import re
 import tempfile
-import tracemalloc
 import zipfile
 from pathlib import Path
 
 import pytest
-from codec_scenes import random_scene
+from codec_scenes import peak_memory, random_scene
 
 from kissgs import compress, decompress
 from kissgs.errors import InvalidContainerError, OutputError
@@ -66,6 +66,12 @@ def test_folder_entries_and_notes_are_ignored():
     entries = [("scene/", b""), *((f"scene/{name}", data) for name, data in FILES.items())]
     found = contents(archive([*entries, ("__MACOSX/._a.webp", b"x"), ("scene/README.txt", b"hello")]))
     assert {name: found[name] for name in FILES} == FILES
+
+
+def test_an_entry_without_a_name_is_ignored():
+    """zipfile ends names at a NUL; asking whether the empty name is a folder's once raised IndexError."""
+    data = archive([*FILES.items(), ("Xabc", b"who?")]).replace(b"Xabc", b"\0abc")
+    assert contents(data) == FILES
 
 
 def test_a_container_is_read_from_anything(tmp_path):
@@ -137,14 +143,9 @@ def test_a_zip_bomb_takes_no_memory(honest):
         size = (64 << 20).to_bytes(4, "little")
         assert data.count(size) == 2
         data = data.replace(size, (1000).to_bytes(4, "little"))
-    tracemalloc.start()
-    try:
-        sentence = refusal(data)
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    assert peak < 8 << 20
-    assert "at most 1048576 are possible here" in sentence or "it is damaged or encrypted" in sentence
+    sentences = []
+    assert peak_memory(lambda: sentences.append(refusal(data))) < 8 << 20
+    assert re.search("at most 1048576 are possible here|it is damaged or encrypted", sentences[0])
 
 
 def damaged(data, old, new, times):
@@ -214,7 +215,7 @@ def test_a_folder_is_not_replaced_by_a_zip(tmp_path):
 
 @pytest.mark.parametrize("name", ["missing/new", "missing/new.zip"])
 def test_a_missing_folder_above_is_an_output_error(tmp_path, name):
-    with pytest.raises(OutputError, match=f"cannot write .*{name}: no such file or directory"):
+    with pytest.raises(OutputError, match=f"cannot write .*{name}: there is no folder"):
         write_container(FILES, tmp_path / name)
 
 

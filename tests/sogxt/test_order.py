@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from kissgs.errors import UnsupportedError
 from kissgs.settings import EncodeSettings, Settings
 from kissgs.sogxt.order import MAX_GRID_SIDE, grid_side, hilbert_order, place
-from kissgs.sogxt.parallel import workers
+from kissgs.sogxt.parallel import blas_workers
 
 
 def walk(levels):
@@ -77,7 +77,7 @@ def test_scenes_too_large_for_one_image_are_refused_before_memory_is_taken(count
 
 def placed(splats, kept, order):
     settings = Settings.from_preset("paper").encode if order == "plas" else EncodeSettings()
-    with workers(2) as pool:
+    with blas_workers(2) as pool:
         return place(splats.means, kept, 16, settings, pool, lambda fraction: None)
 
 

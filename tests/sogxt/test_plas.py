@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kissgs.sogxt import kernels
-from kissgs.sogxt.parallel import workers
+from kissgs.sogxt.parallel import blas_workers
 from kissgs.sogxt.plas import box_blur, plas
 
 
 def sort(items, threads=1, **options):
-    with workers(threads) as pool:
+    with blas_workers(threads) as pool:
         return plas(items, pool, **{"seed": 0, "decay": 0.8, **options})
 
 
@@ -145,7 +145,7 @@ def blurred(image, radius):
 def test_the_filter_is_a_box_that_wraps_sideways_and_mirrors_up_and_down(side, radius, channels):
     image = np.random.default_rng(side).random((side, side, channels), np.float32)
     wanted = blurred(image, radius)
-    with workers(2) as pool:
+    with blas_workers(2) as pool:
         found = box_blur(image, radius, pool)
     np.testing.assert_allclose(found, wanted, rtol=1e-5)
     assert found.dtype == np.float32
@@ -156,6 +156,6 @@ def test_the_filter_leaves_its_input_alone(channels):
     """Up to four channels are one task, whose part of the image once was the image itself: it was written into."""
     image = np.random.default_rng(0).random((8, 8, channels), np.float32)
     before = image.copy()
-    with workers(1) as pool:
+    with blas_workers(1) as pool:
         box_blur(image, 2, pool)
     assert (image == before).all()

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from kissgs.sogxt import kernels
-from kissgs.sogxt.parallel import workers
+from kissgs.sogxt.parallel import blas_workers
 from kissgs.sogxt.plas import box_blur
 from kissgs.sogxt.pras import (
     PERMUTATIONS,
@@ -98,7 +98,7 @@ def test_ties_are_broken_the_same_way_on_every_machine(numbers):
 
 
 def smooth(quats, scales, threads=1, decay=0.8):
-    with workers(threads) as pool:
+    with blas_workers(threads) as pool:
         return smooth_forms(quats, scales, int(len(quats) ** 0.5), pool, decay=decay)
 
 
@@ -134,7 +134,7 @@ def test_each_gaussian_takes_the_form_nearest_to_its_target(gaussians):
     """One radius on an 8 x 8 grid, by brute force: sums of absolute differences over seven channels."""
     quats, scales = gaussians[0][:64], gaussians[1][:64]
     proxies = np.concatenate([quats * 127.5, scales * 20], axis=1).astype(np.float32)
-    with workers(1) as pool:
+    with blas_workers(1) as pool:
         target = box_blur(proxies.reshape(8, 8, 7).copy(), 3, pool).reshape(64, 7)
     forms = np.zeros(64, np.uint8)
     quat_proxy, scale_proxy = (np.ascontiguousarray(part) for part in (proxies[:, :4], proxies[:, 4:]))

@@ -1,0 +1,202 @@
+"""Oracle: the steps that the report states, and the naive decoders of tests/sogxt; for numbers at the edge."""
+
+import numpy as np
+import oracle
+import pytest
+from codec_scenes import assert_round_trip, assert_within, constant_scene, random_scene, replaced
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as stnp
+
+from kissgs import Settings, Splats, clean, compress, decompress
+from kissgs.splats import ATTRIBUTES, OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN, SH_REST_COUNTS, Cleaned
+
+FIELDS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+
+
+def check(splats, preset="fast", **changes):
+    """What comes out is finite, and as near to the cleaned scene as the report says. Returns it, and the result."""
+    result = compress(splats, settings=Settings.from_preset(preset, sh_tolerance=0, **changes))
+    found = decompress(result.files)
+    assert all(np.isfinite(getattr(found, name)).all() for name in ATTRIBUTES)
+    oracle.assert_equal_scenes(found, oracle.decode(result.files), result.files)
+    oracle.check_browser(result.files)
+    assert_round_trip(clean(splats)[0], result)
+    assert result.report.form_error < 1e-6
+    return found, result
+
+
+def assert_sh_within(found, cleaned, result):
+    """For fewer Gaussians than codebook entries. All channels are rounded to one lattice, also the constant ones."""
+    assert_within(found.shN, cleaned.shN[result.order], max(result.report.half_steps["f_rest_centroids"]))
+
+
+def with_value(attribute, value, count=20, at=7):
+    """A scene, one number of which is ``value``."""
+    splats = random_scene(count, 1, seed=11)
+    array = getattr(splats, attribute).copy()
+    array.reshape(count, -1)[at, 0] = value
+    return replaced(splats, **{attribute: array})
+
+
+CLEANED = [
+    *((name, np.nan, "non_finite") for name in FIELDS),
+    *((name, sign * np.inf, "non_finite") for name in ("means", "quats", "sh0", "shN") for sign in (1, -1)),
+    *(("means", value, "far_away") for value in (1.1e15, -1e20, 3.4e38)),
+    *(("opacities", value, "infinite_opacities") for value in (np.inf, -np.inf)),
+    *(("opacities", value, "saturated_opacities") for value in (1000, -1000, 13.81, -14, 3e38)),
+    *(("scales", value, "clamped_scales") for value in (np.inf, -np.inf, 100, -100, 3e38)),
+    *((name, value, "clamped_sh") for name in ("sh0", "shN") for value in (1.1e6, -3e38)),
+]
+
+
+@pytest.mark.parametrize(("attribute", "value", "reason"), CLEANED)
+def test_one_bad_number_is_mended_or_its_gaussian_left_out(attribute, value, reason):
+    splats = with_value(attribute, value)
+    found, result = check(splats)
+    assert result.report.cleaned == Cleaned(**{reason: 1})
+    lost = (reason in ("non_finite", "far_away")) + result.report.invisible
+    assert result.report.source_count == 20
+    assert len(found) == result.report.count == 20 - lost
+    assert result.report.invisible == (attribute == "opacities" and value < -5)
+
+
+@pytest.mark.parametrize("quat", [(0, 0, 0, 0), (-0.0, 0, -0.0, 0)])
+def test_a_rotation_without_length_becomes_none(quat):
+    splats = random_scene(9, 0)
+    splats.quats[3] = quat
+    _, result = check(splats)
+    assert result.report.cleaned == Cleaned(zero_quats=1)
+    assert (clean(splats)[0].quats[3] == [1, 0, 0, 0]).all()
+
+
+@pytest.mark.parametrize("length", [1e-45, 1e-38, 1e-20, 1e-3, 1e3, 1e20, 1e38])
+def test_rotations_of_any_length_are_normalised(length):
+    """float32 squares of these underflow to 0 or overflow to infinity. Denormal numbers keep few digits."""
+    splats = random_scene(30, 0, seed=4)
+    scaled = replaced(splats, quats=splats.quats * np.float64(length))
+    _, result = check(scaled)
+    lengths = np.linalg.norm(clean(scaled)[0].quats.astype(np.float64), axis=1)
+    np.testing.assert_allclose(lengths, 1, atol=1e-6)
+    assert result.report.cleaned.zero_quats + result.report.cleaned.unnormalised_quats == 30
+    if length >= 1e-20:
+        np.testing.assert_allclose(clean(scaled)[0].quats, splats.quats, atol=1e-6)
+
+
+@pytest.mark.parametrize("preset", ["fast", "paper"])
+@pytest.mark.parametrize("scale", [1e-45, 1e-30, 1e-6, 1e6, 1e14])
+def test_worlds_of_any_size(scale, preset):
+    splats = random_scene(60, 0, seed=2)
+    found, _ = check(replaced(splats, means=splats.means / 40 * scale), preset)
+    assert len(found) == 60
+
+
+def test_positions_at_the_limit():
+    means = np.array([[1e15, -1e15, 0], [1e-45, -1e-38, 1e-6], [999, -1e6, 1e6]])
+    check(replaced(random_scene(3, 0), means=means))
+    check(replaced(random_scene(3, 0), means=means), "paper")
+
+
+@pytest.mark.parametrize("preset", ["fast", "paper"])
+@pytest.mark.parametrize(
+    ("attribute", "low", "high"),
+    [
+        ("scales", -30, 30),
+        ("scales", -30, -29.999),
+        ("opacities", OPACITY_LOGIT_MIN, OPACITY_LOGIT_MAX),
+        ("sh0", -1e5, 1e5),
+        ("sh0", 1e6 - 0.0625, 1e6),
+        ("sh0", -1e-45, 1e-45),
+        ("shN", -1e5, 1e5),
+        ("shN", 1e6 - 0.0625, 1e6),
+        ("shN", -1e-20, 1e-20),
+    ],
+)
+def test_whole_attributes_at_the_edge(attribute, low, high, preset):
+    splats = random_scene(50, 2, seed=5)
+    shape = getattr(splats, attribute).shape
+    values = np.random.default_rng(0).uniform(low, high, shape).clip(low, high)
+    found, result = check(replaced(splats, **{attribute: values}), preset, drop_invisible=False)
+    assert len(found) == 50
+    assert result.report.cleaned.removed == 0
+    if attribute == "shN":
+        assert_sh_within(found, clean(replaced(splats, shN=values))[0], result)
+
+
+@pytest.mark.parametrize("attribute", FIELDS)
+@pytest.mark.parametrize("preset", ["fast", "paper"])
+def test_one_outlier_among_thousands(attribute, preset):
+    """It stretches the range of its channel for all: the report must say by how much. Positions suffer little."""
+    outlier = {"means": 1e6, "quats": -1, "scales": 12, "opacities": 13.8, "sh0": 500, "shN": 500}[attribute]
+    count = 3000 if preset == "fast" else 400
+    splats = random_scene(count, 1, seed=8)
+    array = getattr(splats, attribute).copy()
+    array.reshape(count, -1)[17, 0] = outlier
+    found, result = check(replaced(splats, **{attribute: array}), preset)
+    assert len(found) == count
+    half = result.report.half_steps
+    assert max(half["means"]) < 1e-3
+    assert max(half["f_dc"]) < (1.1 if attribute == "sh0" else 0.03)
+
+
+@pytest.mark.parametrize("preset", ["fast", "small", "paper"])
+@pytest.mark.parametrize("count", [1, 65, 500])
+def test_gaussians_that_are_all_the_same(count, preset):
+    splats = constant_scene(count, 3)
+    found, result = check(splats, preset)
+    assert sorted(result.order) == list(range(count))
+    np.testing.assert_allclose(found.shN, splats.shN, rtol=1e-6)
+    assert max(result.report.half_steps["scales"]) == 0
+
+
+@pytest.mark.parametrize("attribute", FIELDS)
+@pytest.mark.parametrize("value", [0.0, -0.0, 1e-45, -7.25])
+def test_constant_attributes(attribute, value):
+    splats = random_scene(40, 1, seed=9)
+    constant = np.full(getattr(splats, attribute).shape, value)
+    found, _ = check(replaced(splats, **{attribute: constant}), drop_invisible=False)
+    if attribute not in ("quats", "means"):
+        assert (getattr(found, attribute) == np.float32(value)).all()
+
+
+@pytest.mark.parametrize("preset", ["fast", "balanced", "small", "paper"])
+@pytest.mark.parametrize("degree", [0, 3])
+def test_scenes_of_which_nothing_is_left(degree, preset):
+    nothing = replaced(random_scene(5, degree), means=np.full((5, 3), np.nan))
+    for splats, removed in ((nothing, 5), (nothing.select(slice(0, 0)), 0)):
+        found, result = check(splats, preset)
+        assert (len(found), found.sh_degree) == (0, degree)
+        assert result.report.cleaned == Cleaned(non_finite=removed)
+
+
+def test_smallest_numbers_everywhere():
+    splats = random_scene(20, 3, seed=1)
+    tiny = {name: getattr(splats, name) * 1e-43 for name in FIELDS}
+    check(replaced(splats, **tiny))
+
+
+def arrays(*shape):
+    """Any float32 numbers at all, many of them alike."""
+    return stnp.arrays(np.float32, shape, elements=st.floats(width=32), fill=st.floats(width=32))
+
+
+@st.composite
+def any_scene(draw):
+    count, coefficients = draw(st.integers(0, 6)), draw(st.sampled_from(SH_REST_COUNTS))
+    return Splats(
+        means=draw(arrays(count, 3)),
+        quats=draw(arrays(count, 4)),
+        scales=draw(arrays(count, 3)),
+        opacities=draw(arrays(count)),
+        sh0=draw(arrays(count, 3)),
+        shN=draw(arrays(count, coefficients, 3)),
+    )
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(any_scene(), st.booleans())
+def test_any_numbers_at_all(splats, drop_invisible):
+    found, result = check(splats, drop_invisible=drop_invisible)
+    assert found.sh_degree == splats.sh_degree
+    assert len(found) + result.report.invisible + result.report.cleaned.removed == len(splats)
+    assert_sh_within(found, clean(splats)[0], result)
