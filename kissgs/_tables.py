@@ -8,9 +8,9 @@ from rich.console import Group, RenderableType
 from rich.table import Column, Table
 from rich.text import Text
 
+from kissgs.bench import RoundTrip
 from kissgs.evaluation.attributes import AttributeErrors, Spread
 from kissgs.evaluation.peers import PeerResult
-from kissgs.evaluation.roundtrip import RoundTrip
 from kissgs.info import Info
 from kissgs.pipeline import Report
 

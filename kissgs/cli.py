@@ -202,7 +202,7 @@ def demo(
 ) -> None:
     """Compress a scene, decompress it, and show what that cost."""
     from kissgs._tables import roundtrip_table
-    from kissgs.evaluation.roundtrip import roundtrip
+    from kissgs.bench import roundtrip
     from kissgs.pipeline import save
     from kissgs.sample import sample_scene
 
@@ -233,8 +233,8 @@ def bench(
     import shlex
 
     from kissgs._tables import bench_table
+    from kissgs.bench import isolated_roundtrip
     from kissgs.evaluation.peers import measure_peer
-    from kissgs.evaluation.roundtrip import isolated_roundtrip
     from kissgs.settings import Preset
 
     rows: list[tuple[str, str, Any]] = []

@@ -12,7 +12,8 @@ from kissgs.errors import InvalidContainerError
 from kissgs.io.ply import read_ply
 from kissgs.pipeline import is_container
 from kissgs.sogxt.container import Source, open_source
-from kissgs.sogxt.metadata import CHANNELS, Layout, read_layout
+from kissgs.sogxt.metadata import CHANNELS, Layout
+from kissgs.sogxt.metadata_reader import read_layout
 from kissgs.sogxt.names import FILES, PLANES
 from kissgs.sogxt.planes import decode_plane
 from kissgs.sogxt.quantize import signed_exp

@@ -18,7 +18,8 @@ from hypothesis import strategies as st
 import kissgs
 from kissgs import InvalidContainerError, KissgsError, Settings, UnsupportedError, compress, decompress
 from kissgs.sogxt.container import MemorySource
-from kissgs.sogxt.metadata import CHANNELS, MAX_METADATA_BYTES, ContainerMeta, Layout, read_layout
+from kissgs.sogxt.metadata import CHANNELS, ContainerMeta, Layout
+from kissgs.sogxt.metadata_reader import MAX_METADATA_BYTES, read_layout
 from kissgs.splats import ATTRIBUTES
 
 FILES = compress(random_scene(70, 2, seed=4), settings=Settings.from_preset("fast")).files

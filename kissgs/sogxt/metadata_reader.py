@@ -1,0 +1,162 @@
+"""Reading a container's metadata: its YAML if it is there, else ``meta.json``. What we do not know is let pass."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import yaml
+from pydantic import ValidationError
+
+from kissgs.errors import InvalidContainerError, UnsupportedError
+from kissgs.sogxt.container import Source
+from kissgs.sogxt.metadata import CHANNELS, Layout
+from kissgs.sogxt.names import JSON_NAME, YAML_NAME
+
+MAX_METADATA_BYTES = 1 << 20
+"""The three metadata files have about 4 kB each."""
+
+MAX_YAML_DEPTH = 50
+"""Ours is nested 6 deep. libyaml composes by recursion, which no limit of Python's stops before the stack ends."""
+
+MAX_SIGNED_LOG = 88.7
+"""e to more than this is beyond float32."""
+
+
+def read_layout(source: Source) -> Layout:
+    """Read and check the metadata of a container.
+
+    Raises:
+        InvalidContainerError: there is none, or it says something impossible.
+        UnsupportedError: its images are not WebP.
+    """
+    names = source.names()
+    if YAML_NAME in names:
+        raw = _from_yaml(source.read(YAML_NAME, MAX_METADATA_BYTES))
+        name = YAML_NAME
+    elif JSON_NAME in names:
+        raw = _from_json(source.read(JSON_NAME, MAX_METADATA_BYTES))
+        name = JSON_NAME
+    else:
+        raise InvalidContainerError(f"this is no SOG-XT container: it has neither {YAML_NAME} nor {JSON_NAME}")
+    try:
+        layout = Layout.model_validate(raw)
+    except ValidationError as error:
+        raise InvalidContainerError(f"{name}: {_first_problem(error)}") from error
+    _check_ranges(layout, name)
+    return layout
+
+
+def _check_ranges(layout: Layout, name: str) -> None:
+    for field, channels in CHANNELS.items():
+        if field not in layout.ranges:
+            raise InvalidContainerError(f"{name} gives no range for {field}")
+        for values in layout.ranges[field]:
+            if len(values) != channels:
+                raise InvalidContainerError(f"{name}: the range of {field} has {len(values)} numbers, not {channels}")
+    if np.abs(layout.limits("means")).max() > MAX_SIGNED_LOG:
+        raise InvalidContainerError(
+            f"{name}: the range of means ends beyond ±{MAX_SIGNED_LOG}, which float32 cannot hold"
+        )
+
+
+def _from_yaml(data: bytes) -> dict[str, Any]:
+    """The fields of :class:`Layout` out of the YAML, as forgiving as the reference decoder."""
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    try:
+        _check_nesting(yaml.parse(data, Loader=loader))
+        document = yaml.load(data, Loader=loader)
+        sides = document["meta"]
+        ops = document["ops"]
+        ranges = dict(found for op in ops for found in _ranges_of(op) if found[0] in CHANNELS)
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise InvalidContainerError(f"{YAML_NAME} is not readable YAML") from error
+    except (KeyError, TypeError, AttributeError, ValueError, IndexError) as error:
+        raise InvalidContainerError(
+            f"{YAML_NAME} lacks 'meta' or 'ops', or they are not of the expected form"
+        ) from error
+    _require_webp(sides.get("image_codec") if isinstance(sides, dict) else None)
+    return {
+        "grid_side": sides.get("grid_side"),
+        "codebook_side": sides.get("f_rest_centroids_side"),
+        "ranges": ranges,
+        "provenance": document.get("kissgs"),
+    }
+
+
+def _check_nesting(events: Iterable[yaml.Event]) -> None:
+    """Raise YAMLError for documents that a few bytes make deep, or, by merge keys that double, endless."""
+    depth = 0
+    for event in events:
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        if depth > MAX_YAML_DEPTH or (isinstance(event, yaml.ScalarEvent) and event.value == "<<"):
+            raise yaml.YAMLError("nested too deep, or with merge keys")
+
+
+def _ranges_of(op: Mapping[str, Any]) -> Iterator[tuple[str, tuple[list[Any], list[Any]]]]:
+    """Field and range of one op, as often as it gives one (the last counts); nothing for ops on several fields."""
+    fields = op["input_fields"]
+    if len(fields) != 1:
+        return
+    for transform in op.get("transforms", ()):
+        quantize = transform.get("simple_quantize")
+        if quantize and "min_values" in quantize:
+            yield fields[0], (_flat(quantize["min_values"]), _flat(quantize["max_values"]))
+
+
+def _from_json(data: bytes) -> dict[str, Any]:
+    """The fields of :class:`Layout` out of ``meta.json``."""
+    try:
+        document = json.loads(data)
+        if document.get("format", "sog-xt") != "sog-xt":
+            raise InvalidContainerError(f"{JSON_NAME} is of the format {document['format']!r}, not 'sog-xt'")
+        keys = {"opacities": "opacities", "means": "means", "scales": "scales", "quats": "quaternions", "sh0": "f_dc"}
+        ranges = {
+            field: (_spread(document[key]["mins"], CHANNELS[field]), _spread(document[key]["maxs"], CHANNELS[field]))
+            for key, field in keys.items()
+        }
+        rest = document["shN"]
+        ranges["f_rest_centroids"] = _spread(rest["centroidsMins"], 45), _spread(rest["centroidsMaxs"], 45)
+        files = document["mask"]["files"]
+        _require_webp(str(files[0]).rsplit(".", 1)[-1])
+        return {"grid_side": document["gridSide"], "codebook_side": rest["centroidSide"], "ranges": ranges}
+    except (ValueError, RecursionError) as error:
+        raise InvalidContainerError(f"{JSON_NAME} is not readable JSON") from error
+    except (KeyError, TypeError, AttributeError, IndexError) as error:
+        raise InvalidContainerError(f"{JSON_NAME} lacks something that a SOG-XT container has: {error}") from error
+
+
+def _require_webp(codec: object) -> None:
+    if codec != "webp":
+        raise UnsupportedError(f"the container's images are {codec!r} files; only 'webp' is read")
+
+
+def _flat(values: Any) -> list[Any]:  # noqa: ANN401
+    """A number as a list of one; nested lists flattened. A few aliases in a YAML could spell millions: stop early."""
+    flat: list[Any] = []
+    waiting = [values]
+    for _ in range(1000):
+        if not waiting:
+            return flat
+        value = waiting.pop()
+        if isinstance(value, list):
+            waiting.extend(reversed(value))
+        else:
+            flat.append(value)
+    raise ValueError("a range of absurd length")
+
+
+def _spread(values: Any, channels: int) -> list[Any]:  # noqa: ANN401
+    """As browsers do: a range of another length stands for all channels by its first number."""
+    flat = _flat(values)
+    return flat if len(flat) == channels else [flat[0]] * channels
+
+
+def _first_problem(error: ValidationError) -> str:
+    problem = error.errors()[0]
+    return f"{'.'.join(map(str, problem['loc']))}: {problem['msg'].lower()}"
