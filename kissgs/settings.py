@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -153,7 +153,7 @@ class Settings(BaseModel):
         return {**given, "encode": {**chosen, **encode} if isinstance(encode, dict) else encode}
 
     @classmethod
-    def from_preset(cls, preset: Preset | str = Preset.BALANCED, **encode: Any) -> Self:  # noqa: ANN401
+    def from_preset(cls, preset: Preset | str = Preset.BALANCED, **encode: Any) -> Settings:  # noqa: ANN401
         """Settings of a preset, with single ones of the encoder replaced.
 
         Raises:

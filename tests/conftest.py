@@ -3,6 +3,20 @@
 from pathlib import Path
 
 import pytest
+from jaxtyping import install_import_hook
+
+# The shapes and dtypes in signatures are executed. Not those of Splats and encode, which have their own sentences for
+# what users hand them, nor of compiled kernels.
+install_import_hook(
+    [
+        "kissgs.evaluation",
+        "kissgs.io",
+        "kissgs.sample",
+        *(f"kissgs.sogxt.{name}" for name in ("codebook", "decode", "kmeans", "order", "planes", "plas", "pras")),
+        "kissgs.sogxt.quantize",
+    ],
+    "checking.typechecker",
+)
 
 
 @pytest.fixture(scope="session")

@@ -41,7 +41,7 @@ class Codebook:
     centroids: Quantized
     labels: Int[np.ndarray, " M"]
 
-    def tiles(self) -> UInt8[np.ndarray, "3*S 5*S 3"]:
+    def tiles(self) -> UInt8[np.ndarray, "H W 3"]:
         """The image: one tile of S × S pixels per coefficient, three rows of five."""
         levels = self.centroids.levels.reshape(self.side, self.side, 3, TILE_ROWS, TILE_COLUMNS)
         tiled = levels.transpose(3, 0, 4, 1, 2)
@@ -102,11 +102,11 @@ def codebook_side(count: int, ratio: float) -> int:
 
 
 def _sort(
-    entries: Float32[np.ndarray, "S*S D"],
+    entries: Float32[np.ndarray, "cells D"],
     settings: EncodeSettings,
     pool: Workers,
     report: Callable[[float], None],
-) -> Int[np.ndarray, " S*S"]:
+) -> Int[np.ndarray, " cells"]:
     """Entry for each place of the image: neighbours alike, so that the image compresses."""
     if (entries == entries[0]).all():
         return np.arange(len(entries), dtype=np.int32)

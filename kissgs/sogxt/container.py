@@ -10,7 +10,7 @@ import tempfile
 import zipfile
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import BinaryIO, Protocol
+from typing import BinaryIO, Protocol, runtime_checkable
 
 from kissgs.errors import InvalidContainerError, OutputError
 from kissgs.io.atomic import atomic_file, look, reason_of, refuse_existing, umask
@@ -20,6 +20,7 @@ MAX_ZIP_ENTRIES = 1000
 """A container has 12 files; people may add notes and previews, not thousands of entries."""
 
 
+@runtime_checkable
 class Source(Protocol):
     """Where a container's files are read from."""
 

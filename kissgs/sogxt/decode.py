@@ -62,7 +62,7 @@ class _Planes:
     means: UInt16[np.ndarray, "cells 3"]
     means_table: Float32[np.ndarray, " levels"]
     labels: UInt8[np.ndarray, "cells 2"]
-    codebook: Float32[np.ndarray, "S*S 3*K"]
+    codebook: Float32[np.ndarray, "entries D"]
 
     def __init__(self, files: Source, layout: Layout) -> None:
         self.files, self.layout = files, layout

@@ -96,7 +96,7 @@ def fit(
     step = 0.0
     if lattice:
         error = np.average(distances, weights=weights) / vectors.shape[1]
-        step = _round_to_lattice(centroids, lattice * error**0.5, tolerance)
+        step = _round_to_lattice(centroids, lattice * float(error) ** 0.5, tolerance)
         _reassign(vectors, centroids, labels, tree, near, pool)
 
     used, compact = np.unique(labels, return_inverse=True)
@@ -129,8 +129,8 @@ class _Tree:
     """Coarse clusters, and the ranges of (sorted) vectors and of centroids that belong to each."""
 
     coarse: Float32[np.ndarray, "J D"]
-    vector_edges: Int[np.ndarray, " J+1"]
-    centroid_edges: Int[np.ndarray, " J+1"]
+    vector_edges: Int[np.ndarray, " edges"]
+    centroid_edges: Int[np.ndarray, " edges"]
 
     def vectors_of(self, j: int) -> slice:
         return slice(int(self.vector_edges[j]), int(self.vector_edges[j + 1]))
@@ -138,7 +138,7 @@ class _Tree:
     def centroids_of(self, j: int) -> slice:
         return slice(int(self.centroid_edges[j]), int(self.centroid_edges[j + 1]))
 
-    def neighbours(self, reach: int) -> list[Int[np.ndarray, " R"]]:
+    def neighbours(self, reach: int) -> list[Int[np.ndarray, "_"]]:
         """For every coarse cluster, the centroids of the ``reach`` coarse clusters nearest to it, itself first."""
         norms = np.einsum("jd,jd->j", self.coarse, self.coarse)
         distances = norms - 2 * (self.coarse @ self.coarse.T)
@@ -219,7 +219,7 @@ def _reassign(
     centroids: np.ndarray,
     labels: np.ndarray,
     tree: _Tree,
-    near: list[Int[np.ndarray, " R"]],
+    near: list[Int[np.ndarray, "_"]],
     pool: Workers,
 ) -> Float32[np.ndarray, " N"]:
     """Move every vector to the nearest centroid near its coarse cluster. Changes ``labels``; returns distances."""
@@ -263,7 +263,7 @@ def _round_to_lattice(centroids: np.ndarray, step: float, tolerance: float) -> f
     return step
 
 
-def _edges(counts: Int[np.ndarray, " J"]) -> Int[np.ndarray, " J+1"]:
+def _edges(counts: Int[np.ndarray, " J"]) -> Int[np.ndarray, " edges"]:
     return np.concatenate([[0], np.cumsum(counts)])
 
 

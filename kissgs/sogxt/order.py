@@ -38,9 +38,9 @@ class Grid:
     """
 
     side: int
-    cells: Int[np.ndarray, " G*G"]
-    mask: Bool[np.ndarray, " G*G"]
-    rows: Int[np.ndarray, " G*G"]
+    cells: Int[np.ndarray, " cells"]
+    mask: Bool[np.ndarray, " cells"]
+    rows: Int[np.ndarray, " cells"]
 
 
 def place(
@@ -78,7 +78,7 @@ def _plas_order(
     settings: EncodeSettings,
     pool: Workers,
     report: Callable[[float], None],
-) -> tuple[Int[np.ndarray, " G*G"], Bool[np.ndarray, " G*G"]]:
+) -> tuple[Int[np.ndarray, " cells"], Bool[np.ndarray, " cells"]]:
     """Cells sorted by PLAS on both position bytes, from a random start; padding is sorted along with the rest."""
     count = len(levels)
     rng = np.random.Generator(np.random.PCG64(settings.seed))

@@ -46,7 +46,7 @@ def encode_plane(image: UInt8[np.ndarray, "H W C"], *, quality: int, method: int
     return buffer.getvalue()
 
 
-def decode_plane(data: bytes, name: str, *, width: int, height: int, channels: int) -> UInt8[np.ndarray, "H*W C"]:
+def decode_plane(data: bytes, name: str, *, width: int, height: int, channels: int) -> UInt8[np.ndarray, "pixels C"]:
     """Decompress one image, as rows of pixels.
 
     Args:

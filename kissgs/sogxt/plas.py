@@ -23,7 +23,7 @@ CHANNELS_PER_TASK = 4
 
 
 def plas(
-    items: Float32[np.ndarray, "S*S C"],
+    items: Float32[np.ndarray, "cells C"],
     pool: Workers,
     *,
     seed: int,
@@ -31,7 +31,7 @@ def plas(
     threshold: float = 1e-4,
     start_radius: int | None = None,
     report: Callable[[float], None] = lambda fraction: None,
-) -> Int32[np.ndarray, " S*S"]:
+) -> Int32[np.ndarray, " cells"]:
     """Arrange ``S*S`` vectors on an S × S grid.
 
     Args:

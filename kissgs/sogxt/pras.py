@@ -43,12 +43,12 @@ CHUNK = 1 << 16
 
 def choose_forms(
     splats: Splats,
-    cells: Int[np.ndarray, " G*G"],
+    cells: Int[np.ndarray, " cells"],
     side: int,
     settings: EncodeSettings,
     pool: Workers,
     report: Callable[[float], None],
-) -> tuple[Float64[np.ndarray, "G*G 4"], Float32[np.ndarray, "G*G 3"], float]:
+) -> tuple[Float64[np.ndarray, "cells 4"], Float32[np.ndarray, "cells 3"], float]:
     """Rotations and log-scales of the Gaussians in ``cells``, in the form that the settings choose.
 
     Returns:

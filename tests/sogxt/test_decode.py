@@ -86,6 +86,17 @@ def test_levels_need_not_span_their_bytes():
     oracle.assert_equal_scenes(decompress(files), oracle.decode(files), files)
 
 
+def test_levels_that_do_not_occur_have_no_value():
+    """The largest ranges that float32 holds, from level 200 to 201: on the same line, level 0 would be -1.2e41."""
+    levels = np.full((16, 16), 200)
+    levels[3, 4] = 201
+    document = yaml.safe_load(foreign()["container_meta.yaml"])
+    op = next(op for op in document["ops"] if op["input_fields"] == ["opacities"])
+    op["transforms"] = [{"simple_quantize": {"min_values": -3e38, "max_values": 3e38}}]
+    files = {**foreign(opacities=levels), "container_meta.yaml": yaml.safe_dump(document).encode()}
+    assert set(decompress(files).opacities) <= {np.float32(-3e38), np.float32(3e38)}
+
+
 @pytest.mark.parametrize("value", [1, 7, 255])
 def test_any_mask_level_above_zero_is_active(value):
     found = decompress(foreign(active_mask=(image_of("active_mask") > 0) * value))

@@ -268,7 +268,7 @@ def test_importance_moves_the_error_to_where_it_matters_less():
 
 
 @pytest.mark.parametrize(
-    "importance", [np.ones(9), np.ones((10, 1)), np.zeros(10), -np.ones(10), np.full(10, np.nan), np.full(10, np.inf)]
+    "importance", [np.ones(9), np.zeros(10), -np.ones(10), np.full(10, np.nan), np.full(10, np.inf)]
 )
 def test_impossible_importance_is_refused(importance):
     scene = random_scene(10, 1)
