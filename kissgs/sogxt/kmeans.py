@@ -138,7 +138,7 @@ class _Tree:
     def centroids_of(self, j: int) -> slice:
         return slice(int(self.centroid_edges[j]), int(self.centroid_edges[j + 1]))
 
-    def neighbours(self, reach: int) -> list[Int[np.ndarray, "_"]]:
+    def neighbours(self, reach: int) -> list[Int[np.ndarray, " _"]]:
         """For every coarse cluster, the centroids of the ``reach`` coarse clusters nearest to it, itself first."""
         norms = np.einsum("jd,jd->j", self.coarse, self.coarse)
         distances = norms - 2 * (self.coarse @ self.coarse.T)
@@ -219,7 +219,7 @@ def _reassign(
     centroids: np.ndarray,
     labels: np.ndarray,
     tree: _Tree,
-    near: list[Int[np.ndarray, "_"]],
+    near: list[Int[np.ndarray, " _"]],
     pool: Workers,
 ) -> Float32[np.ndarray, " N"]:
     """Move every vector to the nearest centroid near its coarse cluster. Changes ``labels``; returns distances."""
