@@ -37,7 +37,7 @@ def check(files):
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_every_degree_and_preset(degree, preset):
-    count = 200 if preset == "paper" else 1000
+    count = 64 if preset == "paper" else 1000
     ours = check(encoded(random_scene(count, degree, seed=degree), preset))
     assert ours.sh_degree == degree
 
@@ -80,7 +80,7 @@ def test_one_constant_channel_beside_others(channel):
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_the_sample_scene(preset):
-    check(encoded(sample_scene(600, seed=5), preset))
+    check(encoded(sample_scene(250, seed=5), preset))
 
 
 @functools.cache
@@ -93,7 +93,7 @@ def real_scene(path):
 def test_real_scenes(shared_data, name, preset):
     splats = real_scene(shared_data / name)
     if preset != "fast":  # all of it once; a part of it in the slower presets
-        splats = splats.select(slice(None, None, 80))
+        splats = splats.select(slice(None, None, 300))
     ours = check(encoded(splats, preset))
     assert ours.sh_degree == splats.sh_degree
 

@@ -86,7 +86,7 @@ def test_mutated_zip_directories(directory):
     check(ZIP[: ZIP.index(b"PK\x01\x02")] + directory)
 
 
-@settings(max_examples=250, deadline=None, derandomize=True)
+@settings(max_examples=150, deadline=None, derandomize=True)
 @given(st.data(), st.sampled_from([name for name in FILES if name != "scene.json"]))
 def test_mutated_files(data, name):
     files = {**FILES, name: data.draw(mutated(FILES[name]))}
@@ -95,7 +95,7 @@ def test_mutated_files(data, name):
     check(files)
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=60, deadline=None, derandomize=True)
 @given(st.integers(12, 60), st.sampled_from([name for name in FILES if name.endswith(".webp")]), st.binary(max_size=12))
 def test_mutated_webp_headers(start, name, new):
     """Sizes, chunk names and lengths, the transforms: what is trusted before the pixels."""
@@ -103,7 +103,7 @@ def test_mutated_webp_headers(start, name, new):
     check({**FILES, name: data[:start] + new + data[start + len(new) :]})
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=60, deadline=None, derandomize=True)
 @given(
     st.dictionaries(st.sampled_from([*FILES, "other"]), st.binary(max_size=300) | st.sampled_from([*FILES.values()]))
 )
@@ -126,7 +126,7 @@ JSON = st.recursive(
 )
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=60, deadline=None, derandomize=True)
 @given(JSON, st.sampled_from(["meta", "ops", "kissgs", None]))
 def test_any_yaml_of_the_right_outline(value, key):
     document = yaml.safe_load(FILES["container_meta.yaml"])
@@ -134,7 +134,7 @@ def test_any_yaml_of_the_right_outline(value, key):
     check({**FILES, "container_meta.yaml": yaml.safe_dump(document).encode()})
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=60, deadline=None, derandomize=True)
 @given(JSON, st.sampled_from([*json.loads(FILES["meta.json"]), None]), st.booleans())
 def test_any_json_of_the_right_outline(value, key, inside):
     document = json.loads(FILES["meta.json"])
