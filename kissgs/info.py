@@ -99,7 +99,7 @@ def _describe_container(path: Path) -> Info:
         if missing:
             raise InvalidContainerError(f"{path} lacks {', '.join(missing)}")
         parts = {name: files.size(name) for name in FILES if name in present}
-        count = layout.provenance.count if layout.provenance else _count_mask(files, layout)
+        count = layout.count if layout.count is not None else _count_mask(files, layout)
     made = layout.provenance
     return Info(
         path=str(path),

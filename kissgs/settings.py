@@ -72,7 +72,7 @@ class EncodeSettings(BaseModel):
         1.15, description="Step of the codebook's entries, in units of the error that the codebook leaves anyway."
     )
     sh_weight_power: float = Field(
-        0.4,
+        0.35,
         ge=0,
         le=1,
         description="How much the codebook favours what is seen: weights are (opacity x projected area) to this power. "

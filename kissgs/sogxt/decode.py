@@ -133,9 +133,9 @@ class _Planes:
         """Levels to values, some thousand Gaussians at a time, so that everything in between stays in the cache."""
         mask = self.mask[:, 0] > 0
         count = int(np.count_nonzero(mask))
-        made = self.layout.provenance
-        if made and made.count != count:
-            raise InvalidContainerError(f"active_mask.webp marks {count} Gaussians; the metadata declares {made.count}")
+        declared = self.layout.count
+        if declared not in (None, count):
+            raise InvalidContainerError(f"active_mask.webp marks {count} Gaussians; the metadata declares {declared}")
         # No cell numbers are needed where all padding is at the end.
         cells = None if mask[:count].all() else np.flatnonzero(mask)
         splats = _empty(count, self.coefficients)

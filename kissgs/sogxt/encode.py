@@ -96,6 +96,7 @@ def encode(
     layout = metadata.Layout(
         grid_side=grid.side,
         codebook_side=codebook.side,
+        count=len(kept),
         ranges=_ranges(fields),
         provenance=metadata.Provenance(
             version=__version__,
@@ -107,7 +108,7 @@ def encode(
             sha256={name: hashlib.sha256(data).hexdigest() for name, data in files.items()},
         ),
     )
-    files = {names.JSON_NAME: layout.to_meta_json(len(kept)), **files}
+    files = {names.JSON_NAME: layout.to_meta_json(), **files}
     return Encoded(
         files={names.YAML_NAME: layout.to_yaml(), names.SCENE_NAME: metadata.scene_json(files), **files},
         order=grid.cells[grid.mask],

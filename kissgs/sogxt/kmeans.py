@@ -255,11 +255,16 @@ def _revive(centroids: np.ndarray, vectors: np.ndarray, errors: np.ndarray, labe
 
 
 def _round_to_lattice(centroids: np.ndarray, step: float, tolerance: float) -> float:
-    """Round in place to multiples of ``step``, or of what 256 levels and the tolerance ask for. Returns the step."""
-    widest = float(np.ptp(centroids.astype(np.float64), axis=0).max())
-    step = max(step, 2 * tolerance, widest / 254)
+    """Round in place to whole steps from each dimension's smallest value, which a constant one keeps.
+
+    Returns:
+        The step: the one asked for, or what 256 levels and the tolerance ask for, if that is larger.
+    """
+    wide = centroids.astype(np.float64)
+    low = wide.min(axis=0)
+    step = max(step, 2 * tolerance, float((wide - low).max()) / 254)
     if step > 0:
-        centroids[:] = np.rint(centroids.astype(np.float64) / step) * step
+        centroids[:] = low + np.rint((wide - low) / step) * step
     return step
 
 

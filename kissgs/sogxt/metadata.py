@@ -86,6 +86,7 @@ class Layout(BaseModel):
     grid_side: int = Field(ge=1, le=MAX_GRID_SIDE)
     codebook_side: int = Field(ge=1, le=MAX_CODEBOOK_SIDE)
     ranges: dict[str, tuple[list[Limit], list[Limit]]]
+    count: int | None = Field(None, ge=0)
     provenance: Provenance | None = None
 
     def limits(self, field: str) -> tuple[np.ndarray, np.ndarray]:
@@ -123,7 +124,7 @@ class Layout(BaseModel):
         dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
         return yaml.dump(document, Dumper=dumper, sort_keys=False, allow_unicode=False, width=120).encode("ascii")
 
-    def to_meta_json(self, count: int) -> bytes:
+    def to_meta_json(self) -> bytes:
         """``meta.json``, version 3: the same for browsers."""
 
         def plane(field: str, *files: str, **more: Any) -> dict[str, Any]:  # noqa: ANN401
@@ -135,7 +136,7 @@ class Layout(BaseModel):
             "version": 3,
             "format": "sog-xt",
             "profile": "SOG-XT",
-            "count": count,
+            "count": self.count,
             "gridSide": self.grid_side,
             "mask": {"files": ["active_mask.webp"]},
             "means": plane("means", "means_bytes_0", "means_bytes_1"),

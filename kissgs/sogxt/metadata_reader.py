@@ -78,11 +78,13 @@ def _from_yaml(data: bytes) -> dict[str, Any]:
             f"{YAML_NAME} lacks 'meta' or 'ops', or they are not of the expected form"
         ) from error
     _require_webp(sides.get("image_codec") if isinstance(sides, dict) else None)
+    made = document.get("kissgs")
     return {
+        "count": made.get("count") if isinstance(made, dict) else None,
         "grid_side": sides.get("grid_side"),
         "codebook_side": sides.get("f_rest_centroids_side"),
         "ranges": ranges,
-        "provenance": document.get("kissgs"),
+        "provenance": made,
     }
 
 
@@ -124,7 +126,14 @@ def _from_json(data: bytes) -> dict[str, Any]:
         ranges["f_rest_centroids"] = _spread(rest["centroidsMins"], 45), _spread(rest["centroidsMaxs"], 45)
         files = document["mask"]["files"]
         _require_webp(str(files[0]).rsplit(".", 1)[-1])
-        return {"grid_side": document["gridSide"], "codebook_side": rest["centroidSide"], "ranges": ranges}
+        count, made = document["count"], document.get("kissgs")
+        return {
+            "count": count,
+            "grid_side": document["gridSide"],
+            "codebook_side": rest["centroidSide"],
+            "ranges": ranges,
+            "provenance": {"count": count, "source_count": count, **made} if isinstance(made, dict) else made,
+        }
     except (ValueError, RecursionError) as error:
         raise InvalidContainerError(f"{JSON_NAME} is not readable JSON") from error
     except (KeyError, TypeError, AttributeError, IndexError) as error:

@@ -140,7 +140,7 @@ def test_centroids_lie_on_the_lattice(count, size, lattice):
     vectors = blobs(count)
     clusters = run(vectors, size, lattice=lattice)
     assert clusters.step > 0
-    numbers = clusters.centroids / np.float64(clusters.step)
+    numbers = (clusters.centroids - clusters.centroids.min(axis=0)) / np.float64(clusters.step)
     np.testing.assert_allclose(numbers, np.rint(numbers), atol=1e-3)
     assert np.ptp(np.rint(numbers), axis=0).max() <= 255, "more levels than an image has"
     widest = np.ptp(vectors, axis=0).max()
@@ -150,6 +150,13 @@ def test_centroids_lie_on_the_lattice(count, size, lattice):
         assert error(vectors, clusters) < (1 + lattice**2 / 6) * loose
     else:
         assert clusters.step <= widest / 254 * 1.0001
+
+
+def test_a_constant_dimension_is_exact():
+    """The lattice once began at 0 in every dimension, and a constant one was up to half a step off."""
+    vectors = blobs(2000)
+    vectors[:, 2] = 0.12345
+    assert (run(vectors, 64, lattice=0.9).centroids[:, 2] == np.float32(0.12345)).all()
 
 
 def test_the_tolerance_widens_the_lattice():

@@ -103,7 +103,7 @@ def test_every_float32_survives_both_spellings(numbers, mean):
         found = np.ravel(low).tolist()
         assert all(type(number) is float for number in found)
         assert (np.float32(found) == exact[field]).all()
-    for name, text in (("container_meta.yaml", layout.to_yaml()), ("meta.json", layout.to_meta_json(0))):
+    for name, text in (("container_meta.yaml", layout.to_yaml()), ("meta.json", layout.to_meta_json())):
         text.decode("ascii")
         read = read_layout(MemorySource({name: text}))
         assert all((read.limits(field)[1] == values).all() for field, values in exact.items())
@@ -409,7 +409,7 @@ YAML_ERRORS = [
         lambda d: d["kissgs"].update(sh_degree=4),
         "container_meta.yaml: provenance.sh_degree: input should be less than or equal to 3",
     ),
-    (lambda d: d["kissgs"].update(count=-1), "container_meta.yaml: provenance.count: input should be greater than"),
+    (lambda d: d["kissgs"].update(count=-1), "container_meta.yaml: count: input should be greater than"),
     (lambda d: d.update(kissgs="yes"), "container_meta.yaml: provenance: input should be a valid dictionary"),
 ]
 
