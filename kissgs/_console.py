@@ -18,7 +18,7 @@ SLOW_START_SECONDS = 1.5
 
 def output() -> Console:
     """Where results go: standard output, as wide as the terminal, or as wide as it takes in a pipe."""
-    console = Console(highlight=False)
+    console = Console(highlight=False, markup=False)
     if not console.is_terminal:
         console.width = 200
     return console

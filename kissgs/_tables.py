@@ -16,6 +16,7 @@ from kissgs.pipeline import Report
 
 CHANGES = {
     "invisible": "left out: opacity 1/255 or less, which no renderer draws",
+    "tamed_colours": "base colour far outside all others, pulled in so that it does not coarsen theirs",
     "non_finite": "removed: NaN or infinite",
     "far_away": "removed: further away than 1e15",
     "infinite_opacities": "opacity logit infinite, set to that of 1e-6 or 1 - 1e-6",
@@ -46,7 +47,7 @@ def report_table(report: Report, target: str) -> RenderableType:
     )
     took = f"{sum(report.seconds.values()):.1f} s ({report.cpu_seconds:.1f} CPU s), {size(report.peak_memory)} at most"
     body = f"{report.count:,} of {report.source_count:,} Gaussians, SH degree {report.sh_degree}; {took}"
-    changed = {"invisible": report.invisible, **report.cleaned.as_dict()}
+    changed = {"invisible": report.invisible, "tamed_colours": report.tamed_colours, **report.cleaned.as_dict()}
     return Group(head, Text(body), parts_table(report.file_bytes, report.count), *_changes(changed))
 
 
@@ -68,7 +69,9 @@ def info_table(info: Info) -> RenderableType:
     ranges = Table("attribute", _right("lowest"), _right("highest"), box=None, pad_edge=False)
     for name, (low, high) in info.ranges.items():
         ranges.add_row(name, f"{low:.5g}", f"{high:.5g}")
-    blocks: list[RenderableType] = [head, Text(body), parts_table(info.parts, info.count), ranges]
+    blocks: list[RenderableType] = [head, Text(body), ranges]
+    if info.parts:
+        blocks.insert(2, parts_table(info.parts, info.count))
     if info.kind == "sog-xt":
         made = info.details
         origin = f"kissgs {made['version']} from {made['source_count']:,} Gaussians" if made["version"] else "unknown"
@@ -139,7 +142,11 @@ def error_table(columns: Mapping[str, AttributeErrors]) -> Table:
 
 
 def _changes(changed: Mapping[str, int]) -> list[Text]:
-    return [Text(f"{count:,} {CHANGES.get(name, name)}", style="yellow") for name, count in changed.items() if count]
+    return [
+        Text(f"{count:,} {CHANGES[name]}", style="yellow")
+        for name, count in changed.items()
+        if count and name in CHANGES
+    ]
 
 
 def _right(title: str) -> Column:

@@ -12,7 +12,7 @@ from typing import Any
 
 from kissgs.errors import UnsupportedError
 from kissgs.evaluation.attributes import AttributeErrors, attribute_errors
-from kissgs.pipeline import Report, compress, decompress, load, peak_memory
+from kissgs.pipeline import Report, compress, decompress, load, peak_memory, save
 from kissgs.progress import Progress, silent
 from kissgs.settings import Settings
 from kissgs.splats import Splats
@@ -69,7 +69,7 @@ def roundtrip(
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     peak = peak_memory()
     if back is not None:
-        decompress(archive, back, overwrite=overwrite, threads=threads)
+        save(decoded, back, overwrite=overwrite)
     scene = source if isinstance(source, Splats) else load(source)
     return RoundTrip(
         report=result.report,

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import glob
 import json
 import os
 import signal
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
+from kissgs._cli_files import each, expand, make_folder, print_json, show, source, stdout, write_stdout
 from kissgs._version import __version__
-from kissgs.errors import KissgsError, OutputError, UnsupportedError
+from kissgs.errors import KissgsError, UnsupportedError
 
 if TYPE_CHECKING:
     from types import FrameType
-
-    from rich.console import RenderableType
 
     from kissgs.settings import Settings
 
@@ -33,6 +30,7 @@ app = typer.Typer(
 )
 
 Scenes = Annotated[list[str], typer.Argument(metavar="FILE…", help="Files or patterns; '-' reads standard input.")]
+Files = Annotated[list[str], typer.Argument(metavar="FILE…", help="Files or patterns.")]
 PresetOption = Annotated[
     str, typer.Option("--preset", "-p", help="[bold]fast[/], [bold]balanced[/], [bold]small[/] or [bold]paper[/].")
 ]
@@ -42,7 +40,7 @@ SetOption = Annotated[
 ]
 SeedOption = Annotated[int | None, typer.Option(help="Of all random choices: same input, settings, seed: same bytes.")]
 ForceOption = Annotated[bool, typer.Option("--force", "-f", help="Overwrite files that exist.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the report as JSON.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON: an object for one file, a list for several.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 ThreadsOption = Annotated[int, typer.Option(min=0, help="0: one per processor. The bytes do not depend on it.")]
 
@@ -74,32 +72,27 @@ def compress(
     scenes: Scenes,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="A .zip, a folder, or '-'; by default the scene's name with .zip."),
+        typer.Option("--output", "-o", help="NAME.zip, a folder for the zips, or '-'; by default beside the scene."),
     ] = None,
     preset: PresetOption = "balanced",
     changes: SetOption = None,
     seed: SeedOption = None,
+    unpacked: Annotated[bool, typer.Option("--unpacked", help="Write folders instead of zips.")] = False,
     threads: ThreadsOption = 0,
     force: ForceOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Compress scenes.
-
-    With several scenes, --output is the folder that receives one zip for each.
-    """
+    """Compress scenes, each into a container of its own."""
     from kissgs.pipeline import compress as run
 
     settings = _settings(preset, changes, seed)
-    reports = []
-    for scene, target in _pairs(scenes, output, ".zip"):
+
+    def work(scene: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"
-        if piped and as_json:
-            raise OutputError("--json and -o - would both write to standard output; choose one")
-        source = sys.stdin.buffer.read() if scene == "-" else Path(scene)
         with _progress(quiet or as_json) as progress:
             result = run(
-                source,
+                source(scene),
                 None if piped else target,
                 settings=settings,
                 overwrite=force,
@@ -107,15 +100,14 @@ def compress(
                 progress=progress,
             )
         if piped:
-            sys.stdout.buffer.write(result.to_zip())
-        elif as_json:
-            reports.append({"input": scene, "output": str(target), **result.report.as_dict()})
-        elif not quiet:
+            write_stdout(result.to_zip())
+        elif not (quiet or as_json):
             from kissgs._tables import report_table
 
-            _print(report_table(result.report, str(target)))
-    if as_json:
-        _print_json(reports)
+            show(report_table(result.report, str(target)))
+        return result.report.as_dict()
+
+    each(scenes, output, "" if unpacked else ".zip", as_json, work)
 
 
 @app.command()
@@ -123,60 +115,54 @@ def decompress(
     containers: Scenes,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="A .ply or '-'; by default the container's name with .ply."),
+        typer.Option("--output", "-o", help="NAME.ply, a folder for them, or '-'; by default beside the container."),
     ] = None,
+    max_gaussians: Annotated[int | None, typer.Option(min=0, help="Refuse more; by default 20 million.")] = None,
     threads: ThreadsOption = 0,
     force: ForceOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Turn containers back into .ply files.
-
-    With several containers, --output is the folder that receives one .ply for each.
-    """
+    """Turn containers back into .ply files."""
     from kissgs.io.ply import write_ply
     from kissgs.pipeline import decompress as run
+    from kissgs.sogxt.decode import MAX_GAUSSIANS
 
-    reports = []
-    for container, target in _pairs(containers, output, ".ply"):
+    def work(container: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"
-        if piped and as_json:
-            raise OutputError("--json and -o - would both write to standard output; choose one")
-        source = sys.stdin.buffer.read() if container == "-" else Path(container)
         with _progress(quiet or as_json) as progress:
-            splats = run(source, None if piped else target, overwrite=force, threads=threads, progress=progress)
-        if piped:
-            write_ply(sys.stdout.buffer, splats)
-            continue
-        reports.append(
-            {
-                "input": container,
-                "output": str(target),
-                "count": len(splats),
-                "sh_degree": splats.sh_degree,
-                "bytes": target.stat().st_size,
-            }
-        )
-        if not (quiet or as_json):
-            _print(
-                f"{target}  {len(splats):,} Gaussians, SH degree {splats.sh_degree}, {target.stat().st_size:,} bytes"
+            splats = run(
+                source(container),
+                None if piped else target,
+                max_gaussians=MAX_GAUSSIANS if max_gaussians is None else max_gaussians,
+                overwrite=force,
+                threads=threads,
+                progress=progress,
             )
-    if as_json:
-        _print_json(reports)
+        if piped:
+            with stdout():
+                write_ply(sys.stdout.buffer, splats)
+            return {}
+        if not (quiet or as_json):
+            show(f"{target}  {len(splats):,} Gaussians, SH degree {splats.sh_degree}")
+        return {"count": len(splats), "sh_degree": splats.sh_degree, "bytes": target.stat().st_size}
+
+    each(containers, output, ".ply", as_json, work)
 
 
 @app.command()
-def info(files: Scenes, as_json: JsonOption = False) -> None:
+def info(files: Files, as_json: JsonOption = False) -> None:
     """Show what .ply files and containers hold."""
     from kissgs._tables import info_table
     from kissgs.info import describe
 
-    found = [describe(Path(name)) for name in _expand(files)]
-    if as_json:
-        _print_json([item.as_dict() for item in found])
-    else:
-        for item in found:
-            _print(info_table(item))
+    def work(file: str, target: Path) -> dict[str, Any]:
+        found = describe(Path(file))
+        if not as_json:
+            show(info_table(found))
+        return found.as_dict()
+
+    each(files, Path("-"), "", as_json, work, writes=False)
 
 
 @app.command()
@@ -207,20 +193,20 @@ def demo(
     from kissgs.sample import sample_scene
 
     settings = _settings(preset, None, None)
-    _make_folder(folder)
+    make_folder(folder)
     with _progress(False) as progress:
         if scene is None:
             scene = folder / "sample.ply"
             save(sample_scene(), scene, overwrite=True, progress=progress)
         container, back = folder / f"{scene.stem}.zip", folder / f"{scene.stem}.decoded.ply"
         result = roundtrip(scene, settings, container=container, back=back, overwrite=True, progress=progress)
-    _print(roundtrip_table(result))
-    _print(f"\nscene      {scene}\ncontainer  {container}\ndecoded    {back}")
+    show(roundtrip_table(result))
+    show(f"\nscene      {scene}\ncontainer  {container}\ndecoded    {back}")
 
 
 @app.command()
 def bench(
-    scenes: Scenes,
+    scenes: Files,
     presets: Annotated[
         list[str] | None, typer.Option("--preset", "-p", help="Repeat for several; default: all.")
     ] = None,
@@ -239,7 +225,7 @@ def bench(
 
     rows: list[tuple[str, str, Any]] = []
     all_settings = [_settings(name, None, None) for name in presets or list(Preset)]
-    for scene in _expand(scenes):
+    for scene in expand(scenes):
         label = Path(scene).name
         for settings in all_settings:
             result = isolated_roundtrip(Path(scene), settings, threads=threads)
@@ -247,9 +233,9 @@ def bench(
         others = shlex.split(splat_transform)
         rows.extend((label, peer, measure_peer(Path(scene), peer, command=others)) for peer in peers or [])
     if as_json:
-        _print_json([{"scene": scene, "encoder": name, **result.as_dict()} for scene, name, result in rows])
+        print_json([{"scene": scene, "encoder": name, **result.as_dict()} for scene, name, result in rows])
     else:
-        _print(bench_table(rows))
+        show(bench_table(rows))
 
 
 @app.command()
@@ -276,67 +262,16 @@ def _settings(preset: str, changes: list[str] | None, seed: int | None) -> Setti
         name, equals, value = change.partition("=")
         if not equals:
             raise UnsupportedError(f"--set {change!r}: write NAME=VALUE, for example --set means_bits=16")
-        values[name.strip()] = value.strip()
+        values[name.strip()] = None if value.strip() == "auto" else value.strip()
     if seed is not None:
         values["seed"] = seed
     return Settings.from_preset(preset, **values)
-
-
-def _pairs(names: list[str], output: Path | None, suffix: str) -> Iterator[tuple[str, Path]]:
-    """Every input with its output."""
-    inputs = _expand(names)
-    if len(inputs) > 1 and output is not None:
-        if output.suffix.lower() in (".zip", ".ply") or str(output) == "-":
-            raise OutputError(f"{len(inputs)} inputs cannot all become {output}; name a folder with -o")
-        _make_folder(output)
-        named = [output / (Path(name).stem + suffix) for name in inputs]
-        if len(set(named)) < len(named):
-            raise OutputError("two inputs have the same name and would become one file; compress them one by one")
-        yield from zip(inputs, named, strict=True)
-        return
-    for name in inputs:
-        if name == "-" and output is None:
-            raise OutputError("standard input has no name; say where to write with -o")
-        yield name, output or Path(name).with_suffix(suffix)
-
-
-def _make_folder(folder: Path) -> None:
-    from kissgs.io.atomic import reason_of
-
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:
-        raise OutputError(f"cannot make the folder {folder}: {reason_of(error)}") from error
-
-
-def _expand(names: list[str]) -> list[str]:
-    """Patterns that the shell has not expanded, expanded."""
-    found: list[str] = []
-    for name in names:
-        if not glob.has_magic(name) or Path(name).exists():
-            found.append(name)
-            continue
-        matches = sorted(glob.glob(name))  # noqa: PTH207  Path.glob takes no absolute patterns
-        if not matches:
-            raise UnsupportedError(f"no file matches {name}")
-        found.extend(matches)
-    return found
 
 
 def _progress(silent: bool) -> Any:  # noqa: ANN401
     from kissgs._console import progress_bar
 
     return progress_bar(silent)
-
-
-def _print(what: RenderableType) -> None:
-    from kissgs._console import output
-
-    output().print(what)
-
-
-def _print_json(reports: list[dict[str, Any]]) -> None:
-    sys.stdout.write(json.dumps(reports[0] if len(reports) == 1 else reports, indent=2) + "\n")
 
 
 def _fail(error: KissgsError) -> NoReturn:

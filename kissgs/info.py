@@ -33,7 +33,7 @@ class Info:
         count: Gaussians.
         sh_degree: 0 to 3.
         bytes: of the file or the folder.
-        parts: bytes per attribute (``.ply``) or per file (container).
+        parts: bytes per file of a container.
         ranges: smallest and largest finite value per attribute, over its channels.
         changed: Gaussians that cleaning removes or mends (``.ply``), or that the encoder did (container), by reason.
         details: grid and codebook side, version and settings of the encoder (container).
@@ -76,7 +76,7 @@ def _describe_ply(path: Path) -> Info:
         count=len(splats),
         sh_degree=splats.sh_degree,
         bytes=path.stat().st_size,
-        parts={name: getattr(splats, name).nbytes for name in ATTRIBUTES},
+        parts={},
         ranges={name: _extremes(getattr(splats, name)) for name in ATTRIBUTES if getattr(splats, name).size},
         changed=clean(splats)[1].as_dict(),
         details={},

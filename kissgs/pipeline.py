@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import sys
 import time
 from collections.abc import Mapping
@@ -20,7 +19,7 @@ from kissgs.io.ply import read_ply, write_ply
 from kissgs.progress import Progress, silent
 from kissgs.settings import Settings
 from kissgs.sogxt.container import check_destination, write_container, zip_bytes
-from kissgs.sogxt.decode import decode
+from kissgs.sogxt.decode import MAX_GAUSSIANS, decode
 from kissgs.splats import Cleaned, Splats, clean
 
 AnyPath = str | PathLike[str]
@@ -41,6 +40,7 @@ class Report:
         file_bytes: per file of the container.
         cleaned: what was wrong with the input (:class:`kissgs.splats.Cleaned`).
         invisible: Gaussians left out because no renderer would draw them.
+        tamed_colours: Gaussians whose base colour is such an outlier that it was pulled in, for the others' sake.
         form_error: largest relative change of a covariance by the choice of its equivalent form.
         half_steps: largest error that quantisation may cause, per field and channel.
         seconds: wall time per stage.
@@ -57,6 +57,7 @@ class Report:
     file_bytes: dict[str, int]
     cleaned: Cleaned
     invisible: int
+    tamed_colours: int
     form_error: float
     half_steps: dict[str, list[float]]
     seconds: dict[str, float]
@@ -107,15 +108,17 @@ class Compressed:
         write_container(self.files, Path(path), overwrite=overwrite)
 
 
-def load(path: AnyPath, *, threads: int = 0, progress: Progress = silent) -> Splats:
+def load(path: AnyPath, *, max_gaussians: int = MAX_GAUSSIANS, threads: int = 0, progress: Progress = silent) -> Splats:
     """Read a scene: a ``.ply`` of any of the field's tools, or a SOG-XT container (zip or folder); cleaned.
+
+    A container with more than ``max_gaussians`` is refused before memory is taken for them.
 
     Raises:
         InvalidSceneError: the ``.ply`` is not a usable scene.
         InvalidContainerError: the container is damaged.
         UnsupportedError: something valid that kissgs does not read.
     """
-    return clean(_read(Path(path), threads, progress))[0]
+    return clean(_read(Path(path), threads, progress, max_gaussians))[0]
 
 
 def save(splats: Splats, path: AnyPath, *, overwrite: bool = False, progress: Progress = silent) -> None:
@@ -148,7 +151,7 @@ def compress(
         source: a scene, or the path or the bytes of a ``.ply`` (a container is decoded and encoded anew).
         destination: ``.zip`` or folder to write; by default nothing is written.
         settings: by default those of the preset ``balanced``.
-        importance: ``(N,)`` positive numbers for the Gaussians of a clean ``source``, see :func:`kissgs.sogxt.encode`.
+        importance: ``(N,)`` numbers from 0 for the Gaussians of a clean ``source``, see :func:`kissgs.sogxt.encode`.
         overwrite: replace ``destination`` if it exists.
         threads: 0 means one per processor; the bytes do not depend on it.
         progress: receives events; raise :class:`kissgs.Cancelled` from it to stop. Nothing is written then.
@@ -182,6 +185,7 @@ def compress(
         file_bytes={name: len(data) for name, data in encoded.files.items()},
         cleaned=cleaned,
         invisible=encoded.dropped,
+        tamed_colours=encoded.tamed,
         form_error=encoded.form_error,
         half_steps=encoded.half_steps,
         seconds=clock.seconds,
@@ -196,6 +200,7 @@ def decompress(
     source: AnyPath | bytes | Mapping[str, bytes],
     destination: AnyPath | None = None,
     *,
+    max_gaussians: int = MAX_GAUSSIANS,
     overwrite: bool = False,
     threads: int = 0,
     progress: Progress = silent,
@@ -205,6 +210,7 @@ def decompress(
     Args:
         source: path of a zip or a folder, the bytes of a zip, or the files in memory.
         destination: ``.ply`` to write; by default nothing is written.
+        max_gaussians: refuse a container that holds more, before memory is taken for them.
         overwrite: replace ``destination`` if it exists.
         threads: 0 means one per processor.
         progress: receives events.
@@ -219,7 +225,8 @@ def decompress(
     """
     if destination is not None:
         _check_ply(Path(destination), overwrite=overwrite)
-    splats = decode(source if isinstance(source, bytes | Mapping) else Path(source), threads=threads, progress=progress)
+    scene = source if isinstance(source, bytes | Mapping) else Path(source)
+    splats = decode(scene, max_gaussians=max_gaussians, threads=threads, progress=progress)
     if destination is not None:
         save(splats, destination, overwrite=overwrite, progress=progress)
     return splats
@@ -232,6 +239,8 @@ def is_container(source: Path | bytes) -> bool:
     try:
         if source.is_dir():
             return True
+        if not source.is_file():  # a pipe would keep us waiting
+            return source.suffix.lower() == ".zip"
         with source.open("rb") as file:
             return file.read(4) in ZIP_BEGINNINGS
     except (OSError, ValueError):
@@ -245,7 +254,11 @@ def _check_ply(path: Path, *, overwrite: bool) -> None:
 
 
 def peak_memory() -> int:
-    """Bytes, the largest resident set this process has had."""
+    """Bytes, the largest resident set this process has had; 0 where the system does not say (Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return 0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
 
@@ -260,10 +273,10 @@ def _open(source: Splats | AnyPath | bytes, threads: int, progress: Progress) ->
     return splats, cleaned, len(scene) if isinstance(scene, bytes) else _size(scene)
 
 
-def _read(source: Path | bytes, threads: int, progress: Progress) -> Splats:
-    """As it stands in the file."""
+def _read(source: Path | bytes, threads: int, progress: Progress, max_gaussians: int = MAX_GAUSSIANS) -> Splats:
+    """As it stands in the file; the limit is for containers, which can hold far more than they weigh."""
     if is_container(source):
-        return decode(source, threads=threads, progress=progress)
+        return decode(source, max_gaussians=max_gaussians, threads=threads, progress=progress)
     return read_ply(source, progress=progress)
 
 

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from kissgs.errors import UnsupportedError
 
-Step = Annotated[float, Field(gt=0, le=10)]
+Step = Annotated[float, Field(ge=1e-4, le=10)]
 
 
 class Preset(StrEnum):
@@ -55,7 +55,7 @@ class EncodeSettings(BaseModel):
     )
     opacity_step: Step = Field(0.15, description="Step of opacity logits; half of it is the largest error.")
     scale_step: Step = Field(0.11, description="Step of log-scales: 0.11 means sizes right to within 5.5 %.")
-    quat_step: Annotated[float, Field(gt=0, le=0.5)] = Field(
+    quat_step: Annotated[float, Field(ge=1e-4, le=0.5)] = Field(
         0.023, description="Step of quaternion components: 0.02 turns a Gaussian by 1 degree on average."
     )
     sh0_step: Step = Field(0.055, description="Step of base colours: 0.055 is an error of up to 2 levels of 255.")
@@ -68,7 +68,7 @@ class EncodeSettings(BaseModel):
         le=1,
         description="Error of SH coefficients that nobody sees: the codebook does not grow to get below it.",
     )
-    sh_step: Annotated[float, Field(gt=0, le=4)] = Field(
+    sh_step: Annotated[float, Field(ge=0.01, le=4)] = Field(
         1.15, description="Step of the codebook's entries, in units of the error that the codebook leaves anyway."
     )
     sh_weight_power: float = Field(
@@ -150,6 +150,8 @@ class Settings(BaseModel):
             return given  # not ours to judge: validation says what is wrong with it
         chosen = PRESETS[Preset(given.get("preset", Preset.BALANCED))]
         encode = given.get("encode", {})
+        if isinstance(encode, EncodeSettings):
+            encode = encode.model_dump(include=encode.model_fields_set)
         return {**given, "encode": {**chosen, **encode} if isinstance(encode, dict) else encode}
 
     @classmethod

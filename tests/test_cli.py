@@ -113,7 +113,45 @@ def test_errors_are_one_line(scene: Path, tmp_path: Path) -> None:
     assert "no folder" in failure("compress", scene, "-o", tmp_path / "missing" / "a.zip")
     assert "both write" in failure("compress", scene, "-o", "-", "--json")
     assert "say where to write" in failure("compress", "-", stdin=b"")
+    assert (
+        "standard input is closed"
+        in subprocess.run(
+            f"{KISSGS} compress - -o {tmp_path}/q.zip <&-", shell=True, capture_output=True, text=True, check=False
+        ).stderr
+    )
+    assert "has no name" in failure("decompress", "/")
+    assert (
+        "no space left"
+        in subprocess.run(
+            f"{KISSGS} info {scene} > /dev/full", shell=True, capture_output=True, text=True, check=False
+        ).stderr
+    )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bad.zip", "text.ply"]
+
+
+def test_one_bad_file_of_several_does_not_stop_the_others(scene: Path, tmp_path: Path) -> None:
+    for name in ("a.ply", "c.ply"):
+        (tmp_path / name).write_bytes(scene.read_bytes())
+    (tmp_path / "b.ply").write_text("not a scene")
+    done = run("compress", tmp_path / "*.ply", "-o", tmp_path / "out", "--json", "-p", "fast")
+    assert done.returncode == 2
+    first, second, third = json.loads(done.stdout)
+    assert second["error"]["code"] == "invalid-scene"
+    assert Path(first["output"]).is_file()
+    assert Path(third["output"]).is_file()
+
+
+def test_a_folder_as_output_means_into_it_for_one_file_as_for_many(scene: Path, tmp_path: Path) -> None:
+    assert run("compress", scene, "-o", tmp_path / "new", "-q").returncode == 0
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["scene.zip"]
+    assert run("compress", scene, "-o", tmp_path / "new", "-q", "--unpacked").returncode == 0
+    assert len(kissgs.load(tmp_path / "new" / "scene.container")) > 0
+
+
+def test_names_are_printed_as_they_are(scene: Path, tmp_path: Path) -> None:
+    """Square brackets once were taken for markup."""
+    done = run("compress", scene, "-o", tmp_path / "[red]x.zip", "-p", "fast")
+    assert "[red]x.zip" in done.stdout.decode()
 
 
 def test_json_errors_have_a_code(tmp_path: Path) -> None:

@@ -309,5 +309,5 @@ def test_paths_that_no_file_system_has_are_refused_in_a_sentence(tmp_path, act, 
 def test_importance_is_handed_on():
     half = np.where(np.arange(120) < 60, 20, 0.1).astype(np.float32)
     assert compress(SCENE, importance=half).to_zip() != compress(SCENE, importance=half[::-1].copy()).to_zip()
-    with pytest.raises(InvalidSceneError, match="importance must be 120 positive numbers"):
+    with pytest.raises(InvalidSceneError, match="importance must be 120 finite numbers from 0"):
         compress(SCENE, importance=half[:-1])

@@ -46,9 +46,10 @@ def test_settings_survive_json(preset):
     assert Settings.model_validate(chosen.model_dump()) == chosen
 
 
-def test_a_group_given_whole_is_taken_whole():
-    own = EncodeSettings(sh_ratio=99)
-    assert Settings(preset="paper", encode=own).encode == own
+def test_a_group_changes_only_what_was_given_to_it():
+    """What it leaves unset comes from the preset named, not from the default one."""
+    settings = Settings(preset="paper", encode=EncodeSettings(sh_ratio=99))
+    assert settings == Settings.from_preset("paper", sh_ratio=99)
 
 
 def test_settings_cannot_be_changed_afterwards():
@@ -82,7 +83,7 @@ def test_an_unknown_setting_is_refused_with_the_list_of_settings():
     [
         ("means_bits", 17, "setting means_bits: input should be less than or equal to 16, not 17"),
         ("means_bits", 7, "setting means_bits: input should be greater than or equal to 8, not 7"),
-        ("opacity_step", 0, "setting opacity_step: input should be greater than 0, not 0"),
+        ("opacity_step", 0, "setting opacity_step: input should be greater than or equal to 0.0001, not 0"),
         ("order", "random", "setting order: input should be 'hilbert' or 'plas', not 'random'"),
         ("seed", "x", "setting seed: input should be a valid integer, unable to parse string as an integer, not 'x'"),
     ],

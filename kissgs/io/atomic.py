@@ -22,7 +22,7 @@ def atomic_file(path: Path, *, overwrite: bool = False) -> Iterator[BinaryIO]:
     refuse_existing(path, overwrite=overwrite)
     temporary: Path | None = None
     try:
-        descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+        descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=".kissgs.", suffix=".part")
         temporary = Path(name)
         with os.fdopen(descriptor, "wb") as file:
             yield file
@@ -66,9 +66,13 @@ def look(path: Path) -> tuple[bool, bool]:
 
 def umask() -> int:
     """The permission bits that new files of this process do not get."""
-    current = os.umask(0)
-    os.umask(current)
-    return current
+    try:
+        status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
+        return int(status.split("Umask:", 1)[1].split(maxsplit=1)[0], 8)
+    except (OSError, IndexError, ValueError):
+        current = os.umask(0o022)  # elsewhere, asking means setting, for all threads for a moment
+        os.umask(current)
+        return current
 
 
 def reason_of(error: OSError | ValueError) -> str:

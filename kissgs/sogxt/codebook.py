@@ -120,6 +120,7 @@ def _weights(splats: Splats, importance: Float32[np.ndarray, " N"] | None, power
         logs = area - np.logaddexp(0, -splats.opacities.astype(np.float64))
         logs = power * (logs - np.median(logs))
     else:
-        logs = np.log(importance.astype(np.float64))
-        logs -= np.median(logs)
+        wide = importance.astype(np.float64)
+        seen = wide[wide > 0]
+        logs = np.log(np.maximum(wide, np.finfo(np.float64).tiny)) - np.log(np.median(seen) if len(seen) else 1)
     return np.exp(np.clip(logs, np.log(WEIGHT_FLOOR), np.log(WEIGHT_CEILING))).astype(np.float32)

@@ -135,6 +135,8 @@ def open_source(source: Path | bytes | Mapping[str, bytes]) -> Iterator[Source]:
         yield MemorySource(source)
     else:
         try:
+            if source.exists() and not (source.is_file() or source.is_dir()):
+                raise InvalidContainerError(f"{source} is neither a file nor a folder")
             file = None if source.is_dir() else source.open("rb")
         except (OSError, ValueError) as error:
             raise InvalidContainerError(f"cannot read {source}: {reason_of(error)}") from error
@@ -196,7 +198,7 @@ def _write_directory(files: Mapping[str, bytes], path: Path) -> None:
     temporary: Path | None = None
     old: Path | None = None
     try:
-        temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part"))
+        temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=".kissgs.", suffix=".part"))
         for name, data in files.items():
             with (temporary / name).open("wb") as file:
                 file.write(data)
@@ -207,11 +209,11 @@ def _write_directory(files: Mapping[str, bytes], path: Path) -> None:
             old = path.rename(temporary.with_suffix(".old"))
         temporary.rename(path)
     except OSError as error:
-        if old is not None:
-            old.rename(path)
-            old = None
         raise OutputError(f"cannot write {path}: {reason_of(error)}") from error
     finally:
+        # Whatever ended the block, an interrupt included: the old container is given up only for the new one.
+        if old is not None and not path.exists():
+            old.rename(path)
         for leftover in (temporary, old):
             if leftover is not None and leftover.exists():
                 shutil.rmtree(leftover)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Float64, Int, UInt8, UInt16
 
-from kissgs.errors import InvalidContainerError
+from kissgs.errors import InvalidContainerError, UnsupportedError
 from kissgs.progress import Progress, silent
 from kissgs.sogxt.container import Source, open_source
 from kissgs.sogxt.metadata import TILE_COLUMNS, TILE_ROWS, Layout
@@ -30,11 +30,22 @@ CHANNELS_OF_PLAIN = {"quaternions": 4, "scales": 3, "f_dc": 3, "opacities": 1}
 """Attributes that are one image of 8-bit levels each."""
 
 
-def decode(source: Path | bytes | Mapping[str, bytes], *, threads: int = 0, progress: Progress = silent) -> Splats:
+MAX_GAUSSIANS = 20_000_000
+"""By default: 5 GB of arrays. A container of a few kilobytes can declare more than any machine holds."""
+
+
+def decode(
+    source: Path | bytes | Mapping[str, bytes],
+    *,
+    max_gaussians: int = MAX_GAUSSIANS,
+    threads: int = 0,
+    progress: Progress = silent,
+) -> Splats:
     """Decode a container.
 
     Args:
         source: a folder, a zip file, the bytes of one, or files in memory.
+        max_gaussians: refuse more, before memory is taken for them.
         threads: to use; 0 means one per processor.
         progress: receives "decode" events.
 
@@ -43,11 +54,11 @@ def decode(source: Path | bytes | Mapping[str, bytes], *, threads: int = 0, prog
 
     Raises:
         InvalidContainerError: something in it is missing, damaged or impossible.
-        UnsupportedError: it uses images other than WebP.
+        UnsupportedError: it uses images other than WebP, or holds more than ``max_gaussians``.
     """
     with open_source(source) as files, Workers(threads) as pool:
         progress("decode", 0.0)
-        planes = _Planes(files, read_layout(files))
+        planes = _Planes(files, read_layout(files), max_gaussians)
         planes.load(pool)
         progress("decode", 0.5)
         splats = planes.look_up(pool)
@@ -64,10 +75,21 @@ class _Planes:
     labels: UInt8[np.ndarray, "cells 2"]
     codebook: Float32[np.ndarray, "entries D"]
 
-    def __init__(self, files: Source, layout: Layout) -> None:
-        self.files, self.layout = files, layout
+    def __init__(self, files: Source, layout: Layout, max_gaussians: int) -> None:
+        self.files, self.layout, self.max_gaussians = files, layout, max_gaussians
+        # Padding is less than half of any grid that follows the size rule, but for the smallest.
+        self.refuse_more_than(2 * max_gaussians + 64, layout.grid_side**2, "cells")
+        self.refuse_more_than(max_gaussians, layout.count or 0, "Gaussians")
         self.coefficients = SH_REST_COUNTS[layout.sh_degree]
         self.plain: dict[str, tuple[UInt8[np.ndarray, "cells C"], _Lookup]] = {}
+
+    def refuse_more_than(self, limit: int, found: int, what: str) -> None:
+        """Raise UnsupportedError if the container is larger than the caller wants to decode."""
+        if found > limit:
+            raise UnsupportedError(
+                f"the container has {found} {what}; with a limit of {self.max_gaussians} Gaussians, {limit} are read: "
+                "raise the limit (--max-gaussians) if you trust it"
+            )
 
     def load(self, pool: Workers) -> None:
         """Decode all images in parallel, the slowest first."""
@@ -136,6 +158,7 @@ class _Planes:
         declared = self.layout.count
         if declared not in (None, count):
             raise InvalidContainerError(f"active_mask.webp marks {count} Gaussians; the metadata declares {declared}")
+        self.refuse_more_than(self.max_gaussians, count, "Gaussians")
         # No cell numbers are needed where all padding is at the end.
         cells = None if mask[:count].all() else np.flatnonzero(mask)
         splats = _empty(count, self.coefficients)

@@ -19,8 +19,11 @@ from kissgs.sogxt.order import Grid, place
 from kissgs.sogxt.parallel import blas_workers
 from kissgs.sogxt.planes import compress_images
 from kissgs.sogxt.pras import choose_forms
-from kissgs.sogxt.quantize import Quantized, anchor, means_bits, quantize, quantize_means
+from kissgs.sogxt.quantize import Quantized, anchor, means_bits, quantize, quantize_means, tame
 from kissgs.splats import NOTHING_CLEANED, SH_REST_COUNTS, Cleaned, Splats
+
+OUTLIERS = 1e-4
+"""Share of base colours, at either end of a channel, that may be pulled in to keep the others' step."""
 
 INVISIBLE_LOGIT = -5.5373
 """Logit of opacity 1/255, rounded up: no renderer draws what is this faint or fainter."""
@@ -35,6 +38,7 @@ class Encoded:
         order: ``(M,)`` for every Gaussian of the container, in its order, the index in the scene that was encoded.
         form_error: largest relative change of a covariance by the choice of its equivalent form.
         dropped: number of Gaussians left out because they are invisible.
+        tamed: number of Gaussians whose base colour, an outlier, was pulled in (:func:`kissgs.sogxt.quantize.tame`).
         half_steps: largest error that quantisation may cause, per field and channel, in the field's own unit
             (positions: of their signed logarithm; f_rest_centroids: of the codebook's entries).
     """
@@ -43,6 +47,7 @@ class Encoded:
     order: Int[np.ndarray, " M"]
     form_error: float
     dropped: int
+    tamed: int
     half_steps: dict[str, list[float]]
 
 
@@ -60,7 +65,7 @@ def encode(
     Args:
         splats: the scene.
         settings: see :class:`EncodeSettings`.
-        importance: ``(N,)``, positive: how much an error in the colour of each Gaussian counts when the SH codebook is
+        importance: ``(N,)``, from 0: how much an error in the colour of each Gaussian counts when the SH codebook is
             built; by default from opacity and size.
         cleaned: what was mended before, for the metadata.
         threads: to use; 0 means one per processor. The bytes do not depend on it.
@@ -80,6 +85,7 @@ def encode(
         grid = place(splats.means, kept, bits, settings, pool, _stage(progress, "order"))
         # Padding repeats Gaussians of the scene; a scene without any lends it a neutral one.
         shown, cells = (splats, grid.cells) if len(kept) else (_neutral(splats.sh_degree), grid.cells * 0)
+        sh0 = tame(shown.sh0, step=settings.sh0_step, share=OUTLIERS) if settings.shared_steps else shown.sh0
         quats, scales, form_error = choose_forms(shown, cells, grid.side, settings, pool, _stage(progress, "forms"))
         codebook = fit_codebook(shown, cells[grid.mask], importance, settings, pool, progress)
         fields = {
@@ -87,12 +93,13 @@ def encode(
             "opacities": _quantize(shown.opacities[cells, None], settings.opacity_step, settings),
             "scales": _quantize(scales, settings.scale_step, settings),
             "quaternions": _quantize(quats, settings.quat_step, settings, paper_top=99),
-            "f_dc": _quantize(shown.sh0[cells], settings.sh0_step, settings),
+            "f_dc": _quantize(sh0[cells], settings.sh0_step, settings),
             "f_rest_centroids": codebook.centroids,
         }
         images = _draw(fields, grid, codebook)
         files = compress_images(images, settings, pool, _stage(progress, "images"))
 
+    tamed = int((sh0 != shown.sh0).any(axis=1).sum())
     layout = metadata.Layout(
         grid_side=grid.side,
         codebook_side=codebook.side,
@@ -103,7 +110,7 @@ def encode(
             sh_degree=splats.sh_degree,
             count=len(kept),
             source_count=len(splats) + cleaned.removed,
-            changed={"invisible": len(splats) - len(kept), **cleaned.as_dict()},
+            changed={"invisible": len(splats) - len(kept), "tamed_colours": tamed, **cleaned.as_dict()},
             settings=settings.model_dump(),
             sha256={name: hashlib.sha256(data).hexdigest() for name, data in files.items()},
         ),
@@ -114,6 +121,7 @@ def encode(
         order=grid.cells[grid.mask],
         form_error=form_error,
         dropped=len(splats) - len(kept),
+        tamed=tamed,
         half_steps={name: _half_steps(field, bits if name == "means" else 16) for name, field in fields.items()},
     )
 
@@ -129,9 +137,9 @@ def load_kernels(progress: Progress = silent) -> None:
 def _check_importance(importance: Float32[np.ndarray, " N"] | None, count: int) -> None:
     if importance is None:
         return
-    if importance.shape != (count,) or not (np.isfinite(importance) & (importance > 0)).all():
+    if importance.shape != (count,) or not (np.isfinite(importance) & (importance >= 0)).all():
         raise InvalidSceneError(
-            f"importance must be {count} positive numbers, one per Gaussian; it has shape {importance.shape}"
+            f"importance must be {count} finite numbers from 0, one per Gaussian; it has shape {importance.shape}"
         )
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int, Int32
 
 from kissgs.sogxt.parallel import Workers
+from kissgs.sogxt.quantize import tame
 
 BLOCK = 1024
 """Vectors per matrix product: its result, against a few thousand centroids, stays in the processor's cache."""
@@ -26,6 +27,9 @@ COARSE_ROUNDS = 6
 SPLIT_ROUNDS = 4
 SAMPLES_PER_COARSE = 64
 MAX_COARSE = 512
+
+OUTLIERS = 1e-3
+"""Share of entries, at either end of a dimension, that may be pulled in to keep the others' step."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,9 +264,11 @@ def _round_to_lattice(centroids: np.ndarray, step: float, tolerance: float) -> f
     Returns:
         The step: the one asked for, or what 256 levels and the tolerance ask for, if that is larger.
     """
-    wide = centroids.astype(np.float64)
+    step = max(step, 2 * tolerance)
+    # Few vectors have no outliers, and an exact codebook has no error that would tell the step.
+    wide = (tame(centroids, step=step, share=OUTLIERS) if step > 2 * tolerance else centroids).astype(np.float64)
     low = wide.min(axis=0)
-    step = max(step, 2 * tolerance, float((wide - low).max()) / 254)
+    step = max(step, float((wide - low).max()) / 254)
     if step > 0:
         centroids[:] = low + np.rint((wide - low) / step) * step
     return step

@@ -33,12 +33,12 @@ class Provenance(BaseModel):
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
-    version: str = Field(description="Version of kissgs that wrote the container.")
+    version: str = Field(pattern=r"^[\w.+-]{1,40}$", description="Version of kissgs that wrote the container.")
     sh_degree: int = Field(ge=0, le=3, description="SH degree of the scene; coefficients of higher bands are zero.")
     count: int = Field(ge=0, description="Number of Gaussians: active cells of the mask.")
     source_count: int = Field(ge=0, description="Number of Gaussians in the scene that was encoded.")
     changed: dict[str, int] = Field(default_factory=dict, description="Gaussians left out or mended, by reason.")
-    settings: dict[str, Any] = Field(default_factory=dict, description="Encoder settings.")
+    settings: dict[str, bool | int | float | str | None] = Field(default_factory=dict, description="Of the encoder.")
     sha256: dict[str, str] = Field(default_factory=dict, description="SHA-256 of each image file, hexadecimal.")
 
 

@@ -21,6 +21,9 @@ MAX_METADATA_BYTES = 1 << 20
 MAX_YAML_DEPTH = 50
 """Ours is nested 6 deep. libyaml composes by recursion, which no limit of Python's stops before the stack ends."""
 
+MAX_YAML_ALIASES = 20
+"""Dumpers write one where two fields share a list; a few thousand would take hours to follow."""
+
 MAX_SIGNED_LOG = 88.7
 """e to more than this is beyond float32."""
 
@@ -89,15 +92,17 @@ def _from_yaml(data: bytes) -> dict[str, Any]:
 
 
 def _check_nesting(events: Iterable[yaml.Event]) -> None:
-    """Raise YAMLError for documents that a few bytes make deep, or, by merge keys that double, endless."""
-    depth = 0
+    """Raise YAMLError for documents that a few bytes make deep, or, by aliases and merge keys, endless."""
+    depth = aliases = 0
     for event in events:
+        aliases += isinstance(event, yaml.AliasEvent)
         if isinstance(event, yaml.CollectionStartEvent):
             depth += 1
         elif isinstance(event, yaml.CollectionEndEvent):
             depth -= 1
-        if depth > MAX_YAML_DEPTH or (isinstance(event, yaml.ScalarEvent) and event.value == "<<"):
-            raise yaml.YAMLError("nested too deep, or with merge keys")
+        merges = isinstance(event, yaml.ScalarEvent) and event.value == "<<"
+        if merges or depth > MAX_YAML_DEPTH or aliases > MAX_YAML_ALIASES:
+            raise yaml.YAMLError("nested too deep, or with too many aliases or merge keys")
 
 
 def _ranges_of(op: Mapping[str, Any]) -> Iterator[tuple[str, tuple[list[Any], list[Any]]]]:
@@ -115,8 +120,7 @@ def _from_json(data: bytes) -> dict[str, Any]:
     """The fields of :class:`Layout` out of ``meta.json``."""
     try:
         document = json.loads(data)
-        if document.get("format", "sog-xt") != "sog-xt":
-            raise InvalidContainerError(f"{JSON_NAME} is of the format {document['format']!r}, not 'sog-xt'")
+        _check_dialect(document)
         keys = {"opacities": "opacities", "means": "means", "scales": "scales", "quats": "quaternions", "sh0": "f_dc"}
         ranges = {
             field: (_spread(document[key]["mins"], CHANNELS[field]), _spread(document[key]["maxs"], CHANNELS[field]))
@@ -132,12 +136,24 @@ def _from_json(data: bytes) -> dict[str, Any]:
             "grid_side": document["gridSide"],
             "codebook_side": rest["centroidSide"],
             "ranges": ranges,
-            "provenance": {"count": count, "source_count": count, **made} if isinstance(made, dict) else made,
+            "provenance": {"source_count": count, **made, "count": count} if isinstance(made, dict) else made,
         }
     except (ValueError, RecursionError) as error:
         raise InvalidContainerError(f"{JSON_NAME} is not readable JSON") from error
     except (KeyError, TypeError, AttributeError, IndexError) as error:
         raise InvalidContainerError(f"{JSON_NAME} lacks something that a SOG-XT container has: {error}") from error
+
+
+def _check_dialect(document: Mapping[str, Any]) -> None:
+    """Refuse what would decode without complaint, and wrong."""
+    for name, found, known in (
+        ("format", document.get("format", "sog-xt"), "sog-xt"),
+        ("version", document.get("version", 3), 3),
+        ("quats.encoding", document["quats"].get("encoding", "direct"), "direct"),
+        ("shN.layout", document["shN"].get("layout", "uv-codebook"), "uv-codebook"),
+    ):
+        if found != known:
+            raise UnsupportedError(f"{JSON_NAME}: {name} is {found!r}; only {known!r} is read")
 
 
 def _require_webp(codec: object) -> None:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
+
+from threadpoolctl import threadpool_limits
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -17,7 +20,7 @@ class Workers:
 
     def __init__(self, threads: int) -> None:
         """``threads`` below 1 means all the processors this process may use."""
-        self.threads = threads if threads >= 1 else len(os.sched_getaffinity(0))
+        self.threads = threads if threads >= 1 else _processors()
         self._pool = ThreadPoolExecutor(self.threads)
 
     def map(
@@ -41,13 +44,36 @@ class Workers:
         self._pool.shutdown(wait=False, cancel_futures=True)
 
 
+def _processors() -> int:
+    """How many this process may use, where the system can say; how many there are, where it cannot."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+_blas_lock = threading.Lock()
+_blas_users = 0
+_blas_limits: threadpool_limits | None = None
+
+
 @contextlib.contextmanager
 def blas_workers(threads: int) -> Iterator[Workers]:
     """Workers during whose time BLAS runs single-threaded in this process.
 
-    Each call is then one task of the pool, and its result the same whatever the number of threads.
+    Each call is then one task of the pool, and its result the same whatever the number of threads. Several may be open
+    at once: the last one to close gives BLAS its threads back.
     """
-    from threadpoolctl import threadpool_limits
-
-    with threadpool_limits(1, user_api="blas"), Workers(threads) as pool:
-        yield pool
+    global _blas_users, _blas_limits  # noqa: PLW0603  the state of BLAS is the process's
+    with _blas_lock:
+        _blas_users += 1
+        if _blas_limits is None:
+            _blas_limits = threadpool_limits(1, user_api="blas")
+    try:
+        with Workers(threads) as pool:
+            yield pool
+    finally:
+        with _blas_lock:
+            _blas_users -= 1
+            if _blas_users == 0 and _blas_limits is not None:
+                _blas_limits.restore_original_limits()
+                _blas_limits = None

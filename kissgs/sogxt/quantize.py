@@ -61,6 +61,25 @@ def quantize(values: Float[np.ndarray, "N C"], *, step: float, shared: bool = Tr
     return Quantized(_levels(wide, low, high, top).astype(np.uint8), low, high, top)
 
 
+def tame(values: Float[np.ndarray, "N C"], *, step: float, share: float) -> Float[np.ndarray, "N C"]:
+    """Pull in outliers that 256 levels of ``step`` cannot span, so that they do not make the step coarse for all.
+
+    Nothing happens where the levels suffice. Else each channel keeps the span of all but the outermost ``share`` of its
+    values at either end, or as much as the levels span if that is more, and values beyond it move to its ends.
+    """
+    low, high = values.min(axis=0, initial=np.inf), values.max(axis=0, initial=-np.inf)
+    if len(values) == 0 or float((high.astype(np.float64) - low).max(initial=0)) <= 255 * step:
+        return values
+    inner_low = np.quantile(values, share, axis=0, method="lower").astype(np.float64)
+    inner_high = np.quantile(values, 1 - share, axis=0, method="higher").astype(np.float64)
+    span = max(float((inner_high - inner_low).max()), 255 * step)
+    middle = (inner_low + inner_high) / 2
+    # As much of the room beside the inner values as is needed, on the side where it is needed.
+    first = np.clip(low, middle - span / 2, None)
+    last = np.clip(high, None, middle + span / 2)
+    return np.clip(values, first.astype(values.dtype), last.astype(values.dtype))
+
+
 def quantize_means(means: Float32[np.ndarray, "N 3"], *, bits: int) -> Quantized:
     """Positions as 16-bit levels of their signed logarithm, with one range for all three axes.
 

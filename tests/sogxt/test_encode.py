@@ -267,12 +267,10 @@ def test_importance_moves_the_error_to_where_it_matters_less():
     assert errors["first"] < 0.7 * errors["last"]
 
 
-@pytest.mark.parametrize(
-    "importance", [np.ones(9), np.zeros(10), -np.ones(10), np.full(10, np.nan), np.full(10, np.inf)]
-)
+@pytest.mark.parametrize("importance", [np.ones(9), -np.ones(10), np.full(10, np.nan), np.full(10, np.inf)])
 def test_impossible_importance_is_refused(importance):
     scene = random_scene(10, 1)
-    with pytest.raises(InvalidSceneError, match="importance must be 10 positive numbers, one per Gaussian"):
+    with pytest.raises(InvalidSceneError, match="importance must be 10 finite numbers from 0, one per Gaussian"):
         encode(scene, Settings().encode, importance=importance.astype(np.float32))
 
 

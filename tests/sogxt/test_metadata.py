@@ -292,8 +292,21 @@ JSON_ERRORS = [
     (lambda meta: meta["sh0"].update(mins="low"), "meta.json: ranges.f_dc.0.0: input should be a valid number"),
     (lambda meta: meta.update(gridSide=0), "meta.json: grid_side: input should be greater than or equal to 1"),
     (lambda meta: meta.update(gridSide=13377), "meta.json: grid_side: input should be less than or equal to 13376"),
-    (lambda meta: meta.update(format="sog"), "meta.json is of the format 'sog', not 'sog-xt'"),
 ]
+
+DIALECTS = [
+    (lambda meta: meta.update(format="sog"), "meta.json: format is 'sog'; only 'sog-xt' is read"),
+    (lambda meta: meta.update(version=99), "meta.json: version is 99; only 3 is read"),
+    (lambda meta: meta["quats"].update(encoding="x"), "meta.json: quats.encoding is 'x'; only 'direct' is read"),
+    (lambda meta: meta["shN"].update(layout="x"), "meta.json: shN.layout is 'x'; only 'uv-codebook' is read"),
+]
+
+
+@pytest.mark.parametrize(("change", "sentence"), DIALECTS)
+def test_other_dialects_are_not_decoded_to_nonsense(change, sentence):
+    with pytest.raises(UnsupportedError) as caught:
+        read_layout(MemorySource(with_json(change)))
+    assert str(caught.value) == sentence
 
 
 @pytest.mark.parametrize(("change", "sentence"), JSON_ERRORS)

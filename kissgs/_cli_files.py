@@ -1,0 +1,146 @@
+"""What the commands share: which files come in, where results go, and what one failure among several means."""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from kissgs.errors import InvalidSceneError, KissgsError, OutputError, UnsupportedError
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+
+def each(
+    names: list[str],
+    output: Path | None,
+    suffix: str,
+    as_json: bool,
+    work: Callable[[str, Path], dict[str, Any]],
+    *,
+    writes: bool = True,
+) -> None:
+    """Do ``work`` for every input. Where one of several fails, the others are done all the same; then it is exit 2."""
+    inputs = expand(names)
+    if writes and as_json and str(output) == "-":
+        raise OutputError("--json and -o - would both write to standard output; choose one")
+    targets = _targets(inputs, output, suffix) if writes else [Path("-")] * len(inputs)
+    if len(inputs) == 1:
+        report = work(inputs[0], targets[0])
+        if as_json:
+            print_json(_entry(inputs[0], targets[0], writes, report))
+        return
+    reports, failed = [], False
+    for name, target in zip(inputs, targets, strict=True):
+        try:
+            reports.append(_entry(name, target, writes, work(name, target)))
+        except KissgsError as error:
+            failed = True
+            reports.append({"input": name, "error": {"code": error.code, "message": str(error)}})
+            sys.stderr.write(f"kissgs: {error}\n")
+    if as_json:
+        print_json(reports)
+    if failed:
+        raise typer.Exit(2)
+
+
+def _entry(name: str, target: Path, writes: bool, report: dict[str, Any]) -> dict[str, Any]:
+    return {"input": name, **({"output": str(target)} if writes else {}), **report}
+
+
+def _targets(inputs: list[str], output: Path | None, suffix: str) -> list[Path]:
+    """Where each result goes: beside its input, or as ``output`` says, which is one file only if it looks like one."""
+    if "-" in inputs and (len(inputs) > 1 or output is None):
+        raise OutputError("standard input has no name and comes alone; say where to write with -o")
+    if output is not None and (str(output) == "-" or (suffix and output.suffix.lower() == suffix)):
+        if len(inputs) > 1:
+            raise OutputError(f"{len(inputs)} inputs cannot all become {output}; name a folder with -o")
+        return [output]
+    if output is not None and "-" in inputs:
+        raise OutputError(f"{output} is taken for a folder, and standard input has no name; write -o NAME{suffix}")
+    if output is not None:
+        make_folder(output)
+    targets = []
+    for name in inputs:
+        path = Path(name).absolute()
+        stem = path.name if path.is_dir() else path.stem
+        if not stem:
+            raise OutputError(f"{name} has no name to call the result after; say where to write with -o")
+        folder = output if output is not None else Path(name).parent
+        targets.append(folder / (stem + (suffix or ".container")))
+    if len(set(targets)) < len(targets):
+        raise OutputError("two inputs have the same name and would become one file; convert them one by one")
+    return targets
+
+
+def source(name: str) -> Path | bytes:
+    """A path, or what comes in on standard input."""
+    if name != "-":
+        return Path(name)
+    if sys.stdin is None:
+        raise InvalidSceneError("standard input is closed; there is nothing to read")
+    return sys.stdin.buffer.read()
+
+
+def make_folder(folder: Path) -> None:
+    from kissgs.io.atomic import reason_of
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        raise OutputError(f"cannot make the folder {folder}: {reason_of(error)}") from error
+
+
+def expand(names: list[str]) -> list[str]:
+    """Patterns that the shell has not expanded, expanded."""
+    found: list[str] = []
+    for name in names:
+        if not glob.has_magic(name) or Path(name).exists():
+            found.append(name)
+            continue
+        matches = sorted(glob.glob(name))  # noqa: PTH207  Path.glob takes no absolute patterns
+        if not matches:
+            raise UnsupportedError(f"no file matches {name}")
+        found.extend(matches)
+    return found
+
+
+@contextlib.contextmanager
+def stdout() -> Iterator[None]:
+    """Writing to standard output, which may be full or gone."""
+    if sys.stdout is None:
+        raise OutputError("standard output is closed; there is nowhere to write to")
+    try:
+        yield
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os._exit(128 + signal.SIGPIPE)  # whoever read it has seen enough
+    except OSError as error:
+        from kissgs.io.atomic import reason_of
+
+        raise OutputError(f"cannot write to standard output: {reason_of(error)}") from error
+
+
+def write_stdout(data: bytes) -> None:
+    with stdout():
+        sys.stdout.buffer.write(data)
+
+
+def show(what: RenderableType) -> None:
+    from kissgs._console import output
+
+    with stdout():
+        output().print(what)
+
+
+def print_json(report: object) -> None:
+    write_stdout((json.dumps(report, indent=2) + "\n").encode())
