@@ -30,6 +30,12 @@ class EncodeSettings(BaseModel):
         "hilbert",
         description="Which Gaussian sits where: along a 3D Hilbert curve (fast, smallest) or by PLAS (the paper).",
     )
+    plas_start_radius: int | None = Field(
+        None,
+        ge=1,
+        description="Where order is plas: start from the Hilbert curve and sort only within this radius; auto: from "
+        "a random order, as the paper.",
+    )
     forms: Literal["upright", "smooth"] = Field(
         "upright",
         description="Which of 48 equivalent rotations is stored: the one nearest to none (fast, smallest), or the one "
@@ -50,7 +56,7 @@ class EncodeSettings(BaseModel):
         0.04,
         gt=0,
         le=1,
-        description="Largest error of a position, as a share of the size of the scene's median Gaussian. Used unless "
+        description="Largest error of the scene's median Gaussian's position, as a share of its size; used unless "
         "means_bits is set.",
     )
     opacity_step: Step = Field(0.15, description="Step of opacity logits; half of it is the largest error.")

@@ -79,15 +79,17 @@ def _plas_order(
     pool: Workers,
     report: Callable[[float], None],
 ) -> tuple[Int[np.ndarray, " cells"], Bool[np.ndarray, " cells"]]:
-    """Cells sorted by PLAS on both position bytes, from a random start; padding is sorted along with the rest."""
+    """Cells sorted by PLAS on both position bytes; padding is sorted along with the rest."""
     count = len(levels)
     rng = np.random.Generator(np.random.PCG64(settings.seed))
     padding = rng.integers(0, count, side * side - count)
-    start = rng.permutation(side * side)
-    index = np.concatenate([np.arange(count), padding])[start]
+    index = np.concatenate([np.arange(count), padding])
+    radius = settings.plas_start_radius
+    start = rng.permutation(side * side) if radius is None else hilbert_order(levels[index])
+    index = index[start]
     high, low = (_standardized(part) for part in (levels[index] >> 8, levels[index] & 255))
     items = np.concatenate([PLAS_HIGH * high, PLAS_LOW * low], axis=1).astype(np.float32)
-    placed = plas(items, pool, seed=settings.seed, decay=settings.plas_decay, report=report)
+    placed = plas(items, pool, seed=settings.seed, decay=settings.plas_decay, start_radius=radius, report=report)
     return index[placed], start[placed] < count
 
 

@@ -1,0 +1,86 @@
+"""Containers that declare more than they should; oracle: how much memory there is to take."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from codec_scenes import peak_memory, random_scene
+
+import kissgs
+from kissgs.errors import OutputError, UnsupportedError
+from kissgs.settings import EncodeSettings
+from kissgs.sogxt import container
+from kissgs.sogxt.encode import encode
+from kissgs.sogxt.names import PLANES
+from kissgs.sogxt.planes import encode_plane
+
+
+def bomb(side):
+    """A small container of a large scene: all planes constant."""
+    scene = random_scene(1, 3)
+    files = dict(encode(scene, EncodeSettings(drop_invisible=False)).files)
+    for name in PLANES:
+        if "centroids" not in name:
+            channels = {"quaternions.webp": 4, "active_mask.webp": 1, "opacities.webp": 1}.get(name, 3)
+            files[name] = encode_plane(np.ones((side, side, channels), np.uint8), quality=0, method=0)
+    text = files["container_meta.yaml"].decode().split("kissgs:")[0]
+    files["container_meta.yaml"] = text.replace("grid_side: 8", f"grid_side: {side}").encode()
+    return files
+
+
+def test_more_gaussians_than_the_limit_are_refused_before_memory_is_taken():
+    files = bomb(512)
+    assert sum(map(len, files.values())) < 20_000
+
+    def refused():
+        with pytest.raises(UnsupportedError, match=r"262144 Gaussians; .* raise the limit"):
+            kissgs.decompress(files, max_gaussians=200_000)
+
+    assert peak_memory(refused) < 30e6
+    assert len(kissgs.decompress(files, max_gaussians=262_144)) == 262_144
+
+
+def test_a_grid_far_beyond_the_limit_is_refused_before_its_images_are_read():
+    files = bomb(512)
+    with pytest.raises(UnsupportedError, match="262144 cells"):
+        kissgs.decompress({**files, "active_mask.webp": b"not even an image"}, max_gaussians=1000)
+
+
+def test_a_swap_that_is_interrupted_leaves_the_old_container(tmp_path, monkeypatch):
+    """An interrupt between the two renames once deleted the old folder as well as the new one."""
+    folder, files = tmp_path / "folder", dict(encode(random_scene(5, 0), EncodeSettings()).files)
+    container.write_container(files, folder)
+    rename = type(folder).rename
+
+    def interrupted(self, target):
+        if self.suffix == ".part":
+            raise KeyboardInterrupt
+        return rename(self, target)
+
+    monkeypatch.setattr(type(folder), "rename", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        container.write_container(files, folder, overwrite=True)
+    assert sorted(entry.name for entry in folder.iterdir()) == sorted(files)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["folder"]
+    monkeypatch.undo()
+    with pytest.raises(OutputError, match="exists already"):
+        container.write_container(files, folder)
+
+
+@pytest.mark.parametrize(("field", "value"), [("sh0", 1000), ("shN", 1000), ("shN", 30)])
+def test_one_outlier_does_not_spoil_the_colours_of_all_others(field, value):
+    """One colour of 1000 among thousands once made the step of all others a hundred times coarser."""
+    scene = kissgs.sample_scene(20_000)
+    spoilt = getattr(scene, field).copy()
+    spoilt[7].flat[0] = value
+    clean, dirty = (
+        kissgs.compress(splats, settings=kissgs.Settings(preset="fast"))
+        for splats in (scene, dataclasses.replace(scene, **{field: spoilt}))
+    )
+    errors = []
+    for result in (clean, dirty):
+        others = result.order != 7
+        found = getattr(kissgs.decompress(result.files), field)[others]
+        errors.append(np.sqrt(np.mean((found - getattr(scene, field)[result.order[others]]) ** 2)))
+    assert errors[1] < 1.05 * errors[0]
+    assert dirty.report.tamed_colours == (1 if field == "sh0" else 0)
