@@ -7,9 +7,10 @@ import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
-from threadpoolctl import threadpool_limits
+if TYPE_CHECKING:
+    from threadpoolctl import threadpool_limits
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -63,6 +64,8 @@ def blas_workers(threads: int) -> Iterator[Workers]:
     Each call is then one task of the pool, and its result the same whatever the number of threads. Several may be open
     at once: the last one to close gives BLAS its threads back.
     """
+    from threadpoolctl import threadpool_limits  # decoding does without
+
     global _blas_users, _blas_limits  # noqa: PLW0603  the state of BLAS is the process's
     with _blas_lock:
         _blas_users += 1
