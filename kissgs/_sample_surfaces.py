@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
+
+from kissgs._typing import Float32
 
 UV = Float32[np.ndarray, "M 2"]
 Rows = Float32[np.ndarray, "M 3"]

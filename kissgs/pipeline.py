@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Int
 
+from kissgs._typing import Float32, Int
 from kissgs.errors import InvalidContainerError, OutputError
 from kissgs.io.atomic import atomic_file, reason_of, refuse_existing
 from kissgs.io.ply import read_ply, write_ply

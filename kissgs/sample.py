@@ -10,9 +10,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32
 
 from kissgs._sample_surfaces import SHADOW_CASTERS, SURFACES, Column, Rows, Surface, f32, unit_sphere
+from kissgs._typing import Float32
 from kissgs.errors import UnsupportedError
 from kissgs.splats import ATTRIBUTES, OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN, SH_C0, SH_REST_COUNTS, Splats
 

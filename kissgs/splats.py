@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int
 
+from kissgs._typing import Bool, Float32, Int
 from kissgs.errors import InvalidSceneError
 
 SH_REST_COUNTS = (0, 3, 8, 15)

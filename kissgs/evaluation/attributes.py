@@ -8,8 +8,8 @@ from itertools import permutations, product
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64
 
+from kissgs._typing import Float, Float32, Float64
 from kissgs.errors import InvalidSceneError
 from kissgs.splats import SH_C0, SH_REST_COUNTS, Splats
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int
 
+from kissgs._typing import Float32, Float64, Int
 from kissgs.errors import InvalidSceneError, UnsupportedError
 from kissgs.evaluation.attributes import sigmoid
 from kissgs.splats import Splats

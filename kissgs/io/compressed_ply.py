@@ -7,8 +7,8 @@ may be absent, their ``f_rest_*``. Older files have no colour bounds: their colo
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float32, Float64, Shaped, UInt32
 
+from kissgs._typing import Float32, Float64, Shaped, UInt32
 from kissgs.errors import InvalidSceneError, UnsupportedError
 from kissgs.io.ply_body import BLOCK_ALIGNMENT, check_complete, rows
 from kissgs.io.ply_header import Element, Header, PlyFile, sh_degree

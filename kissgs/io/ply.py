@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float32
 
+from kissgs._typing import Float32
 from kissgs.errors import InvalidSceneError, UnsupportedError
 from kissgs.io.compressed_ply import check_compressed, is_compressed, read_compressed
 from kissgs.io.ply_body import check_complete, rows

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Int, UInt8
 
+from kissgs._typing import Float32, Int, UInt8
 from kissgs.progress import Progress
 from kissgs.settings import EncodeSettings
 from kissgs.sogxt import kmeans

@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int, UInt8, UInt16
 
+from kissgs._typing import Float32, Float64, Int, UInt8, UInt16
 from kissgs.errors import InvalidContainerError, UnsupportedError
 from kissgs.progress import Progress, silent
 from kissgs.sogxt.container import Source, open_source

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Int, UInt8
 
+from kissgs._typing import Float32, Int, UInt8
 from kissgs._version import __version__
 from kissgs.errors import InvalidSceneError
 from kissgs.progress import Progress, silent

@@ -15,8 +15,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int, Int32
 
+from kissgs._typing import Float32, Float64, Int, Int32
 from kissgs.sogxt.parallel import Workers
 from kissgs.sogxt.quantize import tame
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from math import isqrt
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int, UInt16
 
+from kissgs._typing import Bool, Float32, Int, UInt16
 from kissgs.errors import UnsupportedError
 from kissgs.settings import EncodeSettings
 from kissgs.sogxt.parallel import Workers

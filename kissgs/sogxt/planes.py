@@ -7,9 +7,9 @@ import struct
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from jaxtyping import UInt8
-from PIL import Image
+from PIL import Image, WebPImagePlugin
 
+from kissgs._typing import UInt8
 from kissgs.errors import InvalidContainerError
 from kissgs.settings import EncodeSettings
 from kissgs.sogxt.parallel import Workers
@@ -65,7 +65,8 @@ def decode_plane(data: bytes, name: str, *, width: int, height: int, channels: i
             f"{name} is {found[0]} x {found[1]} pixels; the metadata asks for {width} x {height}"
         )
     try:
-        with Image.open(io.BytesIO(data), formats=["WEBP"]) as picture:
+        # The class itself: Image.open first imports the plugins of all other formats.
+        with WebPImagePlugin.WebPImageFile(io.BytesIO(data)) as picture:
             picture.load()
             pixels = np.asarray(picture)
     except (OSError, ValueError, SyntaxError, EOFError, MemoryError) as error:

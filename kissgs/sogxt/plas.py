@@ -13,8 +13,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float32, Int32
 
+from kissgs._typing import Float32, Int32
 from kissgs.sogxt.parallel import Workers
 
 MIN_BLOCK = 8

@@ -14,8 +14,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int, UInt8
 
+from kissgs._typing import Float32, Float64, Int, UInt8
 from kissgs.settings import EncodeSettings
 from kissgs.sogxt.parallel import Workers
 from kissgs.sogxt.plas import box_blur

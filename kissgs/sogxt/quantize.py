@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from math import ceil
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int, UInt8, UInt16
 
+from kissgs._typing import Float, Float32, Float64, Int, UInt8, UInt16
 from kissgs.splats import Splats
 
 MEANS_TOP = 65_535
