@@ -66,7 +66,8 @@ def info_table(info: Info) -> RenderableType:
     kind = {"ply": "3DGS scene", "sog-xt": "SOG-XT container"}[info.kind]
     head = Text.assemble((info.path, "bold"), f"  {kind}, {size(info.bytes)}")
     body = f"{info.count:,} Gaussians, SH degree {info.sh_degree}, {info.bits_per_gaussian:.1f} bits each"
-    ranges = Table("attribute", _right("lowest"), _right("highest"), box=None, pad_edge=False)
+    what = "" if info.kind == "ply" else " level's value"  # channels share a step, so few reach the highest
+    ranges = Table("attribute", _right(f"lowest{what}"), _right(f"highest{what}"), box=None, pad_edge=False)
     for name, (low, high) in info.ranges.items():
         ranges.add_row(name, f"{low:.5g}", f"{high:.5g}")
     blocks: list[RenderableType] = [head, Text(body), ranges]

@@ -34,7 +34,8 @@ class Info:
         sh_degree: 0 to 3.
         bytes: of the file or the folder.
         parts: bytes per file of a container.
-        ranges: smallest and largest finite value per attribute, over its channels.
+        ranges: per attribute, over its channels, the smallest and largest finite value (``.ply``), or the values of the
+            lowest and highest level (container; where channels share a step, few reach the highest).
         changed: Gaussians that cleaning removes or mends (``.ply``), or that the encoder did (container), by reason.
         details: grid and codebook side, version and settings of the encoder (container).
     """
