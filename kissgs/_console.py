@@ -44,7 +44,10 @@ def progress_bar(quiet: bool) -> Iterator[Receiver]:
 
         def receive(stage: str, fraction: float) -> None:
             if stage == "kernels":
-                notice.start() if fraction == 0 else notice.cancel()
+                if fraction == 0:
+                    notice.start()
+                else:
+                    notice.cancel()
             bar.update(task, description=stage, completed=fraction)
 
         try:

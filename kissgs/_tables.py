@@ -64,6 +64,8 @@ def parts_table(parts: Mapping[str, int], count: int) -> Table:
 def info_table(info: Info) -> RenderableType:
     """What ``kissgs info`` shows."""
     kind = {"ply": "3DGS scene", "sog-xt": "SOG-XT container"}[info.kind]
+    if info.kind == "ply":
+        kind += f" ({info.details['encoding']}{', packed' if info.details['compressed'] else ''})"
     head = Text.assemble((info.path, "bold"), f"  {kind}, {size(info.bytes)}")
     body = f"{info.count:,} Gaussians, SH degree {info.sh_degree}, {info.bits_per_gaussian:.1f} bits each"
     what = "" if info.kind == "ply" else " level's value"  # channels share a step, so few reach the highest

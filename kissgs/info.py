@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from kissgs.errors import InvalidContainerError
-from kissgs.io.ply import read_ply
+from kissgs.io.ply import read_ply, read_ply_info
 from kissgs.pipeline import is_container
 from kissgs.sogxt.container import Source, open_source
 from kissgs.sogxt.metadata import CHANNELS, Layout
@@ -37,7 +37,8 @@ class Info:
         ranges: per attribute, over its channels, the smallest and largest finite value (``.ply``), or the values of the
             lowest and highest level (container; where channels share a step, few reach the highest).
         changed: Gaussians that cleaning removes or mends (``.ply``), or that the encoder did (container), by reason.
-        details: grid and codebook side, version and settings of the encoder (container).
+        details: encoding, and whether it is PlayCanvas' packed kind (``.ply``); grid and codebook side, version and
+            settings of the encoder (container).
     """
 
     path: str
@@ -70,7 +71,7 @@ def describe(path: Path) -> Info:
 
 
 def _describe_ply(path: Path) -> Info:
-    splats = read_ply(path)
+    header, splats = read_ply_info(path), read_ply(path)
     return Info(
         path=str(path),
         kind="ply",
@@ -80,7 +81,7 @@ def _describe_ply(path: Path) -> Info:
         parts={},
         ranges={name: _extremes(getattr(splats, name)) for name in ATTRIBUTES if getattr(splats, name).size},
         changed=clean(splats)[1].as_dict(),
-        details={},
+        details={"encoding": header.encoding, "compressed": header.compressed},
     )
 
 

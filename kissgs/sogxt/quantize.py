@@ -116,12 +116,6 @@ def means_bits(splats: Splats, kept: Int[np.ndarray, " M"], tolerance: float) ->
     return int(np.clip(np.ceil(np.log2(max(levels, 1))), 8, 16))
 
 
-def dequantize(quantized: Quantized) -> Float64[np.ndarray, "N C"]:
-    """The values that the levels stand for."""
-    low, high = quantized.low.astype(np.float64), quantized.high.astype(np.float64)
-    return low + quantized.levels * ((high - low) / quantized.top)
-
-
 def anchor(quantized: Quantized) -> tuple[Float32[np.ndarray, " C"], Float32[np.ndarray, " C"]]:
     """The ranges to write: values of the smallest and the largest level that occur in the image, over all channels.
 
