@@ -3,6 +3,7 @@
 KissgsError
 ├─ InvalidSceneError        a scene file, or the arrays handed in, are not a usable Gaussian scene
 ├─ InvalidContainerError    the bytes are not a valid SOG-XT container
+├─ InvalidViewsError        cameras or photographs that cannot be used: COLMAP, transforms.json, images
 ├─ UnsupportedError         valid input beyond a limit or a feature that kissgs does not have
 ├─ OutputError              the result could not be written: it exists already, no space, no permission
 └─ Cancelled                the caller stopped the work through its progress callback
@@ -29,6 +30,12 @@ class InvalidContainerError(KissgsError):
     """The bytes are not a valid SOG-XT container."""
 
     code = "invalid-container"
+
+
+class InvalidViewsError(KissgsError):
+    """Cameras or photographs that cannot be used."""
+
+    code = "invalid-views"
 
 
 class UnsupportedError(KissgsError):

@@ -14,6 +14,7 @@ import numpy as np
 from kissgs._sample_surfaces import SHADOW_CASTERS, SURFACES, Column, Rows, Surface, f32, unit_sphere
 from kissgs._typing import Float32
 from kissgs.errors import UnsupportedError
+from kissgs.spherical_harmonics import sh_basis
 from kissgs.splats import ATTRIBUTES, OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN, SH_C0, SH_REST_COUNTS, Splats
 
 
@@ -223,7 +224,7 @@ def _appearance(
         # A camera looking along d meets the light's mirror image where d points along ``mirrored``: a round lobe, whose
         # SH coefficients are the basis functions at its axis (addition theorem), damped band by band.
         mirrored = light.direction - 2 * facing[:, None] * normals
-        lobe = _sh_basis(mirrored, sh_degree) * np.exp(-band * (band + 1) * light.softness).astype(np.float32)
+        lobe = sh_basis(mirrored, sh_degree) * np.exp(-band * (band + 1) * light.softness).astype(np.float32)
         strength = surface.gloss * reach * np.clip(4 * facing, 0, 1)
         sh += lobe[:, :, None] * (strength[:, None] * light.colour)[:, None]
     return albedo * received, sh
@@ -252,28 +253,3 @@ def _sh_noise(n: int, sh_degree: int, rng: np.random.Generator) -> Float32[np.nd
     noise = 0.5 * rng.standard_normal((n, k, 3), np.float32) + 0.9 * rng.standard_normal((n, k, 1), np.float32)
     strength = 0.016 * np.exp(0.7 * rng.standard_normal((n, 1, 1), np.float32))
     return np.asarray(strength * noise[:, : SH_REST_COUNTS[sh_degree]])
-
-
-def _sh_basis(directions: Rows, degree: int) -> Float32[np.ndarray, "M K"]:
-    """Real spherical harmonics with the signs of 3DGS, at unit vectors."""
-    x, y, z = directions.T
-    xx, yy, zz = x * x, y * y, z * z
-    band0 = [np.full_like(x, SH_C0)]
-    band1 = [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
-    band2 = [
-        1.0925484305920792 * x * y,
-        -1.0925484305920792 * y * z,
-        0.31539156525252005 * (2 * zz - xx - yy),
-        -1.0925484305920792 * x * z,
-        0.5462742152960396 * (xx - yy),
-    ]
-    band3 = [
-        -0.5900435899266435 * y * (3 * xx - yy),
-        2.890611442640554 * x * y * z,
-        -0.4570457994644658 * y * (4 * zz - xx - yy),
-        0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
-        -0.4570457994644658 * x * (4 * zz - xx - yy),
-        1.445305721320277 * z * (xx - yy),
-        -0.5900435899266435 * x * (xx - 3 * yy),
-    ]
-    return np.stack([*band0, *band1, *band2, *band3][: (degree + 1) ** 2], axis=1)

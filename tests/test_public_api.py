@@ -16,6 +16,7 @@ PUBLIC = [
     "EncodeSettings",
     "InvalidContainerError",
     "InvalidSceneError",
+    "InvalidViewsError",
     "KissgsError",
     "OutputError",
     "Preset",

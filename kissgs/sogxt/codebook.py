@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from kissgs._typing import Float32, Int, UInt8
+from kissgs.parallel import Workers
 from kissgs.progress import Progress
 from kissgs.settings import EncodeSettings
 from kissgs.sogxt import kmeans
 from kissgs.sogxt.metadata import MAX_CODEBOOK_SIDE, TILE_COLUMNS, TILE_ROWS
-from kissgs.sogxt.parallel import Workers
 from kissgs.sogxt.plas import plas
 from kissgs.sogxt.quantize import Quantized, quantize
 from kissgs.splats import Splats

@@ -11,12 +11,12 @@ import numpy as np
 from kissgs._typing import Float32, Int, UInt8
 from kissgs._version import __version__
 from kissgs.errors import InvalidSceneError
+from kissgs.parallel import blas_workers
 from kissgs.progress import Progress, silent
 from kissgs.settings import EncodeSettings
 from kissgs.sogxt import metadata, names
 from kissgs.sogxt.codebook import Codebook, fit_codebook
 from kissgs.sogxt.order import Grid, place
-from kissgs.sogxt.parallel import blas_workers
 from kissgs.sogxt.planes import compress_images
 from kissgs.sogxt.pras import choose_forms
 from kissgs.sogxt.quantize import Quantized, anchor, means_bits, quantize, quantize_means, tame

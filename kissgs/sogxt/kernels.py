@@ -1,35 +1,13 @@
-"""Compiled inner loops of the encoder. Everything else of the codec is NumPy.
-
-Kernels have explicit signatures, so importing this module compiles them (about ten seconds, once) or loads them from
-the cache that numba keeps per user. They hold no GIL and start no threads: callers split the work. Constants are
-literals inside the functions, because the cache would not notice a changed global.
-"""
+"""Compiled inner loops of the encoder. Everything else of the codec is NumPy."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeVar, cast
-
 import numpy as np
-from numba import njit
 
-Kernel = TypeVar("Kernel", bound=Callable[..., Any])
-
-
-def _compiled(signature: str, **options: Any) -> Callable[[Kernel], Kernel]:  # noqa: ANN401
-    """numba's njit, cached where numba finds a folder that it may write, else compiled anew by every process."""
-
-    def decorate(function: Kernel) -> Kernel:
-        common = {"nogil": True, "error_model": "numpy", **options}
-        try:
-            return cast("Kernel", njit(signature, cache=True, **common)(function))
-        except RuntimeError:
-            return cast("Kernel", njit(signature, **common)(function))
-
-    return decorate
+from kissgs.compiled import compiled
 
 
-@_compiled("void(uint16[:, ::1], uint64[::1])")
+@compiled("void(uint16[:, ::1], uint64[::1])")
 def hilbert_keys(cells: np.ndarray, keys: np.ndarray) -> None:
     """Position of every cell ``(N, 3)`` uint16 along the 3D Hilbert curve of order 16, as ``(N,)`` uint64.
 
@@ -78,7 +56,7 @@ def hilbert_keys(cells: np.ndarray, keys: np.ndarray) -> None:
         keys[n] = key
 
 
-@_compiled("void(float32[:, ::1], float32[::1], int32[::1], float64[:, ::1], float64[::1])")
+@compiled("void(float32[:, ::1], float32[::1], int32[::1], float64[:, ::1], float64[::1])")
 def weighted_sums(
     vectors: np.ndarray, weights: np.ndarray, labels: np.ndarray, sums: np.ndarray, totals: np.ndarray
 ) -> None:
@@ -91,7 +69,7 @@ def weighted_sums(
             sums[label, c] += weight * vectors[n, c]
 
 
-@_compiled("void(float32[:, :, ::1], int64, float32[:, :, ::1], float64[:, ::1])")
+@compiled("void(float32[:, :, ::1], int64, float32[:, :, ::1], float64[:, ::1])")
 def box_blur_rows(image: np.ndarray, radius: int, out: np.ndarray, total: np.ndarray) -> None:
     """Mean over 2*radius+1 columns of every row of ``(H, W, C)``, wrapping around; ``total`` is ``(1, C)`` scratch."""
     height, width, channels = image.shape
@@ -110,7 +88,7 @@ def box_blur_rows(image: np.ndarray, radius: int, out: np.ndarray, total: np.nda
                 total[0, c] += np.float64(image[y, enter, c]) - np.float64(image[y, leave, c])
 
 
-@_compiled("void(float32[:, :, ::1], int64, float32[:, :, ::1], float64[:, ::1])")
+@compiled("void(float32[:, :, ::1], int64, float32[:, :, ::1], float64[:, ::1])")
 def box_blur_columns(image: np.ndarray, radius: int, out: np.ndarray, total: np.ndarray) -> None:
     """Mean over 2*radius+1 rows of every column of ``(H, W, C)``, mirrored at the borders without repeating the edge.
 
@@ -137,7 +115,7 @@ def box_blur_columns(image: np.ndarray, radius: int, out: np.ndarray, total: np.
                 total[x, c] += np.float64(image[enter, x, c]) - np.float64(image[leave, x, c])
 
 
-@_compiled("uint64(uint64)", inline="always")
+@compiled("uint64(uint64)", inline="always")
 def _mix(state: np.uint64) -> np.uint64:
     """One step of splitmix64: the same random numbers on every machine, whichever thread asks."""
     z = state + np.uint64(0x9E3779B97F4A7C15)
@@ -146,7 +124,7 @@ def _mix(state: np.uint64) -> np.uint64:
     return z ^ (z >> np.uint64(31))
 
 
-@_compiled("void(float32[:, ::1], int32[::1], float32[:, ::1], int32[::1], float64[::1])")
+@compiled("void(float32[:, ::1], int32[::1], float32[:, ::1], int32[::1], float64[::1])")
 def _sort_four(items: np.ndarray, placed: np.ndarray, target: np.ndarray, cells: np.ndarray, score: np.ndarray) -> None:
     """Put the four items that lie in ``cells`` where their scalar products with the targets there are largest.
 
@@ -187,7 +165,7 @@ def _sort_four(items: np.ndarray, placed: np.ndarray, target: np.ndarray, cells:
         placed[cells[b3]] = i3
 
 
-@_compiled("float64(float32[:, ::1], int32[::1], float32[:, ::1], int64[::1], uint64, float64)")
+@compiled("float64(float32[:, ::1], int32[::1], float32[:, ::1], int64[::1], uint64, float64)")
 def plas_blocks(
     items: np.ndarray, placed: np.ndarray, target: np.ndarray, tiling: np.ndarray, seed: np.uint64, threshold: float
 ) -> float:
@@ -237,7 +215,7 @@ def plas_blocks(
     return gained
 
 
-@_compiled("void(float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1], int64[:, ::1], uint8[::1])")
+@compiled("void(float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[:, ::1], int64[:, ::1], uint8[::1])")
 def nearest_forms(
     quats: np.ndarray,
     scales: np.ndarray,

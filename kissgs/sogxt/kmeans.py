@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kissgs._typing import Float32, Float64, Int, Int32
-from kissgs.sogxt.parallel import Workers
+from kissgs.parallel import Workers
 from kissgs.sogxt.quantize import tame
 
 BLOCK = 1024

@@ -14,8 +14,8 @@ import numpy as np
 
 from kissgs._typing import Bool, Float32, Int, UInt16
 from kissgs.errors import UnsupportedError
+from kissgs.parallel import Workers
 from kissgs.settings import EncodeSettings
-from kissgs.sogxt.parallel import Workers
 from kissgs.sogxt.plas import plas
 from kissgs.sogxt.quantize import quantize_means
 

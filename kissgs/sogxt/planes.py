@@ -11,8 +11,8 @@ from PIL import Image, WebPImagePlugin
 
 from kissgs._typing import UInt8
 from kissgs.errors import InvalidContainerError
+from kissgs.parallel import Workers
 from kissgs.settings import EncodeSettings
-from kissgs.sogxt.parallel import Workers
 
 HIGHEST_EFFORT = (100, 6)
 

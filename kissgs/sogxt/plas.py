@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 
 from kissgs._typing import Float32, Int32
-from kissgs.sogxt.parallel import Workers
+from kissgs.parallel import Workers
 
 MIN_BLOCK = 8
 MIN_CONFIGURATIONS = 4

@@ -16,8 +16,8 @@ from collections.abc import Callable
 import numpy as np
 
 from kissgs._typing import Float32, Float64, Int, UInt8
+from kissgs.parallel import Workers
 from kissgs.settings import EncodeSettings
-from kissgs.sogxt.parallel import Workers
 from kissgs.sogxt.plas import box_blur
 from kissgs.splats import Splats
 

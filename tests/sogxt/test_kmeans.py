@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kissgs import sample_scene
+from kissgs.parallel import blas_workers
 from kissgs.sogxt import kmeans
 from kissgs.sogxt.codebook import codebook_side
 from kissgs.sogxt.kmeans import MAX_COARSE, assign, fit
-from kissgs.sogxt.parallel import blas_workers
 
 
 def run(vectors, size, weights=None, threads=1, **options):

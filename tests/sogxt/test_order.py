@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kissgs.errors import UnsupportedError
+from kissgs.parallel import blas_workers
 from kissgs.settings import EncodeSettings, Settings
 from kissgs.sogxt.order import MAX_GRID_SIDE, grid_side, hilbert_order, place
-from kissgs.sogxt.parallel import blas_workers
 
 
 def walk(levels):

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from kissgs.parallel import blas_workers
 from kissgs.sogxt import kernels
-from kissgs.sogxt.parallel import blas_workers
 from kissgs.sogxt.plas import box_blur
 from kissgs.sogxt.pras import (
     PERMUTATIONS,

@@ -1,4 +1,4 @@
-"""Threads for the codec: plain ordered maps, so that results do not depend on how many threads there are."""
+"""Threads: plain ordered maps, so that results do not depend on how many threads there are."""
 
 from __future__ import annotations
 

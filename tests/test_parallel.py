@@ -6,7 +6,7 @@ import threading
 import pytest
 from threadpoolctl import threadpool_info
 
-from kissgs.sogxt.parallel import Workers, blas_workers
+from kissgs.parallel import Workers, blas_workers
 
 
 def blas_threads():

@@ -1,0 +1,81 @@
+"""``Camera``: a pinhole with a pose, in the conventions of COLMAP and gsplat."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kissgs._typing import Float64
+from kissgs.errors import InvalidViewsError
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """A pinhole camera: x right, y down, z forward; the centre of the first pixel is at (0.5, 0.5).
+
+    Attributes:
+        viewmat: ``(4, 4)`` float64, rigid transform from the world to the camera.
+        K: ``(3, 3)`` float64, intrinsics in pixels: fx, fy, cx, cy; no skew.
+        width: of the picture, pixels.
+        height: of the picture, pixels.
+
+    Raises:
+        InvalidViewsError: a matrix is not finite or not of that kind, a focal length or a side is not positive.
+    """
+
+    viewmat: Float64[np.ndarray, "4 4"]
+    K: Float64[np.ndarray, "3 3"]
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise InvalidViewsError(f"a camera's picture must be at least 1x1, not {self.width}x{self.height}")
+        for name, matrix, shape in (("viewmat", self.viewmat, (4, 4)), ("K", self.K, (3, 3))):
+            if matrix.shape != shape or not np.isfinite(matrix).all():
+                raise InvalidViewsError(f"a camera's {name} must be {shape[0]}x{shape[1]} finite numbers")
+        rotation = self.viewmat[:3, :3]
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
+            raise InvalidViewsError("a camera's viewmat must hold a rotation: orthonormal rows, no mirroring, no scale")
+        if not (self.K[0, 0] > 0 and self.K[1, 1] > 0):
+            raise InvalidViewsError("a camera's focal lengths must be positive")
+
+    @property
+    def position(self) -> Float64[np.ndarray, "3"]:
+        """Where it stands, in world units."""
+        return np.asarray(-self.viewmat[:3, :3].T @ self.viewmat[:3, 3])
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same view on another grid of pixels."""
+        scale = np.array([[width / self.width], [height / self.height], [1.0]])
+        return Camera(self.viewmat, self.K * scale, width, height)
+
+
+def look_at(
+    position: Float64[np.ndarray, "3"],
+    target: Float64[np.ndarray, "3"],
+    up: Float64[np.ndarray, "3"],
+    *,
+    fov: float,
+    width: int,
+    height: int,
+) -> Camera:
+    """A camera at ``position`` with ``target`` in the middle of its picture and ``up`` pointing up in it.
+
+    ``fov`` is the angle of view along the longer side, in radians. Where ``up`` is along the line of sight, any roll
+    may come out.
+    """
+    forward = target - position
+    forward = forward / max(float(np.linalg.norm(forward)), 1e-30)
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-6 * np.linalg.norm(up) or not np.any(up):
+        right = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
+    right = right / np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = rotation
+    viewmat[:3, 3] = -rotation @ position
+    focal = 0.5 * max(width, height) / np.tan(0.5 * fov)
+    K = np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]])
+    return Camera(viewmat, K, width, height)
