@@ -1,0 +1,317 @@
+"""Kernels: Gaussians over pixels, tile by tile. The picture, its derivative, and what a removal would change.
+
+A footprint's exponent is u² + v² with u = l0 dx + l1 dy, v = l2 dy (the Cholesky factor of half the inverse
+covariance): a sum of squares cannot go negative, and a needle costs no digits.
+
+The lists of tiles are read forward for the picture and backward for everything else. From the back, the colour B behind
+a Gaussian is known without subtracting: B <- B + alpha (colour - B), beginning with the background; and T before it is
+T after it / (1 - alpha). The pixel changes with the Gaussian's alpha by T (colour - B), and by alpha T (colour - B) if
+the Gaussian is removed.
+
+Inner loops run over whole rows of a tile, without branches, on one array, so that they become vector instructions.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from kissgs.compiled import compiled
+
+# Sums may be reordered, so that they can be vectorised: always in the same way.
+_FAST = {"contract", "reassoc", "nsz"}
+
+
+@njit(nogil=True, error_model="numpy", fastmath=_FAST, inline="always")
+def _exp_minus(s: np.float32) -> np.float32:
+    """exp(-s) for s from 0 to 6, relative error 1e-6; beyond 6, exp(-6), which is less than any alpha that shows."""
+    t = min(s, np.float32(6.0)) * np.float32(0.125)
+    e = np.float32(-0.00569869049)
+    e = e * t + np.float32(0.0395219925)
+    e = e * t + np.float32(-0.165825967)
+    e = e * t + np.float32(0.499846967)
+    e = e * t + np.float32(-0.999989536)
+    e = e * t + np.float32(0.99999988)
+    e *= e
+    e *= e
+    return e * e
+
+
+@compiled(
+    "void(float32[:, ::1], int32[::1], int64[::1], int64, int64, int64, int64, int64, float32[::1], float32[::1],"
+    " float32[:, :, ::1], float32[:, ::1], int32[:, ::1])",
+    fastmath=_FAST,
+)
+def blend(
+    splats: np.ndarray,
+    members: np.ndarray,
+    starts: np.ndarray,
+    first: int,
+    last: int,
+    width: int,
+    height: int,
+    columns: int,
+    limits: np.ndarray,
+    background: np.ndarray,
+    image: np.ndarray,
+    transmittance: np.ndarray,
+    stops: np.ndarray,
+) -> None:
+    """Draw tiles ``first`` to ``last`` (exclusive).
+
+    Args:
+        splats: ``(M, 12)`` records of :func:`kissgs.rendering.cpu.projection.project`.
+        members: for each tile, front to back, the rows of ``splats`` that touch it.
+        starts: where each tile's members begin; one more than there are tiles.
+        first: tile.
+        last: tile.
+        width: pixels.
+        height: pixels.
+        columns: tiles per row.
+        limits: ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN.
+        background: RGB.
+        image: ``(H, W, 3)``, written.
+        transmittance: ``(H, W)`` left at the end, written.
+        stops: ``(tiles, 256)``, written: members from this one on were not drawn at the pixel.
+    """
+    alpha_min, alpha_max, t_min = limits[0], limits[1], limits[2]
+    zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
+    # One array for all that a pixel has, or the compiler would have to fear that the arrays overlap.
+    s = np.empty(7 * 256, np.float32)
+    for p in range(256):
+        s[p], s[256 + p] = np.float32(p & 15) + half, np.float32(p >> 4) + half
+    for tile in range(first, last):
+        x0, y0 = (tile % columns) * 16, (tile // columns) * 16
+        begin, end = starts[tile], starts[tile + 1]
+        for p in range(256):
+            inside = x0 + (p & 15) < width and y0 + (p >> 4) < height
+            s[512 + p] = np.float32(end - begin) if inside else zero
+            s[768 + p] = one
+            s[1024 + p] = s[1280 + p] = s[1536 + p] = zero
+        for i in range(begin, end):
+            n = members[i]
+            mx, my = splats[n, 0] - np.float32(x0), splats[n, 1] - np.float32(y0)
+            l0, l1, l2 = splats[n, 2], splats[n, 3], splats[n, 4]
+            opacity, red, green, blue = splats[n, 5], splats[n, 6], splats[n, 7], splats[n, 8]
+            reach = splats[n, 10]
+            top = np.uint64(min(max(my - reach - half, zero), np.float32(16)))
+            bottom = np.uint64(min(max(my + reach + half, zero), np.float32(16)))
+            place = np.float32(i - begin)
+            for p in range(top * np.uint64(16), bottom * np.uint64(16)):
+                dx, dy = s[p] - mx, s[p + np.uint64(256)] - my
+                u, v = l0 * dx + l1 * dy, l2 * dy
+                alpha = min(opacity * _exp_minus(u * u + v * v), alpha_max)
+                alpha = alpha if alpha >= alpha_min else zero
+                alpha = alpha if place < s[p + np.uint64(512)] else zero
+                t = s[p + np.uint64(768)]
+                after = t * (one - alpha)
+                ends = after <= t_min
+                weight = zero if ends else alpha * t
+                s[p + np.uint64(512)] = place if ends else s[p + np.uint64(512)]
+                s[p + np.uint64(768)] = t if ends else after
+                s[p + np.uint64(1024)] += weight * red
+                s[p + np.uint64(1280)] += weight * green
+                s[p + np.uint64(1536)] += weight * blue
+            if (i & 7) == 7:
+                furthest = zero
+                for p in range(512, 768):
+                    furthest = max(furthest, s[p])
+                if furthest <= place:
+                    break
+        for p in range(256):
+            x, y = x0 + (p & 15), y0 + (p >> 4)
+            stops[tile, p] = np.int32(s[512 + p])
+            if x < width and y < height:
+                image[y, x, 0] = s[1024 + p] + s[768 + p] * background[0]
+                image[y, x, 1] = s[1280 + p] + s[768 + p] * background[1]
+                image[y, x, 2] = s[1536 + p] + s[768 + p] * background[2]
+                transmittance[y, x] = s[768 + p]
+
+
+@compiled(
+    "void(float32[:, ::1], int32[::1], int32[::1], int64[::1], int64, int64, int64, float32[::1], float32[::1],"
+    " float32[:, ::1], int32[:, ::1], float32[:, :, ::1], float32[:, ::1], float32[:, ::1])",
+    fastmath=_FAST,
+)
+def blend_backward(
+    splats: np.ndarray,
+    members: np.ndarray,
+    slots: np.ndarray,
+    starts: np.ndarray,
+    first: int,
+    last: int,
+    columns: int,
+    limits: np.ndarray,
+    background: np.ndarray,
+    transmittance: np.ndarray,
+    stops: np.ndarray,
+    v_image: np.ndarray,
+    v_alpha: np.ndarray,
+    v_slots: np.ndarray,
+) -> None:
+    """Gradients of tiles ``first`` to ``last`` (exclusive), as :func:`kissgs.rendering.cpu.blending.blend` drew them.
+
+    Args:
+        splats, members, starts, first, last, columns, limits, background, transmittance, stops: as there.
+        slots: where each member's gradient goes.
+        v_image: ``(H, W, 3)`` gradient of the loss by the picture.
+        v_alpha: ``(H, W)`` gradient of the loss by 1 - transmittance.
+        v_slots: ``(slots, 9)``, written: sums over the tile's pixels of the gradient by the exponent times 1, u, v, u²,
+            uv, v²; and the gradient by the colour's R, G, B.
+    """
+    alpha_min, alpha_max = limits[0], limits[1]
+    zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
+    height, width = transmittance.shape
+    # Per pixel: x, y, stop, T, gradient by R, G, B and alpha, and what is behind, weighed by them.
+    s = np.empty(9 * 256, np.float32)
+    for p in range(256):
+        s[p], s[256 + p] = np.float32(p & 15) + half, np.float32(p >> 4) + half
+    for tile in range(first, last):
+        x0, y0 = (tile % columns) * 16, (tile // columns) * 16
+        begin = starts[tile]
+        furthest = 0
+        for p in range(256):
+            x, y = x0 + (p & 15), y0 + (p >> 4)
+            furthest = max(furthest, stops[tile, p])
+            s[512 + p] = np.float32(stops[tile, p])
+            inside = x < width and y < height
+            x, y = min(x, width - 1), min(y, height - 1)
+            s[768 + p] = transmittance[y, x] if inside else one
+            s[1024 + p] = v_image[y, x, 0] if inside else zero
+            s[1280 + p] = v_image[y, x, 1] if inside else zero
+            s[1536 + p] = v_image[y, x, 2] if inside else zero
+            s[1792 + p] = v_alpha[y, x] if inside else zero
+            s[2048 + p] = background[0] * s[1024 + p] + background[1] * s[1280 + p] + background[2] * s[1536 + p]
+        for i in range(begin + furthest, starts[tile + 1]):
+            v_slots[slots[i], :] = zero
+        for i in range(begin + furthest - 1, begin - 1, -1):
+            n = members[i]
+            mx, my = splats[n, 0] - np.float32(x0), splats[n, 1] - np.float32(y0)
+            l0, l1, l2 = splats[n, 2], splats[n, 3], splats[n, 4]
+            opacity, red, green, blue = splats[n, 5], splats[n, 6], splats[n, 7], splats[n, 8]
+            reach = splats[n, 10]
+            top = np.uint64(min(max(my - reach - half, zero), np.float32(16)))
+            bottom = np.uint64(min(max(my + reach + half, zero), np.float32(16)))
+            place = np.float32(i - begin)
+            m, mu, mv, muu, muv, mvv, vr, vg, vb = zero, zero, zero, zero, zero, zero, zero, zero, zero
+            for p in range(top * np.uint64(16), bottom * np.uint64(16)):
+                dx, dy = s[p] - mx, s[p + np.uint64(256)] - my
+                u, v = l0 * dx + l1 * dy, l2 * dy
+                full = opacity * _exp_minus(u * u + v * v)
+                alpha = min(full, alpha_max)
+                alpha = alpha if alpha >= alpha_min else zero
+                alpha = alpha if place < s[p + np.uint64(512)] else zero
+                t = s[p + np.uint64(768)] / (one - alpha)
+                s[p + np.uint64(768)] = t
+                gr, gg, gb = s[p + np.uint64(1024)], s[p + np.uint64(1280)], s[p + np.uint64(1536)]
+                weight = alpha * t
+                vr += weight * gr
+                vg += weight * gg
+                vb += weight * gb
+                change = red * gr + green * gg + blue * gb + s[p + np.uint64(1792)] - s[p + np.uint64(2048)]
+                s[p + np.uint64(2048)] += alpha * change
+                g = -weight * change
+                g = g if full <= alpha_max else zero
+                m += g
+                mu += g * u
+                mv += g * v
+                muu += g * u * u
+                muv += g * u * v
+                mvv += g * v * v
+            slot = slots[i]
+            v_slots[slot, 0] = m
+            v_slots[slot, 1] = mu
+            v_slots[slot, 2] = mv
+            v_slots[slot, 3] = muu
+            v_slots[slot, 4] = muv
+            v_slots[slot, 5] = mvv
+            v_slots[slot, 6] = vr
+            v_slots[slot, 7] = vg
+            v_slots[slot, 8] = vb
+
+
+@compiled(
+    "void(float32[:, ::1], int32[::1], int32[::1], int64[::1], int64, int64, int64, float32[::1], float32[::1],"
+    " float32[:, ::1], int32[:, ::1], float32[::1])",
+    fastmath=_FAST,
+)
+def removal_errors(
+    splats: np.ndarray,
+    members: np.ndarray,
+    slots: np.ndarray,
+    starts: np.ndarray,
+    first: int,
+    last: int,
+    columns: int,
+    limits: np.ndarray,
+    background: np.ndarray,
+    transmittance: np.ndarray,
+    stops: np.ndarray,
+    errors: np.ndarray,
+) -> None:
+    """Squared change of the picture in tiles ``first`` to ``last`` (exclusive) when a member is removed, per slot.
+
+    The arguments are those of :func:`blend_backward`; ``errors`` is written, the sum over the tile's pixels and RGB.
+    """
+    alpha_min, alpha_max = limits[0], limits[1]
+    zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
+    height, width = transmittance.shape
+    # Per pixel: x, y, stop, T, and R, G, B of what is behind.
+    s = np.empty(7 * 256, np.float32)
+    for p in range(256):
+        s[p], s[256 + p] = np.float32(p & 15) + half, np.float32(p >> 4) + half
+    for tile in range(first, last):
+        x0, y0 = (tile % columns) * 16, (tile // columns) * 16
+        begin = starts[tile]
+        furthest = 0
+        for p in range(256):
+            furthest = max(furthest, stops[tile, p])
+            s[512 + p] = np.float32(stops[tile, p])
+            s[768 + p] = transmittance[min(y0 + (p >> 4), height - 1), min(x0 + (p & 15), width - 1)]
+            s[1024 + p], s[1280 + p], s[1536 + p] = background[0], background[1], background[2]
+        for i in range(begin + furthest, starts[tile + 1]):
+            errors[slots[i]] = zero
+        for i in range(begin + furthest - 1, begin - 1, -1):
+            n = members[i]
+            mx, my = splats[n, 0] - np.float32(x0), splats[n, 1] - np.float32(y0)
+            l0, l1, l2 = splats[n, 2], splats[n, 3], splats[n, 4]
+            opacity, red, green, blue = splats[n, 5], splats[n, 6], splats[n, 7], splats[n, 8]
+            reach = splats[n, 10]
+            top = np.uint64(min(max(my - reach - half, zero), np.float32(16)))
+            bottom = np.uint64(min(max(my + reach + half, zero), np.float32(16)))
+            place = np.float32(i - begin)
+            total = zero
+            for p in range(top * np.uint64(16), bottom * np.uint64(16)):
+                dx, dy = s[p] - mx, s[p + np.uint64(256)] - my
+                u, v = l0 * dx + l1 * dy, l2 * dy
+                alpha = min(opacity * _exp_minus(u * u + v * v), alpha_max)
+                alpha = alpha if alpha >= alpha_min else zero
+                alpha = alpha if place < s[p + np.uint64(512)] else zero
+                t = s[p + np.uint64(768)] / (one - alpha)
+                s[p + np.uint64(768)] = t
+                dr = alpha * (red - s[p + np.uint64(1024)])
+                dg = alpha * (green - s[p + np.uint64(1280)])
+                db = alpha * (blue - s[p + np.uint64(1536)])
+                s[p + np.uint64(1024)] += dr
+                s[p + np.uint64(1280)] += dg
+                s[p + np.uint64(1536)] += db
+                total += t * t * (dr * dr + dg * dg + db * db)
+            errors[slots[i]] = total
+
+
+@compiled("void(float32[::1], int64[::1], int64[::1], int32[::1], int64, int64, float64[::1])")
+def sum_errors(
+    errors: np.ndarray,
+    slots_from: np.ndarray,
+    slot_counts: np.ndarray,
+    visible: np.ndarray,
+    first: int,
+    last: int,
+    scores: np.ndarray,
+) -> None:
+    """Add up each footprint's slots into ``scores[visible]``, for footprints ``first`` to ``last`` (exclusive)."""
+    for n in range(first, last):
+        total = 0.0
+        for slot in range(slots_from[n], slots_from[n] + slot_counts[n]):
+            total += errors[slot]
+        scores[visible[n]] = total

@@ -1,0 +1,302 @@
+"""Kernels: Gaussians in the world -> footprints in the picture, and the way back.
+
+The 2x2 covariance is W Wᵀ + dilation, where W = J Rc R diag(s) is 2x3: J the derivative of the projection, Rc and R the
+rotations of camera and Gaussian. Its determinant is taken from W as a sum of positive terms (Cauchy-Binet): a needle
+1e13 long loses no digits. In float64: beside the memory traffic that costs nothing, and nothing overflows.
+
+Vectors are tuples here, matrices tuples of their rows: they live in registers.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from kissgs.compiled import compiled
+
+Vector = tuple[float, float, float]
+Matrix = tuple[Vector, Vector, Vector]
+
+_helper = njit(nogil=True, error_model="numpy")
+
+
+@_helper
+def _load(rows: np.ndarray, n: int) -> Vector:
+    return np.float64(rows[n, 0]), np.float64(rows[n, 1]), np.float64(rows[n, 2])
+
+
+@_helper
+def _dot(a: Vector, b: Vector) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@_helper
+def _cross(a: Vector, b: Vector) -> Vector:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@_helper
+def _mix(x: float, a: Vector, y: float, b: Vector) -> Vector:
+    return x * a[0] + y * b[0], x * a[1] + y * b[1], x * a[2] + y * b[2]
+
+
+@_helper
+def _scaled(a: Vector, s: Vector) -> Vector:
+    return a[0] * s[0], a[1] * s[1], a[2] * s[2]
+
+
+@_helper
+def _times(a: Vector, m: Matrix) -> Vector:
+    """Row vector times matrix."""
+    return (
+        a[0] * m[0][0] + a[1] * m[1][0] + a[2] * m[2][0],
+        a[0] * m[0][1] + a[1] * m[1][1] + a[2] * m[2][1],
+        a[0] * m[0][2] + a[1] * m[1][2] + a[2] * m[2][2],
+    )
+
+
+@_helper
+def _applied(m: Matrix, a: Vector) -> Vector:
+    """Matrix times column vector."""
+    return _dot(m[0], a), _dot(m[1], a), _dot(m[2], a)
+
+
+@_helper
+def _pose(viewmat: np.ndarray) -> tuple[Matrix, Vector]:
+    return (
+        (_load(viewmat, 0), _load(viewmat, 1), _load(viewmat, 2)),
+        (viewmat[0, 3], viewmat[1, 3], viewmat[2, 3]),
+    )
+
+
+@_helper
+def _frustum(K: np.ndarray, width: int, height: int, margin: float) -> tuple[float, float, float, float]:
+    """Bounds of x/z and y/z, beyond which the derivative of the projection is that at the bound."""
+    wide, tall = margin * 0.5 * width / K[0, 0], margin * 0.5 * height / K[1, 1]
+    return (
+        -K[0, 2] / K[0, 0] - wide,
+        (width - K[0, 2]) / K[0, 0] + wide,
+        -K[1, 2] / K[1, 1] - tall,
+        (height - K[1, 2]) / K[1, 1] + tall,
+    )
+
+
+@_helper
+def _unit_quat(quats: np.ndarray, n: int) -> tuple[float, float, float, float, float]:
+    """w, x, y, z, and 1 / the length it had; no rotation, and 0, for one of no length."""
+    w, x, y, z = np.float64(quats[n, 0]), np.float64(quats[n, 1]), np.float64(quats[n, 2]), np.float64(quats[n, 3])
+    norm2 = w * w + x * x + y * y + z * z
+    if norm2 < 1e-24:
+        return 1.0, 0.0, 0.0, 0.0, 0.0
+    shrink = 1.0 / np.sqrt(norm2)
+    return w * shrink, x * shrink, y * shrink, z * shrink, shrink
+
+
+@_helper
+def _rotation(w: float, x: float, y: float, z: float) -> Matrix:
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+@_helper
+def _deviations(scales: np.ndarray, n: int) -> Vector:
+    s = _load(scales, n)
+    return np.exp(s[0]), np.exp(s[1]), np.exp(s[2])
+
+
+@_helper
+def _cholesky(w: Vector, v: Vector, dilation: float) -> tuple[float, float, float]:
+    """l0, l1, l2 with (l0 dx + l1 dy)² + (l2 dy)² half the squared Mahalanobis distance; w, v the rows of W."""
+    c, ww, vv = _cross(w, v), _dot(w, w), _dot(v, v)
+    det = _dot(c, c) + dilation * (ww + vv + dilation)
+    l0 = np.sqrt((vv + dilation) / (2 * det))
+    return l0, -_dot(w, v) / (vv + dilation) * l0, 1.0 / np.sqrt(2 * (vv + dilation))
+
+
+@compiled(
+    "int64(float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[::1],"
+    " int64, int64, float64[:, ::1], float64[:, ::1], int64, int64, float64[::1],"
+    " int32[::1], float32[::1], float32[:, ::1])"
+)
+def project(
+    means: np.ndarray,
+    quats: np.ndarray,
+    scales: np.ndarray,
+    opacities: np.ndarray,
+    first: int,
+    last: int,
+    viewmat: np.ndarray,
+    K: np.ndarray,
+    width: int,
+    height: int,
+    rules: np.ndarray,
+    visible: np.ndarray,
+    depths: np.ndarray,
+    splats: np.ndarray,
+) -> int:
+    """Footprints of the Gaussians ``first`` to ``last`` (exclusive) that touch the picture.
+
+    Args:
+        means: ``(N, 3)``, and so on: stored parameters, see :class:`kissgs.Splats`.
+        first: Gaussian.
+        last: Gaussian.
+        viewmat: ``(4, 4)`` world to camera.
+        K: ``(3, 3)``.
+        width: pixels.
+        height: pixels.
+        rules: NEAR, FAR, DILATION, FRUSTUM_MARGIN, ALPHA_MIN.
+        visible: out, from row ``first``: which Gaussians they are.
+        depths: out, likewise.
+        splats: out, likewise, ``(N, 12)``: centre x, y; l0, l1, l2 of :mod:`kissgs.rendering.cpu.blending`; opacity;
+            R, G, B (not written here); the largest exponent that shows; half height and half width in pixels.
+
+    Returns:
+        How many.
+    """
+    near, far, dilation, alpha_min = rules[0], rules[1], rules[2], rules[4]
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    turn, shift = _pose(viewmat)
+    left, right, high, low = _frustum(K, width, height, rules[3])
+    found = 0
+    for n in range(first, last):
+        mean = _load(means, n)
+        z = _dot(turn[2], mean) + shift[2]
+        if not (z >= near and z <= far):
+            continue
+        opacity = 1.0 / (1.0 + np.exp(-np.float64(opacities[n])))
+        if not opacity >= alpha_min:
+            continue
+        x, y = (_dot(turn[0], mean) + shift[0]) / z, (_dot(turn[1], mean) + shift[1]) / z
+        centre_x, centre_y = fx * x + cx, fy * y + cy
+        p = _mix(fx / z, turn[0], -fx / z * min(right, max(left, x)), turn[2])
+        q = _mix(fy / z, turn[1], -fy / z * min(low, max(high, y)), turn[2])
+        qw, qx, qy, qz, _ = _unit_quat(quats, n)
+        R, s = _rotation(qw, qx, qy, qz), _deviations(scales, n)
+        w, v = _scaled(_times(p, R), s), _scaled(_times(q, R), s)
+        tau = np.log(opacity / alpha_min)
+        half_width, half_height = np.sqrt(2 * tau * (_dot(w, w) + dilation)), np.sqrt(2 * tau * (_dot(v, v) + dilation))
+        across = centre_x + half_width > 0 and centre_x - half_width < width
+        if not (across and centre_y + half_height > 0 and centre_y - half_height < height):
+            continue
+        row = first + found
+        found += 1
+        visible[row] = n
+        depths[row] = z
+        splats[row, 0] = centre_x
+        splats[row, 1] = centre_y
+        splats[row, 2], splats[row, 3], splats[row, 4] = _cholesky(w, v, dilation)
+        splats[row, 5] = opacity
+        splats[row, 9] = tau
+        splats[row, 10] = half_height
+        splats[row, 11] = half_width
+    return found
+
+
+@compiled(
+    "void(float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[::1],"
+    " int32[::1], int64[::1], int64[::1], int64[::1], float32[:, ::1], int64, int64,"
+    " float64[:, ::1], float64[:, ::1], int64, int64, float64[::1],"
+    " float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[::1], float64[:, ::1])"
+)
+def project_backward(
+    means: np.ndarray,
+    quats: np.ndarray,
+    scales: np.ndarray,
+    opacities: np.ndarray,
+    visible: np.ndarray,
+    rows: np.ndarray,
+    slots_from: np.ndarray,
+    slot_counts: np.ndarray,
+    v_slots: np.ndarray,
+    first: int,
+    last: int,
+    viewmat: np.ndarray,
+    K: np.ndarray,
+    width: int,
+    height: int,
+    rules: np.ndarray,
+    v_means: np.ndarray,
+    v_quats: np.ndarray,
+    v_scales: np.ndarray,
+    v_opacities: np.ndarray,
+    v_colors: np.ndarray,
+) -> None:
+    """Gradients of the footprints in ``rows[first:last]``, written to the rows of their Gaussians.
+
+    Args:
+        means, quats, scales, opacities, viewmat, K, width, height, rules: as for :func:`project`.
+        visible: the Gaussian of each footprint.
+        rows: footprints in the order of their Gaussians: so memory is read and written in order.
+        slots_from: the first slot of each footprint.
+        slot_counts: how many it has.
+        v_slots: of :func:`kissgs.rendering.cpu.blending.blend_backward`.
+        first: of ``rows``.
+        last: of ``rows``.
+        v_means: out; and so on, gradients of the shapes of the parameters.
+        v_colors: out, ``(M, 3)``, gradients by the footprints' colours.
+    """
+    dilation = rules[2]
+    fx, fy = K[0, 0], K[1, 1]
+    turn, shift = _pose(viewmat)
+    left, right, high, low = _frustum(K, width, height, rules[3])
+    sums = np.empty(9, np.float64)
+    for i in range(first, last):
+        row = rows[i]
+        n = visible[row]
+        sums[:] = 0.0
+        for slot in range(slots_from[row], slots_from[row] + slot_counts[row]):
+            for c in range(9):
+                sums[c] += v_slots[slot, c]
+        v_colors[row, 0], v_colors[row, 1], v_colors[row, 2] = sums[6], sums[7], sums[8]
+        v_opacities[n] = -sums[0] / (1.0 + np.exp(np.float64(opacities[n])))
+
+        # As in project.
+        mean = _load(means, n)
+        z = _dot(turn[2], mean) + shift[2]
+        x, y = (_dot(turn[0], mean) + shift[0]) / z, (_dot(turn[1], mean) + shift[1]) / z
+        jx, jxz = fx / z, -fx / z * min(right, max(left, x))
+        jy, jyz = fy / z, -fy / z * min(low, max(high, y))
+        p, q = _mix(jx, turn[0], jxz, turn[2]), _mix(jy, turn[1], jyz, turn[2])
+        qw, qx, qy, qz, shrink = _unit_quat(quats, n)
+        R, s = _rotation(qw, qx, qy, qz), _deviations(scales, n)
+        w, v = _scaled(_times(p, R), s), _scaled(_times(q, R), s)
+        l0, l1, l2 = _cholesky(w, v, dilation)
+
+        # By the centre: -2 Lᵀ (Σ u, Σ v). By the covariance: -2 Lᵀ (Σ uu, Σ uv; Σ uv, Σ vv) L.
+        by_x, by_y = -2 * l0 * sums[1], -2 * (l1 * sums[1] + l2 * sums[2])
+        by_xx = -2 * l0 * l0 * sums[3]
+        by_xy = -2 * l0 * (l1 * sums[3] + l2 * sums[4])
+        by_yy = -2 * (l1 * (l1 * sums[3] + l2 * sums[4]) + l2 * (l1 * sums[4] + l2 * sums[5]))
+        # By w and v, from the covariance; then by p and q (a scale is its own derivative by its logarithm).
+        by_w, by_v = _mix(2 * by_xx, w, 2 * by_xy, v), _mix(2 * by_xy, w, 2 * by_yy, v)
+        v_scales[n, 0] = by_w[0] * w[0] + by_v[0] * v[0]
+        v_scales[n, 1] = by_w[1] * w[1] + by_v[1] * v[1]
+        v_scales[n, 2] = by_w[2] * w[2] + by_v[2] * v[2]
+        by_w, by_v = _scaled(by_w, s), _scaled(by_v, s)
+        by_p, by_q = _applied(R, by_w), _applied(R, by_v)
+
+        # By R, rows e0, e1, e2; then by the quaternion, across its own direction: its length changes nothing.
+        e0, e1, e2 = _mix(p[0], by_w, q[0], by_v), _mix(p[1], by_w, q[1], by_v), _mix(p[2], by_w, q[2], by_v)
+        curl = (e2[1] - e1[2], e0[2] - e2[0], e1[0] - e0[1])
+        both = (e1[2] + e2[1], e0[2] + e2[0], e0[1] + e1[0])
+        by_qw = 2 * (qx * curl[0] + qy * curl[1] + qz * curl[2])
+        by_qx = 2 * (qw * curl[0] + qy * both[2] + qz * both[1] - 2 * qx * (e1[1] + e2[2]))
+        by_qy = 2 * (qw * curl[1] + qx * both[2] + qz * both[0] - 2 * qy * (e0[0] + e2[2]))
+        by_qz = 2 * (qw * curl[2] + qx * both[1] + qy * both[0] - 2 * qz * (e0[0] + e1[1]))
+        along = by_qw * qw + by_qx * qx + by_qy * qy + by_qz * qz
+        v_quats[n, 0] = (by_qw - along * qw) * shrink
+        v_quats[n, 1] = (by_qx - along * qx) * shrink
+        v_quats[n, 2] = (by_qy - along * qy) * shrink
+        v_quats[n, 3] = (by_qz - along * qz) * shrink
+
+        # By the position before the camera: through the centre; through J; through J's x/z and y/z if not clamped.
+        by_jx, by_jxz = _dot(by_p, turn[0]), _dot(by_p, turn[2])
+        by_jy, by_jyz = _dot(by_q, turn[1]), _dot(by_q, turn[2])
+        by_ratio_x = by_x * fx - (by_jxz * jx if left < x < right else 0.0)
+        by_ratio_y = by_y * fy - (by_jyz * jy if high < y < low else 0.0)
+        by_z = -(by_jx * jx + by_jxz * jxz + by_jy * jy + by_jyz * jyz + by_ratio_x * x + by_ratio_y * y) / z
+        moved = _times((by_ratio_x / z, by_ratio_y / z, by_z), turn)
+        v_means[n, 0], v_means[n, 1], v_means[n, 2] = moved

@@ -1,0 +1,125 @@
+"""Kernels: which footprints touch which tile, front to back."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from kissgs.compiled import compiled
+
+
+@compiled("void(uint32[::1], int64[::1], int64[::1])")
+def sort_keys(keys: np.ndarray, order: np.ndarray, scratch: np.ndarray) -> None:
+    """Stable sorting permutation of ``keys`` into ``order``, by radix; ``scratch`` is as long."""
+    count = keys.shape[0]
+    for n in range(count):
+        order[n] = n
+    counts = np.empty(2048, np.int64)
+    for shift in range(0, 33, 11):
+        counts[:] = 0
+        for n in range(count):
+            counts[(keys[n] >> np.uint32(shift)) & np.uint32(2047)] += 1
+        total = 0
+        for digit in range(2048):
+            total, counts[digit] = total + counts[digit], total
+        for n in range(count):
+            digit = (keys[order[n]] >> np.uint32(shift)) & np.uint32(2047)
+            scratch[counts[digit]] = order[n]
+            counts[digit] += 1
+        for n in range(count):
+            order[n] = scratch[n]
+
+
+@njit(nogil=True, error_model="numpy")
+def _clamp(value: float, top: int) -> int:
+    """``value`` as a whole number from 0 to ``top``, rounded down; also where an int64 could not hold it, or NaN."""
+    if not value > 0:
+        return 0
+    return int(value) if value < top else top
+
+
+@njit(nogil=True, error_model="numpy")
+def _columns(splats: np.ndarray, n: int, row: int, columns: int) -> tuple[int, int]:
+    """First and last (exclusive) tile that footprint ``n`` touches in a row of tiles.
+
+    The footprint is the disc u² + v² <= tau. In a row of tiles, v lies in an interval; x = (u - k v) / l0 is largest at
+    v = -k √tau / √(1 + k²), or at the interval's nearer end.
+    """
+    centre_x, centre_y = np.float64(splats[n, 0]), np.float64(splats[n, 1])
+    l0, l1, l2 = np.float64(splats[n, 2]), np.float64(splats[n, 3]), np.float64(splats[n, 4])
+    tau = np.float64(splats[n, 9]) * 1.0001 + 1e-5  # float32 alphas may exceed the exact ones a little
+    radius = np.sqrt(tau)
+    low = max((16 * row + 0.5 - centre_y) * l2, -radius)
+    high = min((16 * row + 15.5 - centre_y) * l2, radius)
+    if not low <= high:
+        return 0, 0
+    k = l1 / l2
+    best = k * radius / np.sqrt(1.0 + k * k)
+    v = min(max(-best, low), high)
+    right = centre_x + (np.sqrt(max(tau - v * v, 0.0)) - k * v) / l0
+    v = min(max(best, low), high)
+    left = centre_x - (np.sqrt(max(tau - v * v, 0.0)) + k * v) / l0
+    return _clamp(np.ceil((left - 15.51) / 16), columns), _clamp(np.floor((right - 0.49) / 16) + 1, columns)
+
+
+@njit(nogil=True, error_model="numpy")
+def _rows(splats: np.ndarray, n: int, rows: int) -> tuple[int, int]:
+    """First and last (exclusive) row of tiles that footprint ``n`` touches."""
+    centre, reach = np.float64(splats[n, 1]), np.float64(splats[n, 10]) * 1.0001 + 0.01
+    return _clamp(np.ceil((centre - reach - 15.5) / 16), rows), _clamp(np.floor((centre + reach - 0.5) / 16) + 1, rows)
+
+
+@compiled("void(float32[:, ::1], int64, int64, int64, int64, int64[::1], int64[::1])")
+def count_tiles(
+    splats: np.ndarray, first: int, last: int, columns: int, rows: int, per_tile: np.ndarray, per_splat: np.ndarray
+) -> None:
+    """Add footprints ``first`` to ``last`` (exclusive) to ``per_tile``; write how many tiles each touches."""
+    for n in range(first, last):
+        total = 0
+        top, bottom = _rows(splats, n, rows)
+        for row in range(top, bottom):
+            left, right = _columns(splats, n, row, columns)
+            for column in range(left, right):
+                per_tile[row * columns + column] += 1
+            total += max(right - left, 0)
+        per_splat[n] = total
+
+
+@compiled(
+    "void(float32[:, ::1], int64, int64, int64, int64, int64[::1], int64[::1], int32[::1], int32[::1])",
+)
+def fill_tiles(
+    splats: np.ndarray,
+    first: int,
+    last: int,
+    columns: int,
+    rows: int,
+    ends: np.ndarray,
+    slots_from: np.ndarray,
+    members: np.ndarray,
+    slots: np.ndarray,
+) -> None:
+    """Write footprints ``first`` to ``last`` (exclusive) into the lists of the tiles that they touch.
+
+    Args:
+        splats: ``(M, 12)`` records, front to back.
+        first: footprint.
+        last: footprint.
+        columns: tiles per row.
+        rows: of tiles.
+        ends: per tile, where its list goes on; moved on.
+        slots_from: per footprint, the first of its slots, one for each tile it touches.
+        members: out, lists of footprints, tile after tile.
+        slots: out, the slot of each of these entries.
+    """
+    for n in range(first, last):
+        slot = slots_from[n]
+        top, bottom = _rows(splats, n, rows)
+        for row in range(top, bottom):
+            left, right = _columns(splats, n, row, columns)
+            for column in range(left, right):
+                tile = row * columns + column
+                members[ends[tile]] = n
+                slots[ends[tile]] = slot
+                ends[tile] += 1
+                slot += 1

@@ -1,0 +1,133 @@
+"""The oracle: gsplat's classic mode written down in float64, pixel by pixel, with full covariance matrices.
+
+It shares no code, no formula and no constant with the renderer under test.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+C0 = 0.28209479177387814
+
+
+@dataclass
+class Drawn:
+    image: np.ndarray  # (H, W, 3)
+    alpha: np.ndarray  # (H, W)
+    decisions: list  # per Gaussian, front to back: its number, where it was drawn, where its alpha was clamped
+    doubtful: np.ndarray  # (H, W): a decision here hung on less than float32 can tell
+
+
+def rotation(quat):
+    w, x, y, z = quat / np.linalg.norm(quat)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def sh_values(direction, count):
+    x, y, z = direction
+    xx, yy, zz = x * x, y * y, z * z
+    values = [
+        -0.4886025119029199 * y,
+        0.4886025119029199 * z,
+        -0.4886025119029199 * x,
+        1.0925484305920792 * x * y,
+        -1.0925484305920792 * y * z,
+        0.31539156525252005 * (2 * zz - xx - yy),
+        -1.0925484305920792 * x * z,
+        0.5462742152960396 * (xx - yy),
+        -0.5900435899266435 * y * (3 * xx - yy),
+        2.890611442640554 * x * y * z,
+        -0.4570457994644658 * y * (4 * zz - xx - yy),
+        0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+        -0.4570457994644658 * x * (4 * zz - xx - yy),
+        1.445305721320277 * z * (xx - yy),
+        -0.5900435899266435 * x * (xx - 3 * yy),
+    ]
+    return np.array(values[:count])
+
+
+def draw(params, camera, background, frozen=None, removed=None):
+    """``params``: name -> float64 array, as in Splats. ``frozen``: decisions of an earlier picture, kept as they were.
+
+    ``removed``: a Gaussian that is left out.
+    """
+    means, quats, scales, opacities, sh0, shN = (
+        params[name] for name in ("means", "quats", "scales", "opacities", "sh0", "shN")
+    )
+    W, t, K = camera.viewmat[:3, :3], camera.viewmat[:3, 3], camera.K
+    eye = -W.T @ t
+    height, width = camera.height, camera.width
+    ys, xs = np.mgrid[0:height, 0:width] + 0.5
+    in_camera = means @ W.T + t
+    order = [entry[0] for entry in frozen] if frozen is not None else np.argsort(in_camera[:, 2], kind="stable")
+    image = np.zeros((height, width, 3))
+    left = np.ones((height, width))
+    ended = np.zeros((height, width), bool)
+    doubtful = np.zeros((height, width), bool)
+    decisions = []
+    for place, n in enumerate(order):
+        x, y, z = in_camera[n]
+        if n == removed or z < 0.01 or z > 1e10:
+            continue
+        opacity = 1 / (1 + np.exp(-opacities[n]))
+        fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+        near_x = np.clip(x / z, -cx / fx - 0.15 * width / fx, (width - cx) / fx + 0.15 * width / fx)
+        near_y = np.clip(y / z, -cy / fy - 0.15 * height / fy, (height - cy) / fy + 0.15 * height / fy)
+        J = np.array([[fx / z, 0, -fx * near_x / z], [0, fy / z, -fy * near_y / z]])
+        R = rotation(quats[n])
+        covariance = R @ np.diag(np.exp(2 * scales[n])) @ R.T
+        flat = J @ W @ covariance @ W.T @ J.T + 0.3 * np.eye(2)
+        conic = np.linalg.inv(flat)
+        dx, dy = xs - (fx * x / z + cx), ys - (fy * y / z + cy)
+        exponent = 0.5 * (conic[0, 0] * dx * dx + conic[1, 1] * dy * dy) + conic[0, 1] * dx * dy
+        raw = opacity * np.exp(-exponent)
+        if frozen is None:
+            clamped = raw > 0.99
+            alpha = np.minimum(raw, 0.99)
+            seen = (alpha >= 1 / 255) & ~ended
+            after = left * (1 - alpha)
+            drawn = seen & (after > 1e-4)
+            doubtful |= ~ended & (np.abs(alpha * 255 - 1) < 2e-4)
+            doubtful |= seen & (np.abs(after / 1e-4 - 1) < 2e-3)
+            doubtful |= seen & (np.abs(raw / 0.99 - 1) < 2e-5)
+            ended |= seen & ~drawn
+            decisions.append((n, drawn, clamped))
+        else:
+            _, drawn, clamped = frozen[place]
+            alpha = np.where(clamped, 0.99, raw)
+            after = left * (1 - alpha)
+        direction = (means[n] - eye) / np.linalg.norm(means[n] - eye)
+        colour = 0.5 + C0 * sh0[n] + sh_values(direction, shN.shape[1]) @ shN[n]
+        weight = np.where(drawn, left * alpha, 0)
+        image += weight[:, :, None] * np.maximum(colour, 0)
+        left = np.where(drawn, after, left)
+    return Drawn(image + left[:, :, None] * background, 1 - left, decisions, doubtful)
+
+
+def gradient_by_differences(params, camera, background, v_image, v_alpha, step=1e-5):
+    """Central differences of sum(image * v_image) + sum(alpha * v_alpha), decisions frozen, by every parameter."""
+    frozen = draw(params, camera, background).decisions
+
+    def loss(changed):
+        drawn = draw(changed, camera, background, frozen=frozen)
+        return (drawn.image * v_image).sum() + (drawn.alpha * v_alpha).sum()
+
+    gradients = {}
+    for name, values in params.items():
+        gradient = np.zeros_like(values)
+        for index in np.ndindex(values.shape):
+            size = step * max(1.0, abs(values[index]))
+            both = []
+            for sign in (1, -1):
+                changed = values.copy()
+                changed[index] += sign * size
+                both.append(loss({**params, name: changed}))
+            gradient[index] = (both[0] - both[1]) / (2 * size)
+        gradients[name] = gradient
+    return gradients
