@@ -13,7 +13,11 @@ install_import_hook(
         "kissgs.io",
         "kissgs.sample",
         "kissgs.spherical_harmonics",
-        "kissgs.rendering",
+        *(
+            f"kissgs.rendering.{name}"
+            for name in ("camera", "cpu.frame", "differentiable", "losses", "lpips", "metrics")
+        ),
+        "kissgs.rendering.rasterizer",
         "kissgs.views",
         *(f"kissgs.sogxt.{name}" for name in ("codebook", "decode", "kmeans", "order", "planes", "plas", "pras")),
         "kissgs.sogxt.quantize",

@@ -155,7 +155,8 @@ def differentiate(
         projection.project_backward(
             *(splats.means, splats.quats, splats.scales, splats.opacities),
             *(visible, rows, lists.slots_from, lists.slot_counts, v_slots),
-            *(first, last, camera.viewmat, camera.K, camera.width, camera.height, RULES),
+            *(first, last, camera.viewmat, camera.K),
+            *(camera.width, camera.height, RULES),
             *(found.means, found.quats, found.scales, found.opacities, v_colors),
         )
         shading.shade_backward(
@@ -215,14 +216,14 @@ def _sort_into_tiles(footprints: Footprints, camera: Camera, pool: Workers) -> T
     columns, rows = -(-camera.width // semantics.TILE), -(-camera.height // semantics.TILE)
     records = footprints.records
     parts = _even(len(records), pool)
-    per_part = np.zeros((len(parts) - 1, columns * rows), np.int64)
     slot_counts = np.empty(len(records), np.int64)
 
-    def count(first: int, last: int) -> None:
-        part = int(np.searchsorted(parts, first, side="right")) - 1
-        tiles.count_tiles(records, first, last, columns, rows, per_part[part], slot_counts)
+    def count(first: int, last: int) -> Int64[np.ndarray, " tiles"]:
+        per_tile = np.zeros(columns * rows, np.int64)
+        tiles.count_tiles(records, first, last, columns, rows, per_tile, slot_counts)
+        return per_tile
 
-    _each_part(count, parts, pool)
+    per_part = np.stack(_each_part(count, parts, pool))
     starts, slots_from = _running_sum(per_part.sum(axis=0)), np.empty_like(slot_counts)
     slots_from[footprints.rows] = _running_sum(slot_counts[footprints.rows])[:-1]
     if starts[-1] > MAX_PAIRS:
@@ -231,11 +232,10 @@ def _sort_into_tiles(footprints: Footprints, camera: Camera, pool: Workers) -> T
             "Render it smaller"
         )
     members, slots = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int32)
-    ends = starts[:-1] + np.cumsum(per_part, axis=0) - per_part
+    ends = dict(zip(parts.tolist(), starts[:-1] + np.cumsum(per_part, axis=0) - per_part, strict=False))
 
     def fill(first: int, last: int) -> None:
-        part = int(np.searchsorted(parts, first, side="right")) - 1
-        tiles.fill_tiles(records, first, last, columns, rows, ends[part], slots_from, members, slots)
+        tiles.fill_tiles(records, first, last, columns, rows, ends[first], slots_from, members, slots)
 
     _each_part(fill, parts, pool)
     return TileLists(columns, starts, members, slots, slots_from, slot_counts)

@@ -1,0 +1,114 @@
+"""The rasteriser with gradients, for torch: one function, on whichever device the parameters are."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from kissgs.errors import InvalidViewsError, UnsupportedError
+from kissgs.parallel import Workers
+from kissgs.rendering.camera import Camera
+from kissgs.rendering.cpu.frame import Frame, differentiate, draw
+from kissgs.splats import ATTRIBUTES, Splats
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh0: Tensor,
+    shN: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    *,
+    backgrounds: Tensor | None = None,
+    threads: int = 0,
+) -> tuple[Tensor, Tensor]:
+    """Take pictures of a scene; gradients flow to all of its parameters.
+
+    On the processor by kissgs' own kernels, on CUDA by gsplat (extra ``kissgs[cuda]``); both draw what
+    :mod:`kissgs.rendering.semantics` says. The parameters are those stored in a scene, float32 and finite:
+
+    Args:
+        means: ``(N, 3)`` world units.
+        quats: ``(N, 4)`` w, x, y, z of any length; shorter than 1e-12 means no rotation, with no gradient.
+        scales: ``(N, 3)`` natural logarithms.
+        opacities: ``(N,)`` logits.
+        sh0: ``(N, 3)``.
+        shN: ``(N, K, 3)``, K one of 0, 3, 8, 15.
+        viewmats: ``(C, 4, 4)`` world to camera; x right, y down, z forward. No gradient.
+        Ks: ``(C, 3, 3)`` intrinsics in pixels. No gradient.
+        width: pixels.
+        height: pixels.
+        backgrounds: ``(C, 3)`` RGB; black by default. No gradient.
+        threads: of the processor; 0 means one each. Results do not depend on it.
+
+    Returns:
+        Pictures ``(C, H, W, 3)``, not clamped, and alphas ``(C, H, W)``.
+
+    Raises:
+        UnsupportedError: a gradient by the cameras or the background is asked for; a tensor is not float32; no gsplat.
+        InvalidSceneError: shapes do not fit.
+        InvalidViewsError: no camera, not a rigid pose, or not a pinhole.
+    """
+    parameters = (means, quats, scales, opacities, sh0, shN)
+    if not len(viewmats):
+        raise InvalidViewsError("there is no camera to render from")
+    if backgrounds is None:
+        backgrounds = torch.zeros((len(viewmats), 3), device=means.device)
+    if any(tensor.requires_grad for tensor in (viewmats, Ks, backgrounds)):
+        raise UnsupportedError("gradients flow to the Gaussians only, not to cameras and backgrounds: detach them")
+    if any(tensor.dtype != torch.float32 for tensor in parameters):
+        raise UnsupportedError("the rasteriser takes float32 parameters only")
+    if means.device.type == "cuda":
+        from kissgs.rendering.gsplat_backend import rasterize_on_cuda
+
+        return rasterize_on_cuda(*parameters, viewmats, Ks, width, height, backgrounds)
+    poses, pinholes = viewmats.numpy().astype(np.float64), Ks.numpy().astype(np.float64)
+    cameras = [Camera(pose, K, width, height) for pose, K in zip(poses, pinholes, strict=True)]
+    colours = backgrounds.numpy().astype(np.float32)
+    images, alphas = _Rasterize.apply(*parameters, cameras, colours, threads)  # type: ignore[no-untyped-call]
+    return images, alphas
+
+
+def tensors_of(splats: Splats, device: str = "cpu") -> dict[str, Tensor]:
+    """The scene's parameters by name, as :func:`rasterize` takes them; on the processor they share its memory."""
+    return {name: torch.from_numpy(getattr(splats, name)).to(device) for name in ATTRIBUTES}
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor]:  # noqa: ANN401
+        parameters, (cameras, backgrounds, threads) = inputs[: len(ATTRIBUTES)], inputs[len(ATTRIBUTES) :]
+        arrays = [parameter.detach().contiguous().numpy() for parameter in parameters]
+        splats = Splats(**dict(zip(ATTRIBUTES, arrays, strict=True)))
+        with Workers(threads) as pool:
+            frames = [draw(splats, camera, colour, pool) for camera, colour in zip(cameras, backgrounds, strict=True)]
+        ctx.splats, ctx.frames, ctx.threads = splats, frames, threads
+        ctx.save_for_backward(*parameters)  # torch then notices if one is changed before the way back
+        return _stack([frame.image for frame in frames]), 1 - _stack([frame.transmittance for frame in frames])
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_images: Tensor, v_alphas: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
+        _ = ctx.saved_tensors
+        frames: list[Frame] = ctx.frames
+        image_gradients, alpha_gradients = v_images.contiguous().numpy(), v_alphas.contiguous().numpy()
+        totals: list[Tensor] = []
+        with Workers(ctx.threads) as pool:
+            for frame, v_image, v_alpha in zip(frames, image_gradients, alpha_gradients, strict=True):
+                found = differentiate(ctx.splats, frame, v_image, v_alpha, pool)
+                gradients = [torch.from_numpy(getattr(found, name)) for name in ATTRIBUTES]
+                totals = [a.add_(b) for a, b in zip(totals, gradients, strict=True)] if totals else gradients
+        return (*totals, None, None, None)
+
+
+def _stack(pictures: list[np.ndarray]) -> Tensor:
+    return torch.from_numpy(pictures[0][None] if len(pictures) == 1 else np.stack(pictures))

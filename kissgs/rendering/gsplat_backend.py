@@ -1,0 +1,93 @@
+"""The rasteriser on CUDA: gsplat in its classic mode, with the constants of ``semantics``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from kissgs._typing import Float32
+from kissgs.errors import UnsupportedError
+from kissgs.rendering import semantics
+from kissgs.rendering.camera import Camera
+from kissgs.splats import SH_REST_COUNTS, Splats
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+def rasterize_on_cuda(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh0: Tensor,
+    shN: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    backgrounds: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """:func:`kissgs.rendering.differentiable.rasterize` for tensors on CUDA.
+
+    Raises:
+        UnsupportedError: gsplat is not installed, or cannot use this GPU.
+    """
+    import torch
+
+    try:
+        from gsplat import rasterization
+    except ImportError as error:
+        raise UnsupportedError(
+            "rendering on CUDA is gsplat's work, which is missing: pip install 'kissgs[cuda]'"
+        ) from (error)
+    device = means.device
+    images, alphas, _ = rasterization(
+        means=means,
+        quats=quats,
+        scales=torch.exp(scales),
+        opacities=torch.sigmoid(opacities),
+        colors=torch.cat([sh0[:, None], shN], dim=1),
+        viewmats=viewmats.to(device, torch.float32),
+        Ks=Ks.to(device, torch.float32),
+        width=width,
+        height=height,
+        near_plane=semantics.NEAR,
+        far_plane=semantics.FAR,
+        eps2d=semantics.DILATION,
+        sh_degree=SH_REST_COUNTS.index(shN.shape[1]),
+        tile_size=semantics.TILE,
+        backgrounds=backgrounds.to(device, torch.float32),
+        rasterize_mode="classic",
+    )
+    return images, alphas[..., 0]
+
+
+def render_on_cuda(
+    splats: Splats, camera: Camera, background: Sequence[float]
+) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]:
+    """:func:`kissgs.rendering.rasterizer.render` on CUDA.
+
+    Raises:
+        UnsupportedError: no torch, no CUDA or no gsplat here.
+    """
+    try:
+        import torch
+    except ImportError as error:
+        raise UnsupportedError("rendering on CUDA needs torch, which is missing: pip install 'kissgs[cuda]'") from error
+    if not torch.cuda.is_available():
+        raise UnsupportedError("torch finds no CUDA device here; render on the processor instead")
+    from kissgs.rendering.differentiable import tensors_of
+
+    with torch.no_grad():
+        images, alphas = rasterize_on_cuda(
+            **tensors_of(splats, "cuda"),
+            viewmats=torch.from_numpy(camera.viewmat[None]),
+            Ks=torch.from_numpy(camera.K[None]),
+            width=camera.width,
+            height=camera.height,
+            backgrounds=torch.tensor([list(background)]),
+        )
+    return images[0].cpu().numpy(), alphas[0].cpu().numpy()

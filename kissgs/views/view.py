@@ -1,0 +1,79 @@
+"""``View`` and ``Views``: from where a scene was looked at, and what was seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from kissgs._typing import Float32, UInt8
+from kissgs.errors import InvalidViewsError
+from kissgs.rendering.camera import Camera
+from kissgs.views.pixels import read_photo
+from kissgs.views.undistort import Lens, Window, undistort
+
+
+def black() -> Float32[np.ndarray, "3"]:
+    """The background of photographs, which have none."""
+    return np.zeros(3, dtype=np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Bend:
+    """How a photograph becomes its view's picture: reduced to the lens' size, undistorted, cropped to the window."""
+
+    lens: Lens
+    window: Window
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """A camera, at the resolution to render, and the photograph taken with it.
+
+    Attributes:
+        name: of the view.
+        camera: an undistorted pinhole of the photograph's size after all reduction and cropping.
+        photo: the photograph's file; None where there are only cameras.
+        background: ``(3,)`` red, green, blue from 0 to 1: what transparent pixels of the photograph show.
+        bend: how to undistort the photograph; None if it is a pinhole's.
+    """
+
+    name: str
+    camera: Camera
+    photo: Path | None = None
+    background: Float32[np.ndarray, "3"] = field(default_factory=black)
+    bend: Bend | None = None
+
+    def load_photo(self) -> UInt8[np.ndarray, "H W 3"]:
+        """The photograph at exactly the camera's size; read anew at every call.
+
+        It is reduced first and then undistorted, which is several times cheaper than the other way round.
+
+        Raises:
+            InvalidViewsError: there is none, or it cannot be read.
+            UnsupportedError: its pixels are numbers of 32 bits.
+        """
+        if self.photo is None:
+            raise InvalidViewsError(f"view {self.name} has no photograph, only a camera")
+        if self.bend is None:
+            return read_photo(self.photo, self.camera.width, self.camera.height, self.background)
+        lens = self.bend.lens
+        return undistort(read_photo(self.photo, lens.width, lens.height, self.background), lens, self.bend.window)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Views:
+    """The views of a capture, each part sorted by name.
+
+    Attributes:
+        train: to learn from.
+        test: held out, to judge by; may be empty.
+        background: ``(3,)`` red, green, blue from 0 to 1, over which to render.
+        source: what was read, for people.
+    """
+
+    train: tuple[View, ...]
+    test: tuple[View, ...]
+    background: Float32[np.ndarray, "3"]
+    source: str

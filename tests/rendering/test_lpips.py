@@ -1,0 +1,97 @@
+"""LPIPS. A stand-in for the package notes how it is called; what lpips 0.1.4 expects is written beside it."""
+
+import math
+import sys
+import types
+import urllib.error
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+from kissgs.errors import InvalidViewsError, UnsupportedError
+from kissgs.rendering.lpips import Lpips
+
+
+class FakeNetwork(torch.nn.Module):
+    """Like lpips.LPIPS: two (N, 3, H, W) tensors in, (N, 1, 1, 1) out."""
+
+    def __init__(self, net, verbose):
+        super().__init__()
+        warnings.warn("The parameter 'pretrained' is deprecated", UserWarning, stacklevel=2)
+        self.chosen, self.verbose, self.calls = net, verbose, []
+
+    def forward(self, first, second, retPerLayer=False, normalize=False):
+        self.calls.append((first, second, normalize, torch.is_grad_enabled()))
+        return (first - second).square().mean(dim=(1, 2, 3), keepdim=True)
+
+
+@pytest.fixture
+def package(monkeypatch):
+    module = types.ModuleType("lpips")
+    module.LPIPS = FakeNetwork
+    monkeypatch.setitem(sys.modules, "lpips", module)
+    return module
+
+
+def test_images_go_in_as_the_field_does_it(package):
+    """VGG, channels first, in [0, 1] and not rescaled to [-1, 1]; silent, whatever torchvision deprecates."""
+    rng = np.random.default_rng(0)
+    image, reference = rng.random((2, 20, 33, 3), dtype=np.float32)
+    metric = Lpips()
+    distance = metric(image, reference)
+    assert distance == pytest.approx(np.mean((image - reference) ** 2))
+    network = metric._network
+    ((first, second, normalize, gradients),) = network.calls
+    assert (network.chosen, network.verbose, normalize, gradients) == ("vgg", False, False, False)
+    for tensor, array in ((first, image), (second, reference)):
+        assert tensor.shape == (1, 3, 20, 33)
+        assert (tensor[0].permute(1, 2, 0).numpy() == array).all()
+
+
+def test_bytes_are_255ths(package):
+    image = np.full((16, 16, 3), 51, dtype=np.uint8)
+    assert Lpips()(image, np.zeros((16, 16, 3), dtype=np.float32)) == pytest.approx(0.04)
+
+
+def test_nan_is_not_hidden(package):
+    image = np.zeros((16, 16, 3), dtype=np.float32)
+    image[3, 3] = math.nan
+    assert math.isnan(Lpips()(image, np.zeros_like(image)))
+
+
+def test_images_that_the_network_cannot_halve_four_times_are_refused(package):
+    image = np.zeros((1, 4096, 3), dtype=np.float32)
+    with pytest.raises(UnsupportedError, match="at least 16x16 pixels, not 4096x1"):
+        Lpips()(image, image)
+
+
+def test_images_of_different_sizes_are_refused(package):
+    with pytest.raises(InvalidViewsError, match="both be"):
+        Lpips()(np.zeros((16, 16, 3), dtype=np.float32), np.zeros((16, 17, 3), dtype=np.float32))
+
+
+def test_a_missing_package_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "lpips", None)
+    with pytest.raises(UnsupportedError, match=r"not installed \(.*lpips.*\): pip install 'kissgs\[lpips\]'"):
+        Lpips()
+
+
+@pytest.mark.parametrize(
+    "reason",
+    [
+        urllib.error.URLError("Name or service not known"),
+        ConnectionResetError("reset by peer"),
+        RuntimeError("invalid hash value"),
+    ],
+)
+def test_weights_that_cannot_be_had_say_how_to_get_them(package, monkeypatch, reason):
+    def offline(**options):
+        raise reason
+
+    monkeypatch.setattr(package, "LPIPS", offline)
+    with pytest.raises(UnsupportedError, match="weights of its network, vgg16, which torchvision downloads") as caught:
+        Lpips()
+    assert str(reason) in str(caught.value)
+    assert caught.value.__cause__ is reason

@@ -1,0 +1,182 @@
+"""PSNR and SSIM. Oracles: the textbook formula window by window in float64, and values known in closed form."""
+
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from kissgs.errors import InvalidViewsError
+from kissgs.parallel import Workers
+from kissgs.rendering.metrics import difference_and_ssim, psnr, ssim
+
+C1, C2 = 0.01**2, 0.03**2
+
+
+def naive_ssim(image, reference):
+    """Five weighted means for each window, as Wang et al. write it; nothing but zeros beyond the border."""
+    profile = np.exp(-(np.arange(-5.0, 6.0) ** 2) / (2 * 1.5**2))
+    window = np.outer(profile, profile)[..., None] / profile.sum() ** 2
+    x, y = (np.pad(side.astype(np.float64), ((5, 5), (5, 5), (0, 0))) for side in (image, reference))
+    height, width, _ = image.shape
+    values = np.empty((height, width, 3))
+    for i in range(height):
+        for j in range(width):
+            a, b = x[i : i + 11, j : j + 11], y[i : i + 11, j : j + 11]
+            mx, my, xx, yy, xy = ((window * m).sum(axis=(0, 1)) for m in (a, b, a * a, b * b, a * b))
+            likeness = (2 * mx * my + C1) * (2 * (xy - mx * my) + C2)
+            values[i, j] = likeness / ((mx**2 + my**2 + C1) * (xx - mx**2 + yy - my**2 + C2))
+    return values.mean()
+
+
+def picture(rng, height, width):
+    """Smooth with some noise, in [0, 1]."""
+    y, x = np.mgrid[:height, :width][..., None]
+    wave = 0.5 + 0.4 * np.sin(x / 5 + np.arange(3)) * np.cos(y / 7)
+    return np.clip(wave + 0.1 * rng.standard_normal((height, width, 3)), 0, 1).astype(np.float32)
+
+
+def pictures(height, width, seed=0):
+    rng = np.random.default_rng(seed)
+    image = picture(rng, height, width)
+    return image, np.clip(image + 0.1 * rng.standard_normal(image.shape), 0, 1).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("height", "width"), [(1, 1), (1, 2), (3, 5), (11, 11), (12, 40), (40, 12), (131, 3), (2, 163), (130, 161)]
+)
+def test_ssim_is_that_of_the_textbook(height, width):
+    """Smaller than the window, and with one or several tiles in either direction."""
+    image, reference = pictures(height, width)
+    assert ssim(image, reference) == pytest.approx(naive_ssim(image, reference), abs=1e-6)
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 4096), (4096, 1)])
+def test_ssim_of_a_line(height, width):
+    image, reference = pictures(height, width)
+    assert ssim(image, reference) == pytest.approx(naive_ssim(image, reference), abs=1e-6)
+
+
+def test_ssim_keeps_its_digits_where_images_are_bright_and_flat():
+    """There the variance is a small difference of large numbers: in float32, none of its digits is right."""
+    rng = np.random.default_rng(3)
+    image = np.float32(0.9) + np.float32(0.001) * rng.standard_normal((30, 30, 3), dtype=np.float32)
+    reference = image + np.float32(0.01) * rng.standard_normal((30, 30, 3), dtype=np.float32)
+    assert ssim(image, reference) == pytest.approx(naive_ssim(image, reference), abs=2e-6)
+
+
+@pytest.mark.parametrize("value", [0.0, 0.3, 1.0, 7.0, -3.0])
+def test_equal_constant_images_score_exactly_one(value):
+    image = np.full((20, 33, 3), value, dtype=np.float32)
+    assert ssim(image, image.copy()) == 1
+    assert psnr(image, image.copy()) == math.inf
+
+
+def test_one_pixel_in_closed_form():
+    """Beyond it there are zeros, so that the means are w x and w y, and the moments w x² and so on."""
+    x, y, w = 0.8, 0.5, (1 / np.exp(-(np.arange(-5.0, 6.0) ** 2) / 4.5).sum()) ** 2
+    light = (2 * w * w * x * y + C1) / (w * w * (x * x + y * y) + C1)
+    v = w - w * w
+    expected = light * (2 * v * x * y + C2) / (v * (x * x + y * y) + C2)
+    images = (np.full((1, 1, 3), value, dtype=np.float32) for value in (x, y))
+    assert ssim(*images) == pytest.approx(expected, abs=1e-6)
+
+
+def test_psnr_of_a_known_offset():
+    image, reference = np.zeros((4, 5, 3), dtype=np.float32), np.full((4, 5, 3), 0.1, dtype=np.float32)
+    assert psnr(image, reference) == pytest.approx(20, abs=1e-5)
+    assert psnr(image, np.ones_like(image)) == 0
+    assert psnr(image, np.full_like(image, 10)) == pytest.approx(-20)
+
+
+def test_bytes_are_255ths():
+    rng = np.random.default_rng(1)
+    image, reference = rng.integers(0, 256, (2, 9, 14, 3), dtype=np.uint8)
+    a, b = image / 255, reference / 255
+    assert psnr(image, reference) == pytest.approx(-10 * math.log10(np.mean((a - b) ** 2)), abs=1e-5)
+    assert ssim(image, reference) == pytest.approx(naive_ssim(a, b), abs=1e-6)
+    assert psnr(image, a.astype(np.float32)) > 140
+
+
+def test_views_into_larger_arrays_will_do():
+    image, reference = pictures(40, 40)
+    whole = ssim(np.ascontiguousarray(image[::2, 5:30]), np.ascontiguousarray(reference[::2, 5:30]))
+    assert ssim(image[::2, 5:30], reference[::2, 5:30]) == whole
+    assert ssim(image[::2, 5:30].astype(np.float64), reference[::2, 5:30]) == whole
+
+
+sizes = st.tuples(st.integers(1, 14), st.integers(1, 14), st.just(3))
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data(), shape=sizes, most=st.sampled_from([1.0, 100.0, 1e6, 2.0**127]))
+def test_properties(data, shape, most):
+    """Symmetric to the bit, in [-1, 1], and 1 for an image and itself, whatever a renderer may produce."""
+    values = st.floats(-most, most, width=32, allow_nan=False)
+    image, reference = (data.draw(arrays(np.float32, shape, elements=values)) for _ in range(2))
+    score = ssim(image, reference)
+    assert -1 - 1e-6 <= score <= 1 + 1e-6
+    assert score == ssim(reference, image)
+    assert ssim(image, image.copy()) == 1
+    assert psnr(image, reference) == psnr(reference, image)
+
+
+@pytest.mark.parametrize("extreme", [math.inf, -math.inf, 3e38, 1e9, -1e20, 1e-40])
+def test_extreme_values_give_a_number(extreme):
+    image, reference = pictures(25, 25)
+    image[12, 12] = extreme
+    assert -1 <= ssim(image, reference) <= 1
+    assert not math.isnan(psnr(image, reference))
+
+
+@pytest.mark.parametrize("where", [0, 1])
+def test_nan_is_not_hidden(where):
+    pair = pictures(200, 200)
+    pair[where][199, 0, 1] = math.nan
+    assert math.isnan(ssim(*pair))
+    assert math.isnan(psnr(*pair))
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [((4, 4, 3), (4, 5, 3)), ((4, 4, 4), (4, 4, 4)), ((4, 4), (4, 4)), ((0, 4, 3), (0, 4, 3)), ((1, 4, 4, 3),) * 2],
+)
+@pytest.mark.parametrize("metric", [psnr, ssim])
+def test_what_are_not_two_images_is_refused(metric, first, second):
+    with pytest.raises(InvalidViewsError, match=r"both be \(height, width, 3\), not \("):
+        metric(np.zeros(first, dtype=np.float32), np.zeros(second, dtype=np.float32))
+
+
+def test_integers_other_than_bytes_are_refused():
+    with pytest.raises(InvalidViewsError, match="uint8 or floats in \\[0, 1\\], not int64"):
+        psnr(np.zeros((2, 2, 3), dtype=np.int64), np.zeros((2, 2, 3), dtype=np.int64))
+
+
+def test_threads_change_no_bit():
+    images, targets = (np.stack(side) for side in zip(pictures(140, 330), pictures(140, 330, seed=5), strict=True))
+    results = []
+    for threads in (1, 2, 5):
+        gradient = np.full_like(images, np.nan)
+        with Workers(threads) as pool:
+            sums = difference_and_ssim(images, targets, pool, gradient, (0.3, -0.2))
+        results.append((sums.tobytes(), gradient.tobytes()))
+        assert np.isfinite(gradient).all()
+    assert results[0] == results[1] == results[2]
+
+
+def test_the_inputs_are_left_alone():
+    pair = pictures(20, 20)
+    before = [side.copy() for side in pair]
+    ssim(*pair)
+    psnr(*pair)
+    assert all((now == then).all() for now, then in zip(pair, before, strict=True))
+
+
+def test_metrics_do_without_torch():
+    code = "import numpy, sys; from kissgs.rendering.metrics import ssim; " \
+        "ssim(*numpy.zeros((2, 4, 4, 3), numpy.float32)); sys.exit('torch' in sys.modules)"  # fmt: skip
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,110 @@
+"""Oracle: no picture, gradient or score of finite Gaussians is NaN or infinite, whatever they are."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from render_scenes import blobs, camera, one, together
+from test_rasterizer import pictures
+
+from kissgs.parallel import Workers
+from kissgs.rendering.cpu.frame import draw
+from kissgs.rendering.cpu.frame import removal_scores as scores_of
+from kissgs.splats import Splats
+
+finite32 = {"allow_nan": False, "allow_infinity": False, "width": 32}
+anywhere = st.one_of(
+    st.floats(-1, 1, **finite32), st.floats(-(2.0**20), 2.0**20, **finite32), st.sampled_from([0.0, 1e6, -1e6])
+)
+log_scale = st.one_of(st.floats(-30, 30, **finite32), st.sampled_from([-30.0, 30.0]))
+quat = st.one_of(st.floats(-1, 1, **finite32), st.sampled_from([0.0, 1e-30, 1e-13, 1e-7]))
+gaussian = st.builds(
+    one,
+    mean=st.tuples(anywhere, anywhere, anywhere),
+    quat=st.tuples(quat, quat, quat, quat),
+    scale=st.tuples(log_scale, log_scale, log_scale),
+    opacity=st.one_of(st.floats(-30, 30, **finite32), st.sampled_from([-30.0, 30.0, -5.5])),
+    sh0=st.tuples(anywhere, anywhere, anywhere),
+    shN=st.lists(st.floats(-100, 100, **finite32), min_size=9, max_size=9),
+)
+sizes = st.sampled_from([(1, 1), (1, 4096), (4096, 1), (16, 16), (17, 15)])
+
+
+def all_is_finite(splats, view):
+    images, alphas, tensors = pictures(splats, [view], backgrounds=[[1.0, 0.5, 0.0]])
+    assert torch.isfinite(images).all()
+    assert torch.isfinite(alphas).all()
+    assert ((alphas >= 0) & (alphas <= 1)).all()
+    (images.sum() + alphas.sum()).backward()
+    for name, tensor in tensors.items():
+        assert torch.isfinite(tensor.grad).all(), name
+    with Workers(1) as pool:
+        scores = scores_of(draw(splats, view, np.zeros(3, np.float32), pool), len(splats), pool)
+    assert np.isfinite(scores).all()
+    assert (scores >= 0).all()
+
+
+@settings(max_examples=150, deadline=None)
+@given(gaussians=st.lists(gaussian, min_size=1, max_size=9), size=sizes, seed=st.integers(0, 99))
+def test_nothing_becomes_nan_or_infinite(gaussians, size, seed):
+    all_is_finite(together(*gaussians), camera(*size, seed=seed))
+
+
+@settings(max_examples=60, deadline=None)
+@given(depth=st.sampled_from([0.0, 1e-9, -1e-9, 0.0099, 0.01, 0.0101, 1.0]), scale=log_scale, side=anywhere)
+def test_gaussians_on_and_behind_the_camera_plane(depth, scale, side):
+    view = camera(33, 17)
+    place = view.position + view.viewmat[2, :3] * depth + view.viewmat[0, :3] * side
+    all_is_finite(one(mean=tuple(place), scale=(scale, -3, scale), quat=(1, 1, 0, 0)), view)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 4096), (4096, 1)])
+def test_pictures_of_one_pixel_and_of_one_line(size):
+    all_is_finite(blobs(200, 3, spread=2.0), camera(*size))
+
+
+def test_a_gaussian_as_large_as_the_world_is_fog_of_its_colour():
+    fog = one(scale=(30, 30, 30), opacity=0.0, sh0=(0, 1, 2))
+    images, alphas, _ = pictures(fog, [camera()])
+    torch.testing.assert_close(alphas, torch.full_like(alphas, 0.5), atol=1e-6, rtol=0)
+    expected = 0.5 * (0.5 + 0.28209479177387814 * torch.tensor([0.0, 1.0, 2.0]))
+    torch.testing.assert_close(images[0], expected.expand_as(images[0]), atol=1e-6, rtol=0)
+
+
+def test_nan_in_a_parameter_that_places_a_gaussian_hides_it():
+    """Not promised (kissgs.clean removes them), but no crash either: kernels check no bounds."""
+    good = one()
+    for name in ("means", "quats", "scales", "opacities"):
+        for value in (np.nan, np.inf, -np.inf):
+            arrays = {field: getattr(good, field).copy() for field in Splats.__slots__}
+            arrays[name].flat[0] = value
+            pictures(Splats(**arrays), [camera(200, 100)])
+
+
+BOUNDS = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import numpy as np, torch
+from render_scenes import blobs, camera, one, together
+from test_render_extremes import all_is_finite
+from kissgs.rendering.losses import photometric_loss
+for size in ((1, 1), (33, 50), (1, 4096), (300, 7)):
+    all_is_finite(blobs(40, 3, spread=2.0), camera(*size))
+    all_is_finite(together(one(scale=(30, 30, -30)), one(mean=(1e6, 0, 0), scale=(30, 2, 2))), camera(*size))
+    picture = torch.rand(size[1], size[0], 3, requires_grad=True)
+    photometric_loss(picture, torch.rand(size[1], size[0], 3)).backward()
+"""
+
+
+def test_kernels_stay_within_their_arrays(tmp_path):
+    """With numba's bounds checks on, in a process and with a cache of its own."""
+    environment = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-c", BOUNDS, str(Path(__file__).parent)]
+    done = subprocess.run(command, check=False, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]

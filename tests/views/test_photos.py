@@ -1,0 +1,150 @@
+"""Oracle: folders made by hand, and which of their files a person would say is meant."""
+
+import os
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from kissgs.errors import InvalidViewsError
+from kissgs.views.photos import FoundPhoto, find_photos
+
+
+def touch(root, *names):
+    for name in names:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).touch()
+
+
+def found(root, *names, **options):
+    photos = find_photos(names, root, **options)
+    return None if photos is None else [str(photo.path.relative_to(root)) for photo in photos]
+
+
+@pytest.mark.parametrize(
+    ("folders", "scale", "expected"),
+    [
+        (["images", "images_2", "images_4"], None, ("images", 1)),
+        (["images_4", "images_2", "images_16"], None, ("images_2", 2)),
+        (["images", "images_2", "images_4"], 4, ("images_4", 4)),
+        (["images", "images_4"], 1, ("images", 1)),
+        (["images_2024", "images_old", "images_8"], None, ("images_8", 8)),
+    ],
+)
+def test_folders_by_scale(tmp_path, folders, scale, expected):
+    for folder in folders:
+        touch(tmp_path, f"{folder}/a.jpg")
+    folder, factor = expected
+    assert find_photos(["images/a.jpg"], tmp_path, scale=scale) == (FoundPhoto(tmp_path / folder / "a.jpg", factor),)
+
+
+@pytest.mark.parametrize(
+    ("there", "wanted", "expected"),
+    [
+        (["a.jpg", "a.png", "A.jpg"], "a.jpg", "a.jpg"),
+        (["a.png"], "a.jpg", "a.png"),
+        (["a.JPG"], "a.jpg", "a.JPG"),
+        (["A.JPEG", "a.txt"], "a.jpg", "A.JPEG"),
+        (["a.jpg", "A.png"], "A", "A.png"),
+        (["frame.01.png", "frame.02.png"], "frame.02", "frame.02.png"),
+        (["frame.01.png", "frame.02.png"], "frame.02.jpg", "frame.02.png"),
+        (["a.webp", "a.png"], "a.jpg", "a.png"),
+        (["sub dir/a b.png"], "sub dir/a b.jpg", "sub dir/a b.png"),
+        (["a.heic"], "a.heic", "a.heic"),
+    ],
+)
+def test_names_by_stem(tmp_path, there, wanted, expected):
+    touch(tmp_path, *(f"images/{name}" for name in there))
+    assert found(tmp_path, f"images/{wanted}") == [f"images/{expected}"]
+
+
+def test_spellings_of_a_path(tmp_path):
+    touch(tmp_path, "here/images/a.jpg", "images_2/b.jpg", "c.jpg", "here/d.jpg")
+    here = tmp_path / "here"
+    assert found(here, "./images/a.jpg", "images\\a.jpg", "d.jpg") == ["images/a.jpg"] * 2 + ["d.jpg"]
+    assert [p.path.name for p in find_photos(["../images/b.jpg", "../c.jpg"], here)] == ["b.jpg", "c.jpg"]
+    assert [p.path for p in find_photos([str(here / "images" / "a.jpg")], tmp_path)] == [here / "images" / "a.jpg"]
+
+
+@pytest.mark.parametrize("name", ["/home/elsewhere/capture/images/a.jpg", "C:\\captures\\images\\a.jpg"])
+def test_absolute_paths_of_another_machine(tmp_path, name):
+    touch(tmp_path, "images_2/a.jpg")
+    assert found(tmp_path, name) == ["images_2/a.jpg"]
+
+
+def test_another_folder(tmp_path, monkeypatch):
+    touch(tmp_path, "images/a.jpg", "other_4/a.jpg", "other_4/train/r_0.png", "other_4/test/r_0.png")
+    assert find_photos(["images/a.jpg"], tmp_path, images=tmp_path / "other_4")[0].factor == 4
+    names = ["images/a.jpg", "train/r_0", "./test/r_0", "elsewhere/deep/a.png", "/x/a.jpg", "../a.jpg"]
+    expected = ["a.jpg", "train/r_0.png", "test/r_0.png", "a.jpg", "a.jpg", "a.jpg"]
+    relative = type(tmp_path)("other_4")
+    assert found(tmp_path, *names, images=relative) == [f"other_4/{name}" for name in expected]
+    monkeypatch.chdir(tmp_path)
+    assert find_photos(["images/a.jpg"], tmp_path / "images", images=relative)[0].path == relative / "a.jpg"
+
+
+def test_captures_without_photographs(tmp_path):
+    (tmp_path / "images_old").mkdir()
+    assert found(tmp_path, "images/a.jpg", "images/b.jpg") is None
+    assert found(tmp_path, "a.jpg", "../b.jpg", scale=4) is None
+
+
+def message(root, *names, **options):
+    with pytest.raises(InvalidViewsError) as caught:
+        find_photos(names, root, **options)
+    return str(caught.value)
+
+
+def test_missing_photographs(tmp_path):
+    touch(tmp_path, "images_2/a.jpg", "images_2/c.png")
+    mend = "; add them, or name the folder that has them all (--images)"
+    assert message(tmp_path, *(f"images/{x}.jpg" for x in "abcd")) == (
+        f"2 of 4 photographs are missing, the first is 'images/b.jpg', looked for in {tmp_path}/images_2{mend}"
+    )
+    assert message(tmp_path, "images/b.jpg") == (
+        f"1 of 1 photographs are missing, the first is 'images/b.jpg', looked for in {tmp_path}/images_2{mend}"
+    )
+    assert message(tmp_path, "images/a.jpg", "test/b.jpg") == (
+        f"1 of 2 photographs are missing, the first is 'test/b.jpg', looked for in {tmp_path}/test{mend}"
+    )
+
+
+def test_folders_that_are_not_there(tmp_path):
+    touch(tmp_path, "images/a.jpg", "images_4/a.jpg")
+    where = f"in {tmp_path}, only images, images_4; choose another --scale"
+    assert message(tmp_path, "images/a.jpg", scale=2) == f"there is no folder images_2 {where}"
+    (tmp_path / "images").rename(tmp_path / "images_8")
+    assert message(tmp_path, "images/a.jpg", scale=1) == (
+        f"there is no folder images in {tmp_path}, only images_4, images_8; choose another --scale"
+    )
+    other = type(tmp_path)("nowhere")
+    assert message(tmp_path, "images/a.jpg", images=other) == (
+        f"there is no folder nowhere of photographs, nor {tmp_path}/nowhere; check --images"
+    )
+    assert message(tmp_path, "images/a.jpg", images=other, scale=2) == (
+        "a folder of photographs and a scale exclude each other; give --images or --scale"
+    )
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+def test_folders_that_may_not_be_read(tmp_path):
+    touch(tmp_path, "images/a.jpg")
+    (tmp_path / "images").chmod(0)
+    assert message(tmp_path, "images/a.jpg") == f"cannot read {tmp_path}/images: permission denied"
+    (tmp_path / "images").chmod(0o700)
+
+
+def test_names_too_long_for_any_folder(tmp_path):
+    touch(tmp_path, "images/a.jpg")
+    assert message(tmp_path, f"images/{'a' * 500}/a.jpg").endswith(": file name too long")
+
+
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.text(st.sampled_from("ab./\\: \0é\ud800"), max_size=8), min_size=1, max_size=3), st.booleans())
+def test_any_names(tmp_path, names, named):
+    touch(tmp_path, "a/b.png")
+    try:
+        photos = find_photos(names, tmp_path, images=tmp_path / "a" if named else None)
+    except InvalidViewsError:
+        return
+    assert photos is None or all(photo.path.is_file() for photo in photos)
