@@ -53,7 +53,7 @@ def load_views(
     Args:
         path: of the capture's folder, or of its file of cameras.
         scale: take the photographs from the folder of this scale, such as 4 for ``images_4``. None takes the
-            full-size folder if there is one, else the largest.
+            full-size folder if there is one, else that of scale 4, else the largest.
         images: take them from this folder instead.
         resolution: the largest longer side of a picture, pixels; None stands for 1600.
         hold_out: every such view, of all sorted by name from the first on, is for testing; 0 for none. A capture that

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -47,8 +47,9 @@ def find_photos(
 ) -> tuple[FoundPhoto, ...] | None:
     """Find all photographs, or learn that the capture comes without.
 
-    Without ``scale`` the full-size folder is taken if there is one, else the largest of the scaled ones. A file may
-    have another extension, or other capitals, than its name says, where that name itself does not exist.
+    Without ``scale`` the full-size folder is taken if there is one, else that of scale 4, at which the protocol of 3DGS
+    trains outdoor scenes, else the largest. A file may have another extension, or other capitals, than its name says,
+    where that name itself does not exist.
 
     Args:
         names: of photographs with forward slashes, relative to ``root`` or absolute; an extension may lack.
@@ -81,6 +82,10 @@ def find_photos(
             f"looked for in {places[missing[0]].folder}; add them, or name the folder that has them all (--images)"
         )
     return tuple(photo for photo in found if photo is not None)
+
+
+def _usual(factors: Collection[int]) -> int:
+    return next((factor for factor in (1, 4) if factor in factors), min(factors))
 
 
 class _Disk:
@@ -154,7 +159,7 @@ def _place(name: str, root: Path, scale: int | None, disk: _Disk) -> _Place:
     variants = disk.variants(folder)
     if not variants:
         return _Place(folder, 1, (rest,), promising=False)
-    factor = min(variants) if scale is None else scale
+    factor = _usual(variants) if scale is None else scale
     if factor not in variants:
         wanted = folder.name if factor == 1 else f"{folder.name}_{factor}"
         there = ", ".join(variants[known].name for known in sorted(variants))

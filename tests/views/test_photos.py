@@ -25,7 +25,8 @@ def found(root, *names, **options):
     ("folders", "scale", "expected"),
     [
         (["images", "images_2", "images_4"], None, ("images", 1)),
-        (["images_4", "images_2", "images_16"], None, ("images_2", 2)),
+        (["images_4", "images_2", "images_16"], None, ("images_4", 4)),
+        (["images_8", "images_2", "images_16"], None, ("images_2", 2)),
         (["images", "images_2", "images_4"], 4, ("images_4", 4)),
         (["images", "images_4"], 1, ("images", 1)),
         (["images_2024", "images_old", "images_8"], None, ("images_8", 8)),
