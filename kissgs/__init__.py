@@ -22,16 +22,25 @@ if TYPE_CHECKING:
         OutputError,
         UnsupportedError,
     )
+    from kissgs.evaluation.likeness import Evaluation
+    from kissgs.evaluation.pictures import evaluate
     from kissgs.pipeline import Compressed, Report, compress, decompress, load, save
     from kissgs.progress import Progress
+    from kissgs.rendering.camera import Camera
+    from kissgs.rendering.rasterizer import render
     from kissgs.sample import sample_scene
     from kissgs.settings import EncodeSettings, Preset, Settings
     from kissgs.splats import Splats, clean
+    from kissgs.views.load import load_views
+    from kissgs.views.view import View, Views
+    from kissgs.views.virtual import virtual_views
 
 _HOMES = {
+    "Camera": "rendering.camera",
     "Cancelled": "errors",
     "Compressed": "pipeline",
     "EncodeSettings": "settings",
+    "Evaluation": "evaluation.likeness",
     "InvalidContainerError": "errors",
     "InvalidSceneError": "errors",
     "InvalidViewsError": "errors",
@@ -43,18 +52,26 @@ _HOMES = {
     "Settings": "settings",
     "Splats": "splats",
     "UnsupportedError": "errors",
+    "View": "views.view",
+    "Views": "views.view",
     "clean": "splats",
     "compress": "pipeline",
     "decompress": "pipeline",
+    "evaluate": "evaluation.pictures",
     "load": "pipeline",
+    "load_views": "views.load",
+    "render": "rendering.rasterizer",
     "sample_scene": "sample",
     "save": "pipeline",
+    "virtual_views": "views.virtual",
 }
 
 __all__ = [
+    "Camera",
     "Cancelled",
     "Compressed",
     "EncodeSettings",
+    "Evaluation",
     "InvalidContainerError",
     "InvalidSceneError",
     "InvalidViewsError",
@@ -66,13 +83,19 @@ __all__ = [
     "Settings",
     "Splats",
     "UnsupportedError",
+    "View",
+    "Views",
     "__version__",
     "clean",
     "compress",
     "decompress",
+    "evaluate",
     "load",
+    "load_views",
+    "render",
     "sample_scene",
     "save",
+    "virtual_views",
 ]
 
 

@@ -10,6 +10,7 @@ from rich.text import Text
 
 from kissgs.bench import RoundTrip
 from kissgs.evaluation.attributes import AttributeErrors, Spread
+from kissgs.evaluation.likeness import Evaluation, spell
 from kissgs.evaluation.peers import PeerResult
 from kissgs.info import Info
 from kissgs.pipeline import Report
@@ -48,7 +49,17 @@ def report_table(report: Report, target: str) -> RenderableType:
     took = f"{sum(report.seconds.values()):.1f} s ({report.cpu_seconds:.1f} CPU s), {size(report.peak_memory)} at most"
     body = f"{report.count:,} of {report.source_count:,} Gaussians, SH degree {report.sh_degree}; {took}"
     changed = {"invisible": report.invisible, "tamed_colours": report.tamed_colours, **report.cleaned.as_dict()}
-    return Group(head, Text(body), parts_table(report.file_bytes, report.count), *_changes(changed))
+    pictures = [] if report.evaluation is None else [_pictures(report.evaluation)]
+    return Group(head, Text(body), *pictures, parts_table(report.file_bytes, report.count), *_changes(changed))
+
+
+def _pictures(evaluation: Evaluation) -> Text:
+    mean = evaluation.mean
+    told = f"PSNR {spell(mean.candidate.psnr, 2)} dB, SSIM {spell(mean.candidate.ssim, 4)}"
+    if mean.reference is None:
+        return Text(f"{told} to the scene's own renderings from {evaluation.views_used}")
+    own = f"{spell(mean.reference.psnr, 2)} dB, {spell(mean.reference.ssim, 4)}"
+    return Text(f"{told} to {evaluation.views_used}; the scene itself {own}")
 
 
 def parts_table(parts: Mapping[str, int], count: int) -> Table:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
+from kissgs import _cli_pictures
 from kissgs._cli_files import each, expand, make_folder, print_json, show, source, stdout, write_stdout
 from kissgs._version import __version__
 from kissgs.errors import KissgsError, UnsupportedError
@@ -78,6 +79,10 @@ def compress(
     changes: SetOption = None,
     seed: SeedOption = None,
     unpacked: Annotated[bool, typer.Option("--unpacked", help="Write folders instead of zips.")] = False,
+    evaluate: Annotated[bool, typer.Option("--evaluate", help="Measure PSNR and SSIM of the result.")] = False,
+    views: Annotated[
+        Path | None, typer.Option("--views", metavar="DATA", help="Evaluate on these photographs; see 'evaluate'.")
+    ] = None,
     threads: ThreadsOption = 0,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -87,6 +92,9 @@ def compress(
     from kissgs.pipeline import compress as run
 
     settings = _settings(preset, changes, seed)
+    if views is not None and not evaluate:
+        raise UnsupportedError("--views says from where to evaluate; add --evaluate")
+    capture = _cli_pictures.open_views(views)
 
     def work(scene: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"
@@ -95,6 +103,8 @@ def compress(
                 source(scene),
                 None if piped else target,
                 settings=settings,
+                evaluate=evaluate,
+                views=capture,
                 overwrite=force,
                 threads=threads,
                 progress=progress,
@@ -163,6 +173,9 @@ def info(files: Files, as_json: JsonOption = False) -> None:
         return found.as_dict()
 
     each(files, Path("-"), "", as_json, work, writes=False)
+
+
+app.command()(_cli_pictures.evaluate)
 
 
 @app.command()

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +21,10 @@ from kissgs.settings import Settings
 from kissgs.sogxt.container import check_destination, write_container, zip_bytes
 from kissgs.sogxt.decode import MAX_GAUSSIANS, decode
 from kissgs.splats import Cleaned, Splats, clean
+
+if TYPE_CHECKING:
+    from kissgs.evaluation.likeness import Evaluation
+    from kissgs.views.view import Views
 
 AnyPath = str | PathLike[str]
 
@@ -47,6 +51,7 @@ class Report:
         cpu_seconds: processor time of all stages, over all threads.
         peak_memory: bytes, the largest this process has ever had resident.
         settings: all of them, as used.
+        evaluation: the container's pictures beside those of the cleaned input; None unless it was asked for.
     """
 
     source_count: int
@@ -64,6 +69,7 @@ class Report:
     cpu_seconds: float
     peak_memory: int
     settings: dict[str, Any]
+    evaluation: Evaluation | None = None
 
     @property
     def ratio(self) -> float:
@@ -78,7 +84,8 @@ class Report:
     def as_dict(self) -> dict[str, Any]:
         """For machines."""
         derived = {"ratio": self.ratio, "bytes_per_gaussian": self.bytes_per_gaussian}
-        return {**asdict(self), **derived}
+        evaluation = None if self.evaluation is None else self.evaluation.as_dict()
+        return {**asdict(self), **derived, "evaluation": evaluation}
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,6 +148,8 @@ def compress(
     *,
     settings: Settings | None = None,
     importance: Float32[np.ndarray, " N"] | None = None,
+    evaluate: bool = False,
+    views: Views | None = None,
     overwrite: bool = False,
     threads: int = 0,
     progress: Progress = silent,
@@ -152,6 +161,9 @@ def compress(
         destination: ``.zip`` or folder to write; by default nothing is written.
         settings: by default those of the preset ``balanced``.
         importance: ``(N,)`` numbers from 0 for the Gaussians of a clean ``source``, see :func:`kissgs.sogxt.encode`.
+        evaluate: decode the result and compare its pictures with those of the cleaned scene, and with the photographs
+            of ``views`` if they have any; see :func:`kissgs.evaluate`. The report then has an ``evaluation``.
+        views: from where to evaluate, by default virtual cameras; the container does not depend on them.
         overwrite: replace ``destination`` if it exists.
         threads: 0 means one per processor; the bytes do not depend on it.
         progress: receives events; raise :class:`kissgs.Cancelled` from it to stop. Nothing is written then.
@@ -172,6 +184,7 @@ def compress(
     splats, cleaned, source_bytes = _open(source, threads, clock)
     encoded = encode(splats, settings.encode, importance=importance, cleaned=cleaned, threads=threads, progress=clock)
     archive_bytes = len(zip_bytes(encoded.files))
+    evaluation = _evaluate(splats, encoded.files, views, threads, clock) if evaluate else None
     if target is not None:
         clock("write", 0.0)
         write_container(encoded.files, target, overwrite=overwrite)
@@ -192,6 +205,7 @@ def compress(
         cpu_seconds=clock.cpu_seconds,
         peak_memory=peak_memory(),
         settings=settings.model_dump(mode="json"),
+        evaluation=evaluation,
     )
     return Compressed(encoded.files, encoded.order, report)
 
@@ -263,6 +277,21 @@ def peak_memory() -> int:
     return peak if sys.platform == "darwin" else peak * 1024
 
 
+def _evaluate(
+    splats: Splats, container: Mapping[str, bytes], views: Views | None, threads: int, clock: Progress
+) -> Evaluation:
+    """One stage of compression, whatever stages of its own it has: decoding, kernels, pictures."""
+    from kissgs.evaluation.pictures import evaluate
+
+    clock("evaluate", 0.0)
+    decoded = decode(container, max_gaussians=max(len(splats), MAX_GAUSSIANS), threads=threads)
+
+    def receive(stage: str, fraction: float) -> None:
+        clock("evaluate", fraction if stage == "evaluate" else 0.0)
+
+    return evaluate(splats, decoded, views, threads=threads, progress=receive)
+
+
 def _open(source: Splats | AnyPath | bytes, threads: int, progress: Progress) -> tuple[Splats, Cleaned, int]:
     if isinstance(source, Splats):
         splats, cleaned = clean(source)
@@ -270,7 +299,7 @@ def _open(source: Splats | AnyPath | bytes, threads: int, progress: Progress) ->
     progress("read", 0.0)
     scene = source if isinstance(source, bytes) else Path(source)
     splats, cleaned = clean(_read(scene, threads, progress))
-    return splats, cleaned, len(scene) if isinstance(scene, bytes) else _size(scene)
+    return splats, cleaned, len(scene) if isinstance(scene, bytes) else stored_bytes(scene)
 
 
 def _read(source: Path | bytes, threads: int, progress: Progress, max_gaussians: int = MAX_GAUSSIANS) -> Splats:
@@ -280,7 +309,12 @@ def _read(source: Path | bytes, threads: int, progress: Progress, max_gaussians:
     return read_ply(source, progress=progress)
 
 
-def _size(path: Path) -> int:
+def stored_bytes(path: Path) -> int:
+    """Of a file, or of all files in a folder.
+
+    Raises:
+        InvalidContainerError: the file system refuses.
+    """
     try:
         return sum(entry.stat().st_size for entry in path.iterdir()) if path.is_dir() else path.stat().st_size
     except OSError as error:

@@ -11,9 +11,11 @@ import kissgs
 from kissgs import errors
 
 PUBLIC = [
+    "Camera",
     "Cancelled",
     "Compressed",
     "EncodeSettings",
+    "Evaluation",
     "InvalidContainerError",
     "InvalidSceneError",
     "InvalidViewsError",
@@ -25,13 +27,19 @@ PUBLIC = [
     "Settings",
     "Splats",
     "UnsupportedError",
+    "View",
+    "Views",
     "__version__",
     "clean",
     "compress",
     "decompress",
+    "evaluate",
     "load",
+    "load_views",
+    "render",
     "sample_scene",
     "save",
+    "virtual_views",
 ]
 """Adding a name is a promise, removing one breaks programs: both are seen here."""
 

@@ -76,6 +76,10 @@ def look_at(
     viewmat = np.eye(4)
     viewmat[:3, :3] = rotation
     viewmat[:3, 3] = -rotation @ position
+    return Camera(viewmat, pinhole(fov, width, height), width, height)
+
+
+def pinhole(fov: float, width: int, height: int) -> Float64[np.ndarray, "3 3"]:
+    """Intrinsics of a camera that looks through the middle of its picture; ``fov`` as for :func:`look_at`."""
     focal = 0.5 * max(width, height) / np.tan(0.5 * fov)
-    K = np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]])
-    return Camera(viewmat, K, width, height)
+    return np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]])

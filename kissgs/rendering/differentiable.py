@@ -91,7 +91,7 @@ class _Rasterize(torch.autograd.Function):
         splats = Splats(**dict(zip(ATTRIBUTES, arrays, strict=True)))
         with Workers(threads) as pool:
             frames = [draw(splats, camera, colour, pool) for camera, colour in zip(cameras, backgrounds, strict=True)]
-        ctx.splats, ctx.frames, ctx.threads = splats, frames, threads
+        ctx.frames, ctx.threads = frames, threads
         ctx.save_for_backward(*parameters)  # torch then notices if one is changed before the way back
         return _stack([frame.image for frame in frames]), 1 - _stack([frame.transmittance for frame in frames])
 
@@ -104,7 +104,7 @@ class _Rasterize(torch.autograd.Function):
         totals: list[Tensor] = []
         with Workers(ctx.threads) as pool:
             for frame, v_image, v_alpha in zip(frames, image_gradients, alpha_gradients, strict=True):
-                found = differentiate(ctx.splats, frame, v_image, v_alpha, pool)
+                found = differentiate(frame, v_image, v_alpha, pool)
                 gradients = [torch.from_numpy(getattr(found, name)) for name in ATTRIBUTES]
                 totals = [a.add_(b) for a, b in zip(totals, gradients, strict=True)] if totals else gradients
         return (*totals, None, None, None)

@@ -84,7 +84,7 @@ def removal_scores(
     with Workers(threads) as pool:
         for done, camera in enumerate(cameras):
             progress("score", done / len(cameras))
-            scores += of_frame(draw(splats, camera, colour, pool), len(splats), pool)
+            scores += of_frame(draw(splats, camera, colour, pool), pool)
     progress("score", 1.0)
     return scores
 

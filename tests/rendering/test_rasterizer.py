@@ -186,6 +186,13 @@ def test_render_is_the_same_without_torch():
     assert np.array_equal(alpha, alphas[0].detach().numpy())
 
 
+def test_a_selection_with_steps_is_drawn_like_its_copy():
+    splats, view = blobs(40, 2), camera()
+    every_other = splats.select(slice(None, None, 2))
+    image, _ = render(every_other, view)
+    assert np.array_equal(image, render(splats.select(np.arange(0, 40, 2)), view)[0])
+
+
 def test_the_input_is_not_changed_and_shared():
     splats = blobs(5)
     tensors = tensors_of(splats)

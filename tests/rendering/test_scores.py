@@ -62,7 +62,7 @@ def test_the_change_is_alpha_times_the_derivative_by_alpha():
         frame = draw(splats, view, np.array(background, np.float32), pool)
         change = frame.image - frame.background  # what its removal takes away
         v_alpha = np.zeros(frame.transmittance.shape, np.float32)
-        gradients = differentiate(splats, frame, change, v_alpha, pool)
+        gradients = differentiate(frame, change, v_alpha, pool)
     opacity = 1 / (1 + np.exp(-1.0))
     score = removal_scores(splats, [view], background=background)[0]
     assert gradients.opacities[0] / (1 - opacity) == pytest.approx(score, rel=1e-5)

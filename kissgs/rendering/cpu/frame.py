@@ -19,7 +19,7 @@ from kissgs.parallel import Workers
 from kissgs.rendering import semantics
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu import blending, projection, shading, tiles
-from kissgs.splats import Splats
+from kissgs.splats import ATTRIBUTES, Splats
 
 RULES = np.array(
     [semantics.NEAR, semantics.FAR, semantics.DILATION, semantics.FRUSTUM_MARGIN, semantics.ALPHA_MIN], np.float64
@@ -77,6 +77,7 @@ class Frame:
     """A picture, and what its derivative and the scores need.
 
     Attributes:
+        splats: the scene.
         image: ``(H, W, 3)`` linear in the Gaussians' colours, 0 and up, not clamped to 1.
         transmittance: ``(H, W)`` share of the background that is seen; 1 - alpha.
         camera: that took it.
@@ -86,6 +87,7 @@ class Frame:
         stops: ``(tiles, 256)`` members from this one on were not drawn at the pixel.
     """
 
+    splats: Splats
     image: Float32[np.ndarray, "H W 3"]
     transmittance: Float32[np.ndarray, "H W"]
     camera: Camera
@@ -113,6 +115,7 @@ def draw(splats: Splats, camera: Camera, background: Float32[np.ndarray, "3"], p
     Raises:
         UnsupportedError: more than 2³¹ pairs of a footprint and a tile: no memory would hold them.
     """
+    splats = _contiguous(splats)
     footprints = _project(splats, camera, pool)
     lists = _sort_into_tiles(footprints, camera, pool)
     image = np.empty((camera.height, camera.width, 3), np.float32)
@@ -126,17 +129,17 @@ def draw(splats: Splats, camera: Camera, background: Float32[np.ndarray, "3"], p
         )
 
     _each_part(blend, _even_tiles(lists, pool), pool)
-    return Frame(image, transmittance, camera, background, footprints, lists, stops)
+    return Frame(splats, image, transmittance, camera, background, footprints, lists, stops)
 
 
 def differentiate(
-    splats: Splats,
     frame: Frame,
     v_image: Float32[np.ndarray, "H W 3"],
     v_alpha: Float32[np.ndarray, "H W"],
     pool: Workers,
 ) -> Gradients:
-    """Gradients of a loss, given those by the picture and by its alpha. ``splats`` are those of the ``frame``."""
+    """Gradients of a loss, given those by the picture and by its alpha."""
+    splats = frame.splats
     camera, lists, visible, rows = frame.camera, frame.lists, frame.footprints.visible, frame.footprints.rows
     records = frame.footprints.records
     v_slots = np.empty((len(lists.members), 9), np.float32)
@@ -168,8 +171,8 @@ def differentiate(
     return found
 
 
-def removal_scores(frame: Frame, count: int, pool: Workers) -> Float64[np.ndarray, " N"]:
-    """For each of the scene's ``count`` Gaussians, by how much its removal alone would change the picture.
+def removal_scores(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
+    """For each of the scene's Gaussians, by how much its removal alone would change the picture.
 
     The squared change, summed over pixels and RGB (GaussianPOP); exact but for what was hidden behind the end of a
     pixel's list, which a removal may reveal. Gaussians not in the picture score 0.
@@ -184,9 +187,16 @@ def removal_scores(frame: Frame, count: int, pool: Workers) -> Float64[np.ndarra
         )
 
     _each_part(blend, _even_tiles(lists, pool), pool)
-    scores = np.zeros(count, np.float64)
+    scores = np.zeros(len(frame.splats), np.float64)
     blending.sum_errors(errors, lists.slots_from, lists.slot_counts, visible, 0, len(visible), scores)
     return scores
+
+
+def _contiguous(splats: Splats) -> Splats:
+    """The same if its arrays are such as kernels read; else copies."""
+    if all(getattr(splats, name).flags.c_contiguous for name in ATTRIBUTES):
+        return splats
+    return Splats(**{name: np.ascontiguousarray(getattr(splats, name)) for name in ATTRIBUTES})
 
 
 def _project(splats: Splats, camera: Camera, pool: Workers) -> Footprints:

@@ -1,0 +1,54 @@
+"""What the command line prints about pictures. Nothing here computes."""
+
+from __future__ import annotations
+
+from rich.console import Group, RenderableType
+from rich.table import Column, Table
+from rich.text import Text
+
+from kissgs._tables import size
+from kissgs.evaluation.html import Side
+from kissgs.evaluation.likeness import Evaluation
+
+
+def evaluation_table(evaluation: Evaluation, reference: Side, candidate: Side, *, asked: str) -> RenderableType:
+    """What ``kissgs evaluate`` shows; ``asked`` is the split that was asked for."""
+    what = Text(f"{evaluation.views_used}, {evaluation.size}: {evaluation.source}")
+    notes = []
+    if evaluation.split != asked:
+        notes.append(Text("no view is held out, so these are those that the scene may have learnt from", "yellow"))
+    return Group(_sizes(evaluation, reference, candidate), what, *notes, Text(), _views(evaluation))
+
+
+def _sizes(evaluation: Evaluation, reference: Side, candidate: Side) -> Text:
+    head = Text.assemble((candidate.name, "bold"), " compared with ", (reference.name, "bold"))
+    if reference.bytes is not None and candidate.bytes:
+        ratio = reference.bytes / candidate.bytes
+        change = f"{ratio:.1f}x smaller" if ratio >= 1 else f"{1 / ratio:.1f}x larger"
+        head.append(f"  {size(reference.bytes)} -> {size(candidate.bytes)}, ").append(change, "bold green")
+    return head.append(f"; {evaluation.candidate_count:,} of {evaluation.reference_count:,} Gaussians")
+
+
+def _views(evaluation: Evaluation) -> Table:
+    mean = evaluation.mean
+    parts = ["PSNR", "SSIM"] + (["LPIPS"] if mean.between.lpips is not None else [])
+    groups = ["reference\nto photo", "candidate\nto photo"] if mean.reference is not None else []
+    columns = [_group(group, parts) for group in groups]
+    changes = [Column("change\n\ndB", justify="right")] if groups else []
+    columns += [changes, _group("candidate\nto reference", parts)]
+    table = Table(
+        Column("view", vertical="bottom", overflow="fold"),
+        *(column for group in columns for column in group),
+        box=None,
+        pad_edge=False,
+    )
+    for compared in evaluation.views:
+        table.add_row(Text(compared.view.name), *compared.comparison.spelled())
+    table.add_row("mean", *mean.spelled(), style="bold")
+    return table
+
+
+def _group(title: str, parts: list[str]) -> list[Column]:
+    """Columns with one title: it stands over the first."""
+    first = Column(f"{title}\n{parts[0]}", justify="right")
+    return [first, *(Column(f"\n\n{part}", justify="right") for part in parts[1:])]

@@ -1,0 +1,174 @@
+"""What comparing pictures gives: how alike they are, view by view and on average, for people and for machines."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from kissgs._typing import Float32
+from kissgs.views.view import View
+
+Split = Literal["test", "train", "all"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Likeness:
+    """How alike two pictures are, or many pairs of them on average.
+
+    Attributes:
+        psnr: decibels; infinite for equal pictures, and so for an average over views that has such a pair.
+        ssim: -1 to 1; 1 for equal pictures.
+        lpips: from 0 for equal pictures up to about 1; None where it was not asked for.
+
+    NaN, should a picture have it, is kept: no average hides a failed rendering.
+    """
+
+    psnr: float
+    ssim: float
+    lpips: float | None = None
+
+    def as_dict(self) -> dict[str, float | str | None]:
+        """For JSON, which has no infinity and no NaN: an infinite value is None (null), NaN the string ``"NaN"``."""
+        values = {"psnr": _as_json(self.psnr), "ssim": _as_json(self.ssim)}
+        return values if self.lpips is None else {**values, "lpips": _as_json(self.lpips)}
+
+    def spelled(self) -> list[str]:
+        """For people."""
+        values = [spell(self.psnr, 2), spell(self.ssim, 4)]
+        return values if self.lpips is None else [*values, spell(self.lpips, 4)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Comparison:
+    """The three likenesses that matter, of one view or on average over all.
+
+    Attributes:
+        reference: of the reference's rendering to the photograph; None where there are no photographs.
+        candidate: of the candidate's rendering to the photograph; equal to ``between`` where there are none.
+        between: of the candidate's rendering to the reference's.
+    """
+
+    reference: Likeness | None
+    candidate: Likeness
+    between: Likeness
+
+    @property
+    def change(self) -> float | None:
+        """Of the PSNR to the photograph, decibels: below 0 the candidate lost. None where there are no photographs."""
+        if self.reference is None:
+            return None
+        if self.reference.psnr == self.candidate.psnr:  # both may be infinite
+            return 0.0
+        return self.candidate.psnr - self.reference.psnr
+
+    def as_dict(self) -> dict[str, Any]:
+        """By name."""
+        reference = None if self.reference is None else self.reference.as_dict()
+        return {"reference": reference, "candidate": self.candidate.as_dict(), "between": self.between.as_dict()}
+
+    def spelled(self) -> list[str]:
+        """For people, a row of a table: reference, candidate, change, between; without photographs only the last."""
+        if self.reference is None or self.change is None:
+            return self.between.spelled()
+        change = spell(self.change, 2, signed=True)
+        return [*self.reference.spelled(), *self.candidate.spelled(), change, *self.between.spelled()]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ViewComparison:
+    """One view, and how alike the pictures from it are."""
+
+    view: View
+    comparison: Comparison
+
+    def as_dict(self) -> dict[str, Any]:
+        """Name, size in pixels, and the likenesses."""
+        camera = self.view.camera
+        return {"name": self.view.name, "width": camera.width, "height": camera.height, **self.comparison.as_dict()}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Evaluation:
+    """A candidate scene's pictures beside those of its reference; see :func:`evaluate`.
+
+    Attributes:
+        against: what ``candidate`` was compared with: "photos", or the reference's "renderings".
+        split: the views that were used: "test", "train" or "all". Where "test" was asked for and no view is held out,
+            this is "train".
+        source: of the views, for people.
+        background: ``(3,)`` red, green, blue from 0 to 1, over which everything was rendered.
+        reference_count: Gaussians of the reference.
+        candidate_count: Gaussians of the candidate.
+        views: in their order, one or more.
+    """
+
+    against: Literal["photos", "renderings"]
+    split: Split
+    source: str
+    background: Float32[np.ndarray, "3"]
+    reference_count: int
+    candidate_count: int
+    views: tuple[ViewComparison, ...]
+
+    @property
+    def views_used(self) -> str:
+        """For people: "7 held-out photographs", "1 training camera"."""
+        kind = {"test": "held-out ", "train": "training ", "all": ""}[self.split]
+        noun = "photograph" if self.against == "photos" else "camera"
+        return f"{len(self.views)} {kind}{noun}{'' if len(self.views) == 1 else 's'}"
+
+    @property
+    def size(self) -> str:
+        """For people, in pixels: "540x960", or "3 sizes"."""
+        sizes = {f"{each.view.camera.width}x{each.view.camera.height}" for each in self.views}
+        return sizes.pop() if len(sizes) == 1 else f"{len(sizes)} sizes"
+
+    @property
+    def mean(self) -> Comparison:
+        """Mean over views of each figure; of the PSNR, as is the field's custom, a mean of decibels."""
+        all_views = [view.comparison for view in self.views]
+        references = [view.reference for view in all_views if view.reference is not None]
+        return Comparison(
+            reference=_mean(references) if references else None,
+            candidate=_mean([view.candidate for view in all_views]),
+            between=_mean([view.between for view in all_views]),
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON; see :meth:`Likeness.as_dict` for infinity and NaN."""
+        return {
+            "against": self.against,
+            "split": self.split,
+            "source": self.source,
+            "count": {"reference": self.reference_count, "candidate": self.candidate_count},
+            "views": [view.as_dict() for view in self.views],
+            "mean": self.mean.as_dict(),
+        }
+
+
+def spell(value: float, digits: int, *, signed: bool = False) -> str:
+    """A figure for people: ∞ where two pictures are equal, NaN where one of them failed."""
+    if math.isinf(value):
+        return "∞" if value > 0 else "-∞"
+    if math.isnan(value):
+        return "NaN"
+    return f"{round(value, digits) + 0.0:{'+' if signed else ''}.{digits}f}"  # which makes -0.0 a +0.0
+
+
+def _mean(values: Sequence[Likeness]) -> Likeness:
+    distances = [value.lpips for value in values if value.lpips is not None]
+    return Likeness(
+        psnr=sum(value.psnr for value in values) / len(values),
+        ssim=sum(value.ssim for value in values) / len(values),
+        lpips=sum(distances) / len(values) if distances else None,
+    )
+
+
+def _as_json(value: float) -> float | str | None:
+    if math.isinf(value):
+        return None
+    return "NaN" if math.isnan(value) else value

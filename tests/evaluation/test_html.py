@@ -1,0 +1,238 @@
+"""The page as a strict reader sees it. Oracles: html.parser, Pillow, and places and colours found the slow way."""
+
+import base64
+import io
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from picture_scenes import SCENE, camera, cameras, damaged, picture, write_capture
+from PIL import Image
+
+from kissgs.errors import Cancelled
+from kissgs.evaluation.difference import SCALES, STOPS, WINDOW, difference, full_scale, heat_map, worst_place
+from kissgs.evaluation.html import MOST_VIEWS, Side, chosen_views, html_report
+from kissgs.evaluation.pictures import evaluate
+from kissgs.splats import ATTRIBUTES, Splats
+from kissgs.views.load import load_views
+from kissgs.views.view import View, Views
+
+WORSE = damaged()
+VOID = {"meta", "link", "img", "input", "br"}
+NASTY = "<script>alert(\"1\")</script> & 'two' $table"
+
+
+class Page(HTMLParser):
+    """Elements, text and attributes; every element must be closed."""
+
+    def __init__(self, text):
+        super().__init__(convert_charrefs=True)
+        self.elements, self.open, self.text, self.images = [], [], "", []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        attributes = dict(attrs)
+        self.elements.append((tag, attributes))
+        if tag == "img":
+            self.images.append(self.decode(attributes["src"]))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] not in ("style", "script"):
+            self.text += data
+
+    def decode(self, source):
+        assert source.startswith("data:image/webp;base64,")
+        with Image.open(io.BytesIO(base64.b64decode(source.split(",", 1)[1], validate=True))) as image:
+            return np.asarray(image.convert("RGB"))
+
+    def of(self, tag):
+        return [attributes for name, attributes in self.elements if name == tag]
+
+
+def report(views, *, candidate=WORSE, names=("a.ply", "b.zip"), sizes=(20_000, 4_000), **options):
+    found = evaluate(SCENE, candidate, views, **options)
+    sides = [
+        Side(name=name, splats=scene, bytes=size)
+        for name, scene, size in zip(names, (SCENE, candidate), sizes, strict=True)
+    ]
+    return html_report(found, *sides), found
+
+
+def test_the_page_needs_nothing_beside_itself():
+    text, _ = report(cameras())
+    page = Page(text)
+    for tag, attributes in page.elements:
+        assert tag not in ("iframe", "object", "embed", "base")
+        for name in ("src", "href", "action", "srcset", "poster"):
+            assert attributes.get(name, "#").startswith(("data:", "#")), (tag, attributes[name][:80])
+    assert "//" not in text.replace("<!--", "").split("data:image/webp")[0]
+    assert "url(" not in text
+    assert "@import" not in text
+    assert "default-src 'none'" in text
+
+
+def test_pictures_of_every_view_without_photographs():
+    text, found = report(cameras(test=3))
+    page = Page(text)
+    assert [section["id"] for section in page.of("section") if "id" in section] == ["view-0", "view-1", "view-2"]
+    assert len(page.images) == 3 * (3 + 3)
+    first = page.images[:6]
+    assert all(image.shape == (40, 60, 3) for image in first)
+    view, wanted = found.views[0].view, {}
+    for at, scene in (("candidate", WORSE), ("reference", SCENE)):
+        wanted[at] = np.rint(255 * picture(scene, view)).astype(np.uint8)
+    assert np.abs(first[0].astype(int) - wanted["candidate"]).mean() < 6  # lossy
+    np.testing.assert_array_equal(first[3], wanted["reference"])  # crops are lossless
+    np.testing.assert_array_equal(first[4], wanted["candidate"])
+
+
+def test_photographs_are_shown_where_there_are_any(tmp_path):
+    views = load_views(write_capture(tmp_path / "capture"))
+    text, found = report(views, split="all")
+    page = Page(text)
+    assert len(page.images) == 3 * (4 + 4)
+    np.testing.assert_array_equal(page.images[6], views.test[0].load_photo())
+    for compared in found.views:
+        for cell in compared.comparison.spelled():
+            assert cell.replace("-", "−") in page.text
+    assert "5.0× smaller" in page.text
+    assert "0.02 → 0.00 MB" in page.text
+
+
+def test_names_are_escaped(tmp_path):
+    view = View(NASTY, camera(0))
+    text, _ = report(Views((), (view,), np.zeros(3, np.float32), NASTY), names=(NASTY, NASTY))
+    page = Page(text)
+    assert len(page.of("script")) == 1
+    assert "<script>alert" not in text
+    assert page.text.count(NASTY) >= 5
+    assert any(image["alt"].endswith(NASTY) for image in page.of("img"))
+
+
+def test_a_scene_beside_itself():
+    text, _ = report(cameras(test=1), candidate=SCENE, sizes=(10, 40))
+    page = Page(text)
+    assert "∞ dB" in page.text
+    assert "1 levels of 255" in page.text
+    assert "4.0× larger" in page.text
+    assert (page.images[2] == STOPS[0]).mean() > 0.9
+    text, _ = report(cameras(test=1), candidate=SCENE, sizes=(None, None))
+    assert "1,500 of 1,500 Gaussians" in text
+
+
+def test_large_pictures_are_reduced_and_crops_are_not():
+    page = Page(report(cameras(test=1, size=(1500, 300)))[0])
+    assert [image.shape for image in page.images] == [(256, 1280, 3)] * 3 + [(150, 150, 3)] * 3
+
+
+def test_twelve_of_many_views_and_the_worst_among_them():
+    one = SCENE.select(slice(0, 300))
+    views = cameras(test=30, train=0, size=(8, 6))
+    found = evaluate(one, damaged(one), views)
+    shown = chosen_views(found)
+    worst = int(np.argmin([each.comparison.between.psnr for each in found.views]))
+    assert len(shown) == len(set(shown)) == MOST_VIEWS
+    assert shown == sorted(shown)
+    assert worst in shown
+    assert np.diff(shown).max() <= 6
+    text = html_report(found, Side(name="a", splats=one), Side(name="b", splats=damaged(one)))
+    page = Page(text)
+    assert [section["id"] for section in page.of("section") if "id" in section] == [f"view-{i}" for i in shown]
+    assert {link["href"] for link in page.of("a")} == {f"#view-{i}" for i in shown}
+
+
+def test_cancelling():
+    found = evaluate(SCENE, SCENE, cameras())
+    events = []
+
+    def stop(stage, fraction):
+        events.append((stage, fraction))
+        if len(events) == 2:
+            raise Cancelled("enough")
+
+    with pytest.raises(Cancelled):
+        html_report(found, Side(name="a", splats=SCENE), Side(name="b", splats=SCENE), progress=stop)
+    assert events == [("html", 0), ("html", 1 / 3)]
+
+
+# --- Differences ----------------------------------------------------------------------------------
+
+
+def test_a_difference_is_in_levels():
+    black, image = np.zeros((2, 3, 3), np.float32), np.zeros((2, 3, 3), np.float32)
+    image[0, 1] = 1
+    image[1, 2] = (0, 10 / 255, 0)
+    wanted = [[0, 255, 0], [0, 0, 10 / np.sqrt(3)]]
+    np.testing.assert_allclose(difference(image, black), wanted, rtol=1e-6)
+
+
+def test_colours_grow_lighter_evenly():
+    ramp = heat_map(np.linspace(0, 20, 256, dtype=np.float32)[None], 20)[0]
+    lightness = ramp @ [0.299, 0.587, 0.114]
+    assert tuple(ramp[0]) == STOPS[0]
+    assert tuple(ramp[-1]) == STOPS[-1]
+    assert np.diff(lightness).min() > -0.5  # they are rounded
+    assert np.abs(lightness - np.linspace(0, 245, 256)).max() < 45
+    assert heat_map(np.array([[np.nan, 99]], np.float32), 20).tolist() == [[list(STOPS[-1])] * 2]
+
+
+@given(st.floats(-10, 150) | st.sampled_from([np.inf, np.nan]))
+def test_full_colour_is_a_round_number_that_fits(psnr):
+    full = full_scale(psnr)
+    assert full in SCALES
+    if psnr < 100:
+        mean_error = 255 * 10 ** (-psnr / 20)
+        assert full == 255 or full >= 4 * mean_error
+        assert full == 1 or full <= 12 * mean_error
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 90), st.integers(1, 90), st.integers(1, 60), st.integers(0, 2**32 - 1))
+def test_the_worst_place_is_found(height, width, side, seed):
+    rng = np.random.default_rng(seed)
+    levels = rng.random((height, width)).astype(np.float32)
+    levels[rng.integers(height), rng.integers(width)] = 200
+    rows, columns = worst_place(levels, side)
+    assert (rows.stop - rows.start, columns.stop - columns.start) == (min(side, height), min(side, width))
+    assert rows.start >= 0
+    assert rows.stop <= height
+    assert columns.start >= 0
+    assert columns.stop <= width
+    down, across = min(WINDOW, height), min(WINDOW, width)
+    squares = levels.astype(np.float64) ** 2
+    sums = np.lib.stride_tricks.sliding_window_view(squares, (down, across)).sum(axis=(2, 3))
+    top, left = np.unravel_index(sums.argmax(), sums.shape)
+    middle = top + down // 2, left + across // 2
+    assert rows.start == np.clip(middle[0] - side // 2, 0, height - min(side, height))
+    assert columns.start == np.clip(middle[1] - side // 2, 0, width - min(side, width))
+
+
+def test_where_nothing_differs_it_is_the_middle():
+    assert worst_place(np.zeros((200, 301), np.float32), 160) == (slice(20, 180), slice(70, 230))
+
+
+def test_a_damaged_spot_is_what_is_enlarged():
+    """Where the scene itself is spoilt, there the crop is."""
+    views = cameras(test=1, size=(400, 300))
+    view = views.test[0]
+    homogeneous = np.append(SCENE.means, np.ones((len(SCENE), 1)), axis=1) @ view.camera.viewmat.T
+    pixels = homogeneous[:, :3] @ view.camera.K.T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    near = np.abs(pixels - [300, 200]).max(axis=1) < 15
+    assert near.any()
+    arrays = {name: getattr(SCENE, name).copy() for name in ATTRIBUTES}
+    arrays["sh0"][near] += 3
+    spoilt = Splats(**arrays)
+    levels = difference(picture(spoilt, view), picture(SCENE, view))
+    rows, columns = worst_place(levels, 160)
+    assert rows.start < 200 < rows.stop
+    assert columns.start < 300 < columns.stop

@@ -1,0 +1,273 @@
+"""Oracle: renderings taken and photographs read here, compared by the textbook formulas; fox's README."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from picture_scenes import SCENE, cameras, damaged, picture, write_capture
+from PIL import Image
+
+import kissgs
+from kissgs.errors import Cancelled, InvalidViewsError, UnsupportedError
+from kissgs.evaluation import pictures
+from kissgs.evaluation.likeness import Comparison, Evaluation, Likeness, ViewComparison, spell
+from kissgs.evaluation.pictures import evaluate
+from kissgs.rendering.metrics import ssim
+from kissgs.splats import ATTRIBUTES, Splats
+from kissgs.views.load import load_views
+from kissgs.views.view import View, Views
+
+WORSE = damaged()
+
+
+def decibels(image, target):
+    return -10 * math.log10(np.mean((image.astype(np.float64) - target) ** 2))
+
+
+def photo_of(view):
+    with Image.open(view.photo) as image:
+        return np.asarray(image.convert("RGB")).astype(np.float32) / 255
+
+
+def assert_likeness(found, image, target):
+    assert found.psnr == pytest.approx(decibels(image, target), abs=1e-5)
+    assert found.ssim == pytest.approx(ssim(image, target), abs=1e-7)
+    assert found.lpips is None
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return load_views(write_capture(tmp_path_factory.mktemp("photos") / "capture"))
+
+
+def test_renderings_are_compared_where_there_are_no_photographs():
+    views = cameras(background=(0.2, 0.5, 1))
+    found = evaluate(SCENE, WORSE, views)
+    assert (found.against, found.split, found.source) == ("renderings", "test", "cameras by hand")
+    assert [each.view for each in found.views] == list(views.test)
+    for each in found.views:
+        pair = [picture(scene, each.view, (0.2, 0.5, 1)) for scene in (WORSE, SCENE)]
+        assert_likeness(each.comparison.between, *pair)
+        assert each.comparison.candidate == each.comparison.between
+        assert each.comparison.reference is None
+        assert each.comparison.change is None
+
+
+def test_photographs_are_what_counts_where_there_are_any(capture):
+    found = evaluate(SCENE, WORSE, capture, split="all")
+    assert (found.against, found.split) == ("photos", "all")
+    assert [each.view.name for each in found.views] == ["images/a.png", "images/b.png", "images/c.png"]
+    for each in found.views:
+        before, after, photo = picture(SCENE, each.view), picture(WORSE, each.view), photo_of(each.view)
+        assert_likeness(each.comparison.reference, before, photo)
+        assert_likeness(each.comparison.candidate, after, photo)
+        assert_likeness(each.comparison.between, after, before)
+        assert each.comparison.change == pytest.approx(decibels(after, photo) - decibels(before, photo), abs=1e-5)
+        assert each.comparison.change < 0
+
+
+def test_means_are_means_of_decibels(capture):
+    found = evaluate(SCENE, WORSE, capture, split="all")
+    for side in ("reference", "candidate", "between"):
+        mean, each = getattr(found.mean, side), [getattr(view.comparison, side) for view in found.views]
+        assert mean.psnr == pytest.approx(np.mean([value.psnr for value in each]))
+        assert mean.ssim == pytest.approx(np.mean([value.ssim for value in each]))
+        assert mean.lpips is None
+
+
+def test_equal_scenes_are_infinitely_alike(capture):
+    found = evaluate(SCENE, SCENE, capture, split="train")
+    assert found.mean.between == Likeness(psnr=math.inf, ssim=1.0)
+    assert found.mean.change == 0
+    told = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    assert told["mean"]["between"] == {"psnr": None, "ssim": 1.0}
+    assert told["mean"]["reference"] == told["mean"]["candidate"]
+
+
+def test_the_json_has_the_layout_it_is_known_for(capture):
+    found = evaluate(SCENE, WORSE.select(slice(0, 900)), capture)
+    told = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    assert told["against"] == "photos"
+    assert told["split"] == "test"
+    assert told["source"] == capture.source
+    assert told["count"] == {"reference": 1500, "candidate": 900}
+    (view,) = told["views"]
+    assert (view["name"], view["width"], view["height"]) == ("images/a.png", 60, 40)
+    assert told["mean"] == {side: view[side] for side in ("reference", "candidate", "between")}
+    assert set(view["reference"]) == {"psnr", "ssim"}
+    without = evaluate(SCENE, WORSE, cameras()).as_dict()
+    assert without["mean"]["reference"] is None
+    assert without["mean"]["candidate"] == without["mean"]["between"]
+
+
+def test_scenes_need_not_be_alike_nor_clean():
+    """A NaN Gaussian cannot be drawn; it is removed rather than spread over the picture."""
+    arrays = {name: getattr(SCENE, name).copy() for name in ATTRIBUTES}
+    arrays["means"][3] = np.nan
+    arrays["quats"][5] *= 4
+    found = evaluate(Splats(**arrays), SCENE.select(slice(0, 0)), cameras(test=1))
+    assert (found.reference_count, found.candidate_count) == (1499, 0)
+    assert 0 < found.mean.between.psnr < 40
+
+
+def test_threads_do_not_change_the_figures():
+    results = [evaluate(SCENE, WORSE, cameras(), threads=threads).as_dict() for threads in (1, 3)]
+    assert results[0] == results[1]
+
+
+def test_virtual_cameras_are_the_default():
+    found = evaluate(SCENE, WORSE)
+    assert found.against == "renderings"
+    assert "virtual" in found.source
+    assert found.as_dict() == evaluate(SCENE, WORSE, kissgs.virtual_views(SCENE)).as_dict()
+
+
+def test_fox_is_as_good_as_its_readme_says(shared_data):
+    scene = kissgs.load(shared_data / "fox" / "point_cloud.ply")
+    found = evaluate(scene, scene, load_views(shared_data / "fox", scale=4))
+    assert len(found.views) == 7
+    assert found.mean.reference.psnr == pytest.approx(32.09, abs=0.1)
+    assert found.mean.reference.ssim == pytest.approx(0.913, abs=0.002)
+    each = [view.comparison.reference.psnr for view in found.views]
+    assert each == pytest.approx([34.7, 33.0, 33.2, 29.0, 33.3, 32.7, 28.6], abs=0.1)
+    assert found.mean.between.psnr == math.inf
+
+
+# --- Splits ---------------------------------------------------------------------------------------
+
+
+def test_splits():
+    views = cameras(test=2, train=3)
+    for split, wanted in (("test", views.test), ("train", views.train), ("all", views.test + views.train)):
+        found = evaluate(SCENE, SCENE, views, split=split)
+        assert (found.split, [each.view for each in found.views]) == (split, list(wanted))
+
+
+def test_training_views_stand_in_for_missing_test_views_and_the_result_says_so():
+    found = evaluate(SCENE, SCENE, cameras(test=0, train=2))
+    assert (found.split, len(found.views)) == ("train", 2)
+    assert found.views_used == "2 training cameras"
+
+
+def test_empty_splits_are_refused():
+    with pytest.raises(InvalidViewsError, match="the split 'train' of cameras by hand is empty"):
+        evaluate(SCENE, SCENE, cameras(test=2, train=0), split="train")
+    for split in ("test", "all"):
+        with pytest.raises(InvalidViewsError, match="there is no view to evaluate from"):
+            evaluate(SCENE, SCENE, cameras(test=0, train=0), split=split)
+    with pytest.raises(UnsupportedError, match="there is no split 'val'; choose test, train or all"):
+        pictures._views_to_use(cameras(), "val")
+
+
+def test_photographs_of_some_views_are_refused(capture):
+    """Figures of a part would pass for those of the whole."""
+    mixed = Views(capture.train, cameras(test=1).test, capture.background, "a mixture")
+    with pytest.raises(InvalidViewsError, match="1 of 3 views have no photograph, the first is 'view_00'; give all"):
+        evaluate(SCENE, SCENE, mixed, split="all")
+
+
+def test_missing_photographs_are_an_error(tmp_path):
+    views = load_views(write_capture(tmp_path / "capture"))
+    views.test[0].photo.unlink()
+    with pytest.raises(InvalidViewsError, match="there is no such photograph"):
+        evaluate(SCENE, SCENE, views)
+
+
+# --- Progress, LPIPS, CUDA ------------------------------------------------------------------------
+
+
+def test_progress_and_cancelling():
+    events = []
+    evaluate(SCENE, SCENE, cameras(test=4), progress=lambda stage, fraction: events.append((stage, fraction)))
+    assert [fraction for stage, fraction in events if stage == "evaluate"] == [0, 0.25, 0.5, 0.75, 1]
+    assert {stage for stage, _ in events} == {"kernels", "evaluate"}
+
+    def stop(stage, fraction):
+        if (stage, fraction) == ("evaluate", 0.5):
+            raise Cancelled("enough")
+
+    with pytest.raises(Cancelled, match="enough"):
+        evaluate(SCENE, SCENE, cameras(test=4), progress=stop)
+
+
+def test_lpips_is_measured_if_asked_for(monkeypatch, capture):
+    monkeypatch.setattr(pictures, "Lpips", lambda device: lambda image, target: float(np.abs(image - target).max()))
+    found = evaluate(SCENE, WORSE, cameras(), lpips=True)
+    each = [np.abs(picture(WORSE, view) - picture(SCENE, view)).max() for view in cameras().test]
+    assert found.mean.between.lpips == pytest.approx(np.mean(each))
+    assert set(found.as_dict()["mean"]["between"]) == {"psnr", "ssim", "lpips"}
+
+
+def test_no_cuda_is_one_sentence():
+    import torch
+
+    if torch.cuda.is_available():
+        pytest.skip("this machine has CUDA")
+    with pytest.raises(UnsupportedError, match="torch finds no CUDA device here"):
+        evaluate(SCENE, SCENE, cameras(), device="cuda")
+
+
+# --- Figures --------------------------------------------------------------------------------------
+
+
+def test_a_failed_rendering_is_not_hidden(monkeypatch):
+    def fail_once(splats, camera, **options):
+        image = np.full((camera.height, camera.width, 3), 0.5, np.float32)
+        if camera is views.test[1].camera and len(splats) == 900:
+            image[3, 4, 1] = np.nan
+        return image, image[..., 0]
+
+    views = cameras()
+    monkeypatch.setattr(pictures, "render", fail_once)
+    found = evaluate(SCENE, SCENE.select(slice(0, 900)), views)
+    told = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    assert [view["between"]["psnr"] for view in told["views"]] == [None, "NaN", None]
+    assert told["mean"]["between"] == {"psnr": "NaN", "ssim": "NaN"}
+
+
+FIGURES = st.floats(0, 100) | st.sampled_from([math.inf, math.nan])
+
+
+@given(st.lists(st.tuples(FIGURES, FIGURES, FIGURES), min_size=1, max_size=5))
+def test_any_figures_survive_means_and_json(figures):
+    view = View("a", cameras(test=1).test[0].camera)
+    rows = [[Likeness(psnr=value, ssim=0.5) for value in row] for row in figures]
+    compared = tuple(
+        ViewComparison(view=view, comparison=Comparison(reference=a, candidate=b, between=c)) for a, b, c in rows
+    )
+    found = Evaluation(
+        against="photos",
+        split="all",
+        source="",
+        background=np.zeros(3, np.float32),
+        reference_count=1,
+        candidate_count=1,
+        views=compared,
+    )
+    told = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    for i, side in enumerate(("reference", "candidate", "between")):
+        column = [row[i] for row in figures]
+        wanted = (
+            "NaN" if any(map(math.isnan, column)) else None if math.inf in column else pytest.approx(np.mean(column))
+        )
+        assert told["mean"][side]["psnr"] == wanted
+    assert all(len(each.comparison.spelled()) == 7 for each in compared)
+    same = [a == b for a, b, _ in figures]
+    assert all(each.comparison.change == 0 for each, equal in zip(compared, same, strict=True) if equal)
+
+
+@pytest.mark.parametrize(
+    ("value", "signed", "text"),
+    [
+        (31.456, False, "31.46"),
+        (-0.001, True, "+0.00"),
+        (-0.5, True, "-0.50"),
+        (math.inf, True, "∞"),
+        (math.nan, 0, "NaN"),
+    ],
+)
+def test_spelling(value, signed, text):
+    assert spell(value, 2, signed=bool(signed)) == text

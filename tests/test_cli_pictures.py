@@ -1,0 +1,144 @@
+"""``kissgs evaluate`` and ``compress --evaluate`` as a user runs them; oracle: the library's own functions."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+from picture_scenes import SCENE, damaged, write_capture
+from test_cli import failure, run
+
+import kissgs
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """a.ply, its container b.zip, a damaged c.ply, and a capture."""
+    folder = tmp_path_factory.mktemp("pictures")
+    kissgs.save(SCENE, folder / "a.ply")
+    kissgs.compress(SCENE, folder / "b.zip")
+    kissgs.save(damaged(), folder / "c.ply")
+    write_capture(folder / "capture")
+    return folder
+
+
+def test_json_is_the_evaluation_and_the_bytes(folder: Path) -> None:
+    capture = folder / "capture"
+    done = run("evaluate", folder / "a.ply", folder / "b.zip", "--views", capture, "--json")
+    told = json.loads(done.stdout)
+    found = kissgs.evaluate(kissgs.load(folder / "a.ply"), kissgs.load(folder / "b.zip"), kissgs.load_views(capture))
+    assert told.pop("bytes") == {
+        side: (folder / name).stat().st_size for side, name in (("reference", "a.ply"), ("candidate", "b.zip"))
+    }
+    assert told == json.loads(json.dumps(found.as_dict()))
+
+
+def test_the_table_says_what_was_compared(folder: Path) -> None:
+    done = run("evaluate", folder / "a.ply", folder / "c.ply", "--views", folder / "capture", "--split", "all")
+    text = done.stdout.decode()
+    found = kissgs.evaluate(SCENE, kissgs.load(folder / "c.ply"), kissgs.load_views(folder / "capture"), split="all")
+    assert "3 photographs, 60x40: " in text
+    assert "c.ply compared with a.ply" in text
+    assert "1.0x smaller" in text
+    assert "1,500 of 1,500 Gaussians" in text
+    rows = {row.split()[0]: row.split()[1:] for row in text.splitlines() if row.startswith(("images/", "mean"))}
+    assert rows["images/a.png"] == found.views[0].comparison.spelled()
+    assert rows["mean"] == found.mean.spelled()
+
+
+def test_without_views_it_takes_virtual_ones_and_folders_are_scenes_too(folder: Path, tmp_path: Path) -> None:
+    kissgs.compress(SCENE, tmp_path / "unpacked")
+    done = run("evaluate", folder / "b.zip", tmp_path / "unpacked")
+    text = done.stdout.decode()
+    assert done.returncode == 0, done.stderr
+    assert "virtual" in text
+    assert "∞" in text
+    assert "photo" not in text
+
+
+def test_views_without_a_test_split_say_so(folder: Path, tmp_path: Path) -> None:
+    capture = write_capture(tmp_path / "one", names=("only.png",))
+    text = run("evaluate", folder / "a.ply", folder / "a.ply", "--views", capture).stdout.decode()
+    assert "1 training photograph, 60x40" in text
+    assert "no view is held out" in text
+
+
+def test_a_page_is_written_whole_and_not_over_another(folder: Path, tmp_path: Path) -> None:
+    page, words = (
+        tmp_path / "page.html",
+        ["evaluate", folder / "a.ply", folder / "c.ply", "--views", folder / "capture"],
+    )
+    done = run(*words, "--html", page)
+    assert str(page) in done.stdout.decode()
+    text = page.read_text(encoding="utf-8")
+    assert text.startswith("<!doctype html>")
+    assert text.rstrip().endswith("</html>")
+    assert "exists already" in failure(*words, "--html", page)
+    assert run(*words, "--html", page, "--force", "-q").stdout == b""
+    assert page.read_text(encoding="utf-8") == text
+    assert "no folder" in failure(*words, "--html", tmp_path / "none" / "page.html")
+    assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
+
+
+def test_errors_are_one_line(folder: Path, tmp_path: Path) -> None:
+    pair, capture = [folder / "a.ply", folder / "b.zip"], folder / "capture"
+    assert "no such file" in failure("evaluate", folder / "none.ply", folder / "b.zip").lower()
+    assert "no such file" in failure("evaluate", folder / "a.ply", folder / "none.zip").lower()
+    assert "name the folder of a capture" in failure("evaluate", *pair, "--views", tmp_path / "none")
+    assert "has no cameras" in failure("evaluate", *pair, "--views", tmp_path)
+    assert "choose test, train or all" in failure("evaluate", *pair, "--split", "val")
+    assert "choose cpu or cuda" in failure("evaluate", *pair, "--device", "tpu")
+    for option in ("--scale", "--images", "--resolution"):
+        assert f"{option} is about the photographs" in failure("evaluate", *pair, option, "2")
+    assert "exclude each other" in failure("evaluate", *pair, "--views", capture, "--scale", 2, "--images", tmp_path)
+    (capture / "images" / "a.png").rename(capture / "images" / "a.away")
+    try:
+        assert "photographs are missing" in failure("evaluate", *pair, "--views", capture)
+    finally:
+        (capture / "images" / "a.away").rename(capture / "images" / "a.png")
+
+
+def test_json_errors_have_a_code(folder: Path, tmp_path: Path) -> None:
+    done = run("evaluate", folder / "a.ply", folder / "b.zip", "--views", tmp_path, "--json")
+    assert done.returncode == 2
+    assert json.loads(done.stdout)["error"]["code"] == "invalid-views"
+
+
+def test_compressing_can_evaluate(folder: Path, tmp_path: Path) -> None:
+    words = ["compress", folder / "a.ply", "-o", tmp_path / "a.zip", "--evaluate", "--views", folder / "capture"]
+    told = json.loads(run(*words, "--json").stdout)["evaluation"]
+    views = kissgs.load_views(folder / "capture")
+    found = kissgs.evaluate(SCENE, kissgs.decompress(tmp_path / "a.zip"), views)
+    assert told == json.loads(json.dumps(found.as_dict()))
+    assert (tmp_path / "a.zip").read_bytes() == (folder / "b.zip").read_bytes()
+    text = run(*words, "--force").stdout.decode()
+    psnr, ssim = found.mean.candidate.spelled()
+    assert f"PSNR {psnr} dB, SSIM {ssim} to 1 held-out photograph; the scene itself" in text
+    assert "add --evaluate" in failure("compress", folder / "a.ply", "-o", tmp_path / "b.zip", "--views", folder)
+
+
+def test_compressing_evaluates_on_virtual_cameras_by_default(tmp_path: Path) -> None:
+    stages: list[str] = []
+    result = kissgs.compress(
+        SCENE, tmp_path / "a.zip", evaluate=True, progress=lambda stage, fraction: stages.append(stage)
+    )
+    assert result.report.evaluation is not None
+    assert result.report.evaluation.against == "renderings"
+    assert 20 < result.report.evaluation.mean.between.psnr < math.inf
+    assert list(dict.fromkeys(stages))[-2:] == ["evaluate", "write"]
+    assert result.report.seconds["evaluate"] > 0
+    told = json.loads(json.dumps(result.report.as_dict(), allow_nan=False))
+    assert told["evaluation"]["count"]["reference"] == 1500
+    assert kissgs.compress(SCENE).report.as_dict()["evaluation"] is None
+
+
+def test_cancelling_the_evaluation_writes_nothing(tmp_path: Path) -> None:
+    def stop(stage: str, fraction: float) -> None:
+        if stage == "evaluate" and fraction > 0:
+            raise kissgs.Cancelled("enough")
+
+    with pytest.raises(kissgs.Cancelled, match="enough"):
+        kissgs.compress(SCENE, tmp_path / "a.zip", evaluate=True, progress=stop)
+    assert list(tmp_path.iterdir()) == []
