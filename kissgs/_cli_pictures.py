@@ -65,7 +65,7 @@ def evaluate(
     from kissgs.pipeline import load, stored_bytes
 
     used = cast(Split, _choice("--split", split, Split))
-    where = _device(device)
+    where = device_of(device)
     if html is not None:
         refuse_existing(html, overwrite=force)
     capture = open_views(views, scale=scale, images=images, resolution=resolution)
@@ -105,7 +105,8 @@ def open_views(
     return load_views(path, scale=scale, images=images, resolution=resolution)
 
 
-def _device(name: str) -> Literal["cpu", "cuda"]:
+def device_of(name: str) -> Literal["cpu", "cuda"]:
+    """The value of ``--device``, if it is one."""
     return cast(Literal["cpu", "cuda"], _choice("--device", name, Literal["cpu", "cuda"]))
 
 

@@ -31,8 +31,7 @@ def progress_bar(quiet: bool) -> Iterator[Receiver]:
     if quiet:
         yield silent
         return
-    notice = threading.Timer(SLOW_START_SECONDS, console.print, ["compiling kernels (once; cached from then on) …"])
-    notice.daemon = True
+    notice: threading.Timer | None = None
     columns = (
         TextColumn("{task.description:>14}"),
         BarColumn(),
@@ -43,14 +42,24 @@ def progress_bar(quiet: bool) -> Iterator[Receiver]:
         task = bar.add_task("", total=1.0)
 
         def receive(stage: str, fraction: float) -> None:
-            if stage == "kernels":
-                if fraction == 0:
-                    notice.start()
-                else:
-                    notice.cancel()
+            nonlocal notice
+            if notice is not None:  # whatever comes next, kernels are compiled
+                notice.cancel()
+                notice = None
+            if stage == "kernels" and fraction == 0:  # which a bar may hear several times: a timer runs only once
+                notice = _notice(console)
+                notice.start()
             bar.update(task, description=stage, completed=fraction)
 
         try:
             yield receive
         finally:
-            notice.cancel()
+            if notice is not None:
+                notice.cancel()
+
+
+def _notice(console: Console) -> threading.Timer:
+    message = "compiling kernels (once; cached from then on) …"
+    timer = threading.Timer(SLOW_START_SECONDS, console.print, [message])
+    timer.daemon = True
+    return timer

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from rich.console import Group, RenderableType
 from rich.table import Column, Table
 from rich.text import Text
@@ -9,6 +11,7 @@ from rich.text import Text
 from kissgs._tables import size
 from kissgs.evaluation.html import Side
 from kissgs.evaluation.likeness import Evaluation
+from kissgs.evaluation.speed import RenderingCost
 
 
 def evaluation_table(evaluation: Evaluation, reference: Side, candidate: Side, *, asked: str) -> RenderableType:
@@ -52,3 +55,15 @@ def _group(title: str, parts: list[str]) -> list[Column]:
     """Columns with one title: it stands over the first."""
     first = Column(f"{title}\n{parts[0]}", justify="right")
     return [first, *(Column(f"\n\n{part}", justify="right") for part in parts[1:])]
+
+
+def rendering_table(rows: Iterable[tuple[str, RenderingCost]]) -> Table:
+    """What ``kissgs bench --rendering`` shows: milliseconds of processor time per picture."""
+    works = ("draw", "draw + backward", "L1 + SSIM", "Adam", "draw + scores")
+    head = ("Gaussians", "visible", "picture", *(f"{work} ms" for work in works))
+    table = Table("scene", *(Column(name, justify="right") for name in head), box=None, pad_edge=False)
+    for scene, cost in rows:
+        taken = (cost.draw, cost.draw_and_backward, cost.loss, cost.adam, cost.score)
+        what = f"{cost.gaussians:,}", f"{cost.visible:,}", f"{cost.width}x{cost.height}"
+        table.add_row(scene, *what, *(f"{milliseconds:.1f}" for milliseconds in taken))
+    return table

@@ -99,11 +99,18 @@ def roundtrip_table(result: RoundTrip) -> RenderableType:
     report = result.report
     lost = error_table({"error": result.errors})
     back = f"decoded in {result.decode_seconds:.2f} s ({result.decode_cpu_seconds:.2f} CPU s)"
-    return Group(report_table(report, report.settings["preset"]), Text(back), Text(), lost)
+    pictures = [] if result.pictures is None else [_pictures(result.pictures)]
+    return Group(report_table(report, report.settings["preset"]), Text(back), *pictures, Text(), lost)
 
 
 def bench_table(rows: Iterable[tuple[str, str, RoundTrip | PeerResult]]) -> Table:
     """Scenes × presets and peers."""
+    rows = list(rows)
+    seen = any(result.pictures is not None for _, _, result in rows)
+    photographed = any(
+        result.pictures is not None and result.pictures.mean.reference is not None for *_, result in rows
+    )
+    pictures = (*(["PSNR to photo", "change dB"] * photographed), "PSNR to original", "SSIM") if seen else ()
     right = (
         "B/Gaussian",
         "bytes",
@@ -115,7 +122,7 @@ def bench_table(rows: Iterable[tuple[str, str, RoundTrip | PeerResult]]) -> Tabl
         "log-scale",
         "SH RMSE",
     )
-    table = Table("scene", "encoder", *map(_right, right), box=None, pad_edge=False)
+    table = Table("scene", "encoder", *map(_right, [*right, *pictures]), box=None, pad_edge=False)
     for scene, name, result in rows:
         errors = result.errors
         lost = f"{errors.rotation_degrees.rmse:.2f}", f"{errors.scales.rmse:.3f}", f"{errors.shN.rmse:.4f}"
@@ -132,8 +139,16 @@ def bench_table(rows: Iterable[tuple[str, str, RoundTrip | PeerResult]]) -> Tabl
         else:
             encode, decode = f"{result.encode_cpu_seconds:.1f}", f"{result.decode_cpu_seconds:.2f}"
             cells = f"{result.bytes_per_gaussian:.2f}", f"{result.bytes:,}", encode, "", decode, ""
-        table.add_row(scene, name, *cells, *lost)
+        table.add_row(scene, name, *cells, *lost, *_picture_cells(result.pictures, photographed))
     return table
+
+
+def _picture_cells(evaluation: Evaluation | None, photographed: bool) -> list[str]:
+    if evaluation is None:
+        return []
+    mean = evaluation.mean
+    to_photo = [spell(mean.candidate.psnr, 2), "" if mean.change is None else spell(mean.change, 2, signed=True)]
+    return [*(to_photo if photographed else []), spell(mean.between.psnr, 2), spell(mean.between.ssim, 4)]
 
 
 def error_table(columns: Mapping[str, AttributeErrors]) -> Table:

@@ -6,16 +6,19 @@ import multiprocessing
 import time
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from kissgs.errors import UnsupportedError
 from kissgs.evaluation.attributes import AttributeErrors, attribute_errors
+from kissgs.evaluation.likeness import Evaluation
+from kissgs.evaluation.pictures import evaluate
 from kissgs.pipeline import Report, compress, decompress, load, peak_memory, save
 from kissgs.progress import Progress, silent
 from kissgs.settings import Settings
 from kissgs.splats import Splats
+from kissgs.views.view import Views
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,6 +31,7 @@ class RoundTrip:
         decode_cpu_seconds: processor time of that, over all threads.
         peak_memory: bytes, the largest the process had resident before errors were computed.
         errors: of the Gaussians that are in the container.
+        pictures: what became of the scene's pictures, if asked for.
     """
 
     report: Report
@@ -35,10 +39,13 @@ class RoundTrip:
     decode_cpu_seconds: float
     peak_memory: int
     errors: AttributeErrors
+    pictures: Evaluation | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """For machines."""
-        return {**asdict(self), "report": self.report.as_dict(), "errors": self.errors.as_dict()}
+        pictures = None if self.pictures is None else self.pictures.as_dict()
+        told = replace(self, pictures=None)
+        return {**asdict(told), "report": self.report.as_dict(), "errors": self.errors.as_dict(), "pictures": pictures}
 
 
 def roundtrip(
@@ -48,6 +55,8 @@ def roundtrip(
     container: Path | None = None,
     back: Path | None = None,
     overwrite: bool = False,
+    pictures: bool = False,
+    views: Views | None = None,
     threads: int = 0,
     progress: Progress = silent,
 ) -> RoundTrip:
@@ -59,6 +68,8 @@ def roundtrip(
         container: where to write the container, if wanted.
         back: where to write the decompressed ``.ply``, if wanted.
         overwrite: replace those files.
+        pictures: compare pictures too (:func:`kissgs.evaluate`); no part of the times.
+        views: from where; by default virtual cameras.
         threads: 0 means one per processor.
         progress: receives the events of both directions.
     """
@@ -77,10 +88,13 @@ def roundtrip(
         decode_cpu_seconds=cpu,
         peak_memory=peak,
         errors=attribute_errors(scene.select(result.order), decoded),
+        pictures=evaluate(scene, decoded, views, threads=threads, progress=progress) if pictures else None,
     )
 
 
-def isolated_roundtrip(source: Path, settings: Settings, *, threads: int = 0) -> RoundTrip:
+def isolated_roundtrip(
+    source: Path, settings: Settings, *, pictures: bool = False, views: Views | None = None, threads: int = 0
+) -> RoundTrip:
     """:func:`roundtrip` in a process of its own, so that times and peak memory are those of this scene alone.
 
     Raises:
@@ -89,6 +103,7 @@ def isolated_roundtrip(source: Path, settings: Settings, *, threads: int = 0) ->
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context) as pool:
         try:
-            return pool.submit(roundtrip, source, settings, threads=threads).result()
+            work = pool.submit(roundtrip, source, settings, pictures=pictures, views=views, threads=threads)
+            return work.result()
         except BrokenProcessPool as error:
             raise UnsupportedError(f"{source}: the measurement was killed, most likely for want of memory") from error

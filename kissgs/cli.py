@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from kissgs import _cli_pictures
-from kissgs._cli_files import each, expand, make_folder, print_json, show, source, stdout, write_stdout
+from kissgs import _cli_bench, _cli_pictures, _cli_render
+from kissgs._cli_files import each, make_folder, show, source, stdout, write_stdout
 from kissgs._version import __version__
 from kissgs.errors import KissgsError, UnsupportedError
 
@@ -52,6 +52,7 @@ class _Interrupted(BaseException):
 
 def main() -> None:
     """Entry point. Errors a user can cause end in one line and exit code 2, Ctrl-C in 130."""
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # torch's idle threads would take the processor from ours
     signal.signal(signal.SIGINT, _interrupt)
     signal.signal(signal.SIGTERM, _interrupt)
     try:
@@ -99,6 +100,10 @@ def compress(
     def work(scene: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"
         with _progress(quiet or as_json) as progress:
+            if evaluate:  # announced here, because it is no stage of the evaluation
+                from kissgs.rendering.rasterizer import load_kernels
+
+                load_kernels(progress)
             result = run(
                 source(scene),
                 None if piped else target,
@@ -175,6 +180,7 @@ def info(files: Files, as_json: JsonOption = False) -> None:
     each(files, Path("-"), "", as_json, work, writes=False)
 
 
+app.command()(_cli_render.render)
 app.command()(_cli_pictures.evaluate)
 
 
@@ -199,7 +205,7 @@ def demo(
     folder: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")] = Path("demo-out"),
     preset: PresetOption = "balanced",
 ) -> None:
-    """Compress a scene, decompress it, and show what that cost."""
+    """Compress a scene, decompress it, and show what that cost, pictures included."""
     from kissgs._tables import roundtrip_table
     from kissgs.bench import roundtrip
     from kissgs.pipeline import save
@@ -212,52 +218,27 @@ def demo(
             scene = folder / "sample.ply"
             save(sample_scene(), scene, overwrite=True, progress=progress)
         container, back = folder / f"{scene.stem}.zip", folder / f"{scene.stem}.decoded.ply"
-        result = roundtrip(scene, settings, container=container, back=back, overwrite=True, progress=progress)
+        result = roundtrip(
+            scene, settings, container=container, back=back, overwrite=True, pictures=True, progress=progress
+        )
     show(roundtrip_table(result))
     show(f"\nscene      {scene}\ncontainer  {container}\ndecoded    {back}")
 
 
-@app.command()
-def bench(
-    scenes: Files,
-    presets: Annotated[
-        list[str] | None, typer.Option("--preset", "-p", help="Repeat for several; default: all.")
-    ] = None,
-    peers: Annotated[list[str] | None, typer.Option("--peer", help="sog or spz, by splat-transform.")] = None,
-    splat_transform: Annotated[str, typer.Option(help="How to start it.")] = "splat-transform",
-    threads: ThreadsOption = 0,
-    as_json: JsonOption = False,
-) -> None:
-    """Measure bytes, time, memory and errors of presets and of other tools, each in a process of its own."""
-    import shlex
-
-    from kissgs._tables import bench_table
-    from kissgs.bench import isolated_roundtrip
-    from kissgs.evaluation.peers import measure_peer
-    from kissgs.settings import Preset
-
-    rows: list[tuple[str, str, Any]] = []
-    all_settings = [_settings(name, None, None) for name in presets or list(Preset)]
-    for scene in expand(scenes):
-        label = Path(scene).name
-        for settings in all_settings:
-            result = isolated_roundtrip(Path(scene), settings, threads=threads)
-            rows.append((label, str(settings.preset), result))
-        others = shlex.split(splat_transform)
-        rows.extend((label, peer, measure_peer(Path(scene), peer, command=others)) for peer in peers or [])
-    if as_json:
-        print_json([{"scene": scene, "encoder": name, **result.as_dict()} for scene, name, result in rows])
-    else:
-        show(bench_table(rows))
+app.command()(_cli_bench.bench)
 
 
 @app.command()
 def warmup() -> None:
-    """Compile the encoder's kernels now, so that the first compression does not have to."""
-    from kissgs.sogxt.encode import load_kernels
+    """Compile the encoder's and the rasteriser's kernels now, so that no command has to wait for them later."""
+    from kissgs.rendering.rasterizer import load_kernels as load_rasterizer
+    from kissgs.sogxt.encode import load_kernels as load_encoder
 
-    with _progress(False) as progress:
-        load_kernels(progress)
+    with _progress(False) as progress:  # one stage for both: it is announced once
+        progress("kernels", 0.0)
+        load_encoder()
+        load_rasterizer()
+        progress("kernels", 1.0)
 
 
 @app.callback(invoke_without_command=True)

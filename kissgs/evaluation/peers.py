@@ -6,15 +6,18 @@ import os
 import subprocess
 import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from kissgs.errors import InvalidSceneError, UnsupportedError
 from kissgs.evaluation.attributes import AttributeErrors, attribute_errors, sigmoid
+from kissgs.evaluation.likeness import Evaluation
 from kissgs.evaluation.pairing import pair
+from kissgs.evaluation.pictures import evaluate
 from kissgs.io.ply import read_ply
 from kissgs.splats import Splats, clean
+from kissgs.views.view import Views
 
 PEER_FORMATS = ("sog", "spz")
 
@@ -37,6 +40,7 @@ class PeerResult:
     """both: user and system time of the tool's processes, all threads together, start-up and .ply included"""
     errors: AttributeErrors
     """of the Gaussians that show: an opacity of at most 1/255 no renderer draws, and tools scramble what it hides"""
+    pictures: Evaluation | None = None
 
     @property
     def bytes_per_gaussian(self) -> float:
@@ -45,7 +49,9 @@ class PeerResult:
 
     def as_dict(self) -> dict[str, Any]:
         """All numbers by name, nested as the fields are."""
-        return {**asdict(self), "bytes_per_gaussian": self.bytes_per_gaussian}
+        pictures = None if self.pictures is None else self.pictures.as_dict()
+        numbers = asdict(replace(self, pictures=None))
+        return {**numbers, "bytes_per_gaussian": self.bytes_per_gaussian, "pictures": pictures}
 
 
 def measure_peer(
@@ -54,6 +60,8 @@ def measure_peer(
     *,
     command: Sequence[str] = SPLAT_TRANSFORM,
     sh_iterations: int | None = None,
+    pictures: bool = False,
+    views: Views | None = None,
 ) -> PeerResult:
     """Write ``scene`` in a peer's format, read it back by the same tool, and compare.
 
@@ -65,6 +73,8 @@ def measure_peer(
         format: ``"sog"`` or ``"spz"``.
         command: How to start splat-transform.
         sh_iterations: k-means iterations over the SH of ``.sog``; None leaves the tool's default.
+        pictures: compare pictures too (:func:`kissgs.evaluate`).
+        views: from where; by default virtual cameras.
 
     Raises:
         InvalidSceneError: ``scene``, or what the tool made of it, cannot be read or has no usable Gaussian.
@@ -90,6 +100,7 @@ def measure_peer(
         encode_cpu_seconds=encode_seconds,
         decode_cpu_seconds=decode_seconds,
         errors=_errors_of_visible(reference, candidate),
+        pictures=evaluate(reference, candidate, views) if pictures else None,
     )
 
 

@@ -44,6 +44,10 @@ def rasterize_on_cuda(
             "rendering on CUDA is gsplat's work, which is missing: pip install 'kissgs[cuda]'"
         ) from (error)
     device = means.device
+    backgrounds = backgrounds.to(device, torch.float32)
+    if not len(means):  # which gsplat does not promise to draw
+        empty = backgrounds[:, None, None, :].expand(-1, height, width, -1)
+        return empty.contiguous(), torch.zeros((len(viewmats), height, width), device=device)
     images, alphas, _ = rasterization(
         means=means,
         quats=quats,
@@ -59,7 +63,7 @@ def rasterize_on_cuda(
         eps2d=semantics.DILATION,
         sh_degree=SH_REST_COUNTS.index(shN.shape[1]),
         tile_size=semantics.TILE,
-        backgrounds=backgrounds.to(device, torch.float32),
+        backgrounds=backgrounds,
         rasterize_mode="classic",
     )
     return images, alphas[..., 0]

@@ -105,7 +105,7 @@ def sketch_of(splats: Splats) -> Splats:
     return Splats(
         means=np.ascontiguousarray(thinned.means),
         quats=np.ascontiguousarray(thinned.quats),
-        scales=thinned.scales + np.float32(np.log(step) / 3),
+        scales=thinned.scales + np.float32(np.log(step) / 2),
         opacities=np.ascontiguousarray(thinned.opacities),
         sh0=np.ascontiguousarray(thinned.sh0),
         shN=np.empty((len(thinned), 0, 3), np.float32),

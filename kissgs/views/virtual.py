@@ -33,6 +33,9 @@ ENCLOSED = 0.85
 GOOD_ENOUGH = 0.3
 """How much lower than the best a chosen view may score."""
 
+OVERVIEW = 0.5
+"""What e times the distance is worth where one view stands for the whole scene."""
+
 ROUNDS = 3
 """Of trying more cameras between good ones, where these are few."""
 
@@ -61,32 +64,85 @@ def virtual_views(
     Raises:
         InvalidViewsError: less than one view, or pictures of less than one pixel, are asked for.
     """
-    if min(width, height, count) < 1:
-        raise InvalidViewsError(f"at least 1 view of 1x1 pixels can be had, not {count} of {width}x{height}")
+    _, tried, chosen = _find(splats, (width, height), count, threads, progress)
+    return _split(_sized([tried.cameras[n] for n in chosen], width, height))
+
+
+def best_view(
+    splats: Splats,
+    *,
+    width: int = 640,
+    height: int = 480,
+    count: int = 32,
+    threads: int = 0,
+    progress: Progress = silent,
+) -> View:
+    """The one of :func:`virtual_views`, from the same arguments, to show where only one is shown.
+
+    Good as they are, and from some distance: what shows more of the scene stands for it better than a close-up.
+    """
+    scene, tried, chosen = _find(splats, (width, height), count, threads, progress)
+    views = _split(_sized([tried.cameras[n] for n in chosen], width, height))
+    distances = [float(np.linalg.norm(tried.cameras[n].position - scene.centre)) for n in chosen]
+    scores = tried.scores[chosen] + [of_distance(distance / scene.radius) for distance in distances]
+    return sorted(views.train + views.test, key=lambda view: view.name)[int(scores.argmax())]
+
+
+def of_distance(radii: float) -> float:
+    """What it adds to a view's score, where few are shown, to be so far from the scene's middle."""
+    return OVERVIEW * float(np.log(max(radii, 0.5)))
+
+
+def survey(splats: Splats, size: tuple[int, int], pool: Workers, progress: Progress) -> tuple[Anatomy, Critic, Tried]:
+    """Look a scene over by thumbnails in the shape of a picture of ``size``, (width, height).
+
+    Returns:
+        What the scene is like, who judges its views, and those that were judged for a start.
+
+    Raises:
+        InvalidViewsError: such a picture has no pixel.
+    """
+    if min(size) < 1:
+        raise InvalidViewsError(f"a picture has at least 1x1 pixels, not {size[0]}x{size[1]}")
     sketch = sketch_of(splats)
     scene = anatomy(sketch)
-    shrink = THUMBNAIL / max(width, height)
-    small = max(1, round(width * shrink)), max(1, round(height * shrink))
+    shrink = THUMBNAIL / max(size)
+    small = max(1, round(size[0] * shrink)), max(1, round(size[1] * shrink))
+    critic = Critic(sketch, scene, pool, progress)
+    return scene, critic, _try_all(sketch, scene, small, critic)
+
+
+def _find(
+    splats: Splats, size: tuple[int, int], count: int, threads: int, progress: Progress
+) -> tuple[Anatomy, Tried, list[int]]:
+    """What the scene is like, all that was tried, and the chosen ones of it."""
+    if min(*size, count) < 1:
+        raise InvalidViewsError(f"at least 1 view of 1x1 pixels can be had, not {count} of {size[0]}x{size[1]}")
     with Workers(threads) as pool:
-        critic = Critic(sketch, scene, pool, progress)
-        tried = _try_all(sketch, scene, small, critic)
+        scene, critic, tried = survey(splats, size, pool, progress)
         for _ in range(ROUNDS):
             if len(tried.good()) >= 2 * count:
                 break
             tried = tried.with_more(scene, critic)
     progress("cameras", 1.0)
+    return scene, tried, _choose(tried, scene, count)
+
+
+def _sized(cameras: list[Camera], width: int, height: int) -> list[Camera]:
     K = pinhole(FIELD_OF_VIEW, width, height)
-    return _split([Camera(camera.viewmat, K, width, height) for camera in _choose(tried, scene, count)])
+    return [Camera(camera.viewmat, K, width, height) for camera in cameras]
 
 
 @dataclass(frozen=True, slots=True)
-class _Tried:
+class Tried:
     """Cameras, what they see, and how good that is, 1 at best."""
 
     cameras: list[Camera]
     seen: list[Seen]
     whole: bool
     """Whether the scene should fill the picture; else it stands alone."""
+    enclosed: bool
+    """Whether the cameras are within a room or under a sky."""
     outside: Float64[np.ndarray, " n"]
     """Deduction for cameras outside of what encloses the scene."""
 
@@ -100,7 +156,13 @@ class _Tried:
         scores = self.scores
         return np.flatnonzero(scores >= scores.max() - GOOD_ENOUGH)
 
-    def with_more(self, scene: Anatomy, critic: Critic) -> _Tried:
+    def scores_for(self, cameras: list[Camera], critic: Critic) -> Float64[np.ndarray, " more"]:
+        """How good others are, on the same scale."""
+        deduction = _outside(cameras, critic) if self.enclosed else np.zeros(len(cameras))
+        seen = [*self.seen, *critic.judge(cameras)]
+        return scores_of(seen, whole=self.whole)[len(self.seen) :] - deduction
+
+    def with_more(self, scene: Anatomy, critic: Critic) -> Tried:
         """And those half-way between each good one and the good ones nearest to it."""
         good = self.good()
         places, looks = _poses([self.cameras[n] for n in good], scene)
@@ -115,24 +177,33 @@ class _Tried:
             target = place + looks[one] + looks[other]
             between.append(look_at(place, target, scene.up, fov=FIELD_OF_VIEW, width=first.width, height=first.height))
         deduction = np.concatenate([self.outside, np.zeros(len(between))])
-        return _Tried([*self.cameras, *between], [*self.seen, *critic.judge(between)], self.whole, deduction)
+        seen = [*self.seen, *critic.judge(between)]
+        return Tried([*self.cameras, *between], seen, self.whole, self.enclosed, deduction)
 
 
-def _try_all(splats: Splats, scene: Anatomy, size: tuple[int, int], critic: Critic) -> _Tried:
+def _try_all(splats: Splats, scene: Anatomy, size: tuple[int, int], critic: Critic) -> Tried:
     """Within a room or under a sky; before something with a background; or around something that stands alone."""
     within, outer = list(inside(scene, size)), list(orbit(scene, size))
     cameras = [*within, *outer]
     seen = critic.judge(cameras)
-    deduction = np.zeros(len(cameras))
     full = np.reshape([view.covered - view.near for view in seen[: len(within)]], (-1, WAYS_TO_LOOK)).mean(axis=1)
     if (full > ENCLOSED).sum() >= 3:
-        behind = critic.judge([turned(camera) for camera in cameras])
-        deduction[[view.covered < ENCLOSED for view in behind]] = 1
-        return _Tried(cameras, seen, True, deduction)
-    if np.quantile([view.covered for view in seen[-len(outer) // len(RADII) :]], 0.9) > ENCLOSED:
-        return _Tried(cameras, seen, True, deduction)
+        return Tried(cameras, seen, True, True, _outside(cameras, critic))
+    far = len(outer) // len(RADII)
+    filled = float(np.quantile([view.covered for view in seen[-far:]], 0.9))
+    if filled > ENCLOSED and size[0] < size[1]:  # what stands alone may fill a narrow picture
+        across = critic.judge(list(orbit(scene, (size[1], size[0])))[-far:])
+        filled = float(np.quantile([view.covered for view in across], 0.9))
+    if filled > ENCLOSED:
+        return Tried(cameras, seen, True, False, np.zeros(len(cameras)))
     cameras = list(around(splats, scene, size))
-    return _Tried(cameras, critic.judge(cameras), False, np.zeros(len(cameras)))
+    return Tried(cameras, critic.judge(cameras), False, False, np.zeros(len(cameras)))
+
+
+def _outside(cameras: list[Camera], critic: Critic) -> Float64[np.ndarray, " n"]:
+    """1 for cameras behind which the scene has an end."""
+    behind = critic.judge([turned(camera) for camera in cameras])
+    return np.array([float(view.covered < ENCLOSED) for view in behind])
 
 
 def _poses(cameras: list[Camera], scene: Anatomy) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
@@ -148,7 +219,7 @@ def _apart(
     return np.asarray(np.linalg.norm(places - places[one], axis=1) + np.linalg.norm(looks - looks[one], axis=1))
 
 
-def _choose(tried: _Tried, scene: Anatomy, count: int) -> list[Camera]:
+def _choose(tried: Tried, scene: Anatomy, count: int) -> list[int]:
     """Among the good ones: the best, then always the one farthest from all chosen; in the order of going round."""
     scores, good = tried.scores, tried.good()
     if len(good) < count:
@@ -161,7 +232,7 @@ def _choose(tried: _Tried, scene: Anatomy, count: int) -> list[Camera]:
         chosen.append(int((apart * (1 + scores[good] - scores.max())).argmax()))
     east, north = ground(scene.up)
     angle = [float(np.arctan2(looks[n] @ north, looks[n] @ east)) for n in chosen]
-    ordered = [tried.cameras[good[chosen[n]]] for n in np.argsort(angle, kind="stable")]
+    ordered = [int(good[chosen[n]]) for n in np.argsort(angle, kind="stable")]
     return [ordered[n % len(ordered)] for n in range(count)]
 
 

@@ -9,8 +9,11 @@ import pytest
 
 from kissgs.errors import InvalidSceneError, UnsupportedError
 from kissgs.evaluation.peers import measure_peer
-from kissgs.io.ply import write_ply
+from kissgs.evaluation.pictures import evaluate
+from kissgs.io.ply import read_ply, write_ply
+from kissgs.rendering.camera import look_at
 from kissgs.sample import sample_scene
+from kissgs.views.view import View, Views
 
 STAND_IN = """
 import sys
@@ -60,6 +63,19 @@ def test_bytes_seconds_and_errors(scene, tmp_path):
     assert result.errors.shN.energy_kept == 1
     assert result.as_dict()["bytes_per_gaussian"] == result.bytes_per_gaussian
     assert result.as_dict()["errors"]["means"]["max"] == result.errors.means.max
+
+
+def test_pictures_are_compared_if_asked_for(scene, tmp_path):
+    view = View(
+        "front", look_at(np.array([1.2, -2.2, -5.2]), np.zeros(3), np.array([0, -1.0, 0]), fov=1, width=48, height=32)
+    )
+    views = Views((), (view,), np.zeros(3, np.float32), "one camera")
+    result = measure_peer(scene, "spz", command=tool(tmp_path, STAND_IN), pictures=True, views=views)
+    moved = read_ply(scene)
+    moved.means[:, 0] += np.float32(0.001)
+    expected = evaluate(read_ply(scene), moved, views)
+    assert result.pictures.mean.between.psnr == pytest.approx(expected.mean.between.psnr, abs=0.05)
+    assert result.as_dict()["pictures"]["views"][0]["name"] == "front"
 
 
 def test_how_the_tool_is_called(scene, tmp_path):

@@ -10,7 +10,7 @@ from kissgs.rendering.rasterizer import render
 from kissgs.splats import SH_C0, Splats, clean
 from kissgs.views.anatomy import anatomy, weighted_median
 from kissgs.views.load import load_views
-from kissgs.views.virtual import virtual_views
+from kissgs.views.virtual import best_view, virtual_views
 
 
 def surface(points, normals_along, size, thin=0.1, colour=0.5):
@@ -107,6 +107,27 @@ def test_an_object_is_seen_whole_from_all_around():
     assert whole >= len(views) / 2
     azimuths = np.arctan2(*np.array([view.camera.position[[0, 2]] for view in views]).T)
     assert np.diff(np.sort(azimuths)).max() < np.pi / 2
+
+
+def test_tall_pictures_know_an_object_from_a_scene():
+    """Narrow pictures were filled by it, so that it was taken for a scene with a background."""
+    half = np.array([0.5, 1.5, 0.3])
+    corners = np.array(np.meshgrid(*zip(-half, half, strict=True))).reshape(3, -1).T
+    view = best_view(box(half, 2000, 0.15), width=36, height=96, count=8)
+    pixels = (corners @ view.camera.viewmat[:3, :3].T + view.camera.viewmat[:3, 3]) @ view.camera.K.T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    assert ((pixels > 0) & (pixels < [36, 96])).all()
+
+
+def test_the_best_view_is_one_of_all_and_no_close_up():
+    thing = box((0.5, 1.5, 0.3), 2000, 0.15)
+    options = {"width": 60, "height": 40, "count": 12}
+    best, views = best_view(thing, **options), everything(virtual_views(thing, **options))
+    (same,) = [view for view in views if view.name == best.name]
+    assert np.array_equal(best.camera.viewmat, same.camera.viewmat)
+    assert np.array_equal(best.camera.K, same.camera.K)
+    distances = [np.linalg.norm(view.camera.position) for view in views]
+    assert np.linalg.norm(best.camera.position) > 0.8 * max(distances)
 
 
 def test_a_room_is_seen_from_inside():

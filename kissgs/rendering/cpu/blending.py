@@ -38,13 +38,14 @@ def _exp_minus(s: np.float32) -> np.float32:
 
 
 @compiled(
-    "void(float32[:, ::1], int32[::1], int64[::1], int64, int64, int64, int64, int64, float32[::1], float32[::1],"
-    " float32[:, :, ::1], float32[:, ::1], int32[:, ::1])",
+    "void(float32[:, ::1], int32[::1], uint16[::1], int64[::1], int64, int64, int64, int64, int64,"
+    " float32[::1], float32[::1], float32[:, :, ::1], float32[:, ::1], int32[:, ::1])",
     fastmath=_FAST,
 )
 def blend(
     splats: np.ndarray,
     members: np.ndarray,
+    spans: np.ndarray,
     starts: np.ndarray,
     first: int,
     last: int,
@@ -60,8 +61,9 @@ def blend(
     """Draw tiles ``first`` to ``last`` (exclusive).
 
     Args:
-        splats: ``(M, 12)`` records of :func:`kissgs.rendering.cpu.projection.project`.
+        splats: ``(M, 11)`` records of :func:`kissgs.rendering.cpu.projection.project`.
         members: for each tile, front to back, the rows of ``splats`` that touch it.
+        spans: the rows of pixels that each of these touches, see :func:`kissgs.rendering.cpu.tiles.fill_tiles`.
         starts: where each tile's members begin; one more than there are tiles.
         first: tile.
         last: tile.
@@ -93,9 +95,7 @@ def blend(
             mx, my = splats[n, 0] - np.float32(x0), splats[n, 1] - np.float32(y0)
             l0, l1, l2 = splats[n, 2], splats[n, 3], splats[n, 4]
             opacity, red, green, blue = splats[n, 5], splats[n, 6], splats[n, 7], splats[n, 8]
-            reach = splats[n, 10]
-            top = np.uint64(min(max(my - reach - half, zero), np.float32(16)))
-            bottom = np.uint64(min(max(my + reach + half, zero), np.float32(16)))
+            top, bottom = np.uint64(spans[i] >> 5), np.uint64(spans[i] & 31)
             place = np.float32(i - begin)
             for p in range(top * np.uint64(16), bottom * np.uint64(16)):
                 dx, dy = s[p] - mx, s[p + np.uint64(256)] - my
@@ -129,13 +129,15 @@ def blend(
 
 
 @compiled(
-    "void(float32[:, ::1], int32[::1], int32[::1], int64[::1], int64, int64, int64, float32[::1], float32[::1],"
-    " float32[:, ::1], int32[:, ::1], float32[:, :, ::1], float32[:, ::1], float32[:, ::1])",
+    "void(float32[:, ::1], int32[::1], uint16[::1], int32[::1], int64[::1], int64, int64, int64,"
+    " float32[::1], float32[::1], float32[:, ::1], int32[:, ::1],"
+    " float32[:, :, ::1], float32[:, ::1], float32[:, ::1])",
     fastmath=_FAST,
 )
 def blend_backward(
     splats: np.ndarray,
     members: np.ndarray,
+    spans: np.ndarray,
     slots: np.ndarray,
     starts: np.ndarray,
     first: int,
@@ -152,7 +154,7 @@ def blend_backward(
     """Gradients of tiles ``first`` to ``last`` (exclusive), as :func:`kissgs.rendering.cpu.blending.blend` drew them.
 
     Args:
-        splats, members, starts, first, last, columns, limits, background, transmittance, stops: as there.
+        splats, members, spans, starts, first, last, columns, limits, background, transmittance, stops: as there.
         slots: where each member's gradient goes.
         v_image: ``(H, W, 3)`` gradient of the loss by the picture.
         v_alpha: ``(H, W)`` gradient of the loss by 1 - transmittance.
@@ -189,9 +191,7 @@ def blend_backward(
             mx, my = splats[n, 0] - np.float32(x0), splats[n, 1] - np.float32(y0)
             l0, l1, l2 = splats[n, 2], splats[n, 3], splats[n, 4]
             opacity, red, green, blue = splats[n, 5], splats[n, 6], splats[n, 7], splats[n, 8]
-            reach = splats[n, 10]
-            top = np.uint64(min(max(my - reach - half, zero), np.float32(16)))
-            bottom = np.uint64(min(max(my + reach + half, zero), np.float32(16)))
+            top, bottom = np.uint64(spans[i] >> 5), np.uint64(spans[i] & 31)
             place = np.float32(i - begin)
             m, mu, mv, muu, muv, mvv, vr, vg, vb = zero, zero, zero, zero, zero, zero, zero, zero, zero
             for p in range(top * np.uint64(16), bottom * np.uint64(16)):
@@ -231,13 +231,14 @@ def blend_backward(
 
 
 @compiled(
-    "void(float32[:, ::1], int32[::1], int32[::1], int64[::1], int64, int64, int64, float32[::1], float32[::1],"
-    " float32[:, ::1], int32[:, ::1], float32[::1])",
+    "void(float32[:, ::1], int32[::1], uint16[::1], int32[::1], int64[::1], int64, int64, int64,"
+    " float32[::1], float32[::1], float32[:, ::1], int32[:, ::1], float32[::1])",
     fastmath=_FAST,
 )
 def removal_errors(
     splats: np.ndarray,
     members: np.ndarray,
+    spans: np.ndarray,
     slots: np.ndarray,
     starts: np.ndarray,
     first: int,
@@ -276,9 +277,7 @@ def removal_errors(
             mx, my = splats[n, 0] - np.float32(x0), splats[n, 1] - np.float32(y0)
             l0, l1, l2 = splats[n, 2], splats[n, 3], splats[n, 4]
             opacity, red, green, blue = splats[n, 5], splats[n, 6], splats[n, 7], splats[n, 8]
-            reach = splats[n, 10]
-            top = np.uint64(min(max(my - reach - half, zero), np.float32(16)))
-            bottom = np.uint64(min(max(my + reach + half, zero), np.float32(16)))
+            top, bottom = np.uint64(spans[i] >> 5), np.uint64(spans[i] & 31)
             place = np.float32(i - begin)
             total = zero
             for p in range(top * np.uint64(16), bottom * np.uint64(16)):

@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from kissgs._typing import Float32, Float64, Int32, Int64
+from kissgs._typing import Float32, Float64, Int32, Int64, UInt16
 from kissgs.errors import UnsupportedError
 from kissgs.parallel import Workers
 from kissgs.rendering import semantics
@@ -43,12 +43,12 @@ class Footprints:
     Attributes:
         visible: ``(M,)`` which Gaussians they are.
         rows: ``(M,)`` footprints in the order of their Gaussians.
-        records: ``(M, 12)``, see :func:`kissgs.rendering.cpu.projection.project`.
+        records: ``(M, 11)``, see :func:`kissgs.rendering.cpu.projection.project`.
     """
 
     visible: Int32[np.ndarray, " M"]
     rows: Int64[np.ndarray, " M"]
-    records: Float32[np.ndarray, "M 12"]
+    records: Float32[np.ndarray, "M 11"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +59,7 @@ class TileLists:
         columns: tiles per row of tiles.
         starts: ``(tiles + 1,)`` where each tile's list begins.
         members: ``(P,)`` footprints, tile after tile, front to back.
+        spans: ``(P,)`` the rows of pixels that each touches there, see :func:`kissgs.rendering.cpu.tiles.fill_tiles`.
         slots: ``(P,)`` the slot of each of these pairs.
         slots_from: ``(M,)`` the first slot of each footprint; they are numbered in the order of the Gaussians.
         slot_counts: ``(M,)`` how many it has, one per tile that it touches.
@@ -67,6 +68,7 @@ class TileLists:
     columns: int
     starts: Int64[np.ndarray, " tiles_1"]
     members: Int32[np.ndarray, " P"]
+    spans: UInt16[np.ndarray, " P"]
     slots: Int32[np.ndarray, " P"]
     slots_from: Int64[np.ndarray, " M"]
     slot_counts: Int64[np.ndarray, " M"]
@@ -124,7 +126,7 @@ def draw(splats: Splats, camera: Camera, background: Float32[np.ndarray, "3"], p
 
     def blend(first: int, last: int) -> None:
         blending.blend(
-            *(footprints.records, lists.members, lists.starts, first, last, camera.width, camera.height),
+            *(footprints.records, lists.members, lists.spans, lists.starts, first, last, camera.width, camera.height),
             *(lists.columns, LIMITS, background, image, transmittance, stops),
         )
 
@@ -146,7 +148,7 @@ def differentiate(
 
     def blend(first: int, last: int) -> None:
         blending.blend_backward(
-            *(records, lists.members, lists.slots, lists.starts, first, last, lists.columns, LIMITS),
+            *(records, lists.members, lists.spans, lists.slots, lists.starts, first, last, lists.columns, LIMITS),
             *(frame.background, frame.transmittance, frame.stops, v_image, v_alpha, v_slots),
         )
 
@@ -182,7 +184,7 @@ def removal_scores(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
 
     def blend(first: int, last: int) -> None:
         blending.removal_errors(
-            *(records, lists.members, lists.slots, lists.starts, first, last, lists.columns, LIMITS),
+            *(records, lists.members, lists.spans, lists.slots, lists.starts, first, last, lists.columns, LIMITS),
             *(frame.background, frame.transmittance, frame.stops, errors),
         )
 
@@ -202,7 +204,7 @@ def _contiguous(splats: Splats) -> Splats:
 def _project(splats: Splats, camera: Camera, pool: Workers) -> Footprints:
     count = len(splats)
     visible, depths = np.empty(count, np.int32), np.empty(count, np.float32)
-    records = np.empty((count, 12), np.float32)
+    records = np.empty((count, 11), np.float32)
 
     def project(first: int, last: int) -> slice:
         found = projection.project(
@@ -242,13 +244,14 @@ def _sort_into_tiles(footprints: Footprints, camera: Camera, pool: Workers) -> T
             "Render it smaller"
         )
     members, slots = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int32)
+    spans = np.empty(starts[-1], np.uint16)
     ends = dict(zip(parts.tolist(), starts[:-1] + np.cumsum(per_part, axis=0) - per_part, strict=False))
 
     def fill(first: int, last: int) -> None:
-        tiles.fill_tiles(records, first, last, columns, rows, ends[first], slots_from, members, slots)
+        tiles.fill_tiles(records, first, last, columns, rows, ends[first], slots_from, members, slots, spans)
 
     _each_part(fill, parts, pool)
-    return TileLists(columns, starts, members, slots, slots_from, slot_counts)
+    return TileLists(columns, starts, members, spans, slots, slots_from, slot_counts)
 
 
 def _running_sum(counts: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n_1"]:

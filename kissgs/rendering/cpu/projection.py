@@ -150,8 +150,8 @@ def project(
         rules: NEAR, FAR, DILATION, FRUSTUM_MARGIN, ALPHA_MIN.
         visible: out, from row ``first``: which Gaussians they are.
         depths: out, likewise.
-        splats: out, likewise, ``(N, 12)``: centre x, y; l0, l1, l2 of :mod:`kissgs.rendering.cpu.blending`; opacity;
-            R, G, B (not written here); the largest exponent that shows; half height and half width in pixels.
+        splats: out, likewise, ``(N, 11)``: centre x, y; l0, l1, l2 of :mod:`kissgs.rendering.cpu.blending`; opacity;
+            R, G, B (not written here); the largest exponent that shows; half height in pixels.
 
     Returns:
         How many.
@@ -191,7 +191,6 @@ def project(
         splats[row, 5] = opacity
         splats[row, 9] = tau
         splats[row, 10] = half_height
-        splats[row, 11] = half_width
     return found
 
 

@@ -78,7 +78,7 @@ def shade(
         visible: the Gaussian of each footprint.
         first: footprint.
         last: footprint.
-        splats: ``(M, 12)`` records of :func:`kissgs.rendering.cpu.projection.project`; columns 6 to 8 are written.
+        splats: ``(M, 11)`` records of :func:`kissgs.rendering.cpu.projection.project`; columns 6 to 8 are written.
     """
     rest = shN.shape[1]
     basis = np.empty(15, np.float64)

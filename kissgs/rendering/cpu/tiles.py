@@ -69,6 +69,28 @@ def _rows(splats: np.ndarray, n: int, rows: int) -> tuple[int, int]:
     return _clamp(np.ceil((centre - reach - 15.5) / 16), rows), _clamp(np.floor((centre + reach - 0.5) / 16) + 1, rows)
 
 
+@njit(nogil=True, error_model="numpy")
+def _span(splats: np.ndarray, n: int, column: int, row: int) -> int:
+    """First and last (exclusive) row of pixels that footprint ``n`` touches in a tile, as ``32 * first + last``.
+
+    Within the tile's columns, the footprint's edge is highest above its own highest point, or at the nearer side.
+    """
+    x = 16 * column - np.float64(splats[n, 0])
+    y = 16 * row - np.float64(splats[n, 1])
+    l0, l1, l2 = np.float64(splats[n, 2]), np.float64(splats[n, 3]), np.float64(splats[n, 4])
+    tau = np.float64(splats[n, 9]) * 1.0001 + 1e-5
+    reach = np.sqrt(tau) / l2
+    lean = l1 * reach / l0
+    a = l1 * l1 + l2 * l2
+    dx = min(max(-lean, x + 0.5), x + 15.5)
+    b = l0 * l1 * dx
+    low = (np.sqrt(max(b * b - a * (l0 * l0 * dx * dx - tau), 0.0)) - b) / a
+    dx = min(max(lean, x + 0.5), x + 15.5)
+    b = l0 * l1 * dx
+    high = (np.sqrt(max(b * b - a * (l0 * l0 * dx * dx - tau), 0.0)) + b) / a
+    return 32 * _clamp(np.ceil(-high - y - 0.51), 16) + _clamp(np.floor(low - y - 0.49) + 1, 16)
+
+
 @compiled("void(float32[:, ::1], int64, int64, int64, int64, int64[::1], int64[::1])")
 def count_tiles(
     splats: np.ndarray, first: int, last: int, columns: int, rows: int, per_tile: np.ndarray, per_splat: np.ndarray
@@ -86,7 +108,7 @@ def count_tiles(
 
 
 @compiled(
-    "void(float32[:, ::1], int64, int64, int64, int64, int64[::1], int64[::1], int32[::1], int32[::1])",
+    "void(float32[:, ::1], int64, int64, int64, int64, int64[::1], int64[::1], int32[::1], int32[::1], uint16[::1])"
 )
 def fill_tiles(
     splats: np.ndarray,
@@ -98,11 +120,12 @@ def fill_tiles(
     slots_from: np.ndarray,
     members: np.ndarray,
     slots: np.ndarray,
+    spans: np.ndarray,
 ) -> None:
     """Write footprints ``first`` to ``last`` (exclusive) into the lists of the tiles that they touch.
 
     Args:
-        splats: ``(M, 12)`` records, front to back.
+        splats: ``(M, 11)`` records, front to back.
         first: footprint.
         last: footprint.
         columns: tiles per row.
@@ -111,6 +134,7 @@ def fill_tiles(
         slots_from: per footprint, the first of its slots, one for each tile it touches.
         members: out, lists of footprints, tile after tile.
         slots: out, the slot of each of these entries.
+        spans: out, the rows of pixels that each of them touches, as ``32 * first + last``, the last exclusive.
     """
     for n in range(first, last):
         slot = slots_from[n]
@@ -121,5 +145,6 @@ def fill_tiles(
                 tile = row * columns + column
                 members[ends[tile]] = n
                 slots[ends[tile]] = slot
+                spans[ends[tile]] = _span(splats, n, column, row)
                 ends[tile] += 1
                 slot += 1

@@ -1,0 +1,70 @@
+"""Oracle: a stand-in for gsplat that draws with the CPU backend what it is asked for, in gsplat's own terms.
+
+So what is handed over is checked where there is no GPU; where there is one, test_rasterizer.py draws on it.
+"""
+
+import sys
+import types
+
+import numpy as np
+import pytest
+import torch
+from render_scenes import blobs, camera
+
+from kissgs.errors import UnsupportedError
+from kissgs.rendering.differentiable import rasterize, tensors_of
+from kissgs.rendering.gsplat_backend import rasterize_on_cuda
+
+CLASSIC = {"near_plane": 0.01, "far_plane": 1e10, "eps2d": 0.3, "tile_size": 16, "rasterize_mode": "classic"}
+
+
+def stand_in(means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree, backgrounds, **rest):
+    """gsplat.rasterization: scales and opacities activated, colours the coefficients of all bands."""
+    assert rest == CLASSIC
+    assert colors.shape[1] == (sh_degree + 1) ** 2
+    images, alphas = rasterize(
+        *(means, quats, torch.log(scales), torch.logit(opacities.double()).float(), colors[:, 0], colors[:, 1:]),
+        *(viewmats, Ks, width, height),
+        backgrounds=backgrounds,
+    )
+    return images, alphas[..., None], {}
+
+
+@pytest.fixture
+def gsplat(monkeypatch):
+    module = types.ModuleType("gsplat")
+    module.rasterization = stand_in
+    monkeypatch.setitem(sys.modules, "gsplat", module)
+
+
+def arguments(count, degree):
+    views = [camera(seed=1), camera(seed=2)]
+    return {
+        **tensors_of(blobs(count, degree)),
+        "viewmats": torch.from_numpy(np.stack([view.viewmat for view in views])).float(),
+        "Ks": torch.from_numpy(np.stack([view.K for view in views])).float(),
+        "width": views[0].width,
+        "height": views[0].height,
+        "backgrounds": torch.tensor([[0.1, 0.5, 0.9], [1.0, 0.0, 0.3]]),
+    }
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_gsplat_is_asked_for_the_same_picture(gsplat, degree):
+    wanted = arguments(30, degree)
+    images, alphas = rasterize_on_cuda(**wanted)
+    expected_images, expected_alphas = rasterize(**wanted)
+    torch.testing.assert_close(images, expected_images, atol=2e-5, rtol=0)
+    torch.testing.assert_close(alphas, expected_alphas, atol=2e-5, rtol=0)
+
+
+def test_an_empty_scene_is_its_background(gsplat):
+    wanted = arguments(0, 1)
+    for found, expected in zip(rasterize_on_cuda(**wanted), rasterize(**wanted), strict=True):
+        assert torch.equal(found, expected)
+
+
+def test_without_gsplat_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    with pytest.raises(UnsupportedError, match=r"kissgs\[cuda\]"):
+        rasterize_on_cuda(**arguments(3, 0))
