@@ -17,7 +17,7 @@ from kissgs.evaluation.speed import RenderingCost
 def evaluation_table(evaluation: Evaluation, reference: Side, candidate: Side, *, asked: str) -> RenderableType:
     """What ``kissgs evaluate`` shows; ``asked`` is the split that was asked for."""
     what = Text(f"{evaluation.views_used}, {evaluation.size}: {evaluation.source}")
-    notes = []
+    notes = [Text(evaluation.note, "yellow")] if evaluation.note else []
     if evaluation.split != asked:
         notes.append(Text("no view is held out, so these are those that the scene may have learnt from", "yellow"))
     return Group(_sizes(evaluation, reference, candidate), what, *notes, Text(), _views(evaluation))

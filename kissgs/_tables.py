@@ -57,9 +57,11 @@ def _pictures(evaluation: Evaluation) -> Text:
     mean = evaluation.mean
     told = f"PSNR {spell(mean.candidate.psnr, 2)} dB, SSIM {spell(mean.candidate.ssim, 4)}"
     if mean.reference is None:
-        return Text(f"{told} to the scene's own renderings from {evaluation.views_used}")
-    own = f"{spell(mean.reference.psnr, 2)} dB, {spell(mean.reference.ssim, 4)}"
-    return Text(f"{told} to {evaluation.views_used}; the scene itself {own}")
+        against = f"to the scene's own renderings from {evaluation.views_used}"
+    else:
+        own = f"{spell(mean.reference.psnr, 2)} dB, {spell(mean.reference.ssim, 4)}"
+        against = f"to {evaluation.views_used}; the scene itself {own}"
+    return Text.assemble(f"{told} {against}", (f"; {evaluation.note}" if evaluation.note else "", "yellow"))
 
 
 def parts_table(parts: Mapping[str, int], count: int) -> Table:
@@ -110,7 +112,7 @@ def bench_table(rows: Iterable[tuple[str, str, RoundTrip | PeerResult]]) -> Tabl
     photographed = any(
         result.pictures is not None and result.pictures.mean.reference is not None for *_, result in rows
     )
-    pictures = (*(["PSNR to photo", "change dB"] * photographed), "PSNR to original", "SSIM") if seen else ()
+    pictures = (*(["PSNR to photo", "change dB", "SSIM"] * photographed), "PSNR to original", "SSIM") if seen else ()
     right = (
         "B/Gaussian",
         "bytes",
@@ -147,7 +149,8 @@ def _picture_cells(evaluation: Evaluation | None, photographed: bool) -> list[st
     if evaluation is None:
         return []
     mean = evaluation.mean
-    to_photo = [spell(mean.candidate.psnr, 2), "" if mean.change is None else spell(mean.change, 2, signed=True)]
+    change = "" if mean.change is None else spell(mean.change, 2, signed=True)
+    to_photo = [spell(mean.candidate.psnr, 2), change, spell(mean.candidate.ssim, 4)]
     return [*(to_photo if photographed else []), spell(mean.between.psnr, 2), spell(mean.between.ssim, 4)]
 
 

@@ -5,18 +5,15 @@ from pathlib import Path
 import pytest
 from jaxtyping import install_import_hook
 
-# The shapes and dtypes in signatures are executed. Not those of Splats and encode, which have their own sentences for
-# what users hand them, nor of compiled kernels.
+# The shapes and dtypes in signatures are executed. Not those of Splats, Camera and encode, which have their own
+# sentences for what users hand them, nor of compiled kernels.
 install_import_hook(
     [
         "kissgs.evaluation",
         "kissgs.io",
         "kissgs.sample",
         "kissgs.spherical_harmonics",
-        *(
-            f"kissgs.rendering.{name}"
-            for name in ("camera", "cpu.frame", "differentiable", "losses", "lpips", "metrics")
-        ),
+        *(f"kissgs.rendering.{name}" for name in ("cpu.frame", "differentiable", "losses", "lpips", "metrics")),
         "kissgs.rendering.rasterizer",
         "kissgs.views",
         *(f"kissgs.sogxt.{name}" for name in ("codebook", "decode", "kmeans", "order", "planes", "plas", "pras")),

@@ -65,6 +65,19 @@ def test_views_without_a_test_split_say_so(folder: Path, tmp_path: Path) -> None
     assert "no view is held out" in text
 
 
+def test_photographs_that_are_not_found_are_missed_aloud(folder: Path, tmp_path: Path) -> None:
+    capture = write_capture(tmp_path / "capture")
+    (capture / "images").rename(capture / "rgb")
+    words = ["evaluate", folder / "a.ply", folder / "c.ply", "--views", capture]
+    note = f"no photographs were found (looked in {capture} for 'images', 'input'); name their folder with --images"
+    text = " ".join(run(*words, "--html", tmp_path / "page.html").stdout.decode().split())
+    assert note.replace(" ", "") in text.replace(" ", "")
+    assert note[1:].replace("'", "&#x27;") in (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert json.loads(run(*words, "--json").stdout)["note"] == note
+    told = json.loads(run(*words, "--images", "rgb", "--json").stdout)
+    assert (told["note"], told["against"]) == ("", "photos")
+
+
 def test_a_page_is_written_whole_and_not_over_another(folder: Path, tmp_path: Path) -> None:
     page, words = (
         tmp_path / "page.html",

@@ -37,3 +37,11 @@ def test_links_lead_somewhere() -> None:
     for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
         for target in re.findall(r"\]\((?!https?:)([^)#]+)\)", page.read_text(encoding="utf-8")):
             assert (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+def test_no_page_is_left_unfinished() -> None:
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
+        unfinished = re.findall(
+            r"^[A-Z_]{6,}$|TODO|FIXME|[A-Z]{4,}SSIM", page.read_text(encoding="utf-8"), re.MULTILINE
+        )
+        assert not unfinished, f"{page.name}: {unfinished}"

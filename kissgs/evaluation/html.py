@@ -83,7 +83,7 @@ def html_report(
         title=escape(f"{candidate.name} compared with {reference.name}"),
         reference=escape(reference.name),
         candidate=escape(candidate.name),
-        summary=escape(summary_line(evaluation, len(shown))),
+        summary=escape(summary_line(evaluation, len(shown)) + _sentence(evaluation.note)),
         figures="\n".join(figure_cards(evaluation, reference.bytes, candidate.bytes)),
         table=views_table(evaluation, shown),
         sections="\n".join(sections),
@@ -103,6 +103,10 @@ def chosen_views(evaluation: Evaluation) -> list[int]:
     if worst not in chosen:
         chosen[min(range(MOST_VIEWS), key=lambda i: abs(chosen[i] - worst))] = worst
     return chosen
+
+
+def _sentence(note: str) -> str:
+    return f" {note[0].upper()}{note[1:]}." if note else ""
 
 
 def _badness(psnr: float) -> float:

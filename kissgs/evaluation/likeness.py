@@ -104,6 +104,7 @@ class Evaluation:
         reference_count: Gaussians of the reference.
         candidate_count: Gaussians of the candidate.
         views: in their order, one or more.
+        note: of the views, for people; see :class:`kissgs.views.view.Views`.
     """
 
     against: Literal["photos", "renderings"]
@@ -113,6 +114,7 @@ class Evaluation:
     reference_count: int
     candidate_count: int
     views: tuple[ViewComparison, ...]
+    note: str = ""
 
     @property
     def views_used(self) -> str:
@@ -144,6 +146,7 @@ class Evaluation:
             "against": self.against,
             "split": self.split,
             "source": self.source,
+            "note": self.note,
             "count": {"reference": self.reference_count, "candidate": self.candidate_count},
             "views": [view.as_dict() for view in self.views],
             "mean": self.mean.as_dict(),

@@ -22,6 +22,10 @@ from kissgs.rendering.rasterizer import Device, load_kernels, render
 from kissgs.splats import Splats, clean
 from kissgs.views.view import View, Views
 
+NOTHING_SEEN = (
+    "no picture shows anything of the reference, so these figures say nothing; choose other cameras (--views)"
+)
+
 
 def evaluate(
     reference: Splats,
@@ -64,11 +68,12 @@ def evaluate(
         views = virtual_views(reference, threads=threads, progress=progress)
     used, chosen = _views_to_use(views, split)
     photographed = _have_photos(chosen)
-    compared = []
+    compared, blank = [], len(reference) > 0
     for done, view in enumerate(chosen):
         progress("evaluate", done / len(chosen))
         scenes = (reference, candidate)
         pictures = [take_picture(scene, view.camera, views.background, device, threads) for scene in scenes]
+        blank = blank and bool((pictures[0] == np.clip(views.background, 0, 1)).all())
         photo = view.load_photo() if photographed else None
         compared.append(ViewComparison(view=view, comparison=_compare(pictures[0], pictures[1], photo, measure)))
     progress("evaluate", 1.0)
@@ -80,6 +85,7 @@ def evaluate(
         reference_count=len(reference),
         candidate_count=len(candidate),
         views=tuple(compared),
+        note="; ".join(filter(None, [views.note, NOTHING_SEEN if blank else ""])),
     )
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kissgs.errors import UnsupportedError
+from kissgs.parallel import Workers
 from kissgs.progress import Progress, silent
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.rasterizer import load_kernels, removal_scores, render
@@ -54,15 +54,11 @@ def rendering_cost(
     Raises:
         UnsupportedError: torch is not installed.
     """
-    try:
-        import torch
-    except ImportError as error:
-        raise UnsupportedError("gradients are torch's, which is missing: pip install 'kissgs[train]'") from error
     from kissgs.rendering.differentiable import tensors_of
 
     load_kernels(progress)
     tensors = {name: tensor.clone().requires_grad_() for name, tensor in tensors_of(splats).items()}
-    adam = torch.optim.Adam([{"params": [tensor]} for tensor in tensors.values()], lr=0.0, eps=1e-15, fused=True)
+    adam = _adam(tensors)
     measured = []
     for number, camera in enumerate(cameras):
         progress("measure", number / len(cameras))
@@ -77,12 +73,20 @@ def rendering_cost(
     )
 
 
+def _adam(tensors: dict[str, Tensor]) -> Optimizer:
+    """That changes nothing: every repeat finds the same scene."""
+    from torch.optim import Adam
+
+    return Adam([{"params": [tensor]} for tensor in tensors.values()], lr=0.0, eps=1e-15, fused=True)
+
+
 def _one_view(
     splats: Splats, tensors: dict[str, Tensor], adam: Optimizer, camera: Camera, threads: int
 ) -> tuple[int, dict[str, list[float]]]:
     """How many Gaussians it sees, and milliseconds of each repeat, by what was done."""
     import torch
 
+    from kissgs.rendering.cpu.frame import draw
     from kissgs.rendering.differentiable import rasterize
     from kissgs.rendering.losses import photometric_loss
 
@@ -99,7 +103,6 @@ def _one_view(
         return images.detach()
 
     images = step().requires_grad_()
-    gradient = tensors["opacities"].grad
     works: dict[str, Callable[[], object]] = {
         "draw": lambda: render(splats, camera, threads=threads),
         "draw_and_backward": step,
@@ -108,7 +111,9 @@ def _one_view(
         "score": lambda: removal_scores(splats, [camera], threads=threads),
     }
     taken = {name: [_cpu(work) for _ in range(REPEATS)] for name, work in works.items()}
-    return int(torch.count_nonzero(gradient)) if gradient is not None else 0, taken
+    with Workers(threads) as pool:
+        frame = draw(splats, camera, np.zeros(3, np.float32), pool)
+    return len(frame.footprints.visible), taken
 
 
 def resampled(splats: Splats, count: int, *, seed: int = 0) -> Splats:

@@ -9,10 +9,17 @@ import numpy as np
 from kissgs._typing import Float64
 from kissgs.errors import InvalidViewsError
 
+MAX_SIDE = 1 << 16
+"""Of a picture, pixels; already such a square has 50 GB."""
+
+MAX_FOCAL = 1e15
+
 
 @dataclass(frozen=True, slots=True)
 class Camera:
     """A pinhole camera: x right, y down, z forward; the centre of the first pixel is at (0.5, 0.5).
+
+    Matrices of any type and layout are taken, and copied.
 
     Attributes:
         viewmat: ``(4, 4)`` float64, rigid transform from the world to the camera.
@@ -21,7 +28,8 @@ class Camera:
         height: of the picture, pixels.
 
     Raises:
-        InvalidViewsError: a matrix is not finite or not of that kind, a focal length or a side is not positive.
+        InvalidViewsError: a matrix is not finite or not of that kind; a focal length or a side is not positive, or
+            immense.
     """
 
     viewmat: Float64[np.ndarray, "4 4"]
@@ -30,16 +38,25 @@ class Camera:
     height: int
 
     def __post_init__(self) -> None:
-        if self.width < 1 or self.height < 1:
-            raise InvalidViewsError(f"a camera's picture must be at least 1x1, not {self.width}x{self.height}")
-        for name, matrix, shape in (("viewmat", self.viewmat, (4, 4)), ("K", self.K, (3, 3))):
+        for name, side in (("width", self.width), ("height", self.height)):
+            if not isinstance(side, int | np.integer) or not 1 <= side <= MAX_SIDE:
+                raise InvalidViewsError(
+                    f"a camera's {name} must be a whole number from 1 to {MAX_SIDE:,}, not {side!r}"
+                )
+        for name, shape in (("viewmat", (4, 4)), ("K", (3, 3))):
+            matrix = np.array(getattr(self, name), dtype=np.float64, order="C")  # kernels read no other layout
             if matrix.shape != shape or not np.isfinite(matrix).all():
                 raise InvalidViewsError(f"a camera's {name} must be {shape[0]}x{shape[1]} finite numbers")
-        rotation = self.viewmat[:3, :3]
+            object.__setattr__(self, name, matrix)
+        rotation, K = self.viewmat[:3, :3], self.K
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
             raise InvalidViewsError("a camera's viewmat must hold a rotation: orthonormal rows, no mirroring, no scale")
-        if not (self.K[0, 0] > 0 and self.K[1, 1] > 0):
-            raise InvalidViewsError("a camera's focal lengths must be positive")
+        if np.abs(self.viewmat[3] - (0, 0, 0, 1)).max() > 1e-6:
+            raise InvalidViewsError("a camera's viewmat must end in the row 0 0 0 1")
+        if not (0 < K[0, 0] <= MAX_FOCAL and 0 < K[1, 1] <= MAX_FOCAL):
+            raise InvalidViewsError(f"a camera's focal lengths must be positive, and at most {MAX_FOCAL:.0e} pixels")
+        if K[0, 1] or K[1, 0] or np.abs(K[2] - (0, 0, 1)).max() > 1e-6:
+            raise InvalidViewsError("a camera's K must be fx 0 cx, 0 fy cy, 0 0 1: a pinhole without skew")
 
     @property
     def position(self) -> Float64[np.ndarray, "3"]:

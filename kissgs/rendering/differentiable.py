@@ -5,15 +5,19 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from kissgs.errors import InvalidViewsError, UnsupportedError
 from kissgs.parallel import Workers
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu.frame import Frame, differentiate, draw
 from kissgs.splats import ATTRIBUTES, Splats
+
+try:
+    import torch
+    from torch import Tensor
+    from torch.autograd.function import once_differentiable
+except ImportError as error:
+    raise UnsupportedError("gradients are torch's, which is missing: pip install 'kissgs[train]'") from error
 
 
 def rasterize(
@@ -54,28 +58,38 @@ def rasterize(
         Pictures ``(C, H, W, 3)``, not clamped, and alphas ``(C, H, W)``.
 
     Raises:
-        UnsupportedError: a gradient by the cameras or the background is asked for; a tensor is not float32; no gsplat.
-        InvalidSceneError: shapes do not fit.
-        InvalidViewsError: no camera, not a rigid pose, or not a pinhole.
+        UnsupportedError: a gradient by the cameras or the background is asked for; a parameter is not float32, or not
+            where the others are; the pictures would take too much memory; no gsplat.
+        InvalidSceneError: the parameters' shapes do not fit.
+        InvalidViewsError: no camera, not as many of them as of backgrounds; not a rigid pose, or not a pinhole.
     """
     parameters = (means, quats, scales, opacities, sh0, shN)
-    if not len(viewmats):
-        raise InvalidViewsError("there is no camera to render from")
     if backgrounds is None:
-        backgrounds = torch.zeros((len(viewmats), 3), device=means.device)
-    if any(tensor.requires_grad for tensor in (viewmats, Ks, backgrounds)):
-        raise UnsupportedError("gradients flow to the Gaussians only, not to cameras and backgrounds: detach them")
-    if any(tensor.dtype != torch.float32 for tensor in parameters):
-        raise UnsupportedError("the rasteriser takes float32 parameters only")
+        backgrounds = torch.zeros((len(viewmats), 3))
+    _check_views(viewmats, Ks, backgrounds)
+    if any(tensor.dtype != torch.float32 or tensor.device != means.device for tensor in parameters):
+        raise UnsupportedError("the rasteriser takes float32 parameters only, all on one device")
     if means.device.type == "cuda":
         from kissgs.rendering.gsplat_backend import rasterize_on_cuda
 
         return rasterize_on_cuda(*parameters, viewmats, Ks, width, height, backgrounds)
-    poses, pinholes = viewmats.numpy().astype(np.float64), Ks.numpy().astype(np.float64)
+    if means.device.type != "cpu":
+        raise UnsupportedError(f"the rasteriser draws on cpu and cuda, not on {means.device.type}")
+    poses, pinholes, colours = (tensor.cpu().numpy() for tensor in (viewmats, Ks, backgrounds))
     cameras = [Camera(pose, K, width, height) for pose, K in zip(poses, pinholes, strict=True)]
-    colours = backgrounds.numpy().astype(np.float32)
     images, alphas = _Rasterize.apply(*parameters, cameras, colours, threads)  # type: ignore[no-untyped-call]
     return images, alphas
+
+
+def _check_views(viewmats: Tensor, Ks: Tensor, backgrounds: Tensor) -> None:
+    count = len(viewmats)
+    if not count:
+        raise InvalidViewsError("there is no camera to render from")
+    for name, tensor, shape in (("viewmats", viewmats, (4, 4)), ("Ks", Ks, (3, 3)), ("backgrounds", backgrounds, (3,))):
+        if tensor.shape != (count, *shape):
+            raise InvalidViewsError(f"{name} must be of shape {(count, *shape)}, not {tuple(tensor.shape)}")
+        if tensor.requires_grad:
+            raise UnsupportedError("gradients flow to the Gaussians only, not to cameras and backgrounds: detach them")
 
 
 def tensors_of(splats: Splats, device: str = "cpu") -> dict[str, Tensor]:

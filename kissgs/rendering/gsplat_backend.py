@@ -69,6 +69,18 @@ def rasterize_on_cuda(
     return images, alphas[..., 0]
 
 
+def alpha_max() -> float:
+    """The largest alpha that the installed gsplat draws: releases up to 1.5.3 have 0.999 built in, later ones tell.
+
+    Pictures then differ from those of the processor by a few hundredths where opaque Gaussians overlap.
+    """
+    try:
+        from gsplat.cuda import _constants
+    except ImportError:
+        return 0.999
+    return float(_constants.MAX_ALPHA)
+
+
 def render_on_cuda(
     splats: Splats, camera: Camera, background: Sequence[float]
 ) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]:

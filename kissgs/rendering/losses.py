@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
-from torch.autograd.function import BackwardCFunction, FunctionCtx, once_differentiable
 
 from kissgs._typing import Float
-from kissgs.errors import InvalidViewsError
+from kissgs.errors import InvalidViewsError, UnsupportedError
 from kissgs.parallel import Workers
 from kissgs.rendering.metrics import difference_and_ssim
+
+try:
+    import torch
+    from torch.autograd.function import BackwardCFunction, FunctionCtx, once_differentiable
+except ImportError as error:
+    raise UnsupportedError("this loss is torch's, which is missing: pip install 'kissgs[train]'") from error
 
 
 def photometric_loss(

@@ -39,7 +39,10 @@ def render(
     Returns:
         The picture, from 0 to 1 where the scene is (some SH overshoot: clamp to show it), and its alpha.
 
+    The first picture on a machine compiles the kernels, which takes some seconds; :func:`load_kernels` does it ahead.
+
     Raises:
+        InvalidViewsError: the background is not three finite numbers.
         UnsupportedError: the picture would take too much memory; no CUDA here.
     """
     if device == "cuda":
@@ -74,6 +77,7 @@ def removal_scores(
         progress: receives the stage ``"score"``.
 
     Raises:
+        InvalidViewsError: the background is not three finite numbers.
         UnsupportedError: a picture would take too much memory.
     """
     from kissgs.rendering.cpu.frame import draw

@@ -43,7 +43,7 @@ def anatomy(splats: Splats) -> Anatomy:
     centre = np.array([weighted_median(axis, weights) for axis in means.T])
     distance = np.linalg.norm(means - centre, axis=1)
     size = float(np.exp(np.median(splats.scales.max(axis=1)).astype(np.float64)))
-    smallest = max(size, 1e-5 * float(np.abs(centre).max()), 1e-9)  # float32 positions are no finer
+    smallest = max(2 * size, 1e-5 * float(np.abs(centre).max()), 1e-9)  # float32 positions are no finer
     radius = max(weighted_median(distance, weights), smallest)
     for _ in range(30):
         pull = weights * np.exp(-0.5 * (distance / radius) ** 2)

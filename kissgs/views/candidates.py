@@ -8,6 +8,7 @@ import numpy as np
 
 from kissgs._typing import Float64
 from kissgs.rendering.camera import Camera, look_at
+from kissgs.rendering.semantics import NEAR
 from kissgs.splats import Splats
 from kissgs.views.anatomy import Anatomy, Point, opacity, weighted_median
 
@@ -89,9 +90,9 @@ def _framed(
         along = (means - scene.centre) @ axis
         low, high = (weighted_median(along, weights, share) for share in (0.01, 0.99))
         middle += 0.5 * (low + high) * axis
-        half.append(max(0.5 * (high - low), 0.1 * scene.radius))
+        half.append(max(0.5 * (high - low), 0.5 * scene.radius))
     sides = np.array([width, height]) / (2 * looking.K[0, 0])
-    distance = 1.15 * float((np.array(half[:2]) / sides).max()) + half[2]
+    distance = max(1.15 * float((np.array(half[:2]) / sides).max()), 2 * NEAR) + half[2]
     place = middle + distance * direction
     return look_at(place, middle, scene.up, fov=FIELD_OF_VIEW, width=width, height=height)
 

@@ -23,6 +23,7 @@ from kissgs.views.colmap_files import (
     read_text_cameras,
     read_text_images,
 )
+from kissgs.views.photos import INPUT, is_absolute
 from kissgs.views.shots import MAX_SIDE, Capture, Intrinsics, Shot
 from kissgs.views.undistort import Distortion
 
@@ -60,7 +61,8 @@ def half_model(path: Path) -> str | None:
 def read_colmap(folder: Path) -> Capture:
     """Read the model in ``folder``: ``cameras`` and ``images``, as ``.bin`` or else as ``.txt``.
 
-    Its photographs are expected in ``images`` beside it, or above if the folder is a ``sparse/0`` or the like.
+    Its photographs are expected in ``images`` beside it, or above if the folder is a ``sparse/0`` or the like, unless
+    it names them by absolute paths.
 
     Raises:
         InvalidViewsError: the files are missing, damaged, cut short, or contradict each other.
@@ -84,7 +86,8 @@ def read_colmap(folder: Path) -> Capture:
             camera = cameras[record.camera]
             intrinsics[record.camera] = _intrinsics(camera, f"{cameras_path}, camera {record.camera}")
         viewmat = _viewmat(record, where)
-        shots.append(Shot(record.name, f"images/{record.name}", where, viewmat, intrinsics[record.camera]))
+        photo = record.name if is_absolute(record.name) else f"images/{record.name}"
+        shots.append(Shot(record.name, photo, where, viewmat, intrinsics[record.camera]))
     if not shots:
         raise InvalidViewsError(f"{images_path} has no images; reconstruct the capture again")
     return Capture(tuple(shots), _root(folder), f"COLMAP model {folder}")
@@ -97,9 +100,13 @@ def _is_model(folder: Path, suffix: str) -> bool:
 def _root(folder: Path) -> Path:
     """The capture's folder: the first from ``folder`` upwards with photographs, or else where model folders begin."""
     place = folder.resolve()
-    while not any(found.is_dir() for found in place.glob("images*")) and _MODEL_FOLDERS.fullmatch(place.name):
+    while not _has_photos(place) and _MODEL_FOLDERS.fullmatch(place.name):
         place = place.parent
     return place
+
+
+def _has_photos(folder: Path) -> bool:
+    return any(found.is_dir() for found in [*folder.glob("images*"), folder / INPUT])
 
 
 def _intrinsics(camera: CameraRecord, where: str) -> Intrinsics:

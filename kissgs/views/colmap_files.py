@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import io
 import struct
 from collections.abc import Iterator
@@ -165,13 +166,15 @@ def _check_points(path: Path, number: int, line: str) -> None:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Numbered lines, from 1, without what separates them."""
+    """Numbered lines, from 1, without what separates them and without a byte order mark."""
     with open_file(path) as (file, _):
         number = 0
         while line := file.readline(MAX_LINE_BYTES + 1):
             number += 1
             if len(line) > MAX_LINE_BYTES:
                 raise InvalidViewsError(f"{path}, line {number}: longer than {MAX_LINE_BYTES} bytes; it is damaged")
+            if number == 1:
+                line = line.removeprefix(codecs.BOM_UTF8)
             yield number, _decode(line, f"{path}, line {number}").strip()
 
 

@@ -12,7 +12,7 @@ from kissgs._typing import Float32
 from kissgs.errors import InvalidViewsError
 from kissgs.rendering.camera import Camera
 from kissgs.views.colmap import PLACES, find_colmap, half_model, read_colmap
-from kissgs.views.photos import FoundPhoto, find_photos
+from kissgs.views.photos import FoundPhoto, find_photos, where_looked
 from kissgs.views.pixels import PhotoHeader, read_photo_header
 from kissgs.views.shots import Capture, Shot
 from kissgs.views.transforms import read_split_transforms, read_transforms
@@ -20,7 +20,8 @@ from kissgs.views.undistort import full_window
 from kissgs.views.view import Bend, View, Views
 
 RESOLUTION = 1600
-"""Pixels of the longer side. The protocol of 3DGS, without which published figures do not compare."""
+"""Pixels of the longer side. For landscape pictures it is the protocol of 3DGS, without which published figures do not
+compare; INRIA's code looks at the width alone, and so reduces portrait pictures less, or not at all."""
 
 HOLD_OUT = 8
 """Every eighth view, from the first: the protocol of 3DGS and Mip-NeRF 360."""
@@ -45,15 +46,17 @@ def load_views(
 
     Every camera is brought to its photograph's real size, which counts more than what the file of cameras says. A
     longer side of more than ``resolution`` pixels is then reduced to it, by INRIA's formula, whose rounding may lose
-    one pixel. Photographs of a distorting lens are undistorted when they are loaded.
+    one pixel; INRIA's own code reduces only what is wider than that, and so leaves portrait pictures larger.
+    Photographs of a distorting lens are undistorted when they are loaded.
 
-    Where there is no folder of photographs at all, the views are cameras alone, distortion left out. Where
-    some photographs are missing, nothing is skipped: figures of a part would pass for those of the whole.
+    Where there is no folder of photographs at all, the views are cameras alone, distortion left out, and a note says
+    so. Where some photographs are missing, nothing is skipped: figures of a part would pass for those of the whole.
 
     Args:
         path: of the capture's folder, or of its file of cameras.
         scale: take the photographs from the folder of this scale, such as 4 for ``images_4``. None takes the
-            full-size folder if there is one, else that of scale 4, else the largest.
+            full-size folder if there is one, else that of scale 4, else the largest; without any ``images`` it is
+            ``input``, where INRIA's ``convert.py`` has them.
         images: take them from this folder instead.
         resolution: the largest longer side of a picture, pixels; None stands for 1600.
         hold_out: every such view, of all sorted by name from the first on, is for testing; 0 for none. A capture that
@@ -69,7 +72,8 @@ def load_views(
         capture = _read_capture(Path(path))
     except OSError as error:  # looking at a path may already fail: no permission, a name too long
         raise InvalidViewsError(f"cannot read {path}: {(error.strerror or str(error)).lower()}") from error
-    photos = find_photos([shot.photo for shot in capture.shots], capture.root, scale=scale, images=images)
+    names = [shot.photo for shot in capture.shots]
+    photos = find_photos(names, capture.root, scale=scale, images=images)
     pictures: list[_Picture | None] = [None] * len(capture.shots)
     if photos is not None:
         pictures = [_Picture(photo, read_photo_header(photo.path)) for photo in photos]
@@ -81,8 +85,11 @@ def load_views(
         nominal, size = _sizes(shot, picture, scale or 1)
         views.append((_view(shot, picture, nominal, _reduced(size, limit), background), shot.split))
     train, test = _split(views, hold_out)
-    where = "no photographs" if photos is None else f"photographs in {photos[0].path.parent}"
-    return Views(train, test, background, f"{capture.source}, {where}")
+    if photos is not None:
+        return Views(train, test, background, f"{capture.source}, photographs of {_folders(photos)}")
+    looked = where_looked(names, capture.root)
+    note = f"no photographs were found (looked in {looked}); name their folder with --images"
+    return Views(train, test, background, f"{capture.source}, no photographs", note)
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,6 +178,13 @@ def _reduced(size: tuple[int, int], resolution: int) -> tuple[int, int]:
         return size
     factor = longer / resolution
     return max(1, int(size[0] / factor)), max(1, int(size[1] / factor))
+
+
+def _folders(photos: Sequence[FoundPhoto]) -> str:
+    """Where photographs are, in words."""
+    folders = dict.fromkeys(photo.folder for photo in photos)
+    names = [(folder.resolve() if folder.name in ("", "..") else folder).name for folder in folders]
+    return " and ".join(names) if len(names) <= 2 else f"{len(names)} folders"
 
 
 def _split(views: Sequence[tuple[View, str | None]], hold_out: int) -> tuple[tuple[View, ...], tuple[View, ...]]:

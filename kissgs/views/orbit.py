@@ -32,7 +32,7 @@ FINE_STEPS = 72
 LENIENCE = 0.15
 """How much worse than good enough a place may be on a full circle: better past it than back at it."""
 
-LEAST = np.radians(30)
+LEAST = float(np.radians(30))
 """To and fro over less would hardly show that it moves."""
 
 RADII = (1.1, 1.5, 2.0, 2.6)

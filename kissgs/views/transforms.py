@@ -76,8 +76,9 @@ class _Transforms(_Lens):
 def read_transforms(path: Path) -> Capture:
     """Read one file of cameras, with the split that it has itself, if any.
 
-    nerfstudio's ``train_filenames`` are for training, its ``test_filenames`` (or else ``val_filenames``) held out; a
-    file with only one of these lists has all other frames in the other part. Frames in no list are left out.
+    nerfstudio's ``train_filenames`` are for training, its ``test_filenames`` held out, or ``val_filenames`` where that
+    is empty; a file with only one of these lists has all other frames in the other part. Frames in no list are left
+    out, those in both are held out.
 
     Raises:
         InvalidViewsError: the file is no readable JSON, or lacks or contradicts something.
@@ -198,8 +199,9 @@ def _rotation(matrix: Float64[np.ndarray, "3 3"], where: str) -> Float64[np.ndar
 
 def _parts(path: Path, document: _Transforms) -> dict[str, Literal["train", "test"]] | None:
     """Part of each frame, by its name; None if the file does not say."""
-    held_out = document.val_filenames if document.test_filenames is None else document.test_filenames
-    train = document.train_filenames
+    train, held_out = document.train_filenames, document.test_filenames
+    if not held_out and document.val_filenames is not None:
+        held_out = document.val_filenames
     if train is None and held_out is None:
         return None
     everything = {_normalised(frame.file_path) for frame in document.frames}
@@ -207,12 +209,12 @@ def _parts(path: Path, document: _Transforms) -> dict[str, Literal["train", "tes
         unknown = next((name for name in names or () if _normalised(name) not in everything), None)
         if unknown is not None:
             raise InvalidViewsError(f"{path}: {quoted(unknown)} of {key} is the file_path of no frame")
-    trained = _set(train) if train is not None else everything - _set(held_out)
-    tested = _set(held_out) if held_out is not None else everything - trained
+    tested = _set(held_out) if held_out is not None else everything - _set(train)
+    trained = (everything if train is None else _set(train)) - tested
     if not trained:
         raise InvalidViewsError(f"{path}: its lists of file names leave no frame to learn from; mend train_filenames")
-    parts: dict[str, Literal["train", "test"]] = dict.fromkeys(tested, "test")
-    return {**parts, **dict.fromkeys(trained, "train")}
+    parts: dict[str, Literal["train", "test"]] = dict.fromkeys(trained, "train")
+    return {**parts, **dict.fromkeys(tested, "test")}
 
 
 def _set(names: Iterable[str] | None) -> set[str]:

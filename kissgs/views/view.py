@@ -71,9 +71,11 @@ class Views:
         test: held out, to judge by; may be empty.
         background: ``(3,)`` red, green, blue from 0 to 1, over which to render.
         source: what was read, for people.
+        note: a sentence for people about what they may not have expected, without a capital and a full stop; or none.
     """
 
     train: tuple[View, ...]
     test: tuple[View, ...]
     background: Float32[np.ndarray, "3"]
     source: str
+    note: str = ""

@@ -15,6 +15,7 @@ from kissgs.errors import Cancelled, InvalidViewsError, UnsupportedError
 from kissgs.evaluation import pictures
 from kissgs.evaluation.likeness import Comparison, Evaluation, Likeness, ViewComparison, spell
 from kissgs.evaluation.pictures import evaluate
+from kissgs.rendering.camera import look_at
 from kissgs.rendering.metrics import ssim
 from kissgs.splats import ATTRIBUTES, Splats
 from kissgs.views.load import load_views
@@ -271,3 +272,19 @@ def test_any_figures_survive_means_and_json(figures):
 )
 def test_spelling(value, signed, text):
     assert spell(value, 2, signed=bool(signed)) == text
+
+
+def test_pictures_of_nothing_are_told_apart_from_perfect_ones() -> None:
+    """Equal because both are black: 1e12 world units away, beyond what renderers draw."""
+    scene = kissgs.sample_scene(50, sh_degree=0)
+    away = Splats(**{name: getattr(scene, name) + (1e12 if name == "means" else 0) for name in ATTRIBUTES})
+    assert "say nothing" in evaluate(away, scene, looking_away()).note
+    assert evaluate(scene.select(slice(0)), scene, looking_away()).note == ""
+    assert evaluate(scene, scene).note == ""
+
+
+def looking_away() -> Views:
+    camera = look_at(
+        np.array([0.0, 0, -99]), np.array([0.0, 0, -200]), np.array([0.0, -1, 0]), fov=1, width=9, height=8
+    )
+    return Views((), (View("away", camera),), np.zeros(3, np.float32), "one camera")

@@ -1,13 +1,11 @@
 """Oracle: what a measurement must hold whatever the machine: sizes, counts, positive times, more work for more."""
 
 import json
-import sys
 
 import numpy as np
 import pytest
 
 from kissgs import sample_scene
-from kissgs.errors import UnsupportedError
 from kissgs.evaluation.speed import rendering_cost, resampled
 from kissgs.rendering.camera import look_at
 from kissgs.rendering.metrics import psnr
@@ -44,9 +42,3 @@ def test_a_resampled_scene_has_as_many_and_looks_much_the_same(table, count):
 
 def test_resampling_is_repeatable(table):
     assert np.array_equal(resampled(table, 5000).means, resampled(table, 5000).means)
-
-
-def test_without_torch_the_extra_is_named(table, monkeypatch):
-    monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(UnsupportedError, match=r"kissgs\[train\]"):
-        rendering_cost(table, [VIEW])

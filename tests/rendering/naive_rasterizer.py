@@ -52,10 +52,10 @@ def sh_values(direction, count):
     return np.array(values[:count])
 
 
-def draw(params, camera, background, frozen=None, removed=None):
+def draw(params, camera, background, frozen=None, removed=None, alpha_max=0.99):
     """``params``: name -> float64 array, as in Splats. ``frozen``: decisions of an earlier picture, kept as they were.
 
-    ``removed``: a Gaussian that is left out.
+    ``removed``: a Gaussian that is left out. ``alpha_max``: gsplat's releases clamp elsewhere than the rest.
     """
     means, quats, scales, opacities, sh0, shN = (
         params[name] for name in ("means", "quats", "scales", "opacities", "sh0", "shN")
@@ -88,19 +88,19 @@ def draw(params, camera, background, frozen=None, removed=None):
         exponent = 0.5 * (conic[0, 0] * dx * dx + conic[1, 1] * dy * dy) + conic[0, 1] * dx * dy
         raw = opacity * np.exp(-exponent)
         if frozen is None:
-            clamped = raw > 0.99
-            alpha = np.minimum(raw, 0.99)
+            clamped = raw > alpha_max
+            alpha = np.minimum(raw, alpha_max)
             seen = (alpha >= 1 / 255) & ~ended
             after = left * (1 - alpha)
             drawn = seen & (after > 1e-4)
             doubtful |= ~ended & (np.abs(alpha * 255 - 1) < 2e-4)
             doubtful |= seen & (np.abs(after / 1e-4 - 1) < 2e-3)
-            doubtful |= seen & (np.abs(raw / 0.99 - 1) < 2e-5)
+            doubtful |= seen & (np.abs(raw / alpha_max - 1) < 2e-5)
             ended |= seen & ~drawn
             decisions.append((n, drawn, clamped))
         else:
             _, drawn, clamped = frozen[place]
-            alpha = np.where(clamped, 0.99, raw)
+            alpha = np.where(clamped, alpha_max, raw)
             after = left * (1 - alpha)
         direction = (means[n] - eye) / np.linalg.norm(means[n] - eye)
         colour = 0.5 + C0 * sh0[n] + sh_values(direction, shN.shape[1]) @ shN[n]
@@ -110,12 +110,12 @@ def draw(params, camera, background, frozen=None, removed=None):
     return Drawn(image + left[:, :, None] * background, 1 - left, decisions, doubtful)
 
 
-def gradient_by_differences(params, camera, background, v_image, v_alpha, step=1e-5):
+def gradient_by_differences(params, camera, background, v_image, v_alpha, step=1e-5, alpha_max=0.99):
     """Central differences of sum(image * v_image) + sum(alpha * v_alpha), decisions frozen, by every parameter."""
-    frozen = draw(params, camera, background).decisions
+    frozen = draw(params, camera, background, alpha_max=alpha_max).decisions
 
     def loss(changed):
-        drawn = draw(changed, camera, background, frozen=frozen)
+        drawn = draw(changed, camera, background, frozen=frozen, alpha_max=alpha_max)
         return (drawn.image * v_image).sum() + (drawn.alpha * v_alpha).sum()
 
     gradients = {}

@@ -11,6 +11,7 @@ from render_scenes import blobs, camera, in_float64, one, together
 from kissgs.errors import InvalidSceneError, InvalidViewsError, KissgsError, UnsupportedError
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.differentiable import rasterize, tensors_of
+from kissgs.rendering.gsplat_backend import alpha_max
 from kissgs.rendering.rasterizer import BLACK, WHITE, load_kernels, render
 from kissgs.splats import ATTRIBUTES
 
@@ -46,9 +47,13 @@ def pictures(splats, cameras, device="cpu", backgrounds=None, **parameters):
     return images, alphas, tensors
 
 
+def clamp_of(device):
+    return alpha_max() if device == "cuda" else 0.99
+
+
 def agree(splats, view, background, device="cpu", tolerance=1e-4):
     images, alphas, _ = pictures(splats, [view], device, [background])
-    expected = naive_rasterizer.draw(in_float64(splats), view, np.array(background))
+    expected = naive_rasterizer.draw(in_float64(splats), view, np.array(background), alpha_max=clamp_of(device))
     sure = ~expected.doubtful
     np.testing.assert_allclose(images[0].detach().cpu().numpy()[sure], expected.image[sure], atol=tolerance, rtol=0)
     np.testing.assert_allclose(alphas[0].detach().cpu().numpy()[sure], expected.alpha[sure], atol=tolerance, rtol=0)
@@ -133,10 +138,11 @@ def compare_gradients(splats, view, device, seed, tolerance=1e-3):
     rng = np.random.default_rng(seed)
     background = rng.random(3)
     params = in_float64(splats)
-    sure = ~naive_rasterizer.draw(params, view, background).doubtful
+    clamp = clamp_of(device)
+    sure = ~naive_rasterizer.draw(params, view, background, alpha_max=clamp).doubtful
     v_image = rng.normal(0, 1, (view.height, view.width, 3)) * sure[:, :, None]
     v_alpha = rng.normal(0, 1, (view.height, view.width)) * sure
-    expected = naive_rasterizer.gradient_by_differences(params, view, background, v_image, v_alpha)
+    expected = naive_rasterizer.gradient_by_differences(params, view, background, v_image, v_alpha, alpha_max=clamp)
     images, alphas, tensors = pictures(splats, [view], device, [background])
     loss = (images[0].cpu() * torch.from_numpy(v_image)).sum() + (alphas[0].cpu() * torch.from_numpy(v_alpha)).sum()
     loss.backward()
@@ -226,7 +232,12 @@ def test_tensors_need_not_be_contiguous():
         ({"viewmats": torch.eye(4)[None] * 2}, InvalidViewsError, "orthonormal"),
         ({"Ks": -torch.eye(3)[None]}, InvalidViewsError, "positive"),
         ({"Ks": torch.full((1, 3, 3), float("nan"))}, InvalidViewsError, "finite"),
-        ({"width": 0}, InvalidViewsError, "at least 1x1, not 0x8"),
+        ({"width": 0}, InvalidViewsError, "from 1 to 65,536, not 0"),
+        ({"Ks": torch.eye(3)[None].repeat(2, 1, 1)}, InvalidViewsError, "Ks must be of shape"),
+        ({"Ks": 2 * torch.eye(3)[None]}, InvalidViewsError, "without skew"),
+        ({"backgrounds": torch.ones(1, 2)}, InvalidViewsError, "backgrounds must be of shape"),
+        ({"backgrounds": torch.full((1, 3), float("nan"))}, InvalidViewsError, "three finite numbers"),
+        ({"means": torch.zeros(5, 3, device="meta")}, UnsupportedError, "one device"),
         ({"viewmats": torch.zeros(0, 4, 4), "Ks": torch.zeros(0, 3, 3)}, InvalidViewsError, "no camera"),
     ],
 )
@@ -246,6 +257,52 @@ def test_loading_the_kernels_is_announced():
     told = []
     load_kernels(lambda stage, fraction: told.append((stage, fraction)))
     assert told == [("kernels", 0.0), ("kernels", 1.0)]
+
+
+def test_cameras_of_any_type_and_layout():
+    splats, view = blobs(20), camera()
+    expected, _, _ = pictures(splats, [view, view])
+    viewmats = torch.linalg.inv(torch.linalg.inv(torch.from_numpy(view.viewmat)))[None].expand(2, 4, 4)
+    Ks = torch.from_numpy(view.K).expand(2, 3, 3)
+    images, _ = rasterize(**tensors_of(splats), viewmats=viewmats, Ks=Ks, width=view.width, height=view.height)
+    torch.testing.assert_close(images, expected, atol=1e-4, rtol=0)
+    fortran = np.asfortranarray(view.viewmat.astype(np.float32))
+    fortran.setflags(write=False)
+    image, _ = render(splats, Camera(fortran, np.round(view.K).astype(int), view.width, view.height))
+    assert np.isfinite(image).all()
+
+
+@pytest.mark.parametrize("background", [(1.0,), (1.0, 0.5), (0.0, 0.0, 0.0, 1.0), (0.0, float("nan"), 0.0)])
+def test_a_background_is_three_finite_numbers(background):
+    with pytest.raises(InvalidViewsError, match="three finite numbers"):
+        render(blobs(3), camera(), background=background)
+
+
+def test_read_only_scenes_are_drawn():
+    splats = blobs(10, 2)
+    expected, _ = render(splats, camera())
+    for name in ATTRIBUTES:
+        getattr(splats, name).setflags(write=False)
+    assert np.array_equal(render(splats, camera())[0], expected)
+
+
+def test_too_many_in_one_tile_are_refused(monkeypatch):
+    from kissgs.rendering.cpu import frame
+
+    monkeypatch.setattr(frame, "MAX_MEMBERS", 10)
+    with pytest.raises(UnsupportedError, match="meet in 16x16 pixels"):
+        render(blobs(50), camera())
+
+
+def test_a_picture_beyond_memory_is_refused(monkeypatch):
+    from kissgs.rendering.cpu import frame
+
+    def no_memory(*arguments):
+        raise MemoryError
+
+    monkeypatch.setattr(frame, "_sort_into_tiles", no_memory)
+    with pytest.raises(UnsupportedError, match="not enough memory for a picture of 37x29"):
+        render(blobs(3), camera())
 
 
 def test_too_many_tiles_are_refused(monkeypatch):

@@ -93,9 +93,15 @@ sys.path.insert(0, sys.argv[1])
 import numpy as np, torch
 from render_scenes import blobs, camera, one, together
 from test_render_extremes import all_is_finite
+from kissgs.rendering.camera import Camera
 from kissgs.rendering.losses import photometric_loss
-for size in ((1, 1), (33, 50), (1, 4096), (300, 7)):
-    all_is_finite(blobs(40, 3, spread=2.0), camera(*size))
+for degree, size in enumerate(((1, 1), (33, 50), (1, 4096), (300, 7))):
+    all_is_finite(blobs(0, degree), camera(*size))
+    all_is_finite(blobs(400, degree, spread=2.0), camera(*size))
+    away = camera(*size)
+    K = away.K.copy()
+    K[:2, 2] = 1e4, -1e5
+    all_is_finite(blobs(40, degree, spread=9.0, log_scale=3), Camera(away.viewmat, K, *size))
     all_is_finite(together(one(scale=(30, 30, -30)), one(mean=(1e6, 0, 0), scale=(30, 2, 2))), camera(*size))
     picture = torch.rand(size[1], size[0], 3, requires_grad=True)
     photometric_loss(picture, torch.rand(size[1], size[0], 3)).backward()

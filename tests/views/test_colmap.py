@@ -5,7 +5,7 @@ import struct
 
 import numpy as np
 import pytest
-from naive_cameras import MODELS, PINHOLE, assert_camera, poses, write_binary, write_text
+from naive_cameras import MODELS, PINHOLE, assert_camera, poses, write_binary, write_photo, write_text
 
 from kissgs.views.colmap import find_colmap, read_colmap
 from kissgs.views.load import load_views
@@ -57,6 +57,28 @@ def test_quaternions_need_not_be_of_unit_length(tmp_path):
     assert_camera(load_views(tmp_path).train[0].camera, images[0], K, 120, 80)
 
 
+def test_text_with_a_byte_order_mark(tmp_path):
+    """As some editors save it; before a comment, and before a record."""
+    images = poses(NAMES)
+    write_text(tmp_path, {1: PINHOLE}, images)
+    for path, comments in ((tmp_path / "cameras.txt", 0), (tmp_path / "images.txt", 2)):
+        path.write_bytes(b"\xef\xbb\xbf" + b"".join(path.read_bytes().splitlines(keepends=True)[comments:]))
+    assert [shot.name for shot in read_colmap(tmp_path).shots] == NAMES
+
+
+@WRITERS
+@pytest.mark.parametrize("start", ["C:\\data\\pictures\\", "/data/pictures/"])
+def test_absolute_names(tmp_path, write, start):
+    """They are looked for where they say, and then in the capture's own folder."""
+    images = poses([f"{start}{name}" for name in ("1.jpg", "2.jpg")])
+    write(tmp_path / "sparse" / "0", {1: PINHOLE}, images)
+    write_photo(tmp_path / "images" / "1.jpg", 120, 80)
+    write_photo(tmp_path / "pictures" / "2.jpg", 120, 80)
+    assert [shot.photo for shot in read_colmap(tmp_path / "sparse" / "0").shots] == [pose.name for pose in images]
+    views = load_views(tmp_path, hold_out=0).train
+    assert [view.photo for view in views] == [tmp_path / "images" / "1.jpg", tmp_path / "pictures" / "2.jpg"]
+
+
 @pytest.mark.parametrize("place", ["", "sparse/0", "sparse", "colmap/sparse/0", "0"])
 def test_usual_places(tmp_path, place):
     write_text(tmp_path / place, {1: PINHOLE}, poses(NAMES))
@@ -73,7 +95,7 @@ def test_binary_counts_before_text_and_own_folder_before_sparse(tmp_path):
 
 
 @pytest.mark.parametrize("start", ["", "sparse", "sparse/0"])
-@pytest.mark.parametrize("photos", ["images", "images_4"])
+@pytest.mark.parametrize("photos", ["images", "images_4", "input"])
 def test_root_is_where_the_photographs_are(tmp_path, start, photos):
     capture = tmp_path / "360"  # a name that could be a model's
     write_binary(capture / "sparse" / "0", {1: PINHOLE}, poses(NAMES))

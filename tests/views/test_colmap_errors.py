@@ -131,7 +131,10 @@ def test_cameras_that_are_none(tmp_path):
     write_binary(tmp_path, {1: ("PINHOLE", 120, 80, (-1.0, 1.0, 60.0, 40.0))}, IMAGES)
     with pytest.raises(InvalidViewsError) as caught:
         load_views(tmp_path)
-    assert str(caught.value) == f"{tmp_path}/images.bin, image 'a.jpg': a camera's focal lengths must be positive"
+    assert (
+        str(caught.value)
+        == f"{tmp_path}/images.bin, image 'a.jpg': a camera's focal lengths must be positive, and at most 1e+15 pixels"
+    )
 
 
 def test_every_truncation_is_noticed(tmp_path):

@@ -55,6 +55,44 @@ def test_garden_has_cameras_only(shared_data, tmp_path):
         np.testing.assert_allclose(view.camera.K, K)
         assert view.photo is None
     assert views.source == f"COLMAP model {tmp_path}, no photographs"
+    looked = f"looked in {tmp_path} for 'images', 'input'"
+    assert views.note == f"no photographs were found ({looked}); name their folder with --images"
+
+
+@pytest.mark.parametrize("photos", ["images", "images_4", "input"])
+def test_photographs_that_are_found_need_no_note(tmp_path, photos):
+    """The folder is told, whichever camera of a rig was first."""
+    names = ["left/1.jpg", "left/2.jpg", "right/1.jpg"]
+    factor = 4 if photos == "images_4" else 1
+    capture(tmp_path, names=names, photos=photos, size=(120 // factor, 80 // factor))
+    views = load_views(tmp_path)
+    assert [view.photo for view in views.train] == [tmp_path / photos / name for name in names[1:]]
+    assert (views.train[0].camera.width, views.train[0].camera.height) == (120 // factor, 80 // factor)
+    assert views.source == f"COLMAP model {tmp_path}/sparse/0, photographs of {photos}"
+    assert views.note == ""
+
+
+def test_photographs_in_an_unusual_folder_are_missed_aloud(tmp_path):
+    capture(tmp_path, photos="rgb", size=(120, 80))
+    assert "no photographs were found" in load_views(tmp_path).note
+    views = load_views(tmp_path, images=tmp_path / "rgb")
+    assert (views.note, views.source.split(", ")[-1]) == ("", "photographs of rgb")
+
+
+def test_all_folders_are_told(tmp_path, monkeypatch):
+    parts = ["train", "test", "val"]
+    documents = [{"w": 12, "h": 8, "fl_x": 10, "frames": frames(poses(["a.png"]), f"{part}/")} for part in parts]
+    for part, document in zip(parts, documents, strict=True):
+        write_photo(tmp_path / part / "a.png", 12, 8)
+        write_json(tmp_path / f"transforms_{part}.json", document)
+    assert load_views(tmp_path).source.endswith("photographs of train and test")
+    document = documents[0] | {"frames": [frame for document in documents for frame in document["frames"]]}
+    path = write_json(tmp_path / "transforms.json", document)
+    assert load_views(path).source.endswith("photographs of 3 folders")
+    write_photo(tmp_path / "a.png", 12, 8)
+    write_json(path, document | {"frames": frames(poses(["a.png"]), "")})
+    monkeypatch.chdir(tmp_path)
+    assert load_views(type(tmp_path)("transforms.json")).source.endswith(f"photographs of {tmp_path.name}")
 
 
 @pytest.mark.parametrize(("hold_out", "test"), [(8, "ai"), (3, "adgj"), (2, "acegi"), (0, ""), (100, "a")])
@@ -90,6 +128,13 @@ def test_cameras_take_the_size_of_their_photographs(tmp_path, size, resolution, 
     K = [[110 * across, 0, 61 * across], [0, 115 * down, 39.5 * down], [0, 0, 1]]
     assert_camera(view.camera, pose, K, *expected)
     assert view.load_photo().shape == (*expected[::-1], 3)
+
+
+def test_the_longer_side_of_portrait_pictures_counts(tmp_path):
+    """Where INRIA's code would look at the width alone, and reduce nothing."""
+    capture(tmp_path, ("PINHOLE", 1200, 3200, (900.0, 900.0, 600.0, 1600.0)))
+    camera = load_views(tmp_path).train[0].camera
+    assert (camera.width, camera.height) == (600, 1600)
 
 
 @pytest.mark.parametrize("width", [1601, 1610, 1999, 5187])

@@ -4,13 +4,14 @@ import itertools
 
 import numpy as np
 import pytest
-from test_virtual import box
+from test_virtual import box, try_fewer
 
 from kissgs import sample_scene
 from kissgs.errors import Cancelled, InvalidViewsError
 from kissgs.io.ply import read_ply
 from kissgs.rendering.rasterizer import render
 from kissgs.splats import Splats, clean
+from kissgs.views import orbit as orbits
 from kissgs.views.load import load_views
 from kissgs.views.orbit import LEAST, Orbit, _longest, _stretch, find_orbit
 
@@ -27,6 +28,19 @@ def azimuths(orbit, cameras):
     return np.array([np.arctan2((c.position - orbit.hub) @ side, (c.position - orbit.hub) @ middle) for c in cameras])
 
 
+def step_wider(patch):
+    """Fewer thumbnails: for checks that do not hang on how many were tried."""
+    try_fewer(patch)
+    patch.setattr(orbits, "RADII", (1.1, 2.0))
+    patch.setattr(orbits, "STEPS", 12)
+    patch.setattr(orbits, "FINE_STEPS", 24)
+
+
+@pytest.fixture
+def wider(monkeypatch):
+    step_wider(monkeypatch)
+
+
 @pytest.fixture(scope="module")
 def thing():
     return box((0.5, 1.5, 0.3), 2000, size=0.15)
@@ -34,7 +48,9 @@ def thing():
 
 @pytest.fixture(scope="module")
 def around_thing(thing):
-    return find_orbit(thing, width=96, height=72)
+    with pytest.MonkeyPatch.context() as patch:
+        step_wider(patch)
+        return find_orbit(thing, width=96, height=72)
 
 
 @pytest.mark.parametrize("orbit", [HALF, FULL])
@@ -85,6 +101,7 @@ def test_what_stands_alone_is_seen_whole_from_all_sides(thing, around_thing):
         assert render(thing, camera)[1].mean() > 0.04
 
 
+@pytest.mark.usefixtures("wider")
 def test_tall_pictures_show_it_whole_too(thing):
     orbit = find_orbit(thing, width=36, height=96)
     assert orbit.full
@@ -95,12 +112,14 @@ def test_tall_pictures_show_it_whole_too(thing):
         assert ((pixels > 0) & (pixels < [36, 96])).all()
 
 
+@pytest.mark.usefixtures("wider")
 def test_the_same_for_any_number_of_threads(thing, around_thing):
     again = find_orbit(thing, width=96, height=72, threads=3)
     for one, other in zip(around_thing.loop(3, 96, 72), again.loop(3, 96, 72), strict=True):
         assert np.array_equal(one.viewmat, other.viewmat)
 
 
+@pytest.mark.usefixtures("wider")
 def test_a_table_is_circled_above_it():
     table = sample_scene(3000, sh_degree=0)
     orbit = find_orbit(table, width=64, height=48)
@@ -109,6 +128,7 @@ def test_a_table_is_circled_above_it():
         assert render(table, camera)[1].mean() > 0.85
 
 
+@pytest.mark.usefixtures("wider")
 def test_in_a_room_one_stays_in_it():
     half = np.array([4.0, 1.4, 3.0])
     room = box(half, 4000, size=0.15)
@@ -118,8 +138,9 @@ def test_in_a_room_one_stays_in_it():
         assert render(room, camera)[1].mean() > 0.9
 
 
-def test_only_the_side_that_was_photographed_is_shown(shared_data):
+def test_only_the_side_that_was_photographed_is_shown(shared_data, monkeypatch):
     """Behind the fox is a wall: the way turns back before it."""
+    monkeypatch.setattr(orbits, "STEPS", 12)
     splats, _ = clean(read_ply(shared_data / "fox" / "point_cloud.ply"))
     orbit = find_orbit(splats)
     assert np.radians(45) < orbit.sweep < np.radians(150)
@@ -151,6 +172,7 @@ def test_a_stretch_is_never_too_short_and_forgives_a_full_circle_a_little():
     assert not _stretch(FULL, np.array([1.0] * 71 + [0.7]), 0.9).full
 
 
+@pytest.mark.usefixtures("wider")
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_any_scene_can_be_circled(count):
     splats = Splats(

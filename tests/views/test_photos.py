@@ -7,7 +7,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from kissgs.errors import InvalidViewsError
-from kissgs.views.photos import FoundPhoto, find_photos
+from kissgs.views.photos import FoundPhoto, find_photos, where_looked
 
 
 def touch(root, *names):
@@ -30,13 +30,18 @@ def found(root, *names, **options):
         (["images", "images_2", "images_4"], 4, ("images_4", 4)),
         (["images", "images_4"], 1, ("images", 1)),
         (["images_2024", "images_old", "images_8"], None, ("images_8", 8)),
+        (["input", "images_8"], None, ("images_8", 8)),
+        (["input", "images"], None, ("images", 1)),
+        (["input", "images_old"], None, ("input", 1)),
+        (["input", "input_4"], 1, ("input", 1)),
     ],
 )
 def test_folders_by_scale(tmp_path, folders, scale, expected):
     for folder in folders:
         touch(tmp_path, f"{folder}/a.jpg")
     folder, factor = expected
-    assert find_photos(["images/a.jpg"], tmp_path, scale=scale) == (FoundPhoto(tmp_path / folder / "a.jpg", factor),)
+    photo = FoundPhoto(tmp_path / folder / "a.jpg", factor, tmp_path / folder)
+    assert find_photos(["images/a.jpg"], tmp_path, scale=scale) == (photo,)
 
 
 @pytest.mark.parametrize(
@@ -73,6 +78,25 @@ def test_absolute_paths_of_another_machine(tmp_path, name):
     assert found(tmp_path, name) == ["images_2/a.jpg"]
 
 
+@pytest.mark.parametrize("start", ["/home/elsewhere/", "C:\\captures\\", "d:/captures/", "\\\\server\\share\\"])
+@pytest.mark.parametrize("photos", ["images", "images_4", "input"])
+def test_absolute_paths_by_their_ends(tmp_path, start, photos):
+    """As much of the name as there is here counts: the same number may have been taken by several cameras."""
+    touch(tmp_path, f"{photos}/1.jpg", f"{photos}/left/1.jpg", f"{photos}/2.jpg", "elsewhere/2.jpg", "other_2/3.jpg")
+    names = [f"{start}pictures/{name}" for name in ("1.jpg", "left/1.jpg", "2.jpg")]
+    assert found(tmp_path, *names) == [f"{photos}/1.jpg", f"{photos}/left/1.jpg", f"{photos}/2.jpg"]
+    assert found(tmp_path, f"{start}other/3.jpg") == ["other_2/3.jpg"], "a folder that is called the same comes first"
+    assert found(tmp_path, *names, images=tmp_path / photos) == found(tmp_path, *names)
+
+
+def test_absolute_paths_that_are_here(tmp_path):
+    touch(tmp_path, "elsewhere/a.jpg", "elsewhere/images/c.jpg", "here/images/a.jpg", "here/images/b.jpg")
+    elsewhere = tmp_path / "elsewhere"
+    photos = find_photos([str(elsewhere / name) for name in ("a.jpg", "b.jpg", "images/c.jpg")], tmp_path / "here")
+    wanted = ["elsewhere/a.jpg", "here/images/b.jpg", "elsewhere/images/c.jpg"]
+    assert [str(photo.path.relative_to(tmp_path)) for photo in photos] == wanted
+
+
 def test_another_folder(tmp_path, monkeypatch):
     touch(tmp_path, "images/a.jpg", "other_4/a.jpg", "other_4/train/r_0.png", "other_4/test/r_0.png")
     assert find_photos(["images/a.jpg"], tmp_path, images=tmp_path / "other_4")[0].factor == 4
@@ -88,6 +112,24 @@ def test_captures_without_photographs(tmp_path):
     (tmp_path / "images_old").mkdir()
     assert found(tmp_path, "images/a.jpg", "images/b.jpg") is None
     assert found(tmp_path, "a.jpg", "../b.jpg", scale=4) is None
+    touch(tmp_path, "input/film.mp4")
+    assert found(tmp_path, "images/a.jpg", "images/b.jpg") is None
+
+
+@pytest.mark.parametrize(
+    ("names", "sought"),
+    [
+        (["images/a.jpg", "images/left/b.jpg"], " for 'images', 'input'"),
+        (["train/a", "test/a"], " for 'train', 'test'"),
+        (["a.jpg"], ""),
+        (["a.jpg", "rgb/a.jpg", "../b.jpg"], " for 'rgb', '..'"),
+        (["C:\\x\\rgb\\a.jpg"], " for 'C:/x/rgb', 'rgb', 'images', 'input'"),
+        ([f"{letter}/a.jpg" for letter in "abcdefg"], " for 'a', 'b', 'c', 'd', …"),
+        (["new\nline/a.jpg"], " for 'new\\nline'"),
+    ],
+)
+def test_where_they_were_looked_for(tmp_path, names, sought):
+    assert where_looked(names, tmp_path) == f"{tmp_path}{sought}"
 
 
 def message(root, *names, **options):
@@ -105,6 +147,9 @@ def test_missing_photographs(tmp_path):
     assert message(tmp_path, "images/b.jpg") == (
         f"1 of 1 photographs are missing, the first is 'images/b.jpg', looked for in {tmp_path}/images_2{mend}"
     )
+    assert message(tmp_path, "/else/images/b.jpg", "C:\\else\\rgb\\b.jpg").startswith(
+        f"2 of 2 photographs are missing, the first is '/else/images/b.jpg', looked for in {tmp_path}/images_2; "
+    )
     assert message(tmp_path, "images/a.jpg", "test/b.jpg") == (
         f"1 of 2 photographs are missing, the first is 'test/b.jpg', looked for in {tmp_path}/test{mend}"
     )
@@ -114,6 +159,10 @@ def test_folders_that_are_not_there(tmp_path):
     touch(tmp_path, "images/a.jpg", "images_4/a.jpg")
     where = f"in {tmp_path}, only images, images_4; choose another --scale"
     assert message(tmp_path, "images/a.jpg", scale=2) == f"there is no folder images_2 {where}"
+    touch(tmp_path, "raw/input/a.jpg")
+    assert message(tmp_path / "raw", "images/a.jpg", scale=4) == (
+        f"there is no folder images_4 in {tmp_path}/raw, only input; choose another --scale"
+    )
     (tmp_path / "images").rename(tmp_path / "images_8")
     assert message(tmp_path, "images/a.jpg", scale=1) == (
         f"there is no folder images in {tmp_path}, only images_4, images_8; choose another --scale"

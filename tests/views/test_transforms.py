@@ -137,6 +137,10 @@ def test_background_is_white_only_behind_transparency(tmp_path):
         ({"test_filenames": ["images/b.jpg"], "val_filenames": ["images/a.jpg"]}, "ac", "b"),
         ({"train_filenames": ["images/c.jpg"], "val_filenames": ["images/a.jpg"]}, "c", "a"),
         ({"train_filenames": [f"images/{name}" for name in NAMES], "test_filenames": []}, "abc", ""),
+        ({"train_filenames": ["images/a.jpg", "images/b.jpg"], "test_filenames": ["./images/b.jpg"]}, "a", "b"),
+        ({"test_filenames": [], "val_filenames": ["images/a.jpg"]}, "bc", "a"),
+        ({"train_filenames": ["images/b.jpg"], "test_filenames": [], "val_filenames": ["images/a.jpg"]}, "b", "a"),
+        ({"train_filenames": ["images/a.jpg"], "val_filenames": []}, "a", ""),
     ],
 )
 def test_own_split(tmp_path, lists, train, test):
@@ -216,6 +220,10 @@ WRONG = [
     (
         document(test_filenames=["images/z.jpg"]),
         ": 'images/z.jpg' of test_filenames or val_filenames is the file_path of no frame",
+    ),
+    (
+        document(train_filenames=["images/a.jpg"], test_filenames=["./images/a.jpg"]),
+        ": its lists of file names leave no frame to learn from; mend train_filenames",
     ),
     (
         document(train_filenames=[]),

@@ -8,6 +8,7 @@ from kissgs.errors import Cancelled, InvalidViewsError
 from kissgs.io.ply import read_ply
 from kissgs.rendering.rasterizer import render
 from kissgs.splats import SH_C0, Splats, clean
+from kissgs.views import candidates, virtual
 from kissgs.views.anatomy import anatomy, weighted_median
 from kissgs.views.load import load_views
 from kissgs.views.virtual import best_view, virtual_views
@@ -37,6 +38,19 @@ def box(half, count=20_000, size=0.06, seed=0):
     return surface(points, axis, size)
 
 
+def try_fewer(patch, azimuths=8, radii=(1.1, 2.6)):
+    """Of the several hundred thumbnails, some dozens: for checks that do not hang on how many cameras were tried."""
+    patch.setattr(candidates, "AZIMUTHS", azimuths)
+    for module in (candidates, virtual):
+        patch.setattr(module, "WAYS_TO_LOOK", 4)
+        patch.setattr(module, "RADII", radii)
+
+
+@pytest.fixture
+def fewer(monkeypatch):
+    try_fewer(monkeypatch)
+
+
 def everything(views):
     return sorted(views.train + views.test, key=lambda view: view.name)
 
@@ -63,6 +77,7 @@ def table():
     return sample_scene(20_000, sh_degree=0)
 
 
+@pytest.mark.usefixtures("fewer")
 def test_views_are_split_named_and_of_the_size_asked_for(table):
     views = virtual_views(table, width=200, height=120, count=17)
     assert [view.name for view in everything(views)] == [f"virtual_{n:02}" for n in range(17)]
@@ -74,12 +89,14 @@ def test_views_are_split_named_and_of_the_size_asked_for(table):
     assert len({tuple(view.camera.viewmat.ravel()) for view in everything(views)}) == 17
 
 
+@pytest.mark.usefixtures("fewer")
 def test_the_same_scene_gives_the_same_cameras_for_any_number_of_threads(table):
     first, second = (virtual_views(table, count=8, threads=threads) for threads in (1, 3))
     for one, other in zip(everything(first), everything(second), strict=True):
         assert np.array_equal(one.camera.viewmat, other.camera.viewmat)
 
 
+@pytest.mark.usefixtures("fewer")
 def test_pictures_are_full_and_level_where_the_scene_surrounds(table):
     up = np.array([0.0, -1.0, 0.0])
     for view in everything(virtual_views(table, width=64, height=48, count=16)):
@@ -89,9 +106,10 @@ def test_pictures_are_full_and_level_where_the_scene_surrounds(table):
         assert view.camera.position @ up > -0.1, "and above the table"
 
 
+@pytest.mark.usefixtures("fewer")
 def test_an_object_is_seen_whole_from_all_around():
     half = np.array([0.5, 1.5, 0.3])
-    thing = box(half)
+    thing = box(half, 5000, 0.1)
     views = everything(virtual_views(thing, width=96, height=72, count=16))
     corners = np.array(np.meshgrid(*zip(-half, half, strict=True))).reshape(3, -1).T
     whole = 0
@@ -109,6 +127,7 @@ def test_an_object_is_seen_whole_from_all_around():
     assert np.diff(np.sort(azimuths)).max() < np.pi / 2
 
 
+@pytest.mark.usefixtures("fewer")
 def test_tall_pictures_know_an_object_from_a_scene():
     """Narrow pictures were filled by it, so that it was taken for a scene with a background."""
     half = np.array([0.5, 1.5, 0.3])
@@ -119,6 +138,7 @@ def test_tall_pictures_know_an_object_from_a_scene():
     assert ((pixels > 0) & (pixels < [36, 96])).all()
 
 
+@pytest.mark.usefixtures("fewer")
 def test_the_best_view_is_one_of_all_and_no_close_up():
     thing = box((0.5, 1.5, 0.3), 2000, 0.15)
     options = {"width": 60, "height": 40, "count": 12}
@@ -130,9 +150,10 @@ def test_the_best_view_is_one_of_all_and_no_close_up():
     assert np.linalg.norm(best.camera.position) > 0.8 * max(distances)
 
 
+@pytest.mark.usefixtures("fewer")
 def test_a_room_is_seen_from_inside():
     half = np.array([4.0, 1.4, 3.0])
-    room = box(half, 40_000)
+    room = box(half, 10_000, 0.12)
     for view in everything(virtual_views(room, width=64, height=48, count=16)):
         assert (np.abs(view.camera.position) < half - 0.05).all()
         _, alpha = render(room, view.camera)
@@ -171,6 +192,7 @@ def test_the_side_that_was_photographed_is_found(shared_data):
         assert nearest > np.cos(np.radians(50)), f"{view.name} looks {np.degrees(np.arccos(nearest)):.0f}° off"
 
 
+@pytest.mark.usefixtures("fewer")
 def test_cameras_are_never_inside_matter(shared_data):
     splats, _ = clean(read_ply(shared_data / "guitar" / "guitar.ply"))
     scene = anatomy(splats)
@@ -194,7 +216,8 @@ def test_cameras_are_never_inside_matter(shared_data):
         (40, 1e-6, 1e6, -3, -5),
     ],
 )
-def test_any_scene_gets_cameras(count, size, offset, log_scale, opacity):
+def test_any_scene_gets_cameras(monkeypatch, count, size, offset, log_scale, opacity):
+    try_fewer(monkeypatch, azimuths=4, radii=(1.1,))
     rng = np.random.default_rng(0)
     splats = Splats(
         means=(rng.normal(0, 1, (count, 3)) * size + offset).astype(np.float32),
@@ -212,6 +235,7 @@ def test_any_scene_gets_cameras(count, size, offset, log_scale, opacity):
         assert np.isfinite(image).all()
 
 
+@pytest.mark.usefixtures("fewer")
 def test_one_view_is_for_training():
     views = virtual_views(box((1, 1, 1), 500), count=1)
     assert (len(views.train), len(views.test)) == (1, 0)
@@ -223,6 +247,7 @@ def test_impossible_sizes_are_refused(wrong):
         virtual_views(box((1, 1, 1), 10), **wrong)
 
 
+@pytest.mark.usefixtures("fewer")
 def test_progress_goes_up_to_one_and_can_stop_the_work(table):
     told = []
     virtual_views(table, count=4, progress=lambda stage, fraction: told.append((stage, fraction)))

@@ -37,6 +37,28 @@ def _exp_minus(s: np.float32) -> np.float32:
     return e * e
 
 
+@njit(nogil=True, error_model="numpy")
+def _pixel_centres(s: np.ndarray) -> None:
+    """x and y of a tile's pixels, into the first and the second 256 of ``s``."""
+    for p in range(256):
+        s[p], s[256 + p] = np.float32(p & 15) + np.float32(0.5), np.float32(p >> 4) + np.float32(0.5)
+
+
+@njit(nogil=True, error_model="numpy")
+def _footprint(splats: np.ndarray, n: int, x0: int, y0: int) -> tuple[tuple[np.float32, ...], tuple[np.float32, ...]]:
+    """Centre, in the tile that begins at (x0, y0), and l0, l1, l2; opacity, red, green, blue."""
+    return (
+        (
+            splats[n, 0] - np.float32(x0),
+            splats[n, 1] - np.float32(y0),
+            splats[n, 2],
+            splats[n, 3],
+            splats[n, 4],
+        ),
+        (splats[n, 5], splats[n, 6], splats[n, 7], splats[n, 8]),
+    )
+
+
 @compiled(
     "void(float32[:, ::1], int32[::1], uint16[::1], int64[::1], int64, int64, int64, int64, int64,"
     " float32[::1], float32[::1], float32[:, :, ::1], float32[:, ::1], int32[:, ::1])",
@@ -77,11 +99,10 @@ def blend(
         stops: ``(tiles, 256)``, written: members from this one on were not drawn at the pixel.
     """
     alpha_min, alpha_max, t_min = limits[0], limits[1], limits[2]
-    zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
+    zero, one = np.float32(0), np.float32(1)
     # One array for all that a pixel has, or the compiler would have to fear that the arrays overlap.
     s = np.empty(7 * 256, np.float32)
-    for p in range(256):
-        s[p], s[256 + p] = np.float32(p & 15) + half, np.float32(p >> 4) + half
+    _pixel_centres(s)
     for tile in range(first, last):
         x0, y0 = (tile % columns) * 16, (tile // columns) * 16
         begin, end = starts[tile], starts[tile + 1]
@@ -91,10 +112,7 @@ def blend(
             s[768 + p] = one
             s[1024 + p] = s[1280 + p] = s[1536 + p] = zero
         for i in range(begin, end):
-            n = members[i]
-            mx, my = splats[n, 0] - np.float32(x0), splats[n, 1] - np.float32(y0)
-            l0, l1, l2 = splats[n, 2], splats[n, 3], splats[n, 4]
-            opacity, red, green, blue = splats[n, 5], splats[n, 6], splats[n, 7], splats[n, 8]
+            (mx, my, l0, l1, l2), (opacity, red, green, blue) = _footprint(splats, members[i], x0, y0)
             top, bottom = np.uint64(spans[i] >> 5), np.uint64(spans[i] & 31)
             place = np.float32(i - begin)
             for p in range(top * np.uint64(16), bottom * np.uint64(16)):
@@ -162,12 +180,11 @@ def blend_backward(
             uv, v²; and the gradient by the colour's R, G, B.
     """
     alpha_min, alpha_max = limits[0], limits[1]
-    zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
+    zero, one = np.float32(0), np.float32(1)
     height, width = transmittance.shape
     # Per pixel: x, y, stop, T, gradient by R, G, B and alpha, and what is behind, weighed by them.
     s = np.empty(9 * 256, np.float32)
-    for p in range(256):
-        s[p], s[256 + p] = np.float32(p & 15) + half, np.float32(p >> 4) + half
+    _pixel_centres(s)
     for tile in range(first, last):
         x0, y0 = (tile % columns) * 16, (tile // columns) * 16
         begin = starts[tile]
@@ -187,10 +204,7 @@ def blend_backward(
         for i in range(begin + furthest, starts[tile + 1]):
             v_slots[slots[i], :] = zero
         for i in range(begin + furthest - 1, begin - 1, -1):
-            n = members[i]
-            mx, my = splats[n, 0] - np.float32(x0), splats[n, 1] - np.float32(y0)
-            l0, l1, l2 = splats[n, 2], splats[n, 3], splats[n, 4]
-            opacity, red, green, blue = splats[n, 5], splats[n, 6], splats[n, 7], splats[n, 8]
+            (mx, my, l0, l1, l2), (opacity, red, green, blue) = _footprint(splats, members[i], x0, y0)
             top, bottom = np.uint64(spans[i] >> 5), np.uint64(spans[i] & 31)
             place = np.float32(i - begin)
             m, mu, mv, muu, muv, mvv, vr, vg, vb = zero, zero, zero, zero, zero, zero, zero, zero, zero
@@ -255,12 +269,11 @@ def removal_errors(
     The arguments are those of :func:`blend_backward`; ``errors`` is written, the sum over the tile's pixels and RGB.
     """
     alpha_min, alpha_max = limits[0], limits[1]
-    zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
+    zero, one = np.float32(0), np.float32(1)
     height, width = transmittance.shape
     # Per pixel: x, y, stop, T, and R, G, B of what is behind.
     s = np.empty(7 * 256, np.float32)
-    for p in range(256):
-        s[p], s[256 + p] = np.float32(p & 15) + half, np.float32(p >> 4) + half
+    _pixel_centres(s)
     for tile in range(first, last):
         x0, y0 = (tile % columns) * 16, (tile // columns) * 16
         begin = starts[tile]
@@ -273,10 +286,7 @@ def removal_errors(
         for i in range(begin + furthest, starts[tile + 1]):
             errors[slots[i]] = zero
         for i in range(begin + furthest - 1, begin - 1, -1):
-            n = members[i]
-            mx, my = splats[n, 0] - np.float32(x0), splats[n, 1] - np.float32(y0)
-            l0, l1, l2 = splats[n, 2], splats[n, 3], splats[n, 4]
-            opacity, red, green, blue = splats[n, 5], splats[n, 6], splats[n, 7], splats[n, 8]
+            (mx, my, l0, l1, l2), (opacity, red, green, blue) = _footprint(splats, members[i], x0, y0)
             top, bottom = np.uint64(spans[i] >> 5), np.uint64(spans[i] & 31)
             place = np.float32(i - begin)
             total = zero

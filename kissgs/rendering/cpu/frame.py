@@ -13,8 +13,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from kissgs._typing import Float32, Float64, Int32, Int64, UInt16
-from kissgs.errors import UnsupportedError
+from kissgs._typing import Float32, Float64, Int32, Int64, Shaped, UInt16
+from kissgs.errors import InvalidViewsError, UnsupportedError
 from kissgs.parallel import Workers
 from kissgs.rendering import semantics
 from kissgs.rendering.camera import Camera
@@ -30,7 +30,10 @@ PIXELS_PER_TILE = semantics.TILE**2
 R = TypeVar("R")
 
 MAX_PAIRS = 2**31 - 1
-"""Footprints times the tiles they touch: more would not fit the int32 lists, which take 8 bytes for each."""
+"""Footprints times the tiles they touch: more would not fit the int32 lists."""
+
+MAX_MEMBERS = 2**24 - 1
+"""Footprints in one tile: their places there are float32, so that they fit into vectors with the rest."""
 
 PARTS_PER_THREAD = 4
 """Parts of the work differ in cost; finer ones even it out."""
@@ -111,13 +114,21 @@ class Gradients:
     shN: Float32[np.ndarray, "N K 3"]
 
 
-def draw(splats: Splats, camera: Camera, background: Float32[np.ndarray, "3"], pool: Workers) -> Frame:
+def draw(splats: Splats, camera: Camera, background: Shaped[np.ndarray, "..."], pool: Workers) -> Frame:
     """Take a picture of finite Gaussians (:func:`kissgs.clean`), as :mod:`kissgs.rendering.semantics` says.
 
     Raises:
-        UnsupportedError: more than 2³¹ pairs of a footprint and a tile: no memory would hold them.
+        InvalidViewsError: the background is not three finite numbers.
+        UnsupportedError: too many footprints for the lists of the tiles, or too little memory for the picture.
     """
-    splats = _contiguous(splats)
+    try:
+        return _draw(_readable(splats), camera, _colour(background), pool)
+    except MemoryError as error:
+        size = f"{camera.width}x{camera.height}"
+        raise UnsupportedError(f"there is not enough memory for a picture of {size}: render it smaller") from error
+
+
+def _draw(splats: Splats, camera: Camera, background: Float32[np.ndarray, "3"], pool: Workers) -> Frame:
     footprints = _project(splats, camera, pool)
     lists = _sort_into_tiles(footprints, camera, pool)
     image = np.empty((camera.height, camera.width, 3), np.float32)
@@ -140,7 +151,11 @@ def differentiate(
     v_alpha: Float32[np.ndarray, "H W"],
     pool: Workers,
 ) -> Gradients:
-    """Gradients of a loss, given those by the picture and by its alpha."""
+    """Gradients of a loss, given those by the picture and by its alpha.
+
+    Raises:
+        MemoryError: there is not enough for them.
+    """
     splats = frame.splats
     camera, lists, visible, rows = frame.camera, frame.lists, frame.footprints.visible, frame.footprints.rows
     records = frame.footprints.records
@@ -194,11 +209,17 @@ def removal_scores(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
     return scores
 
 
-def _contiguous(splats: Splats) -> Splats:
-    """The same if its arrays are such as kernels read; else copies."""
-    if all(getattr(splats, name).flags.c_contiguous for name in ATTRIBUTES):
-        return splats
-    return Splats(**{name: np.ascontiguousarray(getattr(splats, name)) for name in ATTRIBUTES})
+def _colour(background: Shaped[np.ndarray, "..."]) -> Float32[np.ndarray, "3"]:
+    colour = np.array(background, np.float32, order="C")
+    if colour.shape != (3,) or not np.isfinite(colour).all():
+        raise InvalidViewsError("a background is three finite numbers: red, green and blue, from 0 to 1")
+    return colour
+
+
+def _readable(splats: Splats) -> Splats:
+    """The same if its arrays are such as kernels read, which are contiguous and writeable; else copies."""
+    arrays = {name: np.require(getattr(splats, name), requirements=("C", "W")) for name in ATTRIBUTES}
+    return splats if all(array is getattr(splats, name) for name, array in arrays.items()) else Splats(**arrays)
 
 
 def _project(splats: Splats, camera: Camera, pool: Workers) -> Footprints:
@@ -238,11 +259,7 @@ def _sort_into_tiles(footprints: Footprints, camera: Camera, pool: Workers) -> T
     per_part = np.stack(_each_part(count, parts, pool))
     starts, slots_from = _running_sum(per_part.sum(axis=0)), np.empty_like(slot_counts)
     slots_from[footprints.rows] = _running_sum(slot_counts[footprints.rows])[:-1]
-    if starts[-1] > MAX_PAIRS:
-        raise UnsupportedError(
-            f"this view has {starts[-1]:,} pairs of a Gaussian and a tile of the picture; at most {MAX_PAIRS:,} fit. "
-            "Render it smaller"
-        )
+    _check_lists(starts)
     members, slots = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int32)
     spans = np.empty(starts[-1], np.uint16)
     ends = dict(zip(parts.tolist(), starts[:-1] + np.cumsum(per_part, axis=0) - per_part, strict=False))
@@ -252,6 +269,20 @@ def _sort_into_tiles(footprints: Footprints, camera: Camera, pool: Workers) -> T
 
     _each_part(fill, parts, pool)
     return TileLists(columns, starts, members, spans, slots, slots_from, slot_counts)
+
+
+def _check_lists(starts: Int64[np.ndarray, " tiles_1"]) -> None:
+    if starts[-1] > MAX_PAIRS:
+        raise UnsupportedError(
+            f"this view has {starts[-1]:,} pairs of a Gaussian and a tile of the picture; at most {MAX_PAIRS:,} fit. "
+            "Render it smaller"
+        )
+    longest = int(np.diff(starts).max())
+    if longest > MAX_MEMBERS:
+        raise UnsupportedError(
+            f"{longest:,} Gaussians meet in 16x16 pixels of this view; at most {MAX_MEMBERS:,} can be drawn. "
+            "Go nearer, or render it larger"
+        )
 
 
 def _running_sum(counts: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n_1"]:

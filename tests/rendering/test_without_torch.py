@@ -1,0 +1,28 @@
+"""Oracle: a Python in which torch cannot be imported. Pictures need none; what needs it names the extra."""
+
+import subprocess
+import sys
+
+CODE = """
+import sys
+sys.modules["torch"] = None
+import kissgs, pytest
+from kissgs.errors import UnsupportedError
+scene = kissgs.sample_scene(300, sh_degree=1)
+views = kissgs.virtual_views(scene, width=32, height=24, count=2)
+result = kissgs.evaluate(scene, kissgs.decompress(kissgs.compress(scene).files), views)
+assert result.mean.between.psnr > 15
+for module in ("differentiable", "losses"):
+    with pytest.raises(UnsupportedError, match="train"):
+        __import__(f"kissgs.rendering.{module}")
+from kissgs.evaluation.speed import rendering_cost
+with pytest.raises(UnsupportedError, match="train"):
+    rendering_cost(scene, [views.train[0].camera])
+with pytest.raises(UnsupportedError, match="cuda"):
+    kissgs.render(scene, views.train[0].camera, device="cuda")
+"""
+
+
+def test_pictures_need_no_torch():
+    done = subprocess.run([sys.executable, "-c", CODE], check=False, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr[-2000:]
