@@ -24,10 +24,11 @@ if TYPE_CHECKING:
     )
     from kissgs.evaluation.likeness import Evaluation
     from kissgs.evaluation.pictures import evaluate
-    from kissgs.pipeline import Compressed, Report, compress, decompress, load, save
+    from kissgs.pipeline import Compressed, compress, decompress, load, save
     from kissgs.progress import Progress
     from kissgs.rendering.camera import Camera
     from kissgs.rendering.rasterizer import render
+    from kissgs.report import Report
     from kissgs.sample import sample_scene
     from kissgs.settings import EncodeSettings, Preset, Settings
     from kissgs.splats import Splats, clean
@@ -48,7 +49,7 @@ _HOMES = {
     "OutputError": "errors",
     "Preset": "settings",
     "Progress": "progress",
-    "Report": "pipeline",
+    "Report": "report",
     "Settings": "settings",
     "Splats": "splats",
     "UnsupportedError": "errors",

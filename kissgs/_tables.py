@@ -13,7 +13,7 @@ from kissgs.evaluation.attributes import AttributeErrors, Spread
 from kissgs.evaluation.likeness import Evaluation, spell
 from kissgs.evaluation.peers import PeerResult
 from kissgs.info import Info
-from kissgs.pipeline import Report
+from kissgs.report import Report
 
 CHANGES = {
     "invisible": "left out: opacity 1/255 or less, which no renderer draws",

@@ -14,8 +14,9 @@ from kissgs.errors import UnsupportedError
 from kissgs.evaluation.attributes import AttributeErrors, attribute_errors
 from kissgs.evaluation.likeness import Evaluation
 from kissgs.evaluation.pictures import evaluate
-from kissgs.pipeline import Report, compress, decompress, load, peak_memory, save
+from kissgs.pipeline import compress, decompress, load, peak_memory, save
 from kissgs.progress import Progress, silent
+from kissgs.report import Report
 from kissgs.settings import Settings
 from kissgs.splats import Splats
 from kissgs.views.view import Views

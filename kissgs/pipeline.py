@@ -5,10 +5,10 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from kissgs.errors import InvalidContainerError, OutputError
 from kissgs.io.atomic import atomic_file, reason_of, refuse_existing
 from kissgs.io.ply import read_ply, write_ply
 from kissgs.progress import Progress, silent
+from kissgs.report import Report
 from kissgs.settings import Settings
 from kissgs.sogxt.container import check_destination, write_container, zip_bytes
 from kissgs.sogxt.decode import MAX_GAUSSIANS, decode
@@ -29,63 +30,6 @@ if TYPE_CHECKING:
 AnyPath = str | PathLike[str]
 
 ZIP_BEGINNINGS = (b"PK\x03\x04", b"PK\x05\x06")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Report:
-    """What a compression took and gave.
-
-    Attributes:
-        source_count: Gaussians in the scene.
-        count: Gaussians in the container.
-        sh_degree: 0 to 3.
-        source_bytes: of the scene file; of the arrays if there was none.
-        container_bytes: of the zip.
-        file_bytes: per file of the container.
-        cleaned: what was wrong with the input (:class:`kissgs.splats.Cleaned`).
-        invisible: Gaussians left out because no renderer would draw them.
-        tamed_colours: Gaussians whose base colour is such an outlier that it was pulled in, for the others' sake.
-        form_error: largest relative change of a covariance by the choice of its equivalent form.
-        half_steps: largest error that quantisation may cause, per field and channel.
-        seconds: wall time per stage.
-        cpu_seconds: processor time of all stages, over all threads.
-        peak_memory: bytes, the largest this process has ever had resident.
-        settings: all of them, as used.
-        evaluation: the container's pictures beside those of the cleaned input; None unless it was asked for.
-    """
-
-    source_count: int
-    count: int
-    sh_degree: int
-    source_bytes: int
-    container_bytes: int
-    file_bytes: dict[str, int]
-    cleaned: Cleaned
-    invisible: int
-    tamed_colours: int
-    form_error: float
-    half_steps: dict[str, list[float]]
-    seconds: dict[str, float]
-    cpu_seconds: float
-    peak_memory: int
-    settings: dict[str, Any]
-    evaluation: Evaluation | None = None
-
-    @property
-    def ratio(self) -> float:
-        """How many times smaller the container is than the scene file."""
-        return self.source_bytes / self.container_bytes
-
-    @property
-    def bytes_per_gaussian(self) -> float:
-        """Of the whole zip, per Gaussian of the scene."""
-        return self.container_bytes / max(self.source_count, 1)
-
-    def as_dict(self) -> dict[str, Any]:
-        """For machines."""
-        derived = {"ratio": self.ratio, "bytes_per_gaussian": self.bytes_per_gaussian}
-        evaluation = None if self.evaluation is None else self.evaluation.as_dict()
-        return {**asdict(self), **derived, "evaluation": evaluation}
 
 
 @dataclass(frozen=True, slots=True)

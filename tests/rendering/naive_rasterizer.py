@@ -1,6 +1,6 @@
 """The oracle: gsplat's classic mode written down in float64, pixel by pixel, with full covariance matrices.
 
-It shares no code, no formula and no constant with the renderer under test.
+It shares no code with the renderer under test, and of its formulas only the definitions.
 """
 
 from dataclasses import dataclass
