@@ -18,6 +18,7 @@ from kissgs.evaluation.html_figures import change_of, figure_cards, in_words, su
 from kissgs.evaluation.likeness import Comparison, Evaluation, spell
 from kissgs.evaluation.pictures import take_picture
 from kissgs.progress import Progress, silent
+from kissgs.rendering.pictures import to_bytes
 from kissgs.rendering.rasterizer import Device
 from kissgs.splats import Splats
 
@@ -125,8 +126,8 @@ def _section(anchor: str, name: str, comparison: Comparison, pictures: _Pictures
     levels = difference(pictures.candidate, pictures.reference)
     place = worst_place(levels, max(SMALLEST_CROP, min(CROP, min(levels.shape) // 2)))
     layers = {
-        "reference": _to_bytes(pictures.reference),
-        "candidate": _to_bytes(pictures.candidate),
+        "reference": to_bytes(pictures.reference),
+        "candidate": to_bytes(pictures.candidate),
         **({} if pictures.photo is None else {"photograph": pictures.photo}),
         "difference": heat_map(levels, full),
     }
@@ -178,10 +179,6 @@ def _mark(place: tuple[slice, slice], shape: tuple[int, ...]) -> str:
     edges = {"top": rows.start / shape[0], "left": columns.start / shape[1]}
     edges |= {"height": (rows.stop - rows.start) / shape[0], "width": (columns.stop - columns.start) / shape[1]}
     return f'<span class="mark" style="{"; ".join(f"{edge}: {100 * at:.2f}%" for edge, at in edges.items())}"></span>'
-
-
-def _to_bytes(image: Float32[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
-    return np.rint(255 * np.nan_to_num(image)).astype(np.uint8)
 
 
 def _large(pixels: UInt8[np.ndarray, "H W 3"]) -> str:

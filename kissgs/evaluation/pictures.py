@@ -115,7 +115,7 @@ def _views_to_use(views: Views, split: str) -> tuple[Split, tuple[View, ...]]:
     parts = {
         "test": views.test,
         "train": views.train,
-        "all": tuple(sorted(views.train + views.test, key=lambda view: view.name)),
+        "all": views.all,
     }
     used = "train" if split == "test" and not views.test else split
     if used not in parts:

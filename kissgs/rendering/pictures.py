@@ -81,15 +81,6 @@ def png(pixels: UInt8[np.ndarray, "H W 3"]) -> bytes:
     return stream.getvalue()
 
 
-def webp(pixels: UInt8[np.ndarray, "H W 3"], *, quality: int = LOSSLESS) -> bytes:
-    """As a WebP file.
-
-    Raises:
-        UnsupportedError: a side is too long for the format.
-    """
-    return film([pixels], fps=1, quality=quality)
-
-
 def film(frames: Sequence[UInt8[np.ndarray, "H W 3"]], *, fps: float, quality: int) -> bytes:
     """As an animated WebP that repeats for ever; a plain one if it has a single frame.
 

@@ -21,7 +21,6 @@ Device = Literal["cpu", "cuda"]
 Colour = Sequence[float]
 
 BLACK: Colour = (0.0, 0.0, 0.0)
-WHITE: Colour = (1.0, 1.0, 1.0)
 
 
 def render(

@@ -17,6 +17,7 @@ from kissgs.errors import InvalidViewsError
 from kissgs.parallel import Workers
 from kissgs.progress import Progress, silent
 from kissgs.rendering.camera import Camera, look_at
+from kissgs.rendering.semantics import NEAR
 from kissgs.splats import Splats
 from kissgs.views.anatomy import Anatomy, Point, opacity, weighted_median
 from kissgs.views.candidates import FIELD_OF_VIEW, ground
@@ -180,7 +181,7 @@ def _around(splats: Splats, scene: Anatomy, aspect: float) -> Iterator[Orbit]:
     for elevation in np.radians(ELEVATIONS):
         upright = tall * np.cos(elevation) + wide * np.sin(elevation)
         ahead = wide * np.cos(elevation) + tall * np.sin(elevation)
-        reach = AIR * max(wide / across[0], upright / across[1]) + ahead
+        reach = max(AIR * max(wide / across[0], upright / across[1]), 2 * NEAR) + ahead
         yield Orbit(hub=hub, reach=float(reach), elevation=float(elevation), up=scene.up)
 
 

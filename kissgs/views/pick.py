@@ -8,12 +8,7 @@ from pathlib import Path, PurePosixPath
 from kissgs.errors import InvalidViewsError
 from kissgs.views._files import quoted
 from kissgs.views.camera_json import read_cameras
-from kissgs.views.view import View, Views
-
-
-def in_order(views: Views) -> tuple[View, ...]:
-    """All of them, sorted by name, whichever part they belong to."""
-    return tuple(sorted(views.train + views.test, key=lambda view: view.name))
+from kissgs.views.view import View
 
 
 def is_camera_file(which: str) -> bool:

@@ -16,7 +16,7 @@ from kissgs.rendering.rasterizer import BLACK, Colour, Device, load_kernels
 from kissgs.rendering.sheet import Label, contact_sheet
 from kissgs.splats import Splats
 from kissgs.views.orbit import find_orbit
-from kissgs.views.pick import in_order, is_camera_file, pick_view, view_of_file
+from kissgs.views.pick import is_camera_file, pick_view, view_of_file
 from kissgs.views.view import View, Views
 from kissgs.views.virtual import best_view, virtual_views
 
@@ -72,14 +72,14 @@ class Photographer:
         if which is not None and is_camera_file(which):
             view, source = view_of_file(which), "camera file"
         elif capture is not None:
-            view, source = pick_view(in_order(capture), which or "0", capture.source), capture.source
+            view, source = pick_view(capture.all, which or "0", capture.source), capture.source
         elif which is None:
             width, height = self.size or PICTURE
             view = best_view(self.splats, width=width, height=height, threads=self.threads, progress=self.progress)
             source = "best of the virtual cameras"
         else:
             virtual = self._virtual(self.size or PICTURE)
-            view, source = pick_view(in_order(virtual), which, virtual.source), virtual.source
+            view, source = pick_view(virtual.all, which, virtual.source), virtual.source
         if self.size is not None:
             view = View(view.name, reframed(view.camera, *self.size))
         return Shots(self._take([view.camera], capture), [view], f"{view.name} ({source})")
@@ -106,9 +106,9 @@ class Photographer:
         load_kernels(self.progress)
         width, height = self.size or CELL
         views = self._virtual((width, height)) if capture is None else capture
-        if not in_order(views):
+        if not views.all:
             raise InvalidViewsError(f"{views.source} has no view to show")
-        shown = [View(view.name, _within(view.camera, width, height)) for view in in_order(views)]
+        shown = [View(view.name, _within(view.camera, width, height)) for view in views.all]
         held_out = {view.name for view in views.test}
         labels = [Label(f"{view.name}{HELD_OUT * (view.name in held_out)}", view.name in held_out) for view in shown]
         sheet = contact_sheet(self._take([view.camera for view in shown], capture), labels)

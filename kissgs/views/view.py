@@ -79,3 +79,8 @@ class Views:
     background: Float32[np.ndarray, "3"]
     source: str
     note: str = ""
+
+    @property
+    def all(self) -> tuple[View, ...]:
+        """Both parts, sorted by name."""
+        return tuple(sorted(self.train + self.test, key=lambda view: view.name))

@@ -85,7 +85,7 @@ def best_view(
     views = _split(_sized([tried.cameras[n] for n in chosen], width, height))
     distances = [float(np.linalg.norm(tried.cameras[n].position - scene.centre)) for n in chosen]
     scores = tried.scores[chosen] + [of_distance(distance / scene.radius) for distance in distances]
-    return sorted(views.train + views.test, key=lambda view: view.name)[int(scores.argmax())]
+    return views.all[int(scores.argmax())]
 
 
 def of_distance(radii: float) -> float:

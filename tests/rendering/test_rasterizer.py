@@ -12,7 +12,7 @@ from kissgs.errors import InvalidSceneError, InvalidViewsError, KissgsError, Uns
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.differentiable import rasterize, tensors_of
 from kissgs.rendering.gsplat_backend import alpha_max
-from kissgs.rendering.rasterizer import BLACK, WHITE, load_kernels, render
+from kissgs.rendering.rasterizer import BLACK, load_kernels, render
 from kissgs.splats import ATTRIBUTES
 
 
@@ -89,7 +89,7 @@ def test_needles_lose_no_digits():
 
 def test_an_opaque_pile_ends_where_the_oracle_ends():
     pile = together(*(one(mean=(0, 0, 0.2 * i), scale=(0, 0, 0), opacity=4.0, sh0=(i, 1, -i)) for i in range(-4, 9)))
-    expected = agree(pile, camera(), WHITE)
+    expected = agree(pile, camera(), (1.0, 1.0, 1.0))
     drawn = np.sum([drawn for _, drawn, _ in expected.decisions], axis=0)
     assert drawn.min() < 5, "some pixels end after a few of the thirteen"
 
@@ -186,8 +186,8 @@ def test_pictures_and_gradients_are_the_same_for_any_number_of_threads():
 
 def test_render_is_the_same_without_torch():
     splats, view = blobs(50, 3), camera()
-    image, alpha = render(splats, view, background=WHITE)
-    images, alphas, _ = pictures(splats, [view], backgrounds=[WHITE])
+    image, alpha = render(splats, view, background=(1.0, 1.0, 1.0))
+    images, alphas, _ = pictures(splats, [view], backgrounds=[(1.0, 1.0, 1.0)])
     assert np.array_equal(image, images[0].detach().numpy())
     assert np.array_equal(alpha, alphas[0].detach().numpy())
 

@@ -8,7 +8,7 @@ from render_scenes import blobs, camera, in_float64, one, together
 from kissgs.errors import Cancelled
 from kissgs.parallel import Workers
 from kissgs.rendering.cpu.frame import differentiate, draw
-from kissgs.rendering.rasterizer import WHITE, removal_scores, render
+from kissgs.rendering.rasterizer import removal_scores, render
 
 
 def brute_force(splats, view, background):
@@ -42,7 +42,7 @@ def test_what_is_not_seen_scores_nothing():
 
 
 def test_a_gaussian_of_the_backgrounds_colour_scores_nothing():
-    scores = removal_scores(one(sh0=(0.5 / 0.28209479,) * 3), [camera()], background=WHITE)
+    scores = removal_scores(one(sh0=(0.5 / 0.28209479,) * 3), [camera()], background=(1.0, 1.0, 1.0))
     assert scores[0] < 1e-10
 
 

@@ -8,7 +8,7 @@ from PIL import Image, ImageSequence
 
 from kissgs.errors import UnsupportedError
 from kissgs.rendering.camera import Camera, look_at
-from kissgs.rendering.pictures import film, png, reframed, render_all, to_bytes, webp
+from kissgs.rendering.pictures import film, png, reframed, render_all, to_bytes
 from kissgs.rendering.rasterizer import render
 from kissgs.rendering.sheet import GAP, INK, MARK, PAGE, Label, contact_sheet, even_columns
 from kissgs.sample import sample_scene
@@ -34,9 +34,9 @@ def test_bytes_are_clamped_and_rounded():
 def test_files_hold_the_pixels():
     pixels = noise(20, 30)
     assert np.array_equal(np.asarray(opened(png(pixels))), pixels)
-    assert np.array_equal(np.asarray(opened(webp(pixels)).convert("RGB")), pixels)
-    assert opened(webp(pixels)).format == "WEBP"
-    assert len(film([pixels], fps=1, quality=10)) < len(webp(pixels))
+    assert np.array_equal(np.asarray(opened(film([pixels], fps=1, quality=100)).convert("RGB")), pixels)
+    assert opened(film([pixels], fps=1, quality=100)).format == "WEBP"
+    assert len(film([pixels], fps=1, quality=10)) < len(film([pixels], fps=1, quality=100))
 
 
 @pytest.mark.parametrize(("count", "fps"), [(5, 12), (7, 60), (3, 1)])
@@ -53,7 +53,7 @@ def test_a_film_has_its_frames_and_takes_its_time(count, fps):
 
 def test_what_the_format_cannot_hold_is_refused():
     with pytest.raises(UnsupportedError, match="16,383 pixels a side, not 16384x1"):
-        webp(flat(1, 16_384, 0))
+        film([flat(1, 16_384, 0)], fps=1, quality=100)
     with pytest.raises(UnsupportedError, match="too large; make its pictures smaller"):
         contact_sheet([flat(100, 20_000, 0)] * 200, columns=1)
 

@@ -8,7 +8,7 @@ import pytest
 from kissgs.errors import InvalidViewsError, OutputError
 from kissgs.rendering.camera import Camera, look_at
 from kissgs.views.camera_json import camera_as_dict, read_cameras, write_camera
-from kissgs.views.pick import in_order, is_camera_file, pick_view, view_of_file
+from kissgs.views.pick import is_camera_file, pick_view, view_of_file
 from kissgs.views.view import View, Views, black
 
 
@@ -112,7 +112,7 @@ def test_views_are_picked_by_name_number_and_file_name():
     camera = some_camera()
     names = ("images/7.png", "left/a.png", "right/a.png", "right/b.png", "1")
     parts = tuple(View(name, camera) for name in names)
-    views = in_order(Views(parts[1:], parts[:1], black(), "x"))
+    views = Views(parts[1:], parts[:1], black(), "x").all
     assert [view.name for view in views] == sorted(names)
     assert pick_view(views, "images/7.png", "x").name == "images/7.png"
     assert pick_view(views, "b.png", "x").name == pick_view(views, "b", "x").name == "right/b.png"

@@ -15,6 +15,7 @@ from numba import njit
 from kissgs.compiled import compiled
 
 Vector = tuple[float, float, float]
+Quat = tuple[float, float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
 
 _helper = njit(nogil=True, error_model="numpy")
@@ -99,6 +100,20 @@ def _rotation(w: float, x: float, y: float, z: float) -> Matrix:
         (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
+
+
+@_helper
+def _by_quat(q: Quat, e: Matrix) -> Quat:
+    """Gradient by a unit quaternion of what has the gradient ``e`` by its rotation; none along its own direction."""
+    w, x, y, z = q
+    curl = (e[2][1] - e[1][2], e[0][2] - e[2][0], e[1][0] - e[0][1])
+    both = (e[1][2] + e[2][1], e[0][2] + e[2][0], e[0][1] + e[1][0])
+    by_w = 2 * (x * curl[0] + y * curl[1] + z * curl[2])
+    by_x = 2 * (w * curl[0] + y * both[2] + z * both[1] - 2 * x * (e[1][1] + e[2][2]))
+    by_y = 2 * (w * curl[1] + x * both[2] + z * both[0] - 2 * y * (e[0][0] + e[2][2]))
+    by_z = 2 * (w * curl[2] + x * both[1] + y * both[0] - 2 * z * (e[0][0] + e[1][1]))
+    along = by_w * w + by_x * x + by_y * y + by_z * z
+    return by_w - along * w, by_x - along * x, by_y - along * y, by_z - along * z
 
 
 @_helper
@@ -277,19 +292,11 @@ def project_backward(
         by_w, by_v = _scaled(by_w, s), _scaled(by_v, s)
         by_p, by_q = _applied(R, by_w), _applied(R, by_v)
 
-        # By R, rows e0, e1, e2; then by the quaternion, across its own direction: its length changes nothing.
+        # By R, rows e0, e1, e2; then by the quaternion as it was before it became one of length 1.
         e0, e1, e2 = _mix(p[0], by_w, q[0], by_v), _mix(p[1], by_w, q[1], by_v), _mix(p[2], by_w, q[2], by_v)
-        curl = (e2[1] - e1[2], e0[2] - e2[0], e1[0] - e0[1])
-        both = (e1[2] + e2[1], e0[2] + e2[0], e0[1] + e1[0])
-        by_qw = 2 * (qx * curl[0] + qy * curl[1] + qz * curl[2])
-        by_qx = 2 * (qw * curl[0] + qy * both[2] + qz * both[1] - 2 * qx * (e1[1] + e2[2]))
-        by_qy = 2 * (qw * curl[1] + qx * both[2] + qz * both[0] - 2 * qy * (e0[0] + e2[2]))
-        by_qz = 2 * (qw * curl[2] + qx * both[1] + qy * both[0] - 2 * qz * (e0[0] + e1[1]))
-        along = by_qw * qw + by_qx * qx + by_qy * qy + by_qz * qz
-        v_quats[n, 0] = (by_qw - along * qw) * shrink
-        v_quats[n, 1] = (by_qx - along * qx) * shrink
-        v_quats[n, 2] = (by_qy - along * qy) * shrink
-        v_quats[n, 3] = (by_qz - along * qz) * shrink
+        by_quat = _by_quat((qw, qx, qy, qz), (e0, e1, e2))
+        for c in range(4):
+            v_quats[n, c] = by_quat[c] * shrink
 
         # By the position before the camera: through the centre; through J; through J's x/z and y/z if not clamped.
         by_jx, by_jxz = _dot(by_p, turn[0]), _dot(by_p, turn[2])
