@@ -1,7 +1,8 @@
-# make demo               a sample scene into a container and back, and what that cost
+# make demo               a service is started, compresses a sample scene, and is stopped; the result is compared
 # make demo SCENE=x.ply   the same with your own
+# make serve              the service, with its page, on http://127.0.0.1:8000 (KISSGS_PORT=… and others: docs/service.md)
 # make test               all tests
-# make lint               format, lint, types, import contract
+# make lint               format, lint, types, import contract; of the JavaScript, format and types
 # make bench              bytes, time, memory and errors of all presets (SCENE=x.ply for your own)
 # make docs               what is generated in docs/
 
@@ -9,10 +10,13 @@ SCENE ?=
 PRESET ?= balanced
 KISSGS = .venv/bin/kissgs
 
-.PHONY: demo test lint bench docs setup setup-dev clean
+.PHONY: demo serve test lint bench docs setup setup-dev clean
 
 demo: setup
-	@$(KISSGS) demo $(if $(SCENE),"$(SCENE)") --preset $(PRESET)
+	@scripts/demo "$(SCENE)" $(PRESET)
+
+serve: setup
+	@.venv/bin/kissgs-serve
 
 test: setup-dev
 	@.venv/bin/pytest -q -n auto
@@ -22,6 +26,7 @@ lint: setup-dev
 	@.venv/bin/ruff check .
 	@.venv/bin/mypy
 	@.venv/bin/lint-imports
+	@PATH="$(CURDIR)/.venv/bin:$$PATH" npm --prefix web_decoder run --silent check
 
 bench: setup
 	@mkdir -p demo-out
@@ -38,4 +43,4 @@ setup-dev:
 	@scripts/setup dev
 
 clean:
-	@rm -rf .venv demo-out build dist
+	@rm -rf .venv demo-out build dist web_decoder/vendor

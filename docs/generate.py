@@ -1,12 +1,18 @@
-"""Write what is generated in docs/: the settings table and the JSON Schemas of the container's metadata."""
+"""Write what is generated in docs/: tables of settings and problems, JSON Schema, OpenAPI."""
 
 from __future__ import annotations
 
 import json
+import tempfile
 from pathlib import Path
+
+from pydantic import ByteSize
 
 from kissgs.settings import PRESETS, EncodeSettings, Preset
 from kissgs.sogxt.metadata import ContainerMeta
+from service.app import create_app
+from service.problems import KINDS
+from service.settings import ServiceSettings
 
 HERE = Path(__file__).parent
 
@@ -34,7 +40,54 @@ def container_schema() -> str:
     return json.dumps(schema, indent=2) + "\n"
 
 
-PAGES = {"settings.md": settings_page, "container_meta.schema.json": container_schema}
+SERVICE_INTRODUCTION = """# The service: settings and problems
+
+Made by `make docs` from `service/settings.py` and `service/problems.py`; how to use it is in [service.md](service.md).
+
+## Settings
+
+Environment variables. A name that is none of these stops the service at its start, and so does a value that is not
+possible; all of them are told at once. Sizes may be written as `2GB` or `512MiB`, lists with spaces or commas.
+
+| variable | default | what it is |
+|---|---|---|
+"""
+
+
+def service_page() -> str:
+    """Every setting of the service, and every code of a problem document."""
+    page = SERVICE_INTRODUCTION
+    for name, field in ServiceSettings.model_fields.items():
+        default = "" if field.default in (None, ()) else f"`{_spelled(name, field.default)}`"
+        page += f"| `KISSGS_{name.upper()}` | {default} | {field.description} |\n"
+    page += "\n## Problems\n\nThe `code` of a problem document. Codes never change their meaning.\n\n"
+    page += "| code | status | what | try again |\n|---|---|---|---|\n"
+    for code, kind in KINDS.items():
+        page += f"| `{code}` | {kind.status} | {kind.title} | {'yes' if kind.retryable else ''} |\n"
+    return page
+
+
+def _spelled(name: str, value: object) -> str:
+    if name.endswith(("bytes", "memory", "rate")) and isinstance(value, ByteSize):
+        return value.human_readable()
+    return str(value).lower() if isinstance(value, bool) else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def openapi_document() -> str:
+    """What a service without keys serves at ``/openapi.json``."""
+    with tempfile.TemporaryDirectory() as folder:
+        app = create_app(ServiceSettings(data_dir=Path(folder)))
+        app.state.context.store.close()
+        app.state.context.folders.close()
+    return json.dumps(app.openapi(), indent=1) + "\n"
+
+
+PAGES = {
+    "settings.md": settings_page,
+    "container_meta.schema.json": container_schema,
+    "service-reference.md": service_page,
+    "openapi.json": openapi_document,
+}
 
 
 def main() -> None:

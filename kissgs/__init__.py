@@ -20,12 +20,15 @@ if TYPE_CHECKING:
         InvalidViewsError,
         KissgsError,
         OutputError,
+        RemoteError,
         UnsupportedError,
     )
     from kissgs.evaluation.likeness import Evaluation
     from kissgs.evaluation.pictures import evaluate
+    from kissgs.io.ply import PlyInfo, read_ply_info
     from kissgs.pipeline import Compressed, compress, decompress, load, save
     from kissgs.progress import Progress
+    from kissgs.remote import Remote
     from kissgs.rendering.camera import Camera
     from kissgs.rendering.rasterizer import render
     from kissgs.report import Report
@@ -47,8 +50,11 @@ _HOMES = {
     "InvalidViewsError": "errors",
     "KissgsError": "errors",
     "OutputError": "errors",
+    "PlyInfo": "io.ply",
     "Preset": "settings",
     "Progress": "progress",
+    "Remote": "remote",
+    "RemoteError": "errors",
     "Report": "report",
     "Settings": "settings",
     "Splats": "splats",
@@ -61,6 +67,7 @@ _HOMES = {
     "evaluate": "evaluation.pictures",
     "load": "pipeline",
     "load_views": "views.load",
+    "read_ply_info": "io.ply",
     "render": "rendering.rasterizer",
     "sample_scene": "sample",
     "save": "pipeline",
@@ -78,8 +85,11 @@ __all__ = [
     "InvalidViewsError",
     "KissgsError",
     "OutputError",
+    "PlyInfo",
     "Preset",
     "Progress",
+    "Remote",
+    "RemoteError",
     "Report",
     "Settings",
     "Splats",
@@ -93,6 +103,7 @@ __all__ = [
     "evaluate",
     "load",
     "load_views",
+    "read_ply_info",
     "render",
     "sample_scene",
     "save",

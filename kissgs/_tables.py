@@ -9,7 +9,6 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from kissgs.bench import RoundTrip
-from kissgs.evaluation.attributes import AttributeErrors, Spread
 from kissgs.evaluation.likeness import Evaluation, spell
 from kissgs.evaluation.peers import PeerResult
 from kissgs.info import Info
@@ -96,15 +95,6 @@ def info_table(info: Info) -> RenderableType:
     return Group(*blocks, *_changes(info.changed))
 
 
-def roundtrip_table(result: RoundTrip) -> RenderableType:
-    """What ``kissgs demo`` shows: the cost of one scene, there and back."""
-    report = result.report
-    lost = error_table({"error": result.errors})
-    back = f"decoded in {result.decode_seconds:.2f} s ({result.decode_cpu_seconds:.2f} CPU s)"
-    pictures = [] if result.pictures is None else [_pictures(result.pictures)]
-    return Group(report_table(report, report.settings["preset"]), Text(back), *pictures, Text(), lost)
-
-
 def bench_table(rows: Iterable[tuple[str, str, RoundTrip | PeerResult]]) -> Table:
     """Scenes × presets and peers."""
     rows = list(rows)
@@ -152,25 +142,6 @@ def _picture_cells(evaluation: Evaluation | None, photographed: bool) -> list[st
     change = "" if mean.change is None else spell(mean.change, 2, signed=True)
     to_photo = [spell(mean.candidate.psnr, 2), change, spell(mean.candidate.ssim, 4)]
     return [*(to_photo if photographed else []), spell(mean.between.psnr, 2), spell(mean.between.ssim, 4)]
-
-
-def error_table(columns: Mapping[str, AttributeErrors]) -> Table:
-    """Root mean square and largest error of each attribute."""
-    table = Table("attribute", *(_right(f"{name} {kind}") for name in columns for kind in ("RMS", "max")), box=None)
-    rows: dict[str, list[Spread]] = {
-        "position, share of 1 + |x|": [e.means_relative for e in columns.values()],
-        "rotation, degrees": [e.rotation_degrees for e in columns.values()],
-        "log-scale": [e.scales for e in columns.values()],
-        "opacity": [e.opacities for e in columns.values()],
-        "base colour, of 255": [e.sh0_levels for e in columns.values()],
-    }
-    for name, spreads in rows.items():
-        table.add_row(name, *(f"{value:.3g}" for spread in spreads for value in (spread.rmse, spread.max)))
-    if any(e.shN.energy_kept is not None for e in columns.values()):
-        kept = [f"{e.shN.energy_kept or 0:.0%} kept" for e in columns.values()]
-        cells = (cell for e, share in zip(columns.values(), kept, strict=True) for cell in (f"{e.shN.rmse:.3g}", share))
-        table.add_row("SH bands 1-3", *cells)
-    return table
 
 
 def _changes(changed: Mapping[str, int]) -> list[Text]:

@@ -14,7 +14,7 @@ from kissgs.errors import UnsupportedError
 from kissgs.evaluation.attributes import AttributeErrors, attribute_errors
 from kissgs.evaluation.likeness import Evaluation
 from kissgs.evaluation.pictures import evaluate
-from kissgs.pipeline import compress, decompress, load, peak_memory, save
+from kissgs.pipeline import compress, decompress, load, peak_memory
 from kissgs.progress import Progress, silent
 from kissgs.report import Report
 from kissgs.settings import Settings
@@ -53,9 +53,6 @@ def roundtrip(
     source: Splats | Path,
     settings: Settings,
     *,
-    container: Path | None = None,
-    back: Path | None = None,
-    overwrite: bool = False,
     pictures: bool = False,
     views: Views | None = None,
     threads: int = 0,
@@ -66,22 +63,17 @@ def roundtrip(
     Args:
         source: a scene, or the path of a ``.ply``.
         settings: of the compression.
-        container: where to write the container, if wanted.
-        back: where to write the decompressed ``.ply``, if wanted.
-        overwrite: replace those files.
         pictures: compare pictures too (:func:`kissgs.evaluate`); no part of the times.
         views: from where; by default virtual cameras.
         threads: 0 means one per processor.
         progress: receives the events of both directions.
     """
-    result = compress(source, container, settings=settings, overwrite=overwrite, threads=threads, progress=progress)
+    result = compress(source, settings=settings, threads=threads, progress=progress)
     archive = result.to_zip()
     wall, cpu = time.perf_counter(), time.process_time()
     decoded = decompress(archive, threads=threads, progress=progress)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     peak = peak_memory()
-    if back is not None:
-        save(decoded, back, overwrite=overwrite)
     scene = source if isinstance(source, Splats) else load(source)
     return RoundTrip(
         report=result.report,

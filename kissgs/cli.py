@@ -11,15 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from kissgs import _cli_bench, _cli_pictures, _cli_render
-from kissgs._cli_files import each, make_folder, show, source, stdout, write_stdout
+from kissgs import _cli_bench, _cli_pictures, _cli_remote, _cli_render
+from kissgs._cli_files import each, show, source, stdout, write_stdout
+from kissgs._cli_settings import chosen
 from kissgs._version import __version__
 from kissgs.errors import KissgsError, UnsupportedError
 
 if TYPE_CHECKING:
     from types import FrameType
-
-    from kissgs.settings import Settings
 
 app = typer.Typer(
     name="kissgs",
@@ -92,7 +91,7 @@ def compress(
     """Compress scenes, each into a container of its own."""
     from kissgs.pipeline import compress as run
 
-    settings = _settings(preset, changes, seed)
+    settings = chosen(preset, changes, seed)
     if views is not None and not evaluate:
         raise UnsupportedError("--views says from where to evaluate; add --evaluate")
     capture = _cli_pictures.open_views(views)
@@ -199,33 +198,8 @@ def sample(
     save(sample_scene(gaussians, sh_degree=degree, seed=seed), output, overwrite=force)
 
 
-@app.command()
-def demo(
-    scene: Annotated[Path | None, typer.Argument(help="Your own .ply; by default the sample scene.")] = None,
-    folder: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")] = Path("demo-out"),
-    preset: PresetOption = "balanced",
-) -> None:
-    """Compress a scene, decompress it, and show what that cost, pictures included."""
-    from kissgs._tables import roundtrip_table
-    from kissgs.bench import roundtrip
-    from kissgs.pipeline import save
-    from kissgs.sample import sample_scene
-
-    settings = _settings(preset, None, None)
-    make_folder(folder)
-    with _progress(False) as progress:
-        if scene is None:
-            scene = folder / "sample.ply"
-            save(sample_scene(), scene, overwrite=True, progress=progress)
-        container, back = folder / f"{scene.stem}.zip", folder / f"{scene.stem}.decoded.ply"
-        result = roundtrip(
-            scene, settings, container=container, back=back, overwrite=True, pictures=True, progress=progress
-        )
-    show(roundtrip_table(result))
-    show(f"\nscene      {scene}\ncontainer  {container}\ndecoded    {back}")
-
-
 app.command()(_cli_bench.bench)
+app.add_typer(_cli_remote.app)
 
 
 @app.command()
@@ -246,20 +220,6 @@ def _version(version: Annotated[bool, typer.Option("--version", help="Print the 
     if version:
         typer.echo(f"kissgs {__version__}")
         raise typer.Exit
-
-
-def _settings(preset: str, changes: list[str] | None, seed: int | None) -> Settings:
-    from kissgs.settings import Settings
-
-    values: dict[str, Any] = {}
-    for change in changes or []:
-        name, equals, value = change.partition("=")
-        if not equals:
-            raise UnsupportedError(f"--set {change!r}: write NAME=VALUE, for example --set means_bits=16")
-        values[name.strip()] = None if value.strip() == "auto" else value.strip()
-    if seed is not None:
-        values["seed"] = seed
-    return Settings.from_preset(preset, **values)
 
 
 def _progress(silent: bool) -> Any:  # noqa: ANN401

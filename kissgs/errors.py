@@ -5,6 +5,7 @@ KissgsError
 ├─ InvalidContainerError    the bytes are not a valid SOG-XT container
 ├─ InvalidViewsError        cameras or photographs that cannot be used: COLMAP, transforms.json, images
 ├─ UnsupportedError         valid input beyond a limit or a feature that kissgs does not have
+├─ RemoteError              a kissgs service cannot be reached, or refuses what it was asked
 ├─ OutputError              the result could not be written: it exists already, no space, no permission
 └─ Cancelled                the caller stopped the work through its progress callback
 
@@ -42,6 +43,19 @@ class UnsupportedError(KissgsError):
     """Valid input beyond a limit, or a feature that kissgs does not have."""
 
     code = "unsupported"
+
+
+class RemoteError(KissgsError):
+    """A kissgs service cannot be reached, or refuses what it was asked.
+
+    Attributes:
+        retry_after: seconds after which the same may succeed; None if it never will, or nobody knows.
+        unreachable: whether nobody has answered at all.
+    """
+
+    code = "remote"
+    retry_after: float | None = None
+    unreachable: bool = False
 
 
 class OutputError(KissgsError):

@@ -66,7 +66,10 @@ class EncodeSettings(BaseModel):
     )
     sh0_step: Step = Field(0.055, description="Step of base colours: 0.055 is an error of up to 2 levels of 255.")
     sh_ratio: float = Field(
-        7, ge=1, le=4096, description="Gaussians per codebook entry: fewer entries are fewer bytes and a rougher gloss."
+        7.0,
+        ge=1,
+        le=4096,
+        description="Gaussians per codebook entry: fewer entries are fewer bytes and a rougher gloss.",
     )
     sh_tolerance: float = Field(
         0.001,

@@ -49,14 +49,18 @@ class PlyInfo:
     """Whether it is PlayCanvas' compressed ``.ply``."""
 
 
-def read_ply_info(source: Path | bytes) -> PlyInfo:
+def read_ply_info(source: Path | bytes, *, size: int | None = None) -> PlyInfo:
     """What a ``.ply`` holds, from its header and its size: the body is not read.
+
+    Args:
+        source: A file, or the bytes of one; of a file that is still arriving, as many as its header takes.
+        size: Bytes of the whole file, where ``source`` is only its beginning.
 
     Raises:
         InvalidSceneError: as :func:`read_ply`, except for what only the body shows.
         UnsupportedError: as :func:`read_ply`.
     """
-    with open_ply(source) as ply:
+    with open_ply(source, size=size) as ply:
         return _check(ply)
 
 

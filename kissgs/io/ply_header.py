@@ -102,21 +102,23 @@ class PlyFile:
 
 
 @contextlib.contextmanager
-def open_ply(source: Path | bytes) -> Iterator[PlyFile]:
+def open_ply(source: Path | bytes, *, size: int | None = None) -> Iterator[PlyFile]:
     """Open a file, or bytes that are one, and parse the header. The body is not read.
+
+    ``size`` is that of the whole file, where ``source`` is only its beginning.
 
     Raises:
         InvalidSceneError: the file cannot be read, or its header is not one of a PLY file.
     """
     if isinstance(source, bytes):
-        yield _opened("the data", io.BytesIO(source))
+        yield _opened("the data", io.BytesIO(source), size)
         return
     try:
         if not source.is_file():  # asked first, because opening a named pipe would wait for its writer
             reason = "it is a folder or a device" if source.exists() else "there is no such file"
             raise InvalidSceneError(f"cannot read {source}: {reason}; name a .ply file")
         with source.open("rb") as file:
-            yield _opened(source.name, file)
+            yield _opened(source.name, file, size)
     except OSError as error:
         raise InvalidSceneError(f"cannot read {source}: {(error.strerror or str(error)).lower()}") from error
 
@@ -141,10 +143,10 @@ def sh_degree(element: Element, name: str) -> int:
     raise InvalidSceneError(f"{name} has {count} f_rest properties; SH degrees 0 to 3 have 0, 9, 24 or 45")
 
 
-def _opened(name: str, file: io.BufferedIOBase) -> PlyFile:
-    size = file.seek(0, io.SEEK_END)
+def _opened(name: str, file: io.BufferedIOBase, size: int | None) -> PlyFile:
+    present = file.seek(0, io.SEEK_END)
     file.seek(0)
-    return PlyFile(name, file, size, _read_header(file, name))
+    return PlyFile(name, file, present if size is None else size, _read_header(file, name))
 
 
 def _read_header(file: io.BufferedIOBase, name: str) -> Header:

@@ -149,7 +149,8 @@ class _Planes:
         expected = self.layout.provenance.sha256.get(file) if self.layout.provenance else None
         if expected and hashlib.sha256(data).hexdigest() != expected:
             raise InvalidContainerError(f"{file} is damaged: its SHA-256 is not the one in the metadata")
-        return decode_plane(data, file, width=width, height=height, channels=channels)
+        checksum = self.layout.crc32.get(file)
+        return decode_plane(data, file, width=width, height=height, channels=channels, crc32=checksum)
 
     def look_up(self, pool: Workers) -> Splats:
         """Levels to values, some thousand Gaussians at a time, so that everything in between stays in the cache."""

@@ -17,7 +17,7 @@ from kissgs.settings import EncodeSettings
 from kissgs.sogxt import metadata, names
 from kissgs.sogxt.codebook import Codebook, fit_codebook
 from kissgs.sogxt.order import Grid, place
-from kissgs.sogxt.planes import compress_images
+from kissgs.sogxt.planes import compress_images, pixels_crc32
 from kissgs.sogxt.pras import choose_forms
 from kissgs.sogxt.quantize import Quantized, anchor, means_bits, quantize, quantize_means, tame
 from kissgs.splats import NOTHING_CLEANED, SH_REST_COUNTS, Cleaned, Splats
@@ -77,12 +77,13 @@ def encode(
     """
     _check_importance(importance, len(splats))
     load_kernels(progress)
+    ordering = _stage(progress, "order")
     kept = np.arange(len(splats))
     if settings.drop_invisible:
         kept = np.flatnonzero(splats.opacities > np.float32(INVISIBLE_LOGIT))
     bits = settings.means_bits or means_bits(splats, kept, settings.means_tolerance)
     with blas_workers(threads) as pool:
-        grid = place(splats.means, kept, bits, settings, pool, _stage(progress, "order"))
+        grid = place(splats.means, kept, bits, settings, pool, ordering)
         # Padding repeats Gaussians of the scene; a scene without any lends it a neutral one.
         shown, cells = (splats, grid.cells) if len(kept) else (_neutral(splats.sh_degree), grid.cells * 0)
         sh0 = tame(shown.sh0, step=settings.sh0_step, share=OUTLIERS) if settings.shared_steps else shown.sh0
@@ -114,6 +115,7 @@ def encode(
             settings=settings.model_dump(),
             sha256={name: hashlib.sha256(data).hexdigest() for name, data in files.items()},
         ),
+        crc32={name: pixels_crc32(image) for name, image in images.items()},
     )
     files = {names.JSON_NAME: layout.to_meta_json(), **files}
     return Encoded(

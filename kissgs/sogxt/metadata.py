@@ -88,6 +88,8 @@ class Layout(BaseModel):
     ranges: dict[str, tuple[list[Limit], list[Limit]]]
     count: int | None = Field(None, ge=0)
     provenance: Provenance | None = None
+    crc32: dict[str, int] = Field(default_factory=dict)
+    """Of each image's pixels (:func:`kissgs.sogxt.planes.pixels_crc32`); in ``meta.json``, as the YAML has SHA-256."""
 
     def limits(self, field: str) -> tuple[np.ndarray, np.ndarray]:
         """``low`` and ``high`` of a field, one number per channel: float32 numbers, as float64."""
@@ -156,7 +158,8 @@ class Layout(BaseModel):
             },
         }
         if self.provenance:
-            document["kissgs"] = self.provenance.model_dump(include={"version", "sh_degree", "sha256"})
+            made = self.provenance.model_dump(include={"version", "sh_degree"})
+            document["kissgs"] = {**made, "crc32": self.crc32}
         return json.dumps(document, separators=(",", ":"), allow_nan=False).encode("ascii")
 
     def _spelled(self, field: str, low: str, high: str) -> dict[str, float | list[float]]:

@@ -137,6 +137,7 @@ def _from_json(data: bytes) -> dict[str, Any]:
             "codebook_side": rest["centroidSide"],
             "ranges": ranges,
             "provenance": {"source_count": count, **made, "count": count} if isinstance(made, dict) else made,
+            "crc32": made.get("crc32", {}) if isinstance(made, dict) else {},
         }
     except (ValueError, RecursionError) as error:
         raise InvalidContainerError(f"{JSON_NAME} is not readable JSON") from error

@@ -23,7 +23,7 @@ from naive_ply import (
     random_columns,
 )
 
-from kissgs.errors import Cancelled
+from kissgs.errors import Cancelled, InvalidSceneError
 from kissgs.io import ply_body
 from kissgs.io.ply import PlyInfo, read_ply, read_ply_info, write_ply
 from kissgs.splats import Splats
@@ -243,3 +243,12 @@ def test_peak_memory(tmp_path):
     size = path.stat().st_size
     path.unlink()  # pytest keeps the folders of three runs
     assert int(result.stdout) < 1.1 * size
+
+
+def test_info_of_a_beginning():
+    """What an upload's first bytes tell, with the size that it will have."""
+    data = ply_bytes(random_columns(3, 1))
+    header = data[: data.index(b"end_header\n") + 11]
+    assert read_ply_info(header, size=len(data)) == read_ply_info(data)
+    with pytest.raises(InvalidSceneError, match="is cut short"):
+        read_ply_info(header, size=len(data) - 1)

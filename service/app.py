@@ -1,0 +1,165 @@
+"""The application: parts put together, errors turned into problem documents, start and stop."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import AsyncIterator
+from http import HTTPStatus
+
+from anyio.to_thread import run_sync
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from fastapi.routing import APIRoute
+from sqlalchemy.exc import SQLAlchemyError
+from starlette.exceptions import HTTPException
+from starlette.middleware.cors import CORSMiddleware
+
+import kissgs
+from service.admission import Admission
+from service.bell import Bell
+from service.clock import Clock
+from service.context import Context
+from service.decoding import Decoder
+from service.events import Follower
+from service.files import Folders
+from service.janitor import Janitor
+from service.metrics import Metrics
+from service.middleware import Envelope
+from service.openapi import describe
+from service.problems import ProblemError, answer, fields_of
+from service.routes import facts, jobs, page, preview, results
+from service.settings import ServiceSettings, SettingsError
+from service.store import Store
+from service.worker import Worker
+
+ROUTERS = (jobs.router, results.router, facts.router, page.router, preview.router)
+
+log = logging.getLogger("kissgs.service")
+
+
+def create_app(settings: ServiceSettings) -> FastAPI:
+    """The service as an ASGI application. Its data folder and database are opened here and now.
+
+    Raises:
+        SettingsError: the data folder or the database cannot be used.
+    """
+    context = build(settings)
+    app = FastAPI(
+        title="kissgs",
+        version=facts.API_VERSION,
+        lifespan=_lifespan,
+        redoc_url=None,
+        openapi_url="/openapi.json",
+        redirect_slashes=False,
+        separate_input_output_schemas=False,
+    )
+    app.state.context = context
+    for router in ROUTERS:
+        app.include_router(router)
+    app.mount("/static", page.Fresh(directory=page.STATIC), name="static")
+    describe(app, keys_required=bool(settings.keys))
+    app.openapi()  # made now, not while a request waits
+    _answer_errors(app)
+    if settings.cors_origins:
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=settings.cors_origins,
+            allow_methods=["GET", "HEAD", "POST", "DELETE"],
+            allow_headers=[
+                *("Authorization", "Content-Type", "Idempotency-Key", "Last-Event-ID", "X-Request-ID"),
+                *("If-None-Match", "If-Range", "Range"),
+            ],
+            expose_headers=[
+                *("Location", "Link", "Retry-After", "X-Request-ID", "Content-Location", "Content-Disposition"),
+                *("ETag", "Content-Digest", "Repr-Digest", "Content-Range"),
+            ],
+        )
+    app.add_middleware(Envelope, metrics=context.metrics, settings=settings)
+    return app
+
+
+def build(settings: ServiceSettings) -> Context:
+    """The parts of a service, ready to start."""
+    folders = Folders(settings.data_dir)
+    folders.remove_unfinished()  # first: it may make the room that the database needs
+    clock = Clock()
+    store = Store(settings.database, clock)
+    if not store.belongs_to(folders.identity()):
+        raise SettingsError(
+            "KISSGS_DATABASE_URL, KISSGS_DATA_DIR: this database is that of another data folder; "
+            "each service needs its own of both"
+        )
+    clock.start_after(store.latest_time())
+    bell, metrics = Bell(), Metrics()
+    metrics.queue_limit.set(settings.max_queue)
+    worker = Worker(settings, store, folders, bell, metrics, clock)
+    admission = Admission(settings, store, folders)
+    decoder = Decoder(settings, store, folders, admission)
+    follower = Follower(store, bell, settings.workers)
+    return Context(settings, store, folders, bell, metrics, clock, worker, admission, decoder, follower)
+
+
+@contextlib.asynccontextmanager
+async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
+    context: Context = app.state.context
+    await run_sync(context.worker.recover)
+    context.worker.start()
+    janitor = asyncio.create_task(Janitor(context, context.clock()).run())
+    try:
+        yield
+    finally:
+        context.bell.close()
+        await context.worker.drain()
+        janitor.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await janitor
+        context.store.close()
+        context.folders.close()
+
+
+def _answer_errors(app: FastAPI) -> None:
+    @app.exception_handler(ProblemError)
+    async def expected(request: Request, error: ProblemError) -> JSONResponse:
+        return answer(error)
+
+    @app.exception_handler(RequestValidationError)
+    async def invalid(request: Request, error: RequestValidationError) -> JSONResponse:
+        text, found = fields_of(error.errors())
+        return answer(ProblemError("invalid-request", f"{text}; see /openapi.json", errors=found))
+
+    @app.exception_handler(HTTPException)
+    async def plain(request: Request, error: HTTPException) -> JSONResponse:
+        headers = dict(error.headers or {})
+        match error.status_code:
+            case HTTPStatus.NOT_FOUND:
+                return answer(
+                    ProblemError("not-found", f"there is nothing at {request.url.path[:200]}; see /openapi.json")
+                )
+            case HTTPStatus.METHOD_NOT_ALLOWED:
+                allowed = _allowed(request.url.path)
+                text = f"{request.method[:20]} is not possible here; use {allowed}"
+                return answer(ProblemError("method-not-allowed", text, headers={"Allow": allowed}))
+            case _:
+                return answer(ProblemError("invalid-request", f"{error.detail}; see /openapi.json", headers=headers))
+
+    @app.exception_handler(kissgs.KissgsError)
+    async def library(request: Request, error: kissgs.KissgsError) -> JSONResponse:
+        return answer(ProblemError(error.code, str(error)))
+
+    @app.exception_handler(SQLAlchemyError)
+    async def database(request: Request, error: SQLAlchemyError) -> JSONResponse:
+        log.error("the job database failed: %s", error)
+        reason = str(getattr(error, "orig", "")).lower()
+        if "is full" in reason or "no space left" in reason:
+            return answer(ProblemError("disk-full", "the server's disk is full; try again later", retry_after=600))
+        return answer(ProblemError("internal", "the job database does not answer; try again later", retry_after=5))
+
+
+def _allowed(path: str) -> str:
+    """The methods of all routes with this path; FastAPI names those of the first, or none."""
+    routes = [route for router in ROUTERS for route in router.routes if isinstance(route, APIRoute)]
+    fitting = [route.methods or set() for route in routes if route.path_regex.match(path)]
+    return ", ".join(sorted(set().union(*fitting))) or "GET, HEAD"

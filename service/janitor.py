@@ -1,0 +1,64 @@
+"""Housekeeping: what has expired is removed, and the time is written down."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from dataclasses import dataclass
+
+from anyio.to_thread import run_sync
+
+from service.bell import ended
+from service.context import Context
+from service.models import ENDED, State
+
+log = logging.getLogger("kissgs.service")
+
+
+GRACE_SECONDS = 3600.0
+
+
+@dataclass(frozen=True, slots=True)
+class Janitor:
+    """Sweeps every ``settings.sweep_seconds``."""
+
+    context: Context
+    began: float
+
+    async def run(self) -> None:
+        """For ever; a failed sweep is logged and tried again."""
+        while True:
+            await asyncio.sleep(self.context.settings.sweep_seconds)
+            try:
+                for job_id in await run_sync(self.sweep):
+                    self.context.bell.ring(job_id)
+                    self.context.bell.ring(ended(job_id))
+            except Exception:
+                log.exception("what has expired could not be removed; trying again")
+
+    def sweep(self) -> list[str]:
+        """Remove the files of ended jobs whose time is over; forget them altogether after as long again.
+
+        Nothing expires in the first hour of a service, should its machine have started with a wrong clock.
+
+        Returns:
+            Ids of the jobs that have expired.
+        """
+        store, folders, now = self.context.store, self.context.folders, self.context.clock()
+        keep, expired = self.context.settings.keep_seconds, []
+        store.keep_time()
+        if now - self.began < min(GRACE_SECONDS, keep):
+            return []
+        while due := store.due(ENDED, now):
+            for number, job_id in due:
+                gone = {"upload_kept": False, "disk_bytes": 0, "spare_bytes": 0}
+                if store.move(number, State.EXPIRED, expires_at=now + keep, **gone):
+                    folders.remove_job(job_id)
+                    expired.append(job_id)
+        while due := store.due([State.EXPIRED], now):
+            for number, job_id in due:
+                store.forget(number)
+                folders.remove_job(job_id)
+        if expired:
+            log.info("%d jobs expired", len(expired))
+        return expired

@@ -1,0 +1,102 @@
+"""The tables, as SQLAlchemy models: SQLite by default, PostgreSQL by URL."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Any
+
+from sqlalchemy import JSON, BigInteger, Float, ForeignKey, Index, Integer, String, UniqueConstraint
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+
+SCHEMA_VERSION = 1
+"""Of the tables below. A database of another version is refused rather than misread."""
+
+Number = BigInteger().with_variant(Integer, "sqlite")  # SQLite counts up only in INTEGER columns
+
+
+class State(StrEnum):
+    """Where a job stands."""
+
+    QUEUED = "queued"
+    RUNNING = "running"
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+    EXPIRED = "expired"
+
+
+ACTIVE = (State.QUEUED, State.RUNNING)
+ENDED = (State.SUCCEEDED, State.FAILED, State.CANCELLED)
+
+
+class Base(DeclarativeBase):
+    """Of all tables."""
+
+
+class Meta(Base):
+    """A few facts about the database itself."""
+
+    __tablename__ = "meta"
+
+    name: Mapped[str] = mapped_column(String(32), primary_key=True)
+    value: Mapped[float] = mapped_column(Float(53))
+
+
+class Job(Base):
+    """One upload and what becomes of it. Times are seconds since 1970; sizes are bytes.
+
+    ``disk_bytes`` is what its files take; ``spare_bytes`` what of that can be given up for new uploads once it has
+    ended: the upload itself, which is kept for comparisons, and the decoded scene.
+    """
+
+    __tablename__ = "jobs"
+    __table_args__ = (
+        UniqueConstraint("owner", "idempotency_key"),
+        Index("jobs_by_state", "state", "number"),
+        Index("jobs_by_owner", "owner", "number"),
+        Index("jobs_by_kind", "preset", "evaluate", "state", "number"),
+        Index("jobs_by_expiry", "expires_at"),
+        Index("jobs_by_size", "disk_bytes"),
+        Index("jobs_by_spare", "spare_bytes"),
+        {"sqlite_autoincrement": True},  # numbers are cursors: none is given twice
+    )
+
+    number: Mapped[int] = mapped_column(Number, primary_key=True, autoincrement=True)
+    id: Mapped[str] = mapped_column(String(32), unique=True)
+    owner: Mapped[str] = mapped_column(String(64))
+    name: Mapped[str] = mapped_column(String(200))
+    state: Mapped[str] = mapped_column(String(16), default=State.QUEUED)
+    options: Mapped[dict[str, Any]] = mapped_column(JSON)
+    preset: Mapped[str] = mapped_column(String(16))
+    evaluate: Mapped[bool]
+    gaussians: Mapped[int] = mapped_column(Integer)
+    sh_degree: Mapped[int] = mapped_column(Integer)
+    upload_bytes: Mapped[int] = mapped_column(BigInteger)
+    upload_sha256: Mapped[str] = mapped_column(String(64))
+    fingerprint: Mapped[str] = mapped_column(String(64))
+    idempotency_key: Mapped[str | None] = mapped_column(String(255))
+    disk_bytes: Mapped[int] = mapped_column(BigInteger)
+    spare_bytes: Mapped[int] = mapped_column(BigInteger, default=0)
+    upload_kept: Mapped[bool] = mapped_column(default=True)
+    starts: Mapped[int] = mapped_column(Integer, default=0)
+    crashes: Mapped[int] = mapped_column(Integer, default=0)
+    stage: Mapped[str | None] = mapped_column(String(64))
+    fraction: Mapped[float] = mapped_column(Float(53), default=0.0)
+    last_event: Mapped[int] = mapped_column(Integer, default=0)
+    created_at: Mapped[float] = mapped_column(Float(53))
+    started_at: Mapped[float | None] = mapped_column(Float(53))
+    finished_at: Mapped[float | None] = mapped_column(Float(53))
+    expires_at: Mapped[float | None] = mapped_column(Float(53))
+    problem: Mapped[dict[str, Any] | None] = mapped_column(JSON)
+    result: Mapped[dict[str, Any] | None] = mapped_column(JSON)
+
+
+class Event(Base):
+    """Something that happened to a job; ``seq`` counts from 1 without gaps."""
+
+    __tablename__ = "events"
+
+    job: Mapped[int] = mapped_column(ForeignKey("jobs.number", ondelete="CASCADE"), primary_key=True)
+    seq: Mapped[int] = mapped_column(Integer, primary_key=True)
+    kind: Mapped[str] = mapped_column(String(16))
+    data: Mapped[dict[str, Any]] = mapped_column(JSON)

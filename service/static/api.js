@@ -1,0 +1,133 @@
+/** Talking to the service: its key, its problem documents, its answers. */
+
+/**
+ * @typedef {{stage: string, fraction: number}} Progress
+ * @typedef {{title: string, detail: string, code: string, status: number, retryable: boolean}} ProblemDocument
+ * @typedef {{container: number, files: Record<string, number>, ratio: number,
+ *   bytes_per_gaussian: number}} Sizes
+ * @typedef {{created_at: string, queue_seconds?: number, run_seconds?: number}} Timings
+ * @typedef {{id: string, name: string, state: string, position?: number, progress?: Progress,
+ *   estimate?: {seconds_left: number}, options: {preset: string, evaluate: boolean}, upload_bytes: number, gaussians: number,
+ *   sh_degree: number, kept?: number, invisible?: number, cleaned?: Record<string, number>,
+ *   evaluation?: {psnr?: number | null, ssim: number}, sizes?: Sizes, timings: Timings, starts: number,
+ *   problem?: ProblemDocument, links: Record<string, string>, expires_at?: string}} Status
+ * @typedef {{jobs: Status[], next: string | null}} JobPage
+ * @typedef {{max_upload_bytes: number, max_header_bytes: number, max_gaussians: number,
+ *   keys_required: boolean}} Limits
+ * @typedef {{name: string, title: string, description: string, bytes_per_gaussian: number, psnr_change: number,
+ *   cpu_seconds_per_million: number}} Preset
+ * @typedef {{default: string, measured_on: string, presets: Preset[]}} Presets
+ */
+
+const STORED = "kissgs-key";
+
+export const key = {
+  /** @returns {string} empty if there is none */
+  get: () => sessionStorage.getItem(STORED) ?? "",
+  /** @param {string} value */
+  set: (value) => sessionStorage.setItem(STORED, value),
+  forget: () => sessionStorage.removeItem(STORED),
+};
+
+/** A request that did not succeed, in the service's words or, where it could not be reached, in ours. */
+export class Problem extends Error {
+  /** @param {ProblemDocument} document */
+  constructor(document) {
+    super(document.detail);
+    this.document = document;
+  }
+
+  get code() {
+    return this.document.code;
+  }
+
+  /** Whether the answer would be the same again: asking once more is pointless. */
+  get final() {
+    return this.document.status >= 400 && this.document.status < 500 && !this.document.retryable;
+  }
+}
+
+/** The service did not answer at all. */
+export const unreachable = () =>
+  new Problem({
+    title: "The service cannot be reached",
+    detail: "The connection failed or was cut. Check your network, then try again.",
+    code: "unreachable",
+    status: 0,
+    retryable: true,
+  });
+
+/**
+ * What an answer that is not a success says is wrong. Not every proxy on the way writes problem documents.
+ * @param {number} status
+ * @param {string} body
+ */
+export function problemFrom(status, body) {
+  try {
+    const document = JSON.parse(body);
+    if (typeof document.title === "string" && typeof document.detail === "string") return new Problem(document);
+  } catch {
+    // no JSON: told below
+  }
+  const detail = `The server, or one in front of it, answered with status ${status}.`;
+  return new Problem({ title: "The request failed", detail, code: "unknown", status, retryable: status >= 500 });
+}
+
+/** @type {() => void} */
+let onUnauthorized = () => {};
+
+/** @param {() => void} handler called whenever a key is refused, whoever has used it */
+export function whenUnauthorized(handler) {
+  onUnauthorized = handler;
+}
+
+/** @returns {Record<string, string>} */
+export const authorization = () => (key.get() ? { Authorization: `Bearer ${key.get()}` } : {});
+
+/**
+ * Read a refusal, and have the page ask for another key where that is the reason.
+ * @param {number} status
+ * @param {string} body
+ */
+export function refused(status, body) {
+  const problem = problemFrom(status, body);
+  if (status === 401) onUnauthorized();
+  return problem;
+}
+
+/**
+ * `fetch` with the key; what is no success is thrown.
+ * @param {string} path
+ * @param {RequestInit & {headers?: Record<string, string>}} [options]
+ * @throws {Problem}
+ */
+export async function call(path, options = {}) {
+  const headers = { ...authorization(), ...options.headers };
+  let answer;
+  try {
+    answer = await fetch(path, { ...options, headers });
+  } catch (error) {
+    throw options.signal?.aborted ? error : unreachable();
+  }
+  if (!answer.ok) throw refused(answer.status, await answer.text().catch(() => ""));
+  return answer;
+}
+
+/**
+ * @param {string} path
+ * @param {RequestInit & {headers?: Record<string, string>}} [options]
+ * @returns {Promise<any>}
+ */
+export const json = async (path, options) => (await call(path, options)).json();
+
+/** @param {string} id @param {AbortSignal} [signal] @returns {Promise<Status>} */
+export const status = (id, signal) => json(`/v1/jobs/${id}`, { signal });
+
+/** @param {string} id @returns {Promise<Status>} */
+export const cancel = (id) => json(`/v1/jobs/${id}/cancel`, { method: "POST" });
+
+/** @param {string} id */
+export const remove = (id) => call(`/v1/jobs/${id}`, { method: "DELETE" });
+
+/** @param {{state: string}} job */
+export const active = (job) => job.state === "queued" || job.state === "running";

@@ -1,0 +1,167 @@
+/** The list of recent jobs: open one again, or delete it. */
+
+import { active, json, remove } from "./api.js";
+import { announce, byId, el, time } from "./dom.js";
+import { ago, short } from "./format.js";
+import { explain, sentence } from "./trouble.js";
+import { stateWord } from "./words.js";
+
+/** @typedef {import("./api.js").Status} Status */
+
+const PAGE = 10;
+const MOST = 100; // that the service lists at once
+const REFRESH_MS = 5000; // while some job in the list has not ended
+
+/**
+ * @param {(id: string) => void} deleted
+ */
+export function recentJobs(deleted) {
+  const [list, more] = [byId("recent-list"), byId("recent-more")];
+  /** @type {Map<string, ReturnType<typeof row>>} */
+  const rows = new Map();
+  /** @type {string | null} */
+  let next = null;
+  let timer = 0;
+
+  /** The first page anew, as long as the list has become by now. */
+  async function load() {
+    clearTimeout(timer);
+    await guarded(async () => {
+      const limit = Math.min(MOST, Math.max(PAGE, rows.size));
+      /** @type {import("./api.js").JobPage} */
+      const page = await json(`/v1/jobs?limit=${limit}`);
+      arrange(page.jobs);
+      paged(page);
+    });
+  }
+
+  async function older() {
+    await guarded(async () => {
+      /** @type {import("./api.js").JobPage} */
+      const page = await json(`/v1/jobs?limit=${PAGE}&cursor=${next}`);
+      arrange([...[...rows.values()].map((row) => row.job()), ...page.jobs]);
+      paged(page);
+      if (page.jobs[0]) rows.get(page.jobs[0].id)?.focus();
+    });
+  }
+
+  /** @param {import("./api.js").JobPage} page */
+  function paged(page) {
+    next = page.next ?? null;
+    more.hidden = next === null;
+    byId("recent").hidden = rows.size === 0;
+    clearTimeout(timer);
+    if ([...rows.values()].some((row) => active(row.job()))) timer = window.setTimeout(load, REFRESH_MS);
+  }
+
+  /**
+   * Rows that stay are not moved: they may have the focus.
+   * @param {Status[]} jobs
+   */
+  function arrange(jobs) {
+    const ids = new Set(jobs.map((job) => job.id));
+    for (const [id, row] of rows)
+      if (!ids.has(id)) {
+        row.element.remove();
+        rows.delete(id);
+      }
+    jobs.forEach((job, at) => {
+      const found = rows.get(job.id) ?? row(ask);
+      rows.set(job.id, found);
+      found.update(job);
+      if (list.children[at] !== found.element) list.insertBefore(found.element, list.children[at] ?? null);
+    });
+  }
+
+  /** @param {Status} job */
+  async function ask(job) {
+    if (!(await confirmed(job))) return;
+    await guarded(async () => {
+      await remove(job.id);
+      announce(`${job.name} was deleted.`);
+      deleted(job.id);
+      await load();
+      byId("recent-title").focus({ preventScroll: true }); // the button that was pressed is gone
+    });
+  }
+
+  more.addEventListener("click", older);
+  return {
+    load,
+    /**
+     * Something newer than the list.
+     * @param {Status} job
+     * @returns {boolean} whether the list has it
+     */
+    see(job) {
+      rows.get(job.id)?.update(job);
+      return rows.has(job.id);
+    },
+    stop: () => clearTimeout(timer),
+    /** @param {string} id which job is open, if any */
+    mark: (id) => rows.forEach((row) => row.mark(id)),
+  };
+}
+
+/** @param {() => Promise<void>} work */
+async function guarded(work) {
+  const place = byId("recent-error");
+  try {
+    await work();
+    place.textContent = "";
+  } catch (error) {
+    const { title, detail } = explain(error);
+    place.textContent = `${title}. ${sentence(detail)}`;
+    byId("recent").hidden = false;
+  }
+}
+
+/** @param {(job: Status) => void} ask */
+function row(ask) {
+  /** @type {Status} */
+  let job;
+  const link = el("a", { class: "job-name" });
+  const [state, ratio, age] = [el("span", { class: "badge" }), el("span", { class: "job-ratio" }), el("span")];
+  age.className = "job-age muted";
+  const button = el("button", { class: "plain", type: "button", onclick: () => ask(job) }, "Delete");
+  const element = el("li", {}, link, state, ratio, age, button);
+  return {
+    element,
+    job: () => job,
+    focus: () => link.focus(),
+    /** @param {string} open */
+    mark: (open) =>
+      job.id === open ? link.setAttribute("aria-current", "true") : link.removeAttribute("aria-current"),
+    /** @param {Status} next */
+    update(next) {
+      job = next;
+      link.textContent = job.name;
+      link.href = `#${job.id}`;
+      state.textContent = stateWord(job.state);
+      state.className = `badge ${job.state}`;
+      ratio.textContent = job.sizes ? `${short(job.sizes.ratio)}×` : "";
+      age.replaceChildren(time(job.timings.created_at, ago(job.timings.created_at)));
+      button.setAttribute("aria-label", `Delete ${job.name}`);
+    },
+  };
+}
+
+/**
+ * @param {Status} job
+ * @returns {Promise<boolean>}
+ */
+function confirmed(job) {
+  /** @type {HTMLDialogElement} */
+  const dialog = byId("confirm");
+  byId("confirm-title").textContent = `Delete ${job.name}?`;
+  byId("confirm-text").textContent = active(job)
+    ? "Its work stops, and the upload is removed."
+    : "Whatever is left of it on the server is removed. This cannot be undone.";
+  byId("confirm-yes").onclick = () => dialog.close("yes");
+  byId("confirm-no").onclick = () => dialog.close("");
+  dialog.returnValue = ""; // Escape leaves it as it is
+  dialog.showModal();
+  return new Promise((resolve) => {
+    dialog.addEventListener("close", () => resolve(dialog.returnValue === "yes"), { once: true });
+  });
+}

@@ -1,0 +1,177 @@
+/** A job that has ended well: what became of the scene, and where to get it. */
+
+import { call } from "./api.js";
+import { el, facts, time } from "./dom.js";
+import { ago, bytes, count, duration, moment, share, short } from "./format.js";
+import { explain, problemBox } from "./trouble.js";
+import { mended, planes } from "./words.js";
+
+/**
+ * @typedef {import("./api.js").Status} Status
+ * @typedef {import("./api.js").Sizes} Sizes
+ */
+
+/**
+ * @param {Status & {sizes: Sizes}} status
+ * @param {boolean} keyed whether downloads need a key, which links cannot carry
+ */
+export function resultView(status, keyed) {
+  const { sizes, name } = status;
+  const notes = mended(status);
+  return [
+    el("p", { class: "kicker good" }, "Done"),
+    el("h1", { id: "job-title", tabindex: "-1" }, name),
+    ratio(status),
+    downloads(status, keyed),
+    figures(status),
+    planeTable(sizes),
+    notes.length ? mendedList(notes) : null,
+  ].filter((child) => child !== null);
+}
+
+/** @param {Status & {sizes: Sizes}} status */
+function ratio(status) {
+  const { sizes } = status;
+  const filled = el("span");
+  filled.style.inlineSize = `${Math.min(100, 100 / sizes.ratio)}%`;
+  const [before, after] = [bytes(status.upload_bytes), bytes(sizes.container)];
+  return el(
+    "div",
+    { class: "ratio" },
+    el("p", {}, el("strong", {}, `${short(sizes.ratio)}×`), " smaller"),
+    el("div", { class: "beside", "aria-hidden": "true" }, filled),
+    el("p", { class: "spread" }, el("span", {}, el("b", {}, after), " container"), el("span", {}, `${before} upload`)),
+  );
+}
+
+/** @param {Status & {sizes: Sizes}} status */
+function figures(status) {
+  const { sizes, timings, evaluation } = status;
+  const [waited, kept] = [timings.queue_seconds ?? 0, status.kept ?? status.gaussians];
+  /** @type {[string, string, string?][]} */
+  const pairs = [
+    ["Per Gaussian", `${short(sizes.bytes_per_gaussian)} bytes`],
+    ["Gaussians", count(kept), kept === status.gaussians ? "all of them" : `of ${count(status.gaussians)}`],
+    ["Time", duration(timings.run_seconds ?? 0), waited >= 1 ? `after ${duration(waited)} in the queue` : undefined],
+    ["Preset", status.options.preset],
+  ];
+  if (evaluation) {
+    const { psnr, ssim } = evaluation; // no PSNR: there is no noise at all
+    pairs.push([
+      "PSNR",
+      typeof psnr === "number" ? `${psnr.toFixed(2)} dB` : "identical",
+      "to the upload's renderings",
+    ]);
+    pairs.push(["SSIM", ssim.toFixed(4), "1 is identical"]);
+  }
+  return facts(pairs);
+}
+
+/** @param {Sizes} sizes */
+function planeTable(sizes) {
+  const rows = planes(sizes.files);
+  const largest = Math.max(...rows.map(([, size]) => size));
+  const lines = rows.map(([name, size]) => {
+    const bar = el("span");
+    bar.style.inlineSize = `${(100 * size) / largest}%`;
+    return el(
+      "tr",
+      {},
+      el("th", { scope: "row" }, name),
+      el("td", { class: "bar", "aria-hidden": "true" }, bar),
+      el("td", {}, bytes(size)),
+      el("td", { class: "muted share" }, share(size / sizes.container)),
+    );
+  });
+  const head = (/** @type {string} */ text, /** @type {string} */ kind) =>
+    el("th", { scope: "col", class: kind }, el("span", { class: "visually-hidden" }, text));
+  const heads = [
+    head("Part", "part"),
+    el("td", { "aria-hidden": "true" }),
+    head("Size", "size"),
+    head("Share", "share"),
+  ];
+  return el(
+    "table",
+    { class: "planes" },
+    el("caption", {}, "Where the bytes go"),
+    el("thead", {}, el("tr", {}, ...heads)),
+    el("tbody", {}, ...lines),
+  );
+}
+
+/** @param {string[]} notes */
+function mendedList(notes) {
+  const items = notes.map((note) => el("li", {}, note));
+  return el("section", { class: "mended" }, el("h2", {}, "Mended in the upload"), el("ul", {}, ...items));
+}
+
+/**
+ * @param {Status} status
+ * @param {boolean} keyed
+ */
+function downloads({ name, links, expires_at: expires }, keyed) {
+  const trouble = el("div");
+  /** @type {[string, string, string, string][]} */
+  const all = [
+    ["result", "Download container (zip)", `${name}.zip`, "primary"],
+    ["decoded", "Decoded .ply", `${name}.decoded.ply`, "quiet"],
+    ["report", "Report", `${name}.report.json`, "quiet"],
+  ];
+  const buttons = all
+    .filter(([link]) => links[link])
+    .map(([link, label, file, kind]) =>
+      keyed
+        ? fetchButton(links[link], label, file, kind, trouble)
+        : el("a", { class: `button ${kind}`, href: links[link], download: file }, label),
+    );
+  // in this tab, because no other has the key
+  const preview = links.preview ? el("a", { class: "button quiet", href: links.preview }, "Preview") : null;
+  const [container, ...others] = buttons;
+  const until = expires
+    ? el("p", { class: "small muted" }, "Kept until ", time(expires, moment(expires)), `, ${ago(expires)}.`)
+    : null;
+  return el(
+    "div",
+    { class: "downloads" },
+    el("div", { class: "buttons" }, container, preview, ...others),
+    until,
+    trouble,
+  );
+}
+
+/**
+ * A download with the key in its header: links cannot send one.
+ * @param {string} path
+ * @param {string} label
+ * @param {string} file
+ * @param {string} kind
+ * @param {HTMLElement} trouble where to tell of it
+ */
+function fetchButton(path, label, file, kind, trouble) {
+  const button = el("button", { class: kind, type: "button", onclick: press }, label);
+  async function press() {
+    button.disabled = true;
+    button.textContent = "Fetching…";
+    trouble.replaceChildren();
+    try {
+      save(await (await call(path)).blob(), file);
+    } catch (error) {
+      trouble.replaceChildren(problemBox(explain(error)));
+    }
+    button.disabled = false;
+    button.textContent = label;
+    button.focus();
+  }
+  return button;
+}
+
+/**
+ * @param {Blob} blob
+ * @param {string} file
+ */
+function save(blob, file) {
+  const url = URL.createObjectURL(blob);
+  el("a", { href: url, download: file }).click();
+  setTimeout(() => URL.revokeObjectURL(url), 60_000); // some browsers begin to read it late
+}

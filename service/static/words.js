@@ -1,0 +1,101 @@
+/** What the service's own names mean to people. What is not in here is shown as it is. */
+
+import { count } from "./format.js";
+
+/** @typedef {import("./api.js").Status} Status */
+
+/** @type {Record<string, string>} */
+const STATES = {
+  queued: "waiting",
+  running: "running",
+  succeeded: "done",
+  failed: "failed",
+  cancelled: "cancelled",
+  expired: "expired",
+};
+
+/** In their order: a job passes through them from first to last. @type {Record<string, string>} */
+const STAGES = {
+  read: "Reading the scene",
+  kernels: "Preparing",
+  order: "Putting Gaussians in order",
+  forms: "Choosing forms",
+  codebook: "Building the codebook",
+  "sort codebook": "Sorting the codebook",
+  images: "Compressing images",
+  write: "Writing the container",
+  cameras: "Placing cameras",
+  evaluate: "Measuring quality",
+};
+
+const ALWAYS = ["read", "kernels", "order", "forms", "images"];
+const WITH_COLOURS_BY_ANGLE = ["codebook", "sort codebook"];
+
+/** @type {[RegExp, string][]} */
+const PLANES = [
+  [/^means_bytes_0\b/, "Positions, low bytes"],
+  [/^means_bytes_1\b/, "Positions, high bytes"],
+  [/^quaternions\b/, "Rotations"],
+  [/^scales\b/, "Sizes"],
+  [/^f_dc\b/, "Colours"],
+  [/^opacities\b/, "Opacity"],
+  [/^f_rest_centroids\b/, "SH codebook"],
+  [/^f_rest_labels\b/, "SH labels"],
+  [/^active_mask\b/, "Mask"],
+  [/\.(json|ya?ml)$/, "Metadata"],
+];
+
+/** @type {Record<string, string>} */
+const CLEANED = {
+  non_finite: "removed: not a number, or infinite",
+  far_away: "removed: too far away to be placed",
+  infinite_opacities: "infinite opacities made finite",
+  saturated_opacities: "opacities limited to what pictures can show",
+  zero_quats: "rotations of zero length replaced",
+  unnormalised_quats: "rotations brought to unit length",
+  clamped_scales: "extreme sizes limited",
+  clamped_sh: "extreme colours limited",
+};
+
+/** @param {string} state */
+export const stateWord = (state) => STATES[state] ?? state;
+
+/** @param {string} stage */
+export const stageWord = (stage) => STAGES[stage] ?? stage;
+
+/**
+ * The stages that a job will pass through, as far as that is known before.
+ * @param {Status} status
+ */
+export function plannedStages(status) {
+  const planned = new Set(ALWAYS);
+  if (status.sh_degree > 0) WITH_COLOURS_BY_ANGLE.forEach((stage) => planned.add(stage));
+  if (status.options.evaluate) planned.add("evaluate");
+  return Object.keys(STAGES).filter((stage) => planned.has(stage));
+}
+
+/**
+ * Bytes of each plane of a container, largest first; files of one meaning are added up.
+ * @param {Record<string, number>} files
+ * @returns {[string, number][]}
+ */
+export function planes(files) {
+  /** @type {Map<string, number>} */
+  const sums = new Map();
+  for (const [file, size] of Object.entries(files)) {
+    const name = PLANES.find(([pattern]) => pattern.test(file))?.[1] ?? file;
+    sums.set(name, (sums.get(name) ?? 0) + size);
+  }
+  return [...sums].sort(([, a], [, b]) => b - a);
+}
+
+/**
+ * What was wrong with an upload and has been mended, in words; empty if nothing was.
+ * @param {Status} status
+ */
+export function mended(status) {
+  const counts = Object.entries(status.cleaned ?? {});
+  const lines = counts.filter(([, n]) => n > 0).map(([name, n]) => `${count(n)} ${CLEANED[name] ?? name}`);
+  if (status.invisible) lines.unshift(`${count(status.invisible)} left out: no renderer would draw them`);
+  return lines;
+}

@@ -1,0 +1,263 @@
+"""The embedded worker: takes jobs in the order they came, gives each a process, records what came of it."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import json
+import logging
+from dataclasses import dataclass, field
+from typing import Any
+
+from anyio.to_thread import run_sync
+from sqlalchemy.exc import SQLAlchemyError
+
+from service.bell import Bell, ended, wait
+from service.clock import Clock
+from service.files import Folders
+from service.metrics import Metrics
+from service.models import Job, State
+from service.problems import KINDS, problem
+from service.runner import Child, Outcome
+from service.settings import ServiceSettings
+from service.store import Store
+
+log = logging.getLogger("kissgs.service")
+
+IDLE_SECONDS = 1.0
+"""How often an idle worker looks at the queue though nobody rang."""
+
+QUEUE = "queue"
+"""What is rung when a job is added."""
+
+
+@dataclass
+class Worker:
+    """Runs jobs, ``settings.workers`` at a time, until :meth:`drain`."""
+
+    settings: ServiceSettings
+    store: Store
+    folders: Folders
+    bell: Bell
+    metrics: Metrics
+    clock: Clock
+    draining: bool = False
+    _children: dict[str, Child] = field(default_factory=dict)
+    _loops: list[asyncio.Task[None]] = field(default_factory=list)
+    _looked: dict[int, float] = field(default_factory=dict)
+
+    def start(self) -> None:
+        """Begin to take jobs."""
+        self._loops = [asyncio.create_task(self._loop(i)) for i in range(self.settings.workers)]
+
+    def trouble(self) -> str | None:
+        """Why the worker cannot be relied on; None if it can."""
+        if self.draining:
+            return "the service is stopping"
+        now = asyncio.get_running_loop().time()
+        for number, loop in enumerate(self._loops):
+            if loop.done():
+                return f"worker {number} has ended"
+            if now - self._looked.get(number, now) > 10 * IDLE_SECONDS and not self._children:
+                return f"worker {number} has not looked at the queue for {now - self._looked[number]:.0f} s"
+        return None
+
+    async def drain(self) -> None:
+        """Take no more jobs; give those that run some time; put back in the queue those that need more."""
+        self.draining = True
+        self.bell.ring(QUEUE)
+        if self._children:
+            patience, count = self.settings.drain_seconds, len(self._children)
+            log.info("waiting up to %g s for %d running jobs; Ctrl-C again ends them now", patience, count)
+        if self._loops:
+            await asyncio.wait(self._loops, timeout=self.settings.drain_seconds)
+        self.hurry()
+        await asyncio.gather(*self._loops, return_exceptions=True)
+
+    def hurry(self) -> None:
+        """Wait no longer for running jobs."""
+        for child in self._children.values():
+            child.kill()
+
+    async def cancel(self, job: Job) -> None:
+        """End a job that has not ended yet: its process is gone, and so are its files, when this returns."""
+        if not await run_sync(lambda: self._end(job, State.CANCELLED, upload_kept=False, disk_bytes=0)):
+            return
+        child = self._children.get(job.id)
+        if child is not None:
+            child.kill()
+            await child.ended.wait()
+        await run_sync(self.folders.remove_job, job.id)
+        self.bell.ring(job.id)
+        self.bell.ring(ended(job.id))
+
+    def recover(self) -> None:
+        """Take up what a former service left: to be called before anything is accepted or started."""
+        for job in self.store.in_state(State.RUNNING):
+            summary = self.folders.result(job.id) / "summary.json"
+            if summary.exists():
+                self._succeed(job, json.loads(summary.read_text(encoding="utf-8")))
+            elif job.starts >= self.settings.job_starts:
+                detail = (
+                    f"the service was ended {job.starts} times while the job ran; submit a scene with fewer Gaussians"
+                )
+                self._fail(job, "crashed", detail)
+            else:
+                self.store.move(job.number, State.QUEUED, stage=None, fraction=0.0)
+        for job in self.store.in_state(State.QUEUED):
+            if not self.folders.upload(job.id).exists():
+                self._fail(job, "internal", "the upload is no longer on the server's disk; submit the scene again")
+        self.folders.remove_strangers(self.store.ids(State.QUEUED, State.RUNNING, State.SUCCEEDED))
+
+    # Running -------------------------------------------------------------------------------------------------------
+
+    async def _loop(self, number: int) -> None:
+        while not self.draining:
+            self._looked[number] = asyncio.get_running_loop().time()
+            ticket = self.bell.ticket(QUEUE)
+            try:
+                job = await run_sync(self.store.claim)
+            except SQLAlchemyError:
+                log.exception("the queue cannot be read; trying again")
+                await asyncio.sleep(IDLE_SECONDS)
+                continue
+            if job is None:
+                await wait(ticket, IDLE_SECONDS)
+            else:
+                await self._run(job)
+
+    async def _run(self, job: Job) -> None:
+        child = self._children[job.id] = Child(seconds=self.settings.job_seconds)
+        log.info("job %s starts: %d Gaussians, %s", job.id, job.gaussians, job.preset)
+        self.metrics.busy.inc()
+        if job.starts == 1 and job.started_at is not None:
+            self.metrics.waited.observe(job.started_at - job.created_at)
+        self.bell.ring(job.id)
+        try:
+            outcome = await self._follow(job, child)
+        except Exception as error:
+            log.exception("job %s: its process could not be run", job.id)
+            outcome = _unrunnable(error)
+        finally:
+            del self._children[job.id]
+            child.ended.set()
+            self.metrics.busy.dec()
+        await self._settle(job, outcome)
+
+    async def _follow(self, job: Job, child: Child) -> Outcome:
+        current = await run_sync(self.store.get, job.id)  # it may have been cancelled before the child was known
+        if current is None or current.state != State.RUNNING:
+            return Outcome("stopped")
+        work = await run_sync(self.folders.new_work, job.id)
+        order = {
+            "task": "compress",
+            "source": str(self.folders.upload(job.id)),
+            "work": str(work),
+            "settings": {name: value for name, value in job.options.items() if name != "evaluate"},
+            "evaluate": job.options["evaluate"],
+            "threads": self.settings.job_threads,
+            "memory": int(self.settings.job_memory),
+        }
+
+        async def progress(stage: str, fraction: float) -> None:
+            try:
+                await run_sync(self.store.progress, job.number, stage, fraction)
+            except SQLAlchemyError:  # a full disk: the job itself may yet succeed
+                log.exception("job %s: progress was not recorded", job.id)
+            self.bell.ring(job.id)
+
+        return await child.run(order, progress)
+
+    # Ending --------------------------------------------------------------------------------------------------------
+
+    async def _settle(self, job: Job, outcome: Outcome) -> None:
+        """Record how a job ended: again and again, if need be, because a job must not be lost to a full disk."""
+        while True:
+            try:
+                await run_sync(self._record, job, outcome)
+                break
+            except (SQLAlchemyError, OSError):
+                log.exception("job %s: its end was not recorded; trying again", job.id)
+                if self.draining:  # the next start takes it up
+                    return
+                await asyncio.sleep(IDLE_SECONDS)
+            except Exception:  # ours: this job must end all the same, and the worker must go on
+                log.exception("job %s: its end could not be recorded as it was", job.id)
+                if outcome is _FAULT:  # the next start takes it up
+                    return
+                outcome = _FAULT
+        self.bell.ring(job.id)
+        self.bell.ring(ended(job.id))
+        if outcome.kind == "postponed":
+            await asyncio.sleep(IDLE_SECONDS)
+        self.bell.ring(QUEUE)
+
+    def _record(self, job: Job, outcome: Outcome) -> None:
+        current = self.store.get(job.id)
+        if current is None or current.state != State.RUNNING:  # cancelled or deleted meanwhile
+            self.folders.remove_work(job.id)
+            return
+        match outcome.kind:
+            case "done":
+                self.folders.keep_result(job.id)
+                self._succeed(job, outcome.data)
+            case "error":
+                self._fail(job, outcome.data["code"], outcome.data["detail"])
+            case "stopped" | "postponed":
+                self._put_back(job)
+            case "crashed" if self.draining:  # whoever stops the service may have signalled its children, too
+                self._put_back(job)
+            case "crashed" if job.crashes == 0 and job.starts < self.settings.job_starts:
+                log.warning("job %s is started again", job.id)
+                self.metrics.restarts.inc()
+                self.store.move(job.number, State.QUEUED, stage=None, fraction=0.0, crashes=1)
+            case "crashed":
+                self._fail(job, "crashed", outcome.data["detail"])
+        self.folders.remove_work(job.id)
+
+    def _put_back(self, job: Job) -> None:
+        """Into the queue, as if it had never been started."""
+        self.store.move(job.number, State.QUEUED, stage=None, fraction=0.0, starts=job.starts - 1)
+
+    def _succeed(self, job: Job, summary: dict[str, Any]) -> None:
+        if not self.settings.keep_uploads:
+            self.folders.discard(self.folders.upload(job.id))
+        values = {
+            "result": summary,
+            "upload_kept": self.settings.keep_uploads,
+            "spare_bytes": job.upload_bytes if self.settings.keep_uploads else 0,
+            "disk_bytes": self.folders.job_bytes(job.id),
+        }
+        if not self._end(job, State.SUCCEEDED, **values):
+            self.folders.discard(self.folders.result(job.id))
+
+    def _fail(self, job: Job, code: str, detail: str) -> None:
+        document = problem(code if code in KINDS else "internal", detail).model_dump(exclude_none=True)
+        if self._end(job, State.FAILED, problem=document, upload_kept=False, disk_bytes=0):
+            self.folders.remove_job(job.id)
+
+    def _end(self, job: Job, state: State, **values: Any) -> bool:  # noqa: ANN401
+        moved = self.store.move(job.number, state, expires_at=self.clock() + self.settings.keep_seconds, **values)
+        current = self.store.get(job.id)
+        if moved and current is not None:
+            seconds = self.clock() - (job.started_at or self.clock())
+            self.metrics.job_ended(current, state, seconds)
+            log.info("job %s %s after %.1f s", job.id, state, seconds)
+        return moved
+
+
+_PASSING = (errno.EMFILE, errno.ENFILE, errno.EAGAIN, errno.ENOMEM, errno.ENOSPC, errno.EDQUOT)
+"""What the system lacks for the moment; no fault of the job."""
+
+_FAULT = Outcome("error", {"code": "internal", "detail": "the job could not be run; please report it with the scene"})
+
+
+def _unrunnable(error: Exception) -> Outcome:
+    if isinstance(error, OSError) and error.errno in _PASSING:
+        return Outcome("postponed")
+    if isinstance(error, OSError):
+        reason = (error.strerror or str(error)).lower()
+        return Outcome(
+            "error", {"code": "output", "detail": f"the job's files cannot be written: {reason}; try again later"}
+        )
+    return _FAULT

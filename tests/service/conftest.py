@@ -1,0 +1,87 @@
+"""Services for the tests: one that many share, and fresh ones."""
+
+import itertools
+import os
+import pwd
+import shutil
+import socket
+import subprocess
+from pathlib import Path
+
+import pytest
+import sqlalchemy as sa
+from preview_browser import preview, software_browser  # noqa: F401
+from serving import Service
+
+from service.models import Base
+
+
+@pytest.fixture(scope="package")
+def service(tmp_path_factory):
+    """One for all tests that leave it as it was."""
+    with Service(
+        tmp_path_factory.mktemp("shared") / "data", KISSGS_MAX_UPLOAD_BYTES="4MB", KISSGS_MAX_GAUSSIANS=20000
+    ) as it:
+        yield it
+
+
+@pytest.fixture
+def start(tmp_path):
+    """``start(KISSGS_X=…)`` starts one, or more, that end with the test."""
+    started = []
+
+    def begin(**settings):
+        folder = tmp_path / f"data{len(started)}"
+        started.append(Service(folder, **settings).start())
+        return started[-1]
+
+    yield begin
+    for service in started:
+        service.__exit__()
+
+
+def programs():
+    found = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"))
+    return found[-1].parent if found else None
+
+
+@pytest.fixture(scope="session")
+def postgresql_server(tmp_path_factory):
+    """A PostgreSQL server of our own, where its programs are installed."""
+    binaries = programs()
+    if binaries is None:
+        pytest.skip("PostgreSQL is not installed")
+    folder = tmp_path_factory.mktemp("postgresql")
+    user = {}
+    if os.geteuid() == 0:  # it refuses to run as root
+        try:
+            account = pwd.getpwnam("postgres")
+        except KeyError:
+            pytest.skip("PostgreSQL does not run as root, and there is no user postgres")
+        user = {"user": "postgres", "group": account.pw_gid}
+        for parent in (folder, *itertools.takewhile(lambda p: p != Path("/tmp"), folder.parents)):
+            parent.chmod(0o755)
+        os.chown(folder, account.pw_uid, account.pw_gid)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    data, settings = folder / "data", f"listen_addresses=127.0.0.1 -c unix_socket_directories={folder} -c fsync=off"
+
+    def run(program, *arguments):
+        with (folder / "log").open("ab") as log:  # a pipe would be held open by the server
+            subprocess.run([binaries / program, "-D", data, *arguments], cwd=folder, check=True, stdout=log, **user)
+
+    run("initdb", "-A", "trust", "-U", "postgres", "-E", "UTF8", "--no-sync")
+    run("pg_ctl", "-w", "-l", folder / "server.log", "-o", f"-p {port} -c {settings}", "start")
+    yield f"postgresql+psycopg://postgres@127.0.0.1:{port}/postgres"
+    run("pg_ctl", "-w", "-m", "immediate", "stop")
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture
+def postgresql(postgresql_server):
+    """The URL of its database, without any tables."""
+    yield postgresql_server
+    engine = sa.create_engine(postgresql_server)
+    Base.metadata.drop_all(engine)
+    engine.dispose()

@@ -1,0 +1,448 @@
+"""What happens to jobs when things go wrong; oracle: the result of the same job where nothing does."""
+
+import asyncio
+import contextlib
+import os
+import random
+import signal
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+from serving import FAST, SLOW, SMALL, Service, problem, scene_bytes
+
+import kissgs
+from service.runner import Child
+
+BIG = scene_bytes(20_000, 3)
+MEDIUM = scene_bytes(6_000, 2)
+EXPECTED = kissgs.compress(SMALL, settings=kissgs.Settings(preset="fast")).to_zip()
+
+
+def gone(pid, seconds=5):
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        with contextlib.suppress(OSError):
+            if Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z":
+                time.sleep(0.02)
+                continue
+        return True
+    return False
+
+
+def whole(service, job):
+    """That a job has succeeded, and that nothing is left over."""
+    status = service.ended(job, seconds=120)
+    assert status["state"] == "succeeded", status
+    content = service.http.get(status["links"]["result"]).content
+    assert service.strays() == []
+    return content
+
+
+def test_the_server_is_killed_while_a_job_waits(start):
+    service = start()
+    running, waiting = service.submit(BIG, SLOW), service.submit()
+    service.running(running)
+    service.kill(signal.SIGKILL)
+    service.restart()
+    service.http.post(f"/v1/jobs/{running['id']}/cancel")
+    assert whole(service, waiting) == EXPECTED
+
+
+def test_the_server_is_killed_while_a_job_runs(start):
+    service = start()
+    job = service.submit(MEDIUM)
+    service.running(job)
+    (child,) = service.children()
+    service.kill(signal.SIGKILL)
+    assert gone(child), "the job's process outlived the service"
+    service.restart()
+    status = service.ended(job)
+    assert (status["state"], status["starts"]) == ("succeeded", 2)
+    assert whole(service, job) == kissgs.compress(MEDIUM, settings=kissgs.Settings(preset="fast")).to_zip()
+
+
+def test_the_server_is_killed_while_an_upload_arrives(start):
+    service = start()
+    with service.raw(b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9000000\r\n\r\n" + BIG[:2_000_000]):
+        end = time.monotonic() + 10
+        while not list((service.folder / "incoming").iterdir()) and time.monotonic() < end:
+            time.sleep(0.02)
+        assert list((service.folder / "incoming").iterdir())
+        service.kill(signal.SIGKILL)
+    service.restart()
+    assert service.strays() == []
+    assert service.http.get("/v1/jobs").json() == {"jobs": []}
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_server_is_killed_at_any_time(start, seed):
+    """Again and again, until the job is done all the same."""
+    service = start(KISSGS_JOB_STARTS=1000)
+    pause = random.Random(seed)
+    job = service.submit()
+    for _ in range(6):
+        time.sleep(pause.uniform(0.0, 2.5))
+        service.kill(signal.SIGKILL)
+        service.restart()
+    assert whole(service, job) == EXPECTED
+
+
+def test_a_job_that_takes_the_server_down_is_given_up(start):
+    service = start(KISSGS_JOB_STARTS=2)
+    job = service.submit(BIG, SLOW)
+    for _ in range(2):
+        service.running(job)
+        service.kill(signal.SIGKILL)
+        service.restart()
+    status = service.ended(job)
+    assert (status["state"], status["problem"]["code"]) == ("failed", "crashed")
+    assert "2 times" in status["problem"]["detail"]
+
+
+def test_a_result_that_was_whole_is_taken_up(tmp_path):
+    """The server is killed after the result is in its place, and before that is written down."""
+    with Service(tmp_path / "data") as service:
+        job = service.ended(service.submit())
+        service.kill(signal.SIGKILL)
+        rewind(service, job, "running")
+        service.restart()
+        status = service.status(job)
+        assert (status["state"], status["starts"]) == ("succeeded", 1)
+        assert whole(service, job) == EXPECTED
+
+
+def test_a_result_that_was_half_written_is_not(tmp_path):
+    with Service(tmp_path / "data") as service:
+        job = service.ended(service.submit())
+        service.kill(signal.SIGKILL)
+        folder = service.folder / "jobs" / job["id"]
+        (folder / "work-0123").mkdir()
+        (folder / "result").rename(folder / "work-0123" / "result")
+        (folder / "work-0123" / "result" / "scene.zip").write_bytes(b"PK half")
+        rewind(service, job, "running")
+        service.restart()
+        assert whole(service, job) == EXPECTED
+        assert service.status(job)["starts"] == 2
+
+
+def test_an_upload_that_has_vanished_fails_its_job(tmp_path):
+    with Service(tmp_path / "data") as service:
+        job = service.ended(service.submit())
+        service.kill(signal.SIGKILL)
+        rewind(service, job, "queued")
+        (service.folder / "jobs" / job["id"] / "scene.ply").unlink()
+        (service.folder / "jobs" / ("0" * 32)).mkdir()  # of no job
+        service.restart()
+        status = service.status(job)
+        assert (status["state"], status["problem"]["code"]) == ("failed", "internal")
+        assert [path.name for path in (service.folder / "jobs").iterdir()] == []
+
+
+def test_the_server_is_killed_while_the_result_is_written(start):
+    service = start()
+    job = service.submit(MEDIUM)
+    end = time.monotonic() + 60
+    while not list((service.folder / "jobs").glob("*/work-*/result")) and time.monotonic() < end:
+        time.sleep(0.001)
+    service.kill(signal.SIGKILL)
+    service.restart()
+    assert whole(service, job) == kissgs.compress(MEDIUM, settings=kissgs.Settings(preset="fast")).to_zip()
+
+
+def test_jobs_in_postgresql_survive_as_well(start, postgresql):
+    service = start(KISSGS_DATABASE_URL=postgresql)
+    done, running, waiting = service.ended(service.submit()), service.submit(MEDIUM), service.submit()
+    service.running(running)
+    service.kill(signal.SIGKILL)
+    service.restart()
+    assert whole(service, waiting) == whole(service, done) == EXPECTED
+    assert service.status(running)["starts"] == 2
+    listed = service.http.get("/v1/jobs").json()["jobs"]
+    assert [job["id"] for job in listed] == [job["id"] for job in (waiting, running, done)]
+    assert service.http.get("/readyz").status_code == 200
+
+
+def rewind(service, job, state):
+    """Make the database of a dead service say that a job is not done yet."""
+    import sqlite3
+
+    with contextlib.closing(sqlite3.connect(service.folder / "jobs.sqlite")) as database, database:
+        database.execute(
+            "UPDATE jobs SET state = ?, result = NULL, finished_at = NULL, expires_at = NULL WHERE id = ?",
+            (state, job["id"]),
+        )
+
+
+def test_the_job_process_is_killed_once(start):
+    service = start()
+    job = service.submit(MEDIUM)
+    service.running(job)
+    os.kill(service.children()[0], signal.SIGKILL)
+    status = service.ended(job)
+    assert (status["state"], status["starts"]) == ("succeeded", 2)
+    assert service.strays() == []
+
+
+def test_the_job_process_is_killed_again(start):
+    service = start()
+    job, next_one = service.submit(BIG, SLOW), service.submit()
+    for start_number in (1, 2):
+        while service.running(job)["starts"] != start_number:
+            time.sleep(0.02)
+        os.kill(service.children()[0], signal.SIGKILL)
+    status = service.ended(job)
+    assert (status["state"], status["starts"]) == ("failed", 2)
+    assert (status["problem"]["code"], status["problem"]["retryable"]) == ("crashed", True)
+    assert "SIGKILL" in status["problem"]["detail"]
+    assert whole(service, next_one) == EXPECTED
+
+
+def test_a_job_that_needs_too_much_memory(start):
+    service = start(KISSGS_JOB_MEMORY="256MiB")
+    job = service.ended(service.submit(scene_bytes(120_000, 3), '{"preset": "balanced"}'), seconds=120)
+    assert (job["state"], job["starts"]) == ("failed", 1)
+    assert job["problem"]["code"] == "memory-limit"
+    assert not job["problem"]["retryable"]
+    assert "fewer Gaussians" in job["problem"]["detail"]
+    assert service.http.get("/readyz").status_code == 200
+
+
+@pytest.mark.parametrize(
+    "last_words",
+    [
+        "LLVM ERROR: out of memory\nBuffer allocation failed",
+        "OpenBLAS error: Memory allocation still failed after 10 retries, giving up.",
+        "terminate called after throwing an instance of 'std::bad_alloc'",
+        "numpy._core._exceptions._ArrayMemoryError: Unable to allocate 17 MiB",
+    ],
+)
+def test_libraries_that_meet_the_memory_limit_in_their_own_words(tmp_path, last_words):
+    trace = tmp_path / "stderr.txt"
+    trace.write_text(last_words)
+    assert Child(seconds=1)._explain(-signal.SIGABRT, trace).data["code"] == "memory-limit"
+    trace.write_text("Segmentation fault")
+    assert Child(seconds=1)._explain(-signal.SIGSEGV, trace).kind == "crashed"
+
+
+def test_a_job_that_takes_too_long(start):
+    service = start(KISSGS_JOB_SECONDS=1.5)
+    job, next_one = service.submit(BIG, SLOW), service.submit()
+    status = service.ended(job)
+    assert (status["state"], status["problem"]["code"]) == ("failed", "time-limit")
+    assert "1.5 s" in status["problem"]["detail"]
+    assert service.ended(next_one)["state"] in ("succeeded", "failed")  # 1.5 s may be too short for it, too
+    assert service.children() == []
+
+
+@pytest.fixture
+def tiny_disk(tmp_path):
+    """A file system of 3 MB."""
+    folder = tmp_path / "tiny"
+    folder.mkdir()
+    if os.geteuid() != 0 or os.system(f"mount -t tmpfs -o size=3m tmpfs '{folder}' 2>/dev/null") != 0:
+        pytest.skip("mounting a small file system needs root, and leave to mount")
+    yield folder
+    os.system(f"umount -l '{folder}'")
+
+
+def test_a_disk_that_fills_up_during_an_upload(tiny_disk):
+    with Service(tiny_disk / "data") as service:
+        service.log = tiny_disk.parent / "log"
+        for body in (BIG, iter([BIG[:2_000_000], BIG[2_000_000:]])):
+            answer = service.http.post("/v1/jobs", content=body, params={"options": FAST})
+            problem(answer, 507, "disk-full")
+            assert service.strays() == []
+        assert whole(service, service.submit()) == EXPECTED
+
+
+def test_a_disk_that_fills_up_during_a_job(tiny_disk):
+    with Service(tiny_disk / "data") as service:
+        job = service.submit(MEDIUM)
+        service.running(job)
+        filler = tiny_disk / "filler"
+        with filler.open("wb", buffering=0) as file, contextlib.suppress(OSError):
+            while True:
+                file.write(bytes(4096))
+        time.sleep(3)
+        filler.unlink()  # while the disk is full, not even the failure can be written down
+        status = service.ended(job)
+        assert status["state"] in ("failed", "succeeded")
+        if status["state"] == "failed":
+            assert (status["problem"]["code"], status["problem"]["retryable"]) == ("output", True)
+        assert whole(service, service.submit()) == EXPECTED
+
+
+def test_stopping_lets_a_short_job_finish(start):
+    service = start()
+    job = service.submit(MEDIUM)
+    service.running(job)
+    assert service.kill(signal.SIGTERM) == 0
+    service.restart()
+    status = service.status(job)
+    assert (status["state"], status["starts"]) == ("succeeded", 1)
+
+
+def test_stopping_puts_a_long_job_back(start):
+    service = start(KISSGS_DRAIN_SECONDS=0.5)
+    job = service.submit(BIG, SLOW)
+    service.running(job)
+    (child,) = service.children()
+    heard = []
+
+    def listen():
+        with contextlib.suppress(Exception), service.http.stream("GET", job["links"]["events"]) as answer:
+            heard.extend(answer.iter_lines())
+
+    listener = threading.Thread(target=listen)
+    listener.start()
+    time.sleep(0.3)
+    begun = time.monotonic()
+    assert service.kill(signal.SIGTERM) == 0
+    assert time.monotonic() - begun < 5  # the open stream does not hold it up
+    listener.join(5)
+    assert not listener.is_alive()
+    assert gone(child)
+    service.restart()
+    service.running(job)
+    assert service.status(job)["starts"] == 1  # an orderly stop counts against nobody
+    seen = service.http.get("/v1/jobs").json()
+    assert len(seen["jobs"]) == 1
+
+
+def test_many_jobs_at_once(start):
+    """200 at the same time: none is lost, none is done twice, memory stays flat."""
+    service = start(KISSGS_MAX_QUEUE=500, KISSGS_MAX_UPLOADS=32, KISSGS_WORKERS=2, KISSGS_JOB_THREADS=1)
+    scenes = [scene_bytes(20, 0, seed=i) for i in range(200)]
+    whole(service, service.submit(scenes[0]))
+    before = service.memory()
+
+    def send(i):
+        for _ in range(100):
+            answer = service.http.post("/v1/jobs", content=scenes[i], params={"options": FAST, "name": str(i)})
+            if answer.status_code == 202:
+                return answer.json()
+            problem(answer, 429, "too-many-uploads")
+            time.sleep(0.2)
+        raise AssertionError("never let in")
+
+    with ThreadPoolExecutor(50) as pool:
+        jobs = list(pool.map(send, range(200)))
+    assert len({job["id"] for job in jobs}) == 200
+    assert service.memory() - before < 64 << 20
+    for i in random.Random(0).sample(range(200), 190):
+        service.http.post(f"/v1/jobs/{jobs[i]['id']}/cancel")
+    states = [service.ended(job, seconds=120) for job in jobs]
+    assert {status["state"] for status in states} <= {"succeeded", "cancelled"}
+    assert sum(status["state"] == "succeeded" for status in states) >= 10
+    for i, status in enumerate(states):
+        assert status["name"] == str(i)
+        assert status["starts"] <= 1
+        if status["state"] == "succeeded":
+            expected = kissgs.compress(scenes[i], settings=kissgs.Settings(preset="fast")).to_zip()
+            assert service.http.get(status["links"]["result"]).content == expected
+    assert service.strays() == []
+
+
+def test_one_key_at_the_same_time(start):
+    service = start()
+    with ThreadPoolExecutor(8) as pool:
+        jobs = list(pool.map(lambda _: service.submit(MEDIUM, **{"Idempotency-Key": "same"}), range(8)))
+    assert len({job["id"] for job in jobs}) == 1
+    assert len(service.http.get("/v1/jobs").json()["jobs"]) == 1
+    assert service.ended(jobs[0])["state"] == "succeeded"
+    assert len(list((service.folder / "jobs").iterdir())) == 1
+    assert service.strays() == []
+
+
+def test_expiry(start):
+    service = start(KISSGS_KEEP_SECONDS=3, KISSGS_SWEEP_SECONDS=0.2)
+    job = service.ended(service.submit())
+    assert whole(service, job) == EXPECTED
+    end = time.monotonic() + 20
+    while service.status(job)["state"] != "expired":
+        assert time.monotonic() < end
+        time.sleep(0.1)
+    problem(service.http.get(f"/v1/jobs/{job['id']}/result"), 410, "gone")
+    assert not (service.folder / "jobs" / job["id"]).exists()
+    while service.http.get(f"/v1/jobs/{job['id']}").status_code != 404:  # and forgotten, after as long again
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
+def test_uploads_are_not_kept_where_that_is_not_wanted(start):
+    service = start(KISSGS_KEEP_UPLOADS="false")
+    job = service.ended(service.submit())
+    assert "source" not in job["links"]
+    assert not (service.folder / "jobs" / job["id"] / "scene.ply").exists()
+
+
+def test_two_services_cannot_share_a_folder(start, tmp_path):
+    service = start()
+    with pytest.raises(AssertionError, match="another service is using"):
+        Service(service.folder).start()
+    assert service.http.get("/livez").status_code == 200
+
+
+def test_the_clock_jumps(tmp_path, monkeypatch):
+    """A year forward, and back: nothing expires before its time, nothing takes less than no time."""
+    from service.app import build
+    from service.janitor import Janitor
+    from service.models import State
+    from service.settings import ServiceSettings
+
+    monkeypatch.setenv("KISSGS_DATA_DIR", str(tmp_path / "data"))
+    context = build(ServiceSettings.from_environment())
+    upload = context.folders.new_upload()
+    upload.write_bytes(SMALL)
+    job = make_job(upload, context)
+    real = time.time
+    for jump in (365 * 86400, -365 * 86400):
+        monkeypatch.setattr(time, "time", lambda jump=jump: real() + jump)
+        asyncio.run(run_one(context))
+        Janitor(context, 0.0).sweep()
+        found = context.store.get(job.id)
+        assert found.state == State.SUCCEEDED
+        assert 0 <= found.finished_at - found.started_at < 60
+        assert 0 <= found.started_at - found.created_at < 60
+    context.store.close()
+    context.folders.close()
+    restarted = build(ServiceSettings.from_environment())  # a year back: time goes on from where it was
+    assert 0 <= restarted.clock() - found.finished_at < 60
+    restarted.folders.close()
+
+
+def make_job(upload, context):
+    import uuid
+
+    from service.models import Job
+
+    job = Job(
+        id=uuid.uuid4().hex,
+        owner="",
+        name="scene",
+        options={"preset": "fast", "evaluate": False},
+        preset="fast",
+        evaluate=False,
+        gaussians=300,
+        sh_degree=1,
+        upload_bytes=len(SMALL),
+        upload_sha256="0" * 64,
+        fingerprint="0",
+        disk_bytes=0,
+    )
+    context.folders.adopt(upload, job.id)
+    return context.admission.add(job)
+
+
+async def run_one(context):
+    context.worker.start()
+    for _ in range(600):
+        await asyncio.sleep(0.05)
+        if not context.store.counts()["queued"] and not context.store.counts()["running"]:
+            break
+    context.worker.draining = True
+    await context.worker.drain()
+    context.worker.draining = False

@@ -1,0 +1,357 @@
+"""Many clients, idle ones and hostile ones; oracle: what one client meets when it is alone."""
+
+import contextlib
+import os
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import uuid
+
+import pytest
+from serving import SLOW, SMALL, events, problem, said, scene_bytes
+
+BIG = scene_bytes(20_000, 3)
+
+
+def worst(service, count=60):
+    """Seconds of the slowest of some looks at the limits."""
+    spent = []
+    for _ in range(count):
+        begun = time.perf_counter()
+        assert service.http.get("/v1/limits").status_code == 200
+        spent.append(time.perf_counter() - begun)
+        time.sleep(0.01)
+    return max(spent)
+
+
+def test_idle_connections_harm_no_job(start):
+    """With few descriptors, three hundred of them made jobs fail that could not open their files."""
+    service = start()
+    resource.prlimit(service.process.pid, resource.RLIMIT_NOFILE, (300, 300))
+    jobs = [service.submit() for _ in range(3)]
+    crowd = []
+    for _ in range(400):
+        with contextlib.suppress(OSError):
+            crowd.append(socket.create_connection(("127.0.0.1", service.port), timeout=5))
+    time.sleep(3)
+    for connection in crowd:
+        connection.close()
+    for job in jobs:
+        status = service.ended(job)
+        assert status["state"] == "succeeded", status
+
+
+def test_abandoned_long_polls_cost_nothing(start):
+    service = start(KISSGS_DRAIN_SECONDS=1)
+    job = service.submit(BIG, SLOW)
+    service.running(job)
+    for _ in range(300):
+        with service.raw(b"GET /v1/jobs/%b?wait=30 HTTP/1.1\r\nHost: localhost\r\n\r\n" % job["id"].encode()):
+            pass
+    assert worst(service) < 2
+    begun = time.monotonic()
+    assert service.kill(signal.SIGTERM) == 0
+    assert time.monotonic() - begun < 8  # nobody is waited for but the job
+
+
+def test_many_followers_see_the_same(start):
+    service = start()
+    job = service.submit(scene_bytes(4_000, 1))
+    heard = [None] * 30
+
+    def follow(i):
+        heard[i] = service.http.get(job["links"]["events"]).text
+
+    threads = [threading.Thread(target=follow, args=(i,)) for i in range(30)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    # What a state tells beside its name is how things stood when it was sent.
+    told = [[(number, kind, {**data, "job": None}) for number, kind, data in events(text)] for text in heard]
+    assert all(story == told[0] for story in told)
+    assert told[0][-1][2]["state"] == "succeeded"
+
+
+def test_bodies_in_single_bytes_are_cut_off(start):
+    service = start()
+    stop, closed = threading.Event(), threading.Event()
+
+    def attack():
+        with service.raw(
+            b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n"
+        ) as connection:
+            while not stop.is_set():
+                try:
+                    connection.sendall(b"1\r\nx\r\n" * 5000)
+                except OSError:
+                    closed.set()
+                    return
+
+    attacker = threading.Thread(target=attack)
+    attacker.start()
+    assert closed.wait(20)
+    stop.set()
+    attacker.join()
+    assert worst(service) < 1
+
+
+def test_what_is_only_announced_takes_nothing_from_anybody(start):
+    service = start(KISSGS_MAX_DISK_BYTES=10 * len(SMALL))
+    job = service.ended(service.submit())
+    for size in (5 * len(SMALL), 100 * len(SMALL)):
+        with service.raw(
+            b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n" % size
+        ) as connection:
+            connection.settimeout(1)
+            with contextlib.suppress(TimeoutError):
+                assert b"507" in said(connection)
+    assert service.http.get(job["links"]["source"]).status_code == 200
+
+
+def test_decoded_scenes_make_room_too(start):
+    service = start(KISSGS_MAX_DISK_BYTES=5 * len(SMALL), KISSGS_KEEP_UPLOADS="false")
+    jobs = [service.ended(service.submit(scene_bytes(300, 1, seed))) for seed in range(2)]
+    for job in jobs:
+        assert service.http.get(job["links"]["decoded"]).status_code == 200
+    assert service.ended(service.submit(scene_bytes(800, 1)))["state"] == "succeeded"
+    assert service.http.get(jobs[0]["links"]["decoded"]).status_code in (200, 507)
+
+
+def test_a_long_tail_of_a_form_is_refused(service):
+    body = b'--b\r\nContent-Disposition: form-data; name="file"; filename="x"\r\n\r\n' + SMALL + b"\r\n--b--\r\n"
+    headers = {"Content-Type": "multipart/form-data; boundary=b"}
+    answer = service.http.post("/v1/jobs", content=iter([body, *([bytes(60_000)] * 20)]), headers=headers)
+    problem(answer, 422, "invalid-request")
+    whole = body + bytes(5_000_000)
+    problem(service.http.post("/v1/jobs", content=whole, headers=headers), 413, "too-large")
+
+
+def test_a_form_needs_no_more_room_than_it_is_large(start):
+    service = start(KISSGS_MAX_DISK_BYTES=4 * len(SMALL))
+    assert service.http.post("/v1/jobs", files={"file": ("x.ply", SMALL)}).status_code == 202
+
+
+def test_a_decode_ends_with_its_job(start):
+    service = start()
+    job = service.ended(service.submit(scene_bytes(120_000, 3)))
+    answers = []
+    asking = threading.Thread(target=lambda: answers.append(service.http.get(job["links"]["decoded"])))
+    asking.start()
+    end = time.monotonic() + 10
+    while not service.children() and time.monotonic() < end:
+        time.sleep(0.005)
+    assert service.http.delete(f"/v1/jobs/{job['id']}").status_code == 204
+    asking.join(20)
+    if answers[0].status_code != 200:  # it was not faster
+        problem(answers[0], 410, "gone")
+    assert str(service.folder) not in answers[0].text[:2000]
+    assert list((service.folder / "jobs").iterdir()) == []
+    assert service.http.get("/readyz").status_code == 200
+
+
+def test_two_at_once_decode_once(start):
+    service = start()
+    job = service.ended(service.submit())
+    answers = []
+    threads = [
+        threading.Thread(target=lambda: answers.append(service.http.get(job["links"]["decoded"]))) for _ in range(5)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(30)
+    assert len({answer.content for answer in answers}) == 1
+    assert {answer.status_code for answer in answers} == {200}
+
+
+def test_a_fault_of_ours_is_said_to_be_one(tmp_path):
+    """It looked like a crash from outside: the interpreter could not end while a thread waited for standard input."""
+    import asyncio
+
+    from service.runner import Child
+
+    async def ignore(stage, fraction):
+        pass
+
+    order = {"task": "no such task", "work": str(tmp_path), "source": "", "memory": 1 << 30}
+    outcome = asyncio.run(Child(seconds=30).run(order, ignore))
+    assert (outcome.kind, outcome.data["code"]) == ("error", "internal")
+
+
+def test_stopping_the_whole_group_puts_the_job_back(start):
+    """As some supervisors do: the signal reaches the job's process, too."""
+    service = start(KISSGS_DRAIN_SECONDS=0.5)
+    job = service.submit(BIG, SLOW)
+    service.running(job)
+    (child,) = service.children()
+    service.process.send_signal(signal.SIGTERM)
+    os.kill(child, signal.SIGTERM)
+    time.sleep(0.05)
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(child, signal.SIGKILL)
+    assert service.kill(signal.SIGTERM) == 0
+    service.restart()
+    status = service.status(job)
+    assert (status["state"] in ("queued", "running"), status["starts"] <= 1) == (True, True)
+
+
+def test_asked_twice_it_stops_at_once(start):
+    service = start(KISSGS_DRAIN_SECONDS=60)
+    job = service.submit(BIG, SLOW)
+    service.running(job)
+    service.process.send_signal(signal.SIGINT)
+    time.sleep(0.5)
+    begun = time.monotonic()
+    assert service.kill(signal.SIGINT) == 0
+    assert time.monotonic() - begun < 10
+    service.restart()
+    assert service.status(job)["state"] in ("queued", "running")
+
+
+def test_an_upload_while_it_stops_is_told_so(start):
+    service = start()
+    head = b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n" % len(BIG)
+    with service.raw(head + BIG[:100_000]) as connection:
+        time.sleep(0.3)
+        service.process.send_signal(signal.SIGTERM)
+        time.sleep(0.3)
+        with contextlib.suppress(ConnectionError):
+            connection.sendall(BIG[100_000:200_000])
+        answer = said(connection)
+    assert answer.startswith(b"HTTP/1.1 503")
+    assert b'"stopping"' in answer
+    assert service.process.wait(20) == 0
+
+
+def test_nothing_a_client_writes_becomes_a_line_or_a_label(service):
+    service.http.get("/x%0a2026-01-01%20ERROR%20forged")
+    for _ in range(3):
+        service.http.request(f"FOO{uuid.uuid4().hex[:6].upper()}", "/livez")
+    assert "\n2026-01-01" not in service.log.read_text()
+    metrics = service.http.get("/metrics").text
+    assert "FOO" not in metrics
+    assert 'method="other"' in metrics
+
+
+def test_a_fault_has_an_id(start):
+    """The database is damaged under a running service: the answer can be found in the log."""
+    service = start()
+    for path in service.folder.glob("jobs.sqlite*"):
+        path.unlink()
+    (service.folder / "jobs.sqlite").write_bytes(b"no database")
+    answer = service.http.get("/v1/jobs", headers={"X-Request-ID": "find-me"})
+    if answer.status_code != 200:  # its connections may still have the old file
+        problem(answer, 500, "internal")
+    assert answer.headers["x-request-id"] == "find-me"
+    time.sleep(0.3)  # the log is written after the answer
+    assert "find-me" in service.log.read_text()
+
+
+def test_what_nobody_foresaw_is_a_problem_document():
+    import asyncio
+
+    from service.metrics import Metrics
+    from service.middleware import Envelope
+    from service.settings import ServiceSettings
+
+    async def application(scope, receive, send):
+        raise RuntimeError("nobody's business")
+
+    async def ask():
+        scope = {"type": "http", "method": "GET", "path": "/x", "headers": [(b"host", b"localhost")]}
+        await Envelope(application, Metrics(), ServiceSettings())(scope, None, send)
+
+    sent = []
+
+    async def send(message):
+        sent.append(message)
+
+    asyncio.run(ask())
+    headers = dict(sent[0]["headers"])
+    assert (sent[0]["status"], headers[b"content-type"]) == (500, b"application/problem+json")
+    assert headers[b"x-request-id"] in sent[1]["body"]
+    assert b"nobody's business" not in sent[1]["body"]
+
+
+@pytest.mark.parametrize("path", ["/", "/livez", "/readyz", "/version", "/favicon.ico"])
+def test_monitors_may_ask_for_headers_only(service, path):
+    answer = service.http.head(path)
+    assert (answer.status_code, answer.content) == (200, b"")
+
+
+def test_refused_methods_are_told_the_others(service):
+    for path, allowed in (("/livez", "GET, HEAD"), ("/v1/jobs", "GET, POST"), ("/v1/jobs/x", "DELETE, GET, HEAD")):
+        answer = service.http.patch(path)
+        assert (answer.headers["allow"], allowed in answer.json()["detail"]) == (allowed, True)
+
+
+def test_another_data_folder_is_refused(tmp_path):
+    from serving import Service
+
+    database = f"sqlite:///{tmp_path}/shared.sqlite"
+    with Service(tmp_path / "a", KISSGS_DATABASE_URL=database) as service:
+        job = service.ended(service.submit())
+        with pytest.raises(AssertionError, match="another data folder"):
+            Service(tmp_path / "b", KISSGS_DATABASE_URL=database).start()
+        assert service.status(job)["state"] == "succeeded"
+
+
+def test_events_go_on_over_a_restart(start):
+    service = start()
+    job = service.submit(scene_bytes(6_000, 2))
+    service.running(job)
+    seen = []
+    with service.http.stream("GET", job["links"]["events"]) as answer:
+        for line in answer.iter_lines():
+            if line.startswith("id: "):
+                seen.append(int(line[4:]))
+            if len(seen) == 3:
+                break
+    service.kill(signal.SIGKILL)
+    service.restart()
+    rest = service.http.get(job["links"]["events"], headers={"Last-Event-ID": str(seen[-1])}).text
+    seen += [int(line[4:]) for line in rest.splitlines() if line.startswith("id: ")]
+    assert seen == list(range(1, len(seen) + 1))
+    assert '"succeeded"' in rest
+
+
+def test_the_measuring_command(monkeypatch, capsys, tmp_path):
+    from service import bench
+
+    for name, value in (("UPLOAD_BYTES", 5_000_000), ("POLLS", 5), ("REPEATS", 1)):
+        monkeypatch.setattr(bench, name, value)
+    scene = tmp_path / "scene.ply"
+    scene.write_bytes(SMALL)
+    bench.bench(scene)
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(":")[0] for line in lines] == [
+        "status while a job uses every processor",
+        "server memory",
+        "over `kissgs compress`, scene.ply",
+    ]
+    missing = subprocess.run(
+        [sys.executable, "-m", "service", "bench", "nothing.ply"],
+        capture_output=True,
+        text=True,
+        timeout=20,
+        check=False,
+    )
+    assert (missing.returncode, "no such file" in missing.stderr) == (2, True)
+
+
+def test_an_upload_that_stalls_does_not_hold_up_a_stop(start):
+    service = start()
+    head = b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 500000\r\n\r\nply\n"
+    with service.raw(head) as connection:
+        time.sleep(0.3)
+        begun = time.monotonic()
+        service.process.send_signal(signal.SIGTERM)
+        answer = said(connection)
+    assert answer.startswith(b"HTTP/1.1 503")
+    assert service.process.wait(20) == 0
+    assert time.monotonic() - begun < 6

@@ -1,0 +1,62 @@
+"""The OpenAPI document; oracles: the snapshot in docs/, and schemathesis, which tries what the document promises."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from serving import ROOT, Service
+
+HERE = Path(__file__).parent
+
+
+def test_the_document_is_the_one_in_the_docs(service):
+    """A change here is a change for every client: look at the diff, then run `make docs`."""
+    expected = json.loads((ROOT / "docs" / "openapi.json").read_text(encoding="utf-8"))
+    assert service.http.get("/openapi.json").json() == expected
+
+
+def test_everything_is_explained(service):
+    document = service.http.get("/openapi.json").json()
+    assert len(document["info"]["description"]) > 100
+    for path, operations in document["paths"].items():
+        for method, operation in operations.items():
+            where = f"{method} {path}"
+            assert operation["summary"], where
+            assert operation["description"], where
+            assert operation["operationId"], where
+            for parameter in operation.get("parameters", []):
+                assert parameter["description"], (where, parameter["name"])
+            for status, answer in operation["responses"].items():
+                assert answer["description"], (where, status)
+                if int(status) >= 400 and status != "503":
+                    assert list(answer["content"]) == ["application/problem+json"], (where, status)
+
+
+def test_keys_are_asked_for_where_they_are_needed(start):
+    guarded = start(KISSGS_KEYS=f"alice:{'0' * 64}").http.get("/openapi.json").json()
+    assert guarded["paths"]["/v1/jobs"]["post"]["security"] == [{"HTTPBearer": []}]
+
+
+@pytest.mark.parametrize("seed", [1])
+def test_schemathesis_finds_nothing(tmp_path, seed):
+    """Its examples, its corners, its fuzzing, and its walks along the links from one answer to the next request."""
+    with Service(tmp_path / "data") as service:
+        found = subprocess.run(
+            [
+                *(Path(sys.executable).with_name("schemathesis"), "--config-file", ROOT / "schemathesis.toml", "run"),
+                *(f"{service.url}/openapi.json", "--seed", str(seed), "--max-examples", "5", "--no-color"),
+                *("--suppress-health-check", "all", "--generation-database", "none"),
+            ],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": f"{HERE}:{ROOT}", "SCHEMATHESIS_HOOKS": "schema_hooks"},
+            capture_output=True,
+            text=True,
+            timeout=300,
+            check=False,
+        )
+        assert found.returncode == 0, "\n".join(line[:300] for line in found.stdout.splitlines()[-80:])
+        assert service.http.get("/readyz").json()["ready"]
+        assert "Traceback" not in service.log.read_text()

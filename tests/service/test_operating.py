@@ -1,0 +1,201 @@
+"""What operators see: settings, health, metrics, the command; oracles: the Prometheus parser, the table of settings."""
+
+import hashlib
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from prometheus_client.openmetrics.parser import text_string_to_metric_families
+from serving import SLOW, SMALL, Service, scene_bytes
+
+from service.settings import ServiceSettings, SettingsError
+
+COMMAND = [sys.executable, "-P", "-m", "service"]
+
+
+def command(*arguments, **settings):
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("KISSGS_")}
+    environment |= settings
+    return subprocess.run(
+        [*COMMAND, *arguments], env=environment, capture_output=True, text=True, timeout=60, check=False
+    )
+
+
+@pytest.fixture
+def environment(monkeypatch):
+    for name in os.environ:
+        if name.startswith("KISSGS_"):
+            monkeypatch.delenv(name)
+    return monkeypatch
+
+
+def test_settings_come_from_the_environment(environment):
+    environment.setenv("KISSGS_MAX_UPLOAD_BYTES", "3GB")
+    environment.setenv("KISSGS_KEYS", f"a:{'0' * 64} b:{'1' * 64},a:{'2' * 64}")
+    environment.setenv("kissgs_port", "9000")
+    environment.setenv("KISSGS_KEY", "of the client")
+    settings = ServiceSettings.from_environment()
+    assert (settings.max_upload_bytes, settings.port) == (3_000_000_000, 9000)
+    assert [key.owner for key in settings.keys] == ["a", "b", "a"]
+
+
+def test_all_that_is_wrong_is_told_at_once(environment):
+    wrong = {
+        "KISSGS_PROT": "80",
+        "KISSGS_PORT": "65536",
+        "KISSGS_MAX_UPLOAD_BYTES": "many",
+        "KISSGS_KEYS": "alice:secret",
+        "KISSGS_CORS_ORIGINS": "example.org",
+        "KISSGS_JOB_MEMORY": "1MB",
+        "KISSGS_JOB_SECONDS": "nan",
+        "KISSGS_LOG_LEVEL": "loud",
+        "KISSGS_WORKERS": "0",
+    }
+    for name, value in wrong.items():
+        environment.setenv(name, value)
+    with pytest.raises(SettingsError) as caught:
+        ServiceSettings.from_environment()
+    lines = str(caught.value).splitlines()
+    for name in wrong:
+        assert sum(line.startswith(f"{name}: ") for line in lines) == 1, name
+    assert "secret" not in str(caught.value)
+
+
+def test_wrong_settings_end_in_a_message(tmp_path):
+    ended = command(KISSGS_PROT="80", KISSGS_WORKERS="none")
+    assert ended.returncode == 2
+    assert "KISSGS_PROT: there is no such setting" in ended.stderr
+    assert "Traceback" not in ended.stderr
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    for settings, said in (
+        ({"KISSGS_DATA_DIR": str(blocked / "data")}, "not a directory"),
+        ({"KISSGS_DATABASE_URL": "nothing://x"}, "KISSGS_DATABASE_URL"),
+        ({"KISSGS_DATABASE_URL": f"sqlite:///{tmp_path}/no/jobs.sqlite"}, "cannot be opened"),
+    ):
+        ended = command(**{"KISSGS_DATA_DIR": str(tmp_path / "data"), **settings})
+        assert (ended.returncode, ended.stdout) == (2, "")
+        assert said in ended.stderr
+        assert "Traceback" not in ended.stderr
+
+
+def test_a_database_of_another_version_is_refused(tmp_path):
+    import sqlite3
+
+    with Service(tmp_path / "data") as service:
+        service.kill(signal.SIGTERM)
+    with sqlite3.connect(tmp_path / "data" / "jobs.sqlite") as database:
+        database.execute("UPDATE meta SET value = 99 WHERE name = 'schema'")
+    database.close()
+    ended = command(KISSGS_DATA_DIR=str(tmp_path / "data"))
+    assert ended.returncode == 2
+    assert "version 99" in ended.stderr
+
+
+def test_a_port_that_is_taken(service, tmp_path):
+    ended = command(KISSGS_PORT=str(service.port), KISSGS_DATA_DIR=str(tmp_path / "data"))
+    assert ended.returncode != 0
+    assert "address already in use" in ended.stderr
+    assert "Traceback" not in ended.stderr
+
+
+def test_making_a_key():
+    ended = command("key", "alice")
+    key = re.search(r"kissgs_[A-Za-z0-9_-]{43}", ended.stdout)[0]
+    assert f"alice:{hashlib.sha256(key.encode()).hexdigest()}" in ended.stdout
+    assert command("key", "not an owner").returncode == 2
+
+
+def test_every_setting_is_listed():
+    listed = command("settings").stdout
+    for name in ServiceSettings.model_fields:
+        assert f"KISSGS_{name.upper()}\n" in listed
+
+
+def test_health_by_command(service):
+    well = command("health", KISSGS_PORT=str(service.port))
+    assert (well.returncode, '"ready":true' in well.stdout) == (0, True)
+    assert command("health", KISSGS_PORT="1").returncode == 1
+
+
+def test_health(service):
+    assert service.http.get("/livez").json() == {"ready": True, "checks": {"process": "ok"}}
+    ready = service.http.get("/readyz")
+    assert ready.json() == {"ready": True, "checks": {"worker": "ok", "database": "ok", "disk": "ok"}}
+    assert service.http.get("/version").json()["container"] == "SOG-XT"
+
+
+def test_a_dead_worker_is_not_ready(tmp_path, environment):
+    import asyncio
+
+    from service.app import build
+
+    async def scenario():
+        context.worker.start()
+        await asyncio.sleep(0.1)
+        assert context.worker.trouble() is None
+        context.worker._loops[0].cancel()
+        await asyncio.sleep(0.1)
+        return context.worker.trouble()
+
+    environment.setenv("KISSGS_DATA_DIR", str(tmp_path / "data"))
+    context = build(ServiceSettings.from_environment())
+    assert asyncio.run(scenario()) == "worker 0 has ended"
+    context.folders.close()
+
+
+def test_metrics(start):
+    service = start()
+    done = service.ended(service.submit())
+    service.ended(service.submit(SMALL.replace(b"vertex 300", b"vertex 299")))
+    text = service.http.get("/metrics")
+    assert text.headers["content-type"].startswith("application/openmetrics-text")
+    values = {
+        (sample.name, *sorted(sample.labels.values())): sample.value
+        for family in text_string_to_metric_families(text.text)
+        for sample in family.samples
+    }
+    assert values["kissgs_jobs", "succeeded"] == 2
+    assert values["kissgs_jobs_submitted_total", "fast"] == 2
+    assert values["kissgs_upload_bytes_total",] == 2 * len(SMALL)
+    assert values["kissgs_container_bytes_total",] >= done["sizes"]["container"]
+    assert values["kissgs_ratio_count",] == values["kissgs_queue_seconds_count",] == 2
+    assert values["kissgs_stage_seconds_count", "images"] == 2
+    assert values["kissgs_disk_bytes",] > 2 * len(SMALL)
+    assert values["kissgs_http_requests_total", "/v1/jobs", "202", "POST"] == 2
+    assert done["id"] not in text.text
+
+
+def test_requests_have_ids(service):
+    assert service.http.get("/livez", headers={"X-Request-ID": "mine-1"}).headers["x-request-id"] == "mine-1"
+    for unusable in ("a b", "x" * 65, "<script>"):
+        assert service.http.get("/livez", headers={"X-Request-ID": unusable}).headers["x-request-id"] != unusable
+    assert "mine-1" in service.log.read_text()
+
+
+def test_the_page(service):
+    page = service.http.get("/")
+    assert page.headers["content-type"].startswith("text/html")
+    assert "default-src 'none'" in page.headers["content-security-policy"]
+    assert "<script>" not in page.text  # the policy would not run it
+    for path in re.findall(r'(?:href|src)="(/[^"#]*)"', page.text):
+        if path != "/docs":
+            assert service.http.get(path).status_code == 200, path
+    assert not re.search(r'(?:src|href)="(?:https?:)?//', page.text)  # nothing from elsewhere
+
+
+def test_status_is_quick_while_a_job_uses_the_processors(start):
+    """Half of all answers within the time that 99 of 100 take on an idle machine; the 99 are measured, not tested."""
+    service = start()
+    job = service.submit(scene_bytes(20_000, 3), SLOW)
+    service.running(job)
+    spent = []
+    for _ in range(100):
+        begun = time.perf_counter()
+        service.status(job)
+        spent.append(time.perf_counter() - begun)
+    assert sorted(spent)[50] < 0.05

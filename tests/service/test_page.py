@@ -1,0 +1,181 @@
+"""The page in a real Chromium; oracle: what the API says of the same job, and what a person would do."""
+
+import hashlib
+import shutil
+
+import pytest
+from serving import SLOW, SMALL, scene_bytes
+
+import kissgs
+
+playwright = pytest.importorskip("playwright.sync_api")
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
+
+QUIET = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=QUIET)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def visit(browser, service):
+    """``visit(at=service)`` opens its page, where nothing may go wrong and nothing come from elsewhere."""
+    contexts, wrong = [], []
+
+    def begin(at=service, **options):
+        context = browser.new_context(**options)
+        contexts.append(context)
+        page = context.new_page()
+        page.set_default_timeout(20_000)
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.on("console", lambda said: wrong.append(said.text) if "Content Security Policy" in said.text else None)
+        page.on(
+            "request", lambda asked: wrong.append(asked.url) if not asked.url.startswith((at.url, "blob:")) else None
+        )
+        page.goto(at.url)
+        return page
+
+    yield begin
+    for context in contexts:
+        context.close()
+    assert wrong == []
+
+
+def choose(page, data=SMALL, name="my scene.ply"):
+    page.locator("#drop").wait_for()
+    page.set_input_files("#file", {"name": name, "mimeType": "application/octet-stream", "buffer": data})
+
+
+def newest(service):
+    return service.http.get("/v1/jobs", params={"limit": 1}).json()["jobs"][0]
+
+
+def test_the_whole_path(visit, service, tmp_path):
+    page = visit()
+    choose(page)
+    page.get_by_text("300 Gaussians").wait_for()
+    page.get_by_label("Fast").check()
+    page.get_by_role("button", name="Compress").click()
+    page.get_by_text("smaller").first.wait_for()
+    job = newest(service)
+    assert (job["name"], job["options"]["preset"], job["state"]) == ("my scene", "fast", "succeeded")
+    assert f"{job['sizes']['ratio']:.3g}×" in page.locator("#job").inner_text()
+    preview = page.get_by_role("link", name="Preview")
+    assert (preview.get_attribute("href"), preview.get_attribute("target")) == (job["links"]["preview"], None)
+    with page.expect_download() as download:
+        page.get_by_role("link", name="Download container").click()
+    download.value.save_as(tmp_path / "x.zip")
+    assert download.value.suggested_filename == "my scene.zip"
+    assert (tmp_path / "x.zip").read_bytes() == kissgs.compress(SMALL, settings=kissgs.Settings(preset="fast")).to_zip()
+    with page.expect_download() as download:
+        page.get_by_role("link", name="Decoded .ply").click()
+    assert download.value.suggested_filename == "my scene.decoded.ply"
+
+
+def test_by_keyboard_alone(visit, service):
+    page = visit()
+    choose(page)
+    page.get_by_text("300 Gaussians").wait_for()
+    page.locator("#file").focus()
+    page.keyboard.press("Tab")
+    page.keyboard.press("ArrowUp")  # from balanced to fast
+    for _ in range(2):
+        page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    page.get_by_text("smaller").first.wait_for()
+    assert newest(service)["options"]["preset"] == "fast"
+
+
+@pytest.mark.parametrize(
+    ("data", "said"), [(b"hello " * 99, "ply"), (SMALL.replace(b"vertex 300\n", b"vertex 99999\n"), "99,999")]
+)
+def test_what_is_no_use_is_said_before_it_is_sent(visit, service, data, said):
+    before = newest(service)["id"] if service.http.get("/v1/jobs").json()["jobs"] else None
+    page = visit()
+    choose(page, data)
+    page.locator("#file-error", has_text=said).wait_for()
+    page.get_by_role("button", name="Compress").click()
+    assert before is None or newest(service)["id"] == before
+
+
+def test_what_the_service_refuses_is_said(visit):
+    page = visit()
+    choose(page, SMALL.replace(b"opacity", b"opaqity"))
+    page.get_by_role("button", name="Compress").click()
+    page.get_by_role("alert").filter(has_text="opacity").wait_for()
+
+
+def test_a_reload_goes_on_following_and_cancel_cancels(visit, start):
+    service = start()
+    page = visit(service)
+    job = service.submit(scene_bytes(20_000, 3), SLOW)
+    page.goto(f"{service.url}/#{job['id']}")
+    page.get_by_role("button", name="Cancel job").wait_for()
+    page.reload()
+    page.get_by_role("button", name="Cancel job").click()
+    page.locator("#job", has_text="ancelled").wait_for()
+    assert service.status(job)["state"] == "cancelled"
+
+
+def test_deleting_asks_first(visit, start):
+    service = start()
+    job = service.ended(service.submit())
+    page = visit(service)
+    page.get_by_role("button", name="Delete").first.click()
+    page.get_by_role("button", name="Keep it").click()
+    assert service.status(job)["state"] == "succeeded"
+    page.locator("#recent-list").get_by_role("button", name="Delete").first.click()
+    page.locator("#confirm-yes").click()
+    page.locator("#recent-list li").first.wait_for(state="detached")
+    assert service.http.get("/v1/jobs").json() == {"jobs": []}
+
+
+def test_names_are_text(visit, start):
+    service = start()
+    answer = service.http.post("/v1/jobs", content=SMALL, params={"name": "<img src=x onerror=alert(1)>"})
+    service.ended(answer.json())
+    page = visit(service)
+    page.locator("#recent-list li").first.wait_for()
+    assert page.locator("#recent-list img").count() == 0
+    assert "img src=x" in page.locator("#recent-list").inner_text()
+
+
+def test_keys_are_asked_for(visit, start):
+    service = start(KISSGS_KEYS=f"alice:{hashlib.sha256(b'secret').hexdigest()}")
+    page = visit(service)
+    page.get_by_role("textbox", name="Key").fill("wrong")
+    page.get_by_role("button", name="Continue").click()
+    page.locator("#gate-error").filter(has_text="key").wait_for()
+    page.get_by_role("textbox", name="Key").fill("secret")
+    page.get_by_role("button", name="Continue").click()
+    choose(page)
+    page.get_by_label("Fast").check()
+    page.get_by_role("button", name="Compress").click()
+    page.get_by_text("smaller").first.wait_for()
+    assert page.get_by_role("link", name="Preview").count() == 1  # the page has the key: it needs none in its address
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Download container").click()
+    assert download.value.suggested_filename == "my scene.zip"
+
+
+@pytest.mark.parametrize("width", [360, 768, 1400])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_nothing_sticks_out(visit, service, width, scheme):
+    job = service.ended(service.submit())
+    page = visit(viewport={"width": width, "height": 800}, color_scheme=scheme)
+    for where in ("", f"#{job['id']}"):
+        page.goto(f"{service.url}/{where}")
+        page.locator("#recent-list li").first.wait_for()
+        assert page.evaluate("document.documentElement.scrollWidth") <= width

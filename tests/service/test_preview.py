@@ -1,0 +1,267 @@
+"""The preview page as the service gives it out; oracle: its files, and for the policy Chromium, which enforces it."""
+
+import asyncio
+import base64
+import hashlib
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+from urllib.parse import urljoin
+
+import httpx
+import pytest
+from serving import ROOT, problem, said
+
+from service.app import create_app
+from service.routes import preview
+from service.settings import ServiceSettings
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+VENDOR = ROOT / "web_decoder" / "vendor"
+
+IMPORTS = '\n{"imports": {"three": "./vendor/three/build/three.module.min.js"}}\n'
+FILES = {
+    "preview.html": f'<script type="importmap">{IMPORTS}</script>\n<script type="module" src="./x.js"></script>',
+    "preview.js": "js",
+    "preview.css": "css",
+    "preview/scene-parts.js": "js",
+    "vendor/versions.json": "{}",
+    "vendor/three/LICENSE": "MIT",
+    "vendor/three/build/three.module.min.js": "three",
+}
+UNSERVED = (
+    *("package.json", "README.md", ".npmrc", "webp.test.js", "eslint.config.js", "tests/webp.js", "preview/tests/x.js"),
+    *("vendor-lock/package.json", "vendor/three/package.json", "vendor/.hidden/x.js", "node_modules/three/x.js"),
+    *("preview/preview.html", "../outside.js", "vendor/../../outside.js"),
+)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Stands for web_decoder: all that may lie there."""
+    folder = tmp_path / "web_decoder"
+    for name in (*FILES, *UNSERVED):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(FILES.get(name, "secret"))
+    monkeypatch.setattr(preview, "FOLDER", folder)
+    return folder
+
+
+@pytest.fixture
+def ask(folder, tmp_path):
+    """``ask(path)`` asks an application whose preview is that folder."""
+    app = create_app(ServiceSettings(data_dir=tmp_path / "data"))
+
+    def asking(path, method="GET", **headers):
+        async def once():
+            transport = httpx.ASGITransport(app)
+            async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
+                return await client.request(method, path, headers=headers)
+
+        return asyncio.run(once())
+
+    yield asking
+    app.state.context.store.close()
+    app.state.context.folders.close()
+
+
+def fixed(answer):
+    return {name: value for name, value in answer.headers.items() if name not in ("date", "x-request-id")}
+
+
+@pytest.mark.parametrize("path", ["/preview/", "/preview/preview.html", "/preview/" + "0a" * 16])
+def test_the_page_and_its_policy(ask, path):
+    answer = ask(path)
+    assert (answer.status_code, answer.text) == (200, FILES["preview.html"])
+    assert answer.headers["content-type"] == "text/html; charset=utf-8"
+    assert answer.headers["cache-control"] == "no-cache"
+    assert answer.headers["x-content-type-options"] == "nosniff"
+    policy = dict(part.split(" ", 1) for part in answer.headers["content-security-policy"].split("; "))
+    digest = base64.b64encode(hashlib.sha256(IMPORTS.encode()).digest()).decode()
+    assert policy.pop("script-src") == f"'self' 'wasm-unsafe-eval' 'sha256-{digest}'"
+    assert policy.pop("worker-src") == "'self' blob:"
+    assert policy.pop("img-src") == "'self' data:"
+    assert {policy.pop(name) for name in ("style-src", "connect-src")} == {"'self'"}
+    assert policy == dict.fromkeys(("default-src", "form-action", "base-uri", "frame-ancestors"), "'none'")
+    assert fixed(ask(path, "HEAD")) == fixed(answer)
+
+
+def test_the_policy_follows_the_page(ask, folder):
+    """As browsers read it: a hash is that of the text with plain line ends."""
+    before = ask("/preview/").headers["content-security-policy"]
+    (folder / "preview.html").write_bytes(FILES["preview.html"].replace("\n", "\r\n").encode())
+    assert ask("/preview/").headers["content-security-policy"] == before
+    (folder / "preview.html").write_text(FILES["preview.html"].replace("three.module", "three.other"))
+    assert ask("/preview/").headers["content-security-policy"] != before
+
+
+@pytest.mark.parametrize(
+    ("name", "media_type"),
+    [
+        ("preview.js", "text/javascript; charset=utf-8"),
+        ("preview.css", "text/css; charset=utf-8"),
+        ("preview/scene-parts.js", "text/javascript; charset=utf-8"),
+        ("vendor/three/build/three.module.min.js", "text/javascript; charset=utf-8"),
+        ("vendor/three/LICENSE", "text/plain; charset=utf-8"),
+        ("vendor/versions.json", "application/json"),
+    ],
+)
+def test_its_parts(ask, name, media_type):
+    answer = ask(f"/preview/{name}")
+    assert (answer.status_code, answer.text) == (200, FILES[name])
+    assert (answer.headers["content-type"], answer.headers["cache-control"]) == (media_type, "no-cache")
+    assert "unsafe" not in answer.headers["content-security-policy"]
+    same = ask(f"/preview/{name}", **{"If-None-Match": answer.headers["etag"]})
+    assert (same.status_code, same.content, same.headers["cache-control"]) == (304, b"", "no-cache")
+    assert fixed(ask(f"/preview/{name}", "HEAD")) == fixed(answer)
+
+
+@pytest.mark.parametrize("name", [*UNSERVED, "none.js", "0a" * 15, "0A" * 16, "0a" * 16 + "/", "preview"])
+def test_nothing_else(ask, name):
+    for written in {name, name.replace("..", "%2e%2e"), name.replace("/", "%2F")}:
+        answer = ask(f"/preview/{written}")
+        problem(answer, 404, "not-found")
+        assert "secret" not in answer.text
+        assert ask(f"/preview/{written}", "HEAD").status_code == 404
+
+
+def test_what_was_not_installed_is_not_found(ask, folder):
+    """The service works without the vendor folder, whose want the page tells itself, and even without the page."""
+    shutil.rmtree(folder / "vendor")
+    problem(ask("/preview/vendor/three/build/three.module.min.js"), 404, "not-found")
+    assert ask("/preview/").status_code == 200
+    shutil.rmtree(folder)
+    assert "without its preview page" in problem(ask("/preview/"), 404, "not-found")["detail"]
+    problem(ask("/preview/preview.js"), 404, "not-found")
+
+
+def test_without_the_slash_it_leads_there(ask):
+    for method in ("GET", "HEAD"):
+        answer = ask("/preview", method)
+        assert (answer.status_code, answer.headers["location"]) == (307, "preview/")
+    answer = ask("/preview/", "POST")
+    problem(answer, 405, "method-not-allowed")
+    assert answer.headers["allow"] == "GET, HEAD"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        *("../v1/limits", "../../pyproject.toml", "%2e%2e/pyproject.toml", "vendor/../../pyproject.toml"),
+        *("%2Fetc%2Fpasswd", "/etc/passwd", "..%2f..%2fetc/passwd", "..%5c..%5cpyproject.toml"),
+        *("preview.js%00.css", "vendor/%2e%2e/%2e%2e/service/app.py"),
+    ],
+)
+def test_no_way_out(service, path):
+    """Written to the socket, because clients tidy what they are given."""
+    request = f"GET /preview/{path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
+    with service.raw(request.encode()) as connection:
+        answer = said(connection)
+    assert answer.startswith((b"HTTP/1.1 404", b"HTTP/1.1 400"))
+    assert b"[project]" not in answer
+
+
+def test_whether_a_job_exists_is_not_told(start):
+    """Nor to anybody without a key."""
+    service = start(KISSGS_KEYS=f"alice:{hashlib.sha256(b'secret').hexdigest()}")
+    job = service.submit(Authorization="Bearer secret")
+    there, nowhere = (service.http.get(f"/preview/{id}") for id in (job["id"], "0" * 32))
+    assert there.status_code == nowhere.status_code == 200
+    assert there.content == nowhere.content
+    assert fixed(there) == fixed(nowhere)
+
+
+def test_only_a_result_has_a_preview(start):
+    service = start(KISSGS_WORKERS=1)
+    job = service.submit()
+    assert "preview" not in job["links"]
+    assert service.ended(job)["links"]["preview"] == f"/preview/{job['id']}"
+    failed = service.http.post(service.submit()["links"]["cancel"]).json()
+    assert "preview" not in failed["links"] or failed["state"] == "succeeded"
+
+
+class Addresses(HTMLParser):
+    """What a page loads: ``found``."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.found, self._tag = set(), {}
+        self.feed(page)
+
+    def handle_starttag(self, tag, attributes):
+        self._tag = dict(attributes)
+        self.found |= {self._tag.get("src"), self._tag.get("href") if tag == "link" else None} - {None}
+
+    def handle_data(self, text):
+        if self._tag.get("type") == "importmap":
+            self.found |= {address for address in json.loads(text)["imports"].values() if not address.endswith("/")}
+        self._tag = {}
+
+
+def test_all_that_the_real_page_asks_for_is_there(service):
+    """From the page's address on, along the imports of its modules."""
+    here = service.url + "/preview/" + "0" * 32
+    page = service.http.get(here).text
+    named = {address for address in Addresses(page).found if not address.startswith("data:")}
+    waiting, seen = {urljoin(here, address) for address in named}, set()
+    assert len(waiting) >= 3
+    while waiting - seen:
+        address = (waiting - seen).pop()
+        seen.add(address)
+        assert address.startswith(f"{service.url}/preview/"), address
+        if "/vendor/" in address and not VENDOR.exists():
+            continue
+        answer = service.http.get(address)
+        assert answer.status_code == 200, address
+        if address.endswith(".js") and "/vendor/" not in address:
+            code = re.sub(r"/\*.*?\*/", "", answer.text, flags=re.DOTALL)  # where types are imported
+            named = re.findall(r'(?:\bfrom|\bimport|\bimport\(|new URL\() ?"(\.[^"]+)"', code)
+            waiting |= {urljoin(address, name) for name in named}
+
+
+DRAW = """async () => {
+  const THREE = await import("three");
+  const { PackedSplats, SparkRenderer, SplatMesh, utils } = await import("@sparkjsdev/spark");
+  const renderer = new THREE.WebGLRenderer();
+  renderer.setSize(64, 64);
+  const scene = new THREE.Scene();
+  const camera = new THREE.PerspectiveCamera(60, 1, 0.1, 100);
+  camera.position.z = 3;
+  const packedArray = new Uint32Array(utils.computeMaxSplats(1) * 4);
+  utils.setPackedSplat(packedArray, 0, 0, 0, 0, 0.5, 0.5, 0.5, 0, 0, 0, 1, 1, 1, 0, 0);
+  const packedSplats = new PackedSplats({ packedArray, numSplats: 1 });
+  scene.add(new SparkRenderer({ renderer }), new SplatMesh({ packedSplats }));
+  const gl = renderer.getContext();
+  const pixel = new Uint8Array(4);
+  for (const end = Date.now() + 20_000; Date.now() < end && pixel[0] < 200; ) {
+    await new Promise(requestAnimationFrame);
+    renderer.render(scene, camera);
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
+    gl.readPixels(32, 32, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
+  }
+  return [...pixel];
+}"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
+@pytest.mark.skipif(not VENDOR.exists(), reason="scripts/vendor has not run")
+def test_spark_draws_under_the_policy(service):
+    """A splat appears only once Spark has sorted: in WebAssembly, in a worker made from a blob."""
+    playwright = pytest.importorskip("playwright.sync_api")
+    software = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--no-sandbox"]
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=software)
+        page = browser.new_page()
+        refused, elsewhere = [], []
+        page.on("console", lambda text: refused.append(text.text) if "Content Security" in text.text else None)
+        page.on("request", lambda asked: elsewhere.append(asked.url))
+        page.goto(f"{service.url}/preview/")
+        red, *others = page.evaluate(DRAW)
+        assert red > 200
+        assert others == [0, 0, 255]
+        with pytest.raises(playwright.Error, match=r"(?i)content security policy|unsafe-eval"):
+            page.evaluate("new Promise((_, no) => setTimeout(() => { try { eval('1') } catch (e) { no(e) } }))")
+        browser.close()
+    assert refused == []
+    assert [url for url in elsewhere if not url.startswith((service.url, "blob:"))] == []

@@ -1,0 +1,411 @@
+"""The preview of a job in a real Chromium; oracle: what Python reads out of the same container."""
+
+import hashlib
+import io
+import zipfile
+
+import numpy as np
+import pytest
+from PIL import Image
+from preview_browser import colours, looks_like
+from serving import SLOW, scene_bytes
+
+import kissgs
+from kissgs.splats import SH_C0
+
+GAUSSIANS = 1500
+KEYS = ":".join(("alice", hashlib.sha256(b"secret").hexdigest()))
+
+
+@pytest.fixture(scope="module")
+def job(service):
+    return service.ended(service.submit(scene_bytes(GAUSSIANS, 3)))
+
+
+@pytest.fixture(scope="module")
+def container(service, job):
+    return service.http.get(job["links"]["result"]).content
+
+
+@pytest.fixture(scope="module")
+def decoded(container):
+    return kissgs.decompress(container)
+
+
+def test_from_the_upload_to_the_picture(preview, service):
+    tab = preview()
+    page = tab.page
+    tab.origin = service.url
+    page.goto(service.url)
+    page.locator("#drop").wait_for()
+    upload = {"name": "knot.ply", "mimeType": "application/octet-stream", "buffer": scene_bytes(GAUSSIANS, 1)}
+    page.set_input_files("#file", upload)
+    page.get_by_label("Fast").check()
+    page.get_by_role("button", name="Compress").click()
+    page.get_by_role("link", name="Preview").click()
+    page.locator("#picture").wait_for()
+    job = service.http.get("/v1/jobs", params={"limit": 1}).json()["jobs"][0]
+    count = len(kissgs.decompress(service.http.get(job["links"]["result"]).content))
+    picture = tab.shown(count)
+    assert page.get_by_role("heading", name="knot").is_visible()
+    assert page.title() == "knot · kissgs"
+    assert colours(picture) > 5000
+    assert (picture.max(axis=2) > 40).mean() > 0.3
+    assert page.locator("#live").inner_text() == f"knot: {count:,} Gaussians."
+    facts = page.locator("#statistics .facts").inner_text()
+    assert f"{job['sizes']['container']:,}" in facts
+    assert f"{job['sizes']['ratio']:.3g}×" in facts
+    sizes = [in_bytes(text) for text in page.locator(".bytes tbody td:nth-child(3)").all_inner_texts()]
+    assert sum(sizes) == pytest.approx(job["sizes"]["container"], rel=0.002)
+    shares = [float(text.strip("<% ")) for text in page.locator(".bytes tbody td:nth-child(4)").all_inner_texts()]
+    assert sum(shares) == pytest.approx(100, abs=0.6)
+    page.locator("#home").click()
+    page.get_by_text("smaller").first.wait_for()
+
+
+def in_bytes(text):
+    number, unit = text.split()
+    return float(number.replace(",", "")) * {"byte": 1, "bytes": 1, "kB": 1e3, "MB": 1e6}[unit]
+
+
+def test_keys_and_mouse_move_the_camera(preview, service, job, decoded):
+    tab = preview().open(service, job["id"])
+    page, press = tab.page, tab.page.keyboard.press
+    home = tab.shown(len(decoded))
+    page.locator("#picture").focus()
+    still = tab.picture()
+    frames = page.evaluate("books().frames")
+    page.wait_for_timeout(700)
+    assert page.evaluate("books().frames") == frames  # nothing moves, so nothing is drawn
+    assert (tab.pixels() == still).all()
+    for key in ("ArrowLeft", "a"):
+        press(key)
+        moved = tab.picture()
+        assert looks_like(moved, still) < 40, key
+        press("Home")
+        assert looks_like(tab.picture(), still) > 60, key
+    for key, least, most in (("+", 1.3, 3), ("-", 0.3, 0.8)):
+        for _ in range(8):
+            press(key)
+        assert least < red(tab.picture()) / red(still) < most, key
+        press("r")
+    assert looks_like(tab.picture(), still) > 60
+    middle = page.locator("#picture").bounding_box()
+    at = (middle["x"] + middle["width"] / 2, middle["y"] + middle["height"] / 2)
+    page.mouse.move(*at)
+    page.mouse.wheel(0, -300)
+    assert looks_like(tab.picture(), still) < 35
+    page.locator("#reset").click()
+    page.mouse.move(*at)
+    page.mouse.down()
+    page.mouse.move(at[0] + 60, at[1], steps=3)
+    page.mouse.up()
+    assert looks_like(tab.picture(), home) < 35
+
+
+def red(picture):
+    """Pixels of the ball."""
+    return ((picture[..., 0] > 120) & (picture[..., 1] < 80) & (picture[..., 2] < 80)).sum()
+
+
+def test_panels_can_be_hidden_and_keys_are_listed(preview, service, job, decoded):
+    tab = preview().open(service, job["id"])
+    page = tab.page
+    narrow = tab.shown(len(decoded))
+    page.locator("#picture").focus()
+    page.keyboard.press("h")
+    assert not page.locator("#panel").is_visible()
+    assert page.locator("#panels").get_attribute("aria-pressed") == "true"
+    wide = tab.picture()
+    assert wide.shape == (400, 820, 3) > narrow.shape
+    assert colours(wide) > 5000
+    page.locator("#panels").click()
+    assert page.locator("#panel").is_visible()
+    page.locator("#picture").focus()
+    page.keyboard.press("?")
+    assert page.get_by_role("dialog").get_by_text("Reset the view").is_visible()
+    page.keyboard.press("Escape")
+    assert not page.get_by_role("dialog").is_visible()
+    page.locator("#background").click()
+    assert tab.page.locator("#background").get_attribute("aria-pressed") == "true"
+    before, after = ((picture[:-80].max(axis=2) < 40).sum() for picture in (narrow, tab.picture()))
+    assert after < before / 2
+
+
+def test_comparing_with_the_original(preview, service, job, decoded):
+    tab = preview().open(service, job["id"])
+    page = tab.page
+    before = tab.shown(len(decoded))
+    page.get_by_role("button", name="Compare with original").click()
+    handle = page.get_by_role("slider", name="original")
+    handle.wait_for()
+    page.locator("#loading").wait_for(state="hidden")
+    assert page.locator(".original-side", has_text="original").is_visible()
+    assert page.locator(".compressed-side", has_text="compressed").is_visible()
+
+    def share():
+        return int(handle.get_attribute("aria-valuenow"))
+
+    assert share() == 50
+    handle.focus()
+    for key, place in (("ArrowRight", 52), ("ArrowDown", 50), ("PageUp", 60), ("PageDown", 50), ("Home", 0)):
+        page.keyboard.press(key)
+        assert share() == place
+    free = np.s_[60:-80, 60:-60]  # of the handle, of labels and of tools
+    compressed = tab.picture()
+    assert looks_like(compressed[free], before[free]) > 60
+    page.keyboard.press("End")
+    assert share() == 100
+    original = tab.picture()
+    between = looks_like(original[free], compressed[free])
+    assert 20 < between < 50
+    for turned in (original[free][:, ::-1], original[free][::-1]):
+        assert looks_like(turned, compressed[free]) < between - 5
+    box, stage = handle.bounding_box(), page.locator("#stage").bounding_box()
+    page.mouse.move(box["x"] + box["width"] / 2 - 5, stage["y"] + 200)
+    page.mouse.down()
+    page.mouse.move(stage["x"] + 0.25 * stage["width"], stage["y"] + 200, steps=3)
+    page.mouse.up()
+    assert share() == 25
+    both, width = tab.picture(), before.shape[1]
+    left, right = np.s_[60:-80, 20 : int(0.25 * width) - 30], np.s_[60:-80, int(0.25 * width) + 30 : -20]
+    assert looks_like(both[left], original[left]) > 60
+    assert looks_like(both[right], compressed[right]) > 60
+    page.locator("#picture").focus()
+    page.keyboard.press("ArrowLeft")  # both turn
+    turned = tab.picture()
+    assert looks_like(turned[left], both[left]) < 45
+    assert looks_like(turned[right], both[right]) < 45
+    page.get_by_role("button", name="End comparison").click()
+    assert page.get_by_role("slider").count() == 0
+    assert page.get_by_role("button", name="Compare with original").is_visible()
+
+
+ORANGE = (255, 176, 32)
+
+
+def marked(picture, before):
+    """Where the marker is, and how far it reaches."""
+    orange = np.abs(picture - ORANGE).max(axis=2) < 60
+    rows, columns = np.nonzero(orange & (np.abs(picture - before).max(axis=2) > 30))
+    assert len(columns) > 20
+    return np.median(columns), np.median(rows), max(columns.std(), rows.std())
+
+
+def numbers(text):
+    return [float(part) for part in text.replace("−", "-").replace(",", "").split()]
+
+
+def test_pointing_at_a_plane(preview, service, job, container, decoded):
+    tab = preview(viewport={"width": 820, "height": 760}).open(service, job["id"])
+    page = tab.page
+    before = tab.shown(len(decoded))
+    archive = zipfile.ZipFile(io.BytesIO(container))
+    planes = {name: np.asarray(Image.open(archive.open(name))) for name in archive.namelist() if name.endswith("webp")}
+    mask = planes["active_mask.webp"]
+    side = len(mask)
+    cells = np.flatnonzero(mask.reshape(side * side, -1)[:, 0])
+    page.get_by_role("button", name="Sizes").click()
+    canvas = page.locator(".plane canvas")
+
+    def point_at(cell):
+        box = canvas.bounding_box()
+        size = box["width"] / side
+        canvas.hover(position={"x": (cell % side + 0.5) * size, "y": (cell // side + 0.5) * size})
+        return page.locator(".readout")
+
+    central = np.flatnonzero((np.linalg.norm(decoded.means, axis=1) < 2.5) & (decoded.opacities > 2))
+    leftmost, rightmost, lowest = (
+        central[at(decoded.means[central, axis])] for axis, at in ((0, np.argmin), (0, np.argmax), (1, np.argmax))
+    )
+    places = {}
+    for index in (leftmost, rightmost, lowest):
+        readout = point_at(cells[index])
+        column, row = cells[index] % side, cells[index] // side
+        readout.get_by_text(f"Column {column}, row {row}: Gaussian {index:,}").wait_for()
+        shown = dict(zip(readout.locator("dt").all_inner_texts(), readout.locator("dd").all_inner_texts(), strict=True))
+        assert numbers(shown["Position"]) == pytest.approx(decoded.means[index], rel=6e-3, abs=1e-9)
+        assert numbers(shown["Deviations"]) == pytest.approx(np.exp(decoded.scales[index]), rel=6e-3)
+        quat = decoded.quats[index] / np.linalg.norm(decoded.quats[index])
+        assert numbers(shown["Quaternion"]) == pytest.approx(quat, abs=6e-4)
+        assert numbers(shown["Colour"]) == pytest.approx(255 * (0.5 + SH_C0 * decoded.sh0[index]), abs=0.51)
+        opacity = 100 / (1 + np.exp(-decoded.opacities[index]))
+        assert float(shown["Opacity"].strip("%")) == pytest.approx(opacity, abs=0.06)
+        label = planes["f_rest_labels.webp"][row, column]
+        book = len(planes["f_rest_centroids.webp"]) // 3
+        assert numbers(shown["SH entry"]) == [label[0] + book * label[1]]
+        assert numbers(shown["Levels RGBA"]) == [*planes["scales.webp"][row, column], 255]
+        places[index] = marked(tab.picture(), before)
+        assert places[index][2] < 40
+    assert places[leftmost][0] < places[rightmost][0] - 50
+    assert places[lowest][1] > min(places[leftmost][1], places[rightmost][1])
+    padding = np.flatnonzero(mask.reshape(side * side, -1)[:, 0] == 0)[-1]
+    assert "padding" in point_at(padding).inner_text()
+    assert looks_like(tab.picture(), before) > 60
+    canvas.press("ArrowLeft")
+    assert f"Column {padding % side - 1}" in page.locator(".readout").inner_text()
+    page.get_by_role("button", name="SH codebook").click()
+    assert "Enlarge" in page.locator(".plane").inner_text()
+    page.locator(".plane canvas").hover(position={"x": 2, "y": 2})
+    assert "Entry 0, coefficient 1" in page.locator(".readout").inner_text()
+
+
+def flipped(body):
+    return body[: len(body) // 2] + bytes([body[len(body) // 2] ^ 0x55]) + body[len(body) // 2 + 1 :]
+
+
+@pytest.mark.parametrize(
+    ("file", "damage"),
+    [
+        ("f_dc.webp", flipped),
+        ("scales.webp", lambda body: body[: len(body) // 2]),
+        ("means_bytes_0.webp", lambda body: b""),
+        ("quaternions.webp", flipped),
+        ("active_mask.webp", lambda body: b"RIFF" + body[5:]),
+        ("f_rest_centroids.webp", None),
+        ("meta.json", lambda body: body[:-40]),
+        ("meta.json", None),
+    ],
+)
+def test_a_damaged_file_is_named(preview, service, job, file, damage):
+    tab = preview()
+
+    def meddle(route):
+        answer = route.fetch()
+        status, body = (200, damage(answer.body())) if damage else (404, b"{}")
+        route.fulfill(status=status, body=body)
+
+    tab.page.route(f"**/files/{file}", meddle)
+    tab.open(service, job["id"])
+    tab.trouble(file, *(() if damage else ("404",)))
+    tab.page.locator("#loading").wait_for(state="hidden")
+    assert tab.page.locator("#picture:visible, #empty:visible").count() == 1
+    if damage is None:
+        tab.forgive("^404 ", "Failed to load resource.*404")
+    tab.page.get_by_role("button", name="Dismiss").click()
+    assert not tab.page.locator("#trouble").is_visible()
+
+
+def test_the_picture_is_drawn_without_what_is_damaged(preview, service, job, decoded):
+    tab = preview(viewport={"width": 820, "height": 760})
+
+    def opened(damaged=None):
+        tab.page.unroute_all()
+        if damaged:
+            tab.page.route(f"**/files/{damaged}.webp", lambda route: route.fulfill(body=flipped(route.fetch().body())))
+        tab.open(service, job["id"])
+        if damaged:
+            tab.trouble(f"{damaged}.webp")
+            tab.fact("Loaded in", "cut short")
+            assert tab.page.locator("#planes .thumb").count() == 8
+            tab.page.get_by_role("button", name="Dismiss").click()
+        return tab.shown(len(decoded))
+
+    def readout():
+        tab.page.locator(".plane canvas").hover(position={"x": 3, "y": 3})
+        return tab.page.locator(".readout").inner_text()
+
+    def bright(picture):
+        return (picture[:-80].max(axis=2) > 40).mean()
+
+    def of_colour(picture):
+        return (picture.max(axis=2) - picture.min(axis=2)).mean()
+
+    whole = opened()
+    assert "not known" not in readout()
+    grey = opened("f_dc")
+    assert readout().count("not known") == 1
+    assert bright(grey) > 0.6
+    assert of_colour(grey) < of_colour(whole) / 3
+    assert 0.1 < bright(opened("scales")) < 0.4
+    for file in ("opacities", "quaternions", "means_bytes_0"):
+        assert 22 < looks_like(opened(file), whole) < 40, file
+    base = [opened(file) for file in ("f_rest_labels", "f_rest_centroids")]
+    assert 30 < looks_like(base[0], whole) < 45
+    assert looks_like(*base) > 60
+
+
+@pytest.mark.parametrize("file", ["active_mask.webp", "means_bytes_1.webp"])
+def test_without_places_there_is_no_picture(preview, service, job, file):
+    tab = preview()
+    tab.page.route(f"**/files/{file}", lambda route: route.fulfill(body=flipped(route.fetch().body())))
+    tab.open(service, job["id"])
+    tab.trouble(file)
+    tab.page.locator("#empty").wait_for()
+    tab.page.wait_for_timeout(300)
+    assert not tab.page.locator("#picture").is_visible()
+    assert tab.page.locator("#planes .thumb").count() == (0 if file.startswith("active") else 8)
+
+
+def test_no_such_job(preview, service):
+    tab = preview().open(service, "0" * 32)
+    tab.trouble("does not have this")
+    assert tab.page.locator("#empty").is_visible()
+    tab.forgive("^404 ", "Failed to load resource.*404")
+
+
+def test_jobs_without_a_result(start, preview):
+    service = start()
+    job = service.submit(scene_bytes(20_000, 3), SLOW)
+    service.running(job)
+    tab = preview().open(service, job["id"])
+    assert "running" in tab.trouble("no container")
+    service.http.post(job["links"]["cancel"])
+    service.ended(job)
+    tab.open(service, job["id"])
+    assert "cancelled" in tab.trouble("no container")
+
+
+def test_with_keys(start, preview):
+    service = start(KISSGS_KEYS=f"{KEYS} bob:{hashlib.sha256(b'other').hexdigest()}")
+    service.http.headers["Authorization"] = "Bearer secret"
+    job = service.ended(service.submit())
+    tab = preview().open(service, job["id"])
+    tab.trouble("key", "enter it on its page")
+    tab.forgive("^401 ", "Failed to load resource.*401")
+    page = tab.page
+    for key, works in (("other", False), ("secret", True)):
+        page.evaluate("key => sessionStorage.setItem('kissgs-key', key)", key)
+        page.reload()
+        if works:
+            tab.shown(len(kissgs.decompress(service.http.get(job["links"]["result"]).content)))
+            page.get_by_role("button", name="Compare").click()
+            page.get_by_role("slider").wait_for()
+            page.locator("#loading").wait_for(state="hidden")
+        else:
+            tab.trouble("does not have this")
+            tab.forgive("^404 ", "Failed to load resource.*404")
+    assert not any("secret" in url for _, url in tab.requests)
+
+
+def test_one_finger_orbits(preview, service, job, decoded):
+    tab = preview(viewport={"width": 390, "height": 780}, has_touch=True, is_mobile=True).open(service, job["id"])
+    before = tab.shown(len(decoded))
+    assert tab.page.evaluate("document.documentElement.scrollWidth") <= 390
+    box = tab.page.locator("#picture").bounding_box()
+    x, y = box["x"] + 150, box["y"] + box["height"] / 2
+    finger = tab.context.new_cdp_session(tab.page)
+    for kind, points in (
+        ("touchStart", [(x, y)]),
+        *(("touchMove", [(x + 15 * step, y)]) for step in range(1, 6)),
+        ("touchEnd", []),
+    ):
+        touches = [{"x": left, "y": top} for left, top in points]
+        finger.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": touches})
+    assert looks_like(tab.picture(), before) < 30
+    assert tab.page.evaluate("scrollY") == 0
+    tab.page.locator("#reset").tap()
+    assert looks_like(tab.picture()[:-80], before[:-80]) > 60
+
+
+def test_without_the_viewer(preview, service, job, decoded):
+    tab = preview()
+    tab.page.route("**/vendor/**", lambda route: route.fulfill(status=404, body="none"))
+    tab.open(service, job["id"])
+    tab.trouble("not installed", "scripts/vendor")
+    tab.fact("Gaussians", f"{len(decoded):,}")
+    tab.page.get_by_role("button", name="Opacity").click()
+    tab.page.locator(".plane canvas").hover(position={"x": 3, "y": 3})
+    assert "Column 0, row 0" in tab.page.locator(".readout").inner_text()
+    assert tab.page.locator("#trouble").is_visible()
+    tab.forgive("^404 .*vendor", "Failed to load resource.*404")

@@ -1,0 +1,343 @@
+"""Every way a request can be refused; oracle: the table of codes and what RFC 9457 and HTTP ask for."""
+
+import contextlib
+import gzip
+import io
+import json
+import socket
+import time
+import zipfile
+
+import httpx
+import pytest
+from serving import FAST, SLOW, SMALL, problem, said, scene_bytes
+
+from service.problems import KINDS
+
+
+def submit(service, data=SMALL, **arguments):
+    return service.http.post("/v1/jobs", content=data, **{"params": {"options": FAST}, **arguments})
+
+
+def bomb():
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("../../scene.ply", b"\0" * 5_000_000)
+    return file.getvalue()
+
+
+def header(count, properties="property float x\n", kind="binary_little_endian"):
+    return f"ply\nformat {kind} 1.0\nelement vertex {count}\n{properties}end_header\n".encode()
+
+
+FULL = SMALL[: SMALL.index(b"end_header\n") + 11]
+
+HOSTILE = {
+    "empty": b"",
+    "text": b"hello " * 1000,
+    "no end of header": b"ply\n" + b"comment x\n" * 100_000,
+    "one endless line": b"ply\ncomment " + b"x" * 1_000_000,
+    "zip bomb": bomb(),
+    "gzip": gzip.compress(SMALL),
+    "html": b"<!doctype html><p>sign in",
+    "git lfs": b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 3\n",
+    "point cloud": header(3, "property float x\nproperty float y\nproperty float z\n") + bytes(36),
+    "a list": FULL.replace(b"property float x\n", b"property list uchar int x\n") + bytes(99999),
+    "truncated": SMALL[:-1],
+    "header alone": FULL,
+    "count that lies": SMALL.replace(b"vertex 300\n", b"vertex 301\n"),
+    "count beyond belief": SMALL.replace(b"vertex 300\n", b"vertex 999999999999999999\n"),
+    "count no number": SMALL.replace(b"vertex 300\n", b"vertex 3e2\n"),
+    "negative count": SMALL.replace(b"vertex 300\n", b"vertex -1\n"),
+    "two vertex elements": FULL.replace(b"end_header", b"element vertex 3\nend_header") + bytes(99999),
+    "unknown type": SMALL.replace(b"property float x\n", b"property quux x\n"),
+    "nul bytes": b"ply\n" + bytes(70_000),
+    "carriage returns": b"ply\rformat ascii 1.0\relement vertex 0\rend_header\r",
+}
+
+
+@pytest.mark.parametrize("kind", HOSTILE)
+@pytest.mark.parametrize("form", [False, True])
+def test_hostile_scenes(service, kind, form):
+    if form:
+        answer = service.http.post("/v1/jobs", files={"file": ("x.ply", HOSTILE[kind])})
+    else:
+        answer = submit(service, HOSTILE[kind])
+    assert answer.status_code == 422, answer.text
+    found = problem(answer, 422, answer.json()["code"])
+    assert found["code"] in ("invalid-scene", "unsupported")
+    assert "the upload" in found["detail"]
+    assert ".part" not in found["detail"]
+    assert not found["retryable"]
+
+
+def test_what_only_the_body_shows_fails_the_job(service):
+    text = header(2, "".join(f"property float {n}\n" for n in NAMES), "ascii") + b"1 2 three\n" * 50
+    found = service.ended(submit(service, text).json())
+    assert (found["state"], found["problem"]["code"]) == ("failed", "invalid-scene")
+    assert "line" in found["problem"]["detail"]
+    assert "/" not in found["problem"]["detail"]
+    assert found["problem"]["type"] == "/v1/problems/invalid-scene"
+    answer = service.http.get(f"/v1/jobs/{found['id']}/result")
+    assert found["problem"]["detail"] in problem(answer, 409, "not-succeeded")["detail"]
+    direct = service.http.post("/v1/compress", content=text)
+    assert problem(direct, 422, "invalid-scene")["detail"] == found["problem"]["detail"]
+
+
+NAMES = [
+    "x",
+    "y",
+    "z",
+    *(f"f_dc_{i}" for i in range(3)),
+    "opacity",
+    *(f"scale_{i}" for i in range(3)),
+    *(f"rot_{i}" for i in range(4)),
+]
+
+
+def test_too_many_gaussians_are_refused_by_the_header(service):
+    """Long before the body has come, which here it never does."""
+    start = scene_bytes(1, 1).replace(b"vertex 1\n", b"vertex 20001\n")[:2000]
+    request = b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 3000000\r\n\r\n" + start
+    with service.raw(request) as connection:
+        answer = said(connection).decode()
+    assert answer.startswith("HTTP/1.1 422")
+    assert "20,001 Gaussians; this service takes 20,000" in answer
+    assert '"code":"unsupported"' in answer
+
+
+def test_a_scene_that_cannot_be_whole_is_refused_by_its_length(service):
+    request = b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n" % (len(SMALL) - 1)
+    with service.raw(request + FULL) as connection:
+        assert b"cut short" in said(connection)
+
+
+@pytest.mark.parametrize("chunked", [False, True])
+def test_too_large(service, chunked):
+    data = SMALL + bytes(5_000_000)
+    answer = submit(service, iter([data[:70_000], *([bytes(100_000)] * 50)]) if chunked else data)
+    assert "4,000,000 bytes" in problem(answer, 413, "too-large")["detail"]
+    assert list((service.folder / "incoming").iterdir()) == []
+
+
+def test_too_large_is_said_before_the_body_comes(service):
+    with service.raw(b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5000000\r\n\r\n") as connection:
+        assert said(connection).startswith(b"HTTP/1.1 413")
+
+
+UNUSABLE = [
+    *("", "{", "[]", "null", "7", "{" * 5000, '{"x": 1}', '{"preset": "tiny"}', '{"evaluate": "perhaps"}'),
+    *(f'{{"encode": {wrong}}}' for wrong in ('{"sh_ratio": -1}', '{"nothing": 1}', '{"seed": 1e400}', "null")),
+]
+
+
+@pytest.mark.parametrize("options", UNUSABLE)
+@pytest.mark.parametrize("form", [False, True])
+def test_options_that_cannot_be_used(service, options, form):
+    if form:
+        answer = service.http.post("/v1/jobs", files={"options": (None, options), "file": ("x.ply", SMALL)})
+    else:
+        answer = submit(service, params={"options": options})
+    found = problem(answer, 422, "invalid-request")
+    assert found["errors"][0]["field"]
+    assert found["errors"][0]["message"]
+
+
+@pytest.mark.parametrize(
+    "kind", ["text/plain", "application/json", "application/x-www-form-urlencoded", "image/png", "x"]
+)
+def test_types_that_are_not_read(service, kind):
+    found = problem(submit(service, headers={"Content-Type": kind}), 415, "media-type")
+    assert "curl -F" in found["detail"]
+
+
+def test_encodings_that_are_not_read(service):
+    problem(submit(service, gzip.compress(SMALL), headers={"Content-Encoding": "gzip"}), 415, "media-type")
+
+
+FORM = {"Content-Type": "multipart/form-data; boundary=b"}
+PART = b'--b\r\nContent-Disposition: form-data; name="%b"\r\n\r\n%b\r\n'
+OPTIONS = PART % (b"options", b"{}")
+
+FORMS = {
+    "no boundary": ("multipart/form-data", b"--b\r\n"),
+    "empty boundary": ("multipart/form-data; boundary=", b""),
+    "endless boundary": ("multipart/form-data; boundary=" + "b" * 300, b""),
+    "nothing": (FORM["Content-Type"], b""),
+    "no form": (FORM["Content-Type"], b"nothing of the kind"),
+    "no parts": (FORM["Content-Type"], b"--b--\r\n"),
+    "a part without a name": (FORM["Content-Type"], b"--b\r\n\r\nno name\r\n--b--\r\n"),
+    "another field": (FORM["Content-Type"], PART % (b"other", b"x") + b"--b--\r\n"),
+    "no scene": (FORM["Content-Type"], OPTIONS + b"--b--\r\n"),
+    "options twice": (FORM["Content-Type"], OPTIONS + OPTIONS + b"--b--\r\n"),
+    "endless header": (FORM["Content-Type"], b"--b\r\nX: " + b"x" * 20_000 + b"\r\n\r\n\r\n--b--\r\n"),
+    "endless options": (FORM["Content-Type"], PART % (b"options", b" " * 70_000)),
+    "scene twice": (FORM["Content-Type"], (PART % (b"file", SMALL)) * 2 + b"--b--\r\n"),
+    "breaks off within the scene": (FORM["Content-Type"], (PART % (b"file", SMALL))[:-2]),
+}
+
+
+@pytest.mark.parametrize("kind", FORMS)
+def test_forms_that_are_none(service, kind):
+    content_type, body = FORMS[kind]
+    answer = submit(service, body, headers={"Content-Type": content_type}, params={})
+    problem(answer, 422, "invalid-request")
+    assert list((service.folder / "incoming").iterdir()) == []
+
+
+def test_options_in_two_places(service):
+    answer = service.http.post(
+        "/v1/jobs", params={"options": "{}"}, files={"options": (None, "{}"), "file": ("x.ply", SMALL)}
+    )
+    problem(answer, 422, "invalid-request")
+
+
+@pytest.mark.parametrize("key", ["x" * 256, "a b", "é"])
+def test_idempotency_keys_that_are_none(service, key):
+    answer = submit(service, headers={"Idempotency-Key": key.encode("latin-1")})
+    problem(answer, 422, "invalid-request")
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status", "code"),
+    [
+        ("GET", "/v1/jobs/" + "0" * 32, 404, "not-found"),
+        ("GET", "/v1/jobs/nope", 404, "not-found"),
+        ("GET", "/v1/jobs/" + "0" * 32 + "/result", 404, "not-found"),
+        ("POST", "/v1/jobs/" + "0" * 32 + "/cancel", 404, "not-found"),
+        ("DELETE", "/v1/jobs/" + "0" * 32, 404, "not-found"),
+        ("GET", "/v1/jobs/../../etc/passwd", 404, "not-found"),
+        ("GET", "/static/..%2f..%2fapp.py", 404, "not-found"),
+        ("GET", "/nothing", 404, "not-found"),
+        ("GET", "/v1/problems/nothing", 404, "not-found"),
+        ("PUT", "/v1/jobs", 405, "method-not-allowed"),
+        ("DELETE", "/v1/limits", 405, "method-not-allowed"),
+    ],
+)
+def test_what_is_not_there(service, method, path, status, code):
+    problem(service.http.request(method, path), status, code)
+
+
+def test_a_wait_that_is_too_long(service):
+    job = service.submit()
+    for wait in (31, -1, "nan", "soon"):
+        problem(service.http.get(f"/v1/jobs/{job['id']}", params={"wait": wait}), 422, "invalid-request")
+
+
+def test_every_code_is_explained(service):
+    listed = service.http.get("/v1/problems").json()
+    assert [kind["code"] for kind in listed] == list(KINDS)
+    for kind in listed:
+        assert service.http.get(f"/v1/problems/{kind['code']}").json() == kind
+
+
+def test_a_full_queue(start):
+    service = start(KISSGS_MAX_QUEUE=2)
+    job = service.submit(scene_bytes(20_000, 3), SLOW)
+    service.running(job)
+    for _ in range(2):
+        service.submit()
+    answer = submit(service)
+    assert problem(answer, 429, "queue-full")["retryable"]
+    assert 1 <= int(answer.headers["retry-after"]) <= 300
+    with service.raw(b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 500000\r\n\r\n") as connection:
+        assert said(connection).startswith(b"HTTP/1.1 429")  # before the body
+
+
+def test_a_full_queue_still_knows_what_it_has_taken(start):
+    service = start(KISSGS_MAX_QUEUE=1)
+    service.running(service.submit(scene_bytes(20_000, 3), SLOW))
+    first = service.submit(**{"Idempotency-Key": "k"})
+    assert service.submit(**{"Idempotency-Key": "k"})["id"] == first["id"]
+
+
+def test_too_many_uploads(start):
+    service = start(KISSGS_MAX_UPLOADS=1)
+    with service.raw(b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 500000\r\n\r\nply\n"):
+        wait_for(lambda: "kissgs_uploads_in_flight 1.0" in service.http.get("/metrics").text)
+        problem(submit(service), 429, "too-many-uploads")
+    wait_for(lambda: submit(service).status_code == 202)
+
+
+def test_no_room(start):
+    service = start(KISSGS_MAX_DISK_BYTES=2 * len(SMALL), KISSGS_KEEP_UPLOADS="true")
+    job = service.ended(service.submit())
+    assert "source" in job["links"]
+    second = service.ended(service.submit(scene_bytes(300, seed=1)))  # for which the first's upload is given up
+    assert second["state"] == "succeeded"
+    assert "source" not in service.status(job)["links"]
+    problem(service.http.get(f"/v1/jobs/{job['id']}/source"), 410, "gone")
+    assert service.http.get(job["links"]["result"]).status_code == 200
+    answer = submit(service, scene_bytes(700))
+    assert problem(answer, 507, "disk-full")["retryable"]
+    assert "retry-after" in answer.headers
+    assert list((service.folder / "incoming").iterdir()) == []
+
+
+def test_a_disk_that_must_keep_some_free(start):
+    service = start(KISSGS_MIN_FREE_BYTES="1000TB")
+    problem(submit(service), 507, "disk-full")
+    answer = service.http.get("/readyz")
+    assert (answer.status_code, answer.json()["ready"]) == (503, False)
+    assert "bytes are free" in answer.json()["checks"]["disk"]
+    assert service.http.get("/livez").status_code == 200
+
+
+def test_an_upload_that_stalls(start):
+    service = start(KISSGS_UPLOAD_IDLE_SECONDS=0.5)
+    with service.raw(b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 500000\r\n\r\nply\n") as connection:
+        answer = said(connection)
+        assert answer.startswith(b"HTTP/1.1 408")
+        assert b"upload-timeout" in answer
+    assert list((service.folder / "incoming").iterdir()) == []
+
+
+def test_an_upload_that_drips(start):
+    """A byte now and then keeps no slot of the service."""
+    service = start(KISSGS_UPLOAD_IDLE_SECONDS=1)
+    connection = service.raw(b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 500000\r\n\r\n")
+    connection.settimeout(0.2)
+    answer, begun = b"", time.monotonic()
+    for byte in SMALL:
+        with contextlib.suppress(TimeoutError, ConnectionError):
+            connection.send(bytes([byte]))
+            answer += connection.recv(65536)
+        if answer:
+            break
+    answer += said(connection)
+    connection.close()
+    assert b"upload-timeout" in answer
+    assert time.monotonic() - begun < 5
+
+
+def test_a_client_that_goes_away(service):
+    before = json.loads(service.http.get("/v1/jobs", params={"limit": 1}).text)
+    with service.raw(
+        b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 500000\r\n\r\n" + SMALL[:30_000]
+    ) as connection:
+        connection.shutdown(socket.SHUT_RDWR)
+    wait_for(lambda: not list((service.folder / "incoming").iterdir()))
+    assert json.loads(service.http.get("/v1/jobs", params={"limit": 1}).text) == before
+    metrics = service.http.get("/metrics").text
+    assert "kissgs_uploads_in_flight 0.0" in metrics
+
+
+def wait_for(condition, seconds=10):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def test_garbage_instead_of_http(service):
+    with service.raw(b"\x16\x03\x01\x02\x00\x01\x00 no HTTP at all\r\n\r\n") as connection:
+        answer = said(connection)
+        assert answer.startswith(b"HTTP/1.1 400")
+        assert b"application/problem+json" in answer
+        assert b'"code":"bad-http"' in answer
+    with (
+        service.raw(b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"x" * 200_000) as connection,
+        contextlib.suppress(ConnectionError),
+    ):
+        assert said(connection).startswith(b"HTTP/1.1 4")
+    assert httpx.get(f"{service.url}/livez").status_code == 200

@@ -1,0 +1,225 @@
+"""The client in Python and on the command line, against a real service; oracle: kissgs.compress here."""
+
+import hashlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from serving import SMALL, Service, scene_bytes
+
+import kissgs
+
+
+@pytest.fixture
+def scene(tmp_path):
+    path = tmp_path / "Schloß 1.ply"
+    path.write_bytes(SMALL)
+    return path
+
+
+FAST = kissgs.Settings(preset="fast")
+
+
+def test_compressing_there_gives_what_compressing_here_does(service, scene, tmp_path):
+    heard = []
+    with kissgs.Remote(service.url) as remote:
+        status = remote.compress(
+            scene, tmp_path / "there.zip", settings=FAST, progress=lambda *event: heard.append(event)
+        )
+    kissgs.compress(scene, tmp_path / "here.zip", settings=FAST)
+    assert (tmp_path / "there.zip").read_bytes() == (tmp_path / "here.zip").read_bytes()
+    assert (status["state"], status["name"], status["gaussians"]) == ("succeeded", "Schloß 1", 300)
+    stages = [stage for stage, _ in heard]
+    assert [stages.index(stage) for stage in ("upload", "queue", "read", "images", "download")] == sorted(
+        stages.index(stage) for stage in ("upload", "queue", "read", "images", "download")
+    )
+    assert all(0 <= fraction <= 1 for _, fraction in heard)
+    assert heard[-1] == ("download", 1.0)
+
+
+@pytest.mark.parametrize(
+    ("data", "kind", "said"),
+    [
+        (b"hello", kissgs.InvalidSceneError, "not a PLY file"),
+        (SMALL[:-1], kissgs.InvalidSceneError, "cut short"),
+        (scene_bytes(20_001, 0), kissgs.UnsupportedError, "20,001 Gaussians"),
+        (SMALL + bytes(5_000_000), kissgs.RemoteError, "4,000,000 bytes"),
+    ],
+)
+def test_what_the_service_refuses_is_raised_here(service, tmp_path, data, kind, said):
+    path = tmp_path / "x.ply"
+    path.write_bytes(data)
+    with kissgs.Remote(service.url) as remote, pytest.raises(kind, match=said):
+        remote.compress(path, tmp_path / "x.zip")
+    assert not (tmp_path / "x.zip").exists()
+
+
+def test_what_goes_wrong_here_is_told(service, scene, tmp_path):
+    with kissgs.Remote(service.url) as remote:
+        with pytest.raises(kissgs.InvalidSceneError, match="no such file"):
+            remote.compress(tmp_path / "nothing.ply", tmp_path / "x.zip")
+        (tmp_path / "x.zip").write_text("mine")
+        with pytest.raises(kissgs.OutputError, match="exists already"):
+            remote.compress(scene, tmp_path / "x.zip", settings=FAST)
+        assert (tmp_path / "x.zip").read_text() == "mine"
+        with pytest.raises(kissgs.RemoteError, match="no job"):
+            remote.status("0" * 32)
+    for address in ("localhost:8000", "ftp://x", "http://[x"):
+        with pytest.raises(kissgs.UnsupportedError, match="address"):
+            kissgs.Remote(address)
+
+
+def test_a_service_that_is_not_there(scene, tmp_path, monkeypatch):
+    from kissgs import remote
+
+    monkeypatch.setattr(remote, "PATIENCE_SECONDS", 1.0)
+    with socket.socket() as nobody:
+        nobody.bind(("127.0.0.1", 0))
+        url = f"http://127.0.0.1:{nobody.getsockname()[1]}"
+        with kissgs.Remote(url) as client, pytest.raises(kissgs.RemoteError, match="cannot reach"):
+            client.compress(scene, tmp_path / "x.zip")
+
+
+def test_stopping_here_stops_it_there(start, tmp_path):
+    service = start()
+    scene = tmp_path / "scene.ply"
+    scene.write_bytes(scene_bytes(20_000, 3))
+
+    def stop(stage, fraction):
+        if stage == "order":
+            raise kissgs.Cancelled("enough")
+
+    with kissgs.Remote(service.url) as remote, pytest.raises(kissgs.Cancelled):
+        remote.compress(scene, tmp_path / "x.zip", settings=kissgs.Settings(preset="paper"), progress=stop)
+    (job,) = service.http.get("/v1/jobs").json()["jobs"]
+    assert job["state"] == "cancelled"
+    assert service.children() == []
+
+
+def test_a_job_that_is_cancelled_there(start, tmp_path):
+    service = start()
+    scene = tmp_path / "scene.ply"
+    scene.write_bytes(scene_bytes(20_000, 3))
+
+    def cancel(stage, fraction):
+        if stage == "order":
+            (job,) = service.http.get("/v1/jobs").json()["jobs"]
+            service.http.post(f"/v1/jobs/{job['id']}/cancel")
+
+    with kissgs.Remote(service.url) as remote, pytest.raises(kissgs.RemoteError, match="cancelled"):
+        remote.compress(scene, tmp_path / "x.zip", settings=kissgs.Settings(preset="paper"), progress=cancel)
+
+
+def test_the_service_restarts_meanwhile(tmp_path):
+    """Killed while the job runs, back at the same address a moment later: the client notices nothing."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    scene = tmp_path / "scene.ply"
+    scene.write_bytes(scene_bytes(6_000, 2))
+    with Service(tmp_path / "data", KISSGS_PORT=port) as service:
+
+        def run():
+            with kissgs.Remote(service.url) as remote:
+                remote.compress(scene, tmp_path / "x.zip", settings=FAST)
+
+        with ThreadPoolExecutor() as pool:
+            client = pool.submit(run)
+            while not service.children():
+                time.sleep(0.02)
+            service.kill(signal.SIGKILL)
+            time.sleep(0.5)
+            service.restart()
+            client.result(60)
+    assert (tmp_path / "x.zip").read_bytes() == kissgs.compress(scene, settings=FAST).to_zip()
+
+
+def test_a_crowded_service_is_asked_again(start, scene, tmp_path):
+    service = start(KISSGS_MAX_QUEUE=1)
+
+    def run(i):
+        with kissgs.Remote(service.url) as remote:
+            remote.compress(scene, tmp_path / f"{i}.zip", settings=FAST)
+
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(run, range(5)))
+    assert len({(tmp_path / f"{i}.zip").read_bytes() for i in range(5)}) == 1
+
+
+def test_a_container_that_is_damaged_on_its_way(service, scene, tmp_path, monkeypatch):
+    import httpx
+
+    real = httpx.Response.iter_bytes
+
+    def damaged(self, *arguments):
+        for block in real(self, *arguments):
+            yield block[:-1] + bytes([block[-1] ^ 1])
+
+    with kissgs.Remote(service.url) as remote:
+        status = remote.follow(remote.submit(scene, settings=FAST)["id"])
+        monkeypatch.setattr(httpx.Response, "iter_bytes", damaged)
+        with pytest.raises(kissgs.RemoteError, match="damaged"):
+            remote.download(status, tmp_path / "x.zip")
+    assert list(tmp_path.glob("*zip*")) == []
+
+
+def kissgs_command(*arguments, **settings):
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("KISSGS_")}
+    return subprocess.run(
+        [sys.executable, "-P", "-c", "from kissgs.cli import main; main()", "remote", *map(str, arguments)],
+        env={**environment, **settings}, capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+
+
+def test_the_command(service, scene, tmp_path):
+    done = kissgs_command("compress", scene, "--server", service.url, "-p", "fast", "--set", "seed=3")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "times smaller" in done.stdout
+    expected = kissgs.compress(scene, settings=kissgs.Settings.from_preset("fast", seed=3)).to_zip()
+    assert (tmp_path / "Schloß 1.zip").read_bytes() == expected
+    again = kissgs_command("compress", scene, "-p", "fast", KISSGS_SERVER=service.url)
+    assert (again.returncode, "exists already" in again.stderr) == (2, True)
+    as_json = kissgs_command("compress", scene, "-p", "fast", "--json", "-f", KISSGS_SERVER=service.url)
+    assert json.loads(as_json.stdout)["state"] == "succeeded"
+
+
+def test_the_command_with_keys(start, scene):
+    service = start(KISSGS_KEYS=f"alice:{hashlib.sha256(b'secret').hexdigest()}")
+    without = kissgs_command("compress", scene, "--server", service.url)
+    assert (without.returncode, "needs a key" in without.stderr) == (2, True)
+    assert kissgs_command("compress", scene, "--server", service.url, KISSGS_KEY="secret").returncode == 0
+
+
+@pytest.mark.parametrize("wrong", [["--server", "nonsense"], ["-p", "tiny"], ["--set", "x=1"], ["-o", "-"]])
+def test_wrong_commands(scene, wrong):
+    done = kissgs_command("compress", scene, *wrong)
+    assert done.returncode == 2
+    assert done.stderr.startswith("kissgs: ")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_interrupting_the_command_cancels_the_job(start, tmp_path):
+    service = start()
+    scene = tmp_path / "scene.ply"
+    scene.write_bytes(scene_bytes(20_000, 3))
+    program = "from kissgs.cli import main; main()"
+    running = subprocess.Popen(
+        [sys.executable, "-P", "-c", program, "remote", "compress", scene, "-p", "paper", "--server", service.url],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    while not service.children():
+        time.sleep(0.05)
+    running.send_signal(signal.SIGINT)
+    assert running.wait(20) == 130
+    assert "interrupted" in running.stderr.read()
+    running.stderr.close()
+    (job,) = service.http.get("/v1/jobs").json()["jobs"]
+    assert job["state"] == "cancelled"
+    assert list(tmp_path.glob("*.zip")) == []

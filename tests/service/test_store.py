@@ -1,0 +1,169 @@
+"""The job store on SQLite and on PostgreSQL; oracle: a table of which state may follow which."""
+
+import contextlib
+import itertools
+import uuid
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from service.models import ENDED, Job, State
+from service.store import Refused, Store
+
+ALLOWED = {
+    *itertools.product([State.QUEUED], [State.RUNNING, State.FAILED, State.CANCELLED]),
+    *itertools.product([State.RUNNING], [State.QUEUED, State.SUCCEEDED, State.FAILED, State.CANCELLED]),
+    *itertools.product(ENDED, [State.EXPIRED]),
+}
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def url(request, tmp_path):
+    if request.param == "sqlite":
+        yield f"sqlite:///{tmp_path / 'jobs.sqlite'}"
+        return
+    yield request.getfixturevalue("postgresql")
+
+
+@pytest.fixture
+def store(url):
+    ticks = itertools.count(1000)
+    opened = Store(url, lambda: float(next(ticks)))
+    yield opened
+    opened.close()
+
+
+def job(owner="", **values):
+    fixed = {
+        "name": "scene",
+        "options": {"preset": "fast"},
+        "preset": "fast",
+        "evaluate": False,
+        "gaussians": 20_000,
+        "sh_degree": 1,
+        "upload_bytes": 5_000_000_000,
+        "upload_sha256": "0" * 64,
+        "fingerprint": "f",
+        "disk_bytes": 3_000_000_000,
+    }
+    return Job(id=uuid.uuid4().hex, owner=owner, **{**fixed, **values})
+
+
+def add(store, owner="", **values):
+    return store.add(job(owner, **values), max_queue=10, max_owner=3)
+
+
+def bring(store, number, state):
+    """A queued job into a state, by the shortest way."""
+    ways = {
+        State.QUEUED: [], State.RUNNING: [State.RUNNING], State.SUCCEEDED: [State.RUNNING, State.SUCCEEDED],
+        State.FAILED: [State.FAILED], State.CANCELLED: [State.CANCELLED], State.EXPIRED: [State.FAILED, State.EXPIRED],
+    }  # fmt: skip
+    for step in ways[state]:
+        assert store.move(number, step)
+
+
+@pytest.mark.parametrize(("before", "after"), list(itertools.product(State, State)))
+def test_states_follow_each_other_as_they_may(store, before, after):
+    number = add(store).number
+    bring(store, number, before)
+    events = len(store.events(number))
+    assert store.move(number, after) == ((before, after) in ALLOWED)
+    assert len(store.events(number)) == events + ((before, after) in ALLOWED)
+
+
+def test_jobs_are_claimed_once_and_in_order(store):
+    ids = [add(store).id for _ in range(8)]
+    claimed = [found.id if found else None for found in together(*[(store.claim,)] * 16)]
+    assert sorted(filter(None, claimed)) == sorted(ids)
+    assert claimed.count(None) == 8
+    again = [add(store).id for _ in range(3)]
+    assert [store.claim().id for _ in range(3)] == again
+    assert store.claim() is None
+
+
+def together(*calls):
+    """The results of calls made at the same time."""
+    with ThreadPoolExecutor(len(calls)) as pool:
+        return [future.result() for future in [pool.submit(*call) for call in calls]]
+
+
+def test_a_cancellation_and_a_result_cannot_both_win(store):
+    for _ in range(10):
+        number = add(store).number
+        store.claim()
+        won = together((store.move, number, State.SUCCEEDED), (store.move, number, State.CANCELLED))
+        assert sorted(won) == [False, True]
+
+
+def test_events_count_up_without_gaps_from_many_threads(store):
+    number = add(store).number
+    store.claim()
+    together(*[(store.progress, number, "order", 0.5)] * 20)
+    found = store.events(number)
+    assert [event.seq for event in found] == list(range(1, 23))
+    assert [event.seq for event in store.events(number, after=20)] == [21, 22]
+
+
+def test_limits(store):
+    for _ in range(3):
+        add(store, "alice")
+    with pytest.raises(Refused, match="owner"):
+        add(store, "alice")
+    for _ in range(7):
+        add(store)
+    with pytest.raises(Refused, match="queue"):
+        add(store)
+
+
+def test_idempotency_keys_are_an_owners(store):
+    first = add(store, "alice", idempotency_key="k")
+    add(store, "bob", idempotency_key="k")
+    with pytest.raises(Refused, match="key"):
+        add(store, "alice", idempotency_key="k")
+    add(store, "alice")
+    assert store.by_idempotency_key("alice", "k").id == first.id
+    assert store.by_idempotency_key("alice", "x") is None
+
+
+def test_sums_and_lists(store):
+    jobs = [add(store, owner) for owner in ("alice", "bob", "alice")]
+    assert store.disk_bytes() == 9_000_000_000
+    assert [found.id for found in store.listing("alice", limit=9)] == [jobs[2].id, jobs[0].id]
+    assert [found.id for found in store.listing("alice", limit=9, before=jobs[2].number)] == [jobs[0].id]
+    store.claim()
+    assert store.counts()[State.RUNNING] == 1
+    assert store.active_of("alice") == 2
+    assert store.get(jobs[0].id, "bob") is None
+    assert sorted(found.state for found in store.active()) == [State.QUEUED, State.QUEUED, State.RUNNING]
+    store.move(jobs[0].number, State.SUCCEEDED, expires_at=5.0, result={"a": 1})
+    assert len(store.rates("fast", False)) == 1
+    assert store.due(ENDED, 6.0) == [(jobs[0].number, jobs[0].id)]
+    assert (store.spare(), store.spare_bytes()) == ([], 0)
+    store.update(jobs[0].number, spare_bytes=2_000_000_000)
+    store.update(jobs[1].number, spare_bytes=5)  # of one that still waits, nothing can be spared
+    assert (store.spare(), store.spare_bytes()) == ([(jobs[0].number, jobs[0].id)], 2_000_000_000)
+    store.forget(jobs[0].number)
+    assert store.get(jobs[0].id) is None
+    assert store.events(jobs[0].number) == []
+
+
+def test_what_is_written_is_there_again(url):
+    first = Store(url, lambda: 5.0)
+    number = add(first, name="Schloß \u4e2d", options={"preset": "fast", "encode": {"seed": 2**31 - 1}}).number
+    first.keep_time()
+    first.close()
+    second = Store(url, lambda: 6.0)
+    (found,) = second.in_state(State.QUEUED)
+    assert (found.number, found.name, found.options["encode"]) == (number, "Schloß \u4e2d", {"seed": 2**31 - 1})
+    assert second.latest_time() == 5.0
+    assert found.upload_bytes == 5_000_000_000
+    second.close()
+
+
+def test_numbers_are_never_given_twice(store):
+    """They are cursors of lists that clients hold on to."""
+    first = add(store).number
+    store.forget(first)
+    with contextlib.suppress(Refused):
+        assert add(store).number > first

@@ -1,0 +1,62 @@
+/** Decodes containers as jobs say, and tells all that happened as JSON; the same in Node, in pages and in workers. */
+
+import { decode, expandSH } from "../../web_decoder/sogxt.js";
+
+const FIELDS = ["means", "quats", "scales", "opacities", "sh0", "labels", "centroids", "cells"];
+
+const toBase64 = (array) => {
+  const bytes = new Uint8Array(array.buffer, array.byteOffset, array.byteLength);
+  let text = "";
+  for (let i = 0; i < bytes.length; i += 8192) text += String.fromCharCode(...bytes.subarray(i, i + 8192));
+  return btoa(text);
+};
+
+/** What `decode` may be given: an address, or bytes in several shapes. */
+function sourceOf({ url, base64, as = "bytes" }) {
+  if (url) return as === "URL" ? new URL(url) : url;
+  const bytes = Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
+  const shifted = new Uint8Array(bytes.length + 7);
+  shifted.set(bytes, 3);
+  return { bytes, buffer: bytes.buffer, blob: new Blob([bytes]), within: shifted.subarray(3, 3 + bytes.length) }[as];
+}
+
+/** One decode; never rejects. */
+export async function perform({ source, options = {}, abort, snapshots, throwAt }) {
+  const said = { progress: [], order: [], snapshots: {} };
+  const stop = new AbortController();
+  if (abort === "before") stop.abort();
+  if (abort === "reason") stop.abort(new RangeError("enough"));
+  if (abort?.after) setTimeout(() => stop.abort(), abort.after);
+  const begun = performance.now();
+  try {
+    const scene = await decode(sourceOf(source), {
+      ...options,
+      ...(abort && { signal: stop.signal }),
+      onProgress: (progress) => said.progress.push(progress),
+      onPlane: (file, partial) => {
+        said.order.push(file);
+        if (snapshots?.includes(file)) {
+          said.snapshots[file] = Object.fromEntries(FIELDS.map((field) => [field, toBase64(partial[field])]));
+        }
+        if (abort?.at === file) stop.abort();
+        if (throwAt === file) throw new Error("thrown by the caller");
+      },
+    });
+    const { count, degree, gridSide, codebookSide, sizes, meta } = scene;
+    Object.assign(said, { count, degree, gridSide, codebookSide, sizes, meta });
+    said.types = Object.fromEntries(FIELDS.map((field) => [field, scene[field].constructor.name]));
+    said.arrays = Object.fromEntries(
+      [...FIELDS.map((f) => [f, scene[f]]), ["shN", expandSH(scene)]].map(([f, a]) => [f, toBase64(a)]),
+    );
+    said.planes = Object.fromEntries(
+      Object.entries(scene.planes).map(([file, { width, height, rgba }]) => [file, [width, height, toBase64(rgba)]]),
+    );
+  } catch (error) {
+    said.error = { name: error.name, message: error.message, stack: String(error.stack), cause: String(error.cause) };
+  }
+  said.ms = performance.now() - begun;
+  said.ended = said.order.length;
+  await new Promise((resolve) => setTimeout(resolve, abort ? 50 : 0));
+  said.later = said.order.length - said.ended;
+  return said;
+}

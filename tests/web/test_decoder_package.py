@@ -1,0 +1,146 @@
+"""The npm package of the decoder: types, size, contents; oracles: TypeScript's compiler, gzip, npm."""
+
+import gzip
+import json
+import re
+import shutil
+import subprocess
+
+import pytest
+from web_tools import DECODER, node, run_node
+
+import kissgs
+
+PARTS = ("webp.js", "sogxt.js", "zip.js")
+MOST_BYTES = 12_000
+
+AGREE = """
+import * as main from "./web_decoder/sogxt.js";
+import * as webp from "./web_decoder/webp.js";
+import type * as mainTypes from "./declared/types.js";
+import type * as webpTypes from "./declared/webp.js";
+
+// What is declared is what there is, and the other way round.
+const decode: typeof mainTypes.decode = main.decode;
+const declaredDecode: typeof main.decode = null! as typeof mainTypes.decode;
+const expandSH: typeof mainTypes.expandSH = main.expandSH;
+const declaredExpandSH: typeof main.expandSH = null! as typeof mainTypes.expandSH;
+const SogxtError: typeof mainTypes.SogxtError = main.SogxtError;
+const decodeWebP: typeof webpTypes.decodeWebP = webp.decodeWebP;
+const declaredDecodeWebP: typeof webp.decodeWebP = null! as typeof webpTypes.decodeWebP;
+const WebPError: typeof webpTypes.WebPError = webp.WebPError;
+const error: Error = new SogxtError("x");
+const notMore: never[] = [] as Exclude<keyof typeof main, keyof typeof mainTypes>[];
+const notLess: never[] = [] as Exclude<keyof typeof mainTypes, keyof typeof main>[];
+const notMoreWebP: never[] = [] as Exclude<keyof typeof webp, keyof typeof webpTypes>[];
+
+// As users write it.
+const scene = await decode(new URL("https://localhost/scene/"), {
+  signal: AbortSignal.timeout(1),
+  request: { headers: { Authorization: "x" } },
+  onPlane: (file, partial) => file.length + partial.means.length,
+  onProgress: ({ received, total }) => received / total,
+});
+const shN: Float32Array = expandSH(scene);
+const { width, rgba }: { width: number; rgba: Uint8Array } = decodeWebP(new Uint8Array(9), { maxPixels: 9 });
+// @ts-expect-error: no such option
+decode("x", { wrokers: 1 });
+// @ts-expect-error: a source of no kind
+decode(5);
+"""
+
+
+def compiler():
+    found = DECODER / "node_modules" / ".bin" / "tsc"
+    if not found.exists():
+        pytest.skip("TypeScript is not installed (npm ci in web_decoder)")
+    return [node(), str(found.resolve())]
+
+
+def compile_types(*arguments):
+    done = subprocess.run([*compiler(), *arguments], capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_types_of_the_code():
+    compile_types("--project", str(DECODER))
+
+
+def test_declarations_agree_with_the_code(tmp_path):
+    """Declarations lie apart from the code here, so that neither hides the other."""
+    (tmp_path / "web_decoder").mkdir()
+    (tmp_path / "declared").mkdir()
+    for path in DECODER.glob("*.js"):
+        shutil.copy(path, tmp_path / "web_decoder")
+    for name in ("types.d.ts", "webp.d.ts"):
+        shutil.copy(DECODER / name, tmp_path / "declared")
+    shutil.copy(DECODER / "types.d.ts", tmp_path / "web_decoder")  # the code imports types from it
+    (tmp_path / "use.ts").write_text(AGREE)
+    options = json.loads((DECODER / "tsconfig.json").read_text())["compilerOptions"]
+    (tmp_path / "tsconfig.json").write_text(json.dumps({"compilerOptions": options, "files": ["use.ts"]}))
+    compile_types("--project", str(tmp_path))
+
+
+def test_what_is_exported():
+    program = "import * as m from '%s'; console.log(JSON.stringify(Object.keys(m)))"
+    for name, wanted in (("sogxt.js", ["SogxtError", "decode", "expandSH"]), ("webp.js", ["WebPError", "decodeWebP"])):
+        said = subprocess.run(
+            [node(), "--input-type=module", "-e", program % (DECODER / name).as_uri()],
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=60,
+        ).stdout
+        assert json.loads(said) == wanted
+
+
+def test_size():
+    """Compressed as servers do, before any minifier."""
+    assert sum(len(gzip.compress((DECODER / name).read_bytes(), 9)) for name in PARTS) < MOST_BYTES
+
+
+def test_package():
+    """All that the code imports, and nothing else; the paths that are promised exist."""
+    npm = shutil.which("npm")
+    if npm is None:
+        pytest.skip("no npm on the PATH")
+    done = subprocess.run(
+        [npm, "pack", "--dry-run", "--json", "--offline", "--ignore-scripts"],
+        cwd=DECODER,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    found = {entry["path"] for entry in json.loads(done.stdout)[0]["files"]}
+    package = json.loads((DECODER / "package.json").read_text())
+    extras = found - {"package.json", "README.md", "LICENSE"}
+    assert extras == set(package["files"]) - {"README.md", "LICENSE"}
+    for name in extras:
+        for imported in re.findall(r'from "\./([\w.]+)"|new URL\("\./([\w.]+)"', (DECODER / name).read_text()):
+            target = next(filter(None, imported))
+            assert target in found or target.replace(".js", ".d.ts") in found
+    for entry in package["exports"].values():
+        for path in entry.values() if isinstance(entry, dict) else [entry]:
+            assert path.removeprefix("./") in found
+    assert package["sideEffects"] == ["./worker.js"]
+    assert not package.get("dependencies")
+
+
+def test_the_package_by_its_names(tmp_path):
+    """As installed: ``kissgs`` and ``kissgs/webp``; inner files are not to be had."""
+    package = tmp_path / "node_modules" / "kissgs"
+    package.mkdir(parents=True)
+    for name in [*json.loads((DECODER / "package.json").read_text())["files"], "package.json"]:
+        if (DECODER / name).exists():
+            shutil.copy(DECODER / name, package)
+    (tmp_path / "use.mjs").write_text(
+        'import { decode } from "kissgs";\nimport { decodeWebP } from "kissgs/webp";\n'
+        'const inner = await import("kissgs/zip.js").catch((error) => error.code);\n'
+        "console.log(typeof decode, typeof decodeWebP, inner);\n"
+    )
+    assert run_node(tmp_path / "use.mjs").split() == ["function", "function", "ERR_PACKAGE_PATH_NOT_EXPORTED"]
+
+
+def test_the_version_is_that_of_the_python_package():
+    assert json.loads((DECODER / "package.json").read_text())["version"] == kissgs.__version__

@@ -1,0 +1,211 @@
+"""Containers decoded by JavaScript in Node; oracles: Pillow for levels, kissgs' Python decoder for values."""
+
+import json
+import zipfile
+
+import numpy as np
+import pytest
+from web_scenes import (
+    IMAGES,
+    array_of,
+    assert_scene,
+    assert_told,
+    container,
+    in_node,
+    job,
+    scene_of,
+    ulps,
+    with_meta,
+    without_checksums,
+    zipped,
+)
+from web_tools import Site, pillow
+
+import kissgs
+
+PRESETS = ("fast", "balanced", "small", "paper")
+COUNTS = (0, 1, 7, 8, 9, 63, 64, 65, 1000)
+WORST = 1
+"""Ulps between values of JavaScript and of Python: both compute in float64, and round once."""
+
+
+@pytest.fixture(scope="module")
+def site():
+    site = Site()
+    yield site
+    site.close()
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("degree", range(4))
+def test_every_preset_degree_and_count(preset, degree):
+    files = [container(preset, degree, count) for count in COUNTS]
+    found = in_node(*(job(some, options={"keepPlanes": True}) for some in files))
+    for said, some in zip(found, files, strict=True):
+        assert sorted(said["planes"]) == sorted(IMAGES)
+        assert assert_scene(said, some) <= WORST
+        assert_told(said)
+
+
+def extremes():
+    rng = np.random.default_rng(3)
+    count = 100
+    far = rng.normal(size=(count, 3)) * 10.0 ** rng.integers(-6, 7, (count, 1))
+    far[0] = 1e6, -1e6, 1e6
+    wild = np.where(rng.random((count, 3)) < 0.5, -30, 30)
+    infinite = np.resize([np.inf, -np.inf, 0, 3], count)
+    one = scene_of(1, 3)
+    return {
+        "far": scene_of(count, 1, means=far),
+        "tiny": scene_of(count, 0, means=far * 1e-20),
+        "beyond": scene_of(count, 1, means=far * 1e30),
+        "wild": scene_of(count, 2, scales=wild),
+        "infinite": scene_of(count, 0, opacities=infinite),
+        "flat": scene_of(count, 3, means=rng.normal(size=(count, 3)) * [1, 0, 0], sh0=np.zeros((count, 3))),
+        "the same": one.select(np.zeros(count, np.int64)),
+        "dark": scene_of(count, 3, shN=np.zeros((count, 15, 3))),
+        "bright": scene_of(count, 3, shN=rng.normal(size=(count, 15, 3)) * 1e5, sh0=rng.normal(size=(count, 3)) * 1e9),
+    }
+
+
+@pytest.mark.parametrize("preset", ["fast", "paper"])
+def test_extreme_values(preset):
+    files = [
+        dict(kissgs.compress(scene, settings=kissgs.Settings(preset=preset)).files) for scene in extremes().values()
+    ]
+    found = in_node(*(job(some) for some in files))
+    assert max(assert_scene(said, some) for said, some in zip(found, files, strict=True)) <= WORST
+
+
+def test_every_kind_of_source(site):
+    """Zips stored and deflated, in folders, with comments; bytes in every shape; addresses of folder, metadata, zip."""
+    files = container()
+    address = site.put("scene", files)
+    site.files["/x/a zip?.zip"] = site.files["/x/scene.zip"] = zipped(files)
+    found = in_node(
+        *(job(files, as_=kind) for kind in ("bytes", "buffer", "blob", "within")),
+        job(zipped(files, zipfile.ZIP_DEFLATED)),
+        job(zipped(files, zipfile.ZIP_DEFLATED, folder="my scene/"), as_="within"),
+        job(zipped(files, folder="a\\b\\")),
+        job(zipped(files, comment=b"made by hand, PK\5\6 or so")),
+        job(zipped({"notes.txt": b"hello", "preview/index.html": b"", **files})),
+        job(address),
+        job(f"{address}?token=1#here"),
+        job(f"{address}meta.json"),
+        job(f"{site.url}/x/scene.zip"),
+        job(f"{site.url}/x/scene.zip?a/"),
+        {"source": {"url": address, "as": "URL"}},
+    )
+    for said in found:
+        assert assert_scene(said, files) <= WORST
+        assert_told(said)
+    assert found[9]["progress"][-1]["received"] == sum(len(files[name]) for name in (*IMAGES, "meta.json"))
+    assert found[12]["progress"][-1]["received"] == len(zipped(files))
+
+
+def test_requests_are_made_as_asked(site):
+    address = site.put("private", container())
+    site.received.clear()
+    (said,) = in_node(job(address, options={"request": {"headers": {"Authorization": "Bearer x"}}}))
+    assert assert_scene(said, container()) <= WORST
+    assert len(site.received) == 10
+    assert {key for _, key in site.received} == {"Bearer x"}
+
+
+def test_without_checksums_and_names_of_kind():
+    """As other encoders leave it: no word of ours, no version, no format."""
+    files = without_checksums(container())
+    bare = with_meta(files, lambda meta: [meta.pop(key) for key in ("format", "version", "profile")])
+    for said, some in zip(in_node(job(files), job(bare)), (files, bare), strict=True):
+        assert assert_scene(said, some) <= WORST
+
+
+def test_images_in_the_worst_order(site):
+    """The mask last, low bytes first; the order in which they are told is right all the same."""
+    files = container(count=1000)
+    address = site.put("late", files)
+    for i, name in enumerate(("means_bytes_0", "f_rest_labels", "means_bytes_1", "active_mask")):
+        site.late[f"/late/{name}.webp"] = 0.05 * (i + 1)
+    (said,) = in_node(job(address))
+    assert assert_scene(said, files) <= WORST
+    assert_told(said)
+
+
+def test_what_is_known_until_now_is_in_the_scene(site):
+    """After the mask: neutral. After the high bytes: positions from their levels, 128 for the low ones."""
+    files = container(count=1000, degree=1)
+    address = site.put("coarse", files)
+    site.late["/coarse/means_bytes_0.webp"] = 0.3
+    (said,) = in_node(job(address, snapshots=["active_mask.webp", "means_bytes_1.webp"]))
+    assert_told(said)
+    assert assert_scene(said, files) <= WORST
+    neutral = {name: array_of(text, name) for name, text in said["snapshots"]["active_mask.webp"].items()}
+    assert (neutral["quats"].reshape(-1, 4) == [1, 0, 0, 0]).all()
+    assert {name: len(array) for name, array in neutral.items() if name != "centroids"} == {
+        **dict.fromkeys(("means", "scales", "sh0"), 3000),
+        **dict.fromkeys(("opacities", "labels", "cells"), 1000),
+        "quats": 4000,
+    }
+    assert not any(neutral[name].any() for name in ("means", "scales", "opacities", "sh0", "labels"))
+    meta = json.loads(files["meta.json"])["means"]
+    low, high = float(np.float32(meta["mins"])), float(np.float32(meta["maxs"]))
+    levels = pillow(files["means_bytes_1.webp"])[:, :, :3].reshape(-1, 3).astype(np.int64) * 256 + 128
+    logs = low + (levels - levels.min()) / (levels.max() - levels.min()) * (high - low)
+    wanted = (np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32)[neutral["cells"]]
+    coarse = array_of(said["snapshots"]["means_bytes_1.webp"]["means"], "means")
+    assert ulps(coarse, wanted.ravel()) <= WORST
+    assert (coarse != array_of(said["arrays"]["means"], "means")).any()
+
+
+def test_stopping(site):
+    """Before, amid, for a reason, while waiting; the signal's reason is thrown, and no more is told."""
+    files = container()
+    address = site.put("slow", files)
+    site.late["/slow/f_dc.webp"] = 1.0
+    found = in_node(
+        job(files, abort="before"),
+        job(address, abort="before"),
+        job(files, abort="reason"),
+        job(address, abort={"after": 100}),
+        job(files, abort={"at": "f_dc.webp"}),
+        job(address, abort={"at": "active_mask.webp"}),
+    )
+    names = [said["error"]["name"] for said in found]
+    assert names == ["AbortError", "AbortError", "RangeError", "AbortError", "AbortError", "AbortError"]
+    assert all(said["later"] == 0 for said in found)
+    assert all(said["ms"] < 900 for said in found)
+    assert [said["order"] for said in found[:3]] == [[], [], []]
+
+
+def test_what_the_caller_throws_ends_the_work():
+    (said,) = in_node(job(container(), throwAt="f_dc.webp"))
+    assert (said["error"]["name"], said["error"]["message"]) == ("Error", "thrown by the caller")
+    assert said["later"] == 0
+
+
+def test_without_workers_others_have_their_turn():
+    """A timer fires between images, so that work can be ended and a page can show how far it is."""
+    data = container(count=20_000)
+    (whole,) = in_node(job(data))
+    (said,) = in_node(job(data, abort={"after": 1}))
+    assert whole["ended"] == len(IMAGES)
+    assert said["error"]["name"] == "AbortError"
+    assert said["ended"] < len(IMAGES)
+
+
+def test_what_is_whole_is_shown_beside_what_is_damaged():
+    files = container()
+    damaged = {**files, "f_dc.webp": files["f_dc.webp"][:-20], "scales.webp": b"RIFF"}
+    (said,) = in_node(job(damaged))
+    assert said["error"]["message"].startswith("f_dc.webp: cut off")
+    assert set(said["order"]) == set(IMAGES) - {"f_dc.webp", "scales.webp"}
+
+
+@pytest.mark.parametrize("preset", ["balanced"])
+def test_a_real_scene(shared_data, preset):
+    files = dict(
+        kissgs.compress(next((shared_data / "fox").glob("*.ply")), settings=kissgs.Settings(preset=preset)).files
+    )
+    (said,) = in_node(job(files, options={"keepPlanes": True}))
+    assert assert_scene(said, files) <= WORST
+    assert_told(said)

@@ -1,0 +1,250 @@
+"""Spark's picture of a scene; oracle: ``kissgs.render``, and for colours the spherical harmonics of the textbooks.
+
+``pytest --log-cli-level INFO`` tells how close they are.
+"""
+
+import base64
+import io
+import logging
+import shutil
+from dataclasses import replace
+from math import factorial
+
+import numpy as np
+import pytest
+from scipy.special import lpmv
+from web_tools import DECODER, Site
+
+import kissgs
+from kissgs.io.ply import write_ply
+from kissgs.rendering.camera import Camera, look_at
+from kissgs.splats import ATTRIBUTES, SH_C0, SH_REST_COUNTS, Splats
+
+playwright = pytest.importorskip("playwright.sync_api")
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+pytestmark = [
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed"),
+    pytest.mark.skipif(not (DECODER / "vendor").exists(), reason="scripts/vendor has not run"),
+]
+
+SOFTWARE = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--no-sandbox"]
+UP = np.array([0, -1.0, 0])
+log = logging.getLogger(__name__)
+
+PAGE = """<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,">
+<script type="importmap">{"imports": {
+  "three": "/web_decoder/vendor/three/build/three.module.min.js",
+  "three/addons/": "/web_decoder/vendor/three/examples/jsm/",
+  "@sparkjsdev/spark": "/web_decoder/vendor/spark/dist/spark.module.min.js"}}</script>
+<script type="module" src="/page.js"></script>"""
+
+PROGRAM = """
+import { Viewer } from "/web_decoder/preview/viewer.js";
+
+const bytesOf = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+const floats = (text) => new Float32Array(bytesOf(text).buffer);
+const textOf = (bytes) => {
+  let text = "";
+  for (let at = 0; at < bytes.length; at += 32768) text += String.fromCharCode(...bytes.subarray(at, at + 32768));
+  return btoa(text);
+};
+const viewer = () => new Viewer(document.body.appendChild(document.createElement("canvas")));
+const [one, other] = [viewer(), viewer()];
+
+function sceneOf({ count, degree, labels, ...fields }) {
+  const arrays = Object.fromEntries(Object.entries(fields).map(([name, text]) => [name, floats(text)]));
+  return { count, degree, labels: new Uint16Array(bytesOf(labels).buffer), ...arrays };
+}
+
+async function pictures(of, cameras) {
+  const taken = [];
+  for (const camera of cameras) {
+    of.setCamera(camera);
+    await of.render();
+    taken.push(textOf(of.readPixels().data));
+  }
+  return taken;
+}
+
+window.draw = async ({ scene, cameras, background = "#000000", ply = null }) => {
+  one.setScene(sceneOf(scene));
+  one.setBackground(background);
+  const found = { drawn: await pictures(one, cameras) };
+  if (ply !== null) {
+    found.read = await other.setPly(bytesOf(ply), one);
+    found.beside = await pictures(other, cameras);
+  }
+  return found;
+};
+"""
+
+
+@pytest.fixture(scope="module")
+def page():
+    wrong = []
+    site = Site()
+    site.files |= {"/": PAGE.encode(), "/page.js": PROGRAM.encode()}
+    site.headers["/"] = {"Content-Type": "text/html"}
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
+        page = browser.new_page()
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.on("console", lambda said: wrong.append(said.text) if said.type == "error" else None)
+        page.goto(f"{site.url}/")
+        yield page
+        browser.close()
+    site.close()
+    assert wrong == []
+
+
+def encoded(array):
+    return base64.b64encode(np.ascontiguousarray(array)).decode()
+
+
+def scene_of(splats):
+    """As the decoder gives it; entries of the codebook stand in an order of their own."""
+    rng = np.random.default_rng(0)
+    order = rng.permutation(len(splats)).astype(np.uint16)
+    return {
+        "count": len(splats),
+        "degree": SH_REST_COUNTS.index(splats.shN.shape[1]),
+        "centroids": encoded(splats.shN[order]),
+        "labels": encoded(np.argsort(order).astype(np.uint16)),
+        **{name: encoded(getattr(splats, name)) for name in ("means", "quats", "scales", "opacities", "sh0")},
+    }
+
+
+def draw(page, splats, cameras, **options):
+    """Pictures as the page draws them, from 0 to 1; with ``ply``, also what its viewer of originals draws."""
+    pinholes = [
+        {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist(), "width": camera.width, "height": camera.height}
+        for camera in cameras
+    ]
+    found = page.evaluate("job => draw(job)", {"scene": scene_of(splats), "cameras": pinholes, **options})
+
+    def pixels(text, camera):
+        return np.frombuffer(base64.b64decode(text), np.uint8).reshape(camera.height, camera.width, 4)[..., :3] / 255
+
+    drawn, beside = (
+        [pixels(text, camera) for text, camera in zip(found.get(kind, []), cameras, strict=False)]
+        for kind in ("drawn", "beside")
+    )
+    return (drawn, beside, found["read"]) if "ply" in options else drawn
+
+
+def psnr(a, b):
+    return -10 * np.log10(np.mean((a - b) ** 2))
+
+
+def expected(splats, camera, background=(0, 0, 0)):
+    return np.clip(kissgs.render(splats, camera, background=background)[0], 0, 1)
+
+
+def seen_from(position, target=(0, -0.8, 0), size=(300, 200), fov=0.9):
+    return look_at(np.array(position, float), np.array(target, float), UP, fov=fov, width=size[0], height=size[1])
+
+
+def skewed(camera):
+    """The same pose behind another lens: its middle elsewhere, its pixels not square."""
+    K = camera.K.copy()
+    K[0, 0] *= 1.25
+    K[:2, 2] += (0.17 * camera.width, -0.12 * camera.height)
+    return Camera(camera.viewmat, K, camera.width, camera.height)
+
+
+FRONT = seen_from((1.2, -2.2, -5.2))
+SIDE = skewed(seen_from((-4.5, -2.6, 2.0)))
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_pictures_are_those_of_the_rasteriser(page, degree):
+    splats = kissgs.sample_scene(5000, sh_degree=degree)
+    for camera, drawn in zip((FRONT, SIDE), draw(page, splats, [FRONT, SIDE]), strict=True):
+        wanted = expected(splats, camera)
+        reached = psnr(drawn, wanted)
+        log.info("degree %d: %.1f dB", degree, reached)
+        assert reached > 40
+        assert np.abs((drawn - wanted).mean(axis=(0, 1))).max() < 2 / 255
+        for mirrored in (drawn[:, ::-1], drawn[::-1], drawn[..., ::-1]):
+            assert psnr(mirrored, wanted) < reached - 15
+
+
+def test_a_white_background(page):
+    scene = kissgs.sample_scene(3000, sh_degree=1)
+    near = np.linalg.norm(scene.means, axis=1) < 2  # no sky
+    splats = Splats(**{name: getattr(scene, name)[near] for name in ATTRIBUTES})
+    (drawn,) = draw(page, splats, [FRONT], background="#ffffff")
+    log.info("on white: %.1f dB", psnr(drawn, expected(splats, FRONT, background=(1, 1, 1))))
+    assert psnr(drawn, expected(splats, FRONT, background=(1, 1, 1))) > 40
+    assert psnr(drawn, expected(splats, FRONT)) < 30
+
+
+def test_far_from_the_origin(page):
+    """Spark has 11 bits for a position."""
+    splats = kissgs.sample_scene(5000, sh_degree=1)
+    far = replace(splats, means=splats.means + np.float32(1000))
+    camera = seen_from(np.array((1.2, -2.2, -5.2)) + 1000, np.array((0, -0.8, 0)) + 1000)
+    (drawn,) = draw(page, far, [camera])
+    reached = psnr(drawn, expected(far, camera))
+    log.info("far from the origin: %.1f dB", reached)
+    assert reached > 40
+
+
+def test_an_original_beside_what_became_of_it(page):
+    """A .ply that Spark reads itself, against the same Gaussians given to it by us."""
+    splats = kissgs.sample_scene(5000, sh_degree=3)
+    file = io.BytesIO()
+    write_ply(file, splats)
+    drawn, beside, count = draw(page, splats, [FRONT, SIDE], ply=base64.b64encode(file.getvalue()).decode())
+    assert count == len(splats)
+    for camera, one, other in zip((FRONT, SIDE), drawn, beside, strict=True):
+        alike, true = psnr(one, other), psnr(other, expected(splats, camera))
+        log.info("read from a .ply: %.1f dB, and %.1f dB to what we give Spark", true, alike)
+        assert alike > 45
+        assert true > 40
+
+
+def spherical_harmonic(degree, order, direction):
+    """As textbooks have it, with the Condon-Shortley phase."""
+    x, y, z = direction
+    size = abs(order)
+    scale = np.sqrt((2 * degree + 1) / (4 * np.pi) * factorial(degree - size) / factorial(degree + size))
+    wave = np.cos if order >= 0 else np.sin
+    return (np.sqrt(2) if order else 1) * scale * lpmv(size, degree, z) * wave(size * np.arctan2(y, x))
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_colours_of_one_gaussian_from_all_sides(page, degree):
+    rng = np.random.default_rng(degree)
+    bands = [(band, order) for band in range(1, degree + 1) for order in range(-band, band + 1)]
+    strength = np.array([0.6 / band for band, _ in bands], np.float32)
+    shN = rng.choice([-1, 1], (1, len(bands), 3)) * rng.uniform(0.5, 1, (1, len(bands), 3)) * strength[:, None]
+    one = Splats(
+        means=np.array([[0.3, -0.2, 0.5]], np.float32),
+        quats=np.array([[0.5, -0.5, 0.5, 0.5]], np.float32),
+        scales=np.log(np.array([[0.1, 0.2, 0.3]], np.float32)),
+        opacities=np.array([12.0], np.float32),
+        sh0=np.array([[0.2, -0.1, 0.1]], np.float32),
+        shN=shN.astype(np.float32),
+    )
+    sides = rng.normal(size=(6, 3))
+    sides /= np.linalg.norm(sides, axis=1)[:, None]
+    cameras = [seen_from(one.means[0] - 4 * side, one.means[0], (41, 41), 0.3) for side in sides]
+    worst = 0
+    for side, picture in zip(sides, draw(page, one, cameras), strict=True):
+        basis = np.array([spherical_harmonic(band, order, side) for band, order in bands])
+        wanted = 0.5 + SH_C0 * one.sh0[0] + basis @ one.shN[0]
+        worst = max(worst, np.abs(picture[20, 20] - wanted.clip(0, 1)).max())
+        assert np.ptp(wanted) > 0.05
+    log.info("degree %d: colours within %.1f of 255", degree, 255 * worst)
+    assert worst < 3 / 255
+
+
+@pytest.mark.parametrize("count", [0, 1])
+@pytest.mark.parametrize("degree", [0, 3])
+def test_hardly_any_gaussians(page, count, degree):
+    splats = kissgs.sample_scene(count, sh_degree=degree)
+    middle = splats.means.mean(axis=0) if count else np.zeros(3)
+    camera = seen_from(middle + np.array([0, 0, -4.0]), middle, (40, 30))
+    (drawn,) = draw(page, splats, [camera], background="#204060")
+    assert np.abs(drawn - expected(splats, camera, (0x20 / 255, 0x40 / 255, 0x60 / 255))).max() < 3 / 255

@@ -1,0 +1,448 @@
+"""Streams that no encoder writes, made bit by bit; oracle: what Pillow (libwebp) makes of the same bytes."""
+
+import base64
+import hashlib
+
+import numpy as np
+import pytest
+from naive_vp8l import (
+    CROSS_COLOUR,
+    INDEXING,
+    NEAR,
+    ORDER,
+    PREDICTOR,
+    SUBTRACT_GREEN,
+    Writer,
+    codes_of,
+    tiles,
+)
+from web_tools import decode_all, pillow
+
+RNG = np.random.default_rng(0)
+
+
+def argb(count, seed=0):
+    return np.random.default_rng(seed).integers(0, 1 << 32, count).tolist()
+
+
+def assert_like_pillow(folder, *writers, channels=4):
+    """Same pixels, or both refuse."""
+    files = [writer.file() for writer in writers]
+    for data, got in zip(files, decode_all(folder, files, pixels=True), strict=True):
+        wanted = pillow(data)
+        if wanted is None:
+            assert got["name"] == "WebPError", got
+            continue
+        assert "rgba" in got, got
+        found = np.frombuffer(base64.b64decode(got["rgba"]), np.uint8).reshape(got["height"], got["width"], 4)
+        assert (found[:, :, :channels] == wanted[:, :, :channels]).all()
+
+
+def accepted(folder, *writers, channels=4):
+    assert all(pillow(writer.file()) is not None for writer in writers)
+    assert_like_pillow(folder, *writers, channels=channels)
+
+
+def refused(folder, *writers, why=""):
+    """By both."""
+    files = [writer.file() for writer in writers]
+    assert [pillow(data) for data in files] == [None] * len(files)
+    for got in decode_all(folder, files):
+        assert got.get("name") == "WebPError", got
+        assert why in got["error"]
+
+
+def plain(width, height, seed=0):
+    writer = Writer(width, height)
+    writer.put(0, 1)
+    writer.image(argb(width * height, seed), picture=True)
+    return writer
+
+
+def with_tiles(kind, bits, width, height, pixel):
+    """One transform with a pixel for each tile; the picture is noise."""
+    writer = Writer(width, height)
+    writer.transform(kind, bits)
+    writer.image([pixel(i) for i in range(tiles(width, bits) * tiles(height, bits))])
+    writer.put(0, 1)
+    writer.image(argb(width * height, seed=bits), picture=True)
+    return writer
+
+
+def test_plain_noise(tmp_path):
+    accepted(tmp_path, plain(1, 1), plain(5, 3), plain(33, 17))
+
+
+@pytest.mark.parametrize("mode", range(16))
+def test_every_predictor_of_noise(mode, tmp_path):
+    """Also 14 and 15, which mean black; other bits of the tiles mean nothing. Narrow ones have none to the right."""
+    tile = 0xFF0000FF | mode << 8
+    accepted(
+        tmp_path,
+        *(with_tiles(PREDICTOR, 4, *size, lambda _: tile) for size in ((40, 19), (1, 9), (2, 9), (9, 1), (17, 33))),
+        with_tiles(PREDICTOR, 3, 30, 30, lambda i: (0xF0 | mode) << 8 | i),
+    )
+
+
+@pytest.mark.parametrize("bits", range(2, 10))
+def test_every_size_of_tiles(bits, tmp_path):
+    side = (1 << bits) + 5 if bits < 8 else 40
+    accepted(
+        tmp_path,
+        with_tiles(PREDICTOR, bits, side, 21, lambda i: i % 14 << 8),
+        with_tiles(CROSS_COLOUR, bits, side, 21, lambda i: i * 2654435761 & 0xFFFFFFFF),
+        with_tiles(PREDICTOR, bits, 21, side, lambda i: i % 14 << 8),
+    )
+
+
+def test_every_factor_of_cross_colour(tmp_path):
+    """Signed bytes from -128 to 127, two tiles of each."""
+    accepted(
+        tmp_path,
+        *(with_tiles(CROSS_COLOUR, 2, 64, 64, lambda i, at=at: (i % 256) << at) for at in (0, 8, 16)),
+    )
+
+
+@pytest.mark.parametrize("order", [(2, 0, 1), (1, 2, 0), (0, 1, 2), (0, 2), (1, 0), (2, 1)])
+def test_transforms_in_any_order(order, tmp_path):
+    writer = Writer(30, 20)
+    for kind in order:
+        writer.transform(kind, None if kind == SUBTRACT_GREEN else 3)
+        if kind != SUBTRACT_GREEN:
+            writer.image(np.array(argb(4 * 3, seed=kind)) & (0xFFFFF5FF if kind == PREDICTOR else -1))
+    writer.put(0, 1)
+    writer.image(argb(600), picture=True)
+    accepted(tmp_path, writer)
+
+
+@pytest.mark.parametrize("others", [(), (SUBTRACT_GREEN,), (PREDICTOR,), (CROSS_COLOUR, PREDICTOR)])
+@pytest.mark.parametrize("before", [True, False])
+@pytest.mark.parametrize("size", [1, 2, 3, 4, 5, 15, 16, 17, 200, 256])
+def test_palettes_with_indices_beyond_them(size, before, others, tmp_path):
+    """And palettes amid other transforms: those after it see packed pixels."""
+    width, height = 29, 11
+    writer = Writer(width, height)
+
+    def put_others():
+        for kind in others:
+            writer.transform(kind, None if kind == SUBTRACT_GREEN else 2)
+            if kind != SUBTRACT_GREEN:
+                writer.image([(i * 37 % 14) << 8 for i in range(tiles(across, 2) * tiles(height, 2))])
+
+    across = width
+    if before:
+        put_others()
+    writer.transform(INDEXING)
+    writer.put(size - 1, 8)
+    writer.image(argb(size, seed=size))
+    across = tiles(width, 0 if size > 16 else 1 if size > 4 else 2 if size > 2 else 3)
+    if not before:
+        put_others()
+    writer.put(0, 1)
+    writer.image(argb(across * height), picture=True)
+    accepted(tmp_path, writer)
+
+
+def test_codes_of_one_and_two_symbols(tmp_path):
+    """Simple or not; of one symbol of any length; two equal symbols; a first symbol of one bit."""
+
+    def green_of(write):
+        writer = Writer(16, 16)
+        writer.put(0, 3)
+        codes = [write(writer), *(writer.simple(symbol) for symbol in (7, 255, 128, 0))]
+        for value in np.random.default_rng(1).choice(list(codes[0].values()), 256):
+            writer.symbol(codes[0], int(value))
+        return writer
+
+    def one_bit(writer):
+        writer.put(0b0001, 4)  # read upwards: simple, one symbol, of one bit, 0
+        return {(1, 0): 0}
+
+    def only(length, symbol):
+        return lambda writer: writer.code([0] * symbol + [length], 280)
+
+    accepted(
+        tmp_path,
+        *(green_of(lambda writer, pair=pair: writer.simple(*pair)) for pair in [(3,), (3, 200), (200, 3), (0, 1)]),
+        green_of(lambda writer: writer.simple(9, 9)),
+        green_of(one_bit),
+        *(green_of(only(length, 77)) for length in (1, 2, 8, 15)),
+        green_of(lambda writer: writer.code([0] * 50 + [1, 1], 280)),
+    )
+
+
+@pytest.mark.parametrize("longest", range(1, 16))
+def test_codes_up_to_15_bits(longest, tmp_path):
+    """One symbol of each length: the longest possible codes, through one or two tables."""
+    lengths = [*range(1, longest + 1), longest]
+    writer = Writer(32, 32)
+    writer.put(0, 3)
+    shuffled = np.random.default_rng(longest).permutation(longest + 1)
+    codes = [writer.code([lengths[i] for i in shuffled], size) for size in (280, 256, 256, 256)]
+    codes.append(writer.simple(0))
+    for _ in range(1024):
+        for code in codes[:4]:
+            writer.symbol(code, int(RNG.integers(0, longest + 1)))
+    accepted(tmp_path, writer)
+
+
+def test_code_lengths_in_all_spellings(tmp_path):
+    """Repeats 16, 17 and 18, at the beginning too (16 then repeats 8), and a count of lengths."""
+    writer = Writer(16, 16)
+    writer.put(0, 3)
+    writer.put(0, 1)
+    writer.put(19 - 4, 4)
+    of = {16: 1, 17: 2, 0: 3, 18: 3}
+    for symbol in ORDER:
+        writer.put(of.get(symbol, 0), 3)
+    table = codes_of([of.get(symbol, 0) for symbol in range(19)])
+    writer.put(0, 1)
+    lengths = []
+    for _ in range(42):  # 252 of 256
+        writer.symbol(table, 16)
+        writer.put(3, 2)
+        lengths += [8] * 6
+    writer.symbol(table, 16)
+    writer.put(1, 2)
+    lengths += [8] * 4
+    writer.symbol(table, 0)
+    writer.symbol(table, 17)
+    writer.put(10 - 3, 3)
+    writer.symbol(table, 18)
+    writer.put(13 - 11, 7)
+    assert 256 + 1 + 10 + 13 == 280
+    assert len(lengths) == 256
+    green = codes_of(lengths)
+    rest = [writer.simple(symbol) for symbol in (1, 2, 255, 0)]
+    for value in range(256):
+        writer.symbol(green, value)
+    assert len(rest) == 4
+    accepted(tmp_path, writer)
+
+
+@pytest.mark.parametrize("bits", range(1, 12))
+def test_colour_caches(bits, tmp_path):
+    """Of all sizes, with places that nothing has been put into (transparent black) and pixels that come thence."""
+    writer = Writer(40, 30)
+    writer.put(0, 1)
+    writer.put(1, 1)
+    writer.put(bits, 4)
+    writer.put(0, 1)
+    codes = writer.literal_codes(cache=bits)
+    rng = np.random.default_rng(bits)
+    count = 0
+    while count < 1200:
+        if rng.random() < 0.5:
+            writer.symbol(codes[0], 280 + int(rng.integers(0, 1 << bits)))
+            count += 1
+        elif rng.random() < 0.2 and 0 < count < 1190:
+            writer.symbol(codes[0], 256 + 3)  # four pixels
+            writer.symbol(codes[4], 1)  # from the left
+            count += 4
+        else:
+            writer.pixel(codes, int(rng.integers(0, 1 << 32)))
+            count += 1
+    if count == 1200:
+        accepted(tmp_path, writer)
+
+
+def test_a_colour_from_an_empty_place_is_put_into_the_cache(tmp_path):
+    """A colour from an empty place is 0, which then takes place 0 from what had it."""
+    bits = 1
+    kept = next(value for value in range(0xFF000001, 0xFFFFFFFF) if (0x1E35A7BD * value & 0xFFFFFFFF) >> 31 == 0)
+    writer = Writer(3, 1)
+    writer.put(0, 1)
+    writer.put(1, 1)
+    writer.put(bits, 4)
+    writer.put(0, 1)
+    codes = writer.literal_codes(cache=bits)
+    writer.pixel(codes, kept)
+    writer.symbol(codes[0], 281)
+    writer.symbol(codes[0], 280)
+    accepted(tmp_path, writer)
+
+
+@pytest.mark.parametrize("width", [1, 2, 5, 9, 40])
+def test_every_distance_and_length(width, tmp_path):
+    """The 120 near ones of each width; those that point ahead mean the pixel before."""
+    height = 400 // width + 30
+    near = [*range(1, 121), 121, 125, 200, 300]
+    writer = Writer(width, height)
+    writer.put(0, 3)
+    codes = writer.literal_codes(lengths=True)
+    count, first = width * height, 9 * width + 300 if width < 9 else 9 * width
+    first = min(max(first, 8 * 8), count - 1)
+
+    def prefix(value):
+        """Symbol, extra bits and their number."""
+        value -= 1
+        if value < 4:
+            return value, 0, 0
+        extra = value.bit_length() - 2
+        return 2 * (extra + 1) + (value >> extra & 1), value & ((1 << extra) - 1), extra
+
+    at = 0
+    for value in argb(first):
+        writer.pixel(codes, value)
+        at += 1
+    step = 0
+    while at < count:
+        length = min(1 + step % 5 + (step % 11 == 0) * 17, count - at)
+        code = near[step % len(near)]
+        back = code - 120 if code > 120 else max(NEAR[code - 1][0] + NEAR[code - 1][1] * width, 1)
+        step += 1
+        if back > at:
+            continue
+        symbol, value, extra = prefix(length)
+        writer.symbol(codes[0], 256 + symbol)
+        writer.put(value, extra)
+        symbol, value, extra = prefix(code)
+        writer.symbol(codes[4], symbol)
+        writer.put(value, extra)
+        at += length
+    accepted(tmp_path, writer)
+
+
+@pytest.mark.parametrize("bits", range(2, 10))
+def test_groups_of_codes(bits, tmp_path):
+    """A group for each tile, by both bytes of its number; one of them is never used."""
+    width, height = (70, 9) if bits < 7 else (2 * (1 << bits) + 3, 2)
+    writer = Writer(width, height)
+    writer.put(0, 2)
+    writer.put(1, 1)
+    writer.put(bits - 2, 3)
+    across = tiles(width, bits)
+    count = across * tiles(height, bits)
+    groups = [(i * 3 + 1) % 300 for i in range(count)]
+    writer.image([group << 8 for group in groups])
+    values = np.random.default_rng(bits).integers(0, 256, (max(groups) + 1, 4))
+    for red, green, blue, alpha in values.tolist():
+        for symbol in (green, red, blue, alpha, 0):
+            writer.simple(symbol)
+    accepted(tmp_path, writer)
+
+
+def test_a_choice_of_codes_that_does_not_begin_with_zero(tmp_path):
+    """Number 300 for all: 301 groups are written, one is used."""
+    writer = Writer(9, 9)
+    writer.put(0, 2)
+    writer.put(1, 1)
+    writer.put(0, 3)
+    writer.image([0xFF0000FF | 300 << 8] * 9)
+    for i in range(301):
+        for symbol in (i & 255, 1, 2, 255, 0):
+            writer.simple(symbol)
+    accepted(tmp_path, writer)
+
+
+@pytest.mark.parametrize("hint", [0, 1])
+def test_alpha_is_what_is_stored_whatever_the_hint_says(hint, tmp_path):
+    """Pillow looks at the hint and gives no alpha then, so that alpha's oracle is what was written."""
+    writer = Writer(6, 4, alpha=hint)
+    writer.put(0, 1)
+    pixels = argb(24)
+    writer.image(pixels, picture=True)
+    assert_like_pillow(tmp_path, writer, channels=3 + hint)
+    wanted = np.array(pixels, dtype=np.uint32).view(np.uint8).reshape(-1, 4)[:, [2, 1, 0, 3]]
+    (got,) = decode_all(tmp_path, [writer.file()])
+    assert got["sha256"] == hashlib.sha256(np.ascontiguousarray(wanted)).hexdigest()
+
+
+# --- What is refused, by both ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", range(4))
+def test_a_transform_twice(kind, tmp_path):
+    writer = Writer(4, 4)
+    for _ in range(2):
+        writer.transform(kind, None if kind in (SUBTRACT_GREEN, INDEXING) else 2)
+        if kind == INDEXING:
+            writer.put(199, 8)
+        if kind != SUBTRACT_GREEN:
+            writer.image([0xFF000000] * (200 if kind == INDEXING else 1))
+    writer.put(0, 1)
+    writer.image(argb(16), picture=True)
+    refused(tmp_path, writer, why="the same transform twice")
+
+
+@pytest.mark.parametrize("version", range(1, 8))
+def test_other_versions(version, tmp_path):
+    writer = Writer(4, 4, version=version)
+    writer.put(0, 1)
+    writer.image(argb(16), picture=True)
+    refused(tmp_path, writer, why="version")
+
+
+@pytest.mark.parametrize("bits", [0, 12, 13, 14, 15])
+def test_caches_of_impossible_size(bits, tmp_path):
+    writer = Writer(4, 4)
+    writer.put(0, 1)
+    writer.put(1, 1)
+    writer.put(bits, 4)
+    writer.put(0, 1)
+    codes = writer.literal_codes(cache=bits)
+    for value in argb(16):
+        writer.pixel(codes, value)
+    refused(tmp_path, writer, why="cache")
+
+
+@pytest.mark.parametrize(
+    "lengths", [[], [2], [1, 2], [1, 1, 1], [1, 2, 2, 2], [3] * 7, [3] * 9, [15] * 2, [1, *[15] * 200]]
+)
+@pytest.mark.parametrize("which", range(5))
+def test_codes_that_do_not_add_up(lengths, which, tmp_path):
+    writer = Writer(4, 4)
+    writer.put(0, 3)
+    for i, size in enumerate((280, 256, 256, 256, 40)):
+        writer.code((lengths if i == which else [1, 1])[:size], size)
+    writer.put(0, 200)
+    if lengths == [2]:
+        accepted(tmp_path, writer)
+    else:
+        refused(tmp_path, writer, why="add up")
+
+
+@pytest.mark.parametrize("at", [0, 1, 5])
+def test_copies_from_before_the_beginning_or_beyond_the_end(at, tmp_path):
+    for length, distance in ((0, 5 - 1), (3, 1)):
+        writer = Writer(3, 2 if at < 5 else 3)
+        writer.put(0, 3)
+        codes = writer.literal_codes(lengths=True)
+        for value in argb(at):
+            writer.pixel(codes, value)
+        writer.symbol(codes[0], 256 + length)
+        writer.symbol(codes[4], distance)
+        writer.put(0, 200)
+        assert_like_pillow(tmp_path, writer)
+
+
+def test_more_code_lengths_than_symbols(tmp_path):
+    """By a count, and by a repeat that runs over the end."""
+    counted = Writer(4, 4)
+    counted.put(0, 3)
+    counted.put(0, 1)
+    counted.put(15, 4)
+    for i in range(19):
+        counted.put(4 * (i not in (0, 1, 8)), 3)
+    counted.put(1, 1)
+    counted.put(7, 3)
+    counted.put(0xFFFF, 16)
+    counted.put(0, 4000)
+    refused(tmp_path, counted, why="more code lengths")
+
+
+def test_a_symbol_outside_its_alphabet(tmp_path):
+    """Distances have 40 symbols."""
+    writer = Writer(2, 2)
+    writer.put(0, 3)
+    for symbol in (1, 2, 3, 4, 200):
+        writer.simple(symbol)
+    refused(tmp_path, writer, why="add up")
+
+
+def test_two_symbols_of_which_one_is_outside_the_alphabet(tmp_path):
+    writer = Writer(2, 2)
+    writer.put(0, 3)
+    for symbols in ((1,), (2,), (3,), (4,), (3, 200)):
+        writer.simple(*symbols)
+    accepted(tmp_path, writer)

@@ -1,0 +1,54 @@
+/** Where to look from. Scenes are in COLMAP's frame: y down, z ahead; three.js has y up, z behind. */
+
+import { Matrix4, Vector3 } from "three";
+
+/**
+ * @typedef {{viewmat: number[][], K: number[][], width: number, height: number}} Pinhole `viewmat` world to camera, as
+ *   OpenCV has it; pixels of `K` from the upper left corner of the picture
+ */
+
+/** From COLMAP's frame to that of three.js, and back. */
+const FLIP = new Matrix4().makeScale(1, -1, -1);
+
+/**
+ * Put a camera where the whole extent is in the picture, seen from the front and a little from above.
+ * @param {import("three").PerspectiveCamera} camera
+ * @param {number} radius of what is around the origin
+ */
+export function lookAtAll(camera, radius) {
+  const half = Math.atan(Math.min(1, camera.aspect) * Math.tan((camera.fov * Math.PI) / 360)); // the narrower angle
+  const distance = radius / Math.sin(half);
+  camera.up.set(0, 1, 0);
+  camera.position.copy(new Vector3(0, 0.25, 1).setLength(distance));
+  camera.near = radius / 500;
+  camera.far = radius * 1e5;
+  camera.lookAt(0, 0, 0);
+  camera.updateProjectionMatrix();
+}
+
+/**
+ * Make a camera an exact pinhole, its centre of projection anywhere.
+ * @param {import("three").PerspectiveCamera} camera
+ * @param {Pinhole} pinhole
+ * @param {number[]} centre of the scene, which is the origin here
+ */
+export function setPinhole(camera, { viewmat, K, width, height }, [x, y, z]) {
+  const [near, far] = [0.01, 1e5];
+  const [fx, , cx, , fy, cy] = K.flat();
+  const view = rowMajor(viewmat.flat())
+    .multiply(new Matrix4().makeTranslation(x, y, z))
+    .premultiply(FLIP)
+    .multiply(FLIP);
+  view.invert().decompose(camera.position, camera.quaternion, new Vector3());
+  [camera.near, camera.far] = [near, far];
+  camera.projectionMatrix = rowMajor([
+    ...[(2 * fx) / width, 0, 1 - (2 * cx) / width, 0],
+    ...[0, (2 * fy) / height, (2 * cy) / height - 1, 0],
+    ...[0, 0, -(far + near) / (far - near), (-2 * far * near) / (far - near)],
+    ...[0, 0, -1, 0],
+  ]);
+  camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
+}
+
+/** @param {number[]} values */
+const rowMajor = (values) => new Matrix4().fromArray(values).transpose();

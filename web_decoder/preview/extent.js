@@ -1,0 +1,70 @@
+/** Where a scene is and how far it reaches. */
+
+import { sigmoid } from "./scene.js";
+
+const SAMPLES = 20_000;
+const DISTANT = 0.85; // of the opacity lies nearer to the centre; the rest may be sky and stray Gaussians
+
+/** @typedef {{centre: number[], radius: number}} Extent */
+
+/**
+ * Where a scene is: its opacity-weighted median, and how far most of it reaches from there. Outliers do not count.
+ * @param {number} count
+ * @param {(index: number) => ArrayLike<number>} mean three numbers
+ * @param {(index: number) => number} weight
+ * @returns {Extent}
+ */
+export function extentOf(count, mean, weight) {
+  const step = Math.max(1, Math.floor(count / SAMPLES));
+  const [points, weights] = [/** @type {number[][]} */ ([]), /** @type {number[]} */ ([])];
+  for (let i = 0; i < count; i += step) {
+    points.push(Array.from(mean(i)));
+    weights.push(weight(i));
+  }
+  const centre = [0, 1, 2].map((axis) =>
+    quantile(
+      points.map((point) => point[axis]),
+      weights,
+      0.5,
+    ),
+  );
+  const distances = points.map((point) => Math.hypot(...point.map((value, axis) => value - centre[axis])));
+  return { centre, radius: quantile(distances, weights, DISTANT) || 1 };
+}
+
+/** @param {import("./scene.js").Scene} scene */
+export const extentOfScene = ({ count, means, opacities }) =>
+  extentOf(
+    count,
+    (i) => means.subarray(3 * i, 3 * i + 3),
+    (i) => sigmoid(opacities[i]),
+  );
+
+/** @param {import("@sparkjsdev/spark").SplatMesh} mesh */
+export function extentOfMesh(mesh) {
+  const [means, weights] = [new Float32Array(3 * mesh.numSplats), new Float32Array(mesh.numSplats)];
+  mesh.forEachSplat((index, centre, _scales, _rotation, opacity) => {
+    means.set([centre.x, centre.y, centre.z], 3 * index);
+    weights[index] = opacity;
+  });
+  return extentOf(
+    mesh.numSplats,
+    (i) => means.subarray(3 * i, 3 * i + 3),
+    (i) => weights[i],
+  );
+}
+
+/**
+ * @param {number[]} values
+ * @param {number[]} weights
+ * @param {number} share
+ */
+function quantile(values, weights, share) {
+  const order = values.map((_, i) => i).sort((a, b) => values[a] - values[b]);
+  let left = share * weights.reduce((sum, weight) => sum + weight, 0);
+  for (const i of order) {
+    left -= weights[i];
+    if (left <= 0) return values[i];
+  }
+  return values[order.at(-1) ?? 0] ?? 0;
+}

@@ -1,0 +1,132 @@
+/** A decoded scene in Spark's own form: 16 bytes per Gaussian, and up to 40 more for spherical harmonics. */
+
+import { PackedSplats, utils } from "@sparkjsdev/spark";
+import { baseColour, sigmoid } from "./scene.js";
+
+/** @typedef {import("./scene.js").Scene} Scene */
+/** @typedef {NonNullable<PackedSplats["splatEncoding"]>} Encoding */
+
+const BANDS = [
+  { name: "sh1", words: 2, from: 0, to: 3, encode: utils.encodeSh1Rgb },
+  { name: "sh2", words: 4, from: 3, to: 8, encode: utils.encodeSh2Rgb },
+  { name: "sh3", words: 4, from: 8, to: 15, encode: utils.encodeSh3Rgb },
+];
+
+/** Spark discards sizes below e^-30 and cannot tell finer ones apart: one outlier must not coarsen all steps. */
+const SMALLEST_LOG_SCALE = -14;
+
+/**
+ * @param {Scene} scene
+ * @param {number[]} centre subtracted from all positions, which are halves: exact only near zero
+ * @param {object} how
+ * @param {number | null} how.size standard deviation to draw all with, while their own are not there
+ * @param {boolean} how.spherical whether the spherical harmonics are there
+ */
+export function pack(scene, centre, { size, spherical }) {
+  const { count, means, quats } = scene;
+  const encoding = encodingOf(scene, size);
+  // Spark shows only whole rows of its texture: arrays must be as long as it wants them, or Gaussians get lost.
+  const room = utils.computeMaxSplats(count);
+  const packed = new Uint32Array(4 * room);
+  for (let i = 0, a = 0, q = 0; i < count; i++, a += 3, q += 4) {
+    const length = Math.hypot(quats[q], quats[q + 1], quats[q + 2], quats[q + 3]) || 1;
+    utils.setPackedSplat(
+      packed,
+      i,
+      means[a] - centre[0],
+      means[a + 1] - centre[1],
+      means[a + 2] - centre[2],
+      size ?? Math.exp(Math.max(SMALLEST_LOG_SCALE, scene.scales[a])),
+      size ?? Math.exp(Math.max(SMALLEST_LOG_SCALE, scene.scales[a + 1])),
+      size ?? Math.exp(Math.max(SMALLEST_LOG_SCALE, scene.scales[a + 2])),
+      quats[q + 1] / length,
+      quats[q + 2] / length,
+      quats[q + 3] / length,
+      quats[q] / length,
+      sigmoid(scene.opacities[i]),
+      baseColour(scene.sh0[a]),
+      baseColour(scene.sh0[a + 1]),
+      baseColour(scene.sh0[a + 2]),
+      encoding,
+    );
+  }
+  const extra = spherical ? sphericalHarmonics(scene, encoding, room) : {};
+  return {
+    splats: new PackedSplats({ packedArray: packed, numSplats: count, extra, splatEncoding: encoding }),
+    encoding,
+  };
+}
+
+/**
+ * The ranges that Spark's few bits are spread over: no wider than the scene needs.
+ * @param {Scene} scene
+ * @param {number | null} size
+ */
+function encodingOf(scene, size) {
+  const [darkest, brightest] = rangeOf(scene.sh0);
+  const [smallest, largest] = size === null ? rangeOf(scene.scales) : [Math.log(size), Math.log(size)];
+  const lnScaleMin = Math.max(SMALLEST_LOG_SCALE, smallest);
+  const encoding = {
+    rgbMin: Math.min(0, baseColour(darkest)),
+    rgbMax: Math.max(1, baseColour(brightest)),
+    lnScaleMin,
+    lnScaleMax: Math.max(lnScaleMin + 1, largest),
+    sh1Max: 1,
+    sh2Max: 1,
+    sh3Max: 1,
+    lodOpacity: false, // Spark's reader of .ply files insists on it
+  };
+  const names = /** @type {const} */ (["sh1Max", "sh2Max", "sh3Max"]);
+  names.forEach((name, at) => (encoding[name] = largestOf(scene, BANDS[at].from, BANDS[at].to) || 1));
+  return encoding;
+}
+
+/** @param {Float32Array} values */
+function rangeOf(values) {
+  let [low, high] = [Infinity, -Infinity];
+  for (const value of values) {
+    if (value < low) low = value;
+    if (value > high) high = value;
+  }
+  return [low, high];
+}
+
+/** @param {number} degree */
+const coefficientsOf = (degree) => [0, 3, 8, 15][degree];
+
+/**
+ * @param {Scene} scene
+ * @param {number} from
+ * @param {number} to
+ */
+function largestOf({ centroids, degree }, from, to) {
+  const stride = 3 * coefficientsOf(degree);
+  let largest = 0;
+  if (3 * to > stride) return largest;
+  for (let entry = 0; entry < centroids.length; entry += stride)
+    for (let at = entry + 3 * from; at < entry + 3 * to; at++) largest = Math.max(largest, Math.abs(centroids[at]));
+  return largest;
+}
+
+/**
+ * Every codebook entry is encoded once; Gaussians get copies of the words, which is many times quicker.
+ * @param {Scene} scene
+ * @param {ReturnType<typeof encodingOf>} encoding
+ * @param {number} room
+ */
+function sphericalHarmonics({ count, degree, labels, centroids }, encoding, room) {
+  /** @type {Record<string, Uint32Array>} */
+  const extra = {};
+  if (!labels.length || !centroids.length) return extra;
+  const stride = 3 * coefficientsOf(degree);
+  const entries = centroids.length / stride;
+  for (const { name, words, from, to, encode } of BANDS.slice(0, degree)) {
+    const book = new Uint32Array(words * entries);
+    for (let entry = 0; entry < entries; entry++)
+      encode(book, entry, centroids.subarray(entry * stride + 3 * from, entry * stride + 3 * to), encoding);
+    const all = (extra[name] = new Uint32Array(words * room));
+    for (let i = 0, at = 0; i < count; i++)
+      for (let word = words * labels[i], end = word + words; word < end; word++) all[at++] = book[word];
+  }
+  return extra;
+}

@@ -1,0 +1,139 @@
+/** The place where the scene is seen: viewer, camera and comparison, as far as this browser can draw at all. */
+
+import { byId } from "./dom.js";
+import { Trouble } from "./trouble.js";
+
+/** @typedef {import("./scene.js").Scene} Scene */
+
+const BACKGROUNDS = { dark: "#0b0a10", white: "#ffffff" };
+const MOST_PIXELS_PER_PIXEL = 2; // more costs much and shows little
+
+const LOST = "The graphics driver has reset, so the picture is gone; reload the page to draw it again.";
+
+/** The modules that need Spark, which may not be installed. */
+async function modules() {
+  if (!document.createElement("canvas").getContext("webgl2"))
+    throw new Trouble("This browser has no WebGL2, so the scene cannot be drawn; its statistics and planes are shown.");
+  try {
+    return await Promise.all([import("./viewer.js"), import("./navigation.js"), import("./compare.js")]);
+  } catch {
+    throw new Trouble(
+      "The viewer is not installed, so the scene cannot be drawn; `make setup` or `scripts/vendor` installs it.",
+    );
+  }
+}
+
+/** @param {(error: unknown) => void} failed what to do if nothing can be drawn */
+export function stage(failed) {
+  const [place, canvas] = [byId("stage"), byId("picture")];
+  /** @type {{viewer: import("./viewer.js").Viewer, camera: ReturnType<typeof import("./navigation.js").navigation>} | null} */
+  let live = null;
+  /** @type {Awaited<ReturnType<typeof import("./compare.js").comparison>> | null} */
+  let beside = null;
+  let white = false;
+
+  const ready = modules().then(([{ Viewer }, { navigation }, { comparison }]) => {
+    const viewer = new Viewer(canvas, { lost: () => fail(new Trouble(LOST)) });
+    live = { viewer, camera: navigation(viewer) };
+    new ResizeObserver(fit).observe(place);
+    paint();
+    return { ...live, comparison };
+  });
+  /** @type {unknown} */
+  let failure = null;
+  const fail = (/** @type {unknown} */ error) => failed((failure = error));
+  ready.catch(fail);
+
+  const viewers = () => [live?.viewer, beside?.original].filter((viewer) => viewer !== undefined);
+
+  function fit() {
+    const { clientWidth: width, clientHeight: height } = place;
+    if (!width || !height || canvas.hidden) return;
+    for (const viewer of viewers()) viewer.resize(width, height, Math.min(MOST_PIXELS_PER_PIXEL, devicePixelRatio));
+    if (!live?.camera.moved) live?.camera.home();
+  }
+
+  function paint() {
+    const colour = white ? BACKGROUNDS.white : BACKGROUNDS.dark;
+    for (const viewer of viewers()) viewer.setBackground(colour);
+    place.style.backgroundColor = colour;
+  }
+
+  /** @param {boolean} fresh whether this is another scene than before */
+  function reveal(fresh) {
+    const first = canvas.hidden;
+    canvas.hidden = false;
+    byId("tools").hidden = false;
+    byId("empty").hidden = true;
+    if (first) fit();
+    if (fresh || !live?.camera.moved) live?.camera.home();
+  }
+
+  function endComparison() {
+    beside?.end();
+    beside = null;
+  }
+
+  return {
+    /** Resolves when a scene can be shown; never where none can. @type {Promise<void>} */
+    ready: new Promise((resolve) =>
+      ready.then(
+        () => resolve(),
+        () => {},
+      ),
+    ),
+    /** Resolves when it is known whether a scene can be shown. @type {Promise<unknown>} */
+    settled: ready.catch(() => {}),
+    /** Why no scene can be shown, or null. */
+    get failure() {
+      return failure;
+    },
+    /**
+     * @param {Scene} scene
+     * @param {import("./scene.js").Parts} parts of it that are there
+     * @param {boolean} fresh
+     */
+    show(scene, parts, fresh) {
+      if (fresh) endComparison();
+      live?.viewer.setScene(scene, parts);
+      reveal(fresh);
+    },
+    /** @param {Uint8Array} bytes */
+    async showPly(bytes) {
+      const { viewer } = await ready;
+      endComparison();
+      const count = await viewer.setPly(bytes);
+      reveal(true);
+      return count;
+    },
+    /** @param {Uint8Array} bytes */
+    async compare(bytes) {
+      const { viewer, comparison } = await ready;
+      endComparison();
+      beside = await comparison(place, viewer, bytes);
+      fit();
+      paint();
+    },
+    endComparison,
+    /** Show no picture, until there is one of another scene. */
+    conceal() {
+      endComparison();
+      canvas.hidden = true;
+      byId("tools").hidden = true;
+    },
+    get comparing() {
+      return beside !== null;
+    },
+    /** @param {import("./scene.js").Gaussian | null} gaussian */
+    mark: (gaussian) => viewers().forEach((viewer) => viewer.mark(gaussian)),
+    home: () => live?.camera.home(),
+    /** @param {KeyboardEvent} event */
+    press: (event) => live?.camera.press(event) ?? false,
+    /** @returns {boolean} whether the background is white now */
+    switchBackground() {
+      white = !white;
+      paint();
+      return white;
+    },
+  };
+}

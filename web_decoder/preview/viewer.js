@@ -1,0 +1,212 @@
+/** The picture of a scene on a canvas, drawn by Spark. Draws only when something has changed. */
+
+import * as THREE from "three";
+import { SparkRenderer, SplatFileType, SplatMesh } from "@sparkjsdev/spark";
+import { lookAtAll, setPinhole } from "./camera.js";
+import { CLASSIC, WIDE, drawFromOutside } from "./classic.js";
+import { extentOfMesh, extentOfScene } from "./extent.js";
+import { marker } from "./marker.js";
+import { pack } from "./pack.js";
+
+/**
+ * @typedef {import("./scene.js").Scene} Scene
+ * @typedef {import("./camera.js").Pinhole} Pinhole
+ * @typedef {import("./extent.js").Extent} Extent
+ */
+
+export class Viewer {
+  #renderer;
+  #spark;
+  #scene = new THREE.Scene();
+  #marker = marker();
+  /** @type {SplatMesh | null} */
+  #mesh = null;
+  /** @type {Scene | null} */
+  #shown = null;
+  /** Whether the extent is final, as nothing more comes that it depends on. */
+  #placed = false;
+  /** @type {Extent} */
+  #extent = { centre: [0, 0, 0], radius: 1 };
+  /** @type {import("./pack.js").Encoding} */
+  #encoding = WIDE;
+  #requested = 0;
+  #disposed = false;
+
+  /**
+   * @param {HTMLCanvasElement} canvas
+   * @param {{afterFrame?: () => void, lost?: () => void}} [options] `lost` if the graphics driver takes the picture away
+   */
+  constructor(canvas, { afterFrame = () => {}, lost = () => {} } = {}) {
+    this.canvas = canvas;
+    this.camera = new THREE.PerspectiveCamera(50, 1);
+    this.afterFrame = afterFrame;
+    this.lost = lost;
+    this.#renderer = new THREE.WebGLRenderer({ canvas, antialias: false, alpha: false, preserveDrawingBuffer: true });
+    this.#renderer.toneMapping = THREE.NoToneMapping;
+    this.#spark = new SparkRenderer({ renderer: this.#renderer, onDirty: () => this.invalidate(), ...CLASSIC });
+    drawFromOutside(this.#spark);
+    this.#scene.add(this.#spark, this.#marker.object);
+    this.setBackground("#000000");
+    canvas.addEventListener("webglcontextlost", (event) => {
+      event.preventDefault();
+      if (!this.#disposed) this.lost();
+    });
+  }
+
+  /** Where the scene is; its centre is the origin of the viewer's own frame. */
+  get extent() {
+    return this.#extent;
+  }
+
+  /** The ranges of Spark's steps, so that another viewer can round as this one does. */
+  get encoding() {
+    return this.#encoding;
+  }
+
+  /**
+   * Show a decoded scene, or what has changed of it: call it again as more of its planes arrive.
+   * @param {Scene} scene
+   * @param {Partial<import("./scene.js").Parts>} [parts] what has come of it; all, unless said
+   */
+  setScene(scene, { placed = true, sized = true, spherical = true } = {}) {
+    if (scene !== this.#shown || !this.#placed) {
+      const extent = extentOfScene(scene);
+      // The frame stays while a scene is refined, or a camera that somebody has moved would jump.
+      this.#extent = scene === this.#shown ? { ...extent, centre: this.#extent.centre } : extent;
+    }
+    [this.#shown, this.#placed] = [scene, placed];
+    const spacing = this.#extent.radius / Math.cbrt(scene.count);
+    const { splats, encoding } = pack(scene, this.#extent.centre, { size: sized ? null : spacing / 2, spherical });
+    this.#encoding = encoding;
+    this.#replace(new SplatMesh({ packedSplats: splats, splatEncoding: encoding })); // or the mesh would reset it
+  }
+
+  /**
+   * Show a .ply, as Spark reads it.
+   * @param {Uint8Array} bytes
+   * @param {Viewer} [beside] share the frame of this viewer
+   * @returns {Promise<number>} the number of Gaussians
+   */
+  async setPly(bytes, beside) {
+    const splatEncoding = beside?.encoding ?? WIDE;
+    const mesh = new SplatMesh({ fileBytes: bytes, fileType: SplatFileType.PLY, splatEncoding });
+    await mesh.initialized;
+    this.#shown = null;
+    this.#extent = beside?.extent ?? extentOfMesh(mesh);
+    const [x, y, z] = this.#extent.centre;
+    mesh.position.set(-x, y, z);
+    this.#replace(mesh);
+    return mesh.numSplats;
+  }
+
+  /** @param {SplatMesh} mesh */
+  #replace(mesh) {
+    mesh.quaternion.set(1, 0, 0, 0); // scenes have y down and z ahead
+    if (this.#mesh) {
+      this.#scene.remove(this.#mesh);
+      this.#mesh.dispose();
+    }
+    this.#mesh = mesh;
+    this.#scene.add(mesh);
+    this.invalidate();
+  }
+
+  /** Put the camera where it sees the whole scene. */
+  lookAtAll() {
+    lookAtAll(this.camera, this.#extent.radius);
+    this.invalidate();
+  }
+
+  /** @param {Pinhole} pinhole */
+  setCamera(pinhole) {
+    this.#renderer.setPixelRatio(1);
+    this.#renderer.setSize(pinhole.width, pinhole.height, false);
+    setPinhole(this.camera, pinhole, this.#extent.centre);
+  }
+
+  /** @param {THREE.PerspectiveCamera} camera of a viewer that this one follows */
+  follow(camera) {
+    this.camera.copy(camera);
+    this.invalidate();
+  }
+
+  /**
+   * @param {number} width CSS pixels
+   * @param {number} height
+   * @param {number} ratio pixels per CSS pixel
+   */
+  resize(width, height, ratio) {
+    this.#renderer.setPixelRatio(ratio);
+    this.#renderer.setSize(width, height, false);
+    this.camera.aspect = width / height;
+    this.camera.updateProjectionMatrix();
+    this.#draw(); // at once: a resized canvas is blank until then
+  }
+
+  /** @param {string} colour */
+  setBackground(colour) {
+    this.#renderer.setClearColor(colour, 1);
+    this.invalidate();
+  }
+
+  /**
+   * Mark a Gaussian, through all that is in front of it.
+   * @param {import("./scene.js").Gaussian | null} gaussian
+   */
+  mark(gaussian) {
+    this.#marker.show(gaussian, this.#extent.centre);
+    this.invalidate();
+  }
+
+  /** Draw before long, once for all that changes until then. */
+  invalidate() {
+    if (!this.#requested && !this.#disposed) this.#requested = requestAnimationFrame(() => this.#draw());
+  }
+
+  #draw() {
+    cancelAnimationFrame(this.#requested);
+    this.#requested = 0;
+    this.#renderer.render(this.#scene, this.camera);
+    this.afterFrame();
+  }
+
+  /** The final picture: with all Gaussians in their order for this camera. */
+  async render() {
+    this.#scene.updateMatrixWorld();
+    this.camera.updateMatrixWorld();
+    await this.#sorted(); // for an earlier camera
+    await this.#spark.update({ scene: this.#scene, camera: this.camera });
+    await this.#sorted();
+    this.#draw();
+  }
+
+  async #sorted() {
+    while ((this.#spark.sorting || this.#spark.sortDirty) && !this.#renderer.getContext().isContextLost())
+      await new Promise((resolve) => setTimeout(resolve, 4));
+  }
+
+  /** The picture on the canvas: RGBA, top row first. */
+  readPixels() {
+    this.#renderer.setRenderTarget(null);
+    const gl = this.#renderer.getContext();
+    const [width, height] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
+    const upward = new Uint8Array(4 * width * height);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, upward);
+    const data = new Uint8Array(upward.length);
+    for (let y = 0; y < height; y++)
+      data.set(upward.subarray(4 * width * y, 4 * width * (y + 1)), 4 * width * (height - 1 - y));
+    return { width, height, data };
+  }
+
+  /** Spark ends first what it is sorting: it would fail in the middle of it, where nobody can catch the error. */
+  async dispose() {
+    this.#disposed = true;
+    cancelAnimationFrame(this.#requested);
+    this.#spark.sortDirty = false;
+    await this.#sorted();
+    this.#mesh?.dispose();
+    this.#spark.dispose();
+    this.#renderer.dispose();
+    this.#renderer.forceContextLoss(); // browsers keep few contexts
+  }
+}

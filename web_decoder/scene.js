@@ -1,0 +1,208 @@
+/** Images of a container to the arrays of a scene. What is done here, the page docs/format.md of kissgs explains. */
+
+/** @import { Scene } from "./types.js" */
+/** Values of the lowest and of the highest level that occur in an image. @typedef {number[]} Range */
+
+/** @type {(why: string) => never} */
+const fail = (why) => {
+  throw new Error(why);
+};
+
+export const [META, MASK] = ["meta.json", "active_mask.webp"];
+const [HIGH, LOW, QUATS] = ["means_bytes_1.webp", "means_bytes_0.webp", "quaternions.webp"];
+const [LABELS, CENTROIDS] = ["f_rest_labels.webp", "f_rest_centroids.webp"];
+/** In the order in which they make a picture. */
+export const PLANES = [MASK, HIGH, "f_dc.webp", "opacities.webp", "scales.webp", QUATS, LOW, LABELS, CENTROIDS];
+/** Images that hold one field in 8-bit levels, and its number of channels. */
+const PLAIN = /** @type {Record<string, ["sh0" | "opacities" | "scales" | "quats", number]>} */ ({
+  "f_dc.webp": ["sh0", 3],
+  "opacities.webp": ["opacities", 1],
+  "scales.webp": ["scales", 3],
+  [QUATS]: ["quats", 4],
+});
+/** Of spherical harmonics, by degree. */
+export const COEFFICIENTS = [0, 3, 8, 15];
+const [TILE_ROWS, TILE_COLUMNS] = [3, 5];
+const MAX_GRID_SIDE = 13376;
+const MAX_CODEBOOK_SIDE = 256;
+const MAX_SIGNED_LOG = 88.7; // e to more than this is beyond float32
+
+/** @type {(json: Uint8Array) => any} */
+function parse(json) {
+  try {
+    const { quats, shN, ...meta } = JSON.parse(new TextDecoder().decode(json));
+    return { ...meta, quats: { ...quats }, shN: { ...shN } };
+  } catch {
+    return fail(`${META} is not readable JSON`);
+  }
+}
+
+/** A range for each channel; one number stands for all. @type {(field: any, ends: string[], channels: number) => Range[]} */
+function rangesOf(field, ends, channels) {
+  const lists = ends.map((end) => [field?.[end]].flat(2));
+  return Array.from({ length: channels }, (_, i) => {
+    const range = lists.map((list) => list[list.length === channels ? i : 0]);
+    if (!range.every((end) => Number.isFinite(end) && Number.isFinite(Math.fround(end)))) {
+      fail(`${META}: ${ends.join(" and ")} are not ${channels} finite numbers`);
+    }
+    return range.map(Math.fround);
+  });
+}
+
+/** The lowest and the highest level of an image's first channels. @type {(levels: Uint8Array | Uint16Array, channels: number) => Range} */
+function observe(levels, channels) {
+  const seen = new Uint8Array(1 << (8 * levels.BYTES_PER_ELEMENT));
+  for (let i = 0; i < levels.length; i += 4) for (let c = 0; c < channels; c++) seen[levels[i + c]] = 1;
+  return [seen.indexOf(1), seen.lastIndexOf(1)];
+}
+
+/**
+ * The values of all levels, channel by channel.
+ * @param {Range} observed
+ * @param {Range[]} ranges
+ * @param {number} [levels]
+ * @param {(value: number) => number} [finish]
+ */
+const valuesOf = ([lowest, highest], ranges, levels = 256, finish = (value) => value) =>
+  new Float32Array(levels * ranges.length).map((_, i) => {
+    const [low, high] = ranges[(i / levels) | 0];
+    const level = Math.min(Math.max(i % levels, lowest), highest) - lowest;
+    return finish(low + (level / Math.max(highest - lowest, 1)) * (high - low));
+  });
+
+/** A scene, and how images become its values, in whichever order they come. */
+export class Assembly {
+  /** @type {Record<string, Range[]>} */
+  ranges = {};
+  /** Images of positions. @type {Record<string, Uint8Array>} */
+  bytes = {};
+
+  /**
+   * @param {Uint8Array} json
+   * @param {number} maxGaussians
+   */
+  constructor(json, maxGaussians) {
+    const meta = parse(json);
+    const { count, gridSide, means, quats, shN, format = "sog-xt", version = 3, kissgs } = meta;
+    const { layout = "uv-codebook", centroidSide: codebookSide, centroidsMins, centroidsMaxs } = shN;
+    const kind = [format, version, quats.encoding ?? "direct", layout].join(", ");
+    if (kind !== "sog-xt, 3, direct, uv-codebook") fail(`${META}: of a kind that is not read: ${kind}`);
+    for (const [name, value, least, most] of [
+      ["count", count, 0, gridSide ** 2],
+      ["gridSide", gridSide, 1, MAX_GRID_SIDE],
+      ["shN.centroidSide", codebookSide, 1, MAX_CODEBOOK_SIDE],
+      ["kissgs.sh_degree", kissgs?.sh_degree ?? 0, 0, 3],
+    ]) {
+      if (!(Number.isInteger(value) && value >= least && value <= most))
+        fail(`${META}: ${name} is impossible: ${value}`);
+    }
+    // Padding is less than half of any grid that follows the size rule, but for the smallest.
+    if (Math.max(count, (gridSide ** 2 - 64) / 2) > maxGaussians) {
+      fail(`larger than the ${maxGaussians} Gaussians need that are allowed (maxGaussians)`);
+    }
+    for (const [file, [field, channels]] of Object.entries(PLAIN)) {
+      this.ranges[file] = rangesOf(meta[field], ["mins", "maxs"], channels);
+    }
+    this.ranges[HIGH] = rangesOf(means, ["mins", "maxs"], 1);
+    if (this.ranges[HIGH][0].some((end) => Math.abs(end) > MAX_SIGNED_LOG)) fail(`${META}: means beyond float32`);
+    const rest = (this.ranges[CENTROIDS] = rangesOf(shN, ["centroidsMins", "centroidsMaxs"], 45));
+    const used = Math.max(...rest.map((range, i) => (range.some(Boolean) ? 1 + (i % 15) : 0)));
+    /** @type {Scene} */
+    this.scene = {
+      ...{ count, gridSide, codebookSide, meta, planes: {}, sizes: { [META]: json.length } },
+      degree: Math.max(
+        COEFFICIENTS.findIndex((coefficients) => coefficients >= used),
+        kissgs?.sh_degree ?? 0,
+      ),
+      ...{ means: new Float32Array(), quats: new Float32Array(), scales: new Float32Array(), sh0: new Float32Array() },
+      ...{ opacities: new Float32Array(), centroids: new Float32Array() },
+      ...{ labels: new Uint16Array(), cells: new Uint32Array() },
+    };
+  }
+
+  /** @param {string} file */
+  sizeOf(file) {
+    const { gridSide, codebookSide } = this.scene;
+    return file === CENTROIDS ? [TILE_COLUMNS * codebookSide, TILE_ROWS * codebookSide] : [gridSide, gridSide];
+  }
+
+  /**
+   * @param {string} file
+   * @param {Uint8Array} rgba
+   */
+  put(file, rgba) {
+    if (file === MASK) this.putMask(rgba);
+    else if (file === LABELS) this.putLabels(rgba);
+    else if (file === CENTROIDS) this.putCentroids(rgba);
+    else if (file in PLAIN) this.putPlain(file, rgba);
+    else this.putPositions(file, rgba);
+  }
+
+  /** @param {Uint8Array} rgba */
+  putMask(rgba) {
+    const { scene } = this;
+    const cells = new Uint32Array(scene.gridSide ** 2);
+    let count = 0;
+    for (let cell = 0; cell < cells.length; cell++) if (rgba[4 * cell]) cells[count++] = cell;
+    if (count !== scene.count) fail(`${MASK} marks ${count} Gaussians; ${META} declares ${scene.count}`);
+    scene.cells = cells.slice(0, count);
+    scene.means = new Float32Array(3 * count);
+    for (const [field, channels] of Object.values(PLAIN)) scene[field] = new Float32Array(channels * count);
+    for (let i = 0; i < count; i++) scene.quats[4 * i] = 1;
+    scene.labels = new Uint16Array(count);
+  }
+
+  /** @type {(file: string, rgba: Uint8Array) => void} */
+  putPlain(file, rgba) {
+    const [field, channels] = PLAIN[file];
+    const { cells, [field]: out } = this.scene;
+    const values = valuesOf(observe(rgba, channels), this.ranges[file]);
+    for (let i = 0, at = 0; i < cells.length; i++) {
+      for (let c = 0; c < channels; c++) out[at++] = values[(c << 8) | rgba[4 * cells[i] + c]];
+    }
+  }
+
+  /** @type {(file: string, rgba: Uint8Array) => void} */
+  putPositions(file, rgba) {
+    this.bytes[file] = rgba;
+    const { [HIGH]: high, [LOW]: low } = this.bytes;
+    if (!high) return;
+    if (low) this.bytes = {};
+    const { cells, means } = this.scene;
+    const levels = new Uint16Array(high.length);
+    for (let i = 0; i < levels.length; i++) levels[i] = (high[i] << 8) | (low ? low[i] : 128);
+    const values = valuesOf(
+      observe(levels, 3),
+      this.ranges[HIGH],
+      1 << 16,
+      (log) => Math.sign(log) * Math.expm1(Math.abs(log)),
+    );
+    for (let i = 0, at = 0; i < cells.length; i++) {
+      for (let c = 0; c < 3; c++) means[at++] = values[levels[4 * cells[i] + c]];
+    }
+  }
+
+  /** @param {Uint8Array} rgba */
+  putLabels(rgba) {
+    const { cells, labels, codebookSide } = this.scene;
+    for (let i = 0; i < rgba.length; i += 4) {
+      if (rgba[i + 1] * codebookSide + rgba[i] >= codebookSide ** 2) fail(`${LABELS} points outside the codebook`);
+    }
+    for (let i = 0; i < labels.length; i++) labels[i] = rgba[4 * cells[i] + 1] * codebookSide + rgba[4 * cells[i]];
+  }
+
+  /** @param {Uint8Array} rgba */
+  putCentroids(rgba) {
+    const { codebookSide: side, degree } = this.scene;
+    const coefficients = COEFFICIENTS[degree];
+    const centroids = (this.scene.centroids = new Float32Array(side * side * coefficients * 3));
+    const values = valuesOf(observe(rgba, 3), this.ranges[CENTROIDS]);
+    for (let entry = 0, at = 0; entry < side * side; entry++) {
+      const corner = ((entry / side) | 0) * side * TILE_COLUMNS + (entry % side);
+      for (let k = 0; k < coefficients; k++) {
+        const pixel = corner + side * (((k / TILE_COLUMNS) | 0) * side * TILE_COLUMNS + (k % TILE_COLUMNS));
+        for (let c = 0; c < 3; c++) centroids[at++] = values[((15 * c + k) << 8) | rgba[4 * pixel + c]];
+      }
+    }
+  }
+}
