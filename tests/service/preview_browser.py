@@ -114,16 +114,15 @@ class Preview:
         shot = self.page.locator("#stage").screenshot(animations="disabled")
         return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
 
-    def picture(self, seconds=15):
-        """The same, once it does not change any more."""
+    def picture(self, seconds=20, still=3):
+        """The same, once that many looks at it, 0.2 s apart, were alike: Spark may still be sorting for a while."""
         end = time.monotonic() + seconds
-        before = self.pixels()
+        seen = [self.pixels()]
         while time.monotonic() < end:
             self.page.wait_for_timeout(200)
-            after = self.pixels()
-            if before.shape == after.shape and (before == after).all():
-                return after
-            before = after
+            seen = [*seen[1 - still :], self.pixels()]
+            if len(seen) == still and all(np.array_equal(seen[0], other) for other in seen[1:]):
+                return seen[-1]
         raise AssertionError("the picture does not come to rest")
 
     def trouble(self, *words):

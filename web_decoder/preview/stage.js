@@ -95,7 +95,7 @@ export function stage(failed) {
      */
     show(scene, parts, fresh) {
       if (fresh) endComparison();
-      live?.viewer.setScene(scene, parts);
+      live?.viewer.setScene(scene, parts, live.camera.moved);
       reveal(fresh);
     },
     /** @param {Uint8Array} bytes */

@@ -67,12 +67,12 @@ export class Viewer {
    * Show a decoded scene, or what has changed of it: call it again as more of its planes arrive.
    * @param {Scene} scene
    * @param {Partial<import("./scene.js").Parts>} [parts] what has come of it; all, unless said
+   * @param {boolean} [held] whether somebody has moved the camera: it would jump if the frame followed the scene
    */
-  setScene(scene, { placed = true, sized = true, spherical = true } = {}) {
+  setScene(scene, { placed = true, sized = true, spherical = true } = {}, held = false) {
     if (scene !== this.#shown || !this.#placed) {
       const extent = extentOfScene(scene);
-      // The frame stays while a scene is refined, or a camera that somebody has moved would jump.
-      this.#extent = scene === this.#shown ? { ...extent, centre: this.#extent.centre } : extent;
+      this.#extent = held && scene === this.#shown ? { ...extent, centre: this.#extent.centre } : extent;
     }
     [this.#shown, this.#placed] = [scene, placed];
     const spacing = this.#extent.radius / Math.cbrt(scene.count);
