@@ -25,11 +25,13 @@ if TYPE_CHECKING:
     )
     from kissgs.evaluation.likeness import Evaluation
     from kissgs.evaluation.pictures import evaluate
+    from kissgs.importance import Importance
     from kissgs.io.ply import PlyInfo, read_ply_info
     from kissgs.pipeline import Compressed, compress, decompress, load, save
     from kissgs.progress import Progress
     from kissgs.remote import Remote
     from kissgs.rendering.camera import Camera
+    from kissgs.rendering.importance import Watch, measure_importance
     from kissgs.rendering.rasterizer import render
     from kissgs.report import Report
     from kissgs.sample import sample_scene
@@ -45,6 +47,7 @@ _HOMES = {
     "Compressed": "pipeline",
     "EncodeSettings": "settings",
     "Evaluation": "evaluation.likeness",
+    "Importance": "importance",
     "InvalidContainerError": "errors",
     "InvalidSceneError": "errors",
     "InvalidViewsError": "errors",
@@ -61,12 +64,14 @@ _HOMES = {
     "UnsupportedError": "errors",
     "View": "views.view",
     "Views": "views.view",
+    "Watch": "rendering.importance",
     "clean": "splats",
     "compress": "pipeline",
     "decompress": "pipeline",
     "evaluate": "evaluation.pictures",
     "load": "pipeline",
     "load_views": "views.load",
+    "measure_importance": "rendering.importance",
     "read_ply_info": "io.ply",
     "render": "rendering.rasterizer",
     "sample_scene": "sample",
@@ -80,6 +85,7 @@ __all__ = [
     "Compressed",
     "EncodeSettings",
     "Evaluation",
+    "Importance",
     "InvalidContainerError",
     "InvalidSceneError",
     "InvalidViewsError",
@@ -96,6 +102,7 @@ __all__ = [
     "UnsupportedError",
     "View",
     "Views",
+    "Watch",
     "__version__",
     "clean",
     "compress",
@@ -103,6 +110,7 @@ __all__ = [
     "evaluate",
     "load",
     "load_views",
+    "measure_importance",
     "read_ply_info",
     "render",
     "sample_scene",

@@ -81,7 +81,8 @@ def compress(
     unpacked: Annotated[bool, typer.Option("--unpacked", help="Write folders instead of zips.")] = False,
     evaluate: Annotated[bool, typer.Option("--evaluate", help="Measure PSNR and SSIM of the result.")] = False,
     views: Annotated[
-        Path | None, typer.Option("--views", metavar="DATA", help="Evaluate on these photographs; see 'evaluate'.")
+        Path | None,
+        typer.Option("--views", metavar="DATA", help="Photographs: keep what their cameras see best; see 'evaluate'."),
     ] = None,
     threads: ThreadsOption = 0,
     force: ForceOption = False,
@@ -92,8 +93,8 @@ def compress(
     from kissgs.pipeline import compress as run
 
     settings = chosen(preset, changes, seed)
-    if views is not None and not evaluate:
-        raise UnsupportedError("--views says from where to evaluate; add --evaluate")
+    if views is not None and not (evaluate or settings.encode.weigh):
+        raise UnsupportedError(f"{preset} takes no pictures: --views only says from where to evaluate; add --evaluate")
     capture = _cli_pictures.open_views(views)
 
     def work(scene: str, target: Path) -> dict[str, Any]:

@@ -14,20 +14,25 @@ import numpy as np
 
 from kissgs._typing import Float32, Int
 from kissgs.errors import InvalidContainerError, OutputError
+from kissgs.importance import Importance
 from kissgs.io.atomic import atomic_file, reason_of, refuse_existing
 from kissgs.io.ply import read_ply, write_ply
 from kissgs.progress import Progress, silent
 from kissgs.report import Report
-from kissgs.settings import Settings
+from kissgs.settings import EncodeSettings, Settings
 from kissgs.sogxt.container import check_destination, write_container, zip_bytes
 from kissgs.sogxt.decode import MAX_GAUSSIANS, decode
 from kissgs.splats import Cleaned, Splats, clean
 
 if TYPE_CHECKING:
     from kissgs.evaluation.likeness import Evaluation
+    from kissgs.sogxt.encode import Encoded
     from kissgs.views.view import Views
 
 AnyPath = str | PathLike[str]
+
+HEDGE = {True: 0.1, False: 0.55}
+"""How little pictures say of others: those from a capture's cameras, and those from virtual ones."""
 
 ZIP_BEGINNINGS = (b"PK\x03\x04", b"PK\x05\x06")
 
@@ -91,7 +96,7 @@ def compress(
     destination: AnyPath | None = None,
     *,
     settings: Settings | None = None,
-    importance: Float32[np.ndarray, " N"] | None = None,
+    importance: Importance | None = None,
     evaluate: bool = False,
     views: Views | None = None,
     overwrite: bool = False,
@@ -104,10 +109,12 @@ def compress(
         source: a scene, or the path or the bytes of a ``.ply`` (a container is decoded and encoded anew).
         destination: ``.zip`` or folder to write; by default nothing is written.
         settings: by default those of the preset ``balanced``.
-        importance: ``(N,)`` numbers from 0 for the Gaussians of a clean ``source``, see :func:`kissgs.sogxt.encode`.
+        importance: of a clean ``source``, measured before (:func:`kissgs.measure_importance`); by default it is
+            measured if the settings ask for it.
         evaluate: decode the result and compare its pictures with those of the cleaned scene, and with the photographs
             of ``views`` if they have any; see :func:`kissgs.evaluate`. The report then has an ``evaluation``.
-        views: from where to evaluate, by default virtual cameras; the container does not depend on them.
+        views: a capture of the scene: its cameras for training weigh the bits, those held out are for evaluation; by
+            default virtual cameras for both.
         overwrite: replace ``destination`` if it exists.
         threads: 0 means one per processor; the bytes do not depend on it.
         progress: receives events; raise :class:`kissgs.Cancelled` from it to stop. Nothing is written then.
@@ -118,15 +125,13 @@ def compress(
     Raises:
         KissgsError: one of its children, with a sentence for the user.
     """
-    from kissgs.sogxt.encode import encode
-
     settings = settings or Settings()
     target = Path(destination) if destination is not None else None
     if target is not None:
         check_destination(target, overwrite=overwrite)
     clock = _Clock(progress)
     splats, cleaned, source_bytes = _open(source, threads, clock)
-    encoded = encode(splats, settings.encode, importance=importance, cleaned=cleaned, threads=threads, progress=clock)
+    encoded = _encode(splats, settings.encode, importance, views, cleaned, threads, clock)
     archive_bytes = len(zip_bytes(encoded.files))
     evaluation = _evaluate(splats, encoded.files, views, threads, clock) if evaluate else None
     if target is not None:
@@ -141,10 +146,11 @@ def compress(
         container_bytes=archive_bytes,
         file_bytes={name: len(data) for name, data in encoded.files.items()},
         cleaned=cleaned,
-        invisible=encoded.dropped,
+        invisible=encoded.invisible,
+        negligible=encoded.negligible,
         tamed_colours=encoded.tamed,
         form_error=encoded.form_error,
-        half_steps=encoded.half_steps,
+        half_steps=encoded.errors,
         seconds=clock.seconds,
         cpu_seconds=clock.cpu_seconds,
         peak_memory=peak_memory(),
@@ -219,6 +225,42 @@ def peak_memory() -> int:
         return 0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
+
+
+def _encode(
+    splats: Splats,
+    settings: EncodeSettings,
+    importance: Importance | None,
+    views: Views | None,
+    cleaned: Cleaned,
+    threads: int,
+    progress: Progress,
+) -> Encoded:
+    """Look at the scene, if the settings say so, and encode it."""
+    from kissgs.sogxt.encode import encode
+
+    if not settings.weigh or len(splats) == 0:
+        return encode(splats, settings, cleaned=cleaned, threads=threads, progress=progress)
+    from kissgs.rendering.importance import measure_importance
+    from kissgs.rendering.rasterizer import load_kernels
+    from kissgs.rendering.refit import refit_colors
+    from kissgs.views.watch import watch
+
+    load_kernels(progress)
+    watched = watch(splats, views, count=settings.views, size=settings.view_size, threads=threads, progress=progress)
+    if importance is None:
+        hedge = settings.hedge if settings.hedge is not None else HEDGE[views is not None]
+        importance = measure_importance(splats, watched, hedge=hedge, threads=threads, progress=progress)
+    colors, guessed, steps = importance.colors, importance.guessed, settings.refit if views is not None else 0
+
+    def recolor(decoded: Splats, order: Int[np.ndarray, " M"]) -> Float32[np.ndarray, "M 3"]:
+        return refit_colors(
+            *(decoded, splats, watched, colors[order], guessed[order]), steps=steps, threads=threads, progress=progress
+        )
+
+    return encode(
+        *(splats, settings), importance=importance, recolor=recolor, cleaned=cleaned, threads=threads, progress=progress
+    )
 
 
 def _evaluate(

@@ -22,9 +22,10 @@ class Report:
         file_bytes: per file of the container.
         cleaned: what was wrong with the input (:class:`kissgs.splats.Cleaned`).
         invisible: Gaussians left out because no renderer would draw them.
+        negligible: Gaussians left out because their bytes would cost more than they show.
         tamed_colours: Gaussians whose base colour is such an outlier that it was pulled in, for the others' sake.
         form_error: largest relative change of a covariance by the choice of its equivalent form.
-        half_steps: largest error that quantisation may cause, per field and channel.
+        half_steps: largest error of quantisation, per field and channel; where all steps are alike, half of one.
         seconds: wall time per stage.
         cpu_seconds: processor time of all stages, over all threads.
         peak_memory: bytes, the largest this process has ever had resident.
@@ -40,6 +41,7 @@ class Report:
     file_bytes: dict[str, int]
     cleaned: Cleaned
     invisible: int
+    negligible: int
     tamed_colours: int
     form_error: float
     half_steps: dict[str, list[float]]

@@ -26,6 +26,60 @@ class EncodeSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    weigh: bool = Field(
+        True,
+        description="Take pictures of the scene, and weigh every bit against the error it saves in them. Steps, "
+        "codebook size and precision then follow from fidelity, and the ones given below are not used.",
+    )
+    fidelity: Annotated[float, Field(ge=-30, le=30)] = Field(
+        0.2, description="Where bits are weighed: decibels above the paper's own settings on the same scene, about."
+    )
+    price: float | None = Field(
+        None,
+        gt=0,
+        lt=1,
+        description="Where bits are weighed: squared error per bit, in place of fidelity; auto: found for the scene.",
+    )
+    drop: float = Field(
+        10.0,
+        ge=0,
+        le=200,
+        description="Where bits are weighed: leave out Gaussians that show less than so many bits are worth. A "
+        "Gaussian takes some 60; beyond 30, holes that they leave together begin to show.",
+    )
+    classes: int = Field(
+        3,
+        ge=1,
+        le=32,
+        description="Where bits are weighed: kinds of Gaussians by importance, each with its own steps. More make "
+        "steps fit better, and positions cost more.",
+    )
+    round_by_price: bool = Field(
+        True, description="Where bits are weighed: prefer levels that many have. False: the nearest level."
+    )
+    sh_thrift: float = Field(
+        0.25,
+        ge=0,
+        le=4,
+        description="Where bits are weighed: how much codebook entries that many have are preferred; 1 would be right "
+        "if errors of neighbours did not add up.",
+    )
+    refit: int = Field(
+        2,
+        ge=0,
+        le=20,
+        description="Where bits are weighed by a capture's cameras: steps of fitting base colours to its pictures, to "
+        "make up for all other losses.",
+    )
+    views: int = Field(48, ge=1, le=1000, description="Where bits are weighed: how many pictures to take, at most.")
+    view_size: int = Field(480, ge=16, le=4096, description="Longer side of these pictures, pixels, at most.")
+    hedge: float | None = Field(
+        None,
+        ge=0,
+        le=1,
+        description="Where bits are weighed: how little these pictures are taken to say of others, 0 to 1; auto: 0.1 "
+        "with a capture's cameras, 0.55 without.",
+    )
     order: Literal["hilbert", "plas"] = Field(
         "hilbert",
         description="Which Gaussian sits where: along a 3D Hilbert curve (fast, smallest) or by PLAS (the paper).",
@@ -100,8 +154,8 @@ class EncodeSettings(BaseModel):
         True,
         description="Leave out Gaussians of opacity 1/255 and less: no renderer draws them. The count is reported.",
     )
-    webp_quality: int = Field(50, ge=0, le=100, description="Effort of libwebp; always lossless.")
-    webp_method: int = Field(2, ge=0, le=6, description="Methods of libwebp; always lossless.")
+    webp_quality: int = Field(75, ge=0, le=100, description="Effort of libwebp; always lossless.")
+    webp_method: int = Field(4, ge=0, le=6, description="Methods of libwebp; always lossless.")
     codebook_effort: bool = Field(
         True, description="Spend libwebp's highest effort on the codebook image: some seconds for 8 % of it."
     )
@@ -111,21 +165,19 @@ class EncodeSettings(BaseModel):
 
 
 PRESETS: dict[Preset, dict[str, Any]] = {
-    Preset.FAST: {"sh_rounds": 1, "sh_reach": 6, "plas_decay": 0.6, "codebook_effort": False},
-    Preset.BALANCED: {},
-    Preset.SMALL: {
-        "means_tolerance": 0.08,
-        "opacity_step": 0.2,
-        "scale_step": 0.15,
-        "quat_step": 0.033,
-        "sh0_step": 0.08,
-        "sh_ratio": 16,
-        "sh_step": 1.4,
-        "sh_rounds": 8,
-        "sh_reach": 32,
-        "plas_decay": 0.95,
+    Preset.FAST: {
+        "weigh": False,
+        "sh_rounds": 1,
+        "sh_reach": 6,
+        "plas_decay": 0.6,
+        "codebook_effort": False,
+        "webp_quality": 50,
+        "webp_method": 2,
     },
+    Preset.BALANCED: {},
+    Preset.SMALL: {"fidelity": -0.1, "drop": 18, "refit": 4, "sh_rounds": 8, "sh_reach": 32, "plas_decay": 0.9},
     Preset.PAPER: {
+        "weigh": False,
         "order": "plas",
         "forms": "smooth",
         "shared_steps": False,

@@ -51,31 +51,43 @@ class Codebook:
 def fit_codebook(
     splats: Splats,
     chosen: Int[np.ndarray, " M"],
-    importance: Float32[np.ndarray, " N"] | None,
+    weights: Float32[np.ndarray, " M"],
+    size: float,
     settings: EncodeSettings,
     pool: Workers,
     progress: Progress,
+    thrift: kmeans.Thrift | None = None,
 ) -> Codebook:
     """Build the codebook for the Gaussians ``chosen``.
 
     A scene without SH, or with bands that are zero throughout, pays nothing for them: their tiles are constant.
+
+    Args:
+        splats: the scene.
+        chosen: which of its Gaussians.
+        weights: how much the gloss of each counts.
+        size: largest number of entries; the image's side is a multiple of 8, and what is left of it is filled too.
+        settings: see :class:`EncodeSettings`.
+        pool: where the work runs.
+        progress: receives "codebook" and "sort codebook" events.
+        thrift: what labels cost.
     """
     dimensions = splats.shN.shape[1] * 3
     if dimensions == 0 or len(chosen) == 0:
         nothing = quantize(np.zeros((MIN_SIDE**2, 3 * COEFFICIENTS)), step=1)
         return Codebook(MIN_SIDE, nothing, np.zeros(max(len(chosen), 1), dtype=np.int32))
     progress("codebook", 0.0)
-    weights = _weights(splats, importance, settings.sh_weight_power)[chosen]
     clusters = kmeans.fit(
         splats.shN[chosen].reshape(len(chosen), dimensions),
         weights,
-        codebook_side(len(chosen), settings.sh_ratio) ** 2,
+        whole_side(size) ** 2,
         pool,
         seed=settings.seed,
         rounds=settings.sh_rounds,
         reach=settings.sh_reach,
         tolerance=settings.sh_tolerance,
         lattice=settings.sh_step if settings.shared_steps else 0.0,
+        thrift=thrift,
         report=lambda fraction: progress("codebook", fraction),
     )
     # The smallest image that holds the entries found; what is left of it repeats some of them.
@@ -95,9 +107,9 @@ def fit_codebook(
     return Codebook(side, levels, position[clusters.labels])
 
 
-def codebook_side(count: int, ratio: float) -> int:
-    """S for ``count`` Gaussians, ``ratio`` of them per entry: a multiple of 8 from 8 to 256, rounded down."""
-    side = int((count / ratio) ** 0.5) // 8 * 8
+def whole_side(size: float) -> int:
+    """S for so many entries: a multiple of 8 from 8 to 256, rounded down."""
+    side = int(size**0.5) // 8 * 8
     return min(max(side, MIN_SIDE), MAX_CODEBOOK_SIDE)
 
 
@@ -113,14 +125,15 @@ def _sort(
     return plas(np.ascontiguousarray(entries), pool, seed=settings.seed, decay=settings.plas_decay, report=report)
 
 
-def _weights(splats: Splats, importance: Float32[np.ndarray, " N"] | None, power: float) -> Float32[np.ndarray, " N"]:
-    """How much each Gaussian's SH counts: as given, or (opacity × area of its two longest axes) to ``power``."""
-    if importance is None:
-        area = np.sort(splats.scales, axis=1)[:, 1:].sum(axis=1, dtype=np.float64)
-        logs = area - np.logaddexp(0, -splats.opacities.astype(np.float64))
-        logs = power * (logs - np.median(logs))
-    else:
-        wide = importance.astype(np.float64)
-        seen = wide[wide > 0]
-        logs = np.log(np.maximum(wide, np.finfo(np.float64).tiny)) - np.log(np.median(seen) if len(seen) else 1)
+def guessed_weights(splats: Splats, power: float) -> Float32[np.ndarray, " N"]:
+    """How much each Gaussian's gloss counts if nobody has looked: (opacity × largest cross-section) to ``power``."""
+    area = np.sort(splats.scales, axis=1)[:, 1:].sum(axis=1, dtype=np.float64)
+    logs = area - np.logaddexp(0, -splats.opacities.astype(np.float64))
+    logs = power * (logs - np.median(logs))
     return np.exp(np.clip(logs, np.log(WEIGHT_FLOOR), np.log(WEIGHT_CEILING))).astype(np.float32)
+
+
+def bounded(weights: Float32[np.ndarray, " N"], low: float, high: float) -> Float32[np.ndarray, " N"]:
+    """In units of their median, those that are not 0, and within bounds."""
+    seen = weights[weights > 0].astype(np.float64)
+    return np.clip(weights / (np.median(seen) if len(seen) else 1.0), low, high).astype(np.float32)

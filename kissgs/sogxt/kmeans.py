@@ -28,8 +28,37 @@ SPLIT_ROUNDS = 4
 SAMPLES_PER_COARSE = 64
 MAX_COARSE = 512
 
+UNUSED = 0.02
+"""Times that a label is taken to occur which does not: its bits are then many, not infinitely many."""
+
 OUTLIERS = 1e-3
 """Share of entries, at either end of a dimension, that may be pulled in to keep the others' step."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Thrift:
+    """Makes a codebook whose labels are cheap to tell: entropy-constrained vector quantisation.
+
+    Chou, Lookabaugh, Gray, "Entropy-constrained vector quantization", IEEE Trans. ASSP 37 (1989).
+
+    Attributes:
+        price: ``(N,)`` of a bit, for each vector, in units of its squared distance.
+        groups: ``(N,)`` from 0; labels are told apart from those of the same group alone.
+    """
+
+    price: Float32[np.ndarray, " N"]
+    groups: Int[np.ndarray, " N"]
+
+    def ordered(self, order: Int[np.ndarray, " N"]) -> Thrift:
+        """For vectors in another order."""
+        return Thrift(self.price[order], self.groups[order])
+
+    def bits(self, labels: Int32[np.ndarray, " N"], size: int) -> Float32[np.ndarray, "G K"]:
+        """Of each label, in each group, if they are chosen as they were."""
+        counts = np.zeros((int(self.groups.max(initial=0)) + 1, size))
+        np.add.at(counts, (self.groups, labels), 1)
+        counts += UNUSED
+        return (np.log2(counts.sum(axis=1, keepdims=True)) - np.log2(counts)).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +81,7 @@ def fit(
     reach: int,
     tolerance: float,
     lattice: float,
+    thrift: Thrift | None = None,
     report: Callable[[float], None] = lambda fraction: None,
 ) -> Clusters:
     """Find at most ``size`` centroids of small weighted squared error.
@@ -67,6 +97,7 @@ def fit(
         tolerance: root mean square error per dimension below which a cluster is not split further.
         lattice: step of the values that centroids are rounded to, in units of the root mean square error that the
             codebook leaves; vectors then choose among the rounded ones. 0 leaves them as they are.
+        thrift: weigh the bits of a label against the error it leaves, in the later half of the rounds.
         report: told the fraction done.
 
     Returns:
@@ -91,17 +122,20 @@ def fit(
     centroids, labels = _split(vectors, weights, tree, rng, pool)
     report(0.4)
     near = tree.neighbours(reach)
+    thrift = None if thrift is None else thrift.ordered(order)
     for step in range(rounds):
         _update(centroids, vectors, weights, labels)
-        distances = _reassign(vectors, centroids, labels, tree, near, pool)
-        _revive(centroids, vectors, weights * distances, labels)
+        saving = thrift if 2 * step >= rounds else None
+        distances = _reassign(vectors, centroids, labels, tree, near, pool, saving)
+        if saving is None:
+            _revive(centroids, vectors, weights * distances, labels)
         report(0.4 + 0.6 * (step + 1) / rounds)
     _update(centroids, vectors, weights, labels)
     step = 0.0
     if lattice:
         error = np.average(distances, weights=weights) / vectors.shape[1]
         step = _round_to_lattice(centroids, lattice * float(error) ** 0.5, tolerance)
-        _reassign(vectors, centroids, labels, tree, near, pool)
+        _reassign(vectors, centroids, labels, tree, near, pool, thrift)
 
     used, compact = np.unique(labels, return_inverse=True)
     unsorted = np.empty(len(labels), dtype=np.int32)
@@ -110,9 +144,16 @@ def fit(
 
 
 def assign(
-    vectors: Float32[np.ndarray, "N D"], centroids: Float32[np.ndarray, "K D"]
+    vectors: Float32[np.ndarray, "N D"],
+    centroids: Float32[np.ndarray, "K D"],
+    price: Float32[np.ndarray, " N"] | None = None,
+    bits: Float32[np.ndarray, "G K"] | None = None,
+    groups: Int[np.ndarray, " N"] | None = None,
 ) -> tuple[Int[np.ndarray, " N"], Float32[np.ndarray, " N"]]:
-    """Nearest centroid of every vector, by brute force, and the squared distance to it."""
+    """Nearest centroid of every vector, by brute force, and the squared distance to it.
+
+    With ``price``, the one of least squared distance plus ``price`` times the centroid's ``bits`` in its group.
+    """
     labels = np.empty(len(vectors), dtype=np.int64)
     distances = np.empty(len(vectors), dtype=np.float32)
     norms = np.einsum("kd,kd->k", centroids, centroids)
@@ -121,7 +162,13 @@ def assign(
         block = vectors[first : first + BLOCK]
         partial = block @ minus_two
         partial += norms
-        best = partial.argmin(axis=1)
+        if price is None or bits is None or groups is None:
+            best = partial.argmin(axis=1)
+        else:
+            charged = bits[groups[first : first + BLOCK]]
+            charged *= price[first : first + BLOCK, None]
+            charged += partial
+            best = charged.argmin(axis=1)
         labels[first : first + BLOCK] = best
         distances[first : first + BLOCK] = partial[np.arange(len(block)), best]
     distances += np.einsum("nd,nd->n", vectors, vectors)
@@ -225,14 +272,20 @@ def _reassign(
     tree: _Tree,
     near: list[Int[np.ndarray, " _"]],
     pool: Workers,
+    thrift: Thrift | None = None,
 ) -> Float32[np.ndarray, " N"]:
-    """Move every vector to the nearest centroid near its coarse cluster. Changes ``labels``; returns distances."""
+    """Move every vector to the best centroid near its coarse cluster. Changes ``labels``; returns distances."""
     distances = np.zeros(len(vectors), dtype=np.float32)
+    bits = None if thrift is None else thrift.bits(labels, len(centroids))
 
     def work(j: int) -> None:
         rows = tree.vectors_of(j)
         if rows.start < rows.stop:
-            best, distances[rows] = assign(vectors[rows], centroids[near[j]])
+            if thrift is None or bits is None:
+                best, distances[rows] = assign(vectors[rows], centroids[near[j]])
+            else:
+                charge = thrift.price[rows], bits[:, near[j]], thrift.groups[rows]
+                best, distances[rows] = assign(vectors[rows], centroids[near[j]], *charge)
             labels[rows] = near[j][best]
 
     pool.map(work, range(len(tree.coarse)))

@@ -50,8 +50,11 @@ def place(
     settings: EncodeSettings,
     pool: Workers,
     report: Callable[[float], None],
+    classes: Int[np.ndarray, " M"] | None = None,
 ) -> Grid:
     """Give every Gaussian of ``kept`` a cell.
+
+    Along the Hilbert curve, those of class 0 may come first, then those of class 1, and so on: a curve for each.
 
     Raises:
         UnsupportedError: there are more than one image can hold.
@@ -63,6 +66,8 @@ def place(
     levels = quantize_means(means[kept], bits=bits).levels
     if settings.order == "hilbert":
         order = hilbert_order(levels)
+        if classes is not None:
+            order = order[np.argsort(classes[order], kind="stable")]
         order = np.concatenate([order, np.repeat(order[-1:], side * side - len(order))])
         mask = np.arange(side * side) < len(kept)
     else:

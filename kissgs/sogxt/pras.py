@@ -48,11 +48,11 @@ def choose_forms(
     settings: EncodeSettings,
     pool: Workers,
     report: Callable[[float], None],
-) -> tuple[Float64[np.ndarray, "cells 4"], Float32[np.ndarray, "cells 3"], float]:
+) -> tuple[Float64[np.ndarray, "cells 4"], Float32[np.ndarray, "cells 3"], float, UInt8[np.ndarray, " cells"]]:
     """Rotations and log-scales of the Gaussians in ``cells``, in the form that the settings choose.
 
     Returns:
-        Quaternions, log-scales, and the largest relative change of a covariance (rounding only).
+        Quaternions, log-scales, the largest relative change of a covariance (rounding only), and the forms.
     """
     quats, scales = splats.quats[cells].astype(np.float64), splats.scales[cells]
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)  # float32 knows a unit only to 1e-7
@@ -61,7 +61,7 @@ def choose_forms(
     else:
         forms = smooth_forms(quats, scales, side, pool, decay=settings.plas_decay, report=report)
     new_quats, new_scales = apply_forms(quats, scales, forms)
-    return new_quats, new_scales, covariance_error(quats, scales, new_quats, new_scales)
+    return new_quats, new_scales, covariance_error(quats, scales, new_quats, new_scales), forms
 
 
 def apply_forms(

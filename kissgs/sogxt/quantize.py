@@ -80,13 +80,13 @@ def tame(values: Float[np.ndarray, "N C"], *, step: float, share: float) -> Floa
     return np.clip(values, first.astype(values.dtype), last.astype(values.dtype))
 
 
-def quantize_means(means: Float32[np.ndarray, "N 3"], *, bits: int) -> Quantized:
+def quantize_means(means: Float32[np.ndarray, "N 3"], *, bits: int | Int[np.ndarray, " N"]) -> Quantized:
     """Positions as 16-bit levels of their signed logarithm, with one range for all three axes.
 
     Args:
         means: finite positions.
-        bits: precision, 8 to 16. Below 16 the levels are multiples of a power of two (the low bytes then compress);
-            the outermost level stays 65535.
+        bits: precision, 8 to 16, of all or of each. Below 16 the levels are multiples of a power of two (the low
+            bytes then compress); the outermost level stays 65535.
 
     Returns:
         Levels (uint16) with ``low`` and ``high`` in the signed-log domain, alike in all channels.
@@ -94,7 +94,7 @@ def quantize_means(means: Float32[np.ndarray, "N 3"], *, bits: int) -> Quantized
     wide = signed_log(means)
     low32, high32 = _range(wide.reshape(-1, 1))
     low, high = np.repeat(low32, 3), np.repeat(high32, 3)
-    spacing = 1 << (16 - bits)
+    spacing = np.exp2(16 - np.reshape(bits, (-1, 1)))
     levels = _levels(wide, low, high, MEANS_TOP, spacing)
     if high[0] > low[0]:
         levels[wide == wide.max()] = MEANS_TOP  # rounding, to even or of the range, could stop just short of it
@@ -157,13 +157,14 @@ def _levels(
     low: Float32[np.ndarray, " C"],
     high: Float32[np.ndarray, " C"],
     top: int,
-    spacing: int = 1,
+    spacing: float | Float64[np.ndarray, "M 1"] = 1,
 ) -> Float64[np.ndarray, "N C"]:
     """Nearest multiples of ``spacing`` in the rounded ranges, at most ``top``."""
     low64 = low.astype(np.float64)
     extent = high.astype(np.float64) - low64
     levels = wide - low64
-    levels *= top / np.where(extent > 0, extent, np.inf) / spacing
+    levels *= top / np.where(extent > 0, extent, np.inf)
+    levels /= spacing
     np.rint(levels, out=levels)
     levels *= spacing
     return np.clip(levels, 0, top, out=levels)

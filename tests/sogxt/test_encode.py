@@ -24,7 +24,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from kissgs import InvalidSceneError, Settings, compress, decompress
+from kissgs import Settings, compress, decompress
 from kissgs.sogxt.encode import encode
 from kissgs.splats import clean
 
@@ -39,7 +39,7 @@ def encoded(splats, preset="fast", **changes):
 @pytest.mark.parametrize("count", [1, 9, 300])
 def test_round_trip_is_within_the_half_steps_that_are_reported(count, preset):
     splats = random_scene(count, 1, seed=count)
-    result = encoded(splats, preset)
+    result = encoded(splats, preset, drop=0)
     assert_round_trip(splats, result)
     assert sorted(result.order) == list(range(count))
 
@@ -63,7 +63,7 @@ def test_round_trip_for_any_steps(count, seed, coarse, fine, quat_step, bits, sh
 @pytest.mark.parametrize("preset", PRESETS)
 def test_sh_of_scenes_below_the_codebook_size_is_within_its_half_steps(preset):
     splats = random_scene(50, 3, seed=2)
-    result = encoded(splats, preset, sh_ratio=1)
+    result = encoded(splats, preset, sh_ratio=1, weigh=False)
     half = max(result.report.half_steps["f_rest_centroids"])
     assert_within(decompress(result.files).shN, splats.select(result.order).shN, half)
 
@@ -113,13 +113,13 @@ def test_invisible_gaussians_are_left_out_and_counted():
 def test_scenes_without_a_visible_gaussian_give_an_empty_container(count):
     """A labels lookup without any entry once raised IndexError; a neutral Gaussian lends the padding its values."""
     splats = replaced(random_scene(count, 2), opacities=np.full(count, -9))
-    result = compress(splats, importance=np.ones(count, np.float32))
+    result = compress(splats)
     assert (result.report.count, result.report.invisible) == (0, count)
     found = decompress(result.files)
     assert (len(found), found.sh_degree) == (0, 2)
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("preset", ["fast", "paper"])
 def test_ranges_are_those_of_the_data_to_the_last_bit(preset):
     """The smallest level that occurs stands for the minimum, whatever the steps; the largest of the widest channel
     for the maximum, within half a step."""
@@ -165,7 +165,7 @@ def test_every_image_spans_its_levels(count, preset):
 @pytest.mark.parametrize("count", [1, 9, 100])
 def test_padding_repeats_cells_that_are_active(count, preset):
     """In the paper's order padding may take another form of its Gaussian, to suit its neighbours."""
-    files = encoded(random_scene(count, 2), preset).files
+    files = encoded(random_scene(count, 2), preset, drop=0).files
     free = ("scales", "quaternions") if preset == "paper" else ()
     cells = [oracle.pixels(files, f"{name}.webp") for name in PLANES[1:8] if name not in free]
     cells = np.concatenate([image.reshape(len(image) ** 2, -1) for image in cells], axis=1)
@@ -254,24 +254,6 @@ def test_bands_that_are_zero_are_constant_in_the_image():
 def test_constant_scenes_cost_next_to_nothing():
     sizes = encoded(constant_scene(4000, 3)).report.file_bytes
     assert all(sizes[name] < 150 for name in IMAGES)
-
-
-def test_importance_moves_the_error_to_where_it_matters_less():
-    splats = random_scene(3000, 1, seed=5)
-    favoured = np.arange(3000) < 1000
-    errors = {}
-    for name, mask in (("first", favoured), ("last", ~favoured)):
-        result = compress(splats, importance=np.where(mask, 20, 0.1).astype(np.float32))
-        difference = decompress(result.files).shN - splats.select(result.order).shN
-        errors[name] = np.square(difference[favoured[result.order]]).mean()
-    assert errors["first"] < 0.7 * errors["last"]
-
-
-@pytest.mark.parametrize("importance", [np.ones(9), -np.ones(10), np.full(10, np.nan), np.full(10, np.inf)])
-def test_impossible_importance_is_refused(importance):
-    scene = random_scene(10, 1)
-    with pytest.raises(InvalidSceneError, match="importance must be 10 finite numbers from 0, one per Gaussian"):
-        encode(scene, Settings().encode, importance=importance.astype(np.float32))
 
 
 def test_progress_names_every_stage_and_ends_at_one():

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from kissgs import sample_scene
 from kissgs.parallel import blas_workers
 from kissgs.sogxt import kmeans
-from kissgs.sogxt.codebook import codebook_side
+from kissgs.sogxt.codebook import whole_side
 from kissgs.sogxt.kmeans import MAX_COARSE, assign, fit
 
 
@@ -203,7 +203,7 @@ def test_progress_runs_upwards_to_one():
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(st.integers(0, 10**8), st.sampled_from([1, 8, 20]))
 def test_codebook_sides_follow_the_formula(count, ratio):
-    side = codebook_side(count, ratio)
+    side = whole_side(count / ratio)
     assert side % 8 == 0
     assert 8 <= side <= 256
     assert side == 8 or side * side * ratio <= count
@@ -212,4 +212,4 @@ def test_codebook_sides_follow_the_formula(count, ratio):
 
 def test_codebook_sides_of_the_published_containers():
     known = {8: 24, 32: 56, 128: 120, 256: 176, 512: 248, 1024: 256, 2048: 256}
-    assert {thousands: codebook_side(1000 * thousands, 8) for thousands in known} == known
+    assert {thousands: whole_side(1000 * thousands / 8) for thousands in known} == known

@@ -15,10 +15,11 @@ import numpy as np
 
 from kissgs._typing import Float32, Float64, Int32, Int64, Shaped, UInt16
 from kissgs.errors import InvalidViewsError, UnsupportedError
+from kissgs.importance import Importance
 from kissgs.parallel import Workers
 from kissgs.rendering import semantics
 from kissgs.rendering.camera import Camera
-from kissgs.rendering.cpu import blending, projection, shading, tiles
+from kissgs.rendering.cpu import blending, projection, sensitivity, shading, tiles
 from kissgs.splats import ATTRIBUTES, Splats
 
 RULES = np.array(
@@ -207,6 +208,40 @@ def removal_scores(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
     scores = np.zeros(len(frame.splats), np.float64)
     blending.sum_errors(errors, lists.slots_from, lists.slot_counts, visible, 0, len(visible), scores)
     return scores
+
+
+def add_sensitivities(frame: Frame, weight: float, into: Importance, pool: Workers) -> None:
+    """Add to ``into`` what small changes of each Gaussian cost in this picture, times ``weight``.
+
+    In ``directions``, sums of (alpha T)² times the harmonics, to be divided by ``colors`` in the end.
+    """
+    splats, camera, lists = frame.splats, frame.camera, frame.lists
+    visible, rows, records = frame.footprints.visible, frame.footprints.rows, frame.footprints.records
+    slots = np.empty((len(lists.members), 16), np.float32)
+
+    def blend(first: int, last: int) -> None:
+        sensitivity.moments(
+            *(records, lists.members, lists.spans, lists.slots, lists.starts, first, last, lists.columns, LIMITS),
+            *(frame.background, frame.transmittance, frame.stops, slots),
+        )
+
+    _each_part(blend, _even_tiles(lists, pool), pool)
+
+    def project(first: int, last: int) -> None:
+        sensitivity.add_to_parameters(
+            *(splats.means, splats.quats, splats.scales, splats.opacities),
+            *(visible, rows, lists.slots_from, lists.slot_counts, slots),
+            first,
+            last,
+            *(camera.viewmat, camera.position, camera.K),
+            camera.width,
+            camera.height,
+            RULES,
+            weight,
+            *(into.places, into.shapes, into.colors, into.directions),
+        )
+
+    _each_part(project, _even(len(visible), pool), pool)
 
 
 def _colour(background: Shaped[np.ndarray, "..."]) -> Float32[np.ndarray, "3"]:

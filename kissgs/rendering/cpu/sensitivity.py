@@ -1,0 +1,278 @@
+"""Kernels: what a small change of each stored parameter costs in the picture, exactly, from one pass from the back.
+
+A pixel changes with the logarithm of a footprint's alpha by w = alpha T (colour - B), B being what is behind it; and
+that logarithm is, to first order, a polynomial of degree 2 in the footprint's own coordinates u, v: the opacity moves
+its constant, the centre its linear, the covariance its quadratic terms. The squared change of the picture is then a
+quadratic form in these six numbers whose entries are moments, sums of |w|² uⁱ vʲ over the pixels with i + j up to 4.
+The chain rule carries it to the stored parameters: J ᵀ J of the picture, without a random probe.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from kissgs.compiled import compiled
+from kissgs.rendering.cpu.blending import _FAST, _exp_minus, _footprint, _pixel_centres
+from kissgs.rendering.cpu.projection import (
+    _cholesky,
+    _deviations,
+    _dot,
+    _frustum,
+    _load,
+    _mix,
+    _pose,
+    _rotation,
+    _scaled,
+    _times,
+    _unit_quat,
+)
+from kissgs.rendering.cpu.shading import _harmonics
+
+
+@compiled(
+    "void(float32[:, ::1], int32[::1], uint16[::1], int32[::1], int64[::1], int64, int64, int64,"
+    " float32[::1], float32[::1], float32[:, ::1], int32[:, ::1], float32[:, ::1])",
+    fastmath=_FAST,
+)
+def moments(
+    splats: np.ndarray,
+    members: np.ndarray,
+    spans: np.ndarray,
+    slots: np.ndarray,
+    starts: np.ndarray,
+    first: int,
+    last: int,
+    columns: int,
+    limits: np.ndarray,
+    background: np.ndarray,
+    transmittance: np.ndarray,
+    stops: np.ndarray,
+    sums: np.ndarray,
+) -> None:
+    """Moments of the members of tiles ``first`` to ``last`` (exclusive).
+
+    The arguments are those of :func:`kissgs.rendering.cpu.blending.removal_errors`; ``sums``, ``(slots, 16)``, is
+    written: over the tile's pixels, of |w|² times 1, u, v, u², uv, v², u³, u²v, uv², v³, u⁴, u³v, u²v², uv³, v⁴; and
+    of (alpha T)².
+    """
+    alpha_min, alpha_max = limits[0], limits[1]
+    zero, one = np.float32(0), np.float32(1)
+    height, width = transmittance.shape
+    # Per pixel: x, y, stop, T, and R, G, B of what is behind.
+    s = np.empty(7 * 256, np.float32)
+    _pixel_centres(s)
+    for tile in range(first, last):
+        x0, y0 = (tile % columns) * 16, (tile // columns) * 16
+        begin = starts[tile]
+        furthest = 0
+        for p in range(256):
+            furthest = max(furthest, stops[tile, p])
+            s[512 + p] = np.float32(stops[tile, p])
+            s[768 + p] = transmittance[min(y0 + (p >> 4), height - 1), min(x0 + (p & 15), width - 1)]
+            s[1024 + p], s[1280 + p], s[1536 + p] = background[0], background[1], background[2]
+        for i in range(begin + furthest, starts[tile + 1]):
+            sums[slots[i], :] = zero
+        for i in range(begin + furthest - 1, begin - 1, -1):
+            (mx, my, l0, l1, l2), (opacity, red, green, blue) = _footprint(splats, members[i], x0, y0)
+            top, bottom = np.uint64(spans[i] >> 5), np.uint64(spans[i] & 31)
+            place = np.float32(i - begin)
+            m0, mu, mv, muu, muv, mvv = zero, zero, zero, zero, zero, zero
+            m30, m21, m12, m03 = zero, zero, zero, zero
+            m40, m31, m22, m13, m04, seen = zero, zero, zero, zero, zero, zero
+            for p in range(top * np.uint64(16), bottom * np.uint64(16)):
+                dx, dy = s[p] - mx, s[p + np.uint64(256)] - my
+                u, v = l0 * dx + l1 * dy, l2 * dy
+                full = opacity * _exp_minus(u * u + v * v)
+                alpha = min(full, alpha_max)
+                alpha = alpha if alpha >= alpha_min else zero
+                alpha = alpha if place < s[p + np.uint64(512)] else zero
+                t = s[p + np.uint64(768)] / (one - alpha)
+                s[p + np.uint64(768)] = t
+                dr = alpha * (red - s[p + np.uint64(1024)])
+                dg = alpha * (green - s[p + np.uint64(1280)])
+                db = alpha * (blue - s[p + np.uint64(1536)])
+                s[p + np.uint64(1024)] += dr
+                s[p + np.uint64(1280)] += dg
+                s[p + np.uint64(1536)] += db
+                weight = alpha * t
+                seen += weight * weight
+                g = t * t * (dr * dr + dg * dg + db * db)
+                g = g if full <= alpha_max else zero
+                uu, uv, vv = u * u, u * v, v * v
+                guu, guv, gvv = g * uu, g * uv, g * vv
+                m0 += g
+                mu += g * u
+                mv += g * v
+                muu += guu
+                muv += guv
+                mvv += gvv
+                m30 += guu * u
+                m21 += guu * v
+                m12 += gvv * u
+                m03 += gvv * v
+                m40 += guu * uu
+                m31 += guu * uv
+                m22 += guu * vv
+                m13 += guv * vv
+                m04 += gvv * vv
+            slot = slots[i]
+            sums[slot, 0] = m0
+            sums[slot, 1] = mu
+            sums[slot, 2] = mv
+            sums[slot, 3] = muu
+            sums[slot, 4] = muv
+            sums[slot, 5] = mvv
+            sums[slot, 6] = m30
+            sums[slot, 7] = m21
+            sums[slot, 8] = m12
+            sums[slot, 9] = m03
+            sums[slot, 10] = m40
+            sums[slot, 11] = m31
+            sums[slot, 12] = m22
+            sums[slot, 13] = m13
+            sums[slot, 14] = m04
+            sums[slot, 15] = seen
+
+
+@njit(nogil=True, error_model="numpy")
+def _form(m: np.ndarray, form: np.ndarray) -> None:
+    """The 6x6 matrix of moments, for polynomials in 1, u, v, u², uv, v²."""
+    place = np.array(
+        [
+            [0, 1, 2, 3, 4, 5],
+            [1, 3, 4, 6, 7, 8],
+            [2, 4, 5, 7, 8, 9],
+            [3, 6, 7, 10, 11, 12],
+            [4, 7, 8, 11, 12, 13],
+            [5, 8, 9, 12, 13, 14],
+        ]
+    )
+    for i in range(6):
+        for j in range(6):
+            form[i, j] = m[place[i, j]]
+
+
+@compiled(
+    "void(float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[::1],"
+    " int32[::1], int64[::1], int64[::1], int64[::1], float32[:, ::1], int64, int64,"
+    " float64[:, ::1], float64[::1], float64[:, ::1], int64, int64, float64[::1], float64,"
+    " float32[:, ::1], float32[:, ::1], float32[::1], float32[:, ::1])"
+)
+def add_to_parameters(
+    means: np.ndarray,
+    quats: np.ndarray,
+    scales: np.ndarray,
+    opacities: np.ndarray,
+    visible: np.ndarray,
+    rows: np.ndarray,
+    slots_from: np.ndarray,
+    slot_counts: np.ndarray,
+    slots: np.ndarray,
+    first: int,
+    last: int,
+    viewmat: np.ndarray,
+    eye: np.ndarray,
+    K: np.ndarray,
+    width: int,
+    height: int,
+    rules: np.ndarray,
+    weight: float,
+    places: np.ndarray,
+    shapes: np.ndarray,
+    colors: np.ndarray,
+    directions: np.ndarray,
+) -> None:
+    """Add a view's quadratic forms to those of the Gaussians whose footprints are in ``rows[first:last]``.
+
+    Args:
+        means, quats, scales, opacities, visible, rows, slots_from, slot_counts, first, last, viewmat, K, width, height,
+            rules: as for :func:`kissgs.rendering.cpu.projection.project_backward`.
+        slots: of :func:`moments`.
+        eye: where the camera stands.
+        weight: of this view.
+        places: ``(N, 6)``, upper triangle of the form of the position: xx, xy, xz, yy, yz, zz.
+        shapes: ``(N, 28)``, upper triangle, row by row, of the form of opacity logit, three log-scales, and a rotation
+            vector in the Gaussian's own frame.
+        colors: ``(N,)``, sum of (alpha T)².
+        directions: ``(N, K)``, the same times the spherical harmonics without the constant one.
+    """
+    dilation = rules[2]
+    fx, fy = K[0, 0], K[1, 1]
+    turn, shift = _pose(viewmat)
+    left, right, high, low = _frustum(K, width, height, rules[3])
+    m, form = np.empty(16, np.float64), np.empty((6, 6), np.float64)
+    by_shape, half = np.zeros((7, 6), np.float64), np.zeros((7, 6), np.float64)
+    by_place = np.zeros((3, 2), np.float64)
+    basis = np.zeros(15, np.float64)
+    for i in range(first, last):
+        row = rows[i]
+        n = visible[row]
+        m[:] = 0.0
+        for slot in range(slots_from[row], slots_from[row] + slot_counts[row]):
+            for c in range(16):
+                m[c] += slots[slot, c]
+        if m[15] == 0.0:
+            continue
+        m *= weight
+        _form(m, form)
+
+        # As in project.
+        mean = _load(means, n)
+        z = _dot(turn[2], mean) + shift[2]
+        x, y = (_dot(turn[0], mean) + shift[0]) / z, (_dot(turn[1], mean) + shift[1]) / z
+        p = _mix(fx / z, turn[0], -fx / z * min(right, max(left, x)), turn[2])
+        q = _mix(fy / z, turn[1], -fy / z * min(low, max(high, y)), turn[2])
+        qw, qx, qy, qz, _ = _unit_quat(quats, n)
+        R, s = _rotation(qw, qx, qy, qz), _deviations(scales, n)
+        a, b = _times(p, R), _times(q, R)
+        w, v = _scaled(a, s), _scaled(b, s)
+        l0, l1, l2 = _cholesky(w, v, dilation)
+
+        # ln alpha by the position: 2 (u, v) L dc, c being the centre.
+        across, down = _mix(fx / z, turn[0], -fx / z * x, turn[2]), _mix(fy / z, turn[1], -fy / z * y, turn[2])
+        for c in range(3):
+            by_place[c, 0] = 2 * (l0 * across[c] + l1 * down[c])
+            by_place[c, 1] = 2 * l2 * down[c]
+        k = 0
+        for c in range(3):
+            for d in range(c, 3):
+                places[n, k] += by_place[c, 0] * (form[1, 1] * by_place[d, 0] + form[1, 2] * by_place[d, 1]) + by_place[
+                    c, 1
+                ] * (form[2, 1] * by_place[d, 0] + form[2, 2] * by_place[d, 1])
+                k += 1
+
+        # By opacity; by the covariance, 2 (u, v) L dS Lᵀ (u, v)ᵀ; S by log-scales and by turns about the own axes.
+        by_shape[0, 0] = 1.0 / (1.0 + np.exp(np.float64(opacities[n])))
+        for c in range(6):
+            if c < 3:
+                xx, xy, yy = 2 * w[c] * w[c], 2 * w[c] * v[c], 2 * v[c] * v[c]
+            else:
+                d, e = (c - 2) % 3, (c - 1) % 3  # the two axes that turn about axis c - 3
+                apart = s[d] * s[d] - s[e] * s[e]
+                xx, xy = 2 * a[d] * a[e] * apart, (a[d] * b[e] + a[e] * b[d]) * apart
+                yy = 2 * b[d] * b[e] * apart
+            by_shape[1 + c, 3] = 2 * (l0 * l0 * xx + 2 * l0 * l1 * xy + l1 * l1 * yy)
+            by_shape[1 + c, 4] = 4 * l2 * (l0 * xy + l1 * yy)
+            by_shape[1 + c, 5] = 2 * l2 * l2 * yy
+        for c in range(7):
+            for d in range(6):
+                half[c, d] = by_shape[c, 0] * form[0, d]
+                for e in range(3, 6):
+                    half[c, d] += by_shape[c, e] * form[e, d]
+        k = 0
+        for c in range(7):
+            for d in range(c, 7):
+                total = half[c, 0] * by_shape[d, 0]
+                for e in range(3, 6):
+                    total += half[c, e] * by_shape[d, e]
+                shapes[n, k] += total
+                k += 1
+
+        colors[n] += m[15]
+        if directions.shape[1] > 0:
+            gaze = (mean[0] - eye[0], mean[1] - eye[1], mean[2] - eye[2])
+            inverse = 1.0 / np.sqrt(_dot(gaze, gaze))
+            _harmonics(gaze[0] * inverse, gaze[1] * inverse, gaze[2] * inverse, directions.shape[1], basis)
+            for c in range(directions.shape[1]):
+                directions[n, c] += m[15] * basis[c]

@@ -1,0 +1,32 @@
+"""What an encoder has chosen for a scene: everything that the images will show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from kissgs.sogxt.codebook import Codebook
+from kissgs.sogxt.order import Grid
+from kissgs.sogxt.quantize import Quantized
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Choice:
+    """Levels of every cell, and what they lost.
+
+    Attributes:
+        grid: which Gaussian sits where.
+        fields: levels by field of the metadata, one row per cell; ``f_rest_centroids``, one per entry.
+        codebook: which entry each Gaussian has.
+        form_error: largest relative change of a covariance by the choice of its equivalent form.
+        tamed: number of Gaussians whose base colour, an outlier, was pulled in.
+        errors: largest error that the choices may cause, base colours' making up for others included; per field and
+            channel, in the field's own unit (positions: of their signed logarithm; f_rest_centroids: of the codebook's
+            entries).
+    """
+
+    grid: Grid
+    fields: dict[str, Quantized]
+    codebook: Codebook
+    form_error: float
+    tamed: int
+    errors: dict[str, list[float]]

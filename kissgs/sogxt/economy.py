@@ -1,0 +1,176 @@
+"""One price for every bit: how fine each step, how large the codebook, and what is not worth its bytes.
+
+lambda is squared image error per bit (:class:`kissgs.Importance` says what error costs are). Rounding to a step d
+costs H d²/12, and halving d costs a bit: so d² = 6 lambda / (ln 2 H) where the two are in balance, whatever the
+attribute. Gaussians are ordered in classes of like importance, and each class has its own steps: multiples of the
+finest class', so that the decoder need not know of them. WebP's entropy codes, which vary over an image, do the rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kissgs._typing import Float64, Int
+from kissgs.importance import OPACITY, ROTATION, SCALES, Importance
+from kissgs.splats import Splats
+
+FLOOR = 1e-3
+"""Least importance, in units of the median: what no camera saw must still not be ruined."""
+
+SH_SHRINK = 0.42
+"""A codebook's error falls as its size to the power of minus this: measured on real scenes, 1,000 to 10,000 entries."""
+
+ENTRY_BITS = 112
+"""What an entry takes in the codebook's image: measured at 45 dimensions."""
+
+LABEL_SHARE = 0.5
+"""Bits of a label for one more bit of a codebook's size: entropy coding makes popular entries cheap."""
+
+DIMENSIONS = 14
+"""Numbers per Gaussian that are rounded: opacity, scales, rotation, base colour, position."""
+
+GROWTH = 2.2
+"""How much larger than H d²/12 the error of rounding comes out: cheap levels are preferred, and errors meet in pixels.
+Measured."""
+
+GLOSS = 0.0796
+"""Mean square of a spherical harmonic over all directions, 1 / 4 pi."""
+
+PAPER_RATIO = 8
+PAPER_GLOSS = 2.0
+"""Errors of gloss that nothing makes up for meet in pixels as if there were twice as many. Measured."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Costs:
+    """Costs of one unit in each attribute, for the Gaussians ``(M,)`` in question; means over channels.
+
+    Attributes:
+        opacity: logit.
+        scale: log-scale.
+        turn: radian about one of the own axes.
+        color: of ``sh0``.
+        place: of the signed logarithm of a coordinate.
+        removal: of leaving it out.
+    """
+
+    opacity: Float64[np.ndarray, " M"]
+    scale: Float64[np.ndarray, " M"]
+    turn: Float64[np.ndarray, " M"]
+    color: Float64[np.ndarray, " M"]
+    place: Float64[np.ndarray, " M"]
+    removal: Float64[np.ndarray, " M"]
+
+    @classmethod
+    def of(cls, importance: Importance, splats: Splats) -> Costs:
+        """With the floor under each."""
+        reach = (1 + np.abs(splats.means).astype(np.float64)) ** 2
+        return cls(
+            opacity=_floored(importance.diagonal(OPACITY)[:, 0]),
+            scale=_floored(importance.diagonal(SCALES).mean(axis=1)),
+            turn=_floored(importance.diagonal(ROTATION).mean(axis=1)),
+            color=_floored(importance.base_colors()),
+            place=_floored((importance.places[:, [0, 3, 5]] * reach).mean(axis=1)),
+            removal=importance.removal(splats),
+        )
+
+    def classes(self, chosen: Int[np.ndarray, " k"], number: int) -> Int[np.ndarray, " k"]:
+        """Class of each of the ``chosen``, from 0, the most important; all of about the same size."""
+        worth = np.log(self.scale[chosen]) + np.log(self.turn[chosen]) + np.log(self.color[chosen])
+        rank = np.empty(len(chosen), np.int64)
+        rank[np.argsort(-worth, kind="stable")] = np.arange(len(chosen))
+        return rank * number // max(len(chosen), 1)
+
+
+def step(cost: float, price: float) -> float:
+    """The step in balance with ``price`` where a unit costs ``cost``."""
+    return float(np.sqrt(6 * price / (np.log(2) * cost)))
+
+
+@dataclass(frozen=True, slots=True)
+class Gloss:
+    """What a scene's SH rest costs: from a codebook made for a trial.
+
+    Attributes:
+        entries: of that codebook.
+        weighed: squared error it leaves, weighed by importance.
+        plain: what a codebook of as many entries leaves that treats all Gaussians alike.
+    """
+
+    entries: int = 1
+    weighed: float = 0.0
+    plain: float = 0.0
+
+    def error(self, entries: float) -> float:
+        """Of a codebook of so many entries."""
+        return self.weighed * (self.entries / entries) ** SH_SHRINK
+
+    def best_size(self, price: float, count: int) -> int:
+        """Entries in balance with ``price``, for ``count`` Gaussians."""
+        low, high = 0.0, np.log(max(count / PAPER_RATIO, 2))
+        for _ in range(50):
+            middle = 0.5 * (low + high)
+            size = np.exp(middle)
+            worth = SH_SHRINK * self.error(size) > price * (ENTRY_BITS * size + LABEL_SHARE * count / np.log(2))
+            low, high = (middle, high) if worth else (low, middle)
+        return round(float(np.exp(low)))
+
+
+def paper_error(costs: Costs, splats: Splats, gloss: Gloss) -> float:
+    """About the mean squared error at which the paper's own settings would leave this scene.
+
+    100 levels for rotations, 256 for the rest and 65,536 for positions, spread from each channel's least to its largest
+    value; a codebook of an entry for 8 Gaussians.
+    """
+    logs = np.sign(splats.means) * np.log1p(np.abs(splats.means).astype(np.float64))
+    steps = (
+        (costs.opacity, splats.opacities[:, None], 255, 1),
+        (costs.scale, splats.scales, 255, 1),
+        (costs.turn, np.full((len(splats), 3), 2.0), 99, 4),
+        (costs.color, splats.sh0, 255, 1),
+        (costs.place, logs, 65535, 1),
+    )
+    total = 0.0
+    for cost, values, top, factor in steps:
+        extent = np.ptp(values, axis=0).astype(np.float64) if factor == 1 else np.full(3, 2.0)
+        total += float(cost.sum()) * float(np.sum(factor * (extent / top) ** 2)) / 12
+    entries = max(len(splats) / PAPER_RATIO, 1)
+    return total + PAPER_GLOSS * gloss.plain * (gloss.entries / entries) ** SH_SHRINK
+
+
+UNKNOWN = 9.0
+"""Decibels by which errors that were put where these pictures do not show them exceed, in other pictures, what they are
+in these; per unit of hedge. Codebooks hardly follow the pictures once they are hedged, so gloss is not among them."""
+
+
+KNOWN_GLOSS, UNKNOWN_GLOSS = 0.2, 2.7
+"""What is left of errors of gloss once base colours make up for them, and how much more per unit of hedge. Measured."""
+
+
+def error_at(price: float, costs: Costs, gloss: Gloss, drop: float, hedge: float) -> float:
+    """About the mean squared error at which everything in balance with ``price`` leaves a scene."""
+    count = len(costs.color)
+    dropped = costs.removal[costs.removal < drop * price]
+    rounding = GROWTH * DIMENSIONS * (count - len(dropped)) * price / (2 * np.log(2))
+    elsewhere = 10 ** (UNKNOWN * hedge / 10)
+    made_up = KNOWN_GLOSS + UNKNOWN_GLOSS * hedge
+    missing = gloss.error(max(gloss.best_size(price, count), 1))
+    return float(elsewhere * (rounding + GROWTH * dropped.sum()) + made_up * missing)
+
+
+def price_for(error: float, costs: Costs, gloss: Gloss, drop: float, hedge: float) -> float:
+    """The price at which a scene is left at about this mean squared error."""
+    low, high = np.log(1e-22), np.log(1e-2)
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (
+            (middle, high) if error_at(float(np.exp(middle)), costs, gloss, drop, hedge) < error else (low, middle)
+        )
+    return float(np.exp(low))
+
+
+def _floored(cost: Float64[np.ndarray, " M"]) -> Float64[np.ndarray, " M"]:
+    seen = cost[cost > 0]
+    return np.maximum(cost, max(FLOOR * float(np.median(seen)), 1e-30) if len(seen) else 1.0)

@@ -1,0 +1,74 @@
+"""From where a scene is watched while it is compressed: where it was photographed from, and a little all around."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kissgs.progress import Progress, silent
+from kissgs.rendering.camera import Camera
+from kissgs.rendering.importance import Watch
+from kissgs.splats import Splats
+from kissgs.views.view import Views
+from kissgs.views.virtual import virtual_views
+
+AROUND = 0.1
+"""Weight of all virtual cameras together, in units of that of the photographs': what was never photographed must not
+fall apart, and hardly anything is lost for what was."""
+
+
+def watch(
+    splats: Splats,
+    views: Views | None,
+    *,
+    count: int,
+    size: int,
+    threads: int = 0,
+    progress: Progress = silent,
+) -> Watch:
+    """Cameras to weigh and to refit by.
+
+    Args:
+        splats: finite.
+        views: of a capture; its cameras for training are used, never those that are held out. None: virtual ones alone.
+        count: the largest number of a capture's cameras, taken evenly; and the number of virtual ones if there are no
+            others, of which there are else two thirds as many.
+        size: longer side of a picture, pixels; smaller pictures stay as they are.
+        threads: 0 means one per processor.
+        progress: receives the stage ``"cameras"``.
+    """
+    if views is None or not views.train:
+        side = size * 4 // 5
+        found = virtual_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
+        cameras = [_wider(view.camera) if n % 2 else view.camera for n, view in enumerate(found.all)]
+        return Watch(cameras, [1.0] * len(found.all), found.background)
+    given = [view.camera for view in views.train]
+    chosen = [_at_most(given[n], size) for n in np.unique(np.linspace(0, len(given) - 1, count).astype(int))]
+    side = round(float(np.sqrt(chosen[0].width * chosen[0].height)))
+    around = virtual_views(
+        splats, width=side, height=side, count=max(1, count * 2 // 3), threads=threads, progress=progress
+    )
+    weight = AROUND * len(chosen) / len(around.all)
+    cameras = [*chosen, *(view.camera for view in around.all)]
+    return Watch(cameras, [1.0] * len(chosen) + [weight] * len(around.all), views.background)
+
+
+WIDER = 0.6
+"""Focal length of every other virtual camera, in units of that of the others: what they just do not see counts too."""
+
+
+def _wider(camera: Camera) -> Camera:
+    K = camera.K.copy()
+    K[[0, 1], [0, 1]] *= WIDER
+    return Camera(camera.viewmat, K, camera.width, camera.height)
+
+
+def _at_most(camera: Camera, size: int) -> Camera:
+    """The same view with at most so many pixels on its longer side."""
+    shrink = size / max(camera.width, camera.height)
+    if shrink >= 1:
+        return camera
+    width, height = max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink))
+    K = camera.K.copy()
+    K[0] *= width / camera.width
+    K[1] *= height / camera.height
+    return Camera(camera.viewmat, K, width, height)
