@@ -242,11 +242,13 @@ def _encode(
     if not settings.weigh or len(splats) == 0:
         return encode(splats, settings, cleaned=cleaned, threads=threads, progress=progress)
     from kissgs.rendering.importance import measure_importance
-    from kissgs.rendering.rasterizer import load_kernels
+    from kissgs.rendering.rasterizer import load_kernels as load_rasterizer
     from kissgs.rendering.refit import refit_colors
+    from kissgs.sogxt.encode import load_kernels as load_encoder
     from kissgs.views.watch import watch
 
-    load_kernels(progress)
+    load_encoder(progress)
+    load_rasterizer()
     watched = watch(splats, views, count=settings.views, size=settings.view_size, threads=threads, progress=progress)
     if importance is None:
         hedge = settings.hedge if settings.hedge is not None else HEDGE[views is not None]
@@ -258,8 +260,12 @@ def _encode(
             *(decoded, splats, watched, colors[order], guessed[order]), steps=steps, threads=threads, progress=progress
         )
 
+    def ready(stage: str, fraction: float) -> None:
+        if stage != "kernels":  # that was before
+            progress(stage, fraction)
+
     return encode(
-        *(splats, settings), importance=importance, recolor=recolor, cleaned=cleaned, threads=threads, progress=progress
+        *(splats, settings), importance=importance, recolor=recolor, cleaned=cleaned, threads=threads, progress=ready
     )
 
 

@@ -78,13 +78,13 @@ def weigh(
     classes, shown = np.sort(classes), splats.select(order)
     costs = Costs(**{name: getattr(costs, name)[order] for name in Costs.__slots__})
 
+    progress("forms", 0.0)
+    rows = np.arange(len(order))
+    quats, scales, form_error, forms = choose_forms(shown, rows, grid.side, settings, pool, lambda fraction: None)
     gloss = _trial(splats, kept, importance, settings, pool)
     codebook = _codebook(
         shown, _sh_weights(importance, order), importance.colors[order], classes, price, gloss, settings, pool, progress
     )
-    progress("forms", 0.0)
-    rows = np.arange(len(order))
-    quats, scales, form_error, forms = choose_forms(shown, rows, grid.side, settings, pool, lambda fraction: None)
     means = _means(shown.means, costs, classes, price)
     progress("rounding", 0.0)
     values = np.concatenate([shown.opacities[:, None], scales, quats], axis=1).astype(np.float64)

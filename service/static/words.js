@@ -18,6 +18,7 @@ const STATES = {
 const STAGES = {
   read: "Reading the scene",
   kernels: "Preparing",
+  cameras: "Placing cameras",
   importance: "Seeing what matters",
   price: "Pricing bits",
   order: "Putting Gaussians in order",
@@ -28,11 +29,11 @@ const STAGES = {
   refit: "Refitting colours",
   images: "Compressing images",
   write: "Writing the container",
-  cameras: "Placing cameras",
   evaluate: "Measuring quality",
 };
 
 const ALWAYS = ["read", "kernels", "order", "forms", "images"];
+const WEIGHED = ["cameras", "importance", "price", "rounding"];
 const WITH_COLOURS_BY_ANGLE = ["codebook", "sort codebook"];
 
 /** @type {[RegExp, string][]} */
@@ -73,6 +74,7 @@ export const stageWord = (stage) => STAGES[stage] ?? stage;
  */
 export function plannedStages(status) {
   const planned = new Set(ALWAYS);
+  if (status.options.encode.weigh) WEIGHED.forEach((stage) => planned.add(stage));
   if (status.sh_degree > 0) WITH_COLOURS_BY_ANGLE.forEach((stage) => planned.add(stage));
   if (status.options.evaluate) planned.add("evaluate");
   return Object.keys(STAGES).filter((stage) => planned.has(stage));

@@ -1,0 +1,208 @@
+"""Oracle: finite differences of the float64 rasteriser, whole pictures of them; and NumPy's least squares."""
+
+from dataclasses import replace
+
+import naive_rasterizer
+import numpy as np
+import pytest
+from render_scenes import blobs, camera, in_float64, one, together
+
+import kissgs
+from kissgs.importance import OPACITY, ROTATION, SCALES, Importance
+from kissgs.parallel import Workers
+from kissgs.rendering.importance import Watch, measure_importance
+from kissgs.rendering.rasterizer import removal_scores, render
+from kissgs.rendering.refit import refit_colors
+from kissgs.spherical_harmonics import sh_basis
+from kissgs.splats import SH_C0, clean
+from kissgs.views.watch import watch
+
+BACKGROUND = np.array([0.3, 0.6, 0.1], np.float32)
+
+
+def looked_at(*cameras):
+    return Watch(cameras, [1.0] * len(cameras), BACKGROUND)
+
+
+def turned(quat, axis, angle):
+    """The rotation, and before it one about its own axis."""
+    w, x, y, z = quat
+    half = np.zeros(3)
+    half[axis] = np.sin(angle / 2)
+    c, (a, b, d) = np.cos(angle / 2), half
+    return np.array(
+        [
+            w * c - x * a - y * b - z * d,
+            w * a + x * c + y * d - z * b,
+            w * b - x * d + y * c + z * a,
+            w * d + x * b - y * a + z * c,
+        ]
+    )
+
+
+def differences(splats, view, n):
+    """Derivatives of the picture by (logit; log-scales; turns about the own axes) and by the position of Gaussian n."""
+    params = in_float64(splats)
+
+    def picture(name, change):
+        moved = {key: value.copy() for key, value in params.items()}
+        moved[name][n] = change(moved[name][n])
+        return naive_rasterizer.draw(moved, view, BACKGROUND.astype(np.float64)).image
+
+    def between(name, change, step):
+        up, down = (picture(name, lambda value, s=s: change(value, s)) for s in (step, -step))
+        return (up - down) / (2 * step)
+
+    def derivative(name, change):
+        """Where two steps agree: in some pixels a Gaussian begins or ends to be drawn."""
+        coarse, fine = (between(name, change, step) for step in (1e-5, 2e-6))
+        return np.where(np.abs(coarse - fine) < 1e-4, fine, 0).reshape(-1)
+
+    axes = np.eye(3)
+    shape = [derivative("opacities", lambda value, s: value + s)]
+    shape += [derivative("scales", lambda value, s, axis=axis: value + s * axis) for axis in axes]
+    shape += [derivative("quats", lambda value, s, axis=axis: turned(value, axis, s)) for axis in range(3)]
+    place = [derivative("means", lambda value, s, axis=axis: value + s * axis) for axis in axes]
+    return np.array(shape), np.array(place)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_forms_are_those_of_the_pictures_derivatives(seed):
+    splats, view = clean(blobs(6, seed % 3, seed=seed, log_scale=-1.5))[0], camera(seed=seed)
+    found = measure_importance(splats, looked_at(view))
+    pixels = 3 * view.width * view.height
+    for n in range(len(splats)):
+        shape, _ = differences(splats, view, n)
+        wanted = (shape @ shape.T / pixels)[np.triu_indices(7)]
+        np.testing.assert_allclose(found.shapes[n], wanted, rtol=2e-3, atol=2e-3 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_forms_of_positions_are_those_of_small_gaussians(seed):
+    """A move also changes a footprint's shape a little, which is left out: the less, the smaller it is."""
+    splats, view = clean(blobs(6, 0, seed=seed, log_scale=-3.5))[0], camera(90, 70, seed=seed)
+    found = measure_importance(splats, looked_at(view))
+    for n in range(len(splats)):
+        _, place = differences(splats, view, n)
+        wanted = (place @ place.T / (3 * view.width * view.height))[np.triu_indices(3)]
+        np.testing.assert_allclose(found.places[n], wanted, rtol=0.03, atol=0.03 * np.abs(wanted).max())
+
+
+def test_colors_are_what_a_change_of_one_channel_costs():
+    splats, view = blobs(20, 0, seed=3), camera(seed=1)
+    found = measure_importance(splats, looked_at(view))
+    for n in (0, 7, 19):
+        splats.sh0[n] = 0.3  # not clamped
+        sh0 = splats.sh0.copy()
+        sh0[n, 1] += 0.1
+        scenes = splats, replace(splats, sh0=sh0)
+        before, after = (render(scene, view, background=BACKGROUND.tolist())[0] for scene in scenes)
+        cost = np.mean(np.square(after.astype(np.float64) - before))
+        np.testing.assert_allclose(cost, found.colors[n] * (0.1 * SH_C0) ** 2, rtol=2e-3, atol=1e-12)
+        np.testing.assert_allclose(cost, found.base_colors()[n] * 0.1**2, rtol=2e-3, atol=1e-12)
+
+
+def test_removal_is_the_exact_score():
+    splats, view = blobs(40, 1, seed=5), camera(seed=2)
+    splats = replace(splats, opacities=np.clip(splats.opacities, None, 4))  # none is clamped to the largest alpha
+    found = measure_importance(splats, looked_at(view)).removal(splats) * (3 * view.width * view.height)
+    scores = removal_scores(splats, [view], background=BACKGROUND.tolist())
+    np.testing.assert_allclose(found, scores, rtol=1e-4, atol=1e-5 * scores.max())
+
+
+def test_views_are_averaged_by_weight_and_directions_by_what_is_seen():
+    splats, views = blobs(15, 3, seed=1), [camera(seed=1), camera(20, 31, seed=2)]
+    apart = [measure_importance(splats, looked_at(view)) for view in views]
+    both = measure_importance(splats, Watch(views, [1.0, 3.0], BACKGROUND))
+    np.testing.assert_allclose(both.shapes, 0.25 * apart[0].shapes + 0.75 * apart[1].shapes, rtol=1e-4, atol=1e-12)
+    colors = [0.25 * apart[0].colors, 0.75 * apart[1].colors]
+    gaze = [splats.means - view.position for view in views]
+    basis = [sh_basis(g / np.linalg.norm(g, axis=1, keepdims=True), 3)[:, 1:] for g in gaze]
+    total = sum(colors)
+    seen = total > 0
+    mean = sum(color[:, None] * values for color, values in zip(colors, basis, strict=True))[seen] / total[seen, None]
+    np.testing.assert_allclose(both.directions[seen], mean, rtol=1e-4, atol=1e-5)
+    assert (both.directions[~seen] == 0).all()
+
+
+def test_threads_do_not_change_it():
+    splats, view = blobs(3000, 2, seed=8, log_scale=-3), camera(200, 150)
+    one_thread, three = (measure_importance(splats, looked_at(view), threads=threads) for threads in (1, 3))
+    for name in ("places", "shapes", "colors", "directions"):
+        np.testing.assert_array_equal(getattr(one_thread, name), getattr(three, name))
+
+
+def test_what_no_camera_sees_costs_nothing_until_hedged():
+    splats = together(one(), one(mean=(0, 0, -50)), one(mean=(0.1, 0, 0)))
+    plain = measure_importance(splats, looked_at(camera()))
+    assert plain.colors[1] == plain.shapes[1].max() == plain.places[1].max() == 0
+    hedged = measure_importance(splats, looked_at(camera()), hedge=0.5)
+    assert hedged.colors[1] > 0
+    assert (hedged.diagonal(SCALES)[1] > 0).all()
+    assert (hedged.diagonal(ROTATION)[1] >= 0).all()
+    assert hedged.diagonal(OPACITY)[1, 0] > 0
+    assert hedged.guessed[1] == pytest.approx(hedged.colors[1])
+    assert hedged.hedge == 0.5
+
+
+def test_a_full_hedge_forgets_what_was_before_a_gaussian():
+    """Two alike, one behind an opaque pile: then they count alike but for their distance."""
+    pile = together(*(one(mean=(0, 0, 0.05 * i), scale=(0, 0, -4), opacity=5.0) for i in range(4)))
+    splats = together(one(mean=(0.2, 0, -0.3)), one(mean=(0.2, 0, 0.6)), pile)
+    plain, hedged = (measure_importance(splats, looked_at(camera()), hedge=hedge) for hedge in (0.0, 1.0))
+    assert plain.colors[1] < 0.01 * plain.colors[0]
+    assert 0.3 < hedged.colors[1] / hedged.colors[0] < 1
+
+
+def test_refitting_is_least_squares():
+    """The matrix, written down: one picture per coefficient."""
+    original, cameras = blobs(12, 1, seed=4), [camera(seed=n) for n in range(5)]
+    original = replace(original, sh0=np.abs(original.sh0) + 1, shN=original.shN * np.float32(0.1))
+    decoded = replace(original, opacities=original.opacities + np.float32(0.3), shN=original.shN * 0)
+    views = looked_at(*cameras)
+    colors = measure_importance(decoded, views).colors
+
+    def pictures(scene):
+        return np.stack([render(scene, c, background=BACKGROUND.tolist())[0][:, :, 0] for c in cameras]).reshape(-1)
+
+    start = pictures(decoded).astype(np.float64)
+    columns = []
+    for n in range(len(decoded)):
+        sh0 = decoded.sh0.copy()
+        sh0[n, 0] += 1
+        columns.append(pictures(replace(decoded, sh0=sh0)) - start)
+    matrix = np.array(columns).T
+    wanted = np.linalg.lstsq(matrix, pictures(original) - start, rcond=None)[0]
+    found = refit_colors(decoded, original, views, colors, colors * 0, steps=30)[:, 0] - decoded.sh0[:, 0]
+    before, best, after = (np.sum((matrix @ x - pictures(original) + start) ** 2) for x in (0 * wanted, wanted, found))
+    assert after < best + 0.1 * (before - best)
+
+
+def test_refitting_without_steps_or_without_sight_changes_nothing():
+    splats = blobs(5)
+    views, nothing = looked_at(camera()), np.zeros(5, np.float32)
+    assert refit_colors(splats, splats, views, nothing + 1, nothing, steps=0) is splats.sh0
+    assert refit_colors(splats, splats, views, nothing, nothing, steps=3) is splats.sh0
+
+
+def test_the_importance_of_another_scene_is_refused():
+    splats = blobs(5, 1)
+    for other in (Importance.none(4, 1), Importance.none(5, 2)):
+        with pytest.raises(kissgs.InvalidSceneError, match="not that of the scene"):
+            other.check(splats)
+
+
+def test_a_capture_is_watched_from_its_training_cameras_and_a_little_all_around():
+    splats = clean(blobs(300, seed=2))[0]
+    views = [kissgs.View(f"{n}", camera(120, 80, seed=n)) for n in range(9)]
+    capture = kissgs.Views(tuple(views[1:]), tuple(views[:1]), BACKGROUND, "a capture")
+    found = watch(splats, capture, count=4, size=60)
+    assert [(c.width, c.height) for c in found.cameras[:4]] == [(60, 40)] * 4
+    given = [view.camera.position.tolist() for view in views[1:]]
+    assert [given.index(c.position.tolist()) for c in found.cameras[:4]] == [0, 2, 4, 7]
+    np.testing.assert_allclose(sum(found.weights[4:]), 0.1 * 4)
+    assert found.background is BACKGROUND
+    alone = watch(splats, None, count=4, size=60)
+    assert len(alone.cameras) == 4
+    with Workers(1):
+        assert watch(splats, capture, count=100, size=500).cameras[0].width == 120
