@@ -64,11 +64,11 @@ def roundtrip(
         source: a scene, or the path of a ``.ply``.
         settings: of the compression.
         pictures: compare pictures too (:func:`kissgs.evaluate`); no part of the times.
-        views: from where; by default virtual cameras.
+        views: a capture of the scene: weighs the bits, and its held-out views are compared; by default virtual cameras.
         threads: 0 means one per processor.
         progress: receives the events of both directions.
     """
-    result = compress(source, settings=settings, threads=threads, progress=progress)
+    result = compress(source, settings=settings, views=views, threads=threads, progress=progress)
     archive = result.to_zip()
     wall, cpu = time.perf_counter(), time.process_time()
     decoded = decompress(archive, threads=threads, progress=progress)

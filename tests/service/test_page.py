@@ -71,7 +71,7 @@ def test_the_whole_path(visit, service, tmp_path):
     page.get_by_text("smaller").first.wait_for()
     job = newest(service)
     assert (job["name"], job["options"]["preset"], job["state"]) == ("my scene", "fast", "succeeded")
-    assert f"{job['sizes']['ratio']:.3g}×" in page.locator("#job").inner_text()
+    assert f"{job['sizes']['ratio']:#.3g}×" in page.locator("#job").inner_text()
     preview = page.get_by_role("link", name="Preview")
     assert (preview.get_attribute("href"), preview.get_attribute("target")) == (job["links"]["preview"], None)
     with page.expect_download() as download:

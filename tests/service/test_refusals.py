@@ -318,8 +318,7 @@ def test_a_client_that_goes_away(service):
         connection.shutdown(socket.SHUT_RDWR)
     wait_for(lambda: not list((service.folder / "incoming").iterdir()))
     assert json.loads(service.http.get("/v1/jobs", params={"limit": 1}).text) == before
-    metrics = service.http.get("/metrics").text
-    assert "kissgs_uploads_in_flight 0.0" in metrics
+    wait_for(lambda: "kissgs_uploads_in_flight 0.0" in service.http.get("/metrics").text)
 
 
 def wait_for(condition, seconds=10):
