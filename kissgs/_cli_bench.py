@@ -9,6 +9,7 @@ import typer
 
 from kissgs._cli_files import expand, print_json, show
 from kissgs._cli_pictures import ImagesOption, ResolutionOption, ScaleOption, ViewsOption, open_views
+from kissgs._cli_settings import chosen
 from kissgs.errors import UnsupportedError
 
 if TYPE_CHECKING:
@@ -23,6 +24,9 @@ def bench(
     scenes: Annotated[list[str], typer.Argument(metavar="FILE…", help="Files or patterns.")],
     presets: Annotated[
         list[str] | None, typer.Option("--preset", "-p", help="Repeat for several; default: all.")
+    ] = None,
+    changes: Annotated[
+        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change one setting of all these presets.")
     ] = None,
     peers: Annotated[list[str] | None, typer.Option("--peer", help="sog or spz, by splat-transform.")] = None,
     splat_transform: Annotated[str, typer.Option(help="How to start it.")] = "splat-transform",
@@ -55,7 +59,9 @@ def bench(
             raise UnsupportedError("--gaussians goes with --rendering; to compress, make a scene: kissgs sample")
         compared = pictures or capture is not None
         peer_options = {"command": splat_transform, "sh_iterations": sog_iterations}
-        rows, table = _compression(expand(scenes), presets, peers or [], peer_options, compared, capture, threads)
+        rows, table = _compression(
+            expand(scenes), presets, changes, peers or [], peer_options, compared, capture, threads
+        )
     if as_json:
         print_json(rows)
     else:
@@ -65,6 +71,7 @@ def bench(
 def _compression(
     scenes: list[str],
     presets: list[str] | None,
+    changes: list[str] | None,
     peers: list[str],
     peer_options: dict[str, Any],
     pictures: bool,
@@ -76,9 +83,9 @@ def _compression(
     from kissgs._tables import bench_table
     from kissgs.bench import isolated_roundtrip
     from kissgs.evaluation.peers import measure_peer
-    from kissgs.settings import Preset, Settings
+    from kissgs.settings import Preset
 
-    all_settings = [Settings.from_preset(name) for name in presets or list(Preset)]
+    all_settings = [chosen(name, changes, None) for name in presets or list(Preset)]
     command, iterations = shlex.split(peer_options["command"]), peer_options["sh_iterations"]
     rows: list[tuple[str, str, Any]] = []
     for scene in expand(scenes):

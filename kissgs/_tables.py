@@ -16,6 +16,7 @@ from kissgs.report import Report
 
 CHANGES = {
     "invisible": "left out: opacity 1/255 or less, which no renderer draws",
+    "negligible": "left out: its bytes would cost more than it shows",
     "tamed_colours": "base colour far outside all others, pulled in so that it does not coarsen theirs",
     "non_finite": "removed: NaN or infinite",
     "far_away": "removed: further away than 1e15",
@@ -47,7 +48,12 @@ def report_table(report: Report, target: str) -> RenderableType:
     )
     took = f"{sum(report.seconds.values()):.1f} s ({report.cpu_seconds:.1f} CPU s), {size(report.peak_memory)} at most"
     body = f"{report.count:,} of {report.source_count:,} Gaussians, SH degree {report.sh_degree}; {took}"
-    changed = {"invisible": report.invisible, "tamed_colours": report.tamed_colours, **report.cleaned.as_dict()}
+    changed = {
+        "invisible": report.invisible,
+        "negligible": report.negligible,
+        "tamed_colours": report.tamed_colours,
+        **report.cleaned.as_dict(),
+    }
     pictures = [] if report.evaluation is None else [_pictures(report.evaluation)]
     return Group(head, Text(body), *pictures, parts_table(report.file_bytes, report.count), *_changes(changed))
 

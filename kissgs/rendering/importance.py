@@ -15,6 +15,9 @@ from kissgs.rendering.camera import Camera
 from kissgs.rendering.semantics import NEAR
 from kissgs.splats import Splats
 
+LARGEST = 1e25
+"""Of a cost: beyond it stand Gaussians so large that squares overflow, and sums of costs would be infinite."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Watch:
@@ -63,6 +66,8 @@ def measure_importance(
         for done, (camera, weight) in enumerate(zip(watch.cameras, watch.per_pixel(), strict=True)):
             progress("importance", done / len(watch.cameras))
             add_sensitivities(draw(splats, camera, watch.background, pool), weight, found, pool)
+    for values in (found.places, found.shapes, found.colors, found.directions):
+        np.nan_to_num(values, copy=False, nan=0.0, posinf=LARGEST, neginf=-LARGEST)
     seen = found.colors > 0
     found.directions[seen] /= found.colors[seen, None]
     progress("importance", 1.0)

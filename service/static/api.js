@@ -7,8 +7,8 @@
  *   bytes_per_gaussian: number}} Sizes
  * @typedef {{created_at: string, queue_seconds?: number, run_seconds?: number}} Timings
  * @typedef {{id: string, name: string, state: string, position?: number, progress?: Progress,
- *   estimate?: {seconds_left: number}, options: {preset: string, evaluate: boolean}, upload_bytes: number, gaussians: number,
- *   sh_degree: number, kept?: number, invisible?: number, cleaned?: Record<string, number>,
+ *   estimate?: {seconds_left: number}, options: {preset: string, encode: {weigh: boolean}, evaluate: boolean},
+ *   upload_bytes: number, gaussians: number, sh_degree: number, kept?: number, invisible?: number, cleaned?: Record<string, number>,
  *   evaluation?: {psnr?: number | null, ssim: number}, sizes?: Sizes, timings: Timings, starts: number,
  *   problem?: ProblemDocument, links: Record<string, string>, expires_at?: string}} Status
  * @typedef {{jobs: Status[], next: string | null}} JobPage

@@ -200,3 +200,25 @@ def test_any_numbers_at_all(splats, drop_invisible):
     assert found.sh_degree == splats.sh_degree
     assert len(found) + result.report.invisible + result.report.cleaned.removed == len(splats)
     assert_sh_within(found, clean(splats)[0], result)
+
+
+STRANGE = {
+    "sizes over sixty orders of e": lambda s, rng: {"scales": rng.uniform(-30, 30, s.scales.shape)},
+    "positions from 1e-6 to 1e14": lambda s, rng: {"means": s.means * 10 ** rng.uniform(-6, 14, (len(s), 1))},
+    "a scene of a micrometre": lambda s, rng: {"means": s.means * 1e-6, "scales": s.scales - 20},
+    "opaque or invisible": lambda s, rng: {"opacities": np.where(rng.random(len(s)) < 0.5, np.inf, -np.inf)},
+    "colours of a million": lambda s, rng: {"sh0": s.sh0 * 1e6, "shN": s.shN * 1e6},
+    "needles": lambda s, rng: {"scales": np.array([-30, 5, 0]) + 0 * s.scales},
+    "all on a line": lambda s, rng: {"means": s.means * [1, 0, 0] + 7},
+    "all in a point": lambda s, rng: {"means": 0 * s.means + 3},
+}
+
+
+@pytest.mark.parametrize("kind", STRANGE)
+@pytest.mark.parametrize("count", [1, 9, 200])
+@pytest.mark.parametrize("preset", ["balanced", "small"])
+def test_strange_scenes_can_be_weighed(kind, count, preset):
+    splats = random_scene(count, 1, seed=count)
+    splats = replaced(splats, **STRANGE[kind](splats, np.random.default_rng(count)))
+    found, result = check(splats, preset, views=4, view_size=48)
+    assert len(found) == result.report.count
