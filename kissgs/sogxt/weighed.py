@@ -36,27 +36,6 @@ SH_WEIGHTS = (1e-2, 1e2)
 OUTLIERS = 1e-4
 
 
-def find_price(
-    splats: Splats,
-    kept: Int[np.ndarray, " M"],
-    importance: Importance,
-    settings: EncodeSettings,
-    pool: Workers,
-    progress: Progress,
-) -> float:
-    """Squared error per bit at which the scene keeps the fidelity that the settings ask for.
-
-    Without a ``price``, that of the paper's own settings on this scene (:func:`kissgs.sogxt.economy.paper_error`).
-    """
-    if settings.price is not None:
-        return settings.price
-    progress("price", 0.0)
-    costs = Costs.of(importance, splats)
-    gloss = _trial(splats, kept, importance, settings, pool)
-    error = paper_error(costs, splats, gloss) * 10 ** (-settings.fidelity / 10)
-    return price_for(error, costs, gloss, settings.drop, importance.hedge)
-
-
 def weigh(
     splats: Splats,
     kept: Int[np.ndarray, " M"],
@@ -67,25 +46,31 @@ def weigh(
     progress: Progress,
 ) -> Choice:
     """Choose everything for the Gaussians ``kept``, at least one of which is seen."""
-    price = find_price(splats, kept, importance, settings, pool, progress)
-    costs = Costs.of(importance, splats)
+    progress("price", 0.0)
+    costs, gloss = Costs.of(importance, splats), _trial(splats, kept, importance, settings, pool)
+    price = settings.price
+    if price is None:
+        error = paper_error(costs, splats, gloss) * 10 ** (-settings.fidelity / 10)
+        price = price_for(error, costs, gloss, settings.drop, importance.hedge)
     worth = costs.removal[kept] >= settings.drop * price
     kept = kept[worth] if worth.any() else kept
     classes = costs.classes(kept, settings.classes)
     progress("order", 0.0)
     grid = place(splats.means, kept, 16, settings, pool, lambda fraction: None, classes)
     order = grid.cells[grid.mask]
-    classes, shown = np.sort(classes), splats.select(order)
+    of_each = np.zeros(len(splats), np.int64)
+    of_each[kept] = classes
+    classes, shown = of_each[order], splats.select(order)
     costs = Costs(**{name: getattr(costs, name)[order] for name in Costs.__slots__})
 
     progress("forms", 0.0)
-    rows = np.arange(len(order))
-    quats, scales, form_error, forms = choose_forms(shown, rows, grid.side, settings, pool, lambda fraction: None)
-    gloss = _trial(splats, kept, importance, settings, pool)
+    quats, scales, form_error, forms = choose_forms(
+        splats, grid.cells, grid.side, settings, pool, lambda fraction: progress("forms", fraction)
+    )
+    quats, scales, forms = quats[grid.mask], scales[grid.mask], forms[grid.mask]
     codebook = _codebook(
         shown, _sh_weights(importance, order), importance.colors[order], classes, price, gloss, settings, pool, progress
     )
-    means = _means(shown.means, costs, classes, price)
     progress("rounding", 0.0)
     values = np.concatenate([shown.opacities[:, None], scales, quats], axis=1).astype(np.float64)
     parts = (
@@ -95,15 +80,14 @@ def weigh(
     )
     if settings.round_by_price:
         parts = round_shapes(values, parts, importance.shapes[order], forms, costs, classes, price, pool)
-    fields = {"means": means, **dict(zip(("opacities", "scales", "quaternions"), parts, strict=True))}
+    fields = dict(zip(("opacities", "scales", "quaternions"), parts, strict=True))
+    fields["means"] = _means(shown.means, costs, classes, price)
 
     rest = _gloss_of(codebook, shown)
     base = shown.sh0 + np.einsum("nk,nkc->nc", importance.directions[order], shown.shN - rest) / np.float32(SH_C0)
     if recolor is not None:
         base = recolor(_decoded(fields, base.astype(np.float32), rest), order)
-    finest = min(step(float(costs.color[classes == c].mean()), price) for c in range(int(classes.max()) + 1))
-    colors = tame(base.astype(np.float64), step=finest, share=OUTLIERS)
-    fields["f_dc"] = quantize_by_class(colors, costs.color, classes, price, COARSEST["f_dc"])
+    fields["f_dc"], tamed = _colors(base.astype(np.float64), costs, classes, price)
     wanted = {
         "means": signed_log(shown.means),
         "opacities": values[:, :1],
@@ -121,7 +105,7 @@ def weigh(
         },
         codebook=codebook,
         form_error=form_error,
-        tamed=int((colors != base).any(axis=1).sum()),
+        tamed=tamed,
         errors={**errors, "f_rest_centroids": half.tolist()},
     )
 
@@ -189,6 +173,16 @@ def _means(means: Float32[np.ndarray, "M 3"], costs: Costs, classes: Int[np.ndar
         for c in range(int(classes.max()) + 1)
     ]
     return quantize_means(means, bits=16 - np.array(coarse, np.int64)[classes])
+
+
+def _colors(
+    base: Float64[np.ndarray, "M 3"], costs: Costs, classes: Int[np.ndarray, " M"], price: float
+) -> tuple[Quantized, int]:
+    """Base colours, and how many of them are outliers that were pulled in."""
+    finest = min(step(float(costs.color[classes == c].mean()), price) for c in range(int(classes.max()) + 1))
+    tamed = tame(base, step=finest, share=OUTLIERS)
+    levels = quantize_by_class(tamed, costs.color, classes, price, COARSEST["f_dc"])
+    return levels, int((tamed != base).any(axis=1).sum())
 
 
 def _gloss_of(codebook: Codebook, shown: Splats) -> Float32[np.ndarray, "M K 3"]:

@@ -306,3 +306,14 @@ def test_thrift_trades_error_for_cheaper_labels():
         assert next_error > error
     for price, (error, bits) in zip((0.05, 0.3), found[1:], strict=True):
         assert error + price * bits < found[0][0] + price * found[0][1]
+
+
+@pytest.mark.parametrize("changes", [{"order": "plas"}, {"forms": "smooth"}, {"shared_steps": False}, {"classes": 7}])
+def test_every_way_of_the_settings_goes_with_it(changes):
+    splats = random_scene(700, 1, seed=8)
+    result = weighed(splats, made_up(splats), drop=0, sh_tolerance=0, **changes)
+    found, wanted = decompress(result.files), splats.select(result.order)
+    assert sorted(result.order) == list(range(700))
+    for name, field in (("opacities", "opacities"), ("sh0", "f_dc")):
+        assert np.abs(getattr(found, name) - getattr(wanted, name)).max() <= max(result.errors[field]) + 1e-5
+    oracle.assert_equal_scenes(found, oracle.decode(result.files), result.files)
