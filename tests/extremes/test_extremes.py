@@ -3,7 +3,7 @@
 import numpy as np
 import oracle
 import pytest
-from codec_scenes import assert_round_trip, assert_within, constant_scene, random_scene, replaced
+from codec_scenes import GLANCE, assert_round_trip, assert_within, constant_scene, random_scene, replaced
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as stnp
@@ -16,7 +16,7 @@ FIELDS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 def check(splats, preset="fast", **changes):
     """What comes out is finite, and as near to the cleaned scene as the report says. Returns it, and the result."""
-    result = compress(splats, settings=Settings.from_preset(preset, sh_tolerance=0, **changes))
+    result = compress(splats, settings=Settings.from_preset(preset, **{"sh_tolerance": 0, **GLANCE, **changes}))
     found = decompress(result.files)
     assert all(np.isfinite(getattr(found, name)).all() for name in ATTRIBUTES)
     oracle.assert_equal_scenes(found, oracle.decode(result.files), result.files)

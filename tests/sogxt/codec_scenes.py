@@ -13,6 +13,9 @@ from kissgs.splats import ATTRIBUTES, SH_REST_COUNTS, Splats
 
 PRESETS = ("fast", "balanced", "small", "paper")
 
+GLANCE = {"views": 4, "view_size": 48}
+"""A look at a small scene that is soon over."""
+
 PLANES = (
     "active_mask",
     "means_bytes_0",

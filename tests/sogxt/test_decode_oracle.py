@@ -5,7 +5,7 @@ import functools
 import numpy as np
 import oracle
 import pytest
-from codec_scenes import PRESETS, constant_scene, random_scene
+from codec_scenes import GLANCE, PRESETS, constant_scene, random_scene
 
 from kissgs import Settings, compress, decompress, load, sample_scene
 from kissgs.splats import ATTRIBUTES
@@ -14,7 +14,7 @@ COUNTS = (0, 1, 7, 8, 9, 63, 64, 65, 1000)
 
 
 def encoded(splats, preset, **settings):
-    return compress(splats, settings=Settings.from_preset(preset, **settings)).files
+    return compress(splats, settings=Settings.from_preset(preset, **GLANCE, **settings)).files
 
 
 def check(files):

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import oracle
 import pytest
-from codec_scenes import PLANES, PRESETS, random_scene, unit
+from codec_scenes import GLANCE, PLANES, PRESETS, random_scene, unit
 
 import kissgs
 from kissgs import Settings, Splats, compress, decompress, sample_scene
@@ -35,7 +35,7 @@ def digests(files):
 def test_threads_and_repetition_do_not_change_a_byte(scene, preset):
     # PLAS is slow: the paper's preset gets a part of the scene, still of several blocks per pass.
     splats = scene.select(slice(0, 550)) if preset == "paper" else scene
-    settings = Settings.from_preset(preset)
+    settings = Settings.from_preset(preset, **GLANCE)
     once, again, threaded = (compress(splats, settings=settings, threads=threads) for threads in (1, 1, 3))
     assert digests(once.files) == digests(again.files) == digests(threaded.files)
     assert once.to_zip() == again.to_zip() == threaded.to_zip()
@@ -70,7 +70,7 @@ def test_the_input_is_not_modified(preset):
     before = {name: getattr(splats, name).copy() for name in ATTRIBUTES}
     for name in ATTRIBUTES:
         getattr(splats, name).flags.writeable = False
-    compress(splats, settings=Settings.from_preset(preset))
+    compress(splats, settings=Settings.from_preset(preset, **GLANCE))
     assert all((getattr(splats, name) == before[name]).all() for name in ATTRIBUTES)
 
 

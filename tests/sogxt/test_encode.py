@@ -9,6 +9,7 @@ import oracle
 import pytest
 import yaml
 from codec_scenes import (
+    GLANCE,
     PLANES,
     PRESETS,
     assert_round_trip,
@@ -32,7 +33,7 @@ IMAGES = [f"{name}.webp" for name in PLANES]
 
 
 def encoded(splats, preset="fast", **changes):
-    return compress(splats, settings=Settings.from_preset(preset, **changes))
+    return compress(splats, settings=Settings.from_preset(preset, **GLANCE, **changes))
 
 
 @pytest.mark.parametrize("preset", PRESETS)

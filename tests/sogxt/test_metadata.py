@@ -7,7 +7,7 @@ import numpy as np
 import oracle
 import pytest
 import yaml
-from codec_scenes import PRESETS, random_scene, replaced
+from codec_scenes import GLANCE, PRESETS, random_scene, replaced
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from metadata_files import FILES, assert_same, document, quantize_of, with_document, with_json, with_yaml
@@ -21,7 +21,7 @@ from kissgs.sogxt.metadata_reader import read_layout
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize(("count", "degree"), [(1, 0), (100, 3)])
 def test_what_we_write_follows_the_schema(preset, count, degree):
-    files = compress(random_scene(count, degree), settings=Settings.from_preset(preset)).files
+    files = compress(random_scene(count, degree), settings=Settings.from_preset(preset, **GLANCE)).files
     jsonschema.validate(yaml.safe_load(files["container_meta.yaml"]), ContainerMeta.model_json_schema())
 
 
