@@ -99,8 +99,8 @@ def test_real_scenes(shared_data, name, preset):
 
 
 def test_containers_in_all_their_forms_decode_alike(tmp_path):
-    files = encoded(random_scene(70, 1), "fast")
     compressed = compress(random_scene(70, 1), settings=Settings.from_preset("fast"))
+    files = compressed.files
     compressed.save(tmp_path / "folder")
     compressed.save(tmp_path / "file.zip")
     wanted = decompress(files)

@@ -41,7 +41,8 @@ def scene_of(count, degree=0, seed=0, **replaced):
 @functools.cache
 def container(preset="fast", degree=3, count=65):
     """Files by name."""
-    return dict(kissgs.compress(scene_of(count, degree), settings=kissgs.Settings(preset=preset)).files)
+    settings = kissgs.Settings.from_preset(preset, views=4, view_size=48)
+    return dict(kissgs.compress(scene_of(count, degree), settings=settings).files)
 
 
 def zipped(files, method=zipfile.ZIP_STORED, folder="", comment=b""):
