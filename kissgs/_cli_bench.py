@@ -85,7 +85,7 @@ def _compression(
     from kissgs.evaluation.peers import measure_peer
     from kissgs.settings import Preset
 
-    all_settings = [chosen(name, changes, None) for name in presets or list(Preset)]
+    all_settings = [chosen(name, changes) for name in presets or list(Preset)]
     command, iterations = shlex.split(peer_options["command"]), peer_options["sh_iterations"]
     rows: list[tuple[str, str, Any]] = []
     for scene in expand(scenes):

@@ -91,6 +91,14 @@ def source(name: str) -> Path | bytes:
     return sys.stdin.buffer.read()
 
 
+def beside(name: str, suffix: str) -> Path:
+    """The file of the same name with another ending."""
+    if name == "-":
+        raise OutputError("standard input has no place beside which anything could be kept")
+    path = Path(name).absolute()
+    return path.parent / ((path.name if path.is_dir() else path.stem) + suffix)
+
+
 def make_folder(folder: Path) -> None:
     from kissgs.io.atomic import reason_of
 

@@ -46,7 +46,7 @@ def compress(
 
     if "-" in scenes or str(output) == "-":
         raise UnsupportedError("remote compression reads and writes files; name them")
-    settings = chosen(preset, changes, None)
+    settings = chosen(preset, changes)
     with Remote(server, key=key) as remote:
 
         def work(scene: str, target: Path) -> dict[str, Any]:

@@ -10,8 +10,8 @@ if TYPE_CHECKING:
     from kissgs.settings import Settings
 
 
-def chosen(preset: str, changes: list[str] | None, seed: int | None) -> Settings:
-    """A preset with ``NAME=VALUE`` changes; the seed overrides the one among them.
+def chosen(preset: str, changes: list[str] | None, **options: float | str | None) -> Settings:
+    """A preset with ``NAME=VALUE`` changes; options of their own, where they are given, override these.
 
     Raises:
         UnsupportedError: no such preset or setting, or a value that is not possible.
@@ -24,6 +24,5 @@ def chosen(preset: str, changes: list[str] | None, seed: int | None) -> Settings
         if not equals:
             raise UnsupportedError(f"--set {change!r}: write NAME=VALUE, for example --set means_bits=16")
         values[name.strip()] = None if value.strip() == "auto" else value.strip()
-    if seed is not None:
-        values["seed"] = seed
+    values.update({name: value for name, value in options.items() if value is not None})
     return Settings.from_preset(preset, **values)

@@ -13,6 +13,7 @@ from kissgs.evaluation.likeness import Evaluation, spell
 from kissgs.evaluation.peers import PeerResult
 from kissgs.info import Info
 from kissgs.report import Report
+from kissgs.search import Trial
 
 CHANGES = {
     "invisible": "left out: opacity 1/255 or less, which no renderer draws",
@@ -54,8 +55,15 @@ def report_table(report: Report, target: str) -> RenderableType:
         "tamed_colours": report.tamed_colours,
         **report.cleaned.as_dict(),
     }
+    searched = [Text(f"searched: {_path(report.trials)}")] if report.trials else []
     pictures = [] if report.evaluation is None else [_pictures(report.evaluation)]
-    return Group(head, Text(body), *pictures, parts_table(report.file_bytes, report.count), *_changes(changed))
+    changes = _changes(changed)
+    return Group(head, Text(body), *searched, *pictures, parts_table(report.file_bytes, report.count), *changes)
+
+
+def _path(trials: Iterable[Trial]) -> str:
+    """What a search tried, in order."""
+    return ", ".join(size(t.bytes) + ("" if t.psnr is None else f" at {spell(t.psnr, 2)} dB") for t in trials)
 
 
 def _pictures(evaluation: Evaluation) -> Text:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 from kissgs import _cli_bench, _cli_pictures, _cli_remote, _cli_render
-from kissgs._cli_files import each, show, source, stdout, write_stdout
+from kissgs._cli_files import beside, each, show, source, stdout, write_stdout
 from kissgs._cli_settings import chosen
 from kissgs._version import __version__
 from kissgs.errors import KissgsError, UnsupportedError
@@ -77,6 +77,12 @@ def compress(
     ] = None,
     preset: PresetOption = "balanced",
     changes: SetOption = None,
+    psnr: Annotated[
+        float | None, typer.Option(metavar="DB", help="The smallest container with this PSNR to the scene's pictures.")
+    ] = None,
+    target_size: Annotated[
+        str | None, typer.Option(metavar="SIZE", help="The best container of at most this size: 800kB, 2.5MB.")
+    ] = None,
     seed: SeedOption = None,
     unpacked: Annotated[bool, typer.Option("--unpacked", help="Write folders instead of zips.")] = False,
     evaluate: Annotated[bool, typer.Option("--evaluate", help="Measure PSNR and SSIM of the result.")] = False,
@@ -84,6 +90,9 @@ def compress(
         Path | None,
         typer.Option("--views", metavar="DATA", help="Photographs: keep what their cameras see best; see 'evaluate'."),
     ] = None,
+    cache: Annotated[
+        bool, typer.Option("--cache", help="Keep what was seen of a scene in a file beside it, for the next time.")
+    ] = False,
     threads: ThreadsOption = 0,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -92,7 +101,7 @@ def compress(
     """Compress scenes, each into a container of its own."""
     from kissgs.pipeline import compress as run
 
-    settings = chosen(preset, changes, seed)
+    settings = chosen(preset, changes, seed=seed, psnr=psnr, target_size=target_size)
     if views is not None and not (evaluate or settings.encode.weigh):
         raise UnsupportedError(f"{preset} takes no pictures: --views only says from where to evaluate; add --evaluate")
     capture = _cli_pictures.open_views(views)
@@ -108,6 +117,7 @@ def compress(
                 source(scene),
                 None if piped else target,
                 settings=settings,
+                cache=beside(scene, ".importance.npz") if cache else None,
                 evaluate=evaluate,
                 views=capture,
                 overwrite=force,

@@ -12,27 +12,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kissgs._typing import Float32, Int
+from kissgs._typing import Int
 from kissgs.errors import InvalidContainerError, OutputError
 from kissgs.importance import Importance
 from kissgs.io.atomic import atomic_file, reason_of, refuse_existing
 from kissgs.io.ply import read_ply, write_ply
 from kissgs.progress import Progress, silent
 from kissgs.report import Report
-from kissgs.settings import EncodeSettings, Settings
+from kissgs.settings import Settings
 from kissgs.sogxt.container import check_destination, write_container, zip_bytes
 from kissgs.sogxt.decode import MAX_GAUSSIANS, decode
 from kissgs.splats import Cleaned, Splats, clean
 
 if TYPE_CHECKING:
     from kissgs.evaluation.likeness import Evaluation
-    from kissgs.sogxt.encode import Encoded
     from kissgs.views.view import Views
 
 AnyPath = str | PathLike[str]
-
-HEDGE = {True: 0.1, False: 0.55}
-"""How little pictures say of others: those from a capture's cameras, and those from virtual ones."""
 
 ZIP_BEGINNINGS = (b"PK\x03\x04", b"PK\x05\x06")
 
@@ -97,6 +93,7 @@ def compress(
     *,
     settings: Settings | None = None,
     importance: Importance | None = None,
+    cache: AnyPath | None = None,
     evaluate: bool = False,
     views: Views | None = None,
     overwrite: bool = False,
@@ -111,6 +108,8 @@ def compress(
         settings: by default those of the preset ``balanced``.
         importance: of a clean ``source``, measured before (:func:`kissgs.measure_importance`); by default it is
             measured if the settings ask for it.
+        cache: ``.npz`` in which to keep the importance that was measured. Next time it is taken from there, if neither
+            the scene nor the cameras have changed, and replaced otherwise.
         evaluate: decode the result and compare its pictures with those of the cleaned scene, and with the photographs
             of ``views`` if they have any; see :func:`kissgs.evaluate`. The report then has an ``evaluation``.
         views: a capture of the scene: its cameras for training weigh the bits, those held out are for evaluation; by
@@ -125,13 +124,16 @@ def compress(
     Raises:
         KissgsError: one of its children, with a sentence for the user.
     """
+    from kissgs.encoding import encode_scene
+
     settings = settings or Settings()
     target = Path(destination) if destination is not None else None
     if target is not None:
         check_destination(target, overwrite=overwrite)
+    kept = Path(cache) if cache is not None else None
     clock = _Clock(progress)
     splats, cleaned, source_bytes = _open(source, threads, clock)
-    encoded = _encode(splats, settings.encode, importance, views, cleaned, threads, clock)
+    encoded, trials = encode_scene(splats, settings.encode, importance, kept, views, cleaned, threads, clock)
     archive_bytes = len(zip_bytes(encoded.files))
     evaluation = _evaluate(splats, encoded.files, views, threads, clock) if evaluate else None
     if target is not None:
@@ -151,6 +153,8 @@ def compress(
         tamed_colours=encoded.tamed,
         form_error=encoded.form_error,
         half_steps=encoded.errors,
+        price=encoded.price,
+        trials=trials,
         seconds=clock.seconds,
         cpu_seconds=clock.cpu_seconds,
         peak_memory=peak_memory(),
@@ -225,48 +229,6 @@ def peak_memory() -> int:
         return 0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
-
-
-def _encode(
-    splats: Splats,
-    settings: EncodeSettings,
-    importance: Importance | None,
-    views: Views | None,
-    cleaned: Cleaned,
-    threads: int,
-    progress: Progress,
-) -> Encoded:
-    """Look at the scene, if the settings say so, and encode it."""
-    from kissgs.sogxt.encode import encode
-
-    if not settings.weigh or len(splats) == 0:
-        return encode(splats, settings, cleaned=cleaned, threads=threads, progress=progress)
-    from kissgs.rendering.importance import measure_importance
-    from kissgs.rendering.rasterizer import load_kernels as load_rasterizer
-    from kissgs.rendering.refit import refit_colors
-    from kissgs.sogxt.encode import load_kernels as load_encoder
-    from kissgs.views.watch import watch
-
-    load_encoder(progress)
-    load_rasterizer()
-    watched = watch(splats, views, count=settings.views, size=settings.view_size, threads=threads, progress=progress)
-    if importance is None:
-        hedge = settings.hedge if settings.hedge is not None else HEDGE[views is not None]
-        importance = measure_importance(splats, watched, hedge=hedge, threads=threads, progress=progress)
-    colors, guessed, steps = importance.colors, importance.guessed, settings.refit if views is not None else 0
-
-    def recolor(decoded: Splats, order: Int[np.ndarray, " M"]) -> Float32[np.ndarray, "M 3"]:
-        return refit_colors(
-            *(decoded, splats, watched, colors[order], guessed[order]), steps=steps, threads=threads, progress=progress
-        )
-
-    def ready(stage: str, fraction: float) -> None:
-        if stage != "kernels":  # that was before
-            progress(stage, fraction)
-
-    return encode(
-        *(splats, settings), importance=importance, recolor=recolor, cleaned=cleaned, threads=threads, progress=ready
-    )
 
 
 def _evaluate(

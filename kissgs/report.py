@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from kissgs.evaluation.likeness import Evaluation
+from kissgs.search import Trial
 from kissgs.splats import Cleaned
 
 
@@ -26,6 +27,8 @@ class Report:
         tamed_colours: Gaussians whose base colour is such an outlier that it was pulled in, for the others' sake.
         form_error: largest relative change of a covariance by the choice of its equivalent form.
         half_steps: largest error of quantisation, per field and channel; where all steps are alike, half of one.
+        price: of a bit, squared error; None where bits were not weighed.
+        trials: where the settings name a goal: what was encoded on the way, in this order.
         seconds: wall time per stage.
         cpu_seconds: processor time of all stages, over all threads.
         peak_memory: bytes, the largest this process has ever had resident.
@@ -45,6 +48,8 @@ class Report:
     tamed_colours: int
     form_error: float
     half_steps: dict[str, list[float]]
+    price: float | None
+    trials: tuple[Trial, ...]
     seconds: dict[str, float]
     cpu_seconds: float
     peak_memory: int

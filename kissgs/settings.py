@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ByteSize, ConfigDict, Field, ValidationError, model_validator
 
 from kissgs.errors import UnsupportedError
 
@@ -39,6 +39,19 @@ class EncodeSettings(BaseModel):
         gt=0,
         lt=1,
         description="Where bits are weighed: squared error per bit, in place of fidelity; auto: found for the scene.",
+    )
+    psnr: float | None = Field(
+        None,
+        gt=0,
+        le=200,
+        description="Where bits are weighed: search for the smallest container whose pictures have at least this PSNR, "
+        "decibels, to those of the scene, from where 'evaluate' takes them. Takes a few encodings.",
+    )
+    target_size: ByteSize | None = Field(
+        None,
+        ge=1,
+        description="Where bits are weighed: search for the best container of at most so many bytes, such as 800kB or "
+        "2.5MB, and at least 97 % of that. Takes a few encodings.",
     )
     drop: float = Field(
         10.0,
@@ -163,6 +176,15 @@ class EncodeSettings(BaseModel):
         0, ge=0, lt=2**31, description="Of all random choices. Same input, settings and seed: same bytes."
     )
 
+    @model_validator(mode="after")
+    def _one_goal(self) -> Self:
+        goals = [name for name in ("price", "psnr", "target_size") if getattr(self, name) is not None]
+        if len(goals) > 1:
+            raise ValueError(f"{goals[0]} and {goals[1]} cannot both be met; give one")
+        if goals and not self.weigh:
+            raise ValueError(f"{goals[0]} needs bits that are weighed: choose balanced or small, or set weigh=true")
+        return self
+
 
 PRESETS: dict[Preset, dict[str, Any]] = {
     Preset.FAST: {
@@ -175,7 +197,7 @@ PRESETS: dict[Preset, dict[str, Any]] = {
         "webp_method": 2,
     },
     Preset.BALANCED: {},
-    Preset.SMALL: {"fidelity": -0.1, "drop": 18, "refit": 4, "sh_rounds": 8, "sh_reach": 32, "plas_decay": 0.9},
+    Preset.SMALL: {"fidelity": -0.3, "drop": 18, "refit": 4, "sh_rounds": 8, "sh_reach": 32, "plas_decay": 0.9},
     Preset.PAPER: {
         "weigh": False,
         "order": "plas",
@@ -232,4 +254,6 @@ class Settings(BaseModel):
             if problem["type"] == "extra_forbidden":
                 known = ", ".join(EncodeSettings.model_fields)
                 raise UnsupportedError(f"there is no setting {name!r}; there are {known}") from error
+            if problem["type"] == "value_error":
+                raise UnsupportedError(str(problem["ctx"]["error"])) from error
             raise UnsupportedError(f"setting {name}: {problem['msg'].lower()}, not {problem['input']!r}") from error

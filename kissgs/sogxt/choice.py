@@ -22,6 +22,7 @@ class Choice:
         errors: largest error that the choices may cause, base colours' making up for others included; per field and
             channel, in the field's own unit (positions: of their signed logarithm; f_rest_centroids: of the codebook's
             entries).
+        price: of a bit, squared error; None where bits were not weighed.
     """
 
     grid: Grid
@@ -30,3 +31,4 @@ class Choice:
     form_error: float
     tamed: int
     errors: dict[str, list[float]]
+    price: float | None = None

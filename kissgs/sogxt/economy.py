@@ -140,7 +140,7 @@ def paper_error(costs: Costs, splats: Splats, gloss: Gloss) -> float:
     return total + PAPER_GLOSS * gloss.plain * (gloss.entries / entries) ** SH_SHRINK
 
 
-UNKNOWN = 9.0
+UNKNOWN = 9.5
 """Decibels by which errors that were put where these pictures do not show them exceed, in other pictures, what they are
 in these; per unit of hedge. Codebooks hardly follow the pictures once they are hedged, so gloss is not among them."""
 

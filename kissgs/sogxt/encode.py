@@ -38,6 +38,7 @@ class Encoded:
         negligible: number of Gaussians left out because their bytes cost more than they show.
         tamed: number of Gaussians whose base colour, an outlier, was pulled in (:func:`kissgs.sogxt.quantize.tame`).
         errors: largest error of quantisation, per field and channel, see :class:`kissgs.sogxt.choice.Choice`.
+        price: of a bit, squared error; None where bits were not weighed.
     """
 
     files: dict[str, bytes]
@@ -47,6 +48,7 @@ class Encoded:
     negligible: int
     tamed: int
     errors: dict[str, list[float]]
+    price: float | None
 
 
 def encode(
@@ -108,7 +110,7 @@ def encode(
                 "tamed_colours": choice.tamed,
                 **cleaned.as_dict(),
             },
-            settings=settings.model_dump(),
+            settings={**settings.model_dump(exclude={"psnr", "target_size"}), "price": choice.price},
             sha256={name: hashlib.sha256(data).hexdigest() for name, data in files.items()},
         ),
         crc32={name: pixels_crc32(image) for name, image in images.items()},
@@ -122,6 +124,7 @@ def encode(
         negligible=unseen,
         tamed=choice.tamed,
         errors=choice.errors,
+        price=choice.price,
     )
 
 

@@ -35,6 +35,9 @@ SH_WEIGHTS = (1e-2, 1e2)
 
 OUTLIERS = 1e-4
 
+REFIT_GAIN = 0.25
+"""Decibels by a step of refitting base colours: less than what is measured on average, for the sake of the worst."""
+
 
 def weigh(
     splats: Splats,
@@ -48,11 +51,15 @@ def weigh(
     """Choose everything for the Gaussians ``kept``, at least one of which is seen."""
     progress("price", 0.0)
     costs, gloss = Costs.of(importance, splats), _trial(splats, kept, importance, settings, pool)
+    drop = settings.drop * (1 - importance.hedge)
     price = settings.price
     if price is None:
         error = paper_error(costs, splats, gloss) * 10 ** (-settings.fidelity / 10)
-        price = price_for(error, costs, gloss, settings.drop, importance.hedge)
-    worth = costs.removal[kept] >= settings.drop * price
+        if settings.psnr is not None:
+            error = 10 ** (-settings.psnr / 10)
+        steps = settings.refit if recolor is not None else 0
+        price = price_for(error * 10 ** (steps * REFIT_GAIN / 10), costs, gloss, drop, importance.hedge)
+    worth = costs.removal[kept] >= drop * price
     kept = kept[worth] if worth.any() else kept
     classes = costs.classes(kept, settings.classes)
     progress("order", 0.0)
@@ -107,6 +114,7 @@ def weigh(
         form_error=form_error,
         tamed=tamed,
         errors={**errors, "f_rest_centroids": half.tolist()},
+        price=price,
     )
 
 

@@ -1,0 +1,47 @@
+"""Importance in a file, for the next time that the same scene is looked at from the same places."""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kissgs.errors import OutputError
+from kissgs.importance import Importance
+from kissgs.io.atomic import atomic_file, reason_of
+
+
+def read_importance(path: Path, key: str) -> Importance | None:
+    """What :func:`write_importance` kept under ``key``; None where there is no file, or one with another key.
+
+    Raises:
+        OutputError: there is something else, which must not be written over.
+    """
+    if not path.exists():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as kept:
+            if str(kept["key"]) != key:
+                return None
+            arrays = {field.name: kept[field.name] for field in fields(Importance)}
+    except OSError as error:
+        raise OutputError(f"cannot read {path}: {reason_of(error)}") from error
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise OutputError(
+            f"{path} is not a file in which kissgs keeps importance; move it away or delete it"
+        ) from error
+    return Importance(**{**arrays, "hedge": float(arrays["hedge"])})
+
+
+def write_importance(path: Path, importance: Importance, key: str) -> None:
+    """Keep it in an ``.npz``, whole or not at all; what was kept there before is replaced.
+
+    Raises:
+        OutputError: the file system refuses.
+    """
+    arrays: dict[str, Any] = {field.name: getattr(importance, field.name) for field in fields(Importance)}
+    with atomic_file(path, overwrite=True) as file:
+        np.savez(file, key=np.asarray(key), **arrays)

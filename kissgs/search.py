@@ -1,0 +1,77 @@
+"""Finds what meets a goal in few attempts, where an attempt is dear and only its outcome tells how near it came."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+ATTEMPTS = 10
+REACH = 4.0
+"""How far from all that is known an attempt may be, octaves."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """A container that was made on the way to the one that was asked for.
+
+    Attributes:
+        price: squared error per bit.
+        bytes: of its zip.
+        psnr: of its pictures, decibels; None where it did not matter.
+    """
+
+    price: float
+    bytes: int
+    psnr: float | None = None
+
+
+def seek(
+    spare: Callable[[float], float], start: float, slope: float, tolerance: float, bounds: tuple[float, float]
+) -> float | None:
+    """Where a monotone function is hardly above zero.
+
+    False position between attempts that met the goal and ones that did not; before there are both, Newton's steps of at
+    most :data:`REACH`.
+
+    Args:
+        spare: at least 0 where the goal is met; only about monotone and smooth, as results of rounding are.
+        start: first attempt.
+        slope: of ``spare``, about; its sign must be right.
+        tolerance: at most so much above 0 is near enough.
+        bounds: attempts stay between these.
+
+    Returns:
+        The best attempt that met the goal; None if none did in :data:`ATTEMPTS`, or the function does not go on rising.
+    """
+    known: dict[float, float] = {}
+    x = start
+    while len(known) < ATTEMPTS and x not in known:
+        known[x] = spare(x)
+        if 0 <= known[x] <= tolerance or _flat(known, tolerance):
+            break
+        x = min(max(_next(known, slope, tolerance / 2), bounds[0]), bounds[1])
+    met = [x for x, found in known.items() if found >= 0]
+    return min(met, key=lambda x: known[x]) if met else None
+
+
+def _next(known: dict[float, float], slope: float, aim: float) -> float:
+    met = [x for x, found in known.items() if found >= 0]
+    unmet = [x for x, found in known.items() if found < 0]
+    if met and unmet:
+        inside, outside = min(met, key=lambda x: known[x]), max(unmet, key=lambda x: known[x])
+        share = (known[inside] - aim) / (known[inside] - known[outside])
+        return inside + (outside - inside) * min(max(share, 0.1), 0.9)
+    *before, last = known
+    if before:
+        measured = (known[last] - known[before[-1]]) / (last - before[-1])
+        if 0.25 < measured / slope < 4:
+            slope = measured
+    return last + min(max((aim - known[last]) / slope, -REACH), REACH)
+
+
+def _flat(known: dict[float, float], tolerance: float) -> bool:
+    """Whether the last step was long and for nothing."""
+    if len(known) < 2:
+        return False
+    (one, first), (two, second) = list(known.items())[-2:]
+    return abs(two - one) > REACH / 2 and abs(second - first) < tolerance
