@@ -22,6 +22,7 @@ from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.decode import decode
 from kissgs.sogxt.encode import Encoded, encode
 from kissgs.sogxt.encode import load_kernels as load_encoder
+from kissgs.sogxt.weighed import Recolor
 from kissgs.splats import ATTRIBUTES, Cleaned, Splats
 from kissgs.views.view import Views
 
@@ -80,23 +81,22 @@ def _look(
 ) -> Encoder:
     """An encoder that weighs by pictures of the scene, which are taken once."""
     from kissgs.rendering.rasterizer import load_kernels as load_rasterizer
-    from kissgs.rendering.refit import refit_colors
     from kissgs.views.watch import watch
 
+    if importance is not None:
+        importance.check(splats)
     load_encoder(progress)
     load_rasterizer()
-    watched = watch(splats, views, count=settings.views, size=settings.view_size, threads=threads, progress=progress)
-    if importance is None:
-        hedge = settings.hedge if settings.hedge is not None else HEDGE[views is not None]
-        importance = _importance(splats, watched, hedge, cache, threads, progress)
-    colors, guessed, steps = importance.colors, importance.guessed, settings.refit
-
-    def recolor(decoded: Splats, order: Int[np.ndarray, " M"]) -> Float32[np.ndarray, "M 3"]:
-        return refit_colors(
-            *(decoded, splats, watched, colors[order], guessed[order]), steps=steps, threads=threads, progress=progress
-        )
-
-    photographed = recolor if views is not None and steps > 0 else None  # virtual pictures would mislead it
+    captured = views is not None and len(views.train) > 0
+    recolor = None
+    if importance is None or (captured and settings.refit):
+        size = settings.view_size
+        watched = watch(splats, views, count=settings.views, size=size, threads=threads, progress=progress)
+        if importance is None:
+            hedge = settings.hedge if settings.hedge is not None else HEDGE[captured]
+            importance = _importance(splats, watched, hedge, cache, threads, progress)
+        if captured and settings.refit:  # virtual pictures would mislead it
+            recolor = _recolor(splats, watched, importance, settings.refit, threads, progress)
 
     def ready(stage: str, fraction: float) -> None:
         if stage != "kernels":  # that was before
@@ -106,7 +106,7 @@ def _look(
         return encode(
             *(splats, chosen),
             importance=importance,
-            recolor=photographed,
+            recolor=recolor,
             cleaned=cleaned,
             threads=threads,
             progress=ready,
@@ -133,6 +133,19 @@ def _importance(
         found = measure_importance(splats, watched, hedge=hedge, threads=threads, progress=progress)
         write_importance(cache, found, key.hexdigest())
     return found
+
+
+def _recolor(
+    splats: Splats, watched: Watch, importance: Importance, steps: int, threads: int, progress: Progress
+) -> Recolor:
+    """Refits base colours to pictures of the scene."""
+    from kissgs.rendering.refit import refit_colors
+
+    def recolor(decoded: Splats, order: Int[np.ndarray, " M"]) -> Float32[np.ndarray, "M 3"]:
+        weights = importance.colors[order], importance.guessed[order]
+        return refit_colors(decoded, splats, watched, *weights, steps=steps, threads=threads, progress=progress)
+
+    return recolor
 
 
 class _Search:

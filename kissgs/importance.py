@@ -13,6 +13,9 @@ from kissgs.splats import SH_C0, SH_REST_COUNTS, Splats
 UNSEEN = 1e-3
 """Least importance, in units of what it would be if nothing were before a Gaussian."""
 
+LARGEST = 1e25
+"""Of a cost: beyond it stand Gaussians so large that squares overflow, and sums of costs would be infinite."""
+
 OPACITY, SCALES, ROTATION = (0,), (7, 13, 18), (22, 25, 27)
 """Where the diagonal entries of a shape's form stand."""
 
@@ -57,16 +60,20 @@ class Importance:
         """See that this is the importance of such a scene.
 
         Raises:
-            InvalidSceneError: it has another number of Gaussians or another SH degree, or is not finite.
+            InvalidSceneError: it has another number of Gaussians or another SH degree, or values that no costs have.
         """
         wanted = Importance.none(len(splats), splats.sh_degree)
         for name in ("places", "shapes", "colors", "directions", "guessed"):
             found, shape = getattr(self, name), getattr(wanted, name).shape
-            if found.shape != shape or not np.isfinite(found).all():
+            if found.shape != shape or found.dtype != np.float32:
                 raise InvalidSceneError(
-                    f"this importance is not that of the scene: {name} must be {shape} finite numbers, and has shape "
-                    f"{found.shape}; measure it for the scene as it is compressed"
+                    f"this importance is not that of the scene: {name} must be {shape} float32, and is {found.shape} "
+                    f"{found.dtype}; measure it for the scene as it is compressed"
                 )
+            if not np.isfinite(found).all() or (name in ("colors", "guessed") and (found < 0).any()):
+                raise InvalidSceneError(f"this importance is damaged: {name} has a value that is no cost; measure it")
+        if not 0 <= self.hedge <= 1:
+            raise InvalidSceneError(f"this importance is damaged: its hedge is {self.hedge}, not from 0 to 1")
 
     def hedged(self, splats: Splats, exposed: Float64[np.ndarray, " N"], share: float) -> Importance:
         """What it probably is for cameras other than those of the pictures, which see what was hidden from these.
@@ -87,16 +94,17 @@ class Importance:
         guess = float(np.median(self.colors[known] / exposed[known])) * exposed
         colors = np.maximum(self.colors.astype(np.float64), UNSEEN * guess)
         least = colors - self.colors
-        unit = {"shapes": 1.0, "places": np.exp(-2.0 * np.sort(splats.scales, axis=1)[:, 1].astype(np.float64))}
+        places = np.exp(-2.0 * np.sort(splats.scales, axis=1)[:, 1].astype(np.float64))
         raised = np.where(colors > 0, (guess / np.maximum(colors, 1e-300)) ** share, 1.0)
         forms = {}
-        for name, diagonals in (("shapes", (OPACITY, SCALES, ROTATION)), ("places", ((0, 3, 5),))):
+        shapes = ((OPACITY, _seen_through(splats) ** 2), (SCALES, 1.0), (ROTATION, 1.0))
+        for name, diagonals in (("shapes", shapes), ("places", (((0, 3, 5), places),))):
             values = getattr(self, name).astype(np.float64)
-            for of in diagonals:
+            for of, unit in diagonals:
                 each = np.maximum(values[:, of].mean(axis=1), 0)
-                ratio = float(np.median((each / (colors * unit[name]))[known]))
-                values[:, of] += (ratio * least * unit[name])[:, None]
-            forms[name] = (values * raised[:, None]).astype(np.float32)
+                ratio = float(np.median((each / (colors * unit))[known]))
+                values[:, of] += (ratio * least * unit)[:, None]
+            forms[name] = np.clip(values * raised[:, None], -LARGEST, LARGEST).astype(np.float32)
         hedged = colors * raised
         guessed = np.maximum(hedged - self.colors, 0)
         return Importance(
@@ -119,7 +127,11 @@ class Importance:
         """What it costs to leave a Gaussian out: the score of GaussianPOP, section 3.
 
         The picture is linear in alpha; a logit moves alpha by (1 - opacity) of itself, a removal by all of it. So this
-        follows from the form of the opacity. (A Gaussian that is clamped to the largest alpha is underestimated.)
+        follows from the form of the opacity.
         """
-        seen_through = 1 / (1 + np.exp(np.clip(splats.opacities.astype(np.float64), None, 12)))
-        return self.diagonal(OPACITY)[:, 0] / seen_through**2
+        return self.diagonal(OPACITY)[:, 0] / _seen_through(splats) ** 2
+
+
+def _seen_through(splats: Splats) -> Float64[np.ndarray, " N"]:
+    """1 - opacity; at least 1e-7, for logits that :func:`kissgs.clean` would not leave so large."""
+    return 1 / (1 + np.exp(np.clip(splats.opacities.astype(np.float64), None, 16)))

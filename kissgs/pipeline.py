@@ -184,7 +184,7 @@ def decompress(
         progress: receives events.
 
     Returns:
-        The scene exactly as stored: quaternions as quantised, their length within a few per cent of 1.
+        The scene exactly as stored: quaternions as quantised, their length only about 1.
 
     Raises:
         InvalidContainerError: the container is damaged.

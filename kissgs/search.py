@@ -64,8 +64,7 @@ def _next(known: dict[float, float], slope: float, aim: float) -> float:
     *before, last = known
     if before:
         measured = (known[last] - known[before[-1]]) / (last - before[-1])
-        if 0.25 < measured / slope < 4:
-            slope = measured
+        slope *= min(max(measured / slope, 0.1), 10.0)
     return last + min(max((aim - known[last]) / slope, -REACH), REACH)
 
 

@@ -136,7 +136,8 @@ class EncodeSettings(BaseModel):
         7.0,
         ge=1,
         le=4096,
-        description="Gaussians per codebook entry: fewer entries are fewer bytes and a rougher gloss.",
+        description="Gaussians per codebook entry: fewer entries are fewer bytes and a rougher gloss. Where bits are "
+        "weighed: at least so many, if there are more than 8,192 entries.",
     )
     sh_tolerance: float = Field(
         0.001,
@@ -177,6 +178,15 @@ class EncodeSettings(BaseModel):
     )
 
     @model_validator(mode="after")
+    def _only_what_counts(self) -> Self:
+        unused = [name for name in UNWEIGHED if self.weigh and getattr(self, name) != _default(name)]
+        if unused:
+            raise ValueError(
+                f"{unused[0]} has no effect where bits are weighed: set fidelity or price, or weigh=false with it"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _one_goal(self) -> Self:
         goals = [name for name in ("price", "psnr", "target_size") if getattr(self, name) is not None]
         if len(goals) > 1:
@@ -184,6 +194,18 @@ class EncodeSettings(BaseModel):
         if goals and not self.weigh:
             raise ValueError(f"{goals[0]} needs bits that are weighed: choose balanced or small, or set weigh=true")
         return self
+
+
+UNWEIGHED = (
+    *("shared_steps", "means_bits", "means_tolerance", "opacity_step", "scale_step", "quat_step", "sh0_step"),
+    "sh_weight_power",
+)
+"""Settings that price and importance decide about where bits are weighed."""
+
+
+def _default(name: str) -> object:
+    """What a setting of the encoder is if nobody sets it."""
+    return EncodeSettings.model_fields[name].default
 
 
 PRESETS: dict[Preset, dict[str, Any]] = {

@@ -95,9 +95,9 @@ def test_info_of_both_kinds(scene: Path, tmp_path: Path) -> None:
 
 
 def test_settings_from_the_command_line(scene: Path, tmp_path: Path) -> None:
-    run("compress", scene, "-o", tmp_path / "a.zip", "-q", "--set", "means_bits=16", "--seed", "3")
+    run("compress", scene, "-o", tmp_path / "a.zip", "-q", "--set", "sh_ratio=16", "--seed", "3")
     settings = json.loads(run("info", tmp_path / "a.zip", "--json").stdout)["details"]["settings"]
-    assert (settings["means_bits"], settings["seed"]) == (16, 3)
+    assert (settings["sh_ratio"], settings["seed"]) == (16, 3)
     assert "there is no setting 'bits'" in failure("compress", scene, "-o", tmp_path / "b.zip", "--set", "bits=16")
     assert "NAME=VALUE" in failure("compress", scene, "-o", tmp_path / "b.zip", "--set", "bits")
     assert "fast, balanced, small, paper" in failure("compress", scene, "-o", tmp_path / "b.zip", "-p", "huge")

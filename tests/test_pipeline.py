@@ -324,5 +324,5 @@ def test_importance_is_handed_on():
     assert errors[0] < 0.7 * errors[1]
     with pytest.raises(InvalidSceneError, match="this importance is not that of the scene: places must be"):
         kissgs.compress(SCENE, importance=kissgs.Importance.none(119, SCENE.sh_degree))
-    with pytest.raises(InvalidSceneError, match="this importance is not that of the scene: colors must be"):
+    with pytest.raises(InvalidSceneError, match="colors has a value that is no cost"):
         kissgs.compress(SCENE, importance=dataclasses.replace(measured, colors=measured.colors * np.float32(np.nan)))

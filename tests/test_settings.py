@@ -31,11 +31,11 @@ def test_presets_differ():
 
 @pytest.mark.parametrize("preset", list(Preset))
 def test_single_settings_replace_those_of_the_preset(preset):
-    changed = Settings.from_preset(preset, sh_ratio=33, means_bits=9)
+    changed = Settings.from_preset(preset, sh_ratio=33, sh_step=2)
     plain = Settings.from_preset(preset)
-    assert (changed.encode.sh_ratio, changed.encode.means_bits) == (33, 9)
-    assert changed.encode == plain.encode.model_copy(update={"sh_ratio": 33, "means_bits": 9})
-    assert changed == Settings.model_validate({"preset": preset, "encode": {"sh_ratio": 33, "means_bits": 9}})
+    assert (changed.encode.sh_ratio, changed.encode.sh_step) == (33, 2)
+    assert changed.encode == plain.encode.model_copy(update={"sh_ratio": 33, "sh_step": 2})
+    assert changed == Settings.model_validate({"preset": preset, "encode": {"sh_ratio": 33, "sh_step": 2}})
 
 
 @pytest.mark.parametrize("preset", list(Preset))

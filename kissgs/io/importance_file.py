@@ -23,7 +23,7 @@ def read_importance(path: Path, key: str) -> Importance | None:
     if not path.exists():
         return None
     try:
-        with np.load(path, allow_pickle=False) as kept:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as kept:
             if str(kept["key"]) != key:
                 return None
             arrays = {field.name: kept[field.name] for field in fields(Importance)}

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from kissgs._typing import Float32, Float64
-from kissgs.importance import Importance
+from kissgs.errors import InvalidViewsError
+from kissgs.importance import LARGEST, OPACITY, ROTATION, SCALES, Importance
 from kissgs.parallel import Workers
 from kissgs.progress import Progress, silent
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.semantics import NEAR
 from kissgs.splats import Splats
-
-LARGEST = 1e25
-"""Of a cost: beyond it stand Gaussians so large that squares overflow, and sums of costs would be infinite."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,11 +26,25 @@ class Watch:
         cameras: at the size to render.
         weights: of each, positive; they need not sum to 1.
         background: ``(3,)`` red, green, blue.
+        spread: standard deviation of each channel of the background: how little is known of it.
+
+    Raises:
+        InvalidViewsError: no camera; not as many weights as cameras; a weight or the spread is negative or not finite.
     """
 
     cameras: Sequence[Camera]
     weights: Sequence[float]
     background: Float32[np.ndarray, "3"]
+    spread: float = 0.25
+
+    def __post_init__(self) -> None:
+        if not self.cameras or len(self.cameras) != len(self.weights):
+            raise InvalidViewsError(
+                f"a scene is watched by one camera or more with a weight each, not by {len(self.cameras)} cameras with "
+                f"{len(self.weights)} weights"
+            )
+        if not all(0 < weight < math.inf for weight in self.weights) or not 0 <= self.spread < math.inf:
+            raise InvalidViewsError("weights of cameras must be positive and finite, and the spread not negative")
 
     def per_pixel(self) -> list[float]:
         """Weights of the squared error of one channel of one pixel, so that a weighted sum is a mean."""
@@ -52,7 +65,8 @@ def measure_importance(
     Args:
         splats: finite (:func:`kissgs.clean`).
         watch: at least one camera.
-        hedge: share of a guess to add for cameras that are not among them (:meth:`kissgs.Importance.hedged`).
+        hedge: from 0 to 1, share of a guess to add for cameras that are not among them
+            (:meth:`kissgs.Importance.hedged`).
         threads: 0 means one per processor; the result does not depend on it.
         progress: receives the stage ``"importance"``.
 
@@ -65,13 +79,23 @@ def measure_importance(
     with Workers(threads) as pool:
         for done, (camera, weight) in enumerate(zip(watch.cameras, watch.per_pixel(), strict=True)):
             progress("importance", done / len(watch.cameras))
-            add_sensitivities(draw(splats, camera, watch.background, pool), weight, found, pool)
-    for values in (found.places, found.shapes, found.colors, found.directions):
-        np.nan_to_num(values, copy=False, nan=0.0, posinf=LARGEST, neginf=-LARGEST)
+            add_sensitivities(draw(splats, camera, watch.background, pool), weight, watch.spread, found, pool)
+    _bound(found.places, (0, 3, 5))
+    _bound(found.shapes, OPACITY + SCALES + ROTATION)
+    np.nan_to_num(found.colors, copy=False, nan=LARGEST, posinf=LARGEST)
+    np.nan_to_num(found.directions, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
     seen = found.colors > 0
     found.directions[seen] /= found.colors[seen, None]
     progress("importance", 1.0)
     return found.hedged(splats, _exposed(splats, watch), hedge)
+
+
+def _bound(forms: Float32[np.ndarray, "N n"], diagonal: tuple[int, ...]) -> None:
+    """Where a form overflows, keep its diagonal, at most as large as can be."""
+    wild = ~(np.abs(forms) <= LARGEST).all(axis=1)
+    kept = np.nan_to_num(forms[wild][:, diagonal], nan=LARGEST)
+    forms[wild] = 0
+    forms[np.ix_(wild, diagonal)] = np.minimum(kept, LARGEST)
 
 
 def _exposed(splats: Splats, watch: Watch) -> Float64[np.ndarray, " N"]:

@@ -22,6 +22,13 @@ from kissgs.splats import SH_C0, Splats
 DAMPING = 0.02
 """How much all are held to the colours that they begin from, in units of the diagonal's median."""
 
+REACH = 0.5 / SH_C0
+"""Largest change of a coefficient: half of a colour's range. Few pictures would let faint Gaussians go further, for
+nothing that other pictures would thank them for."""
+
+KEPT = 1 << 27
+"""Pixels of the original's pictures that are kept; where there are more, they are drawn anew for each step."""
+
 STEP = 0.1
 """Root mean square of the changes by which the matrix is probed: colours that are clamped at black are not linear."""
 
@@ -71,13 +78,15 @@ def refit_colors(
         for done, (camera, weight) in enumerate(zip(watch.cameras, watch.per_pixel(), strict=True)):
             progress("refit", (sweeps + done / len(watch.cameras)) / total)
             frame = draw(scene, camera, watch.background, pool)
-            missing = (targets[done] - frame.image) * np.float32(weight)
+            target = targets[done] if targets else draw(original, camera, watch.background, pool).image
+            missing = (target - frame.image) * np.float32(weight)
             pull += differentiate(frame, missing, np.zeros(missing.shape[:2], np.float32), pool).sh0
         sweeps += 1
         return pull
 
     with Workers(threads) as pool:
-        targets = [draw(original, camera, watch.background, pool).image for camera in watch.cameras]
+        few = sum(camera.width * camera.height for camera in watch.cameras) <= KEPT
+        targets = [draw(original, camera, watch.background, pool).image for camera in watch.cameras] if few else []
         sh0 = decoded.sh0.astype(np.float64)
         rest = gradient(sh0, pool)
         search = rest / diagonal
@@ -94,4 +103,4 @@ def refit_colors(
             size, before = float((rest * ahead).sum()), size
             search = ahead + (size / before) * search
     progress("refit", 1.0)
-    return sh0.astype(np.float32)
+    return np.clip(sh0, decoded.sh0 - REACH, decoded.sh0 + REACH).astype(np.float32)

@@ -50,7 +50,7 @@ def decode(
         progress: receives "decode" events.
 
     Returns:
-        The Gaussians in the order of the grid. Quaternions are as stored, their length within a few per cent of 1.
+        The Gaussians in the order of the grid. Quaternions are as stored, their length only about 1.
 
     Raises:
         InvalidContainerError: something in it is missing, damaged or impossible.

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kissgs._typing import Float64, Int
+from kissgs._typing import Bool, Float64, Int
 from kissgs.importance import OPACITY, ROTATION, SCALES, Importance
 from kissgs.splats import Splats
 
@@ -27,6 +27,9 @@ ENTRY_BITS = 112
 
 LABEL_SHARE = 0.5
 """Bits of a label for one more bit of a codebook's size: entropy coding makes popular entries cheap."""
+
+QUICK = 1 << 13
+"""Entries of a codebook that is found in a few seconds."""
 
 DIMENSIONS = 14
 """Numbers per Gaussian that are rounded: opacity, scales, rotation, base colour, position."""
@@ -76,12 +79,28 @@ class Costs:
             removal=importance.removal(splats),
         )
 
-    def classes(self, chosen: Int[np.ndarray, " k"], number: int) -> Int[np.ndarray, " k"]:
-        """Class of each of the ``chosen``, from 0, the most important; all of about the same size."""
-        worth = np.log(self.scale[chosen]) + np.log(self.turn[chosen]) + np.log(self.color[chosen])
-        rank = np.empty(len(chosen), np.int64)
-        rank[np.argsort(-worth, kind="stable")] = np.arange(len(chosen))
-        return rank * number // max(len(chosen), 1)
+    def take(self, chosen: Int[np.ndarray, " k"]) -> Costs:
+        """Those of the Gaussians ``chosen`` alone."""
+        return Costs(**{name: getattr(self, name)[chosen] for name in Costs.__slots__})
+
+    def classes(self, number: int) -> Int[np.ndarray, " M"]:
+        """Class of each, from 0, the most important; all of about the same size, and none empty."""
+        worth = np.log(self.scale) + np.log(self.turn) + np.log(self.color)
+        rank = np.empty(len(worth), np.int64)
+        rank[np.argsort(-worth, kind="stable")] = np.arange(len(worth))
+        return rank * min(number, len(worth)) // max(len(worth), 1)
+
+    def negligible(self, price: float, drop: float) -> Bool[np.ndarray, " M"]:
+        """Whose removal costs less than ``drop`` bits; never more than :data:`MOST_DROPPED` of all."""
+        worthless = self.removal < drop * price
+        most = int(MOST_DROPPED * len(worthless))
+        if int(worthless.sum()) > most:
+            worthless[np.argsort(self.removal, kind="stable")[most:]] = False
+        return worthless
+
+
+MOST_DROPPED = 0.5
+"""Share of the Gaussians. What is removed is no longer there to hide what else is: scores hold for few of them."""
 
 
 def step(cost: float, price: float) -> float:
@@ -107,9 +126,12 @@ class Gloss:
         """Of a codebook of so many entries."""
         return self.weighed * (self.entries / entries) ** SH_SHRINK
 
-    def best_size(self, price: float, count: int) -> int:
-        """Entries in balance with ``price``, for ``count`` Gaussians."""
-        low, high = 0.0, np.log(max(count / PAPER_RATIO, 2))
+    def best_size(self, price: float, count: int, ratio: float) -> int:
+        """Entries in balance with ``price``, for ``count`` Gaussians.
+
+        Beyond :data:`QUICK`, where more would take long to find, not more than one for ``ratio`` of them.
+        """
+        low, high = 0.0, np.log(max(count / ratio, min(count / 2, QUICK), 2))
         for _ in range(50):
             middle = 0.5 * (low + high)
             size = np.exp(middle)
@@ -118,25 +140,22 @@ class Gloss:
         return round(float(np.exp(low)))
 
 
-def paper_error(costs: Costs, splats: Splats, gloss: Gloss) -> float:
-    """About the mean squared error at which the paper's own settings would leave this scene.
+def paper_error(costs: Costs, splats: Splats, kept: Int[np.ndarray, " M"], gloss: Gloss) -> float:
+    """About the mean squared error at which the paper's own settings would leave the ``M`` Gaussians ``kept``.
 
     100 levels for rotations, 256 for the rest and 65,536 for positions, spread from each channel's least to its largest
     value; a codebook of an entry for 8 Gaussians.
     """
-    logs = np.sign(splats.means) * np.log1p(np.abs(splats.means).astype(np.float64))
+    means = splats.means[kept].astype(np.float64)
     steps = (
-        (costs.opacity, splats.opacities[:, None], 255, 1),
-        (costs.scale, splats.scales, 255, 1),
-        (costs.turn, np.full((len(splats), 3), 2.0), 99, 4),
-        (costs.color, splats.sh0, 255, 1),
-        (costs.place, logs, 65535, 1),
+        (costs.opacity, np.ptp(splats.opacities[kept]), 255),
+        (costs.scale, np.ptp(splats.scales[kept], axis=0), 255),
+        (costs.turn, np.full(3, 4.0), 99),  # a quaternion's change of 1 turns by 2; its components reach from -1 to 1
+        (costs.color, np.ptp(splats.sh0[kept], axis=0), 255),
+        (costs.place, np.ptp(np.sign(means) * np.log1p(np.abs(means)), axis=0), 65535),
     )
-    total = 0.0
-    for cost, values, top, factor in steps:
-        extent = np.ptp(values, axis=0).astype(np.float64) if factor == 1 else np.full(3, 2.0)
-        total += float(cost.sum()) * float(np.sum(factor * (extent / top) ** 2)) / 12
-    entries = max(len(splats) / PAPER_RATIO, 1)
+    total = sum(float(cost.sum()) * float(np.sum((np.float64(extent) / top) ** 2)) / 12 for cost, extent, top in steps)
+    entries = max(len(kept) / PAPER_RATIO, 1)
     return total + PAPER_GLOSS * gloss.plain * (gloss.entries / entries) ** SH_SHRINK
 
 
@@ -149,28 +168,27 @@ KNOWN_GLOSS, UNKNOWN_GLOSS = 0.2, 2.7
 """What is left of errors of gloss once base colours make up for them, and how much more per unit of hedge. Measured."""
 
 
-def error_at(price: float, costs: Costs, gloss: Gloss, drop: float, hedge: float) -> float:
+def error_at(price: float, costs: Costs, gloss: Gloss, drop: float, ratio: float, hedge: float) -> float:
     """About the mean squared error at which everything in balance with ``price`` leaves a scene."""
     count = len(costs.color)
-    dropped = costs.removal[costs.removal < drop * price]
+    dropped = costs.removal[costs.negligible(price, drop)]
     rounding = GROWTH * DIMENSIONS * (count - len(dropped)) * price / (2 * np.log(2))
     elsewhere = 10 ** (UNKNOWN * hedge / 10)
     made_up = KNOWN_GLOSS + UNKNOWN_GLOSS * hedge
-    missing = gloss.error(max(gloss.best_size(price, count), 1))
+    missing = gloss.error(max(gloss.best_size(price, count, ratio), 1))
     return float(elsewhere * (rounding + GROWTH * dropped.sum()) + made_up * missing)
 
 
-def price_for(error: float, costs: Costs, gloss: Gloss, drop: float, hedge: float) -> float:
+def price_for(error: float, costs: Costs, gloss: Gloss, drop: float, ratio: float, hedge: float) -> float:
     """The price at which a scene is left at about this mean squared error."""
     low, high = np.log(1e-22), np.log(1e-2)
     for _ in range(60):
         middle = 0.5 * (low + high)
-        low, high = (
-            (middle, high) if error_at(float(np.exp(middle)), costs, gloss, drop, hedge) < error else (low, middle)
-        )
+        small = error_at(float(np.exp(middle)), costs, gloss, drop, ratio, hedge) < error
+        low, high = (middle, high) if small else (low, middle)
     return float(np.exp(low))
 
 
 def _floored(cost: Float64[np.ndarray, " M"]) -> Float64[np.ndarray, " M"]:
     seen = cost[cost > 0]
-    return np.maximum(cost, max(FLOOR * float(np.median(seen)), 1e-30) if len(seen) else 1.0)
+    return np.maximum(cost, max(FLOOR * float(np.median(seen)), 1e-30) if len(seen) else 1e-30)

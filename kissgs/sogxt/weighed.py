@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from kissgs._typing import Float32, Float64, Int
-from kissgs.importance import Importance
+from kissgs.importance import LARGEST, Importance
 from kissgs.parallel import Workers
 from kissgs.progress import Progress
 from kissgs.settings import EncodeSettings
@@ -50,25 +50,21 @@ def weigh(
 ) -> Choice:
     """Choose everything for the Gaussians ``kept``, at least one of which is seen."""
     progress("price", 0.0)
-    costs, gloss = Costs.of(importance, splats), _trial(splats, kept, importance, settings, pool)
-    drop = settings.drop * (1 - importance.hedge)
-    price = settings.price
+    costs, gloss = Costs.of(importance, splats).take(kept), _trial(splats, kept, importance, settings, pool)
+    drop, price = settings.drop * (1 - importance.hedge), settings.price
     if price is None:
-        error = paper_error(costs, splats, gloss) * 10 ** (-settings.fidelity / 10)
-        if settings.psnr is not None:
-            error = 10 ** (-settings.psnr / 10)
-        steps = settings.refit if recolor is not None else 0
-        price = price_for(error * 10 ** (steps * REFIT_GAIN / 10), costs, gloss, drop, importance.hedge)
-    worth = costs.removal[kept] >= drop * price
-    kept = kept[worth] if worth.any() else kept
-    classes = costs.classes(kept, settings.classes)
+        error = 10 ** (-settings.psnr / 10) if settings.psnr is not None else paper_error(costs, splats, kept, gloss)
+        gain = settings.fidelity if settings.psnr is None else 0.0
+        gain -= REFIT_GAIN * settings.refit if recolor is not None else 0.0
+        price = price_for(error * 10 ** (-gain / 10), costs, gloss, drop, settings.sh_ratio, importance.hedge)
+    worth = np.flatnonzero(~costs.negligible(price, drop))
+    kept, costs = kept[worth], costs.take(worth)
+    classes = costs.classes(settings.classes)
     progress("order", 0.0)
-    grid = place(splats.means, kept, 16, settings, pool, lambda fraction: None, classes)
+    grid = place(splats.means, kept, 16, settings, pool, lambda fraction: progress("order", fraction), classes)
     order = grid.cells[grid.mask]
-    of_each = np.zeros(len(splats), np.int64)
-    of_each[kept] = classes
-    classes, shown = of_each[order], splats.select(order)
-    costs = Costs(**{name: getattr(costs, name)[order] for name in Costs.__slots__})
+    rank = np.searchsorted(kept, order)
+    classes, costs, shown = classes[rank], costs.take(rank), splats.select(order)
 
     progress("forms", 0.0)
     quats, scales, form_error, forms = choose_forms(
@@ -167,8 +163,9 @@ def _codebook(
     thrift = None
     if settings.sh_thrift > 0 and (colors > 0).any():
         unit = float(np.median(colors[colors > 0])) * GLOSS
-        thrift = kmeans.Thrift((settings.sh_thrift * price / (weights * unit)).astype(np.float32), classes)
-    size = gloss.best_size(price, len(shown))
+        bits = settings.sh_thrift * price / (weights.astype(np.float64) * unit)
+        thrift = kmeans.Thrift(np.minimum(bits, LARGEST).astype(np.float32), classes)
+    size = gloss.best_size(price, len(shown), settings.sh_ratio)
     return fit_codebook(shown, np.arange(len(shown)), weights, size, settings, pool, progress, thrift)
 
 

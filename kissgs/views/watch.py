@@ -11,7 +11,7 @@ from kissgs.splats import Splats
 from kissgs.views.view import Views
 from kissgs.views.virtual import virtual_views
 
-AROUND = 0.1
+AROUND = 0.3
 """Weight of all virtual cameras together, in units of that of the photographs': what was never photographed must not
 fall apart, and hardly anything is lost for what was."""
 

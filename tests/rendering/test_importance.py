@@ -20,8 +20,8 @@ from kissgs.views.watch import watch
 BACKGROUND = np.array([0.3, 0.6, 0.1], np.float32)
 
 
-def looked_at(*cameras):
-    return Watch(cameras, [1.0] * len(cameras), BACKGROUND)
+def looked_at(*cameras, background=BACKGROUND, spread=0.0):
+    return Watch(cameras, [1.0] * len(cameras), background, spread)
 
 
 def turned(quat, axis, angle):
@@ -104,16 +104,45 @@ def test_colors_are_what_a_change_of_one_channel_costs():
 
 def test_removal_is_the_exact_score():
     splats, view = blobs(40, 1, seed=5), camera(seed=2)
-    splats = replace(splats, opacities=np.clip(splats.opacities, None, 4))  # none is clamped to the largest alpha
+    splats.opacities[:3] = 5, 9, 13.8  # clamped to the largest alpha
     found = measure_importance(splats, looked_at(view)).removal(splats) * (3 * view.width * view.height)
     scores = removal_scores(splats, [view], background=BACKGROUND.tolist())
     np.testing.assert_allclose(found, scores, rtol=1e-4, atol=1e-5 * scores.max())
 
 
+@pytest.mark.parametrize("spread", [0.1, 0.5])
+def test_an_unknown_background_is_the_mean_over_backgrounds(spread):
+    splats, view = clean(blobs(12, 1, seed=6))[0], camera(seed=3)
+    found = measure_importance(splats, looked_at(view, spread=spread))
+    ends = [
+        measure_importance(splats, looked_at(view, background=BACKGROUND + np.float32(step)))
+        for step in (-spread, spread)
+    ]
+    for name in ("shapes", "places", "colors"):
+        wanted = 0.5 * (getattr(ends[0], name) + getattr(ends[1], name))
+        np.testing.assert_allclose(getattr(found, name), wanted, rtol=1e-3, atol=1e-4 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize(
+    ("cameras", "weights", "spread", "told"),
+    [
+        (0, [], 0.2, "by one camera or more with a weight each, not by 0 cameras with 0 weights"),
+        (2, [1.0], 0.2, "not by 2 cameras with 1 weights"),
+        (1, [0.0], 0.2, "weights of cameras must be positive and finite"),
+        (1, [np.nan], 0.2, "weights of cameras must be positive and finite"),
+        (1, [1.0], -1.0, "the spread not negative"),
+        (1, [1.0], np.inf, "the spread not negative"),
+    ],
+)
+def test_what_cannot_be_watched_from_is_refused(cameras, weights, spread, told):
+    with pytest.raises(kissgs.InvalidViewsError, match=told):
+        Watch([camera()] * cameras, weights, BACKGROUND, spread)
+
+
 def test_views_are_averaged_by_weight_and_directions_by_what_is_seen():
     splats, views = blobs(15, 3, seed=1), [camera(seed=1), camera(20, 31, seed=2)]
     apart = [measure_importance(splats, looked_at(view)) for view in views]
-    both = measure_importance(splats, Watch(views, [1.0, 3.0], BACKGROUND))
+    both = measure_importance(splats, Watch(views, [1.0, 3.0], BACKGROUND, 0.0))
     np.testing.assert_allclose(both.shapes, 0.25 * apart[0].shapes + 0.75 * apart[1].shapes, rtol=1e-4, atol=1e-12)
     colors = [0.25 * apart[0].colors, 0.75 * apart[1].colors]
     gaze = [splats.means - view.position for view in views]
@@ -178,6 +207,24 @@ def test_refitting_is_least_squares():
     assert after < best + 0.1 * (before - best)
 
 
+def test_refitting_goes_no_further_than_half_a_colour():
+    """However much is missing: the original is far brighter than any colour that is allowed."""
+    splats, views = blobs(6, 0, seed=2), looked_at(camera(seed=1), camera(seed=2))
+    colors = measure_importance(splats, views).colors
+    original = replace(splats, sh0=splats.sh0 + np.float32(9))
+    found = refit_colors(splats, original, views, colors, colors * 0, steps=6)
+    np.testing.assert_allclose(np.abs(found - splats.sh0).max(), 0.5 / SH_C0, rtol=1e-5)
+
+
+def test_refitting_draws_anew_what_would_not_fit_into_memory(monkeypatch):
+    splats, views = blobs(20, 1, seed=2), looked_at(camera(seed=1), camera(seed=2))
+    colors = measure_importance(splats, views).colors
+    decoded = replace(splats, shN=splats.shN * 0)
+    kept = refit_colors(decoded, splats, views, colors, colors * 0, steps=2)
+    monkeypatch.setattr(kissgs.rendering.refit, "KEPT", 10)
+    np.testing.assert_array_equal(refit_colors(decoded, splats, views, colors, colors * 0, steps=2), kept)
+
+
 def test_refitting_without_steps_or_without_sight_changes_nothing():
     splats = blobs(5)
     views, nothing = looked_at(camera()), np.zeros(5, np.float32)
@@ -190,6 +237,16 @@ def test_the_importance_of_another_scene_is_refused():
     for other in (Importance.none(4, 1), Importance.none(5, 2)):
         with pytest.raises(kissgs.InvalidSceneError, match="not that of the scene"):
             other.check(splats)
+    right = measure_importance(splats, looked_at(camera()))
+    right.check(splats)
+    for name, value, told in (
+        ("colors", -right.colors - 1, "colors has a value that is no cost"),
+        ("guessed", right.guessed + np.float32(np.nan), "guessed has a value that is no cost"),
+        ("hedge", 5.0, "its hedge is 5.0"),
+        ("hedge", float("nan"), "its hedge is nan"),
+    ):
+        with pytest.raises(kissgs.InvalidSceneError, match=told):
+            replace(right, **{name: value}).check(splats)
 
 
 def test_a_capture_is_watched_from_its_training_cameras_and_a_little_all_around():
@@ -200,7 +257,7 @@ def test_a_capture_is_watched_from_its_training_cameras_and_a_little_all_around(
     assert [(c.width, c.height) for c in found.cameras[:4]] == [(60, 40)] * 4
     given = [view.camera.position.tolist() for view in views[1:]]
     assert [given.index(c.position.tolist()) for c in found.cameras[:4]] == [0, 2, 4, 7]
-    np.testing.assert_allclose(sum(found.weights[4:]), 0.1 * 4)
+    np.testing.assert_allclose(sum(found.weights[4:]), 0.3 * 4)
     assert found.background is BACKGROUND
     alone = watch(splats, None, count=4, size=60)
     assert len(alone.cameras) == 4

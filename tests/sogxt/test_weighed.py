@@ -61,22 +61,33 @@ def test_prices_are_found_for_the_error_asked_for():
     costs = Costs.of(made_up(splats), splats)
     gloss = Gloss(1024, 1e-6, 2e-6)
     for error in (1e-6, 1e-4):
-        price = price_for(error, costs, gloss, 10, 0.2)
-        np.testing.assert_allclose(error_at(price, costs, gloss, 10, 0.2), error, rtol=0.05)
-    sizes = [gloss.best_size(price, 100_000) for price in (1e-14, 1e-12, 1e-10)]
+        price = price_for(error, costs, gloss, 10, 7, 0.2)
+        np.testing.assert_allclose(error_at(price, costs, gloss, 10, 7, 0.2), error, rtol=0.05)
+    sizes = [gloss.best_size(price, 100_000, 7) for price in (1e-14, 1e-12, 1e-10)]
     assert sizes == sorted(sizes, reverse=True)
-    assert sizes[0] <= 100_000 / 8
+    assert sizes[0] <= round(100_000 / 7)
+    assert gloss.best_size(1e-20, 6000, 7) == 3000
 
 
 def test_classes_are_of_like_importance_and_size():
     splats = random_scene(1000, 0)
-    costs = Costs.of(made_up(splats), splats)
-    chosen = np.arange(0, 1000, 2)
-    classes = costs.classes(chosen, 5)
+    costs = Costs.of(made_up(splats), splats).take(np.arange(0, 1000, 2))
+    classes = costs.classes(5)
     assert np.bincount(classes).tolist() == [100] * 5
-    worth = costs.scale[chosen] * costs.turn[chosen] * costs.color[chosen]
+    worth = costs.scale * costs.turn * costs.color
     assert all(worth[classes == c].min() >= worth[classes == c + 1].max() for c in range(4))
-    assert (costs.classes(chosen, 1) == 0).all()
+    assert (costs.classes(1) == 0).all()
+    for few in range(1, 10):
+        assert (np.bincount(costs.take(np.arange(few)).classes(32)) == 1).all()
+
+
+def test_what_is_dropped_is_worth_least_and_never_more_than_half():
+    splats = random_scene(101, 0, seed=3)
+    costs = Costs.of(made_up(splats), splats)
+    ranked = np.argsort(costs.removal)
+    for price, count in ((0.0, 0), (float(costs.removal[ranked[10]]) / 7, 10), (1e9, 50)):
+        dropped = costs.negligible(price, 7)
+        assert sorted(np.flatnonzero(dropped)) == sorted(ranked[:count])
 
 
 def test_levels_of_a_class_are_multiples_of_its_step():
@@ -308,7 +319,7 @@ def test_thrift_trades_error_for_cheaper_labels():
         assert error + price * bits < found[0][0] + price * found[0][1]
 
 
-@pytest.mark.parametrize("changes", [{"order": "plas"}, {"forms": "smooth"}, {"shared_steps": False}, {"classes": 7}])
+@pytest.mark.parametrize("changes", [{"order": "plas"}, {"forms": "smooth"}, {"sh_ratio": 50}, {"classes": 7}])
 def test_every_way_of_the_settings_goes_with_it(changes):
     splats = random_scene(700, 1, seed=8)
     result = weighed(splats, made_up(splats), drop=0, sh_tolerance=0, **changes)

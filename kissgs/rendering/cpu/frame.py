@@ -210,10 +210,11 @@ def removal_scores(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
     return scores
 
 
-def add_sensitivities(frame: Frame, weight: float, into: Importance, pool: Workers) -> None:
+def add_sensitivities(frame: Frame, weight: float, spread: float, into: Importance, pool: Workers) -> None:
     """Add to ``into`` what small changes of each Gaussian cost in this picture, times ``weight``.
 
-    In ``directions``, sums of (alpha T)² times the harmonics, to be divided by ``colors`` in the end.
+    ``spread`` is the standard deviation of each channel of the background. In ``directions``, sums of (alpha T)² times
+    the harmonics, to be divided by ``colors`` in the end.
     """
     splats, camera, lists = frame.splats, frame.camera, frame.lists
     visible, rows, records = frame.footprints.visible, frame.footprints.rows, frame.footprints.records
@@ -222,7 +223,7 @@ def add_sensitivities(frame: Frame, weight: float, into: Importance, pool: Worke
     def blend(first: int, last: int) -> None:
         sensitivity.moments(
             *(records, lists.members, lists.spans, lists.slots, lists.starts, first, last, lists.columns, LIMITS),
-            *(frame.background, frame.transmittance, frame.stops, slots),
+            *(frame.background, spread, frame.transmittance, frame.stops, slots),
         )
 
     _each_part(blend, _even_tiles(lists, pool), pool)

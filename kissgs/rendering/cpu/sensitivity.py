@@ -5,6 +5,8 @@ that logarithm is, to first order, a polynomial of degree 2 in the footprint's o
 its constant, the centre its linear, the covariance its quadratic terms. The squared change of the picture is then a
 quadratic form in these six numbers whose entries are moments, sums of |w|² uⁱ vʲ over the pixels with i + j up to 4.
 The chain rule carries it to the stored parameters: J ᵀ J of the picture, without a random probe.
+
+Nobody knows before which background a scene will be shown, so that is random: |w|² is the mean over it.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ from kissgs.rendering.cpu.shading import _harmonics
 
 @compiled(
     "void(float32[:, ::1], int32[::1], uint16[::1], int32[::1], int64[::1], int64, int64, int64,"
-    " float32[::1], float32[::1], float32[:, ::1], int32[:, ::1], float32[:, ::1])",
+    " float32[::1], float32[::1], float64, float32[:, ::1], int32[:, ::1], float32[:, ::1])",
     fastmath=_FAST,
 )
 def moments(
@@ -46,21 +48,24 @@ def moments(
     columns: int,
     limits: np.ndarray,
     background: np.ndarray,
+    spread: float,
     transmittance: np.ndarray,
     stops: np.ndarray,
     sums: np.ndarray,
 ) -> None:
     """Moments of the members of tiles ``first`` to ``last`` (exclusive).
 
-    The arguments are those of :func:`kissgs.rendering.cpu.blending.removal_errors`; ``sums``, ``(slots, 16)``, is
-    written: over the tile's pixels, of |w|² times 1, u, v, u², uv, v², u³, u²v, uv², v³, u⁴, u³v, u²v², uv³, v⁴; and
-    of (alpha T)².
+    The arguments are those of :func:`kissgs.rendering.cpu.blending.removal_errors`, and the standard deviation of each
+    channel of the background; ``sums``, ``(slots, 16)``, is written: over the tile's pixels, of |w|² times 1, u, v, u²,
+    uv, v², u³, u²v, uv², v³, u⁴, u³v, u²v², uv³, v⁴; and of (alpha T)². Where alpha is at its largest, it does not
+    change: these pixels count in the first alone, which is thereby what it costs to remove a Gaussian.
     """
     alpha_min, alpha_max = limits[0], limits[1]
     zero, one = np.float32(0), np.float32(1)
     height, width = transmittance.shape
-    # Per pixel: x, y, stop, T, and R, G, B of what is behind.
-    s = np.empty(7 * 256, np.float32)
+    variance = np.float32(3 * spread * spread)
+    # Per pixel: x, y, stop, T; R, G, B of what is behind, and how much of the background shines through that.
+    s = np.empty(8 * 256, np.float32)
     _pixel_centres(s)
     for tile in range(first, last):
         x0, y0 = (tile % columns) * 16, (tile // columns) * 16
@@ -71,6 +76,7 @@ def moments(
             s[512 + p] = np.float32(stops[tile, p])
             s[768 + p] = transmittance[min(y0 + (p >> 4), height - 1), min(x0 + (p & 15), width - 1)]
             s[1024 + p], s[1280 + p], s[1536 + p] = background[0], background[1], background[2]
+            s[1792 + p] = one
         for i in range(begin + furthest, starts[tile + 1]):
             sums[slots[i], :] = zero
         for i in range(begin + furthest - 1, begin - 1, -1):
@@ -97,11 +103,13 @@ def moments(
                 s[p + np.uint64(1536)] += db
                 weight = alpha * t
                 seen += weight * weight
-                g = t * t * (dr * dr + dg * dg + db * db)
+                shine = alpha * s[p + np.uint64(1792)]
+                s[p + np.uint64(1792)] -= shine
+                g = t * t * (dr * dr + dg * dg + db * db + variance * (shine * shine))
+                m0 += g
                 g = g if full <= alpha_max else zero
                 uu, uv, vv = u * u, u * v, v * v
                 guu, guv, gvv = g * uu, g * uv, g * vv
-                m0 += g
                 mu += g * u
                 mv += g * v
                 muu += guu

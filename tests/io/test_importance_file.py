@@ -1,0 +1,79 @@
+"""Oracle: what was measured, and whether it was measured again."""
+
+import numpy as np
+import pytest
+from picture_scenes import cameras
+
+import kissgs
+from kissgs import OutputError, Settings
+from kissgs.importance import Importance
+from kissgs.io.importance_file import read_importance, write_importance
+
+SCENE = kissgs.sample_scene(300, sh_degree=1, seed=2)
+GLANCE = {"views": 4, "view_size": 48}
+
+
+def compressed(cache, scene=SCENE, preset="balanced", views=None, **settings):
+    """The files, and whether the scene was looked at."""
+    stages = []
+    settings = Settings.from_preset(preset, **{**GLANCE, **settings})
+    found = kissgs.compress(
+        scene, settings=settings, cache=cache, views=views, progress=lambda stage, fraction: stages.append(stage)
+    )
+    return found.files, "importance" in stages
+
+
+def test_it_is_measured_once(tmp_path):
+    file = tmp_path / "scene.importance.npz"
+    first, measured = compressed(file)
+    assert measured
+    assert [entry.name for entry in tmp_path.iterdir()] == ["scene.importance.npz"]
+    again, measured = compressed(file)
+    assert not measured
+    assert again == first == compressed(None)[0]
+    assert not compressed(file, preset="small")[1]
+
+
+@pytest.mark.parametrize("change", ["scene", "cameras", "hedge", "capture"])
+def test_it_is_measured_anew_when_anything_has_changed(tmp_path, change):
+    file = tmp_path / "a.npz"
+    compressed(file)
+    moved = SCENE.select(np.arange(299))
+    cases = {
+        "scene": {"scene": moved},
+        "cameras": {"view_size": 60},
+        "hedge": {"hedge": 0.3},
+        "capture": {"views": cameras()},
+    }
+    options = cases[change]
+    files, measured = compressed(file, **options)
+    assert measured
+    assert files == compressed(None, **options)[0]
+    assert not compressed(file, **options)[1]
+
+
+@pytest.mark.parametrize("content", [b"", b"a scene", b"PK\x03\x04 broken"])
+def test_other_files_are_not_written_over(tmp_path, content):
+    file = tmp_path / "a.npz"
+    file.write_bytes(content)
+    with pytest.raises(OutputError, match="is not a file in which kissgs keeps importance; move it away"):
+        compressed(file)
+    assert file.read_bytes() == content
+
+
+def test_other_arrays_are_not_written_over(tmp_path):
+    np.savez(tmp_path / "a.npz", weights=np.ones(3))
+    with pytest.raises(OutputError, match="is not a file in which kissgs keeps importance"):
+        read_importance(tmp_path / "a.npz", "key")
+
+
+def test_it_survives(tmp_path):
+    rng = np.random.default_rng(0)
+    kept = Importance.none(5, 2)
+    for values in (kept.places, kept.shapes, kept.colors, kept.directions, kept.guessed):
+        values[:] = rng.random(values.shape)
+    write_importance(tmp_path / "a.npz", kept, "key")
+    found = read_importance(tmp_path / "a.npz", "key")
+    assert all(np.array_equal(getattr(found, name), getattr(kept, name)) for name in Importance.__slots__)
+    assert read_importance(tmp_path / "a.npz", "another") is None
+    assert read_importance(tmp_path / "b.npz", "key") is None

@@ -1,0 +1,145 @@
+"""Oracle: functions whose crossing is known, and the size and the pictures of what a search returns."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import kissgs
+from kissgs import Settings, UnsupportedError
+from kissgs.search import ATTEMPTS, REACH, seek
+
+SCENE = kissgs.sample_scene(1500, sh_degree=1, seed=5)
+GLANCE = {"views": 4, "view_size": 48}
+
+
+class Counted:
+    def __init__(self, function):
+        self.function, self.asked = function, []
+
+    def __call__(self, x):
+        self.asked.append(x)
+        return self.function(x)
+
+
+@given(st.floats(-20, 20), st.floats(0.3, 3), st.sampled_from([-1, 1]), st.floats(-15, 15))
+def test_a_bent_line_is_met_in_few_attempts(crossing, steepness, sign, start):
+    """Steeper above its crossing than below, and up to three times as steep as announced."""
+    spare = Counted(lambda x: sign * steepness * (x - crossing) * (1.5 if sign * x > sign * crossing else 0.8))
+    found = seek(spare, start, sign * 1.0, 0.1, (-50, 50))
+    assert 0 <= spare(found) <= 0.1
+    assert len(spare.asked) <= ATTEMPTS + 1
+    assert all(
+        abs(after - before) <= REACH + 1e-9 for before, after in zip(spare.asked, spare.asked[1:-1], strict=False)
+    )
+
+
+def test_steps_are_lived_with():
+    """What rounding gives: nothing between 0.4 below and 0.6 above; the best of what was tried is returned."""
+    spare = Counted(lambda x: 0.6 - round(x) if abs(x) < 3 else -x)
+    found = seek(spare, 2.2, -1.0, 0.05, (-9, 9))
+    assert spare(found) == pytest.approx(0.6)
+
+
+@pytest.mark.parametrize("function", [lambda x: -5.0 - math.exp(-abs(x)), lambda x: min(-x, 40) - 41])
+def test_what_cannot_be_met_is_given_up(function):
+    spare = Counted(function)
+    assert seek(spare, 3.0, -1.0, 0.05, (-50, 50)) is None
+    assert len(spare.asked) <= ATTEMPTS + 1
+
+
+def test_bounds_are_kept_and_end_the_search():
+    spare = Counted(lambda x: -20 - x)
+    assert seek(spare, 0.0, -1.0, 0.05, (-7, 7)) is None
+    assert min(spare.asked) == -7
+    assert len(spare.asked) == 3
+    spare = Counted(lambda x: 20 - x)
+    assert seek(spare, 0.0, -1.0, 0.05, (-7, 7)) == 7
+
+
+@pytest.mark.parametrize("share", [0.7, 1.15])
+def test_a_size_is_met_from_below(share):
+    plain = kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **GLANCE))
+    wanted = round(share * len(plain.to_zip()))
+    found = kissgs.compress(SCENE, settings=Settings.from_preset("balanced", target_size=wanted, **GLANCE))
+    assert 0.97 * wanted <= len(found.to_zip()) <= wanted
+    assert found.report.trials[0].bytes == pytest.approx(len(plain.to_zip()), rel=0.01)
+    assert len(found.to_zip()) in [trial.bytes for trial in found.report.trials]
+
+
+@pytest.mark.parametrize("change", [-2.5, 2.0])
+def test_a_psnr_is_met_from_above(change):
+    """As evaluate measures it, from the cameras that it takes by itself, or from those of a capture."""
+    plain = kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **GLANCE), evaluate=True)
+    wanted = plain.report.evaluation.mean.between.psnr + change
+    settings = Settings.from_preset("balanced", psnr=wanted, **GLANCE)
+    found = kissgs.compress(SCENE, settings=settings, evaluate=True)
+    assert wanted <= found.report.evaluation.mean.between.psnr <= wanted + 1
+    assert found.report.evaluation.mean.between.psnr in [trial.psnr for trial in found.report.trials]
+    assert (len(found.to_zip()) > len(plain.to_zip())) == (change > 0)
+
+
+def test_the_price_that_was_found_gives_the_same_container():
+    found = kissgs.compress(SCENE, settings=Settings.from_preset("small", target_size="40 kB", **GLANCE))
+    again = kissgs.compress(SCENE, settings=Settings.from_preset("small", price=found.report.price, **GLANCE))
+    assert again.files == found.files
+
+
+@pytest.mark.parametrize(
+    ("goal", "told"),
+    [
+        ({"psnr": 150}, r"no container .* has 150 dB, the best has \d+\.\d\d; ask for no more"),
+        ({"target_size": 900}, r"no container .* has at most 900 bytes, the smallest has [\d,]+; ask for no less"),
+    ],
+)
+def test_goals_out_of_reach_are_refused_and_nothing_is_written(tmp_path, goal, told):
+    with pytest.raises(UnsupportedError, match=told):
+        kissgs.compress(SCENE, tmp_path / "a.zip", settings=Settings.from_preset("balanced", **goal, **GLANCE))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("count", [0, 1, 7])
+def test_hardly_anything_can_have_a_goal(count):
+    few = SCENE.select(range(count))
+    for goal in ({"psnr": 20}, {"target_size": "9kB"}):
+        found = kissgs.compress(few, settings=Settings.from_preset("balanced", **goal, **GLANCE))
+        assert len(found.to_zip()) < 9000
+        assert len(kissgs.decompress(found.files)) <= count
+
+
+@pytest.mark.parametrize(
+    ("preset", "goal", "told"),
+    [
+        ("fast", {"psnr": 40}, "psnr needs bits that are weighed: choose balanced or small"),
+        ("paper", {"target_size": "3MB"}, "target_size needs bits that are weighed"),
+        ("balanced", {"psnr": 40, "target_size": "3MB"}, "psnr and target_size cannot both be met; give one"),
+        ("balanced", {"psnr": 40, "price": 1e-9}, "price and psnr cannot both be met"),
+        ("balanced", {"psnr": 0}, "setting psnr: input should be greater than 0"),
+        ("balanced", {"target_size": 0}, "setting target_size: input should be greater than or equal to 1"),
+        ("balanced", {"target_size": "3 XB"}, "setting target_size: could not interpret byte unit"),
+        (
+            "balanced",
+            {"opacity_step": 0.02},
+            "opacity_step has no effect where bits are weighed: set fidelity or price",
+        ),
+    ],
+)
+def test_goals_that_make_no_sense_are_refused(preset, goal, told):
+    with pytest.raises(UnsupportedError, match=told):
+        Settings.from_preset(preset, **goal)
+
+
+def test_a_search_can_be_stopped(tmp_path):
+    encodings = 0
+
+    def stop(stage, fraction):
+        nonlocal encodings
+        encodings += stage == "price"
+        if encodings == 2:
+            raise kissgs.Cancelled
+
+    settings = Settings.from_preset("balanced", target_size="20kB", **GLANCE)
+    with pytest.raises(kissgs.Cancelled):
+        kissgs.compress(SCENE, tmp_path / "a.zip", settings=settings, progress=stop)
+    assert list(tmp_path.iterdir()) == []
