@@ -15,6 +15,7 @@ from kissgs.sogxt import kmeans
 from kissgs.sogxt.metadata import MAX_CODEBOOK_SIDE, TILE_COLUMNS, TILE_ROWS
 from kissgs.sogxt.plas import plas
 from kissgs.sogxt.quantize import Quantized, quantize
+from kissgs.sogxt.thrift import Thrift
 from kissgs.splats import Splats
 
 COEFFICIENTS = TILE_ROWS * TILE_COLUMNS
@@ -56,7 +57,7 @@ def fit_codebook(
     settings: EncodeSettings,
     pool: Workers,
     progress: Progress,
-    thrift: kmeans.Thrift | None = None,
+    thrift: Thrift | None = None,
 ) -> Codebook:
     """Build the codebook for the Gaussians ``chosen``.
 

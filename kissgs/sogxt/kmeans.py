@@ -19,6 +19,7 @@ import numpy as np
 from kissgs._typing import Float32, Float64, Int, Int32
 from kissgs.parallel import Workers
 from kissgs.sogxt.quantize import tame
+from kissgs.sogxt.thrift import Thrift
 
 BLOCK = 1024
 """Vectors per matrix product: its result, against a few thousand centroids, stays in the processor's cache."""
@@ -28,37 +29,8 @@ SPLIT_ROUNDS = 4
 SAMPLES_PER_COARSE = 64
 MAX_COARSE = 512
 
-UNUSED = 0.02
-"""Times that a label is taken to occur which does not: its bits are then many, not infinitely many."""
-
 OUTLIERS = 1e-3
 """Share of entries, at either end of a dimension, that may be pulled in to keep the others' step."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Thrift:
-    """Makes a codebook whose labels are cheap to tell: entropy-constrained vector quantisation.
-
-    Chou, Lookabaugh, Gray, "Entropy-constrained vector quantization", IEEE Trans. ASSP 37 (1989).
-
-    Attributes:
-        price: ``(N,)`` of a bit, for each vector, in units of its squared distance.
-        groups: ``(N,)`` from 0; labels are told apart from those of the same group alone.
-    """
-
-    price: Float32[np.ndarray, " N"]
-    groups: Int[np.ndarray, " N"]
-
-    def ordered(self, order: Int[np.ndarray, " N"]) -> Thrift:
-        """For vectors in another order."""
-        return Thrift(self.price[order], self.groups[order])
-
-    def bits(self, labels: Int32[np.ndarray, " N"], size: int) -> Float32[np.ndarray, "G K"]:
-        """Of each label, in each group, if they are chosen as they were."""
-        counts = np.zeros((int(self.groups.max(initial=0)) + 1, size))
-        np.add.at(counts, (self.groups, labels), 1)
-        counts += UNUSED
-        return (np.log2(counts.sum(axis=1, keepdims=True)) - np.log2(counts)).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)

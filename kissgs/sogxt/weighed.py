@@ -19,6 +19,7 @@ from kissgs.sogxt.order import Grid, place
 from kissgs.sogxt.pras import choose_forms
 from kissgs.sogxt.quantize import MEANS_TOP, Quantized, quantize_means, signed_exp, signed_log, tame
 from kissgs.sogxt.rounding import COARSEST, quantize_by_class, round_shapes
+from kissgs.sogxt.thrift import Thrift
 from kissgs.splats import SH_C0, Splats
 
 Recolor = Callable[[Splats, Int[np.ndarray, " M"]], Float32[np.ndarray, "M 3"]]
@@ -164,7 +165,7 @@ def _codebook(
     if settings.sh_thrift > 0 and (colors > 0).any():
         unit = float(np.median(colors[colors > 0])) * GLOSS
         bits = settings.sh_thrift * price / (weights.astype(np.float64) * unit)
-        thrift = kmeans.Thrift(np.minimum(bits, LARGEST).astype(np.float32), classes)
+        thrift = Thrift(np.minimum(bits, LARGEST).astype(np.float32), classes)
     size = gloss.best_size(price, len(shown), settings.sh_ratio)
     return fit_codebook(shown, np.arange(len(shown)), weights, size, settings, pool, progress, thrift)
 

@@ -287,9 +287,9 @@ def test_read_only_scenes_are_drawn():
 
 
 def test_too_many_in_one_tile_are_refused(monkeypatch):
-    from kissgs.rendering.cpu import frame
+    from kissgs.rendering.cpu import lists
 
-    monkeypatch.setattr(frame, "MAX_MEMBERS", 10)
+    monkeypatch.setattr(lists, "MAX_MEMBERS", 10)
     with pytest.raises(UnsupportedError, match="meet in 16x16 pixels"):
         render(blobs(50), camera())
 
@@ -300,14 +300,14 @@ def test_a_picture_beyond_memory_is_refused(monkeypatch):
     def no_memory(*arguments):
         raise MemoryError
 
-    monkeypatch.setattr(frame, "_sort_into_tiles", no_memory)
+    monkeypatch.setattr(frame, "sort_into_tiles", no_memory)
     with pytest.raises(UnsupportedError, match="not enough memory for a picture of 37x29"):
         render(blobs(3), camera())
 
 
 def test_too_many_tiles_are_refused(monkeypatch):
-    from kissgs.rendering.cpu import frame
+    from kissgs.rendering.cpu import lists
 
-    monkeypatch.setattr(frame, "MAX_PAIRS", 10)
+    monkeypatch.setattr(lists, "MAX_PAIRS", 10)
     with pytest.raises(KissgsError, match="Render it smaller"):
         render(blobs(50), camera(200, 200))

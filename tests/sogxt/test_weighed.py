@@ -18,6 +18,7 @@ from kissgs.sogxt.encode import encode
 from kissgs.sogxt.pras import ROTATIONS, apply_forms
 from kissgs.sogxt.quantize import quantize
 from kissgs.sogxt.rounding import MIRRORS, quantize_by_class, round_shapes
+from kissgs.sogxt.thrift import Thrift
 from kissgs.splats import clean
 
 WEIGHED = ["balanced", "small"]
@@ -307,7 +308,7 @@ def test_thrift_trades_error_for_cheaper_labels():
     given = {"seed": 0, "rounds": 6, "reach": 32, "tolerance": 0.0, "lattice": 0.0}
     found = []
     for price in (0, 0.05, 0.3):
-        thrift = kmeans.Thrift(np.full(4000, price, np.float32), np.arange(4000) % 2) if price else None
+        thrift = Thrift(np.full(4000, price, np.float32), np.arange(4000) % 2) if price else None
         with blas_workers(1) as pool:
             clusters = kmeans.fit(vectors, weights, 256, pool, thrift=thrift, **given)
         error = np.square(vectors - clusters.centroids[clusters.labels]).sum(axis=1).mean()
