@@ -70,13 +70,6 @@ class EncodeSettings(BaseModel):
     round_by_price: bool = Field(
         True, description="Where bits are weighed: prefer levels that many have. False: the nearest level."
     )
-    sh_thrift: float = Field(
-        0.25,
-        ge=0,
-        le=4,
-        description="Where bits are weighed: how much codebook entries that many have are preferred; 1 would be right "
-        "if errors of neighbours did not add up.",
-    )
     refit: int = Field(
         2,
         ge=0,

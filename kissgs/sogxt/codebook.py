@@ -15,7 +15,6 @@ from kissgs.sogxt import kmeans
 from kissgs.sogxt.metadata import MAX_CODEBOOK_SIDE, TILE_COLUMNS, TILE_ROWS
 from kissgs.sogxt.plas import plas
 from kissgs.sogxt.quantize import Quantized, quantize
-from kissgs.sogxt.thrift import Thrift
 from kissgs.splats import Splats
 
 COEFFICIENTS = TILE_ROWS * TILE_COLUMNS
@@ -57,7 +56,6 @@ def fit_codebook(
     settings: EncodeSettings,
     pool: Workers,
     progress: Progress,
-    thrift: Thrift | None = None,
 ) -> Codebook:
     """Build the codebook for the Gaussians ``chosen``.
 
@@ -71,7 +69,6 @@ def fit_codebook(
         settings: see :class:`EncodeSettings`.
         pool: where the work runs.
         progress: receives "codebook" and "sort codebook" events.
-        thrift: what labels cost.
     """
     dimensions = splats.shN.shape[1] * 3
     if dimensions == 0 or len(chosen) == 0:
@@ -88,7 +85,6 @@ def fit_codebook(
         reach=settings.sh_reach,
         tolerance=settings.sh_tolerance,
         lattice=settings.sh_step if settings.shared_steps else 0.0,
-        thrift=thrift,
         report=lambda fraction: progress("codebook", fraction),
     )
     # The smallest image that holds the entries found; what is left of it repeats some of them.

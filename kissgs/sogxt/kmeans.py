@@ -19,7 +19,6 @@ import numpy as np
 from kissgs._typing import Float32, Float64, Int, Int32
 from kissgs.parallel import Workers
 from kissgs.sogxt.quantize import tame
-from kissgs.sogxt.thrift import Thrift
 
 BLOCK = 1024
 """Vectors per matrix product: its result, against a few thousand centroids, stays in the processor's cache."""
@@ -53,7 +52,6 @@ def fit(
     reach: int,
     tolerance: float,
     lattice: float,
-    thrift: Thrift | None = None,
     report: Callable[[float], None] = lambda fraction: None,
 ) -> Clusters:
     """Find at most ``size`` centroids of small weighted squared error.
@@ -69,7 +67,6 @@ def fit(
         tolerance: root mean square error per dimension below which a cluster is not split further.
         lattice: step of the values that centroids are rounded to, in units of the root mean square error that the
             codebook leaves; vectors then choose among the rounded ones. 0 leaves them as they are.
-        thrift: weigh the bits of a label against the error it leaves, in the later half of the rounds.
         report: told the fraction done.
 
     Returns:
@@ -94,20 +91,17 @@ def fit(
     centroids, labels = _split(vectors, weights, tree, rng, pool)
     report(0.4)
     near = tree.neighbours(reach)
-    thrift = None if thrift is None else thrift.ordered(order)
     for step in range(rounds):
         _update(centroids, vectors, weights, labels)
-        saving = thrift if 2 * step >= rounds else None
-        distances = _reassign(vectors, centroids, labels, tree, near, pool, saving)
-        if saving is None:
-            _revive(centroids, vectors, weights * distances, labels)
+        distances = _reassign(vectors, centroids, labels, tree, near, pool)
+        _revive(centroids, vectors, weights * distances, labels)
         report(0.4 + 0.6 * (step + 1) / rounds)
     _update(centroids, vectors, weights, labels)
     step = 0.0
     if lattice:
         error = np.average(distances, weights=weights) / vectors.shape[1]
         step = _round_to_lattice(centroids, lattice * float(error) ** 0.5, tolerance)
-        _reassign(vectors, centroids, labels, tree, near, pool, thrift)
+        _reassign(vectors, centroids, labels, tree, near, pool)
 
     used, compact = np.unique(labels, return_inverse=True)
     unsorted = np.empty(len(labels), dtype=np.int32)
@@ -116,16 +110,9 @@ def fit(
 
 
 def assign(
-    vectors: Float32[np.ndarray, "N D"],
-    centroids: Float32[np.ndarray, "K D"],
-    price: Float32[np.ndarray, " N"] | None = None,
-    bits: Float32[np.ndarray, "G K"] | None = None,
-    groups: Int[np.ndarray, " N"] | None = None,
+    vectors: Float32[np.ndarray, "N D"], centroids: Float32[np.ndarray, "K D"]
 ) -> tuple[Int[np.ndarray, " N"], Float32[np.ndarray, " N"]]:
-    """Nearest centroid of every vector, by brute force, and the squared distance to it.
-
-    With ``price``, the one of least squared distance plus ``price`` times the centroid's ``bits`` in its group.
-    """
+    """Nearest centroid of every vector, by brute force, and the squared distance to it."""
     labels = np.empty(len(vectors), dtype=np.int64)
     distances = np.empty(len(vectors), dtype=np.float32)
     norms = np.einsum("kd,kd->k", centroids, centroids)
@@ -134,13 +121,7 @@ def assign(
         block = vectors[first : first + BLOCK]
         partial = block @ minus_two
         partial += norms
-        if price is None or bits is None or groups is None:
-            best = partial.argmin(axis=1)
-        else:
-            charged = bits[groups[first : first + BLOCK]]
-            charged *= price[first : first + BLOCK, None]
-            charged += partial
-            best = charged.argmin(axis=1)
+        best = partial.argmin(axis=1)
         labels[first : first + BLOCK] = best
         distances[first : first + BLOCK] = partial[np.arange(len(block)), best]
     distances += np.einsum("nd,nd->n", vectors, vectors)
@@ -244,20 +225,14 @@ def _reassign(
     tree: _Tree,
     near: list[Int[np.ndarray, " _"]],
     pool: Workers,
-    thrift: Thrift | None = None,
 ) -> Float32[np.ndarray, " N"]:
     """Move every vector to the best centroid near its coarse cluster. Changes ``labels``; returns distances."""
     distances = np.zeros(len(vectors), dtype=np.float32)
-    bits = None if thrift is None else thrift.bits(labels, len(centroids))
 
     def work(j: int) -> None:
         rows = tree.vectors_of(j)
         if rows.start < rows.stop:
-            if thrift is None or bits is None:
-                best, distances[rows] = assign(vectors[rows], centroids[near[j]])
-            else:
-                charge = thrift.price[rows], bits[:, near[j]], thrift.groups[rows]
-                best, distances[rows] = assign(vectors[rows], centroids[near[j]], *charge)
+            best, distances[rows] = assign(vectors[rows], centroids[near[j]])
             labels[rows] = near[j][best]
 
     pool.map(work, range(len(tree.coarse)))

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from kissgs._typing import Float32, Float64, Int
-from kissgs.importance import LARGEST, Importance
+from kissgs.importance import Importance
 from kissgs.parallel import Workers
 from kissgs.progress import Progress
 from kissgs.settings import EncodeSettings
@@ -19,7 +19,6 @@ from kissgs.sogxt.order import Grid, place
 from kissgs.sogxt.pras import choose_forms
 from kissgs.sogxt.quantize import MEANS_TOP, Quantized, quantize_means, signed_exp, signed_log, tame
 from kissgs.sogxt.rounding import COARSEST, quantize_by_class, round_shapes
-from kissgs.sogxt.thrift import Thrift
 from kissgs.splats import SH_C0, Splats
 
 Recolor = Callable[[Splats, Int[np.ndarray, " M"]], Float32[np.ndarray, "M 3"]]
@@ -72,9 +71,8 @@ def weigh(
         splats, grid.cells, grid.side, settings, pool, lambda fraction: progress("forms", fraction)
     )
     quats, scales, forms = quats[grid.mask], scales[grid.mask], forms[grid.mask]
-    codebook = _codebook(
-        shown, _sh_weights(importance, order), importance.colors[order], classes, price, gloss, settings, pool, progress
-    )
+    weights, size = _sh_weights(importance, order), gloss.best_size(price, len(order), settings.sh_ratio)
+    codebook = fit_codebook(shown, np.arange(len(order)), weights, size, settings, pool, progress)
     progress("rounding", 0.0)
     values = np.concatenate([shown.opacities[:, None], scales, quats], axis=1).astype(np.float64)
     parts = (
@@ -147,27 +145,6 @@ def _sh_weights(importance: Importance, chosen: Int[np.ndarray, " M"]) -> Float3
     """How much the gloss of each counts."""
     power = max(1 - SH_HEDGE * importance.hedge, 0.0)
     return bounded(importance.colors[chosen] ** np.float32(power), *SH_WEIGHTS)
-
-
-def _codebook(
-    shown: Splats,
-    weights: Float32[np.ndarray, " M"],
-    colors: Float32[np.ndarray, " M"],
-    classes: Int[np.ndarray, " M"],
-    price: float,
-    gloss: Gloss,
-    settings: EncodeSettings,
-    pool: Workers,
-    progress: Progress,
-) -> Codebook:
-    """Of the size, and with the labels, that the price asks for."""
-    thrift = None
-    if settings.sh_thrift > 0 and (colors > 0).any():
-        unit = float(np.median(colors[colors > 0])) * GLOSS
-        bits = settings.sh_thrift * price / (weights.astype(np.float64) * unit)
-        thrift = Thrift(np.minimum(bits, LARGEST).astype(np.float32), classes)
-    size = gloss.best_size(price, len(shown), settings.sh_ratio)
-    return fit_codebook(shown, np.arange(len(shown)), weights, size, settings, pool, progress, thrift)
 
 
 def _means(means: Float32[np.ndarray, "M 3"], costs: Costs, classes: Int[np.ndarray, " M"], price: float) -> Quantized:

@@ -1,6 +1,5 @@
 """Oracle: all choices by brute force, the square law of rounding, and the scenes that break weights."""
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -11,14 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from kissgs import Settings, compress, decompress
 from kissgs.importance import Importance
-from kissgs.parallel import Workers, blas_workers
-from kissgs.sogxt import kmeans
+from kissgs.parallel import Workers
 from kissgs.sogxt.economy import Costs, Gloss, error_at, price_for, step
 from kissgs.sogxt.encode import encode
 from kissgs.sogxt.pras import ROTATIONS, apply_forms
 from kissgs.sogxt.quantize import quantize
 from kissgs.sogxt.rounding import MIRRORS, quantize_by_class, round_shapes
-from kissgs.sogxt.thrift import Thrift
 from kissgs.splats import clean
 
 WEIGHED = ["balanced", "small"]
@@ -294,30 +291,6 @@ def test_threads_do_not_change_a_byte():
     settings = Settings.from_preset("small").encode
     one, three = (encode(splats, settings, importance=importance, threads=threads).files for threads in (1, 3))
     assert one == three
-
-
-def entropy(labels):
-    counts = np.bincount(labels)
-    return -(counts[counts > 0] / len(labels) * np.log2(counts[counts > 0] / len(labels))).sum()
-
-
-def test_thrift_trades_error_for_cheaper_labels():
-    rng = np.random.default_rng(3)
-    vectors = (rng.normal(size=(4000, 6)) * rng.exponential(1, (4000, 1))).astype(np.float32)
-    weights = np.ones(4000, np.float32)
-    given = {"seed": 0, "rounds": 6, "reach": 32, "tolerance": 0.0, "lattice": 0.0}
-    found = []
-    for price in (0, 0.05, 0.3):
-        thrift = Thrift(np.full(4000, price, np.float32), np.arange(4000) % 2) if price else None
-        with blas_workers(1) as pool:
-            clusters = kmeans.fit(vectors, weights, 256, pool, thrift=thrift, **given)
-        error = np.square(vectors - clusters.centroids[clusters.labels]).sum(axis=1).mean()
-        found.append((error, entropy(clusters.labels)))
-    for (error, bits), (next_error, next_bits) in itertools.pairwise(found):
-        assert next_bits < bits
-        assert next_error > error
-    for price, (error, bits) in zip((0.05, 0.3), found[1:], strict=True):
-        assert error + price * bits < found[0][0] + price * found[0][1]
 
 
 @pytest.mark.parametrize("changes", [{"order": "plas"}, {"forms": "smooth"}, {"sh_ratio": 50}, {"classes": 7}])
