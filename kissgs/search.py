@@ -58,7 +58,8 @@ def _next(known: dict[float, float], slope: float, aim: float) -> float:
     met = [x for x, found in known.items() if found >= 0]
     unmet = [x for x, found in known.items() if found < 0]
     if met and unmet:
-        inside, outside = min(met, key=lambda x: known[x]), max(unmet, key=lambda x: known[x])
+        inside = max(met, key=lambda x: -slope * x)
+        outside = min(unmet, key=lambda x: abs(x - inside))
         share = (known[inside] - aim) / (known[inside] - known[outside])
         return inside + (outside - inside) * min(max(share, 0.1), 0.9)
     *before, last = known

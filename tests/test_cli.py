@@ -94,6 +94,24 @@ def test_info_of_both_kinds(scene: Path, tmp_path: Path) -> None:
     assert "bits each" in table
 
 
+def test_goals_and_what_was_seen_from_the_command_line(scene: Path, tmp_path: Path) -> None:
+    glance = "--set", "views=4", "--set", "view_size=48"
+    copy = tmp_path / "scene.ply"
+    copy.write_bytes(scene.read_bytes())
+    done = run("compress", copy, "--target-size", "16kB", "--cache", *glance)
+    assert b"searched: " in done.stdout
+    assert 15_520 <= (tmp_path / "scene.zip").stat().st_size <= 16_000
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["scene.importance.npz", "scene.ply", "scene.zip"]
+    report = json.loads(run("compress", copy, "-f", "--psnr", "38", "--cache", "--evaluate", "--json", *glance).stdout)
+    assert "importance" not in report["seconds"]
+    assert report["evaluation"]["mean"]["between"]["psnr"] >= 38
+    assert report["trials"][0]["bytes"] > 0
+    assert "has 150 dB, the best has" in failure("compress", copy, "-f", "-q", "--psnr", "150", *glance)
+    assert "psnr needs bits that are weighed" in failure("compress", copy, "-f", "-p", "fast", "--psnr", "40")
+    piped = failure("compress", "-", "-o", tmp_path / "b.zip", "--cache", stdin=scene.read_bytes())
+    assert "standard input has no place" in piped
+
+
 def test_settings_from_the_command_line(scene: Path, tmp_path: Path) -> None:
     run("compress", scene, "-o", tmp_path / "a.zip", "-q", "--set", "sh_ratio=16", "--seed", "3")
     settings = json.loads(run("info", tmp_path / "a.zip", "--json").stdout)["details"]["settings"]

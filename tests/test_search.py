@@ -42,6 +42,14 @@ def test_steps_are_lived_with():
     assert spare(found) == pytest.approx(0.6)
 
 
+def test_it_goes_on_where_nearer_attempts_are_no_better():
+    """A function that is not quite monotone: the same place is not tried twice."""
+    spare = Counted(lambda x: 0.9 - 0.3 * x if x < 0.1 else -0.1 - 0.02 * (1 - x) if x < 1 else -x)
+    found = seek(spare, 1.0, -1.0, 0.05, (-9, 9))
+    assert len(set(spare.asked)) == len(spare.asked) > 5
+    assert spare(found) >= 0.85
+
+
 @pytest.mark.parametrize("function", [lambda x: -5.0 - math.exp(-abs(x)), lambda x: min(-x, 40) - 41])
 def test_what_cannot_be_met_is_given_up(function):
     spare = Counted(function)
@@ -75,7 +83,7 @@ def test_a_psnr_is_met_from_above(change):
     wanted = plain.report.evaluation.mean.between.psnr + change
     settings = Settings.from_preset("balanced", psnr=wanted, **GLANCE)
     found = kissgs.compress(SCENE, settings=settings, evaluate=True)
-    assert wanted <= found.report.evaluation.mean.between.psnr <= wanted + 1
+    assert wanted <= found.report.evaluation.mean.between.psnr <= wanted + 1.5
     assert found.report.evaluation.mean.between.psnr in [trial.psnr for trial in found.report.trials]
     assert (len(found.to_zip()) > len(plain.to_zip())) == (change > 0)
 
