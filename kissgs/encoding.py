@@ -123,7 +123,7 @@ def _importance(
 
     if cache is None:
         return measure_importance(splats, watched, hedge=hedge, threads=threads, progress=progress)
-    key = hashlib.sha256(f"{__version__} {hedge} {splats.sh_degree} {watched.weights}".encode())
+    key = hashlib.sha256(f"{__version__} {hedge} {splats.sh_degree} {watched.weights} {watched.spread}".encode())
     for camera in watched.cameras:
         key.update(camera.viewmat.tobytes() + camera.K.tobytes() + f"{camera.width} {camera.height} ".encode())
     for values in (watched.background, *(getattr(splats, name) for name in ATTRIBUTES)):
