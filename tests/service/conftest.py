@@ -1,11 +1,11 @@
 """Services for the tests: one that many share, and fresh ones."""
 
-import itertools
 import os
 import pwd
 import shutil
 import socket
 import subprocess
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -46,12 +46,12 @@ def programs():
 
 
 @pytest.fixture(scope="session")
-def postgresql_server(tmp_path_factory):
+def postgresql_server():
     """A PostgreSQL server of our own, where its programs are installed."""
     binaries = programs()
     if binaries is None:
         pytest.skip("PostgreSQL is not installed")
-    folder = tmp_path_factory.mktemp("postgresql")
+    folder = Path(tempfile.mkdtemp(prefix="kissgs-postgresql-"))  # pytest's own folders are closed to other users
     user = {}
     if os.geteuid() == 0:  # it refuses to run as root
         try:
@@ -59,8 +59,6 @@ def postgresql_server(tmp_path_factory):
         except KeyError:
             pytest.skip("PostgreSQL does not run as root, and there is no user postgres")
         user = {"user": "postgres", "group": account.pw_gid}
-        for parent in (folder, *itertools.takewhile(lambda p: p != Path("/tmp"), folder.parents)):
-            parent.chmod(0o755)
         os.chown(folder, account.pw_uid, account.pw_gid)
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
