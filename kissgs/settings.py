@@ -29,7 +29,7 @@ class EncodeSettings(BaseModel):
     weigh: bool = Field(
         True,
         description="Take pictures of the scene, and weigh every bit against the error it saves in them. Steps, "
-        "codebook size and precision then follow from fidelity, and the ones given below are not used.",
+        "codebook size and precision then follow from fidelity, and settings of even steps are refused.",
     )
     fidelity: Annotated[float, Field(ge=-30, le=30)] = Field(
         0.2, description="Where bits are weighed: decibels above the paper's own settings on the same scene, about."
@@ -51,7 +51,7 @@ class EncodeSettings(BaseModel):
         None,
         ge=1,
         description="Where bits are weighed: search for the best container of at most so many bytes, such as 800kB or "
-        "2.5MB, and at least 97 % of that. Takes a few encodings.",
+        "2.5MB; hardly smaller where that can be. Takes a few encodings.",
     )
     drop: float = Field(
         10.0,
