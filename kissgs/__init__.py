@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from kissgs._version import __version__
 
 if TYPE_CHECKING:
+    from kissgs.compaction.result import Compacted, CompactionReport
     from kissgs.errors import (
         Cancelled,
         InvalidContainerError,
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from kissgs.evaluation.pictures import evaluate
     from kissgs.importance import Importance
     from kissgs.io.ply import PlyInfo, read_ply_info
-    from kissgs.pipeline import Compressed, compress, decompress, load, save
+    from kissgs.pipeline import Compressed, compact, compress, decompress
     from kissgs.progress import Progress
     from kissgs.remote import Remote
     from kissgs.rendering.camera import Camera
@@ -35,7 +36,8 @@ if TYPE_CHECKING:
     from kissgs.rendering.rasterizer import render
     from kissgs.report import Report
     from kissgs.sample import sample_scene
-    from kissgs.settings import EncodeSettings, Preset, Settings
+    from kissgs.scenes import load, save
+    from kissgs.settings import CompactSettings, EncodeSettings, Preset, Settings
     from kissgs.splats import Splats, clean
     from kissgs.views.load import load_views
     from kissgs.views.view import View, Views
@@ -44,6 +46,9 @@ if TYPE_CHECKING:
 _HOMES = {
     "Camera": "rendering.camera",
     "Cancelled": "errors",
+    "CompactSettings": "settings",
+    "Compacted": "compaction.result",
+    "CompactionReport": "compaction.result",
     "Compressed": "pipeline",
     "EncodeSettings": "settings",
     "Evaluation": "evaluation.likeness",
@@ -66,22 +71,26 @@ _HOMES = {
     "Views": "views.view",
     "Watch": "rendering.importance",
     "clean": "splats",
+    "compact": "pipeline",
     "compress": "pipeline",
     "decompress": "pipeline",
     "evaluate": "evaluation.pictures",
-    "load": "pipeline",
+    "load": "scenes",
     "load_views": "views.load",
     "measure_importance": "rendering.importance",
     "read_ply_info": "io.ply",
     "render": "rendering.rasterizer",
     "sample_scene": "sample",
-    "save": "pipeline",
+    "save": "scenes",
     "virtual_views": "views.virtual",
 }
 
 __all__ = [
     "Camera",
     "Cancelled",
+    "CompactSettings",
+    "Compacted",
+    "CompactionReport",
     "Compressed",
     "EncodeSettings",
     "Evaluation",
@@ -105,6 +114,7 @@ __all__ = [
     "Watch",
     "__version__",
     "clean",
+    "compact",
     "compress",
     "decompress",
     "evaluate",

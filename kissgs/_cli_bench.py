@@ -109,7 +109,7 @@ def _rendering(
     from kissgs._console import progress_bar
     from kissgs._picture_tables import rendering_table
     from kissgs.evaluation.speed import rendering_cost, resampled
-    from kissgs.pipeline import load
+    from kissgs.scenes import load
     from kissgs.views.virtual import virtual_views
 
     rows = []

@@ -62,7 +62,7 @@ def evaluate(
     from kissgs.evaluation.likeness import Split
     from kissgs.evaluation.pictures import evaluate as measure
     from kissgs.io.atomic import atomic_file, refuse_existing
-    from kissgs.pipeline import load, stored_bytes
+    from kissgs.scenes import load, stored_bytes
 
     used = cast(Split, _choice("--split", split, Split))
     where = device_of(device)

@@ -106,7 +106,7 @@ def render(
     """Take a picture of a scene, a film or a sheet of pictures around it, or a sheet of its views."""
     from kissgs._console import progress_bar
     from kissgs.io.atomic import refuse_existing
-    from kissgs.pipeline import load
+    from kissgs.scenes import load
     from kissgs.views.camera_json import write_camera
     from kissgs.views.shooting import Photographer
 

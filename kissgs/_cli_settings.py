@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any
 
 from kissgs.errors import UnsupportedError
@@ -9,20 +10,74 @@ from kissgs.errors import UnsupportedError
 if TYPE_CHECKING:
     from kissgs.settings import Settings
 
+Values = dict[str, Any]
+THOUSANDS = {"": 1, "k": 1e3, "m": 1e6}
 
-def chosen(preset: str, changes: list[str] | None, **options: float | str | None) -> Settings:
+
+def chosen(
+    preset: str,
+    changes: list[str] | None,
+    *,
+    group: str = "encode",
+    budget: Values | None = None,
+    **options: float | str | None,
+) -> Settings:
     """A preset with ``NAME=VALUE`` changes; options of their own, where they are given, override these.
+
+    Args:
+        preset: its name.
+        changes: of settings of ``group``, or of another one as ``GROUP.NAME=VALUE``.
+        group: "encode" or "compact".
+        budget: settings of "compact".
+        options: settings of ``group``; None is not given.
 
     Raises:
         UnsupportedError: no such preset or setting, or a value that is not possible.
     """
     from kissgs.settings import Settings
 
-    values: dict[str, Any] = {}
+    values: dict[str, Values] = {"compact": {}, "encode": {}}
     for change in changes or []:
         name, equals, value = change.partition("=")
         if not equals:
             raise UnsupportedError(f"--set {change!r}: write NAME=VALUE, for example --set means_bits=16")
-        values[name.strip()] = None if value.strip() == "auto" else value.strip()
-    values.update({name: value for name, value in options.items() if value is not None})
-    return Settings.from_preset(preset, **values)
+        of, dot, inner = name.strip().partition(".")
+        if dot and of not in values:
+            raise UnsupportedError(f"--set {change!r}: there are settings of compact and of encode")
+        values[of if dot else group][inner if dot else of] = None if value.strip() == "auto" else value.strip()
+    values["compact"].update(budget or {})
+    values[group].update({name: value for name, value in options.items() if value is not None})
+    return Settings.from_preset(preset, compact=values["compact"], **values["encode"])
+
+
+def count_of(text: str) -> int:
+    """Of Gaussians: 200000, 200k, 1.5M.
+
+    Raises:
+        UnsupportedError: it is none.
+    """
+    match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)([km]?)", text.strip().replace(",", "").lower())
+    if match is None:
+        raise UnsupportedError(f"{text!r} is no number of Gaussians; write 200000, 200k or 1.5M")
+    return round(float(match[1]) * THOUSANDS[match[2]])
+
+
+def budget_of(text: str) -> Values:
+    """A budget in one word: a count such as 200k, a share such as 20%, or a loss such as 0.2dB.
+
+    Raises:
+        UnsupportedError: it is none of these.
+    """
+    word = text.strip().lower().replace(" ", "")
+    for ending, name, unit in (("%", "ratio", 0.01), ("db", "max_psnr_drop", 1.0)):
+        if word.endswith(ending):
+            number = word.removesuffix(ending)
+            if not re.fullmatch(r"[0-9]*\.?[0-9]+", number):
+                break
+            return {name: float(number) * unit}
+    if not re.fullmatch(r"[0-9.,]+[km]?", word):
+        raise UnsupportedError(
+            f"--compact {text}: say how many Gaussians to keep (200k), which share (20%), or how much PSNR may be "
+            "lost (0.2dB)"
+        )
+    return {"count": count_of(word)}

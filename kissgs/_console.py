@@ -37,11 +37,12 @@ def progress_bar(quiet: bool) -> Iterator[Receiver]:
         BarColumn(),
         TextColumn("{task.percentage:>3.0f} %"),
         TimeElapsedColumn(),
+        TextColumn("{task.fields[note]}"),
     )
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=1.0)
+        task = bar.add_task("", total=1.0, note="")
 
-        def receive(stage: str, fraction: float) -> None:
+        def receive(stage: str, fraction: float, note: str = "") -> None:
             nonlocal notice
             if notice is not None:  # whatever comes next, kernels are compiled
                 notice.cancel()
@@ -49,7 +50,7 @@ def progress_bar(quiet: bool) -> Iterator[Receiver]:
             if stage == "kernels" and fraction == 0:  # which a bar may hear several times: a timer runs only once
                 notice = _notice(console)
                 notice.start()
-            bar.update(task, description=stage, completed=fraction)
+            bar.update(task, description=stage, completed=fraction, note=note)
 
         try:
             yield receive

@@ -9,6 +9,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from kissgs.bench import RoundTrip
+from kissgs.compaction.result import CompactionReport
 from kissgs.evaluation.likeness import Evaluation, spell
 from kissgs.evaluation.peers import PeerResult
 from kissgs.info import Info
@@ -19,6 +20,7 @@ CHANGES = {
     "invisible": "left out: opacity 1/255 or less, which no renderer draws",
     "negligible": "left out: its bytes would cost more than it shows",
     "tamed_colours": "base colour far outside all others, pulled in so that it does not coarsen theirs",
+    "compacted": "left out by compaction: others do their work",
     "non_finite": "removed: NaN or infinite",
     "far_away": "removed: further away than 1e15",
     "infinite_opacities": "opacity logit infinite, set to that of 1e-6 or 1 - 1e-6",
@@ -58,7 +60,44 @@ def report_table(report: Report, target: str) -> RenderableType:
     searched = [Text(f"searched: {_path(report.trials)}")] if report.trials else []
     pictures = [] if report.evaluation is None else [_pictures(report.evaluation)]
     changes = _changes(changed)
-    return Group(head, Text(body), *searched, *pictures, parts_table(report.file_bytes, report.count), *changes)
+    compaction = [] if report.compaction is None else _compaction(report.compaction)
+    return Group(
+        head, Text(body), *compaction, *searched, *pictures, parts_table(report.file_bytes, report.count), *changes
+    )
+
+
+def compaction_table(report: CompactionReport, target: str) -> RenderableType:
+    """The report of one compaction."""
+    seconds = sum(step.seconds for step in report.steps)
+    head = Text.assemble(
+        (target, "bold"),
+        f"  {report.source_count:,} -> ",
+        (f"{report.count:,} Gaussians", "bold green"),
+        f", {seconds:.1f} s",
+    )
+    return Group(head, *_compaction(report))
+
+
+def _compaction(report: CompactionReport) -> list[RenderableType]:
+    """Where the Gaussians went, step by step."""
+    lines: list[RenderableType] = [Text(report.note, style="yellow")] if report.note else []
+    if report.trials:
+        lines.append(Text("searched: " + ", ".join(f"{count:,} lose {drop:.2f} dB" for count, drop in report.trials)))
+    if not report.steps:
+        return lines
+    taught = {"photos": f"photographs: {report.source}", "renderings": f"the scene itself: {report.source}"}
+    lines.append(
+        Text(f"learnt from {taught[report.taught_by]}" if report.taught_by in taught else f"scored by {report.source}")
+    )
+    judged = report.steps[0].bytes is not None
+    columns = [_right(name) for name in ("Gaussians", "seconds", *(("PSNR", "SSIM", "bytes") if judged else ()))]
+    table = Table("step", *columns, box=None, pad_edge=False)
+    for step in report.steps:
+        cells = [f"{step.count:,}", f"{step.seconds:.1f}"]
+        if step.psnr is not None and step.ssim is not None and step.bytes is not None:
+            cells += [spell(step.psnr, 2), spell(step.ssim, 4), f"{step.bytes:,}"]
+        table.add_row(step.name, *cells)
+    return [*lines, table]
 
 
 def _path(trials: Iterable[Trial]) -> str:

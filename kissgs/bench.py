@@ -10,13 +10,15 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from kissgs.clock import peak_memory
 from kissgs.errors import UnsupportedError
 from kissgs.evaluation.attributes import AttributeErrors, attribute_errors
 from kissgs.evaluation.likeness import Evaluation
 from kissgs.evaluation.pictures import evaluate
-from kissgs.pipeline import compress, decompress, load, peak_memory
+from kissgs.pipeline import compress, decompress
 from kissgs.progress import Progress, silent
 from kissgs.report import Report
+from kissgs.scenes import load
 from kissgs.settings import Settings
 from kissgs.splats import Splats
 from kissgs.views.view import Views

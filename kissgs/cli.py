@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from kissgs import _cli_bench, _cli_pictures, _cli_remote, _cli_render
+from kissgs import _cli_bench, _cli_compact, _cli_pictures, _cli_remote, _cli_render
 from kissgs._cli_files import beside, each, show, source, stdout, write_stdout
-from kissgs._cli_settings import chosen
+from kissgs._cli_settings import budget_of, chosen
 from kissgs._version import __version__
 from kissgs.errors import KissgsError, UnsupportedError
 
@@ -83,12 +83,16 @@ def compress(
     target_size: Annotated[
         str | None, typer.Option(metavar="SIZE", help="The best container of at most this size: 800kB, 2.5MB.")
     ] = None,
+    compact: Annotated[
+        str | None,
+        typer.Option(metavar="BUDGET", help="Fewer Gaussians first: 200k, 20% or 0.2dB; see 'compact'."),
+    ] = None,
     seed: SeedOption = None,
     unpacked: Annotated[bool, typer.Option("--unpacked", help="Write folders instead of zips.")] = False,
     evaluate: Annotated[bool, typer.Option("--evaluate", help="Measure PSNR and SSIM of the result.")] = False,
     views: Annotated[
         Path | None,
-        typer.Option("--views", metavar="DATA", help="Photographs: keep what their cameras see best; see 'evaluate'."),
+        typer.Option("--views", metavar="DATA", help="Photographs: learn from them, keep what they see best."),
     ] = None,
     cache: Annotated[
         bool, typer.Option("--cache", help="Keep what was seen of a scene in a file beside it, for the next time.")
@@ -101,8 +105,9 @@ def compress(
     """Compress scenes, each into a container of its own."""
     from kissgs.pipeline import compress as run
 
-    settings = chosen(preset, changes, seed=seed, psnr=psnr, target_size=target_size)
-    if views is not None and not (evaluate or settings.encode.weigh):
+    budget = None if compact is None else budget_of(compact)
+    settings = chosen(preset, changes, budget=budget, seed=seed, psnr=psnr, target_size=target_size)
+    if views is not None and not (evaluate or settings.encode.weigh or settings.compact.wanted):
         raise UnsupportedError(f"{preset} takes no pictures: --views only says from where to evaluate; add --evaluate")
     capture = _cli_pictures.open_views(views)
 
@@ -190,6 +195,7 @@ def info(files: Files, as_json: JsonOption = False) -> None:
     each(files, Path("-"), "", as_json, work, writes=False)
 
 
+app.command()(_cli_compact.compact)
 app.command()(_cli_render.render)
 app.command()(_cli_pictures.evaluate)
 
@@ -203,8 +209,8 @@ def sample(
     force: ForceOption = False,
 ) -> None:
     """Make a sample scene: glossy, textured things on a table."""
-    from kissgs.pipeline import save
     from kissgs.sample import sample_scene
+    from kissgs.scenes import save
 
     save(sample_scene(gaussians, sh_degree=degree, seed=seed), output, overwrite=force)
 

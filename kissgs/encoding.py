@@ -51,19 +51,24 @@ def encode_scene(
     cleaned: Cleaned,
     threads: int,
     progress: Progress,
+    *,
+    original: Splats,
 ) -> tuple[Encoded, tuple[Trial, ...]]:
     """Encode a clean scene as the settings ask, and tell what was tried on the way if they name a goal.
+
+    A goal's PSNR is that to pictures of ``original``, from which the scene may have been compacted.
 
     Raises:
         OutputError: ``cache`` is something else, or cannot be written.
         UnsupportedError: the goal cannot be met; the scene is too large for one container.
     """
     if not settings.weigh or len(splats) == 0:
-        return encode(splats, settings, cleaned=cleaned, threads=threads, progress=progress), ()
-    encoder = _look(splats, settings, importance, cache, views, cleaned, threads, progress)
+        compacted = len(original) - len(splats)
+        return encode(splats, settings, cleaned=cleaned, compacted=compacted, threads=threads, progress=progress), ()
+    encoder = _look(splats, settings, importance, cache, views, cleaned, len(original) - len(splats), threads, progress)
     if settings.psnr is None and settings.target_size is None:
         return encoder(settings), ()
-    return _Search(splats, settings, encoder, views, threads, progress).run()
+    return _Search(original, settings, encoder, views, threads, progress).run()
 
 
 Encoder = Callable[[EncodeSettings], Encoded]
@@ -76,6 +81,7 @@ def _look(
     cache: Path | None,
     views: Views | None,
     cleaned: Cleaned,
+    compacted: int,
     threads: int,
     progress: Progress,
 ) -> Encoder:
@@ -98,7 +104,7 @@ def _look(
         if captured and settings.refit:  # virtual pictures would mislead it
             recolor = _recolor(splats, watched, importance, settings.refit, threads, progress)
 
-    def ready(stage: str, fraction: float) -> None:
+    def ready(stage: str, fraction: float, note: str = "") -> None:
         if stage != "kernels":  # that was before
             progress(stage, fraction)
 
@@ -108,6 +114,7 @@ def _look(
             importance=importance,
             recolor=recolor,
             cleaned=cleaned,
+            compacted=compacted,
             threads=threads,
             progress=ready,
         )
@@ -153,14 +160,14 @@ class _Search:
 
     def __init__(
         self,
-        splats: Splats,
+        original: Splats,
         settings: EncodeSettings,
         encoder: Encoder,
         views: Views | None,
         threads: int,
         progress: Progress,
     ) -> None:
-        self.splats, self.settings, self.encoder = splats, settings, encoder
+        self.original, self.settings, self.encoder = original, settings, encoder
         self.views, self.threads, self.progress = views, threads, progress
         self.trials: list[Trial] = []
         self.best: tuple[int, Encoded] | None = None
@@ -206,9 +213,9 @@ class _Search:
 
         self.progress("evaluate", 0.0)
         if self.views is None:  # those that evaluate would take
-            self.views = virtual_views(self.splats, threads=self.threads)
-        decoded = decode(encoded.files, max_gaussians=len(self.splats), threads=self.threads)
-        return evaluate(self.splats, decoded, self.views, threads=self.threads, progress=silent).mean.between.psnr
+            self.views = virtual_views(self.original, threads=self.threads)
+        decoded = decode(encoded.files, max_gaussians=len(self.original), threads=self.threads)
+        return evaluate(self.original, decoded, self.views, threads=self.threads, progress=silent).mean.between.psnr
 
     def _regret(self) -> str:
         if self.settings.psnr is not None:

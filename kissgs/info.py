@@ -10,7 +10,7 @@ import numpy as np
 
 from kissgs.errors import InvalidContainerError
 from kissgs.io.ply import read_ply, read_ply_info
-from kissgs.pipeline import is_container
+from kissgs.scenes import is_container
 from kissgs.sogxt.container import Source, open_source
 from kissgs.sogxt.metadata import CHANNELS, Layout
 from kissgs.sogxt.metadata_reader import read_layout

@@ -1,36 +1,30 @@
-"""``compress`` and ``decompress``: the stages put together, and the report of what each took and gave."""
+"""``compact``, ``compress`` and ``decompress``: the stages put together, and the report of what each took and gave."""
 
 from __future__ import annotations
 
-import sys
-import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from os import PathLike
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from kissgs._typing import Int
-from kissgs.errors import InvalidContainerError, OutputError
+from kissgs.clock import Clock, peak_memory
+from kissgs.compaction.result import Compacted
+from kissgs.errors import UnsupportedError
 from kissgs.importance import Importance
-from kissgs.io.atomic import atomic_file, reason_of, refuse_existing
-from kissgs.io.ply import read_ply, write_ply
-from kissgs.progress import Progress, silent
+from kissgs.progress import Progress, as_stage, silent
 from kissgs.report import Report
+from kissgs.scenes import AnyPath, check_ply, open_scene, save
 from kissgs.settings import Settings
 from kissgs.sogxt.container import check_destination, write_container, zip_bytes
 from kissgs.sogxt.decode import MAX_GAUSSIANS, decode
-from kissgs.splats import Cleaned, Splats, clean
+from kissgs.splats import Splats
 
 if TYPE_CHECKING:
     from kissgs.evaluation.likeness import Evaluation
     from kissgs.views.view import Views
-
-AnyPath = str | PathLike[str]
-
-ZIP_BEGINNINGS = (b"PK\x03\x04", b"PK\x05\x06")
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,31 +54,63 @@ class Compressed:
         write_container(self.files, Path(path), overwrite=overwrite)
 
 
-def load(path: AnyPath, *, max_gaussians: int = MAX_GAUSSIANS, threads: int = 0, progress: Progress = silent) -> Splats:
-    """Read a scene: a ``.ply`` of any of the field's tools, or a SOG-XT container (zip or folder); cleaned.
+def compact(
+    source: Splats | AnyPath | bytes,
+    destination: AnyPath | None = None,
+    *,
+    settings: Settings,
+    evaluate: bool = False,
+    views: Views | None = None,
+    checkpoint: AnyPath | None = None,
+    overwrite: bool = False,
+    threads: int = 0,
+    progress: Progress = silent,
+) -> Compacted:
+    """Bring a scene down to fewer Gaussians that show the same.
 
-    A container with more than ``max_gaussians`` is refused before memory is taken for them.
+    Args:
+        source: a scene, or the path or the bytes of a ``.ply``, or a container.
+        destination: ``.ply`` to write; by default nothing is written.
+        settings: their group ``compact`` says how many Gaussians to keep, and how: for example
+            ``Settings.from_preset("balanced", compact={"ratio": 0.2})``.
+        evaluate: measure PSNR, SSIM and bytes after every step, for the report.
+        views: a capture of the scene to learn from, and its held-out views to judge by; by default virtual cameras, and
+            the scene itself is the teacher.
+        checkpoint: file in which the state of the training is kept every half minute. If the same call is made again,
+            it goes on from there and ends as if nothing had been. When ``destination`` is written it is removed.
+        overwrite: replace ``destination`` if it exists.
+        threads: 0 means one per processor; the result does not depend on it.
+        progress: receives events; raise :class:`kissgs.Cancelled` from it to stop. Nothing is written then.
+
+    Returns:
+        The smaller scene, and the report.
 
     Raises:
-        InvalidSceneError: the ``.ply`` is not a usable scene.
-        InvalidContainerError: the container is damaged.
-        UnsupportedError: something valid that kissgs does not read.
+        KissgsError: one of its children, with a sentence for the user.
     """
-    return clean(_read(Path(path), threads, progress, max_gaussians))[0]
+    from kissgs.compaction.budget import compact_scene
+
+    target = Path(destination) if destination is not None else None
+    if target is not None:
+        check_ply(target, overwrite=overwrite)
+    splats, _, _ = open_scene(source, threads, progress)
+    result = compact_scene(
+        *(splats, settings.compact, views),
+        judge=evaluate,
+        checkpoint=Path(checkpoint) if checkpoint is not None else None,
+        threads=threads,
+        progress=progress,
+    )
+    if target is not None:
+        save(result.splats, target, overwrite=overwrite, progress=progress)
+        _forget(checkpoint)
+    return result
 
 
-def save(splats: Splats, path: AnyPath, *, overwrite: bool = False, progress: Progress = silent) -> None:
-    """Write a scene as ``.ply`` (binary, INRIA layout, at its own SH degree), whole or not at all.
-
-    For containers there is :func:`compress`.
-
-    Raises:
-        OutputError: it exists and ``overwrite`` is false, its name does not end in ``.ply``, or the disk refuses.
-    """
-    path = Path(path)
-    _check_ply(path, overwrite=overwrite)
-    with atomic_file(path, overwrite=overwrite) as file:
-        write_ply(file, splats, progress=progress)
+def _forget(checkpoint: AnyPath | None) -> None:
+    """What it led to is written."""
+    if checkpoint is not None:
+        Path(checkpoint).unlink(missing_ok=True)
 
 
 def compress(
@@ -96,6 +122,7 @@ def compress(
     cache: AnyPath | None = None,
     evaluate: bool = False,
     views: Views | None = None,
+    checkpoint: AnyPath | None = None,
     overwrite: bool = False,
     threads: int = 0,
     progress: Progress = silent,
@@ -105,15 +132,17 @@ def compress(
     Args:
         source: a scene, or the path or the bytes of a ``.ply`` (a container is decoded and encoded anew).
         destination: ``.zip`` or folder to write; by default nothing is written.
-        settings: by default those of the preset ``balanced``.
+        settings: by default those of the preset ``balanced``. If their group ``compact`` has a budget, the scene is
+            compacted first, see :func:`kissgs.compact`.
         importance: of a clean ``source``, measured before (:func:`kissgs.measure_importance`); by default it is
             measured if the settings ask for it.
         cache: ``.npz`` in which to keep the importance that was measured. Next time it is taken from there, if neither
             the scene nor the cameras have changed, and replaced otherwise.
         evaluate: decode the result and compare its pictures with those of the cleaned scene, and with the photographs
             of ``views`` if they have any; see :func:`kissgs.evaluate`. The report then has an ``evaluation``.
-        views: a capture of the scene: its cameras for training weigh the bits, those held out are for evaluation; by
-            default virtual cameras for both.
+        views: a capture of the scene: its views for training are learned from and weigh the bits, those held out are
+            for evaluation; by default virtual cameras for all.
+        checkpoint: of the compaction, see :func:`kissgs.compact`.
         overwrite: replace ``destination`` if it exists.
         threads: 0 means one per processor; the bytes do not depend on it.
         progress: receives events; raise :class:`kissgs.Cancelled` from it to stop. Nothing is written then.
@@ -131,23 +160,31 @@ def compress(
     if target is not None:
         check_destination(target, overwrite=overwrite)
     kept = Path(cache) if cache is not None else None
-    clock = _Clock(progress)
-    splats, cleaned, source_bytes = _open(source, threads, clock)
-    encoded, trials = encode_scene(splats, settings.encode, importance, kept, views, cleaned, threads, clock)
+    clock = Clock(progress)
+    original, cleaned, source_bytes = open_scene(source, threads, clock)
+    splats, index, compaction = original, np.arange(len(original)), None
+    if settings.compact.wanted:
+        compacted = _compact(original, settings, importance, views, checkpoint, evaluate, threads, clock)
+        splats, index, compaction = compacted.splats, compacted.index, compacted.report
+    encoded, trials = encode_scene(
+        splats, settings.encode, importance, kept, views, cleaned, threads, clock, original=original
+    )
     archive_bytes = len(zip_bytes(encoded.files))
-    evaluation = _evaluate(splats, encoded.files, views, threads, clock) if evaluate else None
+    evaluation = _evaluate(original, encoded.files, views, threads, clock) if evaluate else None
     if target is not None:
         clock("write", 0.0)
         write_container(encoded.files, target, overwrite=overwrite)
+        _forget(checkpoint)
     clock.stop()
     report = Report(
-        source_count=len(splats) + cleaned.removed,
+        source_count=len(original) + cleaned.removed,
         count=len(encoded.order),
         sh_degree=splats.sh_degree,
         source_bytes=source_bytes,
         container_bytes=archive_bytes,
         file_bytes={name: len(data) for name, data in encoded.files.items()},
         cleaned=cleaned,
+        compaction=compaction,
         invisible=encoded.invisible,
         negligible=encoded.negligible,
         tamed_colours=encoded.tamed,
@@ -161,7 +198,7 @@ def compress(
         settings=settings.model_dump(mode="json"),
         evaluation=evaluation,
     )
-    return Compressed(encoded.files, encoded.order, report)
+    return Compressed(encoded.files, index[encoded.order], report)
 
 
 def decompress(
@@ -192,7 +229,7 @@ def decompress(
         OutputError: ``destination`` cannot be written.
     """
     if destination is not None:
-        _check_ply(Path(destination), overwrite=overwrite)
+        check_ply(Path(destination), overwrite=overwrite)
     scene = source if isinstance(source, bytes | Mapping) else Path(source)
     splats = decode(scene, max_gaussians=max_gaussians, threads=threads, progress=progress)
     if destination is not None:
@@ -200,35 +237,24 @@ def decompress(
     return splats
 
 
-def is_container(source: Path | bytes) -> bool:
-    """Whether this looks like a container rather than a ``.ply``: a folder, or something that begins as a zip."""
-    if isinstance(source, bytes):
-        return source[:4] in ZIP_BEGINNINGS
-    try:
-        if source.is_dir():
-            return True
-        if not source.is_file():  # a pipe would keep us waiting
-            return source.suffix.lower() == ".zip"
-        with source.open("rb") as file:
-            return file.read(4) in ZIP_BEGINNINGS
-    except (OSError, ValueError):
-        return source.suffix.lower() == ".zip"
+def _compact(
+    splats: Splats,
+    settings: Settings,
+    importance: Importance | None,
+    views: Views | None,
+    checkpoint: AnyPath | None,
+    judge: bool,
+    threads: int,
+    progress: Progress,
+) -> Compacted:
+    from kissgs.compaction.budget import compact_scene
 
-
-def _check_ply(path: Path, *, overwrite: bool) -> None:
-    if path.suffix.lower() != ".ply":
-        raise OutputError(f"{path}: only .ply files are written here; use compress for containers")
-    refuse_existing(path, overwrite=overwrite)
-
-
-def peak_memory() -> int:
-    """Bytes, the largest resident set this process has had; 0 where the system does not say (Windows)."""
-    try:
-        import resource
-    except ImportError:
-        return 0
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024
+    if importance is not None:
+        raise UnsupportedError("importance is that of a scene before its compaction; compact first, then measure")
+    kept = Path(checkpoint) if checkpoint is not None else None
+    return compact_scene(
+        splats, settings.compact, views, judge=judge, checkpoint=kept, threads=threads, progress=progress
+    )
 
 
 def _evaluate(
@@ -240,62 +266,4 @@ def _evaluate(
     clock("evaluate", 0.0)
     decoded = decode(container, max_gaussians=max(len(splats), MAX_GAUSSIANS), threads=threads)
 
-    def receive(stage: str, fraction: float) -> None:
-        clock("evaluate", fraction if stage == "evaluate" else 0.0)
-
-    return evaluate(splats, decoded, views, threads=threads, progress=receive)
-
-
-def _open(source: Splats | AnyPath | bytes, threads: int, progress: Progress) -> tuple[Splats, Cleaned, int]:
-    if isinstance(source, Splats):
-        splats, cleaned = clean(source)
-        return splats, cleaned, source.nbytes
-    progress("read", 0.0)
-    scene = source if isinstance(source, bytes) else Path(source)
-    splats, cleaned = clean(_read(scene, threads, progress))
-    return splats, cleaned, len(scene) if isinstance(scene, bytes) else stored_bytes(scene)
-
-
-def _read(source: Path | bytes, threads: int, progress: Progress, max_gaussians: int = MAX_GAUSSIANS) -> Splats:
-    """As it stands in the file; the limit is for containers, which can hold far more than they weigh."""
-    if is_container(source):
-        return decode(source, max_gaussians=max_gaussians, threads=threads, progress=progress)
-    return read_ply(source, progress=progress)
-
-
-def stored_bytes(path: Path) -> int:
-    """Of a file, or of all files in a folder.
-
-    Raises:
-        InvalidContainerError: the file system refuses.
-    """
-    try:
-        return sum(entry.stat().st_size for entry in path.iterdir()) if path.is_dir() else path.stat().st_size
-    except OSError as error:
-        raise InvalidContainerError(f"cannot read {path}: {reason_of(error)}") from error
-
-
-@dataclass
-class _Clock:
-    """Passes progress on, and takes the time of each stage on the way."""
-
-    receiver: Progress
-    seconds: dict[str, float] = field(default_factory=dict)
-    cpu_seconds: float = 0.0
-    _stage: str | None = None
-    _since: float = 0.0
-    _cpu_since: float = field(default_factory=time.process_time)
-
-    def __call__(self, stage: str, fraction: float) -> None:
-        if stage != self._stage:
-            self.stop()
-            self._stage, self._since = stage, time.perf_counter()
-        self.receiver(stage, fraction)
-
-    def stop(self) -> None:
-        """End the current stage."""
-        if self._stage is not None:
-            spent = time.perf_counter() - self._since
-            self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + spent
-            self._stage = None
-        self.cpu_seconds = time.process_time() - self._cpu_since
+    return evaluate(splats, decoded, views, threads=threads, progress=as_stage("evaluate", clock))

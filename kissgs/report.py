@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from kissgs.compaction.result import CompactionReport
 from kissgs.evaluation.likeness import Evaluation
 from kissgs.search import Trial
 from kissgs.splats import Cleaned
@@ -22,6 +23,7 @@ class Report:
         container_bytes: of the zip.
         file_bytes: per file of the container.
         cleaned: what was wrong with the input (:class:`kissgs.splats.Cleaned`).
+        compaction: of the scene before it was encoded; None unless it was asked for.
         invisible: Gaussians left out because no renderer would draw them.
         negligible: Gaussians left out because their bytes would cost more than they show.
         tamed_colours: Gaussians whose base colour is such an outlier that it was pulled in, for the others' sake.
@@ -43,6 +45,7 @@ class Report:
     container_bytes: int
     file_bytes: dict[str, int]
     cleaned: Cleaned
+    compaction: CompactionReport | None
     invisible: int
     negligible: int
     tamed_colours: int
@@ -70,4 +73,5 @@ class Report:
         """For machines."""
         derived = {"ratio": self.ratio, "bytes_per_gaussian": self.bytes_per_gaussian}
         evaluation = None if self.evaluation is None else self.evaluation.as_dict()
-        return {**asdict(self), **derived, "evaluation": evaluation}
+        compaction = None if self.compaction is None else self.compaction.as_dict()
+        return {**asdict(self), **derived, "compaction": compaction, "evaluation": evaluation}

@@ -26,7 +26,12 @@ class Trial:
 
 
 def seek(
-    spare: Callable[[float], float], start: float, slope: float, tolerance: float, bounds: tuple[float, float]
+    spare: Callable[[float], float],
+    start: float,
+    slope: float,
+    tolerance: float,
+    bounds: tuple[float, float],
+    grain: float = 0.0,
 ) -> float | None:
     """Where a monotone function is hardly above zero.
 
@@ -39,19 +44,24 @@ def seek(
         slope: of ``spare``, about; its sign must be right.
         tolerance: at most so much above 0 is near enough.
         bounds: attempts stay between these.
+        grain: attempts are whole multiples of this; 0 for any number.
 
     Returns:
         The best attempt that met the goal; None if none did in :data:`ATTEMPTS`, or the function does not go on rising.
     """
     known: dict[float, float] = {}
-    x = start
+    x = _whole(start, grain)
     while len(known) < ATTEMPTS and x not in known:
         known[x] = spare(x)
         if 0 <= known[x] <= tolerance or _flat(known, tolerance):
             break
-        x = min(max(_next(known, slope, tolerance / 2), bounds[0]), bounds[1])
+        x = _whole(min(max(_next(known, slope, tolerance / 2), bounds[0]), bounds[1]), grain)
     met = [x for x, found in known.items() if found >= 0]
     return min(met, key=lambda x: known[x]) if met else None
+
+
+def _whole(x: float, grain: float) -> float:
+    return round(x / grain) * grain if grain else x
 
 
 def _next(known: dict[float, float], slope: float, aim: float) -> float:

@@ -16,7 +16,7 @@ import pytest
 import kissgs
 from kissgs import Cancelled, InvalidContainerError, InvalidSceneError, KissgsError, OutputError, Settings
 from kissgs.io.ply import write_ply
-from kissgs.pipeline import is_container
+from kissgs.scenes import is_container
 from kissgs.splats import ATTRIBUTES, Splats, clean
 
 FAST = Settings.from_preset("fast")

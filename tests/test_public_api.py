@@ -13,6 +13,9 @@ from kissgs import errors
 PUBLIC = [
     "Camera",
     "Cancelled",
+    "CompactSettings",
+    "Compacted",
+    "CompactionReport",
     "Compressed",
     "EncodeSettings",
     "Evaluation",
@@ -36,6 +39,7 @@ PUBLIC = [
     "Watch",
     "__version__",
     "clean",
+    "compact",
     "compress",
     "decompress",
     "evaluate",

@@ -16,8 +16,9 @@ def test_presets_are_valid_and_named(preset):
     chosen = Settings.from_preset(preset)
     assert chosen.preset == preset
     assert chosen == Settings.from_preset(str(preset)) == Settings(preset=preset)
-    for name, value in PRESETS[preset].items():
-        assert getattr(chosen.encode, name) == value
+    for group, values in PRESETS[preset].items():
+        for name, value in values.items():
+            assert getattr(getattr(chosen, group), name) == value
 
 
 def test_the_default_is_balanced_and_balanced_is_the_defaults():
@@ -71,7 +72,7 @@ def test_an_unknown_setting_is_refused_with_the_list_of_settings():
     with pytest.raises(UnsupportedError) as caught:
         Settings.from_preset("fast", speed=11)
     known = ", ".join(EncodeSettings.model_fields)
-    assert str(caught.value) == f"there is no setting 'speed'; there are {known}"
+    assert str(caught.value) == f"there is no setting 'speed' of encode; there are {known}"
     with pytest.raises(ValidationError, match="speed"):
         Settings.model_validate({"encode": {"speed": 11}})
     with pytest.raises(ValidationError, match="speed"):

@@ -68,6 +68,13 @@ class Camera:
         scale = np.array([[width / self.width], [height / self.height], [1.0]])
         return Camera(self.viewmat, self.K * scale, width, height)
 
+    def at_most(self, size: int) -> Camera:
+        """The same view with at most so many pixels on its longer side."""
+        shrink = size / max(self.width, self.height)
+        if shrink >= 1:
+            return self
+        return self.resized(max(1, round(self.width * shrink)), max(1, round(self.height * shrink)))
+
 
 def look_at(
     position: Float64[np.ndarray, "3"],

@@ -58,6 +58,7 @@ def encode(
     importance: Importance | None = None,
     recolor: Recolor | None = None,
     cleaned: Cleaned = NOTHING_CLEANED,
+    compacted: int = 0,
     threads: int = 0,
     progress: Progress = silent,
 ) -> Encoded:
@@ -71,6 +72,7 @@ def encode(
         recolor: where choices are weighed: given the Gaussians as a decoder will find them, and their indices in the
             scene, returns better ``sh0``.
         cleaned: what was mended before, for the metadata.
+        compacted: by how many Gaussians compaction has made the scene smaller before, for the metadata.
         threads: to use; 0 means one per processor. The bytes do not depend on it.
         progress: receives "kernels", "price", "order", "forms", "codebook", "sort codebook", "rounding" and "images".
 
@@ -103,11 +105,12 @@ def encode(
             version=__version__,
             sh_degree=splats.sh_degree,
             count=count,
-            source_count=len(splats) + cleaned.removed,
+            source_count=len(splats) + compacted + cleaned.removed,
             changed={
                 "invisible": len(splats) - len(kept),
                 "negligible": unseen,
                 "tamed_colours": choice.tamed,
+                **({"compacted": compacted} if compacted else {}),
                 **cleaned.as_dict(),
             },
             settings={**settings.model_dump(exclude={"psnr", "target_size"}), "price": choice.price},

@@ -77,6 +77,11 @@ class Lens:
         """Of the pinhole in it."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
+    def resized(self, width: int, height: int) -> Lens:
+        """Of the same photograph on another grid of pixels; distortion is in units of the focal length."""
+        x, y = width / self.width, height / self.height
+        return Lens(self.fx * x, self.fy * y, self.cx * x, self.cy * y, width, height, self.distortion)
+
 
 @dataclass(frozen=True, slots=True)
 class Window:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ from kissgs._typing import Float32, UInt8
 from kissgs.errors import InvalidViewsError
 from kissgs.rendering.camera import Camera
 from kissgs.views.pixels import read_photo
-from kissgs.views.undistort import Lens, Window, undistort
+from kissgs.views.undistort import Lens, Window, full_window, undistort
 
 
 def black() -> Float32[np.ndarray, "3"]:
@@ -44,6 +44,17 @@ class View:
     photo: Path | None = None
     background: Float32[np.ndarray, "3"] = field(default_factory=black)
     bend: Bend | None = None
+
+    def at_most(self, size: int) -> View:
+        """The same with at most so many pixels on the longer side; the photograph is reduced when it is loaded."""
+        camera = self.camera.at_most(size)
+        if self.bend is None or camera is self.camera:
+            return replace(self, camera=camera)
+        lens, shrink = self.bend.lens, size / max(self.camera.width, self.camera.height)
+        small = lens.resized(max(1, int(lens.width * shrink)), max(1, int(lens.height * shrink)))
+        window = full_window(small)
+        camera = Camera(self.camera.viewmat, window.K(small), window.width, window.height)
+        return replace(self, camera=camera, bend=Bend(small, window))
 
     def load_photo(self) -> UInt8[np.ndarray, "H W 3"]:
         """The photograph at exactly the camera's size; read anew at every call.

@@ -42,7 +42,7 @@ def watch(
         cameras = [_wider(view.camera) if n % 2 else view.camera for n, view in enumerate(found.all)]
         return Watch(cameras, [1.0] * len(found.all), found.background)
     given = [view.camera for view in views.train]
-    chosen = [_at_most(given[n], size) for n in np.unique(np.linspace(0, len(given) - 1, count).astype(int))]
+    chosen = [given[n].at_most(size) for n in np.unique(np.linspace(0, len(given) - 1, count).astype(int))]
     side = round(float(np.sqrt(chosen[0].width * chosen[0].height)))
     around = virtual_views(
         splats, width=side, height=side, count=max(1, count * 2 // 3), threads=threads, progress=progress
@@ -60,15 +60,3 @@ def _wider(camera: Camera) -> Camera:
     K = camera.K.copy()
     K[[0, 1], [0, 1]] *= WIDER
     return Camera(camera.viewmat, K, camera.width, camera.height)
-
-
-def _at_most(camera: Camera, size: int) -> Camera:
-    """The same view with at most so many pixels on its longer side."""
-    shrink = size / max(camera.width, camera.height)
-    if shrink >= 1:
-        return camera
-    width, height = max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink))
-    K = camera.K.copy()
-    K[0] *= width / camera.width
-    K[1] *= height / camera.height
-    return Camera(camera.viewmat, K, width, height)

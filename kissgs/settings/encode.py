@@ -1,24 +1,12 @@
-"""What the user may choose: one model per stage, and the presets. Every setting says what it trades."""
+"""``EncodeSettings``: how Gaussians become images."""
 
 from __future__ import annotations
 
-from enum import StrEnum
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ByteSize, ConfigDict, Field, ValidationError, model_validator
-
-from kissgs.errors import UnsupportedError
+from pydantic import BaseModel, ByteSize, ConfigDict, Field, model_validator
 
 Step = Annotated[float, Field(ge=1e-4, le=10)]
-
-
-class Preset(StrEnum):
-    """Named points on the curve of speed, size and quality."""
-
-    FAST = "fast"
-    BALANCED = "balanced"
-    SMALL = "small"
-    PAPER = "paper"
 
 
 class EncodeSettings(BaseModel):
@@ -199,76 +187,3 @@ UNWEIGHED = (
 def _default(name: str) -> object:
     """What a setting of the encoder is if nobody sets it."""
     return EncodeSettings.model_fields[name].default
-
-
-PRESETS: dict[Preset, dict[str, Any]] = {
-    Preset.FAST: {
-        "weigh": False,
-        "sh_rounds": 1,
-        "sh_reach": 6,
-        "plas_decay": 0.6,
-        "codebook_effort": False,
-        "webp_quality": 50,
-        "webp_method": 2,
-    },
-    Preset.BALANCED: {},
-    Preset.SMALL: {"fidelity": 0.0, "drop": 18, "refit": 4, "sh_rounds": 8, "sh_reach": 32, "plas_decay": 0.9},
-    Preset.PAPER: {
-        "weigh": False,
-        "order": "plas",
-        "forms": "smooth",
-        "shared_steps": False,
-        "means_bits": 16,
-        "sh_ratio": 8,
-        "sh_weight_power": 0,
-        "sh_tolerance": 0,
-        "sh_rounds": 8,
-        "sh_reach": 32,
-        "plas_decay": 0.95,
-        "drop_invisible": False,
-        "webp_quality": 75,
-        "webp_method": 4,
-        "codebook_effort": False,
-    },
-}
-
-
-class Settings(BaseModel):
-    """All settings of a compression: one group per stage."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    preset: Preset = Field(Preset.BALANCED, description="Where settings that are not given come from.")
-    encode: EncodeSettings = EncodeSettings()
-
-    @model_validator(mode="before")
-    @classmethod
-    def _fill_from_preset(cls, given: Any) -> Any:  # noqa: ANN401
-        if not isinstance(given, dict) or given.get("preset", Preset.BALANCED) not in list(Preset):
-            return given  # not ours to judge: validation says what is wrong with it
-        chosen = PRESETS[Preset(given.get("preset", Preset.BALANCED))]
-        encode = given.get("encode", {})
-        if isinstance(encode, EncodeSettings):
-            encode = encode.model_dump(include=encode.model_fields_set)
-        return {**given, "encode": {**chosen, **encode} if isinstance(encode, dict) else encode}
-
-    @classmethod
-    def from_preset(cls, preset: Preset | str = Preset.BALANCED, **encode: Any) -> Settings:  # noqa: ANN401
-        """Settings of a preset, with single ones of the encoder replaced.
-
-        Raises:
-            UnsupportedError: no such preset or setting, or a value that is not possible.
-        """
-        if preset not in list(Preset):
-            raise UnsupportedError(f"there is no preset {preset!r}; choose one of {', '.join(Preset)}")
-        try:
-            return cls.model_validate({"preset": preset, "encode": encode})
-        except ValidationError as error:
-            problem = error.errors()[0]
-            name = str(problem["loc"][-1])
-            if problem["type"] == "extra_forbidden":
-                known = ", ".join(EncodeSettings.model_fields)
-                raise UnsupportedError(f"there is no setting {name!r}; there are {known}") from error
-            if problem["type"] == "value_error":
-                raise UnsupportedError(str(problem["ctx"]["error"])) from error
-            raise UnsupportedError(f"setting {name}: {problem['msg'].lower()}, not {problem['input']!r}") from error

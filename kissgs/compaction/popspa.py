@@ -1,0 +1,272 @@
+"""POPSpa: score and prune, fit while opacities are made sparse, score and prune again, fit (KISS-GS, section 3.1)."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from kissgs._typing import Int
+from kissgs._version import __version__
+from kissgs.compaction.result import Compacted, CompactionReport, CompactionStep
+from kissgs.compaction.school import School
+from kissgs.compaction.scoring import show_most
+from kissgs.evaluation.pictures import evaluate
+from kissgs.progress import Progress, as_stage, silent
+from kissgs.rendering.rasterizer import load_kernels
+from kissgs.settings import CompactSettings, Settings
+from kissgs.sogxt.container import zip_bytes
+from kissgs.sogxt.encode import encode
+from kissgs.splats import ATTRIBUTES, Splats
+from kissgs.training.checkpoint import Checkpoint
+
+if TYPE_CHECKING:
+    from kissgs.training.lessons import Lessons
+    from kissgs.training.loop import Rates
+
+MEANS_RATE = 1.6e-4
+RATES = {"scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 1.25e-4}
+"""Learning rates of 3DGS; that of the means is in units of the cameras' extent."""
+
+State = Mapping[str, np.ndarray]
+
+
+def popspa(
+    splats: Splats,
+    count: int,
+    settings: CompactSettings,
+    school: School,
+    *,
+    teacher: Splats | None = None,
+    judge: bool = False,
+    checkpoint: Path | None = None,
+    threads: int = 0,
+    progress: Progress = silent,
+) -> Compacted:
+    """Bring a clean scene down to exactly ``count`` Gaussians.
+
+    Args:
+        splats: the scene.
+        count: at least 1, and no more than it has.
+        settings: of the recipe; their budget is not looked at.
+        school: views to score by, to learn from and to judge by.
+        teacher: what the pictures should show where there are no photographs; by default the scene itself.
+        judge: measure PSNR, SSIM and bytes after every step.
+        checkpoint: file to keep the state in, every minute while training. If there is one of this very work, it is
+            taken up where it was left, and ends as if it had never been interrupted. It stays when all is done: whoever
+            has written the result elsewhere may delete it.
+        threads: 0 means one per processor; the result does not depend on it.
+        progress: receives "kernels", "score", "lessons", "sparsify", "refine", "evaluate".
+
+    Raises:
+        InvalidViewsError: a photograph cannot be read.
+        OutputError: ``checkpoint`` is of other work, or cannot be written.
+        UnsupportedError: there is no torch to train with; a picture would take too much memory.
+    """
+    teacher = teacher or splats
+    key = "" if checkpoint is None else _key((splats, teacher), count, settings, school)
+    kept = Checkpoint(checkpoint, key)
+    return _Recipe(splats, count, settings, school, teacher, judge, kept, threads, progress).run()
+
+
+def _key(scenes: Sequence[Splats], count: int, settings: CompactSettings, school: School) -> str:
+    """Of the work: equal only where the result is equal."""
+    key = hashlib.sha256(f"{__version__} {count} {settings.model_dump_json()} {school.background}".encode())
+    for view in (*school.train, *school.test):
+        camera = view.camera
+        key.update(camera.viewmat.tobytes() + camera.K.tobytes() + f"{camera.width} {camera.height}".encode())
+        key.update(b"" if view.photo is None else view.load_photo().tobytes())
+    for scene, name in itertools.product(scenes, ATTRIBUTES):
+        key.update(getattr(scene, name).tobytes())
+    return key.hexdigest()
+
+
+@dataclass(frozen=True, slots=True)
+class _Phase:
+    """Of training: so many steps, after which all but ``count`` Gaussians go."""
+
+    name: str
+    steps: int
+    count: int
+
+
+class _Recipe:
+    """One compaction: where it stands is in ``trainee``, ``index`` and ``steps``."""
+
+    def __init__(
+        self,
+        splats: Splats,
+        count: int,
+        settings: CompactSettings,
+        school: School,
+        teacher: Splats,
+        judge: bool,
+        checkpoint: Checkpoint,
+        threads: int,
+        progress: Progress,
+    ) -> None:
+        self.splats, self.count, self.settings = splats, count, settings
+        self.school, self.teacher = school, teacher
+        self.judge, self.checkpoint, self.threads, self.progress = judge, checkpoint, threads, progress
+        self.index: Int[np.ndarray, " M"] = np.arange(len(splats))
+        self.steps: list[CompactionStep] = []
+        self.since = time.perf_counter()
+
+    def run(self) -> Compacted:
+        """All steps, or those that a checkpoint has left."""
+        load_kernels(self.progress)
+        phases = list(self._phases())
+        if not phases:
+            self._done("input", self.splats)
+            scene = self.splats.select(self._prune(self.splats, self.count))
+            self._done("prune", scene)
+            return self._result(scene, "nothing")
+        lessons = self._lessons()
+        begun, done, state = self._begin()
+        for number in range(begun, len(phases)):
+            self._train(phases[number], number, done, state, lessons)
+            done, state = 0, {}
+        self._save(len(phases), 0, {})
+        return self._result(self.trainee.splats(), lessons.taught_by)
+
+    def _phases(self) -> Iterator[_Phase]:
+        chosen = self.settings
+        if chosen.sparsify_steps:
+            rounds = min(chosen.rounds, chosen.sparsify_steps)
+            first, shares = self._first_count(), np.arange(1, rounds + 1) / rounds
+            counts = np.rint(first * (self.count / first) ** shares).astype(int)
+            edges = np.rint(chosen.sparsify_steps * np.concatenate([[0], shares])).astype(int)
+            for steps, count in zip(np.diff(edges), counts, strict=True):
+                yield _Phase("sparsify", int(steps), int(count))
+        if chosen.refine_steps:
+            yield _Phase("refine", chosen.refine_steps, self.count)
+
+    def _first_count(self) -> int:
+        """How many the first pruning leaves."""
+        share = self.settings.first_share if self.settings.sparsify_steps else 1.0
+        return round(len(self.splats) * (self.count / len(self.splats)) ** share)
+
+    def _lessons(self) -> Lessons:
+        from kissgs.training.lessons import lessons
+
+        school = self.school
+        return lessons(self.teacher, school.train, school.background, threads=self.threads, progress=self.progress)
+
+    def _begin(self) -> tuple[int, int, State]:
+        """Prune for a start, or take up what was left: number of the phase, steps of it that are done, its state."""
+        from kissgs.training.trainee import Trainee
+
+        state = self.checkpoint.load()
+        if state is not None:
+            told = json.loads(str(state["told"]))
+            self.index, self.trainee = state["index"], Trainee.restored(state)
+            self.steps = [CompactionStep(**step) for step in told["steps"]]
+            self.since -= told["seconds"]
+            return told["phase"], told["done"], state
+        self._done("input", self.splats)
+        scene = self.splats.select(self._prune(self.splats, self._first_count()))
+        self._done("prune", scene)
+        self.trainee = Trainee(scene)
+        return 0, 0, {}
+
+    def _prune(self, scene: Splats, count: int) -> Int[np.ndarray, " M"]:
+        """Which to keep."""
+        cameras = [view.camera for view in self.school.train]
+        chosen = show_most(
+            *(scene, cameras, self.school.background, count),
+            rounds=self.settings.score_rounds,
+            threads=self.threads,
+            progress=self.progress,
+        )
+        self.index = self.index[chosen]
+        return chosen
+
+    def _train(self, phase: _Phase, number: int, done: int, state: State, lessons: Lessons) -> None:
+        """One phase from a step of it on, and the pruning after it."""
+        from kissgs.compaction.regularizers import Shape
+        from kissgs.compaction.sparsify import Sparsity
+        from kissgs.training.loop import Plan, Regularizer, train
+
+        chosen, wishes = self.settings, list[Regularizer]()
+        if chosen.needle_weight or chosen.flat_weight:
+            wishes.append(Shape(chosen.needle_weight, chosen.flat_weight, lessons.extent))
+        sparsity = None
+        if phase.name == "sparsify" and chosen.rho:
+            sparsity = Sparsity(self.trainee.parameters["opacities"], phase.count, chosen.rho, chosen.interval)
+            wishes.append(sparsity)
+            if state:
+                sparsity.restore(state)
+
+        def after(step: int) -> None:
+            if self.checkpoint.due:
+                self._save(number, step, {} if sparsity is None else sparsity.state())
+
+        plan = Plan(
+            stage=phase.name,
+            steps=phase.steps,
+            rates=self._rates(phase, lessons.extent),
+            ssim_weight=chosen.ssim_weight,
+            seed=(chosen.seed, number),
+            regularizers=tuple(wishes),
+        )
+        train(self.trainee, lessons, plan, first=done, after=after, threads=self.threads, progress=self.progress)
+        scene = self.trainee.splats()
+        self._done(phase.name, scene)
+        if len(scene) > phase.count:
+            self.trainee.keep(self._prune(scene, phase.count))
+            self._done("prune", self.trainee.splats())
+
+    def _rates(self, phase: _Phase, extent: float) -> Rates:
+        """The schedule of 3DGS, continued: rates stay while opacities are made sparse, and then fall."""
+        from kissgs.training.loop import falling
+
+        chosen = self.settings
+        base = {"means": MEANS_RATE * extent, **RATES}
+        begin = {name: chosen.means_rate if name == "means" else 1.0 for name in base}
+        end = {name: chosen.means_rate_end if name == "means" else chosen.rate_end for name in base}
+        return falling(base, begin, end if phase.name == "refine" else begin)
+
+    def _save(self, number: int, done: int, extra: State) -> None:
+        told = {
+            "phase": number,
+            "done": done,
+            "seconds": time.perf_counter() - self.since,
+            "steps": [asdict(step) for step in self.steps],
+        }
+        state = {**self.trainee.state(), **extra, "index": self.index, "told": np.asarray(json.dumps(told))}
+        self.checkpoint.save(state)
+
+    def _done(self, name: str, scene: Splats) -> None:
+        """Note a step: what it took, and if asked for, what it gave."""
+        seconds = time.perf_counter() - self.since
+        psnr = ssim = size = None
+        if self.judge:
+            likeness = evaluate(
+                *(self.teacher, scene, self.school.exam),
+                threads=self.threads,
+                progress=as_stage("evaluate", self.progress),
+            ).mean.candidate
+            fast = Settings.from_preset("fast").encode
+            psnr, ssim = likeness.psnr, likeness.ssim
+            size = len(zip_bytes(encode(scene, fast, threads=self.threads).files))
+        self.steps.append(
+            CompactionStep(name=name, count=len(scene), seconds=seconds, psnr=psnr, ssim=ssim, bytes=size)
+        )
+        self.since = time.perf_counter()
+
+    def _result(self, scene: Splats, taught_by: str) -> Compacted:
+        report = CompactionReport(
+            source_count=len(self.splats),
+            count=len(scene),
+            taught_by=taught_by,
+            source=self.school.source,
+            steps=tuple(self.steps),
+        )
+        return Compacted(scene, self.index, report)

@@ -1,0 +1,152 @@
+"""Ways to have fewer Gaussians, side by side: what each gives at the same count, after the same number of steps."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from kissgs._typing import Int
+from kissgs.compaction.popspa import popspa
+from kissgs.compaction.school import school
+from kissgs.compaction.scoring import highest
+from kissgs.evaluation.pictures import evaluate
+from kissgs.progress import Progress, as_stage, silent
+from kissgs.settings import CompactSettings, Settings
+from kissgs.sogxt.container import zip_bytes
+from kissgs.sogxt.encode import encode
+from kissgs.splats import Splats
+from kissgs.views.view import Views
+
+RATIOS = (0.7, 0.5, 0.3, 0.2, 0.1, 0.05)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Point:
+    """One way at one count.
+
+    Attributes:
+        way: its name in :data:`WAYS`, or "input".
+        count: Gaussians left.
+        psnr: decibels, mean over held-out views: to photographs, or to the input's renderings where there are none.
+        ssim: the same.
+        bytes: of its container as the preset ``fast`` makes it.
+        seconds: wall time.
+        cpu_seconds: of all threads.
+    """
+
+    way: str
+    count: int
+    psnr: float
+    ssim: float
+    bytes: int
+    seconds: float
+    cpu_seconds: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """For machines."""
+        return asdict(self)
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """One of them: whom it begins from, and what the recipe's settings are then.
+
+    Attributes:
+        name: for people.
+        start: which Gaussians, given the scene and the count; None for those that score best.
+        changes: of the settings, given the number of steps that all ways have.
+    """
+
+    name: str
+    start: Callable[[Splats, int], Int[np.ndarray, " M"]] | None = None
+    changes: Callable[[int], dict[str, Any]] = field(default=lambda steps: {})
+
+
+def by_chance(splats: Splats, count: int) -> Int[np.ndarray, " M"]:
+    """Any, the same each time."""
+    return np.sort(np.random.default_rng(0).permutation(len(splats))[:count])
+
+
+def by_opacity(splats: Splats, count: int) -> Int[np.ndarray, " M"]:
+    """The most opaque ones."""
+    return highest(splats.opacities, count)
+
+
+def _no_steps(steps: int) -> dict[str, Any]:
+    return {"sparsify_steps": 0, "refine_steps": 0}
+
+
+def _refined(steps: int) -> dict[str, Any]:
+    return {"sparsify_steps": 0, "refine_steps": steps}
+
+
+WAYS = (
+    Way("random", by_chance, _no_steps),
+    Way("opacity", by_opacity, _no_steps),
+    Way("POP", changes=lambda steps: {**_no_steps(steps), "score_rounds": 1}),
+    Way("POP in rounds", changes=_no_steps),
+    Way("random + refine", by_chance, _refined),
+    Way("opacity + refine", by_opacity, _refined),
+    Way("POP + refine", changes=lambda steps: {**_refined(steps), "score_rounds": 1}),
+    Way("POP in rounds + refine", changes=_refined),
+    Way("one pruning half-way", changes=lambda steps: {"rounds": 1, "rho": 0, "needle_weight": 0, "flat_weight": 0}),
+    Way("+ sparsify (POPSpa without erank)", changes=lambda steps: {"rounds": 1, "needle_weight": 0, "flat_weight": 0}),
+    Way("+ erank (POPSpa)", changes=lambda steps: {"rounds": 1, "needle_weight": 0.002, "flat_weight": 0.0}),
+    Way("prunings along the way, no sparsify", changes=lambda steps: {"rho": 0}),
+    Way("as set"),
+)
+"""All of them, the cheapest first."""
+
+
+def study(
+    splats: Splats,
+    settings: CompactSettings,
+    views: Views | None = None,
+    *,
+    ratios: Sequence[float] = RATIOS,
+    ways: Sequence[Way] = WAYS,
+    threads: int = 0,
+    progress: Progress = silent,
+) -> list[Point]:
+    """Try every way at every ratio.
+
+    Args:
+        splats: clean.
+        settings: of the recipe; ways that differ from it have as many steps in all.
+        views: a capture; by default virtual views, with the scene as the teacher.
+        ratios: counts, as shares of the scene's.
+        ways: some of :data:`WAYS`.
+        threads: 0 means one per processor.
+        progress: receives the stages of the recipe.
+    """
+    taught = school(splats, views, count=settings.views, size=settings.view_size, threads=threads, progress=progress)
+    steps = settings.sparsify_steps + settings.refine_steps
+
+    def judged(way: str, scene: Splats, seconds: float, cpu_seconds: float) -> Point:
+        receive = as_stage("evaluate", progress)
+        likeness = evaluate(splats, scene, taught.exam, threads=threads, progress=receive).mean.candidate
+        files = encode(scene, Settings.from_preset("fast").encode, threads=threads).files
+        return Point(
+            way=way,
+            count=len(scene),
+            psnr=likeness.psnr,
+            ssim=likeness.ssim,
+            bytes=len(zip_bytes(files)),
+            seconds=seconds,
+            cpu_seconds=cpu_seconds,
+        )
+
+    points = [judged("input", splats, 0.0, 0.0)]
+    for way in ways:
+        for ratio in ratios:
+            count = max(1, round(len(splats) * ratio))
+            chosen = CompactSettings(**{**settings.model_dump(), **way.changes(steps)})
+            wall, cpu = time.perf_counter(), time.process_time()
+            scene = splats if way.start is None else splats.select(way.start(splats, count))
+            found = popspa(scene, count, chosen, taught, teacher=splats, threads=threads, progress=progress)
+            points.append(judged(way.name, found.splats, time.perf_counter() - wall, time.process_time() - cpu))
+    return points

@@ -1,0 +1,8 @@
+"""What the user may choose: one model per stage, and the presets. Every setting says what it trades."""
+
+from kissgs.settings.all import Settings
+from kissgs.settings.compact import CompactSettings
+from kissgs.settings.encode import EncodeSettings
+from kissgs.settings.presets import PRESETS, Preset
+
+__all__ = ["PRESETS", "CompactSettings", "EncodeSettings", "Preset", "Settings"]

@@ -1,0 +1,67 @@
+"""``Settings``: one group per stage, filled from a preset."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from kissgs.errors import UnsupportedError
+from kissgs.settings.compact import CompactSettings
+from kissgs.settings.encode import EncodeSettings
+from kissgs.settings.presets import PRESETS, Preset
+
+GROUPS: dict[str, type[BaseModel]] = {"compact": CompactSettings, "encode": EncodeSettings}
+
+
+class Settings(BaseModel):
+    """All settings of a compression: one group per stage."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    preset: Preset = Field(Preset.BALANCED, description="Where settings that are not given come from.")
+    compact: CompactSettings = CompactSettings()
+    encode: EncodeSettings = EncodeSettings()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_from_preset(cls, given: Any) -> Any:  # noqa: ANN401
+        if not isinstance(given, dict) or given.get("preset", Preset.BALANCED) not in list(Preset):
+            return given  # not ours to judge: validation says what is wrong with it
+        chosen = PRESETS[Preset(given.get("preset", Preset.BALANCED))]
+        return {**given, **{name: _filled(given.get(name, {}), chosen[name]) for name in GROUPS}}
+
+    @classmethod
+    def from_preset(
+        cls,
+        preset: Preset | str = Preset.BALANCED,
+        *,
+        compact: Mapping[str, Any] | None = None,
+        **encode: Any,  # noqa: ANN401
+    ) -> Settings:
+        """Settings of a preset, with single ones of the encoder replaced, and those of ``compact`` of the compaction.
+
+        Raises:
+            UnsupportedError: no such preset or setting, or a value that is not possible.
+        """
+        if preset not in list(Preset):
+            raise UnsupportedError(f"there is no preset {preset!r}; choose one of {', '.join(Preset)}")
+        try:
+            return cls.model_validate({"preset": preset, "compact": dict(compact or {}), "encode": encode})
+        except ValidationError as error:
+            problem = error.errors()[0]
+            group, name = str(problem["loc"][0]), str(problem["loc"][-1])
+            if problem["type"] == "extra_forbidden":
+                known = ", ".join(GROUPS[group].model_fields)
+                raise UnsupportedError(f"there is no setting {name!r} of {group}; there are {known}") from error
+            if problem["type"] == "value_error":
+                raise UnsupportedError(str(problem["ctx"]["error"])) from error
+            raise UnsupportedError(f"setting {name}: {problem['msg'].lower()}, not {problem['input']!r}") from error
+
+
+def _filled(group: Any, preset: Mapping[str, Any]) -> Any:  # noqa: ANN401
+    """What is given of a group, and the rest from the preset."""
+    if isinstance(group, BaseModel):
+        group = group.model_dump(include=group.model_fields_set)
+    return {**preset, **group} if isinstance(group, dict) else group

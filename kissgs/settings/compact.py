@@ -1,0 +1,82 @@
+"""``CompactSettings``: how a scene comes to have fewer Gaussians."""
+
+from __future__ import annotations
+
+from typing import Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+
+class CompactSettings(BaseModel):
+    """How many Gaussians are left, and how they learn to do the work of the others."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    count: int | None = Field(None, ge=1, description="Keep so many Gaussians; a scene with fewer stays as it is.")
+    ratio: float | None = Field(None, gt=0, le=1, description="Keep this share of the Gaussians.")
+    max_psnr_drop: float | None = Field(
+        None,
+        gt=0,
+        le=20,
+        description="Keep as few as are found whose pictures from held-out views lose at most so many decibels. "
+        "Takes several compactions.",
+    )
+    score_rounds: int = Field(
+        4, ge=1, le=64, description="Pruning in so many rounds, each scored anew: one Gaussian may cover for another."
+    )
+    first_share: float = Field(
+        0.43,
+        ge=0,
+        le=1,
+        description="How much of the way the first pruning goes, on a scale of ratios: of a scene that shall keep "
+        "20 %, 0.43 keeps 50 %.",
+    )
+    sparsify_steps: int = Field(
+        2500, ge=0, le=1_000_000, description="Steps of training while the rest of the Gaussians go; 0: all go at once."
+    )
+    rounds: int = Field(
+        5,
+        ge=1,
+        le=1000,
+        description="Prunings along these steps, by the same factor each; the paper has one, at their end.",
+    )
+    refine_steps: int = Field(2500, ge=0, le=1_000_000, description="Steps of training when all have gone.")
+    rho: float = Field(
+        5e-4, ge=0, le=10, description="How hard opacities of those that shall go next are drawn to 0 before; 0: not."
+    )
+    interval: int = Field(50, ge=1, le=100_000, description="Steps between two such pulls.")
+    needle_weight: float = Field(
+        0.0, ge=0, le=100, description="Of effective rank in the loss: keeps Gaussians from becoming needles."
+    )
+    flat_weight: float = Field(
+        0.0,
+        ge=0,
+        le=1000,
+        description="Of the smallest extent of each Gaussian in the loss, in extents of the cameras.",
+    )
+    ssim_weight: float = Field(0.2, ge=0, le=1, description="Of 1 - SSIM in the loss; the rest is absolute difference.")
+    means_rate: float = Field(
+        1.0, gt=0, le=100, description="Learning rate of positions, in units of that with which 3DGS begins."
+    )
+    means_rate_end: float = Field(0.01, gt=0, le=100, description="The same at the end of the last steps.")
+    rate_end: float = Field(
+        1.0, gt=0, le=100, description="All other learning rates at the end, in units of those of 3DGS."
+    )
+    views: int = Field(96, ge=1, le=10_000, description="Virtual views, where there is no capture to learn from.")
+    view_size: int = Field(640, ge=16, le=8192, description="Longer side of pictures to learn from, pixels, at most.")
+    seed: int = Field(0, ge=0, lt=2**31, description="Of the order of the pictures. Same seed: same scene.")
+
+    @property
+    def wanted(self) -> bool:
+        """Whether a budget is given: without one, a scene keeps all its Gaussians."""
+        return any(getattr(self, name) is not None for name in BUDGETS)
+
+    @model_validator(mode="after")
+    def _one_budget(self) -> Self:
+        given = [name for name in BUDGETS if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise ValueError(f"{given[0]} and {given[1]} cannot both be met; give one")
+        return self
+
+
+BUDGETS = ("count", "ratio", "max_psnr_drop")

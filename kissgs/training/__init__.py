@@ -1,0 +1,1 @@
+"""Fitting Gaussians to pictures: what compaction and fine-tuning have in common."""

@@ -1,0 +1,98 @@
+"""What a scene is fitted to: photographs, or pictures of the scene itself as it was."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from kissgs._typing import Float32, Shaped
+from kissgs.progress import Progress, silent
+from kissgs.rendering.camera import Camera
+from kissgs.rendering.rasterizer import render
+from kissgs.splats import Splats
+from kissgs.views.view import View
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lessons:
+    """Cameras and what they should see.
+
+    Attributes:
+        cameras: one or more.
+        pictures: for each ``(H, W, 3)``: uint8 of photographs, float16 from 0 to 1 of renderings.
+        background: ``(3,)`` RGB over which to render.
+        taught_by: where the pictures come from.
+    """
+
+    cameras: tuple[Camera, ...]
+    pictures: tuple[Shaped[np.ndarray, "H W 3"], ...]
+    background: Float32[np.ndarray, "3"]
+    taught_by: Literal["photos", "renderings"]
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def picture(self, n: int) -> Float32[np.ndarray, "H W 3"]:
+        """What the camera ``n`` should see, from 0 to 1."""
+        picture = self.pictures[n]
+        return picture.astype(np.float32) / np.float32(255 if picture.dtype == np.uint8 else 1)
+
+    def order(self, seed: Sequence[int], first: int = 0) -> Iterator[int]:
+        """Which to take at step ``first`` and those after it: all once in an order of chance, all again in another.
+
+        It depends on nothing but the seed and the step, so that work can be taken up where it was left.
+        """
+        count = len(self)
+        while True:
+            round_, begin = divmod(first, count)
+            order = np.random.default_rng([*seed, round_]).permutation(count)
+            yield from order[begin:].tolist()
+            first += count - begin
+
+    @property
+    def extent(self) -> float:
+        """Of the cameras, world units: 1.1 times the greatest distance from their middle, as 3DGS measures a scene."""
+        places = np.array([camera.position for camera in self.cameras])
+        return 1.1 * float(np.linalg.norm(places - places.mean(axis=0), axis=1).max())
+
+
+def lessons(
+    teacher: Splats,
+    views: Sequence[View],
+    background: Float32[np.ndarray, "3"],
+    *,
+    threads: int = 0,
+    progress: Progress = silent,
+) -> Lessons:
+    """The photographs of ``views`` if all have one, else what ``teacher`` looks like from there.
+
+    Args:
+        teacher: finite.
+        views: at the size at which to learn; one or more.
+        background: RGB over which to render.
+        threads: 0 means one per processor.
+        progress: receives the stage ``"lessons"``.
+
+    Raises:
+        InvalidViewsError: a photograph cannot be read.
+        UnsupportedError: a picture would take too much memory.
+    """
+    photographed = all(view.photo is not None for view in views)
+    pictures = []
+    for done, view in enumerate(views):
+        progress("lessons", done / len(views))
+        if photographed:
+            pictures.append(view.load_photo())
+        else:
+            image, _ = render(teacher, view.camera, background=background.tolist(), threads=threads)
+            pictures.append(np.clip(image, 0, 1).astype(np.float16))
+    progress("lessons", 1.0)
+    return Lessons(
+        cameras=tuple(view.camera for view in views),
+        pictures=tuple(pictures),
+        background=background,
+        taught_by="photos" if photographed else "renderings",
+    )

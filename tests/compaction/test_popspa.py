@@ -1,0 +1,199 @@
+"""Oracle: the parts called one by one, the same work without interruption, and pictures of the scene as it was."""
+
+import itertools
+
+import numpy as np
+import pytest
+from training_scenes import around, cloud, same
+
+import kissgs
+from kissgs import CompactSettings, OutputError
+from kissgs.compaction import popspa as recipe
+from kissgs.compaction.popspa import popspa
+from kissgs.compaction.school import School, school
+from kissgs.compaction.scoring import show_most
+from kissgs.progress import silent
+from kissgs.rendering.rasterizer import render
+from kissgs.splats import ATTRIBUTES
+from kissgs.training.checkpoint import Checkpoint
+from kissgs.views.view import black
+
+SHORT = {"sparsify_steps": 8, "refine_steps": 6, "rounds": 2, "score_rounds": 2, "interval": 3}
+
+
+def taught():
+    return School(around(5), around(3), black(), "five views")
+
+
+def settings(**changes):
+    return CompactSettings(**{**SHORT, **changes})
+
+
+def error(scene, original, views):
+    pictures = [[render(one, view.camera)[0] for one in (scene, original)] for view in views]
+    return np.mean([(a - b) ** 2 for a, b in pictures])
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"rounds": 1},
+        {"rounds": 8},
+        {"rounds": 1000},
+        {"sparsify_steps": 0},
+        {"refine_steps": 0},
+        {"sparsify_steps": 0, "refine_steps": 0},
+        {"first_share": 0.0},
+        {"first_share": 1.0},
+        {"rho": 0.0},
+        {"needle_weight": 0.1, "flat_weight": 0.1},
+    ],
+)
+@pytest.mark.parametrize("count", [1, 13, 59])
+def test_exactly_so_many_are_left_and_it_says_which(count, changes):
+    scene = cloud(60)
+    result = popspa(scene, count, settings(**changes), taught())
+    assert len(result.splats) == len(result.index) == result.report.count == count
+    assert result.report.source_count == 60
+    assert (np.diff(result.index) > 0).all()
+    assert all(np.isfinite(getattr(result.splats, name)).all() for name in ATTRIBUTES)
+    near = np.linalg.norm(result.splats.means - scene.means[result.index], axis=1)
+    assert near.max() < 0.2, "each is where it was, or not far"
+    counts = [step.count for step in result.report.steps]
+    assert counts[0] == 60
+    assert counts == sorted(counts, reverse=True)
+
+
+def test_without_training_it_is_pruning_alone():
+    scene, taught_by = cloud(60), taught()
+    result = popspa(scene, 20, settings(sparsify_steps=0, refine_steps=0), taught_by)
+    kept = show_most(scene, [view.camera for view in taught_by.train], black(), 20, rounds=2)
+    assert (result.index == kept).all()
+    assert same(result.splats, scene.select(kept))
+    assert result.report.taught_by == "nothing"
+
+
+def test_training_makes_up_for_what_went():
+    scene, taught_by = cloud(200), taught()
+    pruned = popspa(scene, 60, settings(sparsify_steps=0, refine_steps=0), taught_by)
+    fitted = popspa(scene, 60, settings(sparsify_steps=60, refine_steps=120), taught_by)
+    assert error(fitted.splats, scene, taught_by.train) < 0.5 * error(pruned.splats, scene, taught_by.train)
+
+
+def test_the_steps_are_told():
+    result = popspa(cloud(100), 20, settings(first_share=0.5), taught(), judge=True)
+    names = [step.name for step in result.report.steps]
+    assert names == ["input", "prune", "sparsify", "prune", "sparsify", "prune", "refine"]
+    assert [step.count for step in result.report.steps] == [100, 45, 45, 30, 30, 20, 20]
+    first, *others = result.report.steps
+    assert first.psnr == float("inf")
+    assert first.ssim == 1
+    assert all(0 < step.psnr < 100 and step.ssim < 1 and step.bytes < first.bytes for step in others)
+    assert result.report.as_dict()["steps"][0]["psnr"] is None
+
+
+def test_the_same_seed_gives_the_same_scene_whatever_the_threads():
+    found = [popspa(cloud(300, 2), 50, settings(), taught(), threads=threads) for threads in (1, 2, 3)]
+    assert same(found[0].splats, found[1].splats)
+    assert same(found[0].splats, found[2].splats)
+    assert not same(found[0].splats, popspa(cloud(300, 2), 50, settings(seed=1), taught()).splats)
+
+
+class Interrupted(Exception):
+    pass
+
+
+def stopping_after(steps):
+    left = itertools.count(steps - 1, -1)
+
+    def progress(stage, fraction, note=""):
+        if stage in ("sparsify", "refine") and next(left) < 0:
+            raise Interrupted
+
+    return progress
+
+
+@pytest.mark.parametrize("steps", [0, 2, 4, 5, 9, 10, 13, 15])
+def test_what_was_interrupted_ends_as_if_it_had_not_been(tmp_path, monkeypatch, steps):
+    monkeypatch.setattr(Checkpoint, "due", True)
+    whole = popspa(cloud(80), 20, settings(), taught(), judge=True)
+    path = tmp_path / "c.npz"
+    with pytest.raises(Interrupted):
+        popspa(cloud(80), 20, settings(), taught(), judge=True, checkpoint=path, progress=stopping_after(steps))
+    assert path.exists() == (steps > 0)
+    resumed = []
+    again = popspa(
+        *(cloud(80), 20, settings(), taught()),
+        judge=True,
+        checkpoint=path,
+        progress=lambda stage, fraction, note="": resumed.append(stage),
+    )
+    assert same(whole.splats, again.splats)
+    assert (whole.index == again.index).all()
+    told = [[(step.name, step.count, step.psnr, step.bytes) for step in one.report.steps] for one in (whole, again)]
+    assert told[0] == told[1]
+    assert steps <= 10 or "sparsify" not in resumed
+    begun = []
+    third = popspa(
+        *(cloud(80), 20, settings(), taught()),
+        checkpoint=path,
+        progress=lambda stage, fraction, note="": begun.append(stage),
+    )
+    assert same(whole.splats, third.splats), "what was finished is not done again"
+    assert set(begun) == {"kernels", "lessons"}
+
+
+@pytest.mark.parametrize("other", ["scene", "count", "settings", "views"])
+def test_the_checkpoint_of_other_work_is_refused(tmp_path, monkeypatch, other):
+    monkeypatch.setattr(Checkpoint, "due", True)
+    path = tmp_path / "c.npz"
+    with pytest.raises(Interrupted):
+        popspa(cloud(80), 20, settings(), taught(), checkpoint=path, progress=stopping_after(3))
+    work = {
+        "scene": (cloud(80, seed=5), 20, settings(), taught()),
+        "count": (cloud(80), 21, settings(), taught()),
+        "settings": (cloud(80), 20, settings(rho=1e-3), taught()),
+        "views": (cloud(80), 20, settings(), School(around(4), around(3), black(), "four views")),
+    }
+    with pytest.raises(OutputError, match="checkpoint of other work"):
+        popspa(*work[other], checkpoint=path)
+    assert path.exists()
+
+
+def test_a_full_disk_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(Checkpoint, "due", True)
+    with pytest.raises(OutputError, match="cannot write"):
+        popspa(cloud(80), 20, settings(), taught(), checkpoint=tmp_path / "nowhere" / "c.npz")
+
+
+def test_virtual_views_teach_where_there_is_no_capture():
+    scene = kissgs.sample_scene(400, sh_degree=0)
+    found = school(scene, None, count=16, size=50)
+    assert (len(found.train), len(found.test)) == (14, 2)
+    assert all(max(view.camera.width, view.camera.height) <= 50 for view in found.train)
+    result = popspa(scene, 100, settings(), found)
+    assert result.report.taught_by == "renderings"
+    assert result.report.source == "16 virtual cameras"
+
+
+def test_nothing_is_seen():
+    """All cameras look away: every score is 0, and the first Gaussians stay."""
+    scene = cloud(30)
+    far = kissgs.Splats(**{**{n: getattr(scene, n) for n in ATTRIBUTES}, "means": scene.means + np.float32(500)})
+    result = popspa(far, 10, settings(rho=0), taught())
+    assert result.index.tolist() == list(range(10))
+    assert same(result.splats, far.select(result.index))
+
+
+def test_phases_are_by_the_same_factor():
+    """In each, as many steps as in the others, give or take one."""
+    chosen = settings(sparsify_steps=10, rounds=3, first_share=0.0)
+    made = recipe._Recipe(cloud(100), 10, chosen, taught(), cloud(100), False, Checkpoint(None, ""), 0, silent)
+    phases = list(made._phases())
+    assert [(phase.name, phase.steps, phase.count) for phase in phases] == [
+        ("sparsify", 3, 46),
+        ("sparsify", 4, 22),
+        ("sparsify", 3, 10),
+        ("refine", 6, 10),
+    ]

@@ -1,0 +1,56 @@
+"""Oracle: counting, and for a pile of copies, knowing that one of them is enough. Scores: tests/rendering."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from training_scenes import around, cloud
+
+import kissgs
+from kissgs.compaction.scoring import highest, show_most
+from kissgs.rendering.rasterizer import removal_scores
+from kissgs.splats import ATTRIBUTES
+from kissgs.views.view import black
+
+CAMERAS = [view.camera for view in around()]
+
+
+@given(st.lists(st.sampled_from([0.0, 1.0, 2.5, 7.0]), max_size=12), st.integers(0, 14))
+def test_exactly_so_many_the_highest_and_of_equal_ones_the_first(scores, count):
+    chosen = highest(np.array(scores), count).tolist()
+    best = sorted(range(len(scores)), key=lambda n: (-scores[n], n))[:count]
+    assert chosen == sorted(best)
+
+
+def test_in_one_round_those_with_the_highest_scores_stay():
+    scene = cloud(80)
+    scores = removal_scores(scene, CAMERAS)
+    assert show_most(scene, CAMERAS, black(), 20).tolist() == sorted(np.argsort(-scores)[:20].tolist())
+
+
+@pytest.mark.parametrize("rounds", [1, 2, 3, 10, 50])
+@pytest.mark.parametrize("count", [1, 7, 79])
+def test_however_many_rounds_exactly_so_many_stay(rounds, count):
+    kept = show_most(cloud(80), CAMERAS, black(), count, rounds=rounds)
+    assert len(kept) == count
+    assert (np.diff(kept) > 0).all()
+
+
+def test_rounds_do_not_throw_away_both_of_a_pair():
+    """Two opaque ones at each place: each is superfluous as long as the other is there."""
+    scene = cloud(20, 0, seed=3)
+    opaque = {**{name: getattr(scene, name) for name in ATTRIBUTES}, "opacities": np.full(20, 5, np.float32)}
+    pairs = kissgs.Splats(**{name: np.concatenate([value, value]) for name, value in opaque.items()})
+
+    def places(rounds):
+        return len(set((show_most(pairs, CAMERAS, black(), 20, rounds=rounds) % 20).tolist()))
+
+    assert places(20) > places(1)
+    assert places(20) >= 15
+
+
+def test_progress_rises_to_the_end():
+    told = []
+    show_most(cloud(30), CAMERAS, black(), 5, rounds=3, progress=lambda stage, fraction, note="": told.append(fraction))
+    assert told == sorted(told)
+    assert told[-1] == 1.0

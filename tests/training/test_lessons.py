@@ -1,0 +1,56 @@
+"""Oracle: the photographs and renderings themselves; for the order, counting."""
+
+from collections import Counter
+from itertools import islice
+
+import numpy as np
+import pytest
+from PIL import Image
+from training_scenes import around, cloud, taught
+
+from kissgs.rendering.rasterizer import render
+from kissgs.training.lessons import lessons
+from kissgs.views.view import View, black
+
+
+def test_without_photographs_the_scene_itself_is_the_teacher():
+    scene, views = cloud(), around(3)
+    found = lessons(scene, views, np.float32([0.2, 0.4, 0.6]))
+    assert found.taught_by == "renderings"
+    assert len(found) == 3
+    for n, view in enumerate(views):
+        image, _ = render(scene, view.camera, background=(0.2, 0.4, 0.6))
+        assert found.picture(n).dtype == np.float32
+        np.testing.assert_allclose(found.picture(n), np.clip(image, 0, 1), atol=3e-4)
+
+
+def test_photographs_are_what_is_learned_where_all_views_have_one(tmp_path):
+    pictures = np.random.default_rng(0).integers(0, 256, (2, 32, 40, 3), dtype=np.uint8)
+    views = []
+    for n, (view, picture) in enumerate(zip(around(2), pictures, strict=True)):
+        Image.fromarray(picture).save(tmp_path / f"{n}.png")
+        views.append(View(view.name, view.camera, tmp_path / f"{n}.png"))
+    found = lessons(cloud(), views, black())
+    assert found.taught_by == "photos"
+    np.testing.assert_array_equal(found.picture(1), pictures[1].astype(np.float32) / np.float32(255))
+    assert lessons(cloud(), [views[0], around(2)[1]], black()).taught_by == "renderings"
+
+
+@pytest.mark.parametrize("first", [0, 1, 3, 4, 9])
+def test_the_order_can_be_taken_up_anywhere(first):
+    found = taught(cloud())
+    whole = list(islice(found.order((7,)), 40))
+    assert list(islice(found.order((7,), first), 40 - first)) == whole[first:]
+
+
+def test_every_view_comes_once_in_every_round():
+    found = taught(cloud())
+    steps = list(islice(found.order((0, 1)), 20))
+    assert all(Counter(steps[n : n + 4]) == Counter(range(4)) for n in range(0, 20, 4))
+    assert steps != list(islice(found.order((0, 2)), 20))
+    assert len({tuple(steps[n : n + 4]) for n in range(0, 20, 4)}) > 1
+
+
+def test_the_extent_is_that_of_the_cameras():
+    """A circle of radius 3: in INRIA's code, 1.1 times the largest distance from the mean."""
+    assert taught(cloud()).extent == pytest.approx(3.3)
