@@ -37,6 +37,20 @@ def bench(
     rendering: Annotated[
         bool, typer.Option("--rendering", help="Measure the rasteriser instead: pictures, gradients, loss, scores.")
     ] = False,
+    compaction: Annotated[
+        bool,
+        typer.Option("--compaction", help="Measure ways to have fewer Gaussians instead, with each preset's training."),
+    ] = False,
+    ratios: Annotated[
+        list[float] | None,
+        typer.Option("--ratio", min=0, max=1, help="With --compaction: keep this share. Repeat for several."),
+    ] = None,
+    ways: Annotated[
+        list[str] | None, typer.Option("--way", help="With --compaction: only this way. Repeat for several.")
+    ] = None,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="With --compaction: PSNR over count, as .svg, .png or .pdf.")
+    ] = None,
     gaussians: Annotated[
         list[int] | None,
         typer.Option(min=1, help="With --rendering: resample the scene to so many. Repeat for several."),
@@ -50,7 +64,18 @@ def bench(
 ) -> None:
     """Measure bytes, time, memory and errors of presets and of other tools, each in a process of its own."""
     capture = open_views(views, scale=scale, images=images, resolution=resolution)
-    if rendering:
+    rows: list[dict[str, Any]]
+    table: RenderableType
+    if not compaction and (ratios or ways or plot):
+        raise UnsupportedError("--ratio, --way and --plot go with --compaction")
+    if compaction:
+        from kissgs._cli_curves import compaction_curves
+
+        if rendering or peers or gaussians or len(presets or []) > 1:
+            raise UnsupportedError("--compaction goes with one --preset, and with nothing else that is measured")
+        preset = (presets or ["balanced"])[0]
+        rows, table = compaction_curves(expand(scenes), preset, changes, ratios, ways, plot, capture, threads)
+    elif rendering:
         if presets or peers:
             raise UnsupportedError("--rendering measures the rasteriser, no presets and no peers")
         rows, table = _rendering(expand(scenes), gaussians, capture, threads)

@@ -69,6 +69,11 @@ class Report:
         """Of the whole zip, per Gaussian of the scene."""
         return self.container_bytes / max(self.source_count, 1)
 
+    @property
+    def compacted(self) -> int:
+        """Gaussians that compaction left out."""
+        return 0 if self.compaction is None else self.compaction.source_count - self.compaction.count
+
     def as_dict(self) -> dict[str, Any]:
         """For machines."""
         derived = {"ratio": self.ratio, "bytes_per_gaussian": self.bytes_per_gaussian}

@@ -75,6 +75,7 @@ def _compress(order: dict[str, Any], send: Send) -> dict[str, Any]:
         "report": _described(folder / "report.json"),
         "files": files,
         "count": report["count"],
+        "compacted": result.report.compacted,
         "invisible": report["invisible"],
         "cleaned": report["cleaned"],
         "seconds": report["seconds"],

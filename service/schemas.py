@@ -11,16 +11,35 @@ import kissgs
 from service.models import State
 from service.problems import Problem
 
+COMPACTED = "+compact"
+"""After the preset, in the kind of a job."""
+
 
 class JobOptions(kissgs.Settings):
     """How to compress: a preset, and single settings of its stages replaced."""
 
     model_config = ConfigDict(
         title="JobOptions",
-        json_schema_extra={"examples": [{"preset": "balanced"}, {"preset": "small", "encode": {"seed": 7}}]},
+        json_schema_extra={
+            "examples": [
+                {"preset": "balanced"},
+                {"preset": "small", "encode": {"seed": 7}},
+                {"compact": {"ratio": 0.2}},
+            ]
+        },
     )
 
     evaluate: bool = Field(False, description="Also render both scenes and compare the pictures (PSNR, SSIM); slower.")
+
+    @property
+    def kind(self) -> str:
+        """What its duration depends on beside the scene: the preset, and whether Gaussians are to go."""
+        return f"{self.preset}{COMPACTED if self.compact.wanted else ''}"
+
+    @property
+    def trains(self) -> bool:
+        """Whether what is left of the scene is to be fitted to pictures of it."""
+        return self.compact.wanted and self.compact.sparsify_steps + self.compact.refine_steps > 0
 
 
 class Wire(BaseModel):
@@ -92,6 +111,7 @@ class JobStatus(Wire):
     gaussians: int = Field(description="In the upload.")
     sh_degree: int = Field(ge=0, le=3)
     kept: int | None = Field(None, description="Gaussians in the container.")
+    compacted: int | None = Field(None, description="Gaussians left out by compaction, whose work others do.")
     invisible: int | None = Field(None, description="Gaussians left out because no renderer would draw them.")
     cleaned: dict[str, int] | None = Field(None, description="What was wrong with the upload and was mended, counted.")
     evaluation: dict[str, Any] | None = Field(None, description="PSNR and SSIM to the upload's own renderings.")
@@ -127,6 +147,7 @@ class Limits(Wire):
     sync_seconds: float
     max_wait_seconds: float
     keys_required: bool
+    training: bool = Field(description="Whether compaction can train here; where not, only the preset fast compacts.")
 
 
 class PresetFacts(Wire):

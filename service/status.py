@@ -74,6 +74,7 @@ def status_of(job: Job, outlook: Outlook) -> JobStatus:
         gaussians=job.gaussians,
         sh_degree=job.sh_degree,
         kept=result.get("count"),
+        compacted=result.get("compacted"),
         invisible=result.get("invisible"),
         cleaned=result.get("cleaned"),
         evaluation=result.get("evaluation"),

@@ -17,6 +17,7 @@ from service.admission import FULL_SECONDS
 from service.context import Context
 from service.models import Job
 from service.multipart import PartBegin, PartData, parts
+from service.presets import can_train
 from service.problems import ProblemError, fields_of
 from service.schemas import JobOptions
 from service.store import Refused
@@ -104,12 +105,19 @@ def parse_options(text: str | bytes) -> JobOptions:
         ProblemError: they are none; every field that is wrong is named.
     """
     try:
-        return JobOptions.model_validate_json(text)
+        options = JobOptions.model_validate_json(text)
     except ValidationError as error:
         named, found = fields_of(error.errors())
         raise ProblemError(
             "invalid-request", f"the options cannot be used: {named}; GET /v1/presets shows all settings", errors=found
         ) from error
+    if options.trains and not can_train():
+        raise ProblemError(
+            "invalid-request",
+            "this service has no torch to train with, so it compacts with the preset fast only; whoever runs it can "
+            "install kissgs[train]",
+        )
+    return options
 
 
 def _check_headers(request: Request, kind: str) -> None:
@@ -191,7 +199,7 @@ def _queue(context: Context, submission: Submission, owner: str) -> tuple[Job, b
         owner=owner,
         name=submission.name,
         options=options.model_dump(mode="json"),
-        preset=options.preset,
+        preset=options.kind,
         evaluate=options.evaluate,
         gaussians=received.info.count,
         sh_degree=received.info.sh_degree,

@@ -125,13 +125,13 @@ class _Recipe:
         phases = list(self._phases())
         if not phases:
             self._done("input", self.splats)
-            scene = self.splats.select(self._prune(self.splats, self.count))
+            scene = self.splats.select(self._prune(self.splats, self.count, self.progress))
             self._done("prune", scene)
             return self._result(scene, "nothing")
         lessons = self._lessons()
         begun, done, state = self._begin()
         for number in range(begun, len(phases)):
-            self._train(phases[number], number, done, state, lessons)
+            self._train(phases, number, done, state, lessons)
             done, state = 0, {}
         self._save(len(phases), 0, {})
         return self._result(self.trainee.splats(), lessons.taught_by)
@@ -171,30 +171,31 @@ class _Recipe:
             self.since -= told["seconds"]
             return told["phase"], told["done"], state
         self._done("input", self.splats)
-        scene = self.splats.select(self._prune(self.splats, self._first_count()))
+        scene = self.splats.select(self._prune(self.splats, self._first_count(), self.progress))
         self._done("prune", scene)
         self.trainee = Trainee(scene)
         return 0, 0, {}
 
-    def _prune(self, scene: Splats, count: int) -> Int[np.ndarray, " M"]:
+    def _prune(self, scene: Splats, count: int, progress: Progress) -> Int[np.ndarray, " M"]:
         """Which to keep."""
         cameras = [view.camera for view in self.school.train]
         chosen = show_most(
             *(scene, cameras, self.school.background, count),
             rounds=self.settings.score_rounds,
             threads=self.threads,
-            progress=self.progress,
+            progress=progress,
         )
         self.index = self.index[chosen]
         return chosen
 
-    def _train(self, phase: _Phase, number: int, done: int, state: State, lessons: Lessons) -> None:
+    def _train(self, phases: list[_Phase], number: int, done: int, state: State, lessons: Lessons) -> None:
         """One phase from a step of it on, and the pruning after it."""
         from kissgs.compaction.regularizers import Shape
         from kissgs.compaction.sparsify import Sparsity
         from kissgs.training.loop import Plan, Regularizer, train
 
-        chosen, wishes = self.settings, list[Regularizer]()
+        phase, chosen, wishes = phases[number], self.settings, list[Regularizer]()
+        progress = self._within(phases, number)
         if chosen.needle_weight or chosen.flat_weight:
             wishes.append(Shape(chosen.needle_weight, chosen.flat_weight, lessons.extent))
         sparsity = None
@@ -216,12 +217,24 @@ class _Recipe:
             seed=(chosen.seed, number),
             regularizers=tuple(wishes),
         )
-        train(self.trainee, lessons, plan, first=done, after=after, threads=self.threads, progress=self.progress)
+        train(self.trainee, lessons, plan, first=done, after=after, threads=self.threads, progress=progress)
         scene = self.trainee.splats()
         self._done(phase.name, scene)
         if len(scene) > phase.count:
-            self.trainee.keep(self._prune(scene, phase.count))
+            self.trainee.keep(self._prune(scene, phase.count, progress))
             self._done("prune", self.trainee.splats())
+
+    def _within(self, phases: list[_Phase], number: int) -> Progress:
+        """Tells of all phases of one name as of one stage, with the prunings between them."""
+        name = phases[number].name
+        before = sum(phase.steps for phase in phases[:number] if phase.name == name)
+        total = sum(phase.steps for phase in phases if phase.name == name)
+
+        def receive(stage: str, fraction: float, note: str = "") -> None:
+            done = phases[number].steps * (fraction if stage == name else 1.0)
+            self.progress(name, (before + done) / total, note)
+
+        return receive
 
     def _rates(self, phase: _Phase, extent: float) -> Rates:
         """The schedule of 3DGS, continued: rates stay while opacities are made sparse, and then fall."""
@@ -229,7 +242,7 @@ class _Recipe:
 
         chosen = self.settings
         base = {"means": MEANS_RATE * extent, **RATES}
-        begin = {name: chosen.means_rate if name == "means" else 1.0 for name in base}
+        begin = {name: chosen.means_rate if name == "means" else chosen.rate for name in base}
         end = {name: chosen.means_rate_end if name == "means" else chosen.rate_end for name in base}
         return falling(base, begin, end if phase.name == "refine" else begin)
 

@@ -59,9 +59,10 @@ class CompactSettings(BaseModel):
         1.0, gt=0, le=100, description="Learning rate of positions, in units of that with which 3DGS begins."
     )
     means_rate_end: float = Field(0.01, gt=0, le=100, description="The same at the end of the last steps.")
-    rate_end: float = Field(
-        1.0, gt=0, le=100, description="All other learning rates at the end, in units of those of 3DGS."
+    rate: float = Field(
+        2.0, gt=0, le=100, description="All other learning rates, in units of those of 3DGS, until the last steps."
     )
+    rate_end: float = Field(1.0, gt=0, le=100, description="The same at the end of the last steps.")
     views: int = Field(96, ge=1, le=10_000, description="Virtual views, where there is no capture to learn from.")
     view_size: int = Field(640, ge=16, le=8192, description="Longer side of pictures to learn from, pixels, at most.")
     seed: int = Field(0, ge=0, lt=2**31, description="Of the order of the pictures. Same seed: same scene.")

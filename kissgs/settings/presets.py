@@ -58,6 +58,7 @@ COMPACT: dict[Preset, dict[str, Any]] = {
         "needle_weight": 0.01,
         "flat_weight": 1.0,
         "means_rate": 0.01,
+        "rate": 1.0,
         "means_rate_end": 0.00215,
     },
 }

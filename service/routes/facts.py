@@ -11,7 +11,7 @@ from sqlalchemy.exc import SQLAlchemyError
 import kissgs
 from service.context import Context, Service
 from service.metrics import CONTENT_TYPE
-from service.presets import presets
+from service.presets import can_train, presets
 from service.problems import KINDS, ProblemError
 from service.routes.common import MAX_WAIT_SECONDS, NO_STORE, problems
 from service.schemas import Health, Limits, Presets, ProblemKind, Version
@@ -41,6 +41,7 @@ async def get_limits(context: Service) -> Limits:
         sync_seconds=settings.sync_seconds,
         max_wait_seconds=MAX_WAIT_SECONDS,
         keys_required=bool(settings.keys),
+        training=can_train(),
     )
 
 

@@ -7,13 +7,15 @@
  *   bytes_per_gaussian: number}} Sizes
  * @typedef {{created_at: string, queue_seconds?: number, run_seconds?: number}} Timings
  * @typedef {{id: string, name: string, state: string, position?: number, progress?: Progress,
- *   estimate?: {seconds_left: number}, options: {preset: string, encode: {weigh: boolean}, evaluate: boolean},
- *   upload_bytes: number, gaussians: number, sh_degree: number, kept?: number, invisible?: number, cleaned?: Record<string, number>,
+ *   estimate?: {seconds_left: number}, options: {preset: string, encode: {weigh: boolean}, evaluate: boolean,
+ *     compact: {count: number | null, ratio: number | null, max_psnr_drop: number | null, sparsify_steps: number,
+ *     refine_steps: number}},
+ *   upload_bytes: number, gaussians: number, sh_degree: number, kept?: number, compacted?: number, invisible?: number, cleaned?: Record<string, number>,
  *   evaluation?: {psnr?: number | null, ssim: number}, sizes?: Sizes, timings: Timings, starts: number,
  *   problem?: ProblemDocument, links: Record<string, string>, expires_at?: string}} Status
  * @typedef {{jobs: Status[], next: string | null}} JobPage
  * @typedef {{max_upload_bytes: number, max_header_bytes: number, max_gaussians: number,
- *   keys_required: boolean}} Limits
+ *   keys_required: boolean, training: boolean}} Limits
  * @typedef {{name: string, title: string, description: string, bytes_per_gaussian: number, psnr_change: number,
  *   cpu_seconds_per_million: number}} Preset
  * @typedef {{default: string, measured_on: string, presets: Preset[]}} Presets

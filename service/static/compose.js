@@ -6,7 +6,7 @@ import { Unsuitable, inspect } from "./ply.js";
 import { presetList } from "./presets.js";
 
 /**
- * @typedef {{preset: string, evaluate: boolean}} Options
+ * @typedef {{preset: string, evaluate: boolean, compact?: {ratio?: number | null}}} Options
  * @typedef {{file: File, options: Options}} Order
  */
 
@@ -25,6 +25,10 @@ export function composer(limits, presets, submit) {
 
   byId("file-limits").textContent =
     `Up to ${bytes(limits.max_upload_bytes)} and ${count(limits.max_gaussians)} Gaussians.`;
+
+  byId("keep-note").textContent = limits.training
+    ? "Those that stay are trained to do the work of the others: a file that shrinks with them, after minutes of work."
+    : "Fewer is smaller, and rougher: without torch on this server nothing is trained, and only the preset fast does it.";
 
   /** @param {File} file */
   async function take(file) {
@@ -52,7 +56,9 @@ export function composer(limits, presets, submit) {
   });
   form.addEventListener("submit", (/** @type {SubmitEvent} */ event) => {
     event.preventDefault();
-    if (chosen) return submit({ file: chosen, options: { preset: list.chosen(), evaluate: byId("evaluate").checked } });
+    const [preset, evaluate, share] = [list.chosen(), byId("evaluate").checked, Number(byId("keep").value)];
+    if (chosen)
+      return submit({ file: chosen, options: { preset, evaluate, ...(share && { compact: { ratio: share } }) } });
     say("Choose a .ply first.");
     input.focus();
   });
@@ -67,6 +73,7 @@ export function composer(limits, presets, submit) {
     prefer(options) {
       list.choose(options.preset);
       byId("evaluate").checked = options.evaluate;
+      byId("keep").value = String(options.compact?.ratio ?? "");
     },
   };
 }

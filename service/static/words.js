@@ -19,6 +19,10 @@ const STAGES = {
   read: "Reading the scene",
   kernels: "Preparing",
   cameras: "Placing cameras",
+  score: "Scoring Gaussians",
+  lessons: "Taking pictures to learn from",
+  sparsify: "Training while Gaussians go",
+  refine: "Training those that stay",
   importance: "Seeing what matters",
   price: "Pricing bits",
   order: "Putting Gaussians in order",
@@ -34,6 +38,8 @@ const STAGES = {
 
 const ALWAYS = ["read", "kernels", "order", "forms", "images"];
 const WEIGHED = ["cameras", "importance", "price", "rounding"];
+const COMPACTED = ["cameras", "score"];
+const TRAINED = ["lessons", "sparsify", "refine"];
 const WITH_COLOURS_BY_ANGLE = ["codebook", "sort codebook"];
 
 /** @type {[RegExp, string][]} */
@@ -75,6 +81,11 @@ export const stageWord = (stage) => STAGES[stage] ?? stage;
 export function plannedStages(status) {
   const planned = new Set(ALWAYS);
   if (status.options.encode.weigh) WEIGHED.forEach((stage) => planned.add(stage));
+  const { count: wanted, ratio, max_psnr_drop: drop, sparsify_steps, refine_steps } = status.options.compact;
+  if (wanted !== null || ratio !== null || drop !== null) {
+    COMPACTED.forEach((stage) => planned.add(stage));
+    if (sparsify_steps + refine_steps > 0) TRAINED.forEach((stage) => planned.add(stage));
+  }
   if (status.sh_degree > 0) WITH_COLOURS_BY_ANGLE.forEach((stage) => planned.add(stage));
   if (status.options.evaluate) planned.add("evaluate");
   return Object.keys(STAGES).filter((stage) => planned.has(stage));
@@ -102,6 +113,7 @@ export function planes(files) {
 export function mended(status) {
   const counts = Object.entries(status.cleaned ?? {});
   const lines = counts.filter(([, n]) => n > 0).map(([name, n]) => `${count(n)} ${CLEANED[name] ?? name}`);
+  if (status.compacted) lines.unshift(`${count(status.compacted)} left out by compaction: others do their work`);
   if (status.invisible) lines.unshift(`${count(status.invisible)} left out: no renderer would draw them`);
   return lines;
 }

@@ -108,7 +108,7 @@ def stopping_after(steps):
     left = itertools.count(steps - 1, -1)
 
     def progress(stage, fraction, note=""):
-        if stage in ("sparsify", "refine") and next(left) < 0:
+        if note and next(left) < 0:
             raise Interrupted
 
     return progress

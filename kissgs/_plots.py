@@ -1,0 +1,53 @@
+"""Plots, by matplotlib: what benchmarks found, for people."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from kissgs.errors import UnsupportedError
+from kissgs.io.atomic import atomic_file
+
+if TYPE_CHECKING:
+    from kissgs.compaction.study import Point
+
+FORMATS = ("svg", "png", "pdf")
+
+
+def compaction_plot(points: Sequence[Point], path: Path) -> None:
+    """PSNR over count, a curve for each way, the input as a level line.
+
+    Raises:
+        OutputError: the file system refuses.
+        UnsupportedError: there is no matplotlib, or no such format.
+    """
+    kind = path.suffix.lower().lstrip(".")
+    if kind not in FORMATS:
+        raise UnsupportedError(f"{path}: plots are {', '.join(FORMATS)}; name such a file")
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise UnsupportedError("plots are matplotlib's, which is missing: pip install 'kissgs[bench]'") from error
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    axes = figure.add_subplot()
+    (whole,) = (point for point in points if point.way == "input")
+    styles = itertools.cycle(itertools.product(("-", "--"), ("o", "s", "^", "D", "v")))
+    for way in dict.fromkeys(point.way for point in points if point.way != "input"):
+        line, marker = next(styles)
+        curve = sorted((point.count, point.psnr) for point in points if point.way == way)
+        axes.plot(*zip(*curve, strict=True), line, marker=marker, markersize=4, label=way)
+    if math.isfinite(whole.psnr):
+        axes.axhline(whole.psnr, color="black", linewidth=0.8, label=f"input, {whole.count:,} Gaussians")
+    axes.set_xscale("log")
+    ticks = sorted({point.count for point in points})
+    axes.set_xticks(ticks, [f"{count / 1000:.3g}k" if count >= 1000 else str(count) for count in ticks])
+    axes.minorticks_off()
+    axes.set_xlabel("Gaussians")
+    axes.set_ylabel("PSNR of held-out views, dB")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small")
+    with atomic_file(path, overwrite=True) as file:
+        figure.savefig(file, format=kind, metadata={"Date": None} if kind == "svg" else None, dpi=150)
