@@ -181,7 +181,7 @@ class _Recipe:
         cameras = [view.camera for view in self.school.train]
         chosen = show_most(
             *(scene, cameras, self.school.background, count),
-            rounds=self.settings.score_rounds,
+            share=self.settings.score_share,
             threads=self.threads,
             progress=progress,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -25,22 +26,22 @@ def show_most(
     background: Float32[np.ndarray, "3"],
     count: int,
     *,
-    rounds: int = 1,
+    share: float = 0.0,
     threads: int = 0,
     progress: Progress = silent,
 ) -> Int[np.ndarray, " M"]:
     """Which ``count`` Gaussians to keep: those whose removal would change the pictures most.
 
-    GaussianPOP, section 3, in several rounds. A score is the error of one removal alone: of two Gaussians, one behind
-    the other, each may be superfluous only as long as the other is there. So a part is removed, by a factor that is the
-    same each time, and the rest is scored anew.
+    GaussianPOP, section 3, in as many rounds as ``share`` asks for. A score is the error of one removal alone: of two
+    Gaussians, one behind the other, each may be superfluous only as long as the other is there. So a part is removed,
+    by the same factor in each round, and the rest is scored anew.
 
     Args:
         splats: finite.
         cameras: pictures to take.
         background: of all of them.
         count: at least 1.
-        rounds: of scoring, at least 1.
+        share: the smallest that one scoring may leave, from 0 (one scoring will do) to less than 1.
         threads: 0 means one per processor; the choice does not depend on it.
         progress: receives the stage ``"score"``.
 
@@ -48,6 +49,7 @@ def show_most(
         Their numbers, rising.
     """
     kept = np.arange(len(splats))
+    rounds = max(1, math.ceil(math.log(count / max(len(splats), count)) / math.log(share))) if share > 0 else 1
     shrink = (count / max(len(splats), 1)) ** (1 / rounds)
     for round_ in range(rounds):
         if len(kept) <= count:

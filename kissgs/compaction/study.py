@@ -87,11 +87,11 @@ def _refined(steps: int) -> dict[str, Any]:
 WAYS = (
     Way("random", by_chance, _no_steps),
     Way("opacity", by_opacity, _no_steps),
-    Way("POP", changes=lambda steps: {**_no_steps(steps), "score_rounds": 1}),
+    Way("POP", changes=lambda steps: {**_no_steps(steps), "score_share": 0.0}),
     Way("POP in rounds", changes=_no_steps),
     Way("random + refine", by_chance, _refined),
     Way("opacity + refine", by_opacity, _refined),
-    Way("POP + refine", changes=lambda steps: {**_refined(steps), "score_rounds": 1}),
+    Way("POP + refine", changes=lambda steps: {**_refined(steps), "score_share": 0.0}),
     Way("POP in rounds + refine", changes=_refined),
     Way("one pruning half-way", changes=lambda steps: {"rounds": 1, "rho": 0, "needle_weight": 0, "flat_weight": 0}),
     Way("+ sparsify (POPSpa without erank)", changes=lambda steps: {"rounds": 1, "needle_weight": 0, "flat_weight": 0}),

@@ -21,8 +21,12 @@ class CompactSettings(BaseModel):
         description="Keep as few as are found whose pictures from held-out views lose at most so many decibels. "
         "Takes several compactions.",
     )
-    score_rounds: int = Field(
-        4, ge=1, le=64, description="Pruning in so many rounds, each scored anew: one Gaussian may cover for another."
+    score_share: float = Field(
+        0.8,
+        ge=0,
+        le=0.99,
+        description="The smallest share that one scoring may leave; pruning that goes further scores again in between, "
+        "because Gaussians may cover for each other. 0: one scoring will do.",
     )
     first_share: float = Field(
         0.43,

@@ -51,7 +51,7 @@ COMPACT: dict[Preset, dict[str, Any]] = {
     Preset.BALANCED: {},
     Preset.SMALL: {"sparsify_steps": 5000, "refine_steps": 5000},
     Preset.PAPER: {
-        "score_rounds": 1,
+        "score_share": 0.0,
         "sparsify_steps": 5000,
         "rounds": 1,
         "refine_steps": 5000,

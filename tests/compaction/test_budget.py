@@ -14,7 +14,7 @@ from kissgs.evaluation.pictures import evaluate
 from kissgs.rendering.rasterizer import render
 from kissgs.views.view import View, Views, black
 
-ONLY_PRUNE = {"sparsify_steps": 0, "refine_steps": 0, "score_rounds": 2}
+ONLY_PRUNE = {"sparsify_steps": 0, "refine_steps": 0, "score_share": 0.6}
 
 
 def views():

@@ -18,7 +18,7 @@ from kissgs.splats import ATTRIBUTES
 from kissgs.training.checkpoint import Checkpoint
 from kissgs.views.view import black
 
-SHORT = {"sparsify_steps": 8, "refine_steps": 6, "rounds": 2, "score_rounds": 2, "interval": 3}
+SHORT = {"sparsify_steps": 8, "refine_steps": 6, "rounds": 2, "score_share": 0.6, "interval": 3}
 
 
 def taught():
@@ -68,7 +68,7 @@ def test_exactly_so_many_are_left_and_it_says_which(count, changes):
 def test_without_training_it_is_pruning_alone():
     scene, taught_by = cloud(60), taught()
     result = popspa(scene, 20, settings(sparsify_steps=0, refine_steps=0), taught_by)
-    kept = show_most(scene, [view.camera for view in taught_by.train], black(), 20, rounds=2)
+    kept = show_most(scene, [view.camera for view in taught_by.train], black(), 20, share=0.6)
     assert (result.index == kept).all()
     assert same(result.splats, scene.select(kept))
     assert result.report.taught_by == "nothing"

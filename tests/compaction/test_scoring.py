@@ -28,10 +28,10 @@ def test_in_one_round_those_with_the_highest_scores_stay():
     assert show_most(scene, CAMERAS, black(), 20).tolist() == sorted(np.argsort(-scores)[:20].tolist())
 
 
-@pytest.mark.parametrize("rounds", [1, 2, 3, 10, 50])
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.8, 0.99])
 @pytest.mark.parametrize("count", [1, 7, 79])
-def test_however_many_rounds_exactly_so_many_stay(rounds, count):
-    kept = show_most(cloud(80), CAMERAS, black(), count, rounds=rounds)
+def test_however_many_rounds_exactly_so_many_stay(share, count):
+    kept = show_most(cloud(80), CAMERAS, black(), count, share=share)
     assert len(kept) == count
     assert (np.diff(kept) > 0).all()
 
@@ -42,15 +42,29 @@ def test_rounds_do_not_throw_away_both_of_a_pair():
     opaque = {**{name: getattr(scene, name) for name in ATTRIBUTES}, "opacities": np.full(20, 5, np.float32)}
     pairs = kissgs.Splats(**{name: np.concatenate([value, value]) for name, value in opaque.items()})
 
-    def places(rounds):
-        return len(set((show_most(pairs, CAMERAS, black(), 20, rounds=rounds) % 20).tolist()))
+    def places(share):
+        return len(set((show_most(pairs, CAMERAS, black(), 20, share=share) % 20).tolist()))
 
-    assert places(20) > places(1)
-    assert places(20) >= 15
+    assert places(0.99) > places(0.0) + 1
 
 
 def test_progress_rises_to_the_end():
     told = []
-    show_most(cloud(30), CAMERAS, black(), 5, rounds=3, progress=lambda stage, fraction, note="": told.append(fraction))
+    show_most(
+        cloud(30), CAMERAS, black(), 5, share=0.6, progress=lambda stage, fraction, note="": told.append(fraction)
+    )
     assert told == sorted(told)
     assert told[-1] == 1.0
+
+
+@pytest.mark.parametrize(("share", "scorings"), [(0.0, 1), (0.1, 1), (0.25, 1), (0.5, 2), (0.7, 4), (0.99, 138)])
+def test_it_scores_as_often_as_needed(share, scorings):
+    """From 80 to 20: a quarter."""
+    begun = []
+
+    def progress(stage, fraction, note=""):
+        begun.append(fraction)
+
+    show_most(cloud(80), CAMERAS[:1], black(), 20, share=share, progress=progress)
+    told = (len(begun) - 1) / 2  # each scoring tells its beginning and its end
+    assert told == scorings if scorings < 5 else 55 < told <= scorings, "60 Gaussians go, at least one at a time"

@@ -16,6 +16,7 @@ class Drawn:
     alpha: np.ndarray  # (H, W)
     decisions: list  # per Gaussian, front to back: its number, where it was drawn, where its alpha was clamped
     doubtful: np.ndarray  # (H, W): a decision here hung on less than float32 can tell
+    layers: list  # per Gaussian, front to back: its number, alphas, transmittances before it, colour
 
 
 def rotation(quat):
@@ -70,7 +71,7 @@ def draw(params, camera, background, frozen=None, removed=None, alpha_max=0.99):
     left = np.ones((height, width))
     ended = np.zeros((height, width), bool)
     doubtful = np.zeros((height, width), bool)
-    decisions = []
+    decisions, layers = [], []
     for place, n in enumerate(order):
         x, y, z = in_camera[n]
         if n == removed or z < 0.01 or z > 1e10:
@@ -106,8 +107,9 @@ def draw(params, camera, background, frozen=None, removed=None, alpha_max=0.99):
         colour = 0.5 + C0 * sh0[n] + sh_values(direction, shN.shape[1]) @ shN[n]
         weight = np.where(drawn, left * alpha, 0)
         image += weight[:, :, None] * np.maximum(colour, 0)
+        layers.append((n, np.where(drawn, alpha, 0), left, np.maximum(colour, 0)))
         left = np.where(drawn, after, left)
-    return Drawn(image + left[:, :, None] * background, 1 - left, decisions, doubtful)
+    return Drawn(image + left[:, :, None] * background, 1 - left, decisions, doubtful, layers)
 
 
 def gradient_by_differences(params, camera, background, v_image, v_alpha, step=1e-5, alpha_max=0.99):
