@@ -65,7 +65,7 @@ def compact_scene(
     count = settings.count or max(1, round(len(splats) * (settings.ratio or 0.0)))
     if count >= len(splats):
         return _unchanged(splats, "no more than asked for")
-    taught = school(splats, views, count=settings.views, size=settings.view_size, threads=threads, progress=progress)
+    taught = school(splats, views, settings, threads=threads, progress=progress)
     if settings.max_psnr_drop is None:
         return popspa(
             *(splats, count, settings, taught),

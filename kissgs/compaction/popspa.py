@@ -59,7 +59,7 @@ def popspa(
         school: views to score by, to learn from and to judge by.
         teacher: what the pictures should show where there are no photographs; by default the scene itself.
         judge: measure PSNR, SSIM and bytes after every step.
-        checkpoint: file to keep the state in, every minute while training. If there is one of this very work, it is
+        checkpoint: file to keep the state in, every half minute of training. If there is one of this very work, it is
             taken up where it was left, and ends as if it had never been interrupted. It stays when all is done: whoever
             has written the result elsewhere may delete it.
         threads: 0 means one per processor; the result does not depend on it.
@@ -79,7 +79,7 @@ def popspa(
 def _key(scenes: Sequence[Splats], count: int, settings: CompactSettings, school: School) -> str:
     """Of the work: equal only where the result is equal."""
     key = hashlib.sha256(f"{__version__} {count} {settings.model_dump_json()} {school.background}".encode())
-    for view in (*school.train, *school.test):
+    for view in (*school.train, *school.score, *school.test):
         camera = view.camera
         key.update(camera.viewmat.tobytes() + camera.K.tobytes() + f"{camera.width} {camera.height}".encode())
         key.update(b"" if view.photo is None else view.load_photo().tobytes())
@@ -178,7 +178,7 @@ class _Recipe:
 
     def _prune(self, scene: Splats, count: int, progress: Progress) -> Int[np.ndarray, " M"]:
         """Which to keep."""
-        cameras = [view.camera for view in self.school.train]
+        cameras = [view.camera for view in self.school.score]
         chosen = show_most(
             *(scene, cameras, self.school.background, count),
             share=self.settings.score_share,

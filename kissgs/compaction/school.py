@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from kissgs._typing import Float32
 from kissgs.progress import Progress, silent
+from kissgs.settings import CompactSettings
 from kissgs.splats import Splats
+from kissgs.views.anatomy import anatomy
 from kissgs.views.view import View, Views
 from kissgs.views.virtual import virtual_views
+from kissgs.views.wander import wander
+
+SCATTERED = 4
+"""Virtual cameras to learn from, for each that was found good: they stand around it."""
 
 JUDGED = 16
 """Held-out views that are looked at, at most."""
@@ -22,13 +29,15 @@ class School:
     """Views, all at the size at which to learn.
 
     Attributes:
-        train: to score by and to learn from; one or more.
+        train: to learn from; one or more.
+        score: to score by; those, or where there are very many, some of them.
         test: to judge by: held out, or where no view is, some of those to learn from.
         background: ``(3,)`` RGB over which to render.
         source: for people.
     """
 
     train: tuple[View, ...]
+    score: tuple[View, ...]
     test: tuple[View, ...]
     background: Float32[np.ndarray, "3"]
     source: str
@@ -40,26 +49,52 @@ class School:
 
 
 def school(
-    splats: Splats, views: Views | None, *, count: int, size: int, threads: int = 0, progress: Progress = silent
+    splats: Splats,
+    views: Views | None,
+    settings: CompactSettings,
+    *,
+    threads: int = 0,
+    progress: Progress = silent,
 ) -> School:
-    """A capture's views for training, or virtual ones where there are none.
+    """A capture's views for training and a few virtual ones all around, or virtual ones alone if there is none.
 
     Args:
         splats: finite.
         views: of a capture.
-        count: of virtual views.
-        size: longer side of a picture, pixels; smaller ones stay as they are.
+        settings: how many virtual views, and the size of pictures; smaller ones stay as they are.
         threads: 0 means one per processor.
         progress: receives the stage ``"cameras"``.
     """
     if views is None or not views.train:
-        side = size * 4 // 5
-        views = virtual_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
+        return _virtual(splats, settings, threads, progress)
+    size = settings.view_size
+    if settings.around > 0:
+        camera = views.train[0].camera.at_most(size)
+        side = round(math.sqrt(camera.width * camera.height))
+        count = max(1, round(len(views.train) * settings.around / (1 - settings.around)))
+        around = virtual_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
+        views = replace(views, train=(*views.train, *around.all), source=f"{views.source}, and {around.source}")
+    train = _sized(views.train, size)
     return School(
-        train=_sized(views.train, size),
+        train=train,
+        score=train,
         test=_sized(_some(views.test or views.train), size),
         background=views.background,
         source=views.source,
+    )
+
+
+def _virtual(splats: Splats, settings: CompactSettings, threads: int, progress: Progress) -> School:
+    """Where the scene is its own teacher, pictures of it cost nothing but time."""
+    side, count = settings.view_size * 3 // 5, max(1, settings.views // SCATTERED)
+    found = virtual_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
+    train = tuple(wander(found.train, SCATTERED, anatomy(splats).radius, settings.seed))
+    return School(
+        train=train,
+        score=train[::SCATTERED],
+        test=tuple(_some(found.test or found.train)),
+        background=found.background,
+        source=f"{len(train)} virtual cameras",
     )
 
 

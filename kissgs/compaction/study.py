@@ -84,20 +84,23 @@ def _refined(steps: int) -> dict[str, Any]:
     return {"sparsify_steps": 0, "refine_steps": steps}
 
 
+RHO, NEEDLES = 5e-4, 0.01
+"""Of GaussianSpa's and of effective rank's published code."""
+
 WAYS = (
     Way("random", by_chance, _no_steps),
     Way("opacity", by_opacity, _no_steps),
     Way("POP", changes=lambda steps: {**_no_steps(steps), "score_share": 0.0}),
     Way("POP in rounds", changes=_no_steps),
-    Way("random + refine", by_chance, _refined),
     Way("opacity + refine", by_opacity, _refined),
     Way("POP + refine", changes=lambda steps: {**_refined(steps), "score_share": 0.0}),
     Way("POP in rounds + refine", changes=_refined),
-    Way("one pruning half-way", changes=lambda steps: {"rounds": 1, "rho": 0, "needle_weight": 0, "flat_weight": 0}),
-    Way("+ sparsify (POPSpa without erank)", changes=lambda steps: {"rounds": 1, "needle_weight": 0, "flat_weight": 0}),
-    Way("+ erank (POPSpa)", changes=lambda steps: {"rounds": 1, "needle_weight": 0.002, "flat_weight": 0.0}),
-    Way("prunings along the way, no sparsify", changes=lambda steps: {"rho": 0}),
-    Way("as set"),
+    Way("POP, train, POP, refine", changes=lambda steps: {"rounds": 1, "rho": 0.0}),
+    Way("POP, sparsify, POP, refine", changes=lambda steps: {"rounds": 1, "rho": RHO}),
+    Way("POPSpa", changes=lambda steps: {"rounds": 1, "rho": RHO, "needle_weight": NEEDLES}),
+    Way("prunings along the way", changes=lambda steps: {"rho": 0.0, "needle_weight": 0.0}),
+    Way("the same, sparsified", changes=lambda steps: {"rho": RHO, "needle_weight": 0.0}),
+    Way("the same, with erank", changes=lambda steps: {"rho": 0.0, "needle_weight": NEEDLES}),
 )
 """All of them, the cheapest first."""
 
@@ -123,7 +126,7 @@ def study(
         threads: 0 means one per processor.
         progress: receives the stages of the recipe.
     """
-    taught = school(splats, views, count=settings.views, size=settings.view_size, threads=threads, progress=progress)
+    taught = school(splats, views, settings, threads=threads, progress=progress)
     steps = settings.sparsify_steps + settings.refine_steps
 
     def judged(way: str, scene: Splats, seconds: float, cpu_seconds: float) -> Point:

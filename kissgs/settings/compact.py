@@ -36,7 +36,7 @@ class CompactSettings(BaseModel):
         "20 %, 0.43 keeps 50 %.",
     )
     sparsify_steps: int = Field(
-        2500, ge=0, le=1_000_000, description="Steps of training while the rest of the Gaussians go; 0: all go at once."
+        1500, ge=0, le=1_000_000, description="Steps of training while the rest of the Gaussians go; 0: all go at once."
     )
     rounds: int = Field(
         5,
@@ -44,9 +44,9 @@ class CompactSettings(BaseModel):
         le=1000,
         description="Prunings along these steps, by the same factor each; the paper has one, at their end.",
     )
-    refine_steps: int = Field(2500, ge=0, le=1_000_000, description="Steps of training when all have gone.")
+    refine_steps: int = Field(1500, ge=0, le=1_000_000, description="Steps of training when all have gone.")
     rho: float = Field(
-        5e-4, ge=0, le=10, description="How hard opacities of those that shall go next are drawn to 0 before; 0: not."
+        0.0, ge=0, le=10, description="How hard opacities of those that shall go next are drawn to 0 before; 0: not."
     )
     interval: int = Field(50, ge=1, le=100_000, description="Steps between two such pulls.")
     needle_weight: float = Field(
@@ -66,8 +66,15 @@ class CompactSettings(BaseModel):
     rate: float = Field(
         2.0, gt=0, le=100, description="All other learning rates, in units of those of 3DGS, until the last steps."
     )
-    rate_end: float = Field(1.0, gt=0, le=100, description="The same at the end of the last steps.")
-    views: int = Field(96, ge=1, le=10_000, description="Virtual views, where there is no capture to learn from.")
+    rate_end: float = Field(0.1, gt=0, le=100, description="The same at the end of the last steps.")
+    around: float = Field(
+        0.1,
+        ge=0,
+        le=0.9,
+        description="Where there is a capture: share of pictures from virtual cameras all around it, of the scene as "
+        "it was. What was never photographed must not fall apart.",
+    )
+    views: int = Field(384, ge=1, le=10_000, description="Virtual views, where there is no capture to learn from.")
     view_size: int = Field(640, ge=16, le=8192, description="Longer side of pictures to learn from, pixels, at most.")
     seed: int = Field(0, ge=0, lt=2**31, description="Of the order of the pictures. Same seed: same scene.")
 

@@ -13,7 +13,7 @@ import numpy as np
 from kissgs.errors import OutputError
 from kissgs.io.atomic import atomic_file, reason_of
 
-SECONDS = 60.0
+SECONDS = 30.0
 """Between two savings: what is lost at most."""
 
 
@@ -24,8 +24,8 @@ class Checkpoint:
         key: of the work: its input, settings and version. What was kept under another is not taken up.
     """
 
-    def __init__(self, path: Path | None, key: str, seconds: float = SECONDS) -> None:
-        self._path, self.key, self._seconds = path, key, seconds
+    def __init__(self, path: Path | None, key: str) -> None:
+        self._path, self.key = path, key
         self._saved = time.monotonic()
 
     def load(self) -> dict[str, np.ndarray] | None:
@@ -53,7 +53,7 @@ class Checkpoint:
     @property
     def due(self) -> bool:
         """Whether it is time to save again."""
-        return self._path is not None and time.monotonic() - self._saved >= self._seconds
+        return self._path is not None and time.monotonic() - self._saved >= SECONDS
 
     def save(self, state: Mapping[str, np.ndarray]) -> None:
         """Keep it, whole or not at all, in place of what was kept before.

@@ -24,7 +24,7 @@ class Lessons:
         cameras: one or more.
         pictures: for each ``(H, W, 3)``: uint8 of photographs, float16 from 0 to 1 of renderings.
         background: ``(3,)`` RGB over which to render.
-        taught_by: where the pictures come from.
+        taught_by: where the pictures come from; "photos" if any is one.
     """
 
     cameras: tuple[Camera, ...]
@@ -67,7 +67,7 @@ def lessons(
     threads: int = 0,
     progress: Progress = silent,
 ) -> Lessons:
-    """The photographs of ``views`` if all have one, else what ``teacher`` looks like from there.
+    """The photographs of ``views``, and what ``teacher`` looks like from those that have none.
 
     Args:
         teacher: finite.
@@ -80,11 +80,10 @@ def lessons(
         InvalidViewsError: a photograph cannot be read.
         UnsupportedError: a picture would take too much memory.
     """
-    photographed = all(view.photo is not None for view in views)
     pictures = []
     for done, view in enumerate(views):
         progress("lessons", done / len(views))
-        if photographed:
+        if view.photo is not None:
             pictures.append(view.load_photo())
         else:
             image, _ = render(teacher, view.camera, background=background.tolist(), threads=threads)
@@ -94,5 +93,5 @@ def lessons(
         cameras=tuple(view.camera for view in views),
         pictures=tuple(pictures),
         background=background,
-        taught_by="photos" if photographed else "renderings",
+        taught_by="photos" if any(view.photo is not None for view in views) else "renderings",
     )

@@ -16,13 +16,13 @@ from kissgs.progress import silent
 from kissgs.rendering.rasterizer import render
 from kissgs.splats import ATTRIBUTES
 from kissgs.training.checkpoint import Checkpoint
-from kissgs.views.view import black
+from kissgs.views.view import Views, black
 
 SHORT = {"sparsify_steps": 8, "refine_steps": 6, "rounds": 2, "score_share": 0.6, "interval": 3}
 
 
 def taught():
-    return School(around(5), around(3), black(), "five views")
+    return School(around(5), around(5), around(3), black(), "five views")
 
 
 def settings(**changes):
@@ -154,7 +154,7 @@ def test_the_checkpoint_of_other_work_is_refused(tmp_path, monkeypatch, other):
         "scene": (cloud(80, seed=5), 20, settings(), taught()),
         "count": (cloud(80), 21, settings(), taught()),
         "settings": (cloud(80), 20, settings(rho=1e-3), taught()),
-        "views": (cloud(80), 20, settings(), School(around(4), around(3), black(), "four views")),
+        "views": (cloud(80), 20, settings(), School(around(4), around(4), around(3), black(), "four views")),
     }
     with pytest.raises(OutputError, match="checkpoint of other work"):
         popspa(*work[other], checkpoint=path)
@@ -169,12 +169,24 @@ def test_a_full_disk_is_told(tmp_path, monkeypatch):
 
 def test_virtual_views_teach_where_there_is_no_capture():
     scene = kissgs.sample_scene(400, sh_degree=0)
-    found = school(scene, None, count=16, size=50)
-    assert (len(found.train), len(found.test)) == (14, 2)
+    found = school(scene, None, settings(views=64, view_size=50))
+    assert (len(found.train), len(found.score), len(found.test)) == (56, 14, 2)
     assert all(max(view.camera.width, view.camera.height) <= 50 for view in found.train)
     result = popspa(scene, 100, settings(), found)
     assert result.report.taught_by == "renderings"
-    assert result.report.source == "16 virtual cameras"
+    assert result.report.source == "56 virtual cameras"
+
+
+@pytest.mark.parametrize(("around_it", "virtual"), [(0.0, 0), (0.1, 1), (0.5, 5)])
+def test_a_capture_has_virtual_views_around_it(around_it, virtual):
+    """Its own views come first, and those held out are never learned from."""
+    capture = Views(around(5), around(3), black(), "a capture")
+    found = school(kissgs.sample_scene(400, sh_degree=0), capture, settings(around=around_it))
+    assert len(found.train) == 5 + virtual
+    assert [view.name for view in found.train[:5]] == [view.name for view in capture.train]
+    assert [view.name for view in found.test] == [view.name for view in capture.test]
+    assert found.score == found.train
+    assert found.source == "a capture" + (f", and {virtual} virtual cameras" if virtual else "")
 
 
 def test_nothing_is_seen():

@@ -77,7 +77,7 @@ def taught(size=1.0):
         pose = view.camera.viewmat.copy()
         pose[:3, 3] *= size
         views.append(View(view.name, kissgs.Camera(pose, view.camera.K, view.camera.width, view.camera.height)))
-    return School(tuple(views), tuple(views), black(), "five views")
+    return School(*[tuple(views)] * 3, black(), "five views")
 
 
 def error(scene, original, school):

@@ -49,6 +49,31 @@ def test_submitting_a_form(service, first):
     assert service.http.get(status["links"]["result"]).content == expected
 
 
+def test_fewer_gaussians(service):
+    options = {"preset": "fast", "compact": {"ratio": 0.5, "views": 24, "view_size": 48}}
+    status = service.ended(service.submit(options=json.dumps(options)))
+    expected = kissgs.compress(SMALL, settings=kissgs.Settings.model_validate(options))
+    assert (status["compacted"], status["kept"]) == (150, expected.report.count)
+    assert service.http.get(status["links"]["result"]).content == expected.to_zip()
+    report = service.http.get(status["links"]["report"]).json()
+    assert [step["count"] for step in report["compaction"]["steps"]] == [300, 150]
+
+
+def test_training_in_a_job(service):
+    changes = {"count": 100, "sparsify_steps": 4, "refine_steps": 4, "views": 24, "view_size": 48}
+    status = service.ended(service.submit(options=json.dumps({"preset": "fast", "compact": changes})))
+    assert (status["state"], status["compacted"]) == ("succeeded", 200)
+    assert status["timings"]["stages"].keys() >= {"score", "lessons", "sparsify", "refine"}
+
+
+@pytest.mark.parametrize(
+    "compact", [{"ratio": 2}, {"count": 0}, {"count": 5, "ratio": 0.1}, {"max_psnr_drop": -1}, {"speed": 1}]
+)
+def test_impossible_budgets_are_refused(service, compact):
+    answer = service.http.post("/v1/jobs", content=SMALL, params={"options": json.dumps({"compact": compact})})
+    problem(answer, 422, "invalid-request")
+
+
 def test_the_options_are_optional(service):
     status = service.http.post("/v1/jobs", files={"file": ("x.ply", SMALL)}).json()
     assert (status["options"]["preset"], status["options"]["evaluate"]) == ("balanced", False)

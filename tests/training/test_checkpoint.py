@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from kissgs import OutputError
+from kissgs.training import checkpoint
 from kissgs.training.checkpoint import Checkpoint
 
 STATE = {"a": np.arange(6.0).reshape(2, 3), "told": np.asarray('{"x": 1}'), "none": np.empty(0, np.float32)}
@@ -42,13 +43,14 @@ def test_a_folder_in_its_place(tmp_path):
         Checkpoint(tmp_path, "key").load()
 
 
-def test_it_is_due_after_its_time(tmp_path):
-    assert Checkpoint(tmp_path / "c.npz", "key", seconds=0).due
-    assert not Checkpoint(tmp_path / "c.npz", "key", seconds=1000).due
+@pytest.mark.parametrize(("seconds", "due"), [(0.0, True), (1000.0, False)])
+def test_it_is_due_after_its_time(tmp_path, monkeypatch, seconds, due):
+    monkeypatch.setattr(checkpoint, "SECONDS", seconds)
+    assert Checkpoint(tmp_path / "c.npz", "key").due == due
+    assert not Checkpoint(None, "key").due
 
 
 def test_without_a_path_nothing_is_kept():
-    kept = Checkpoint(None, "", seconds=0)
+    kept = Checkpoint(None, "")
     kept.save(STATE)
     assert kept.load() is None
-    assert not kept.due

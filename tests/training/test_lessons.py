@@ -24,7 +24,7 @@ def test_without_photographs_the_scene_itself_is_the_teacher():
         np.testing.assert_allclose(found.picture(n), np.clip(image, 0, 1), atol=3e-4)
 
 
-def test_photographs_are_what_is_learned_where_all_views_have_one(tmp_path):
+def test_photographs_are_what_is_learned_where_there_are_any(tmp_path):
     pictures = np.random.default_rng(0).integers(0, 256, (2, 32, 40, 3), dtype=np.uint8)
     views = []
     for n, (view, picture) in enumerate(zip(around(2), pictures, strict=True)):
@@ -33,7 +33,10 @@ def test_photographs_are_what_is_learned_where_all_views_have_one(tmp_path):
     found = lessons(cloud(), views, black())
     assert found.taught_by == "photos"
     np.testing.assert_array_equal(found.picture(1), pictures[1].astype(np.float32) / np.float32(255))
-    assert lessons(cloud(), [views[0], around(2)[1]], black()).taught_by == "renderings"
+    mixed = lessons(cloud(), [views[0], around(2)[1]], black())
+    assert mixed.taught_by == "photos"
+    np.testing.assert_array_equal(mixed.picture(0), found.picture(0))
+    np.testing.assert_array_equal(mixed.picture(1), taught(cloud(), around(2)).picture(1))
 
 
 @pytest.mark.parametrize("first", [0, 1, 3, 4, 9])
