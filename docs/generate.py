@@ -8,7 +8,8 @@ from pathlib import Path
 
 from pydantic import ByteSize
 
-from kissgs.settings import PRESETS, EncodeSettings, Preset
+from kissgs.settings import PRESETS, CompactSettings, EncodeSettings, Preset
+from kissgs.settings.compact import BUDGETS
 from kissgs.sogxt.metadata import ContainerMeta
 from service.app import create_app
 from service.problems import KINDS
@@ -18,20 +19,37 @@ HERE = Path(__file__).parent
 
 INTRODUCTION = """# Settings
 
-Made by `make docs` from `kissgs/settings.py`. A preset sets all of them; `--set NAME=VALUE` on the command line, or
-`Settings.from_preset("balanced", NAME=VALUE)` in Python, changes one. No decoder needs to know any.
-
+Made by `make docs` from `kissgs/settings/`. A preset sets all of them. No decoder needs to know any.
 """
+
+GROUPS = {
+    "encode": (
+        EncodeSettings,
+        'How Gaussians become images. `kissgs compress --set NAME=VALUE`, or `Settings.from_preset("balanced", '
+        "NAME=VALUE)` in Python, changes one.",
+    ),
+    "compact": (
+        CompactSettings,
+        "How a scene comes to have fewer Gaussians ([compaction.md](compaction.md)). "
+        "`kissgs compact --set NAME=VALUE`, "
+        '`kissgs compress --set compact.NAME=VALUE`, or `Settings.from_preset("balanced", compact={"NAME": VALUE})` '
+        "in Python, changes one.",
+    ),
+}
 
 
 def settings_page() -> str:
     """Every setting, what it trades, and its value in each preset."""
-    lines = [f"| setting | {' | '.join(Preset)} | what it trades |", "|---" * (len(Preset) + 2) + "|"]
-    for name, field in EncodeSettings.model_fields.items():
-        values = [PRESETS[preset].get(name, field.default) for preset in Preset]
-        cells = " | ".join("auto" if value is None else str(value) for value in values)
-        lines.append(f"| `{name}` | {cells} | {field.description} |")
-    return INTRODUCTION + "\n".join(lines) + "\n"
+    page = INTRODUCTION
+    for group, (model, about) in GROUPS.items():
+        lines = [f"| setting | {' | '.join(Preset)} | what it trades |", "|---" * (len(Preset) + 2) + "|"]
+        for name, field in model.model_fields.items():
+            values = [PRESETS[preset][group].get(name, field.default) for preset in Preset]
+            unset = "" if group == "compact" and name in BUDGETS else "auto"
+            cells = " | ".join(unset if value is None else str(value) for value in values)
+            lines.append(f"| `{name}` | {cells} | {field.description} |")
+        page += f"\n## {group}\n\n{about}\n\n" + "\n".join(lines) + "\n"
+    return page
 
 
 def container_schema() -> str:

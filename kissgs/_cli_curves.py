@@ -28,8 +28,8 @@ def compaction_curves(
     threads: int,
 ) -> tuple[list[dict[str, Any]], Table]:
     """All ways on all scenes: for machines, and as a table."""
+    from kissgs._plots import check_plot, compaction_plot
     from kissgs.compaction.study import RATIOS, WAYS, study
-    from kissgs.io.atomic import refuse_existing
     from kissgs.scenes import load
 
     known = {way.name: way for way in WAYS}
@@ -39,7 +39,7 @@ def compaction_curves(
     if plot is not None:
         if len(scenes) > 1:
             raise UnsupportedError("--plot draws one scene; name one")
-        refuse_existing(plot, overwrite=True)
+        check_plot(plot)
     settings = chosen(preset, changes, group="compact").compact
     rows: list[tuple[str, Point]] = []
     with progress_bar(False) as progress:
@@ -55,8 +55,6 @@ def compaction_curves(
             )
             rows += [(Path(scene).name, point) for point in found]
     if plot is not None:
-        from kissgs._plots import compaction_plot
-
         compaction_plot([point for _, point in rows], plot)
     return [{"scene": scene, **point.as_dict()} for scene, point in rows], _table(rows)
 

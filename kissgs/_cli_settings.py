@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from kissgs.settings import Settings
 
 Values = dict[str, Any]
-THOUSANDS = {"": 1, "k": 1e3, "m": 1e6}
+THOUSANDS = {"k": 1e3, "m": 1e6}
 
 
 def chosen(
@@ -51,15 +51,19 @@ def chosen(
 
 
 def count_of(text: str) -> int:
-    """Of Gaussians: 200000, 200k, 1.5M.
+    """Of Gaussians: 200000, 200,000, 200k, 1.5M.
 
     Raises:
         UnsupportedError: it is none.
     """
-    match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)([km]?)", text.strip().replace(",", "").lower())
-    if match is None:
-        raise UnsupportedError(f"{text!r} is no number of Gaussians; write 200000, 200k or 1.5M")
-    return round(float(match[1]) * THOUSANDS[match[2]])
+    word = text.strip().lower()
+    if re.fullmatch(r"[0-9]{1,3}(,[0-9]{3})+|[0-9]+", word):
+        return int(word.replace(",", ""))
+    if re.fullmatch(r"[0-9]+(\.[0-9]+)?[km]", word):
+        return round(float(word[:-1]) * THOUSANDS[word[-1]])
+    raise UnsupportedError(
+        f"{text!r} is no number of Gaussians; write 200000, 200k or 1.5M, or a share with --ratio 0.2"
+    )
 
 
 def budget_of(text: str) -> Values:
@@ -70,14 +74,13 @@ def budget_of(text: str) -> Values:
     """
     word = text.strip().lower().replace(" ", "")
     for ending, name, unit in (("%", "ratio", 0.01), ("db", "max_psnr_drop", 1.0)):
-        if word.endswith(ending):
-            number = word.removesuffix(ending)
-            if not re.fullmatch(r"[0-9]*\.?[0-9]+", number):
-                break
+        number = word.removesuffix(ending)
+        if word.endswith(ending) and re.fullmatch(r"[0-9]*\.?[0-9]+", number):
             return {name: float(number) * unit}
-    if not re.fullmatch(r"[0-9.,]+[km]?", word):
+    try:
+        return {"count": count_of(word)}
+    except UnsupportedError as error:
         raise UnsupportedError(
             f"--compact {text}: say how many Gaussians to keep (200k), which share (20%), or how much PSNR may be "
             "lost (0.2dB)"
-        )
-    return {"count": count_of(word)}
+        ) from error

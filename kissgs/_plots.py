@@ -5,16 +5,33 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kissgs.errors import UnsupportedError
-from kissgs.io.atomic import atomic_file
+from kissgs.io.atomic import atomic_file, refuse_existing
 
 if TYPE_CHECKING:
     from kissgs.compaction.study import Point
 
 FORMATS = ("svg", "png", "pdf")
+
+
+def check_plot(path: Path) -> str:
+    """See that a plot can be drawn there, before the work that it is to show; returns its format.
+
+    Raises:
+        OutputError: the file system refuses.
+        UnsupportedError: there is no matplotlib, or no such format.
+    """
+    kind = path.suffix.lower().lstrip(".")
+    if kind not in FORMATS:
+        raise UnsupportedError(f"{path}: plots are {', '.join(FORMATS)}; name such a file")
+    if find_spec("matplotlib") is None:
+        raise UnsupportedError("plots are matplotlib's, which is missing: pip install 'kissgs[bench]'")
+    refuse_existing(path, overwrite=True)
+    return kind
 
 
 def compaction_plot(points: Sequence[Point], path: Path) -> None:
@@ -24,13 +41,10 @@ def compaction_plot(points: Sequence[Point], path: Path) -> None:
         OutputError: the file system refuses.
         UnsupportedError: there is no matplotlib, or no such format.
     """
-    kind = path.suffix.lower().lstrip(".")
-    if kind not in FORMATS:
-        raise UnsupportedError(f"{path}: plots are {', '.join(FORMATS)}; name such a file")
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise UnsupportedError("plots are matplotlib's, which is missing: pip install 'kissgs[bench]'") from error
+    kind = check_plot(path)
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(8, 5), layout="constrained")
     axes = figure.add_subplot()
     (whole,) = (point for point in points if point.way == "input")
@@ -49,5 +63,5 @@ def compaction_plot(points: Sequence[Point], path: Path) -> None:
     axes.set_ylabel("PSNR of held-out views, dB")
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small")
-    with atomic_file(path, overwrite=True) as file:
+    with rc_context({"svg.hashsalt": "kissgs"}), atomic_file(path, overwrite=True) as file:
         figure.savefig(file, format=kind, metadata={"Date": None} if kind == "svg" else None, dpi=150)

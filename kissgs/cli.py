@@ -97,6 +97,10 @@ def compress(
     cache: Annotated[
         bool, typer.Option("--cache", help="Keep what was seen of a scene in a file beside it, for the next time.")
     ] = False,
+    checkpoint: Annotated[
+        bool,
+        typer.Option("--checkpoint", help="Keep the state of --compact beside the scene; see 'compact'."),
+    ] = False,
     threads: ThreadsOption = 0,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -125,6 +129,7 @@ def compress(
                 cache=beside(scene, ".importance.npz") if cache else None,
                 evaluate=evaluate,
                 views=capture,
+                checkpoint=beside(scene, _cli_compact.CHECKPOINT) if checkpoint else None,
                 overwrite=force,
                 threads=threads,
                 progress=progress,

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -93,24 +94,28 @@ def compact(
     target = Path(destination) if destination is not None else None
     if target is not None:
         check_ply(target, overwrite=overwrite)
-    splats, _, _ = open_scene(source, threads, progress)
+    clock = Clock(progress)
+    splats, cleaned, _ = open_scene(source, threads, clock)
     result = compact_scene(
         *(splats, settings.compact, views),
-        judge=evaluate,
+        judges=evaluate,
         checkpoint=Path(checkpoint) if checkpoint is not None else None,
         threads=threads,
-        progress=progress,
+        progress=clock,
     )
     if target is not None:
-        save(result.splats, target, overwrite=overwrite, progress=progress)
-        _forget(checkpoint)
-    return result
+        save(result.splats, target, overwrite=overwrite, progress=clock)
+        _forget(result)
+    clock.stop()
+    report = replace(result.report, cleaned=cleaned, cpu_seconds=clock.cpu_seconds, peak_memory=peak_memory())
+    return replace(result, report=report)
 
 
-def _forget(checkpoint: AnyPath | None) -> None:
-    """What it led to is written."""
-    if checkpoint is not None:
-        Path(checkpoint).unlink(missing_ok=True)
+def _forget(compacted: Compacted) -> None:
+    """Its checkpoint, now that what it led to is written."""
+    if compacted.checkpoint is not None:
+        with contextlib.suppress(OSError):
+            compacted.checkpoint.unlink(missing_ok=True)
 
 
 def compress(
@@ -162,10 +167,10 @@ def compress(
     kept = Path(cache) if cache is not None else None
     clock = Clock(progress)
     original, cleaned, source_bytes = open_scene(source, threads, clock)
-    splats, index, compaction = original, np.arange(len(original)), None
+    compacted = None
     if settings.compact.wanted:
-        compacted = _compact(original, settings, importance, views, checkpoint, evaluate, threads, clock)
-        splats, index, compaction = compacted.splats, compacted.index, compacted.report
+        compacted = _compact(original, settings, importance, views, checkpoint, threads, clock)
+    splats = original if compacted is None else compacted.splats
     encoded, trials = encode_scene(
         splats, settings.encode, importance, kept, views, cleaned, threads, clock, original=original
     )
@@ -174,17 +179,18 @@ def compress(
     if target is not None:
         clock("write", 0.0)
         write_container(encoded.files, target, overwrite=overwrite)
-        _forget(checkpoint)
+        if compacted is not None:
+            _forget(compacted)
     clock.stop()
     report = Report(
         source_count=len(original) + cleaned.removed,
         count=len(encoded.order),
-        sh_degree=splats.sh_degree,
+        sh_degree=original.sh_degree,
         source_bytes=source_bytes,
         container_bytes=archive_bytes,
         file_bytes={name: len(data) for name, data in encoded.files.items()},
         cleaned=cleaned,
-        compaction=compaction,
+        compaction=None if compacted is None else compacted.report,
         invisible=encoded.invisible,
         negligible=encoded.negligible,
         tamed_colours=encoded.tamed,
@@ -198,7 +204,8 @@ def compress(
         settings=settings.model_dump(mode="json"),
         evaluation=evaluation,
     )
-    return Compressed(encoded.files, index[encoded.order], report)
+    order = encoded.order if compacted is None else compacted.index[encoded.order]
+    return Compressed(encoded.files, order, report)
 
 
 def decompress(
@@ -243,7 +250,6 @@ def _compact(
     importance: Importance | None,
     views: Views | None,
     checkpoint: AnyPath | None,
-    judge: bool,
     threads: int,
     progress: Progress,
 ) -> Compacted:
@@ -252,9 +258,7 @@ def _compact(
     if importance is not None:
         raise UnsupportedError("importance is that of a scene before its compaction; compact first, then measure")
     kept = Path(checkpoint) if checkpoint is not None else None
-    return compact_scene(
-        splats, settings.compact, views, judge=judge, checkpoint=kept, threads=threads, progress=progress
-    )
+    return compact_scene(splats, settings.compact, views, checkpoint=kept, threads=threads, progress=progress)
 
 
 def _evaluate(

@@ -55,7 +55,7 @@ def seek(
         known[x] = spare(x)
         if 0 <= known[x] <= tolerance or _flat(known, tolerance):
             break
-        x = _whole(min(max(_next(known, slope, tolerance / 2), bounds[0]), bounds[1]), grain)
+        x = min(max(_whole(_next(known, slope, tolerance / 2), grain), bounds[0]), bounds[1])
     met = [x for x, found in known.items() if found >= 0]
     return min(met, key=lambda x: known[x]) if met else None
 

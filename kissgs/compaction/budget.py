@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,11 +22,16 @@ from kissgs.settings import CompactSettings
 from kissgs.splats import Splats
 from kissgs.views.view import Views
 
+if TYPE_CHECKING:
+    from kissgs.training.lessons import Lessons
+
 USUAL = 30.0
 """Decibels between a scene's pictures and photographs, where there are none to ask: about that of good captures."""
 
 START, SLOPE, LARGEST = -2.0, 0.4, -0.1
 """First share that is tried, decibels that doubling it is about worth, and the largest share; powers of 2."""
+
+MODELLED = f"without photographs, the drop is that of a scene {USUAL:g} dB from them to which the new errors are added"
 
 GRAIN = 1 / 64
 """Of shares, the same: counts that are nearer to each other than 1 % are not told apart."""
@@ -38,7 +45,7 @@ def compact_scene(
     settings: CompactSettings,
     views: Views | None = None,
     *,
-    judge: bool = False,
+    judges: bool = False,
     checkpoint: Path | None = None,
     threads: int = 0,
     progress: Progress = silent,
@@ -50,7 +57,7 @@ def compact_scene(
         settings: with a budget.
         views: a capture: its views for training are learned from, those that are held out judge. By default virtual
             ones, and the scene itself is the teacher.
-        judge: measure PSNR, SSIM and bytes after every step.
+        judges: measure PSNR, SSIM and bytes after every step, unless several compactions are tried.
         checkpoint: see :func:`kissgs.compaction.popspa.popspa`.
         threads: 0 means one per processor; the result does not depend on it.
         progress: receives "cameras" and the stages of that.
@@ -62,6 +69,13 @@ def compact_scene(
     """
     if not settings.wanted:
         raise UnsupportedError("how many Gaussians to keep is not said; give count, ratio or max_psnr_drop")
+    if settings.max_psnr_drop is not None and checkpoint is not None:
+        raise UnsupportedError("a search for a drop of PSNR keeps no checkpoint; give a count or a ratio with it")
+    if settings.sparsify_steps + settings.refine_steps and find_spec("torch") is None:
+        raise UnsupportedError(
+            "training is done with torch, which is missing: pip install 'kissgs[train]' (a CPU build will do); the "
+            "preset fast only prunes, and needs none"
+        )
     count = settings.count or max(1, round(len(splats) * (settings.ratio or 0.0)))
     if count >= len(splats):
         return _unchanged(splats, "no more than asked for")
@@ -69,18 +83,17 @@ def compact_scene(
     if settings.max_psnr_drop is None:
         return popspa(
             *(splats, count, settings, taught),
-            judge=judge,
+            judges=judges,
             checkpoint=checkpoint,
             threads=threads,
             progress=progress,
         )
-    if checkpoint is not None:
-        raise UnsupportedError("a search for a drop of PSNR keeps no checkpoint; give a count or a ratio with it")
-    return _Search(splats, settings, taught, judge, threads, progress).run(settings.max_psnr_drop)
+    return _Search(splats, settings, taught, threads, progress).run(settings.max_psnr_drop)
 
 
 def _unchanged(splats: Splats, why: str) -> Compacted:
-    note = f"the scene has {len(splats):,} Gaussians, {why}: it stays as it is"
+    count = f"{len(splats):,} Gaussian{'' if len(splats) == 1 else 's'}"
+    note = f"the scene has {count}, {why}: it stays as it is"
     report = CompactionReport(
         source_count=len(splats), count=len(splats), taught_by="nothing", source="", steps=(), note=note
     )
@@ -103,9 +116,10 @@ class _Search:
     """For the fewest Gaussians whose pictures lose no more than is allowed."""
 
     def __init__(
-        self, splats: Splats, settings: CompactSettings, taught: School, judge: bool, threads: int, progress: Progress
+        self, splats: Splats, settings: CompactSettings, taught: School, threads: int, progress: Progress
     ) -> None:
-        self.splats, self.settings, self.school, self.judge = splats, settings, taught, judge
+        self.splats, self.settings, self.school = splats, settings, taught
+        self.lessons: Lessons | None = None
         self.threads, self.progress = threads, progress
         self.trials: list[tuple[int, float]] = []
         self.best: Compacted | None = None
@@ -119,13 +133,22 @@ class _Search:
         best = self.best or _unchanged(
             self.splats, f"and every smaller one that was tried loses more than {allowed:g} dB"
         )
-        return replace(best, report=replace(best.report, trials=tuple(self.trials)))
+        modelled = "" if any(view.photo for view in self.school.test) else MODELLED
+        note = "; ".join(filter(None, [best.report.note, modelled]))
+        return replace(best, report=replace(best.report, trials=tuple(self.trials), note=note))
 
     def _drop(self, share: float, allowed: float) -> float:
         count = max(1, round(len(self.splats) * 2**share))
+        if self.lessons is None and self.settings.sparsify_steps + self.settings.refine_steps:
+            from kissgs.training.lessons import lessons
+
+            taught = self.school
+            self.lessons = lessons(
+                self.splats, taught.train, taught.background, threads=self.threads, progress=self.progress
+            )
         found = popspa(
             *(self.splats, count, self.settings, self.school),
-            judge=self.judge,
+            lessons=self.lessons,
             threads=self.threads,
             progress=self.progress,
         )

@@ -7,7 +7,7 @@ import itertools
 import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,17 +15,18 @@ import numpy as np
 
 from kissgs._typing import Int
 from kissgs._version import __version__
+from kissgs.compaction.judging import judge
 from kissgs.compaction.result import Compacted, CompactionReport, CompactionStep
 from kissgs.compaction.school import School
 from kissgs.compaction.scoring import show_most
-from kissgs.evaluation.pictures import evaluate
-from kissgs.progress import Progress, as_stage, silent
+from kissgs.errors import OutputError
+from kissgs.progress import Progress, silent
 from kissgs.rendering.rasterizer import load_kernels
-from kissgs.settings import CompactSettings, Settings
-from kissgs.sogxt.container import zip_bytes
-from kissgs.sogxt.encode import encode
+from kissgs.settings import CompactSettings
 from kissgs.splats import ATTRIBUTES, Splats
 from kissgs.training.checkpoint import Checkpoint
+from kissgs.views._files import open_file
+from kissgs.views.anatomy import anatomy
 
 if TYPE_CHECKING:
     from kissgs.training.lessons import Lessons
@@ -45,7 +46,8 @@ def popspa(
     school: School,
     *,
     teacher: Splats | None = None,
-    judge: bool = False,
+    lessons: Lessons | None = None,
+    judges: bool = False,
     checkpoint: Path | None = None,
     threads: int = 0,
     progress: Progress = silent,
@@ -58,12 +60,13 @@ def popspa(
         settings: of the recipe; their budget is not looked at.
         school: views to score by, to learn from and to judge by.
         teacher: what the pictures should show where there are no photographs; by default the scene itself.
-        judge: measure PSNR, SSIM and bytes after every step.
+        lessons: pictures from the school's views for training, if they are at hand.
+        judges: measure PSNR, SSIM and bytes after every step.
         checkpoint: file to keep the state in, every half minute of training. If there is one of this very work, it is
             taken up where it was left, and ends as if it had never been interrupted. It stays when all is done: whoever
             has written the result elsewhere may delete it.
         threads: 0 means one per processor; the result does not depend on it.
-        progress: receives "kernels", "score", "lessons", "sparsify", "refine", "evaluate".
+        progress: receives "kernels", "score", "lessons", "sparsify", "refine" and "judge".
 
     Raises:
         InvalidViewsError: a photograph cannot be read.
@@ -71,18 +74,22 @@ def popspa(
         UnsupportedError: there is no torch to train with; a picture would take too much memory.
     """
     teacher = teacher or splats
-    key = "" if checkpoint is None else _key((splats, teacher), count, settings, school)
+    key = "" if checkpoint is None else _key((splats, teacher), count, settings, school, judges)
     kept = Checkpoint(checkpoint, key)
-    return _Recipe(splats, count, settings, school, teacher, judge, kept, threads, progress).run()
+    found = _Recipe(splats, count, settings, school, teacher, lessons, judges, kept, threads, progress).run()
+    trained = settings.sparsify_steps + settings.refine_steps > 0
+    return replace(found, checkpoint=checkpoint) if trained else found
 
 
-def _key(scenes: Sequence[Splats], count: int, settings: CompactSettings, school: School) -> str:
+def _key(scenes: Sequence[Splats], count: int, settings: CompactSettings, school: School, judges: bool) -> str:
     """Of the work: equal only where the result is equal."""
-    key = hashlib.sha256(f"{__version__} {count} {settings.model_dump_json()} {school.background}".encode())
-    for view in (*school.train, *school.score, *school.test):
+    key = hashlib.sha256(f"{__version__} {count} {judges} {settings.model_dump_json()} {school.background}".encode())
+    for view in (*school.train, *school.test):
         camera = view.camera
         key.update(camera.viewmat.tobytes() + camera.K.tobytes() + f"{camera.width} {camera.height}".encode())
-        key.update(b"" if view.photo is None else view.load_photo().tobytes())
+        if view.photo is not None:
+            with open_file(view.photo) as (file, _):
+                key.update(file.read())
     for scene, name in itertools.product(scenes, ATTRIBUTES):
         key.update(getattr(scene, name).tobytes())
     return key.hexdigest()
@@ -107,17 +114,19 @@ class _Recipe:
         settings: CompactSettings,
         school: School,
         teacher: Splats,
-        judge: bool,
+        lessons: Lessons | None,
+        judges: bool,
         checkpoint: Checkpoint,
         threads: int,
         progress: Progress,
     ) -> None:
         self.splats, self.count, self.settings = splats, count, settings
-        self.school, self.teacher = school, teacher
-        self.judge, self.checkpoint, self.threads, self.progress = judge, checkpoint, threads, progress
+        self.school, self.teacher, self.lessons = school, teacher, lessons
+        self.judges, self.checkpoint, self.threads, self.progress = judges, checkpoint, threads, progress
         self.index: Int[np.ndarray, " M"] = np.arange(len(splats))
         self.steps: list[CompactionStep] = []
         self.since = time.perf_counter()
+        self.note = ""
 
     def run(self) -> Compacted:
         """All steps, or those that a checkpoint has left."""
@@ -128,7 +137,7 @@ class _Recipe:
             scene = self.splats.select(self._prune(self.splats, self.count, self.progress))
             self._done("prune", scene)
             return self._result(scene, "nothing")
-        lessons = self._lessons()
+        lessons = self.lessons or self._look()
         begun, done, state = self._begin()
         for number in range(begun, len(phases)):
             self._train(phases, number, done, state, lessons)
@@ -153,7 +162,7 @@ class _Recipe:
         share = self.settings.first_share if self.settings.sparsify_steps else 1.0
         return round(len(self.splats) * (self.count / len(self.splats)) ** share)
 
-    def _lessons(self) -> Lessons:
+    def _look(self) -> Lessons:
         from kissgs.training.lessons import lessons
 
         school = self.school
@@ -174,6 +183,7 @@ class _Recipe:
         scene = self.splats.select(self._prune(self.splats, self._first_count(), self.progress))
         self._done("prune", scene)
         self.trainee = Trainee(scene)
+        self._save(0, 0, {})  # if that cannot be, it is better known before the work than after
         return 0, 0, {}
 
     def _prune(self, scene: Splats, count: int, progress: Progress) -> Int[np.ndarray, " M"]:
@@ -197,7 +207,7 @@ class _Recipe:
         phase, chosen, wishes = phases[number], self.settings, list[Regularizer]()
         progress = self._within(phases, number)
         if chosen.needle_weight or chosen.flat_weight:
-            wishes.append(Shape(chosen.needle_weight, chosen.flat_weight, lessons.extent))
+            wishes.append(Shape(chosen.needle_weight, chosen.flat_weight, self._extent(lessons)))
         sparsity = None
         if phase.name == "sparsify" and chosen.rho:
             sparsity = Sparsity(self.trainee.parameters["opacities"], phase.count, chosen.rho, chosen.interval)
@@ -212,7 +222,7 @@ class _Recipe:
         plan = Plan(
             stage=phase.name,
             steps=phase.steps,
-            rates=self._rates(phase, lessons.extent),
+            rates=self._rates(phase, self._extent(lessons)),
             ssim_weight=chosen.ssim_weight,
             seed=(chosen.seed, number),
             regularizers=tuple(wishes),
@@ -223,6 +233,10 @@ class _Recipe:
         if len(scene) > phase.count:
             self.trainee.keep(self._prune(scene, phase.count, progress))
             self._done("prune", self.trainee.splats())
+
+    def _extent(self, lessons: Lessons) -> float:
+        """By which lengths are measured: the cameras', or the scene's where all cameras stand in one place."""
+        return lessons.extent or anatomy(self.splats).radius
 
     def _within(self, phases: list[_Phase], number: int) -> Progress:
         """Tells of all phases of one name as of one stage, with the prunings between them."""
@@ -254,23 +268,28 @@ class _Recipe:
             "steps": [asdict(step) for step in self.steps],
         }
         state = {**self.trainee.state(), **extra, "index": self.index, "told": np.asarray(json.dumps(told))}
-        self.checkpoint.save(state)
+        try:
+            self.checkpoint.save(state)
+        except OutputError as error:
+            if not (number or done):
+                raise
+            self.note = f"the work went on without a checkpoint: {error}"
 
     def _done(self, name: str, scene: Splats) -> None:
         """Note a step: what it took, and if asked for, what it gave."""
         seconds = time.perf_counter() - self.since
-        psnr = ssim = size = None
-        if self.judge:
-            likeness = evaluate(
-                *(self.teacher, scene, self.school.exam),
-                threads=self.threads,
-                progress=as_stage("evaluate", self.progress),
-            ).mean.candidate
-            fast = Settings.from_preset("fast").encode
-            psnr, ssim = likeness.psnr, likeness.ssim
-            size = len(zip_bytes(encode(scene, fast, threads=self.threads).files))
+        likeness, size = None, None
+        if self.judges:
+            likeness, size = judge(scene, self.teacher, self.school, self.threads, self.progress)
         self.steps.append(
-            CompactionStep(name=name, count=len(scene), seconds=seconds, psnr=psnr, ssim=ssim, bytes=size)
+            CompactionStep(
+                name=name,
+                count=len(scene),
+                seconds=seconds,
+                psnr=None if likeness is None else likeness.psnr,
+                ssim=None if likeness is None else likeness.ssim,
+                bytes=size,
+            )
         )
         self.since = time.perf_counter()
 
@@ -281,5 +300,6 @@ class _Recipe:
             taught_by=taught_by,
             source=self.school.source,
             steps=tuple(self.steps),
+            note="; ".join(filter(None, [self.school.note, self.note])),
         )
         return Compacted(scene, self.index, report)

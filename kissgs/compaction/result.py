@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from kissgs._typing import Int
-from kissgs.splats import Splats
+from kissgs.splats import NOTHING_CLEANED, Cleaned, Splats
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -16,7 +17,7 @@ class CompactionStep:
     """One of the steps of a compaction, and the scene after it.
 
     Attributes:
-        name: "input", "prune", "sparsify", "prune again" or "refine".
+        name: "input", "prune", "sparsify" or "refine".
         count: Gaussians.
         seconds: wall time, without what judging it took.
         psnr: decibels, mean over held-out views: to their photographs, or to the input's renderings where there are
@@ -44,6 +45,9 @@ class CompactionReport:
         source: of the views, for people.
         steps: in their order, the input first.
         trials: where a drop of PSNR was given instead of a count: counts that were tried, and the drop of each, dB.
+        cleaned: what was wrong with the input, which counts are without.
+        cpu_seconds: processor time, over all threads.
+        peak_memory: bytes, the largest this process has ever had resident.
         note: a sentence for people about what they may not have expected, without a capital and a full stop; or none.
     """
 
@@ -53,6 +57,9 @@ class CompactionReport:
     source: str
     steps: tuple[CompactionStep, ...]
     trials: tuple[tuple[int, float], ...] = ()
+    cleaned: Cleaned = NOTHING_CLEANED
+    cpu_seconds: float = 0.0
+    peak_memory: int = 0
     note: str = ""
 
     def as_dict(self) -> dict[str, Any]:
@@ -69,10 +76,12 @@ class Compacted:
 
     Attributes:
         splats: clean.
-        index: ``(M,)`` for each of its Gaussians, which one of the input it was; rising.
+        index: ``(M,)`` for each of its Gaussians, which one of the cleaned input it was; rising.
         report: what it took and gave.
+        checkpoint: the file that holds all this, if there is one: to be deleted when it is kept elsewhere.
     """
 
     splats: Splats
     index: Int[np.ndarray, " M"]
     report: CompactionReport
+    checkpoint: Path | None = None

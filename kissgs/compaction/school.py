@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -31,9 +31,10 @@ class School:
     Attributes:
         train: to learn from; one or more.
         score: to score by; those, or where there are very many, some of them.
-        test: to judge by: held out, or where no view is, some of those to learn from.
+        test: to judge by: held out, or where no view is, some of those to learn from. All have photographs, or none.
         background: ``(3,)`` RGB over which to render.
         source: for people.
+        note: a sentence for people about what they may not have expected, without a capital and a full stop; or none.
     """
 
     train: tuple[View, ...]
@@ -41,6 +42,7 @@ class School:
     test: tuple[View, ...]
     background: Float32[np.ndarray, "3"]
     source: str
+    note: str = ""
 
     @property
     def exam(self) -> Views:
@@ -67,21 +69,28 @@ def school(
     """
     if views is None or not views.train:
         return _virtual(splats, settings, threads, progress)
-    size = settings.view_size
+    size, train, source = settings.view_size, views.train, views.source
     if settings.around > 0:
         camera = views.train[0].camera.at_most(size)
         side = round(math.sqrt(camera.width * camera.height))
         count = max(1, round(len(views.train) * settings.around / (1 - settings.around)))
         around = virtual_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
-        views = replace(views, train=(*views.train, *around.all), source=f"{views.source}, and {around.source}")
-    train = _sized(views.train, size)
+        train, source = (*train, *around.all), f"{source}, and {around.source}"
+    sized = _sized(train, size)
+    unheld = "" if views.test else "no view is held out: the figures are those of views that were learned from"
     return School(
-        train=train,
-        score=train,
-        test=_sized(_some(views.test or views.train), size),
+        train=sized,
+        score=sized,
+        test=_sized(_some(_alike(views.test or views.train)), size),
         background=views.background,
-        source=views.source,
+        source=source,
+        note="; ".join(filter(None, [views.note, unheld])),
     )
+
+
+def _alike(views: Sequence[View]) -> Sequence[View]:
+    """Those with a photograph, if any has one."""
+    return [view for view in views if view.photo is not None] or views
 
 
 def _virtual(splats: Splats, settings: CompactSettings, threads: int, progress: Progress) -> School:

@@ -49,7 +49,7 @@ def show_most(
         Their numbers, rising.
     """
     kept = np.arange(len(splats))
-    rounds = max(1, math.ceil(math.log(count / max(len(splats), count)) / math.log(share))) if share > 0 else 1
+    rounds = max(1, math.ceil(math.log(count / max(len(splats), count)) / math.log(share) - 1e-9)) if share > 0 else 1
     shrink = (count / max(len(splats), 1)) ** (1 / rounds)
     for round_ in range(rounds):
         if len(kept) <= count:

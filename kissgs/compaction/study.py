@@ -10,14 +10,12 @@ from typing import Any
 import numpy as np
 
 from kissgs._typing import Int
+from kissgs.compaction.judging import judge
 from kissgs.compaction.popspa import popspa
 from kissgs.compaction.school import school
 from kissgs.compaction.scoring import highest
-from kissgs.evaluation.pictures import evaluate
-from kissgs.progress import Progress, as_stage, silent
-from kissgs.settings import CompactSettings, Settings
-from kissgs.sogxt.container import zip_bytes
-from kissgs.sogxt.encode import encode
+from kissgs.progress import Progress, silent
+from kissgs.settings import CompactSettings
 from kissgs.splats import Splats
 from kissgs.views.view import Views
 
@@ -130,15 +128,13 @@ def study(
     steps = settings.sparsify_steps + settings.refine_steps
 
     def judged(way: str, scene: Splats, seconds: float, cpu_seconds: float) -> Point:
-        receive = as_stage("evaluate", progress)
-        likeness = evaluate(splats, scene, taught.exam, threads=threads, progress=receive).mean.candidate
-        files = encode(scene, Settings.from_preset("fast").encode, threads=threads).files
+        likeness, size = judge(scene, splats, taught, threads, progress)
         return Point(
             way=way,
             count=len(scene),
             psnr=likeness.psnr,
             ssim=likeness.ssim,
-            bytes=len(zip_bytes(files)),
+            bytes=size,
             seconds=seconds,
             cpu_seconds=cpu_seconds,
         )

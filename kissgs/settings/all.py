@@ -37,7 +37,7 @@ class Settings(BaseModel):
         cls,
         preset: Preset | str = Preset.BALANCED,
         *,
-        compact: Mapping[str, Any] | None = None,
+        compact: Mapping[str, Any] | CompactSettings | None = None,
         **encode: Any,  # noqa: ANN401
     ) -> Settings:
         """Settings of a preset, with single ones of the encoder replaced, and those of ``compact`` of the compaction.
@@ -48,7 +48,13 @@ class Settings(BaseModel):
         if preset not in list(Preset):
             raise UnsupportedError(f"there is no preset {preset!r}; choose one of {', '.join(Preset)}")
         try:
-            return cls.model_validate({"preset": preset, "compact": dict(compact or {}), "encode": encode})
+            return cls.model_validate(
+                {
+                    "preset": preset,
+                    "compact": compact if isinstance(compact, CompactSettings) else dict(compact or {}),
+                    "encode": encode,
+                }
+            )
         except ValidationError as error:
             problem = error.errors()[0]
             group, name = str(problem["loc"][0]), str(problem["loc"][-1])

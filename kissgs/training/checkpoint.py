@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from kissgs.errors import OutputError
-from kissgs.io.atomic import atomic_file, reason_of
+from kissgs.io.atomic import atomic_file, reason_of, refuse_existing
 
 SECONDS = 30.0
 """Between two savings: what is lost at most."""
@@ -20,40 +20,45 @@ SECONDS = 30.0
 class Checkpoint:
     """A file ``.npz`` that holds the state of one piece of work; without a path, nothing is kept.
 
-    Attributes:
+    Args:
+        path: of the file.
         key: of the work: its input, settings and version. What was kept under another is not taken up.
+
+    Raises:
+        OutputError: the file is of other work, or no such file, and must not be written over; or it could not be
+            written.
     """
 
     def __init__(self, path: Path | None, key: str) -> None:
-        self._path, self.key = path, key
-        self._saved = time.monotonic()
+        self._path, self._key = path, key
+        self._saved, self._took = time.monotonic(), 0.0
+        if path is not None:
+            refuse_existing(path, overwrite=True)
+            if path.exists() and self._read(path) is None:
+                raise OutputError(
+                    f"{path} is the checkpoint of other work: another scene, other views or settings, or another "
+                    "version of kissgs; delete it to begin anew"
+                )
 
     def load(self) -> dict[str, np.ndarray] | None:
-        """What was kept; None if nothing was.
+        """What was kept; None if nothing was."""
+        return self._read(self._path) if self._path is not None and self._path.exists() else None
 
-        Raises:
-            OutputError: the file is of other work, or no such file, and must not be written over.
-        """
-        if self._path is None or not self._path.exists():
-            return None
+    def _read(self, path: Path) -> dict[str, np.ndarray] | None:
         try:
-            with self._path.open("rb") as file, np.load(file, allow_pickle=False) as kept:
-                key, state = str(kept["key"]), {name: kept[name] for name in kept.files if name != "key"}
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as kept:
+                if str(kept["key"]) != self._key:
+                    return None
+                return {name: kept[name] for name in kept.files if name != "key"}
         except OSError as error:
-            raise OutputError(f"cannot read {self._path}: {reason_of(error)}") from error
-        except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise OutputError(f"{self._path} is no checkpoint of kissgs; move it away or delete it") from error
-        if key != self.key:
-            raise OutputError(
-                f"{self._path} is the checkpoint of other work: another scene, other views or settings, or another "
-                "version of kissgs; delete it to begin anew"
-            )
-        return state
+            raise OutputError(f"cannot read {path}: {reason_of(error)}") from error
+        except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+            raise OutputError(f"{path} is no checkpoint of kissgs; move it away or delete it") from error
 
     @property
     def due(self) -> bool:
-        """Whether it is time to save again."""
-        return self._path is not None and time.monotonic() - self._saved >= SECONDS
+        """Whether it is time to save again: half a minute has gone, and saving takes no more than a twentieth of it."""
+        return self._path is not None and time.monotonic() - self._saved >= max(SECONDS, 20 * self._took)
 
     def save(self, state: Mapping[str, np.ndarray]) -> None:
         """Keep it, whole or not at all, in place of what was kept before.
@@ -63,7 +68,14 @@ class Checkpoint:
         """
         if self._path is None:
             return
+        begun = time.monotonic()
+        arrays: dict[str, Any] = {"key": np.asarray(self._key), **state}
         with atomic_file(self._path, overwrite=True) as file:
-            arrays: dict[str, Any] = {"key": np.asarray(self.key), **state}
             np.savez(file, **arrays)
         self._saved = time.monotonic()
+        self._took = self._saved - begun
+
+    def remove(self) -> None:
+        """What it led to is kept elsewhere."""
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)

@@ -54,7 +54,10 @@ class Lessons:
 
     @property
     def extent(self) -> float:
-        """Of the cameras, world units: 1.1 times the greatest distance from their middle, as 3DGS measures a scene."""
+        """Of the cameras, world units: 1.1 times the greatest distance from their middle, as 3DGS measures a scene.
+
+        0 where all stand in one place.
+        """
         places = np.array([camera.position for camera in self.cameras])
         return 1.1 * float(np.linalg.norm(places - places.mean(axis=0), axis=1).max())
 

@@ -9,7 +9,16 @@ import numpy as np
 from kissgs._typing import Int
 from kissgs.errors import UnsupportedError
 from kissgs.rendering.differentiable import tensors_of
-from kissgs.splats import ATTRIBUTES, LOG_SCALE_LIMIT, OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN, Splats, clean
+from kissgs.splats import (
+    ATTRIBUTES,
+    LOG_SCALE_LIMIT,
+    MEAN_LIMIT,
+    OPACITY_LOGIT_MAX,
+    OPACITY_LOGIT_MIN,
+    SH_LIMIT,
+    Splats,
+    clean,
+)
 
 try:
     import torch
@@ -18,7 +27,14 @@ except ImportError as error:
     raise UnsupportedError("training is torch's, which is missing: pip install 'kissgs[train]'") from error
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
-BOUNDS = {"opacities": (OPACITY_LOGIT_MIN, OPACITY_LOGIT_MAX), "scales": (-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)}
+BOUNDS = {
+    "means": (-0.999 * MEAN_LIMIT, 0.999 * MEAN_LIMIT),  # float32 could round up
+    "scales": (-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT),
+    "opacities": (OPACITY_LOGIT_MIN, OPACITY_LOGIT_MAX),
+    "sh0": (-SH_LIMIT, SH_LIMIT),
+    "shN": (-SH_LIMIT, SH_LIMIT),
+}
+"""What :func:`kissgs.splats.clean` would change or remove."""
 LARGEST = 1e15
 """Of a gradient: its square is still a float32."""
 
@@ -48,8 +64,8 @@ class Trainee:
     def step(self, rates: Mapping[str, float]) -> None:
         """Move all parameters against their gradients, at these learning rates, and forget the gradients.
 
-        What a stored scene cannot hold is kept out: opacities and log-scales stay within the bounds of
-        :func:`kissgs.splats.clean`, and a gradient that is no number counts as none.
+        What a stored scene cannot hold is kept out: values stay within the bounds of :func:`kissgs.splats.clean`, and
+        a gradient that is no number counts as none.
         """
         for group in self._adam.param_groups:
             group["lr"] = rates[group["name"]]

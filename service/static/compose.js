@@ -28,7 +28,7 @@ export function composer(limits, presets, submit) {
 
   byId("keep-note").textContent = limits.training
     ? "Those that stay are trained to do the work of the others: a file that shrinks with them, after minutes of work."
-    : "Fewer is smaller, and rougher: without torch on this server nothing is trained, and only the preset fast does it.";
+    : "This server has no torch: choose Fast to have fewer. Nothing is trained then, and pictures become rougher.";
 
   /** @param {File} file */
   async function take(file) {
@@ -73,7 +73,10 @@ export function composer(limits, presets, submit) {
     prefer(options) {
       list.choose(options.preset);
       byId("evaluate").checked = options.evaluate;
-      byId("keep").value = String(options.compact?.ratio ?? "");
+      const [keep, ratio] = [/** @type {HTMLSelectElement} */ (byId("keep")), options.compact?.ratio ?? null];
+      if (ratio !== null && ![...keep.options].some(({ value }) => Number(value) === ratio))
+        keep.add(new Option(`Keep ${Math.round(100 * ratio)} %`, String(ratio)));
+      keep.value = [...keep.options].find(({ value }) => Number(value) === ratio)?.value ?? "";
     },
   };
 }

@@ -20,6 +20,7 @@ const STAGES = {
   kernels: "Preparing",
   cameras: "Placing cameras",
   score: "Scoring Gaussians",
+  judge: "Judging what it has come to",
   lessons: "Taking pictures to learn from",
   sparsify: "Training while Gaussians go",
   refine: "Training those that stay",
@@ -39,7 +40,6 @@ const STAGES = {
 const ALWAYS = ["read", "kernels", "order", "forms", "images"];
 const WEIGHED = ["cameras", "importance", "price", "rounding"];
 const COMPACTED = ["cameras", "score"];
-const TRAINED = ["lessons", "sparsify", "refine"];
 const WITH_COLOURS_BY_ANGLE = ["codebook", "sort codebook"];
 
 /** @type {[RegExp, string][]} */
@@ -84,7 +84,9 @@ export function plannedStages(status) {
   const { count: wanted, ratio, max_psnr_drop: drop, sparsify_steps, refine_steps } = status.options.compact;
   if (wanted !== null || ratio !== null || drop !== null) {
     COMPACTED.forEach((stage) => planned.add(stage));
-    if (sparsify_steps + refine_steps > 0) TRAINED.forEach((stage) => planned.add(stage));
+    if (sparsify_steps + refine_steps > 0) planned.add("lessons");
+    if (sparsify_steps > 0) planned.add("sparsify");
+    if (refine_steps > 0) planned.add("refine");
   }
   if (status.sh_degree > 0) WITH_COLOURS_BY_ANGLE.forEach((stage) => planned.add(stage));
   if (status.options.evaluate) planned.add("evaluate");

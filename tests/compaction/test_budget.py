@@ -68,6 +68,22 @@ def test_as_few_as_lose_no_more_than_is_allowed(allowed):
     assert len({count for count, _ in result.report.trials}) == len(result.report.trials)
 
 
+def test_that_a_drop_without_photographs_is_a_model_is_said():
+    assert "that of a scene 30 dB from them" in compacted(cloud(60), max_psnr_drop=1).report.note
+
+
+def test_counts_are_of_the_cleaned_scene():
+    scene = cloud(50)
+    scene.means[0] = np.nan
+    result = kissgs.compact(scene, settings=kissgs.Settings.from_preset("fast", compact={"count": 20}), views=views())
+    assert result.report.source_count == 49
+    assert result.report.cleaned.non_finite == 1
+    assert result.report.as_dict()["cleaned"]["non_finite"] == 1
+    assert result.report.cpu_seconds > 0
+    assert result.report.peak_memory > 1e7
+    assert (result.splats.means == kissgs.clean(scene)[0].means[result.index]).all()
+
+
 def test_where_nothing_can_go_it_stays_as_it_is():
     scene = cloud(40)
     result = compacted(scene, max_psnr_drop=1e-9)

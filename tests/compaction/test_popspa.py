@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+from PIL import Image
 from training_scenes import around, cloud, same
 
 import kissgs
@@ -16,7 +17,7 @@ from kissgs.progress import silent
 from kissgs.rendering.rasterizer import render
 from kissgs.splats import ATTRIBUTES
 from kissgs.training.checkpoint import Checkpoint
-from kissgs.views.view import Views, black
+from kissgs.views.view import View, Views, black
 
 SHORT = {"sparsify_steps": 8, "refine_steps": 6, "rounds": 2, "score_share": 0.6, "interval": 3}
 
@@ -82,7 +83,7 @@ def test_training_makes_up_for_what_went():
 
 
 def test_the_steps_are_told():
-    result = popspa(cloud(100), 20, settings(first_share=0.5), taught(), judge=True)
+    result = popspa(cloud(100), 20, settings(first_share=0.5), taught(), judges=True)
     names = [step.name for step in result.report.steps]
     assert names == ["input", "prune", "sparsify", "prune", "sparsify", "prune", "refine"]
     assert [step.count for step in result.report.steps] == [100, 45, 45, 30, 30, 20, 20]
@@ -117,15 +118,15 @@ def stopping_after(steps):
 @pytest.mark.parametrize("steps", [0, 2, 4, 5, 9, 10, 13, 15])
 def test_what_was_interrupted_ends_as_if_it_had_not_been(tmp_path, monkeypatch, steps):
     monkeypatch.setattr(Checkpoint, "due", True)
-    whole = popspa(cloud(80), 20, settings(), taught(), judge=True)
+    whole = popspa(cloud(80), 20, settings(), taught(), judges=True)
     path = tmp_path / "c.npz"
     with pytest.raises(Interrupted):
-        popspa(cloud(80), 20, settings(), taught(), judge=True, checkpoint=path, progress=stopping_after(steps))
-    assert path.exists() == (steps > 0)
+        popspa(cloud(80), 20, settings(), taught(), judges=True, checkpoint=path, progress=stopping_after(steps))
+    assert path.exists()
     resumed = []
     again = popspa(
         *(cloud(80), 20, settings(), taught()),
-        judge=True,
+        judges=True,
         checkpoint=path,
         progress=lambda stage, fraction, note="": resumed.append(stage),
     )
@@ -137,11 +138,78 @@ def test_what_was_interrupted_ends_as_if_it_had_not_been(tmp_path, monkeypatch, 
     begun = []
     third = popspa(
         *(cloud(80), 20, settings(), taught()),
+        judges=True,
         checkpoint=path,
         progress=lambda stage, fraction, note="": begun.append(stage),
     )
     assert same(whole.splats, third.splats), "what was finished is not done again"
     assert set(begun) == {"kernels", "lessons"}
+
+
+def test_what_was_begun_without_figures_is_not_taken_up_for_figures(tmp_path, monkeypatch):
+    """The steps before would have none."""
+    monkeypatch.setattr(Checkpoint, "due", True)
+    path = tmp_path / "c.npz"
+    with pytest.raises(Interrupted):
+        popspa(cloud(80), 20, settings(), taught(), checkpoint=path, progress=stopping_after(9))
+    with pytest.raises(OutputError, match="other work"):
+        popspa(cloud(80), 20, settings(), taught(), judges=True, checkpoint=path)
+
+
+def test_a_disk_that_fills_later_does_not_end_the_work(tmp_path, monkeypatch):
+    monkeypatch.setattr(Checkpoint, "due", True)
+    saves, whole = [], Checkpoint.save
+
+    def save(self, state):
+        saves.append(1)
+        if len(saves) > 3:
+            raise OutputError("cannot write c.npz: no space left on device")
+        whole(self, state)
+
+    monkeypatch.setattr(Checkpoint, "save", save)
+    result = popspa(cloud(80), 20, settings(), taught(), checkpoint=tmp_path / "c.npz")
+    assert len(result.splats) == 20
+    assert result.report.note == "the work went on without a checkpoint: cannot write c.npz: no space left on device"
+
+
+def test_a_file_that_is_no_checkpoint_stays(tmp_path):
+    path = tmp_path / "thesis.npz"
+    for steps in ({}, {"sparsify_steps": 0, "refine_steps": 0}):
+        path.write_text("years of work")
+        with pytest.raises(OutputError, match="is no checkpoint of kissgs"):
+            popspa(cloud(80), 20, settings(**steps), taught(), checkpoint=path)
+        assert path.read_text() == "years of work"
+
+
+@pytest.mark.parametrize("compact", [{}, {"count": 1000}])
+def test_where_nothing_is_trained_no_file_is_touched(tmp_path, compact):
+    path = tmp_path / "thesis.npz"
+    path.write_text("years of work")
+    chosen = kissgs.Settings.from_preset("fast", compact=compact)
+    kissgs.compress(cloud(50), tmp_path / "o.zip", settings=chosen, checkpoint=path)
+    assert path.read_text() == "years of work"
+
+
+def test_all_cameras_in_one_place():
+    """A tripod: their extent is 0, and says nothing of the size of the world."""
+    (view,) = around(1)
+    turned = [View(f"{n}", kissgs.Camera(view.camera.viewmat, view.camera.K, 40 - n, 32)) for n in range(3)]
+    school_ = School(*[tuple(turned)] * 3, black(), "a tripod")
+    scene = cloud(60)
+    result = popspa(scene, 30, settings(flat_weight=1.0, needle_weight=0.1), school_)
+    assert np.abs(result.splats.means - scene.means[result.index]).max() > 1e-4
+
+
+def test_the_scene_as_it_was_teaches_the_smaller_one():
+    """``teacher`` is for those that are pruned already."""
+    scene, taught_by = cloud(200), taught()
+    pruned = scene.select(np.arange(0, 200, 3))
+    steps = settings(sparsify_steps=0, refine_steps=80)
+    apart = [
+        error(popspa(pruned, len(pruned), steps, taught_by, teacher=teacher).splats, scene, taught_by.train)
+        for teacher in (scene, pruned)
+    ]
+    assert apart[0] < 0.7 * apart[1]
 
 
 @pytest.mark.parametrize("other", ["scene", "count", "settings", "views"])
@@ -163,7 +231,7 @@ def test_the_checkpoint_of_other_work_is_refused(tmp_path, monkeypatch, other):
 
 def test_a_full_disk_is_told(tmp_path, monkeypatch):
     monkeypatch.setattr(Checkpoint, "due", True)
-    with pytest.raises(OutputError, match="cannot write"):
+    with pytest.raises(OutputError, match="there is no folder"):
         popspa(cloud(80), 20, settings(), taught(), checkpoint=tmp_path / "nowhere" / "c.npz")
 
 
@@ -189,6 +257,21 @@ def test_a_capture_has_virtual_views_around_it(around_it, virtual):
     assert found.source == "a capture" + (f", and {virtual} virtual cameras" if virtual else "")
 
 
+@pytest.mark.parametrize("photos", [0, 2, 4])
+def test_a_capture_that_holds_no_view_out(tmp_path, photos):
+    """It is judged by views that it learned from, which is said; with photographs or without, never by both."""
+    train = list(around(4))
+    for n in range(photos):
+        Image.new("RGB", (40, 32), (50, 90, 20)).save(tmp_path / f"{n}.png")
+        train[n] = View(train[n].name, train[n].camera, tmp_path / f"{n}.png")
+    scene = cloud(60)
+    found = school(scene, Views(tuple(train), (), black(), "a capture", "a note"), settings(around=0.5))
+    assert len(found.test) == (photos or 4)
+    result = popspa(scene, 20, settings(), found, judges=True)
+    assert result.report.note.startswith("a note; no view is held out")
+    assert result.report.taught_by == ("photos" if photos else "renderings")
+
+
 def test_nothing_is_seen():
     """All cameras look away: every score is 0, and the first Gaussians stay."""
     scene = cloud(30)
@@ -201,7 +284,7 @@ def test_nothing_is_seen():
 def test_phases_are_by_the_same_factor():
     """In each, as many steps as in the others, give or take one."""
     chosen = settings(sparsify_steps=10, rounds=3, first_share=0.0)
-    made = recipe._Recipe(cloud(100), 10, chosen, taught(), cloud(100), False, Checkpoint(None, ""), 0, silent)
+    made = recipe._Recipe(cloud(100), 10, chosen, taught(), cloud(100), None, False, Checkpoint(None, ""), 0, silent)
     phases = list(made._phases())
     assert [(phase.name, phase.steps, phase.count) for phase in phases] == [
         ("sparsify", 3, 46),

@@ -11,6 +11,8 @@ import pytest
 from serving import FAST, SLOW, SMALL, events, problem, scene_bytes
 
 import kissgs
+from service.problems import ProblemError
+from service.submission import parse_options
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +74,18 @@ def test_training_in_a_job(service):
 def test_impossible_budgets_are_refused(service, compact):
     answer = service.http.post("/v1/jobs", content=SMALL, params={"options": json.dumps({"compact": compact})})
     problem(answer, 422, "invalid-request")
+
+
+def test_a_service_without_torch_does_not_accept_what_it_cannot_do(monkeypatch):
+    monkeypatch.setattr("service.submission.can_train", lambda: False)
+    with pytest.raises(ProblemError, match="no torch to train with"):
+        parse_options('{"compact": {"ratio": 0.2}}')
+    assert parse_options('{"preset": "fast", "compact": {"ratio": 0.2}}').kind == "fast+compact"
+    assert parse_options("{}").kind == "balanced"
+
+
+def test_limits_tell_whether_it_trains(service):
+    assert service.http.get("/v1/limits").json()["training"] is True
 
 
 def test_the_options_are_optional(service):

@@ -27,11 +27,14 @@ def test_other_work_is_not_taken_up_and_not_written_over(tmp_path):
         Checkpoint(tmp_path / "c.npz", "other").load()
 
 
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut short", b"some text", "npz"])
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut short", b"some text", "npz", "npy"])
 def test_other_files_are_told_from_checkpoints(tmp_path, content):
     path = tmp_path / "c.npz"
     if content == "npz":
         np.savez(path, x=np.zeros(3))
+    elif content == "npy":
+        with path.open("wb") as file:
+            np.save(file, np.zeros(3))
     else:
         path.write_bytes(content)
     with pytest.raises(OutputError, match=r"c\.npz is no checkpoint of kissgs; move it away or delete it"):
@@ -39,7 +42,7 @@ def test_other_files_are_told_from_checkpoints(tmp_path, content):
 
 
 def test_a_folder_in_its_place(tmp_path):
-    with pytest.raises(OutputError, match="cannot read"):
+    with pytest.raises(OutputError, match="is a folder; name a file"):
         Checkpoint(tmp_path, "key").load()
 
 

@@ -1,0 +1,25 @@
+"""How good a smaller scene is: its pictures from held-out views, and the bytes it will take."""
+
+from __future__ import annotations
+
+from kissgs.compaction.school import School
+from kissgs.evaluation.likeness import Likeness
+from kissgs.evaluation.pictures import evaluate
+from kissgs.progress import Progress, as_stage, silent
+from kissgs.settings import Preset, Settings
+from kissgs.sogxt.container import zip_bytes
+from kissgs.sogxt.encode import encode
+from kissgs.splats import Splats
+
+
+def judge(
+    scene: Splats, reference: Splats, school: School, threads: int = 0, progress: Progress = silent
+) -> tuple[Likeness, int]:
+    """How alike its pictures are to the photographs, or to those of ``reference`` where there are none; and its bytes.
+
+    The bytes are those of its container as the preset ``fast`` makes it. ``progress`` receives the stage ``"judge"``.
+    """
+    receive = as_stage("judge", progress)
+    compared = evaluate(reference, scene, school.exam, threads=threads, progress=receive)
+    encoded = encode(scene, Settings(preset=Preset.FAST).encode, threads=threads, progress=receive)
+    return compared.mean.candidate, len(zip_bytes(encoded.files))

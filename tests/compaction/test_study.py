@@ -1,0 +1,51 @@
+"""Oracle: the ways called by themselves; for plots, that they are drawn and can be read."""
+
+import math
+
+import numpy as np
+import pytest
+from PIL import Image
+from training_scenes import around, cloud
+
+from kissgs import CompactSettings, UnsupportedError
+from kissgs._plots import check_plot, compaction_plot
+from kissgs.compaction.study import WAYS, study
+from kissgs.views.view import Views, black
+
+SHORT = CompactSettings(sparsify_steps=6, refine_steps=6, rounds=2, around=0)
+
+
+@pytest.fixture(scope="module")
+def points():
+    return study(cloud(80), SHORT, Views(around(5), around(3), black(), "five views"), ratios=[0.5, 0.2])
+
+
+def test_all_ways_at_all_ratios(points):
+    first, *others = points
+    assert (first.way, first.count, first.psnr) == ("input", 80, math.inf)
+    assert [(point.way, point.count) for point in others] == [(way.name, count) for way in WAYS for count in (40, 16)]
+    assert all(0 < point.psnr < 100 and 0 < point.bytes < first.bytes for point in others)
+
+
+def test_who_is_best_is_left(points):
+    """Scores beat chance, and training beats none."""
+    psnr = {point.way: point.psnr for point in points if point.count == 16}
+    assert psnr["random"] < psnr["POP in rounds"] < psnr["POP in rounds + refine"]
+    assert psnr["opacity"] < psnr["opacity + refine"]
+
+
+@pytest.mark.parametrize("kind", ["png", "svg", "pdf"])
+def test_the_plot_is_drawn(tmp_path, points, kind):
+    path = tmp_path / f"plot.{kind}"
+    compaction_plot(points, path)
+    data = path.read_bytes()
+    assert data.startswith({"png": b"\x89PNG", "svg": b"<?xml", "pdf": b"%PDF"}[kind])
+    if kind == "png":
+        assert np.asarray(Image.open(path).convert("L")).std() > 10
+    compaction_plot(points, path)
+    assert kind == "pdf" or path.read_bytes() == data
+
+
+def test_what_cannot_be_drawn_is_said_before_the_work(tmp_path):
+    with pytest.raises(UnsupportedError, match="plots are svg, png, pdf"):
+        check_plot(tmp_path / "plot.jpg")
