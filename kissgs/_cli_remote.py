@@ -33,20 +33,23 @@ def compress(
     changes: Annotated[
         list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change one setting of the preset.")
     ] = None,
+    compact: Annotated[
+        str | None, typer.Option(metavar="BUDGET", help="Fewer Gaussians first: 200k, 20% or 0.2dB.")
+    ] = None,
     evaluate: Annotated[bool, typer.Option("--evaluate", help="Measure PSNR and SSIM of the result.")] = False,
     force: Annotated[bool, typer.Option("--force", "-f", help="Overwrite files that exist.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print what the service reports as JSON.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
 ) -> None:
     """Compress scenes on a server. Ctrl-C cancels the job there."""
-    from kissgs._cli_settings import chosen
+    from kissgs._cli_settings import budget_of, chosen
     from kissgs._console import progress_bar
     from kissgs.errors import UnsupportedError
     from kissgs.remote import Remote
 
     if "-" in scenes or str(output) == "-":
         raise UnsupportedError("remote compression reads and writes files; name them")
-    settings = chosen(preset, changes)
+    settings = chosen(preset, changes, budget=None if compact is None else budget_of(compact))
     with Remote(server, key=key) as remote:
 
         def work(scene: str, target: Path) -> dict[str, Any]:

@@ -27,7 +27,7 @@ export function composer(limits, presets, submit) {
     `Up to ${bytes(limits.max_upload_bytes)} and ${count(limits.max_gaussians)} Gaussians.`;
 
   byId("keep-note").textContent = limits.training
-    ? "Those that stay are trained to do the work of the others: a file that shrinks with them, after minutes of work."
+    ? "Those that stay learn to do the work of the others: a smaller file, after some minutes of training."
     : "This server has no torch: choose Fast to have fewer. Nothing is trained then, and pictures become rougher.";
 
   /** @param {File} file */
