@@ -155,7 +155,7 @@ class _Search:
         compared = evaluate(
             *(self.splats, found.splats, self.school.exam),
             threads=self.threads,
-            progress=as_stage("evaluate", self.progress),
+            progress=as_stage("judge", self.progress),
         )
         drop = drop_of(compared)
         self.trials.append((count, drop))

@@ -212,7 +212,7 @@ class _Recipe:
         if phase.name == "sparsify" and chosen.rho:
             sparsity = Sparsity(self.trainee.parameters["opacities"], phase.count, chosen.rho, chosen.interval)
             wishes.append(sparsity)
-            if state:
+            if "z" in state:  # not where the phase had not begun
                 sparsity.restore(state)
 
         def after(step: int) -> None:
@@ -251,7 +251,7 @@ class _Recipe:
         return receive
 
     def _rates(self, phase: _Phase, extent: float) -> Rates:
-        """The schedule of 3DGS, continued: rates stay while opacities are made sparse, and then fall."""
+        """Rates stay while Gaussians go, and fall exponentially, as 3DGS has it for the means, in the refinement."""
         from kissgs.training.loop import falling
 
         chosen = self.settings

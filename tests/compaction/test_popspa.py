@@ -115,6 +115,18 @@ def stopping_after(steps):
     return progress
 
 
+@pytest.mark.parametrize("steps", [0, 3, 4, 7])
+def test_opacities_that_are_made_sparse_are_taken_up_too(tmp_path, monkeypatch, steps):
+    """Before the first step there is a checkpoint, and no z and u in it."""
+    monkeypatch.setattr(Checkpoint, "due", True)
+    chosen, path = settings(rho=0.01, interval=1), tmp_path / "c.npz"
+    whole = popspa(cloud(80), 20, chosen, taught())
+    assert not same(whole.splats, popspa(cloud(80), 20, settings(rho=0.0), taught()).splats)
+    with pytest.raises(Interrupted):
+        popspa(cloud(80), 20, chosen, taught(), checkpoint=path, progress=stopping_after(steps))
+    assert same(whole.splats, popspa(cloud(80), 20, chosen, taught(), checkpoint=path).splats)
+
+
 @pytest.mark.parametrize("steps", [0, 2, 4, 5, 9, 10, 13, 15])
 def test_what_was_interrupted_ends_as_if_it_had_not_been(tmp_path, monkeypatch, steps):
     monkeypatch.setattr(Checkpoint, "due", True)
