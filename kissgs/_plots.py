@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from importlib.util import find_spec
@@ -16,6 +15,11 @@ if TYPE_CHECKING:
     from kissgs.compaction.study import Point
 
 FORMATS = ("svg", "png", "pdf")
+
+LINES, MARKERS = ("-", "--", ":"), ("o", "s", "^", "D", "v")
+
+COLOURS = 10
+"""Of matplotlib, before they begin again: then the next kind of line is taken."""
 
 
 def check_plot(path: Path) -> str:
@@ -48,9 +52,8 @@ def compaction_plot(points: Sequence[Point], path: Path) -> None:
     figure = Figure(figsize=(8, 5), layout="constrained")
     axes = figure.add_subplot()
     (whole,) = (point for point in points if point.way == "input")
-    styles = itertools.cycle(itertools.product(("-", "--"), ("o", "s", "^", "D", "v")))
-    for way in dict.fromkeys(point.way for point in points if point.way != "input"):
-        line, marker = next(styles)
+    for number, way in enumerate(dict.fromkeys(point.way for point in points if point.way != "input")):
+        line, marker = LINES[number // COLOURS % len(LINES)], MARKERS[number % len(MARKERS)]
         curve = sorted((point.count, point.psnr) for point in points if point.way == way)
         axes.plot(*zip(*curve, strict=True), line, marker=marker, markersize=4, label=way)
     if math.isfinite(whole.psnr):
