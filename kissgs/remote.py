@@ -174,7 +174,8 @@ class Remote:
                 for number, event, data in _events(_checked(answer)):
                     last = number
                     if event == "progress":
-                        progress(data["stage"], data["fraction"])
+                        # Receivers that know nothing of notes can follow all else.
+                        progress(data["stage"], data["fraction"], *([data["note"]] if "note" in data else []))
                     elif data["state"] == "queued":
                         progress("queue", 0.0)
 

@@ -17,7 +17,10 @@ import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import kissgs
 
 EVENT_SECONDS = 0.25
 """Between progress events of one stage."""
@@ -52,15 +55,7 @@ def main() -> None:
 
 
 def _compress(order: dict[str, Any], send: Send) -> dict[str, Any]:
-    import kissgs
-
-    result = kissgs.compress(
-        Path(order["source"]),
-        settings=kissgs.Settings.model_validate(order["settings"]),
-        evaluate=order["evaluate"],
-        threads=order["threads"],
-        progress=_Throttle(send),
-    )
+    result = _compressed(order, send)
     folder = Path(order["work"]) / "result"
     folder.mkdir()
     result.save(folder / "scene.zip")
@@ -86,6 +81,35 @@ def _compress(order: dict[str, Any], send: Send) -> dict[str, Any]:
         summary["evaluation"] = report["evaluation"]["mean"]["between"]
     _write(folder / "summary.json", json.dumps(summary).encode())
     return summary
+
+
+def _compressed(order: dict[str, Any], send: Send) -> kissgs.Compressed:
+    """The work itself, from its checkpoint on if there is one.
+
+    A checkpoint is a help, no condition: one of no use (damaged, or of another version of kissgs) is replaced, and
+    where none can be written (a full disk), the work is done without.
+    """
+    import kissgs
+
+    checkpoint = None
+    if order["checkpoint"] is not None:  # as seen from here: the report may name it, and is the client's to read
+        checkpoint = Path(os.path.relpath(order["checkpoint"], order["work"]))
+    while True:
+        found = checkpoint is not None and checkpoint.exists()
+        try:
+            return kissgs.compress(
+                Path(order["source"]),
+                settings=kissgs.Settings.model_validate(order["settings"]),
+                evaluate=order["evaluate"],
+                checkpoint=checkpoint,
+                threads=order["threads"],
+                progress=_Throttle(send),
+            )
+        except kissgs.OutputError:  # the checkpoint's: nothing else is written yet
+            if checkpoint is None:
+                raise
+            checkpoint.unlink(missing_ok=True)
+            checkpoint = checkpoint if found else None
 
 
 def _decode(order: dict[str, Any], send: Send) -> dict[str, Any]:
@@ -121,15 +145,15 @@ class _Throttle:
 
     def __init__(self, send: Send) -> None:
         self._send = send
-        self._last, self._next = ("", -1.0), 0.0
+        self._last, self._next = ("", -1.0, ""), 0.0
 
     def __call__(self, stage: str, fraction: float, note: str = "") -> None:
         now = time.monotonic()
-        event = stage, round(min(1.0, max(0.0, fraction)), 4)
+        event = stage, round(min(1.0, max(0.0, fraction)), 4), note
         if event == self._last or (stage == self._last[0] and now < self._next):
             return
         self._last, self._next = event, now + EVENT_SECONDS
-        self._send({"stage": stage, "fraction": event[1]})
+        self._send({"stage": stage, "fraction": event[1], "note": note})
 
 
 def _sender() -> Send:

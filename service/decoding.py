@@ -11,15 +11,12 @@ from typing import Any
 from anyio.to_thread import run_sync
 
 from service.admission import Admission
-from service.files import Folders
+from service.files import BYTES_PER_GAUSSIAN, Folders
 from service.models import Job, State
 from service.problems import KINDS, ProblemError
 from service.runner import Child
 from service.settings import ServiceSettings
 from service.store import Store
-
-BYTES_PER_GAUSSIAN = (68, 104, 164, 248)
-"""Of a ``.ply``, by SH degree."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +76,7 @@ class Decoder:
             child.kill()
 
     async def _run(self, job: Job, work: Path) -> None:
-        async def ignore(stage: str, fraction: float) -> None:
+        async def ignore(stage: str, fraction: float, note: str) -> None:
             pass
 
         order = {

@@ -3,6 +3,7 @@
     incoming/TOKEN.part          an upload as it arrives
     jobs/ID/scene.ply            the upload, whole
     jobs/ID/work-TOKEN/          what a running job has written so far
+    jobs/ID/checkpoint.npz       where its training stands: all that outlives its process, until the job has ended
     jobs/ID/result/              the result, renamed into place once it is whole and on the disk
         scene.zip  report.json  files/NAME
     jobs/ID/decoded.ply          made when first asked for; decoded.json has its size and checksum
@@ -20,6 +21,22 @@ from pathlib import Path
 from typing import IO
 
 from service.settings import SettingsError
+
+BYTES_PER_GAUSSIAN = (68, 104, 164, 248)
+"""Of a ``.ply``, by SH degree."""
+
+UNFINISHED = ("work-*", ".*.part")
+"""What a process that was ended leaves in its job's folder: a folder of its own, and the file that was to become the
+next checkpoint."""
+
+
+def checkpoint_bytes(gaussians: int, sh_degree: int) -> int:
+    """What the checkpoint of a scene's training takes at most.
+
+    It holds each parameter and the two moments of Adam, of no more Gaussians than the scene has. While it is written
+    anew, the former one is still there.
+    """
+    return 2 * (20_000 + 3 * BYTES_PER_GAUSSIAN[sh_degree] * gaussians)
 
 
 class Folders:
@@ -75,6 +92,10 @@ class Folders:
         """The decoded scene, if it has been asked for."""
         return self.jobs / job_id / "decoded.ply"
 
+    def checkpoint(self, job_id: str) -> Path:
+        """Where the job's training keeps its state."""
+        return self.jobs / job_id / "checkpoint.npz"
+
     def spare(self, job_id: str) -> list[Path]:
         """What an ended job can do without: its upload and its decoded scene, as far as they are there."""
         return [path for path in (self.upload(job_id), self.decoded(job_id)) if path.exists()]
@@ -98,9 +119,10 @@ class Folders:
         _sync(self.jobs / job_id)
 
     def remove_work(self, job_id: str) -> None:
-        """Remove what a process of the job has left."""
-        for work in (self.jobs / job_id).glob("work-*"):
-            self.discard(work)
+        """Remove what a process of the job has left, but for its checkpoint."""
+        for pattern in UNFINISHED:
+            for path in (self.jobs / job_id).glob(pattern):
+                self.discard(path)
 
     def discard(self, path: Path) -> None:
         """Remove a file or folder, if it is there."""
@@ -115,8 +137,10 @@ class Folders:
 
     def remove_unfinished(self) -> None:
         """Remove what was being written when a former service ended."""
-        for path in (*self.incoming.iterdir(), *self.jobs.glob("*/work-*")):
+        for path in self.incoming.iterdir():
             self.discard(path)
+        for folder in self.jobs.iterdir():
+            self.remove_work(folder.name)
 
     def remove_strangers(self, known: set[str]) -> None:
         """Remove what no known job owns: only while nothing arrives."""

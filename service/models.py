@@ -8,8 +8,11 @@ from typing import Any
 from sqlalchemy import JSON, BigInteger, Float, ForeignKey, Index, Integer, String, UniqueConstraint
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 """Of the tables below. A database of another version is refused rather than misread."""
+
+NOTE_CHARS = 200
+"""Of what a running job has to say; the rest is cut."""
 
 Number = BigInteger().with_variant(Integer, "sqlite")  # SQLite counts up only in INTEGER columns
 
@@ -45,8 +48,9 @@ class Meta(Base):
 class Job(Base):
     """One upload and what becomes of it. Times are seconds since 1970; sizes are bytes.
 
-    ``disk_bytes`` is what its files take; ``spare_bytes`` what of that can be given up for new uploads once it has
-    ended: the upload itself, which is kept for comparisons, and the decoded scene.
+    ``disk_bytes`` is what its files take; from its start to its end, the upload and ``work_bytes``: what its checkpoint
+    takes at most. ``spare_bytes`` is what of that can be given up for new uploads once it has ended: the upload itself,
+    which is kept for comparisons, and the decoded scene.
     """
 
     __tablename__ = "jobs"
@@ -77,11 +81,13 @@ class Job(Base):
     idempotency_key: Mapped[str | None] = mapped_column(String(255))
     disk_bytes: Mapped[int] = mapped_column(BigInteger)
     spare_bytes: Mapped[int] = mapped_column(BigInteger, default=0)
+    work_bytes: Mapped[int] = mapped_column(BigInteger, default=0)
     upload_kept: Mapped[bool] = mapped_column(default=True)
     starts: Mapped[int] = mapped_column(Integer, default=0)
     crashes: Mapped[int] = mapped_column(Integer, default=0)
     stage: Mapped[str | None] = mapped_column(String(64))
     fraction: Mapped[float] = mapped_column(Float(53), default=0.0)
+    note: Mapped[str | None] = mapped_column(String(NOTE_CHARS))
     last_event: Mapped[int] = mapped_column(Integer, default=0)
     created_at: Mapped[float] = mapped_column(Float(53))
     started_at: Mapped[float | None] = mapped_column(Float(53))

@@ -19,7 +19,8 @@ from service.child import MEMORY_DETAIL
 
 log = logging.getLogger("kissgs.service")
 
-OnProgress = Callable[[str, float], Awaitable[None]]
+OnProgress = Callable[[str, float, str], Awaitable[None]]
+"""Told a stage, the fraction of it, and a note, which may be empty."""
 
 OUT_OF_MEMORY = re.compile(
     "MemoryError|bad_alloc|out of memory|memory allocation|cannot allocate memory", re.IGNORECASE
@@ -116,7 +117,7 @@ class Child:
             event = json.loads(line)
             if "stage" not in event:
                 return event
-            await on_progress(event["stage"], event["fraction"])
+            await on_progress(event["stage"], event["fraction"], event["note"])
         return None
 
     def _explain(self, status: int, trace: Path) -> Outcome:

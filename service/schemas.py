@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field
 
 import kissgs
-from service.models import State
+from service.models import NOTE_CHARS, State
 from service.problems import Problem
 
 COMPACTED = "+compact"
@@ -41,6 +41,11 @@ class JobOptions(kissgs.Settings):
         """Whether what is left of the scene is to be fitted to pictures of it."""
         return self.compact.wanted and self.compact.sparsify_steps + self.compact.refine_steps > 0
 
+    @property
+    def resumable(self) -> bool:
+        """Whether its training can be taken up where it was left: a search, which trains several times, cannot."""
+        return self.trains and self.compact.max_psnr_drop is None
+
 
 class Wire(BaseModel):
     """Of all answers."""
@@ -53,6 +58,12 @@ class Progress(Wire):
 
     stage: str = Field(description="What is being done.", examples=["codebook"])
     fraction: float = Field(ge=0, le=1, description="Of that stage.")
+    note: str | None = Field(
+        None,
+        max_length=NOTE_CHARS,
+        description="For people: what training has come to. Other stages have none.",
+        examples=["15,890 Gaussians, loss 0.0123, PSNR 31.20"],
+    )
 
 
 class Estimate(Wire):

@@ -67,7 +67,7 @@ def status_of(job: Job, outlook: Outlook) -> JobStatus:
         name=job.name,
         state=State(job.state),
         position=outlook.position(job) if waits else None,
-        progress=Progress(stage=job.stage, fraction=job.fraction) if runs and job.stage else None,
+        progress=Progress(stage=job.stage, fraction=job.fraction, note=job.note) if runs and job.stage else None,
         estimate=_estimate(job, outlook) if waits or runs else None,
         options=JobOptions.model_validate(job.options),
         upload_bytes=job.upload_bytes,

@@ -14,7 +14,7 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session, load_only
 
 from service.database import connect
-from service.models import ACTIVE, ENDED, Event, Job, Meta, State
+from service.models import ACTIVE, ENDED, NOTE_CHARS, Event, Job, Meta, State
 
 _NEXT: dict[State, tuple[State, ...]] = {
     State.RUNNING: (State.QUEUED,),
@@ -113,27 +113,33 @@ class Store:
                 return None
             job.starts += 1
             job.started_at = self.clock()
-            job.stage, job.fraction = None, 0.0
+            job.disk_bytes = job.upload_bytes + job.work_bytes
             job.state = State.RUNNING
             _note(session, job, "state", {"state": State.RUNNING, "start": job.starts})
             return job
 
-    def progress(self, number: int, stage: str, fraction: float) -> None:
-        """Note how far a running job is."""
+    def progress(self, number: int, stage: str, fraction: float, note: str = "") -> None:
+        """Note how far a running job is, and what it has to say of that, if anything."""
         with self._writing.begin() as session:
             job = session.get(Job, number, with_for_update=True)
             if job is not None and job.state == State.RUNNING:
-                job.stage, job.fraction = stage, fraction
-                _note(session, job, "progress", {"stage": stage, "fraction": fraction})
+                job.stage, job.fraction, job.note = stage, fraction, note[:NOTE_CHARS] or None
+                said = {"note": job.note} if job.note else {}
+                _note(session, job, "progress", {"stage": stage, "fraction": fraction, **said})
 
     def move(self, number: int, state: State, **values: Any) -> bool:  # noqa: ANN401
-        """Set a job's state, and ``values`` with it; False if it is no longer in a state that leads there."""
+        """Set a job's state, and ``values`` with it; False if it is no longer in a state that leads there.
+
+        A job that goes back into the queue has nothing behind it.
+        """
         with self._writing.begin() as session:
             job = session.get(Job, number, with_for_update=True)
             if job is None or job.state not in _NEXT[state]:
                 return False
             for name, value in values.items():
                 setattr(job, name, value)
+            if state == State.QUEUED:
+                job.stage, job.fraction, job.note = None, 0.0, None
             if state in ENDED:
                 job.finished_at = self.clock()
             job.state = state

@@ -15,6 +15,7 @@ from starlette.requests import Request
 
 from service.admission import FULL_SECONDS
 from service.context import Context
+from service.files import checkpoint_bytes
 from service.models import Job
 from service.multipart import PartBegin, PartData, parts
 from service.presets import can_train
@@ -205,6 +206,7 @@ def _queue(context: Context, submission: Submission, owner: str) -> tuple[Job, b
         sh_degree=received.info.sh_degree,
         upload_bytes=received.size,
         disk_bytes=received.size,
+        work_bytes=checkpoint_bytes(received.info.count, received.info.sh_degree) if options.resumable else 0,
         upload_sha256=received.sha256,
         fingerprint=submission.fingerprint,
         idempotency_key=submission.key,

@@ -19,6 +19,7 @@ from service.metrics import Metrics
 from service.models import Job, State
 from service.problems import KINDS, problem
 from service.runner import Child, Outcome
+from service.schemas import JobOptions
 from service.settings import ServiceSettings
 from service.store import Store
 
@@ -103,7 +104,7 @@ class Worker:
                 )
                 self._fail(job, "crashed", detail)
             else:
-                self.store.move(job.number, State.QUEUED, stage=None, fraction=0.0)
+                self.store.move(job.number, State.QUEUED)
         for job in self.store.in_state(State.QUEUED):
             if not self.folders.upload(job.id).exists():
                 self._fail(job, "internal", "the upload is no longer on the server's disk; submit the scene again")
@@ -149,19 +150,21 @@ class Worker:
         if current is None or current.state != State.RUNNING:
             return Outcome("stopped")
         work = await run_sync(self.folders.new_work, job.id)
+        resumable = JobOptions.model_validate(job.options).resumable
         order = {
             "task": "compress",
             "source": str(self.folders.upload(job.id)),
             "work": str(work),
             "settings": {name: value for name, value in job.options.items() if name != "evaluate"},
             "evaluate": job.options["evaluate"],
+            "checkpoint": str(self.folders.checkpoint(job.id)) if resumable else None,
             "threads": self.settings.job_threads,
             "memory": int(self.settings.job_memory),
         }
 
-        async def progress(stage: str, fraction: float) -> None:
+        async def progress(stage: str, fraction: float, note: str) -> None:
             try:
-                await run_sync(self.store.progress, job.number, stage, fraction)
+                await run_sync(self.store.progress, job.number, stage, fraction, note)
             except SQLAlchemyError:  # a full disk: the job itself may yet succeed
                 log.exception("job %s: progress was not recorded", job.id)
             self.bell.ring(job.id)
@@ -197,9 +200,11 @@ class Worker:
         if current is None or current.state != State.RUNNING:  # cancelled or deleted meanwhile
             self.folders.remove_work(job.id)
             return
+        if outcome.kind == "done":
+            self.folders.keep_result(job.id)
+        self.folders.remove_work(job.id)  # now: once the job is back in the queue, another worker may be at it
         match outcome.kind:
             case "done":
-                self.folders.keep_result(job.id)
                 self._succeed(job, outcome.data)
             case "error":
                 self._fail(job, outcome.data["code"], outcome.data["detail"])
@@ -210,16 +215,16 @@ class Worker:
             case "crashed" if job.crashes == 0 and job.starts < self.settings.job_starts:
                 log.warning("job %s is started again", job.id)
                 self.metrics.restarts.inc()
-                self.store.move(job.number, State.QUEUED, stage=None, fraction=0.0, crashes=1)
+                self.store.move(job.number, State.QUEUED, crashes=1)
             case "crashed":
                 self._fail(job, "crashed", outcome.data["detail"])
-        self.folders.remove_work(job.id)
 
     def _put_back(self, job: Job) -> None:
         """Into the queue, as if it had never been started."""
-        self.store.move(job.number, State.QUEUED, stage=None, fraction=0.0, starts=job.starts - 1)
+        self.store.move(job.number, State.QUEUED, starts=job.starts - 1)
 
     def _succeed(self, job: Job, summary: dict[str, Any]) -> None:
+        self.folders.discard(self.folders.checkpoint(job.id))
         if not self.settings.keep_uploads:
             self.folders.discard(self.folders.upload(job.id))
         values = {

@@ -52,7 +52,7 @@ class Checkpoint:
                 return {name: kept[name] for name in kept.files if name != "key"}
         except OSError as error:
             raise OutputError(f"cannot read {path}: {reason_of(error)}") from error
-        except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        except (ValueError, KeyError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile) as error:
             raise OutputError(f"{path} is no checkpoint of kissgs; move it away or delete it") from error
 
     @property

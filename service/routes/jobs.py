@@ -220,7 +220,7 @@ async def get_job(request: Request, context: Service, job: Found, response: Resp
     responses={
         200: {
             "description": "Server-sent events until the job has ended: `state` with the job's status, `progress` with "
-            "a stage and a fraction of it. Ids count from 1 without gaps.",
+            "a stage, a fraction of it and, while it trains, a note. Ids count from 1 without gaps.",
             "content": {"text/event-stream": {"schema": _EVENT}},
         },
         204: {"description": "The job has ended, and `Last-Event-ID` was its last event."},

@@ -1,7 +1,7 @@
 /** Talking to the service: its key, its problem documents, its answers. */
 
 /**
- * @typedef {{stage: string, fraction: number}} Progress
+ * @typedef {{stage: string, fraction: number, note?: string}} Progress
  * @typedef {{title: string, detail: string, code: string, status: number, retryable: boolean}} ProblemDocument
  * @typedef {{container: number, files: Record<string, number>, ratio: number,
  *   bytes_per_gaussian: number}} Sizes

@@ -10,7 +10,7 @@ const LONGEST_WAIT_MS = 15000; // between two tries to connect
  * @typedef {import("./api.js").Status} Status
  * @typedef {object} Watcher
  * @property {(status: Status) => void} status called first with the status at the start, last with that of the end
- * @property {(stage: string, fraction: number) => void} progress
+ * @property {(progress: import("./api.js").Progress) => void} progress
  * @property {() => void} restarted its work begins anew
  * @property {(connected: boolean) => void} connection
  * @property {(problem: Problem) => void} lost the job cannot be followed any more
@@ -34,7 +34,7 @@ export function follow(id, watcher) {
     if (signal.aborted) return;
     watcher.status(status);
     if (!active(status)) stop();
-    else if (!connected && status.progress) watcher.progress(status.progress.stage, status.progress.fraction);
+    else if (!connected && status.progress) watcher.progress(status.progress);
   }
 
   /** @param {unknown} error */
@@ -56,7 +56,7 @@ export function follow(id, watcher) {
   /** @param {import("./events.js").Message} message */
   async function take({ event, data }) {
     const told = JSON.parse(data);
-    if (event === "progress") return watcher.progress(told.stage, told.fraction);
+    if (event === "progress") return watcher.progress(told);
     if (event !== "state") return;
     if (told.start > 1) watcher.restarted();
     if (told.job) accept(told.job);

@@ -16,6 +16,7 @@ export function runningView(first, cancel) {
   const [headline, amount] = [el("span", { class: "stage" }), el("span", { class: "stage" })];
   const bar = el("progress", { max: 1, "aria-label": "Of this stage" });
   const [elapsed, left] = [el("span"), el("span")];
+  const note = el("p", { class: "note small muted", hidden: true }); // not read out: it changes all the time
   const notice = el("p", { class: "small muted", hidden: true }, "The connection was lost; connecting again…");
   const button = el("button", { class: "quiet", type: "button", onclick: press }, "Cancel job");
   const steps = stepList(first);
@@ -26,6 +27,7 @@ export function runningView(first, cancel) {
     el("p", { class: "spread" }, headline, amount),
     bar,
     el("p", { class: "spread muted" }, elapsed, left),
+    note,
     steps.element,
     notice,
     el("div", { class: "buttons" }, button),
@@ -54,19 +56,23 @@ export function runningView(first, cancel) {
     if (queued) {
       stage = "";
       headlineIs(next.position === 1 ? "Next in the queue" : `Number ${next.position ?? "?"} in the queue`);
+      note.hidden = true;
       measure(0);
     } else if (!stage) headlineIs("Starting");
     tick();
   }
 
-  /** @param {string} name @param {number} fraction */
-  function progress(name, fraction) {
-    if (name !== stage) {
-      stage = name;
-      steps.at(name);
-      headlineIs(stageWord(name));
+  /** @param {import("./api.js").Progress} now */
+  function progress(now) {
+    if (now.stage !== stage) {
+      stage = now.stage;
+      steps.at(stage);
+      headlineIs(stageWord(stage));
+      note.hidden = true;
     }
-    measure(fraction);
+    measure(now.fraction);
+    note.textContent = now.note ?? "";
+    if (now.note) note.hidden = false; // for the whole stage, so that nothing jumps while it has nothing to say
   }
 
   /**
@@ -98,6 +104,7 @@ export function runningView(first, cancel) {
     restarted() {
       stage = "";
       steps.at("");
+      note.hidden = true;
     },
     /** @param {boolean} connected */
     connection: (connected) => (notice.hidden = connected),

@@ -134,7 +134,8 @@ class Service:
 
     def strays(self) -> list[str]:
         """Files that belong to nothing."""
-        found = [*(self.folder / "incoming").iterdir(), *(self.folder / "jobs").glob("*/work-*")]
+        jobs = self.folder / "jobs"
+        found = [*(self.folder / "incoming").iterdir(), *jobs.glob("*/work-*"), *jobs.glob("*/.*")]
         return [str(path.relative_to(self.folder)) for path in found]
 
     def raw(self, data: bytes) -> socket.socket:

@@ -84,6 +84,15 @@ def test_a_service_without_torch_does_not_accept_what_it_cannot_do(monkeypatch):
     assert parse_options("{}").kind == "balanced"
 
 
+@pytest.mark.parametrize(
+    ("compact", "resumable"),
+    [({"ratio": 0.2}, True), ({"count": 9}, True), ({"max_psnr_drop": 0.2}, False), ({}, False)],
+)
+def test_which_training_can_be_taken_up(compact, resumable):
+    assert parse_options(json.dumps({"compact": compact})).resumable == resumable
+    assert not parse_options(json.dumps({"preset": "fast", "compact": compact})).resumable
+
+
 def test_limits_tell_whether_it_trains(service):
     assert service.http.get("/v1/limits").json()["training"] is True
 

@@ -175,7 +175,7 @@ def test_a_fault_of_ours_is_said_to_be_one(tmp_path):
 
     from service.runner import Child
 
-    async def ignore(stage, fraction):
+    async def ignore(stage, fraction, note):
         pass
 
     order = {"task": "no such task", "work": str(tmp_path), "source": "", "memory": 1 << 30}

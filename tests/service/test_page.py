@@ -1,6 +1,7 @@
 """The page in a real Chromium; oracle: what the API says of the same job, and what a person would do."""
 
 import hashlib
+import json
 import shutil
 
 import pytest
@@ -127,6 +128,17 @@ def test_a_reload_goes_on_following_and_cancel_cancels(visit, start):
     page.get_by_role("button", name="Cancel job").click()
     page.locator("#job", has_text="ancelled").wait_for()
     assert service.status(job)["state"] == "cancelled"
+
+
+def test_training_tells_what_it_has_come_to(visit, start):
+    service = start()
+    page = visit(service)
+    changes = {"count": 100, "sparsify_steps": 1000, "refine_steps": 1000, "views": 24, "view_size": 48}
+    job = service.submit(options=json.dumps({"preset": "fast", "compact": changes}))
+    page.goto(f"{service.url}/#{job['id']}")
+    page.locator("#job .note", has_text="Gaussians, loss").wait_for()
+    page.locator("#live", has_text="Training").wait_for(state="attached")
+    assert "loss" not in page.locator("#live").inner_text()  # what is read out is the stage
 
 
 def test_deleting_asks_first(visit, start):

@@ -43,6 +43,21 @@ def test_compressing_there_gives_what_compressing_here_does(service, scene, tmp_
     assert heard[-1] == ("download", 1.0)
 
 
+def test_notes_of_training_are_heard_here(service, scene, tmp_path):
+    changes = {"count": 100, "sparsify_steps": 4, "refine_steps": 4, "views": 24, "view_size": 48}
+    heard = []
+    with kissgs.Remote(service.url) as remote:
+        remote.compress(
+            scene,
+            tmp_path / "x.zip",
+            settings=kissgs.Settings.from_preset("fast", compact=changes),
+            progress=lambda *event: heard.append(event),
+        )
+    notes = {stage: note for stage, _, *said in heard for note in said}
+    assert notes.keys() == {"sparsify", "refine"}
+    assert all(note.startswith("1") and "Gaussians" in note for note in notes.values())
+
+
 @pytest.mark.parametrize(
     ("data", "kind", "said"),
     [

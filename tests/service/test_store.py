@@ -105,6 +105,32 @@ def test_events_count_up_without_gaps_from_many_threads(store):
     assert [event.seq for event in store.events(number, after=20)] == [21, 22]
 
 
+def test_notes_last_as_long_as_they_are_true(store):
+    found = add(store)
+    store.claim()
+    store.progress(found.number, "refine", 0.5, "x" * 1000)
+    assert store.get(found.id).note == "x" * 200
+    store.progress(found.number, "refine", 0.6)
+    assert store.get(found.id).note is None
+    assert [event.data.get("note") for event in store.events(found.number)] == [None, None, "x" * 200, None]
+    store.progress(found.number, "refine", 0.7, "y")
+    store.move(found.number, State.QUEUED)
+    waiting = store.get(found.id)
+    assert (waiting.stage, waiting.fraction, waiting.note) == (None, 0.0, None)
+
+
+def test_what_a_job_may_write_counts_from_its_start_to_its_end(store):
+    number = add(store, upload_bytes=100, disk_bytes=100, work_bytes=600).number
+    assert store.disk_bytes() == 100
+    store.claim()
+    assert store.disk_bytes() == 700
+    store.move(number, State.QUEUED)
+    assert store.disk_bytes() == 700  # the next start takes up what there is
+    store.claim()
+    store.move(number, State.SUCCEEDED, disk_bytes=120)
+    assert store.disk_bytes() == 120
+
+
 def test_limits(store):
     for _ in range(3):
         add(store, "alice")
