@@ -48,6 +48,14 @@ def bench(
     ways: Annotated[
         list[str] | None, typer.Option("--way", help="With --compaction: only this way. Repeat for several.")
     ] = None,
+    learn_from: Annotated[
+        str,
+        typer.Option(
+            metavar="WHAT",
+            help="With --compaction: from the [bold]photos[/] of --views, from its [bold]cameras[/] alone, or from the "
+            "[bold]scene[/] alone. --views judges in any case.",
+        ),
+    ] = "photos",
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE", help="With --compaction: PSNR over count, as .svg, .png or .pdf.")
     ] = None,
@@ -66,15 +74,17 @@ def bench(
     capture = open_views(views, scale=scale, images=images, resolution=resolution)
     rows: list[dict[str, Any]]
     table: RenderableType
-    if not compaction and (ratios or ways or plot):
-        raise UnsupportedError("--ratio, --way and --plot go with --compaction")
+    if not compaction and (ratios or ways or plot or learn_from != "photos"):
+        raise UnsupportedError("--ratio, --way, --learn-from and --plot go with --compaction")
     if compaction:
         from kissgs._cli_curves import compaction_curves
 
         if rendering or peers or gaussians or len(presets or []) > 1:
             raise UnsupportedError("--compaction goes with one --preset, and with nothing else that is measured")
         preset = (presets or ["balanced"])[0]
-        rows, table = compaction_curves(expand(scenes), preset, changes, ratios, ways, plot, capture, threads)
+        rows, table = compaction_curves(
+            expand(scenes), preset, changes, ratios, ways, plot, capture, learn_from, threads
+        )
     elif rendering:
         if presets or peers:
             raise UnsupportedError("--rendering measures the rasteriser, no presets and no peers")

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from rich.table import Column, Table
 
+from kissgs._cli_pictures import choice
 from kissgs._cli_settings import chosen
 from kissgs._console import progress_bar
 from kissgs.errors import UnsupportedError
@@ -25,17 +26,21 @@ def compaction_curves(
     names: list[str] | None,
     plot: Path | None,
     views: Views | None,
+    learn_from: str,
     threads: int,
 ) -> tuple[list[dict[str, Any]], Table]:
     """All ways on all scenes: for machines, and as a table."""
     from kissgs._plots import check_plot, compaction_plot
-    from kissgs.compaction.study import RATIOS, WAYS, study
+    from kissgs.compaction.study import RATIOS, WAYS, Source, study
     from kissgs.scenes import load
 
     known = {way.name: way for way in WAYS}
     for name in names or []:
         if name not in known:
             raise UnsupportedError(f"there is no way {name!r}; there are {', '.join(known)}")
+    source = cast(Source, choice("--learn-from", learn_from, Source))
+    if views is None and source == "cameras":
+        raise UnsupportedError("--learn-from cameras: say whose with --views")
     if plot is not None:
         if len(scenes) > 1:
             raise UnsupportedError("--plot draws one scene; name one")
@@ -50,6 +55,7 @@ def compaction_curves(
                 views,
                 ratios=ratios or RATIOS,
                 ways=[known[name] for name in names or known],
+                learn_from=source,
                 threads=threads,
                 progress=progress,
             )

@@ -64,7 +64,7 @@ def evaluate(
     from kissgs.io.atomic import atomic_file, refuse_existing
     from kissgs.scenes import load, stored_bytes
 
-    used = cast(Split, _choice("--split", split, Split))
+    used = cast(Split, choice("--split", split, Split))
     where = device_of(device)
     if html is not None:
         refuse_existing(html, overwrite=force)
@@ -107,10 +107,11 @@ def open_views(
 
 def device_of(name: str) -> Literal["cpu", "cuda"]:
     """The value of ``--device``, if it is one."""
-    return cast(Literal["cpu", "cuda"], _choice("--device", name, Literal["cpu", "cuda"]))
+    return cast(Literal["cpu", "cuda"], choice("--device", name, Literal["cpu", "cuda"]))
 
 
-def _choice(option: str, value: str, allowed: Any) -> str:  # noqa: ANN401  a Literal has no type of its own
+def choice(option: str, value: str, allowed: Any) -> str:  # noqa: ANN401  a Literal has no type of its own
+    """The value of an option that is one of ``allowed``, a Literal."""
     names = get_args(allowed)
     if value not in names:
         raise UnsupportedError(f"{option} {value}: choose {', '.join(names[:-1])} or {names[-1]}")

@@ -12,6 +12,8 @@ from kissgs.errors import UnsupportedError
 from kissgs.io.atomic import atomic_file, refuse_existing
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
     from kissgs.compaction.study import Point
 
 FORMATS = ("svg", "png", "pdf")
@@ -38,8 +40,12 @@ def check_plot(path: Path) -> str:
     return kind
 
 
+CLOSE = 4.0
+"""Decibels below the input down to which the second panel shows what the first crowds."""
+
+
 def compaction_plot(points: Sequence[Point], path: Path) -> None:
-    """PSNR over count, a curve for each way, the input as a level line.
+    """PSNR over count, a curve for each way, the input as a level line: all, and the best from near.
 
     Raises:
         OutputError: the file system refuses.
@@ -49,22 +55,29 @@ def compaction_plot(points: Sequence[Point], path: Path) -> None:
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(8, 5), layout="constrained")
-    axes = figure.add_subplot()
-    (whole,) = (point for point in points if point.way == "input")
+    figure = Figure(figsize=(10, 4.5), layout="constrained")
+    whole, near = panels = figure.subplots(1, 2)
+    (before,) = (point for point in points if point.way == "input")
+    for axes in panels:
+        _draw(axes, points, before)
+    whole.set_ylabel("PSNR of held-out views, dB")
+    best = before.psnr if math.isfinite(before.psnr) else max(p.psnr for p in points if math.isfinite(p.psnr))
+    near.set_ylim(best - CLOSE, best + 0.1 * CLOSE)
+    figure.legend(*whole.get_legend_handles_labels(), loc="outside right upper", fontsize="small")
+    with rc_context({"svg.hashsalt": "kissgs"}), atomic_file(path, overwrite=True) as file:
+        figure.savefig(file, format=kind, metadata={"Date": None} if kind == "svg" else None, dpi=150)
+
+
+def _draw(axes: Axes, points: Sequence[Point], before: Point) -> None:
     for number, way in enumerate(dict.fromkeys(point.way for point in points if point.way != "input")):
         line, marker = LINES[number // COLOURS % len(LINES)], MARKERS[number % len(MARKERS)]
         curve = sorted((point.count, point.psnr) for point in points if point.way == way)
         axes.plot(*zip(*curve, strict=True), line, marker=marker, markersize=4, label=way)
-    if math.isfinite(whole.psnr):
-        axes.axhline(whole.psnr, color="black", linewidth=0.8, label=f"input, {whole.count:,} Gaussians")
+    if math.isfinite(before.psnr):
+        axes.axhline(before.psnr, color="black", linewidth=0.8, label=f"input, {before.count:,} Gaussians")
     axes.set_xscale("log")
     ticks = sorted({point.count for point in points})
     axes.set_xticks(ticks, [f"{count / 1000:.3g}k" if count >= 1000 else str(count) for count in ticks])
     axes.minorticks_off()
     axes.set_xlabel("Gaussians")
-    axes.set_ylabel("PSNR of held-out views, dB")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize="small")
-    with rc_context({"svg.hashsalt": "kissgs"}), atomic_file(path, overwrite=True) as file:
-        figure.savefig(file, format=kind, metadata={"Date": None} if kind == "svg" else None, dpi=150)

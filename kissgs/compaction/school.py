@@ -12,13 +12,12 @@ from kissgs._typing import Float32
 from kissgs.progress import Progress, silent
 from kissgs.settings import CompactSettings
 from kissgs.splats import Splats
-from kissgs.views.anatomy import anatomy
 from kissgs.views.view import View, Views
 from kissgs.views.virtual import virtual_views
 from kissgs.views.wander import wander
 
-SCATTERED = 4
-"""Virtual cameras to learn from, for each that was found good: they stand around it."""
+SCORED = 4
+"""Of virtual cameras, one in so many scores."""
 
 JUDGED = 16
 """Held-out views that are looked at, at most."""
@@ -81,11 +80,16 @@ def school(
     return School(
         train=sized,
         score=sized,
-        test=_sized(_some(_alike(views.test or views.train)), size),
+        test=held_out(views, size),
         background=views.background,
         source=source,
         note="; ".join(filter(None, [views.note, unheld])),
     )
+
+
+def held_out(views: Views, size: int) -> tuple[View, ...]:
+    """Those of a capture to judge by, at most so large: all with photographs, or none."""
+    return _sized(_some(_alike(views.test or views.train)), size)
 
 
 def _alike(views: Sequence[View]) -> Sequence[View]:
@@ -95,15 +99,20 @@ def _alike(views: Sequence[View]) -> Sequence[View]:
 
 def _virtual(splats: Splats, settings: CompactSettings, threads: int, progress: Progress) -> School:
     """Where the scene is its own teacher, pictures of it cost nothing but time."""
-    side, count = settings.view_size * 3 // 5, max(1, settings.views // SCATTERED)
-    found = virtual_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
-    train = tuple(wander(found.train, SCATTERED, anatomy(splats).radius, settings.seed))
+    found = wander(
+        splats,
+        side=settings.view_size * 3 // 5,
+        count=settings.views,
+        seed=settings.seed,
+        threads=threads,
+        progress=progress,
+    )
     return School(
-        train=train,
-        score=train[::SCATTERED],
+        train=found.train,
+        score=found.train[::SCORED],
         test=tuple(_some(found.test or found.train)),
         background=found.background,
-        source=f"{len(train)} virtual cameras",
+        source=f"{len(found.train)} virtual cameras",
     )
 
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 
 from kissgs._typing import Int
 from kissgs.compaction.judging import judge
 from kissgs.compaction.popspa import popspa
-from kissgs.compaction.school import school
+from kissgs.compaction.school import School, held_out, school
 from kissgs.compaction.scoring import highest
 from kissgs.progress import Progress, silent
 from kissgs.settings import CompactSettings
@@ -20,6 +20,10 @@ from kissgs.splats import Splats
 from kissgs.views.view import Views
 
 RATIOS = (0.7, 0.5, 0.3, 0.2, 0.1, 0.05)
+
+Source = Literal["photos", "cameras", "scene"]
+"""What to learn from: a capture's photographs; its cameras alone, with pictures of the scene as it was; or the scene
+alone, from virtual cameras."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,6 +114,7 @@ def study(
     *,
     ratios: Sequence[float] = RATIOS,
     ways: Sequence[Way] = WAYS,
+    learn_from: Source = "photos",
     threads: int = 0,
     progress: Progress = silent,
 ) -> list[Point]:
@@ -121,10 +126,11 @@ def study(
         views: a capture; by default virtual views, with the scene as the teacher.
         ratios: counts, as shares of the scene's.
         ways: some of :data:`WAYS`.
+        learn_from: how much of the capture is learned from; its held-out views judge in any case.
         threads: 0 means one per processor.
         progress: receives the stages of the recipe.
     """
-    taught = school(splats, views, settings, threads=threads, progress=progress)
+    taught = _taught(splats, settings, views, learn_from, threads, progress)
     steps = settings.sparsify_steps + settings.refine_steps
 
     def judged(way: str, scene: Splats, seconds: float, cpu_seconds: float) -> Point:
@@ -149,3 +155,15 @@ def study(
             found = popspa(scene, count, chosen, taught, teacher=splats, threads=threads, progress=progress)
             points.append(judged(way.name, found.splats, time.perf_counter() - wall, time.process_time() - cpu))
     return points
+
+
+def _taught(
+    splats: Splats, settings: CompactSettings, views: Views | None, learn_from: Source, threads: int, progress: Progress
+) -> School:
+    if views is None or learn_from == "photos":
+        return school(splats, views, settings, threads=threads, progress=progress)
+    if learn_from == "cameras":
+        bare = tuple(replace(view, photo=None) for view in views.train)
+        return school(splats, replace(views, train=bare), settings, threads=threads, progress=progress)
+    alone = school(splats, None, settings, threads=threads, progress=progress)
+    return replace(alone, test=held_out(views, settings.view_size), background=views.background)

@@ -65,7 +65,7 @@ def virtual_views(
         InvalidViewsError: less than one view, or pictures of less than one pixel, are asked for.
     """
     _, tried, chosen = _find(splats, (width, height), count, threads, progress)
-    return _split(_sized([tried.cameras[n] for n in chosen], width, height))
+    return split_views(_sized([tried.cameras[n] for n in chosen], width, height))
 
 
 def best_view(
@@ -82,7 +82,7 @@ def best_view(
     Good as they are, and from some distance: what shows more of the scene stands for it better than a close-up.
     """
     scene, tried, chosen = _find(splats, (width, height), count, threads, progress)
-    views = _split(_sized([tried.cameras[n] for n in chosen], width, height))
+    views = split_views(_sized([tried.cameras[n] for n in chosen], width, height))
     distances = [float(np.linalg.norm(tried.cameras[n].position - scene.centre)) for n in chosen]
     scores = tried.scores[chosen] + [of_distance(distance / scene.radius) for distance in distances]
     return views.all[int(scores.argmax())]
@@ -236,7 +236,8 @@ def _choose(tried: Tried, scene: Anatomy, count: int) -> list[int]:
     return [ordered[n % len(ordered)] for n in range(count)]
 
 
-def _split(cameras: list[Camera]) -> Views:
+def split_views(cameras: list[Camera]) -> Views:
+    """Named by number; every 8th is for testing, unless it is the only one."""
     digits = len(str(len(cameras) - 1))
     views = [View(f"virtual_{n:0{digits}}", camera) for n, camera in enumerate(cameras)]
     test = tuple(view for n, view in enumerate(views) if n % HOLD_OUT == 0 and len(views) > 1)

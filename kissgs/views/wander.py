@@ -1,47 +1,123 @@
-"""More cameras from few: around each good one some that stand, look and zoom a little differently.
+"""Cameras to learn from: at random, wherever a photograph of a scene might have been taken.
 
-What is fitted to few pictures falls apart between them. On fox, whose own pictures taught it from 96 virtual cameras, a
-fifth of its Gaussians were 31.1 dB from the original where photographs had been taken; from four times as many,
-scattered about these, 34.1.
+:func:`kissgs.virtual_views` picks few cameras, each as good as can be, to judge by. What is fitted to pictures from
+such falls apart between them and beside them. These are many and of all sorts: near and far, high and low, from the
+sides as well, all that the critic lets pass.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable
 
 import numpy as np
 
-from kissgs.rendering.camera import look_at
-from kissgs.views.view import View
+from kissgs._typing import Float64
+from kissgs.errors import InvalidViewsError
+from kissgs.parallel import Workers
+from kissgs.progress import Progress, silent
+from kissgs.rendering.camera import Camera, look_at
+from kissgs.splats import Splats
+from kissgs.views.anatomy import Anatomy, Point
+from kissgs.views.candidates import ground
+from kissgs.views.view import Views
+from kissgs.views.virtual import Tried, split_views, survey, virtual_views
 
-STROLL = 0.5
-"""How far from its place a camera moves, radii of the scene: root mean square."""
-
-GLANCE = 0.3
-"""By how much its line of sight turns, radians: root mean square."""
+PASSABLE = 0.5
+"""How much lower than the best a view may score: as photographs of real captures do."""
 
 FIELDS_OF_VIEW = np.radians((50, 90))
 """Angles along the longer side: from phones' to wide angle."""
 
+NEAR, FAR = 0.8, 2.6
+"""Distances from the middle, in radii of the scene, where that does not enclose the cameras."""
 
-def wander(views: Sequence[View], each: int, radius: float, seed: int) -> Iterator[View]:
-    """``each`` views about every one of these, the first from its very place.
+LOW, HIGH = -np.pi / 6, np.pi / 3
+"""Elevations above the ground, from the middle, likewise."""
+
+AIM = 0.35
+"""How far beside the middle a camera aims, radii of the scene along each axis: root mean square."""
+
+PATIENCE = 8
+"""Tries for each camera, at most."""
+
+Pose = tuple[Point, Point]
+"""Place and target."""
+
+
+def wander(
+    splats: Splats, *, side: int, count: int, seed: int = 0, threads: int = 0, progress: Progress = silent
+) -> Views:
+    """Cameras for square pictures, all about a scene that came without any; every 8th is for testing.
+
+    The same scene and seed give the same cameras, whatever the number of threads.
 
     Args:
-        views: good ones.
-        each: at least 1.
-        radius: of the scene (:class:`kissgs.views.anatomy.Anatomy`).
+        splats: finite (:func:`kissgs.clean`).
+        side: of the pictures, pixels.
+        count: how many views. Where a scene hardly shows from anywhere, they are fewer.
         seed: another one, other views.
+        threads: 0 means one per processor.
+        progress: receives the stage ``"cameras"``.
+
+    Raises:
+        InvalidViewsError: less than one view, or pictures of less than one pixel, are asked for.
     """
+    if count < 1:
+        raise InvalidViewsError(f"at least 1 view can be had, not {count}")
     rng = np.random.default_rng(seed)
-    for view in views:
-        camera = view.camera
-        _, down, forward = camera.viewmat[:3, :3]
-        for n in range(each):
-            step, turn = rng.normal(size=(2, 3)) / np.sqrt(3)
-            place = camera.position + (STROLL * radius * step if n else 0.0)
-            look = forward + GLANCE * turn
-            fov = float(rng.uniform(*FIELDS_OF_VIEW))
-            moved = look_at(place, place + look, -down, fov=fov, width=camera.width, height=camera.height)
-            yield replace(view, name=f"{view.name}_{n}", camera=moved)
+    found: list[Camera] = []
+    with Workers(threads) as pool:
+        scene, critic, tried = survey(splats, (side, side), pool, progress)
+        propose, small = _proposer(scene, tried, rng), tried.cameras[0].width
+        least = float(tried.scores.max()) - PASSABLE
+        for _ in range(PATIENCE):
+            poses = [propose() for _ in range(count)]
+            fields = rng.uniform(FIELDS_OF_VIEW[0], FIELDS_OF_VIEW[1], count)
+            thumbnails = [_take(pose, scene, fov, small) for pose, fov in zip(poses, fields, strict=True)]
+            passes = tried.scores_for(thumbnails, critic) >= least
+            found += [_take(poses[n], scene, fields[n], side) for n in np.flatnonzero(passes)]
+            if len(found) >= count:
+                break
+    if len(found) < min(2, count):
+        return virtual_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
+    progress("cameras", 1.0)
+    return split_views(found[:count])
+
+
+def _take(pose: Pose, scene: Anatomy, fov: float, side: int) -> Camera:
+    return look_at(*pose, scene.up, fov=fov, width=side, height=side)
+
+
+def _proposer(scene: Anatomy, tried: Tried, rng: np.random.Generator) -> Callable[[], Pose]:
+    """Where to try, by the kind of scene: in a room, about an object, or before what has a background."""
+    east, north = ground(scene.up)
+
+    def towards(elevation: float) -> Float64[np.ndarray, "3"]:
+        """A direction at this angle above the ground, from any side."""
+        azimuth = rng.uniform(0, 2 * np.pi)
+        level = np.cos(azimuth) * east + np.sin(azimuth) * north
+        return np.asarray(np.cos(elevation) * level + np.sin(elevation) * scene.up)
+
+    def elevation(low: float = LOW, high: float = HIGH) -> float:
+        return float(np.arcsin(rng.uniform(np.sin(low), np.sin(high))))
+
+    def beside(target: Point) -> Point:
+        return target + AIM * scene.radius * rng.normal(size=3)
+
+    def in_a_room() -> Pose:
+        away = np.sqrt(rng.uniform()) * towards(0.0) + rng.uniform(-0.1, 0.4) * scene.up
+        place = scene.centre + scene.radius * away
+        return place, place + towards(elevation(-0.5, 0.3))
+
+    def about_an_object() -> Pose:
+        framed = tried.cameras[rng.integers(len(tried.cameras))]
+        distance = rng.uniform(0.4, 1.0) * np.linalg.norm(framed.position - scene.centre)
+        return scene.centre + distance * towards(elevation()), beside(scene.centre)
+
+    def before_it() -> Pose:
+        distance = np.exp(rng.uniform(np.log(NEAR), np.log(FAR)))
+        return scene.centre + distance * scene.radius * towards(elevation()), beside(scene.centre)
+
+    if tried.enclosed:
+        return in_a_room
+    return before_it if tried.whole else about_an_object

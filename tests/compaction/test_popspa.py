@@ -250,7 +250,7 @@ def test_a_full_disk_is_told(tmp_path, monkeypatch):
 def test_virtual_views_teach_where_there_is_no_capture():
     scene = kissgs.sample_scene(400, sh_degree=0)
     found = school(scene, None, settings(views=64, view_size=50))
-    assert (len(found.train), len(found.score), len(found.test)) == (56, 14, 2)
+    assert (len(found.train), len(found.score), len(found.test)) == (56, 14, 8)
     assert all(max(view.camera.width, view.camera.height) <= 50 for view in found.train)
     result = popspa(scene, 100, settings(), found)
     assert result.report.taught_by == "renderings"

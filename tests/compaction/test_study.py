@@ -1,6 +1,7 @@
 """Oracle: the ways called by themselves; for plots, that they are drawn and can be read."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from PIL import Image
 from training_scenes import around, cloud
 
 from kissgs import CompactSettings, UnsupportedError
+from kissgs._cli_curves import compaction_curves
 from kissgs._plots import check_plot, compaction_plot
 from kissgs.compaction.study import WAYS, study
 from kissgs.views.view import Views, black
@@ -32,6 +34,30 @@ def test_who_is_best_is_left(points):
     psnr = {point.way: point.psnr for point in points if point.count == 16}
     assert psnr["random"] < psnr["POP in rounds"] < psnr["POP in rounds + refine"]
     assert psnr["opacity"] < psnr["opacity + refine"]
+
+
+@pytest.mark.parametrize("learn_from", ["photos", "cameras", "scene"])
+def test_who_judges_does_not_depend_on_what_is_learned_from(tmp_path, learn_from):
+    """Photographs are black here: what learned from them shows it."""
+    black_photo = tmp_path / "black.png"
+    Image.new("RGB", (24, 24)).save(black_photo)
+    taken = [tuple(replace(view, photo=black_photo) for view in views) for views in (around(5), around(3))]
+    views = Views(*taken, black(), "five views")
+    short = SHORT.model_copy(update={"views": 16, "view_size": 24})
+    (refined,) = [way for way in WAYS if way.name == "POP + refine"]
+    before, after = study(cloud(80), short, views, ratios=[0.5], ways=[refined], learn_from=learn_from)
+    (blank,) = study(cloud(80), short, views, ratios=[], ways=[])
+    assert before.psnr == blank.psnr
+    (cut,) = [way for way in WAYS if way.name == "POP"]
+    pruned = study(cloud(80), short, views, ratios=[0.5], ways=[cut], learn_from=learn_from)[-1]
+    assert (after.psnr > pruned.psnr + 1) == (learn_from == "photos")
+
+
+def test_nobodys_cameras_cannot_be_learned_from():
+    with pytest.raises(UnsupportedError, match="say whose with --views"):
+        compaction_curves(["x.ply"], "fast", None, None, None, None, None, "cameras", 1)
+    with pytest.raises(UnsupportedError, match="choose photos, cameras or scene"):
+        compaction_curves(["x.ply"], "fast", None, None, None, None, None, "books", 1)
 
 
 @pytest.mark.parametrize("kind", ["png", "svg", "pdf"])

@@ -41,6 +41,17 @@ def test_other_files_are_told_from_checkpoints(tmp_path, content):
         Checkpoint(path, "key").load()
 
 
+def test_a_damaged_one_is_told_too(tmp_path):
+    path = tmp_path / "c.npz"
+    Checkpoint(path, "key").save(STATE)
+    data = bytearray(path.read_bytes())
+    for signature, at in ((b"PK\x03\x04", 8), (b"PK\x01\x02", 10)):
+        data[data.index(signature) + at] = 99  # a method of compression that nobody has
+    path.write_bytes(data)
+    with pytest.raises(OutputError, match=r"c\.npz is no checkpoint of kissgs"):
+        Checkpoint(path, "key")
+
+
 def test_a_folder_in_its_place(tmp_path):
     with pytest.raises(OutputError, match="is a folder; name a file"):
         Checkpoint(tmp_path, "key").load()

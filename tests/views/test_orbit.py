@@ -4,7 +4,8 @@ import itertools
 
 import numpy as np
 import pytest
-from test_virtual import box, try_fewer
+from hollow_scenes import box
+from test_virtual import try_fewer
 
 from kissgs import sample_scene
 from kissgs.errors import Cancelled, InvalidViewsError
