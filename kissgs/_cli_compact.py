@@ -50,6 +50,7 @@ def compact(
         bool,
         typer.Option("--checkpoint", help="Keep the state in a file beside the scene, and go on from it next time."),
     ] = False,
+    device: Annotated[str, typer.Option(help="Trains: [bold]cpu[/] or [bold]cuda[/].")] = "cpu",
     threads: Annotated[int, typer.Option(min=0, help="0: one per processor. The result does not depend on it.")] = 0,
     force: Annotated[bool, typer.Option("--force", "-f", help="Overwrite files that exist.")] = False,
     as_json: Annotated[
@@ -75,7 +76,7 @@ def compact(
         raise UnsupportedError("say how many Gaussians to keep: -n 200k, --ratio 0.2 or --max-psnr-drop 0.2")
     if output is None:
         raise UnsupportedError("say where to write with -o: beside the scene stands the scene itself")
-    capture = _cli_pictures.open_views(views)
+    capture, where = _cli_pictures.open_views(views), _cli_pictures.device_of(device)
 
     def work(scene: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"
@@ -89,6 +90,7 @@ def compact(
                 checkpoint=beside(scene, CHECKPOINT) if checkpoint else None,
                 overwrite=force,
                 threads=threads,
+                device=where,
                 progress=progress,
             )
         if piped:

@@ -101,6 +101,7 @@ def compress(
         bool,
         typer.Option("--checkpoint", help="Keep the state of --compact beside the scene; see 'compact'."),
     ] = False,
+    device: Annotated[str, typer.Option(help="Trains for --compact: [bold]cpu[/] or [bold]cuda[/].")] = "cpu",
     threads: ThreadsOption = 0,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -113,7 +114,7 @@ def compress(
     settings = chosen(preset, changes, budget=budget, seed=seed, psnr=psnr, target_size=target_size)
     if views is not None and not (evaluate or settings.encode.weigh or settings.compact.wanted):
         raise UnsupportedError(f"{preset} takes no pictures: --views only says from where to evaluate; add --evaluate")
-    capture = _cli_pictures.open_views(views)
+    capture, where = _cli_pictures.open_views(views), _cli_pictures.device_of(device)
 
     def work(scene: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"
@@ -132,6 +133,7 @@ def compress(
                 checkpoint=beside(scene, _cli_compact.CHECKPOINT) if checkpoint else None,
                 overwrite=force,
                 threads=threads,
+                device=where,
                 progress=progress,
             )
         if piped:

@@ -16,6 +16,7 @@ from kissgs.compaction.result import Compacted
 from kissgs.errors import UnsupportedError
 from kissgs.importance import Importance
 from kissgs.progress import Progress, as_stage, silent
+from kissgs.rendering.rasterizer import Device
 from kissgs.report import Report
 from kissgs.scenes import AnyPath, check_ply, open_scene, save
 from kissgs.settings import Settings
@@ -65,6 +66,7 @@ def compact(
     checkpoint: AnyPath | None = None,
     overwrite: bool = False,
     threads: int = 0,
+    device: Device = "cpu",
     progress: Progress = silent,
 ) -> Compacted:
     """Bring a scene down to fewer Gaussians that show the same.
@@ -81,6 +83,7 @@ def compact(
             it goes on from there and ends as if nothing had been. When ``destination`` is written it is removed.
         overwrite: replace ``destination`` if it exists.
         threads: 0 means one per processor; the result does not depend on it.
+        device: where to train; ``"cuda"`` needs the extra ``kissgs[cuda]``.
         progress: receives events; raise :class:`kissgs.Cancelled` from it to stop. Nothing is written then.
 
     Returns:
@@ -101,6 +104,7 @@ def compact(
         judges=evaluate,
         checkpoint=Path(checkpoint) if checkpoint is not None else None,
         threads=threads,
+        device=device,
         progress=clock,
     )
     if target is not None:
@@ -130,6 +134,7 @@ def compress(
     checkpoint: AnyPath | None = None,
     overwrite: bool = False,
     threads: int = 0,
+    device: Device = "cpu",
     progress: Progress = silent,
 ) -> Compressed:
     """Compress a scene into a SOG-XT container.
@@ -150,6 +155,7 @@ def compress(
         checkpoint: of the compaction, see :func:`kissgs.compact`.
         overwrite: replace ``destination`` if it exists.
         threads: 0 means one per processor; the bytes do not depend on it.
+        device: of the compaction's training, likewise.
         progress: receives events; raise :class:`kissgs.Cancelled` from it to stop. Nothing is written then.
 
     Returns:
@@ -169,7 +175,7 @@ def compress(
     original, cleaned, source_bytes = open_scene(source, threads, clock)
     compacted = None
     if settings.compact.wanted:
-        compacted = _compact(original, settings, importance, views, checkpoint, threads, clock)
+        compacted = _compact(original, settings, importance, views, checkpoint, threads, device, clock)
     splats = original if compacted is None else compacted.splats
     encoded, trials = encode_scene(
         splats, settings.encode, importance, kept, views, cleaned, threads, clock, original=original
@@ -251,6 +257,7 @@ def _compact(
     views: Views | None,
     checkpoint: AnyPath | None,
     threads: int,
+    device: Device,
     progress: Progress,
 ) -> Compacted:
     from kissgs.compaction.budget import compact_scene
@@ -258,7 +265,9 @@ def _compact(
     if importance is not None:
         raise UnsupportedError("importance is that of a scene before its compaction; compact first, then measure")
     kept = Path(checkpoint) if checkpoint is not None else None
-    return compact_scene(splats, settings.compact, views, checkpoint=kept, threads=threads, progress=progress)
+    return compact_scene(
+        *(splats, settings.compact, views), checkpoint=kept, threads=threads, device=device, progress=progress
+    )
 
 
 def _evaluate(

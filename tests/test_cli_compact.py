@@ -37,7 +37,7 @@ def test_it_writes_what_the_library_finds(folder: Path, tmp_path: Path) -> None:
     assert same(kissgs.load(tmp_path / "b.ply"), kissgs.clean(found.splats)[0])
     text = done.stdout.decode()
     assert "1,500 -> 300 Gaussians" in text
-    assert "learnt from the scene itself: 20 virtual cameras" in text
+    assert "learnt from the scene itself: 21 virtual cameras" in text
     rows = [row.split() for row in text.splitlines() if row.startswith(("input", "prune", "sparsify", "refine"))]
     assert [row[1] for row in rows] == [f"{step.count:,}" for step in found.report.steps]
     assert [row[-1] for row in rows] == [f"{step.bytes:,}" for step in found.report.steps]
@@ -128,6 +128,7 @@ def test_ctrl_c_leaves_a_checkpoint_to_go_on_from(folder: Path, tmp_path: Path) 
         (["-n", "9", "-o", "b.ply", "--set", "no.speed=9"], "there are settings of compact and of encode"),
         (["-n", "9", "-o", "b.zip/"], "b.zip"),
         (["--max-psnr-drop", "1", "-o", "b.ply", "--checkpoint"], "keeps no checkpoint"),
+        (["-n", "9", "-o", "b.ply", "--device", "tpu"], "--device tpu: choose cpu or cuda"),
     ],
 )
 def test_what_cannot_be_done_is_said(folder: Path, tmp_path: Path, words: list[str], sentence: str) -> None:

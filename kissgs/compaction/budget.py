@@ -17,6 +17,8 @@ from kissgs.errors import UnsupportedError
 from kissgs.evaluation.likeness import Evaluation
 from kissgs.evaluation.pictures import evaluate
 from kissgs.progress import Progress, as_stage, silent
+from kissgs.rendering.gsplat_backend import need_cuda
+from kissgs.rendering.rasterizer import Device
 from kissgs.search import seek
 from kissgs.settings import CompactSettings
 from kissgs.splats import Splats
@@ -48,6 +50,7 @@ def compact_scene(
     judges: bool = False,
     checkpoint: Path | None = None,
     threads: int = 0,
+    device: Device = "cpu",
     progress: Progress = silent,
 ) -> Compacted:
     """Fewer Gaussians for the same pictures, as the settings ask.
@@ -60,12 +63,13 @@ def compact_scene(
         judges: measure PSNR, SSIM and bytes after every step, unless several compactions are tried.
         checkpoint: see :func:`kissgs.compaction.popspa.popspa`.
         threads: 0 means one per processor; the result does not depend on it.
+        device: see the same.
         progress: receives "cameras" and the stages of that.
 
     Raises:
         InvalidViewsError: a photograph cannot be read.
         OutputError: ``checkpoint`` is of other work, or cannot be written.
-        UnsupportedError: no budget is given; no torch to train with; too little memory.
+        UnsupportedError: no budget is given; no torch or no GPU to train with; too little memory.
     """
     if not settings.wanted:
         raise UnsupportedError("how many Gaussians to keep is not said; give count, ratio or max_psnr_drop")
@@ -76,6 +80,8 @@ def compact_scene(
             "training is done with torch, which is missing: pip install 'kissgs[train]' (a CPU build will do); the "
             "preset fast only prunes, and needs none"
         )
+    if device == "cuda":
+        need_cuda()
     count = settings.count or max(1, round(len(splats) * (settings.ratio or 0.0)))
     if count >= len(splats):
         return _unchanged(splats, "no more than asked for")
@@ -86,9 +92,10 @@ def compact_scene(
             judges=judges,
             checkpoint=checkpoint,
             threads=threads,
+            device=device,
             progress=progress,
         )
-    return _Search(splats, settings, taught, threads, progress).run(settings.max_psnr_drop)
+    return _Search(splats, settings, taught, threads, device, progress).run(settings.max_psnr_drop)
 
 
 def _unchanged(splats: Splats, why: str) -> Compacted:
@@ -116,11 +123,17 @@ class _Search:
     """For the fewest Gaussians whose pictures lose no more than is allowed."""
 
     def __init__(
-        self, splats: Splats, settings: CompactSettings, taught: School, threads: int, progress: Progress
+        self,
+        splats: Splats,
+        settings: CompactSettings,
+        taught: School,
+        threads: int,
+        device: Device,
+        progress: Progress,
     ) -> None:
         self.splats, self.settings, self.school = splats, settings, taught
         self.lessons: Lessons | None = None
-        self.threads, self.progress = threads, progress
+        self.threads, self.device, self.progress = threads, device, progress
         self.trials: list[tuple[int, float]] = []
         self.best: Compacted | None = None
 
@@ -144,12 +157,16 @@ class _Search:
 
             taught = self.school
             self.lessons = lessons(
-                self.splats, taught.train, taught.background, threads=self.threads, progress=self.progress
+                *(self.splats, taught.train, taught.background),
+                threads=self.threads,
+                device=self.device,
+                progress=self.progress,
             )
         found = popspa(
             *(self.splats, count, self.settings, self.school),
             lessons=self.lessons,
             threads=self.threads,
+            device=self.device,
             progress=self.progress,
         )
         compared = evaluate(

@@ -7,7 +7,7 @@ import itertools
 import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +21,7 @@ from kissgs.compaction.school import School
 from kissgs.compaction.scoring import show_most
 from kissgs.errors import OutputError
 from kissgs.progress import Progress, silent
-from kissgs.rendering.rasterizer import load_kernels
+from kissgs.rendering.rasterizer import Device, load_kernels
 from kissgs.settings import CompactSettings
 from kissgs.splats import ATTRIBUTES, Splats
 from kissgs.training.checkpoint import Checkpoint
@@ -31,6 +31,7 @@ from kissgs.views.anatomy import anatomy
 if TYPE_CHECKING:
     from kissgs.training.lessons import Lessons
     from kissgs.training.loop import Rates
+    from kissgs.training.trainee import Trainee
 
 MEANS_RATE = 1.6e-4
 RATES = {"scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 1.25e-4}
@@ -50,6 +51,7 @@ def popspa(
     judges: bool = False,
     checkpoint: Path | None = None,
     threads: int = 0,
+    device: Device = "cpu",
     progress: Progress = silent,
 ) -> Compacted:
     """Bring a clean scene down to exactly ``count`` Gaussians.
@@ -66,6 +68,7 @@ def popspa(
             taken up where it was left, and ends as if it had never been interrupted. It stays when all is done: whoever
             has written the result elsewhere may delete it.
         threads: 0 means one per processor; the result does not depend on it.
+        device: where it is trained; ``"cuda"`` needs the extra ``kissgs[cuda]``. Scores are always the processor's.
         progress: receives "kernels", "score", "lessons", "sparsify", "refine" and "judge".
 
     Raises:
@@ -74,16 +77,19 @@ def popspa(
         UnsupportedError: there is no torch to train with; a picture would take too much memory.
     """
     teacher = teacher or splats
-    key = "" if checkpoint is None else _key((splats, teacher), count, settings, school, judges)
+    key = "" if checkpoint is None else _key((splats, teacher), count, settings, school, judges, device)
     kept = Checkpoint(checkpoint, key)
-    found = _Recipe(splats, count, settings, school, teacher, lessons, judges, kept, threads, progress).run()
+    found = _Recipe(splats, count, settings, school, teacher, lessons, judges, kept, threads, device, progress).run()
     trained = settings.sparsify_steps + settings.refine_steps > 0
     return replace(found, checkpoint=checkpoint) if trained else found
 
 
-def _key(scenes: Sequence[Splats], count: int, settings: CompactSettings, school: School, judges: bool) -> str:
+def _key(
+    scenes: Sequence[Splats], count: int, settings: CompactSettings, school: School, judges: bool, device: Device
+) -> str:
     """Of the work: equal only where the result is equal."""
-    key = hashlib.sha256(f"{__version__} {count} {judges} {settings.model_dump_json()} {school.background}".encode())
+    told = f"{__version__} {count} {judges} {device} {settings.model_dump_json()} {school.background}"
+    key = hashlib.sha256(told.encode())
     for view in (*school.train, *school.test):
         camera = view.camera
         key.update(camera.viewmat.tobytes() + camera.K.tobytes() + f"{camera.width} {camera.height}".encode())
@@ -104,29 +110,29 @@ class _Phase:
     count: int
 
 
+@dataclass(slots=True, eq=False)
 class _Recipe:
     """One compaction: where it stands is in ``trainee``, ``index`` and ``steps``."""
 
-    def __init__(
-        self,
-        splats: Splats,
-        count: int,
-        settings: CompactSettings,
-        school: School,
-        teacher: Splats,
-        lessons: Lessons | None,
-        judges: bool,
-        checkpoint: Checkpoint,
-        threads: int,
-        progress: Progress,
-    ) -> None:
-        self.splats, self.count, self.settings = splats, count, settings
-        self.school, self.teacher, self.lessons = school, teacher, lessons
-        self.judges, self.checkpoint, self.threads, self.progress = judges, checkpoint, threads, progress
-        self.index: Int[np.ndarray, " M"] = np.arange(len(splats))
-        self.steps: list[CompactionStep] = []
-        self.since = time.perf_counter()
-        self.note = ""
+    splats: Splats
+    count: int
+    settings: CompactSettings
+    school: School
+    teacher: Splats
+    lessons: Lessons | None
+    judges: bool
+    checkpoint: Checkpoint
+    threads: int
+    device: Device
+    progress: Progress
+    index: Int[np.ndarray, " M"] = field(init=False)
+    trainee: Trainee = field(init=False)
+    steps: list[CompactionStep] = field(init=False, default_factory=list)
+    since: float = field(init=False, default_factory=time.perf_counter)
+    note: str = field(init=False, default="")
+
+    def __post_init__(self) -> None:
+        self.index = np.arange(len(self.splats))
 
     def run(self) -> Compacted:
         """All steps, or those that a checkpoint has left."""
@@ -166,7 +172,12 @@ class _Recipe:
         from kissgs.training.lessons import lessons
 
         school = self.school
-        return lessons(self.teacher, school.train, school.background, threads=self.threads, progress=self.progress)
+        return lessons(
+            *(self.teacher, school.train, school.background),
+            threads=self.threads,
+            device=self.device,
+            progress=self.progress,
+        )
 
     def _begin(self) -> tuple[int, int, State]:
         """Prune for a start, or take up what was left: number of the phase, steps of it that are done, its state."""
@@ -175,14 +186,14 @@ class _Recipe:
         state = self.checkpoint.load()
         if state is not None:
             told = json.loads(str(state["told"]))
-            self.index, self.trainee = state["index"], Trainee.restored(state)
+            self.index, self.trainee = state["index"], Trainee.restored(state, self.device)
             self.steps = [CompactionStep(**step) for step in told["steps"]]
             self.since -= told["seconds"]
             return told["phase"], told["done"], state
         self._done("input", self.splats)
         scene = self.splats.select(self._prune(self.splats, self._first_count(), self.progress))
         self._done("prune", scene)
-        self.trainee = Trainee(scene)
+        self.trainee = Trainee(scene, self.device)
         self._save(0, 0, {})  # if that cannot be, it is better known before the work than after
         return 0, 0, {}
 

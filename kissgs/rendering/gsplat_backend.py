@@ -81,6 +81,20 @@ def alpha_max() -> float:
     return float(_constants.MAX_ALPHA)
 
 
+def need_cuda() -> None:
+    """See that there is a GPU to work on, before the work.
+
+    Raises:
+        UnsupportedError: no torch or no CUDA here.
+    """
+    try:
+        import torch
+    except ImportError as error:
+        raise UnsupportedError("work on CUDA needs torch, which is missing: pip install 'kissgs[cuda]'") from error
+    if not torch.cuda.is_available():
+        raise UnsupportedError("torch finds no CUDA device here; leave the work to the processor")
+
+
 def render_on_cuda(
     splats: Splats, camera: Camera, background: Sequence[float]
 ) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]:
@@ -89,12 +103,9 @@ def render_on_cuda(
     Raises:
         UnsupportedError: no torch, no CUDA or no gsplat here.
     """
-    try:
-        import torch
-    except ImportError as error:
-        raise UnsupportedError("rendering on CUDA needs torch, which is missing: pip install 'kissgs[cuda]'") from error
-    if not torch.cuda.is_available():
-        raise UnsupportedError("torch finds no CUDA device here; render on the processor instead")
+    need_cuda()
+    import torch
+
     from kissgs.rendering.differentiable import tensors_of
 
     with torch.no_grad():

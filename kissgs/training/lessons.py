@@ -11,7 +11,7 @@ import numpy as np
 from kissgs._typing import Float32, Shaped
 from kissgs.progress import Progress, silent
 from kissgs.rendering.camera import Camera
-from kissgs.rendering.rasterizer import render
+from kissgs.rendering.rasterizer import Device, render
 from kissgs.splats import Splats
 from kissgs.views.view import View
 
@@ -68,6 +68,7 @@ def lessons(
     background: Float32[np.ndarray, "3"],
     *,
     threads: int = 0,
+    device: Device = "cpu",
     progress: Progress = silent,
 ) -> Lessons:
     """The photographs of ``views``, and what ``teacher`` looks like from those that have none.
@@ -77,6 +78,7 @@ def lessons(
         views: at the size at which to learn; one or more.
         background: RGB over which to render.
         threads: 0 means one per processor.
+        device: where the pictures are taken.
         progress: receives the stage ``"lessons"``.
 
     Raises:
@@ -89,7 +91,7 @@ def lessons(
         if view.photo is not None:
             pictures.append(view.load_photo())
         else:
-            image, _ = render(teacher, view.camera, background=background.tolist(), threads=threads)
+            image, _ = render(teacher, view.camera, background=background.tolist(), threads=threads, device=device)
             pictures.append(np.clip(image, 0, 1).astype(np.float16))
     progress("lessons", 1.0)
     return Lessons(

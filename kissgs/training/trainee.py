@@ -9,6 +9,7 @@ import numpy as np
 from kissgs._typing import Int
 from kissgs.errors import UnsupportedError
 from kissgs.rendering.differentiable import tensors_of
+from kissgs.rendering.rasterizer import Device
 from kissgs.splats import (
     ATTRIBUTES,
     LOG_SCALE_LIMIT,
@@ -46,7 +47,7 @@ class Trainee:
         parameters: by their names in :class:`kissgs.splats.Splats`, float32, with gradients.
     """
 
-    def __init__(self, splats: Splats, device: str = "cpu") -> None:
+    def __init__(self, splats: Splats, device: Device = "cpu") -> None:
         """``splats`` is copied; it must be clean."""
         leaves = {name: tensor.clone().requires_grad_() for name, tensor in tensors_of(splats, device).items()}
         self._adam = torch.optim.Adam(
@@ -104,7 +105,7 @@ class Trainee:
         return arrays
 
     @classmethod
-    def restored(cls, state: Mapping[str, np.ndarray], device: str = "cpu") -> Trainee:
+    def restored(cls, state: Mapping[str, np.ndarray], device: Device = "cpu") -> Trainee:
         """One that goes on exactly as the one whose :meth:`state` this was."""
         trainee = cls(Splats(**{name: state[name] for name in ATTRIBUTES}), device)
         for name, leaf in trainee.parameters.items():

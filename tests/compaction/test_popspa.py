@@ -4,16 +4,16 @@ import itertools
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from training_scenes import around, cloud, same
 
 import kissgs
-from kissgs import CompactSettings, OutputError
-from kissgs.compaction import popspa as recipe
+from kissgs import CompactSettings, OutputError, UnsupportedError
+from kissgs.compaction.budget import compact_scene
 from kissgs.compaction.popspa import popspa
 from kissgs.compaction.school import School, school
 from kissgs.compaction.scoring import show_most
-from kissgs.progress import silent
 from kissgs.rendering.rasterizer import render
 from kissgs.splats import ATTRIBUTES
 from kissgs.training.checkpoint import Checkpoint
@@ -293,14 +293,22 @@ def test_nothing_is_seen():
     assert same(result.splats, far.select(result.index))
 
 
-def test_phases_are_by_the_same_factor():
-    """In each, as many steps as in the others, give or take one."""
+def test_prunings_are_by_the_same_factor():
     chosen = settings(sparsify_steps=10, rounds=3, first_share=0.0)
-    made = recipe._Recipe(cloud(100), 10, chosen, taught(), cloud(100), None, False, Checkpoint(None, ""), 0, silent)
-    phases = list(made._phases())
-    assert [(phase.name, phase.steps, phase.count) for phase in phases] == [
-        ("sparsify", 3, 46),
-        ("sparsify", 4, 22),
-        ("sparsify", 3, 10),
-        ("refine", 6, 10),
-    ]
+    steps = popspa(cloud(100), 10, chosen, taught()).report.steps
+    assert [step.count for step in steps if step.name == "prune"] == [100, 46, 22, 10]
+    assert [step.name for step in steps] == ["input", "prune", *["sparsify", "prune"] * 3, "refine"]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+def test_a_gpu_trains_as_well():
+    scene, views = cloud(200), taught()
+    here, there = (popspa(scene, 60, settings(), views, device=device) for device in ("cpu", "cuda"))
+    assert len(there.splats) == 60
+    assert error(there.splats, scene, views.test) < 1.2 * error(here.splats, scene, views.test)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device here")
+def test_no_gpu_is_said_before_the_work():
+    with pytest.raises(UnsupportedError, match="torch finds no CUDA device here"):
+        compact_scene(cloud(60), settings(count=20), device="cuda", progress=None)
