@@ -39,7 +39,7 @@ class JobOptions(kissgs.Settings):
     @property
     def trains(self) -> bool:
         """Whether what is left of the scene is to be fitted to pictures of it."""
-        return self.compact.wanted and self.compact.sparsify_steps + self.compact.refine_steps > 0
+        return self.compact.wanted and self.compact.trains
 
     @property
     def resumable(self) -> bool:

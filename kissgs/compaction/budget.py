@@ -75,7 +75,7 @@ def compact_scene(
         raise UnsupportedError("how many Gaussians to keep is not said; give count, ratio or max_psnr_drop")
     if settings.max_psnr_drop is not None and checkpoint is not None:
         raise UnsupportedError("a search for a drop of PSNR keeps no checkpoint; give a count or a ratio with it")
-    if settings.sparsify_steps + settings.refine_steps and find_spec("torch") is None:
+    if settings.trains and find_spec("torch") is None:
         raise UnsupportedError(
             "training is done with torch, which is missing: pip install 'kissgs[train]' (a CPU build will do); the "
             "preset fast only prunes, and needs none"
@@ -152,7 +152,7 @@ class _Search:
 
     def _drop(self, share: float, allowed: float) -> float:
         count = max(1, round(len(self.splats) * 2**share))
-        if self.lessons is None and self.settings.sparsify_steps + self.settings.refine_steps:
+        if self.lessons is None and self.settings.trains:
             from kissgs.training.lessons import lessons
 
             taught = self.school

@@ -80,8 +80,7 @@ def popspa(
     key = "" if checkpoint is None else _key((splats, teacher), count, settings, school, judges, device)
     kept = Checkpoint(checkpoint, key)
     found = _Recipe(splats, count, settings, school, teacher, lessons, judges, kept, threads, device, progress).run()
-    trained = settings.sparsify_steps + settings.refine_steps > 0
-    return replace(found, checkpoint=checkpoint) if trained else found
+    return replace(found, checkpoint=checkpoint) if settings.trains else found
 
 
 def _key(

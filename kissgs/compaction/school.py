@@ -17,7 +17,7 @@ from kissgs.views.virtual import virtual_views
 from kissgs.views.wander import wander
 
 SCORED = 4
-"""Of virtual cameras, one in so many scores."""
+"""Of virtual cameras to learn from, one in so many scores."""
 
 JUDGED = 16
 """Held-out views that are looked at, at most."""
@@ -99,17 +99,18 @@ def _alike(views: Sequence[View]) -> Sequence[View]:
 
 def _virtual(splats: Splats, settings: CompactSettings, threads: int, progress: Progress) -> School:
     """Where the scene is its own teacher, pictures of it cost nothing but time."""
+    stride = SCORED if settings.trains else 1
     found = wander(
         splats,
         side=settings.view_size * 3 // 5,
-        count=settings.views,
+        count=max(1, settings.views * stride // SCORED),
         seed=settings.seed,
         threads=threads,
         progress=progress,
     )
     return School(
         train=found.train,
-        score=found.train[::SCORED],
+        score=found.train[::stride],
         test=tuple(_some(found.test or found.train)),
         background=found.background,
         source=f"{len(found.train)} virtual cameras",

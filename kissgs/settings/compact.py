@@ -81,7 +81,8 @@ class CompactSettings(BaseModel):
         ge=1,
         le=10_000,
         description="Virtual views where there is no capture to learn from, an eighth of them held out; every fourth "
-        "of the rest scores. Their sides are three fifths of view_size.",
+        "of the rest scores. Without training a quarter of them, and all score. Their sides are three fifths of "
+        "view_size.",
     )
     view_size: int = Field(640, ge=16, le=8192, description="Longer side of pictures to learn from, pixels, at most.")
     seed: int = Field(0, ge=0, lt=2**31, description="Of the order of the pictures. Same seed: same scene.")
@@ -90,6 +91,11 @@ class CompactSettings(BaseModel):
     def wanted(self) -> bool:
         """Whether a budget is given: without one, a scene keeps all its Gaussians."""
         return any(getattr(self, name) is not None for name in BUDGETS)
+
+    @property
+    def trains(self) -> bool:
+        """Whether what is left is fitted to pictures; else it is pruned and nothing more."""
+        return self.sparsify_steps + self.refine_steps > 0
 
     @model_validator(mode="after")
     def _one_budget(self) -> Self:

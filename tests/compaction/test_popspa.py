@@ -252,6 +252,8 @@ def test_virtual_views_teach_where_there_is_no_capture():
     found = school(scene, None, settings(views=64, view_size=50))
     assert (len(found.train), len(found.score), len(found.test)) == (56, 14, 8)
     assert all(max(view.camera.width, view.camera.height) <= 50 for view in found.train)
+    pruned = school(scene, None, settings(views=64, view_size=50, sparsify_steps=0, refine_steps=0))
+    assert len(pruned.score) == len(found.score)
     result = popspa(scene, 100, settings(), found)
     assert result.report.taught_by == "renderings"
     assert result.report.source == "56 virtual cameras"
