@@ -15,6 +15,7 @@ from kissgs.errors import UnsupportedError
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
+    from kissgs.compaction.study import Point
     from kissgs.views.view import Views
 
 ThreadsOption = Annotated[int, typer.Option(min=0, help="0: one per processor.")]
@@ -74,17 +75,18 @@ def bench(
     capture = open_views(views, scale=scale, images=images, resolution=resolution)
     rows: list[dict[str, Any]]
     table: RenderableType
+    curves: list[tuple[str, Point]] = []
     if not compaction and (ratios or ways or plot or learn_from != "photos"):
         raise UnsupportedError("--ratio, --way, --learn-from and --plot go with --compaction")
     if compaction:
-        from kissgs._cli_curves import compaction_curves
+        from kissgs._cli_curves import compaction_curves, curves_table
 
         if rendering or peers or gaussians or len(presets or []) > 1:
             raise UnsupportedError("--compaction goes with one --preset, and with nothing else that is measured")
         preset = (presets or ["balanced"])[0]
-        rows, table = compaction_curves(
-            expand(scenes), preset, changes, ratios, ways, plot, capture, learn_from, threads
-        )
+        curves = compaction_curves(expand(scenes), preset, changes, ratios, ways, plot, capture, learn_from, threads)
+        rows = [{"scene": scene, **point.as_dict()} for scene, point in curves]
+        table = curves_table(curves)
     elif rendering:
         if presets or peers:
             raise UnsupportedError("--rendering measures the rasteriser, no presets and no peers")
@@ -101,6 +103,10 @@ def bench(
         print_json(rows)
     else:
         show(table)
+    if plot is not None:  # last: what it shows has taken long to find
+        from kissgs._plots import compaction_plot
+
+        compaction_plot([point for _, point in curves], plot)
 
 
 def _compression(

@@ -42,7 +42,9 @@ def compact(
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Change one setting of the preset; see docs/settings.md."),
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Of the order of the pictures. Same seed: same scene.")] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Of the order of pictures and of virtual cameras. Same seed: same scene.")
+    ] = None,
     evaluate: Annotated[
         bool, typer.Option("--evaluate", help="Measure PSNR, SSIM and bytes after every step.")
     ] = False,
@@ -50,7 +52,9 @@ def compact(
         bool,
         typer.Option("--checkpoint", help="Keep the state in a file beside the scene, and go on from it next time."),
     ] = False,
-    device: Annotated[str, typer.Option(help="Trains: [bold]cpu[/] or [bold]cuda[/].")] = "cpu",
+    device: Annotated[
+        str, typer.Option(help="Where to train: [bold]cpu[/], or [bold]cuda[/], whose results vary a little.")
+    ] = "cpu",
     threads: Annotated[int, typer.Option(min=0, help="0: one per processor. The result does not depend on it.")] = 0,
     force: Annotated[bool, typer.Option("--force", "-f", help="Overwrite files that exist.")] = False,
     as_json: Annotated[
@@ -98,6 +102,8 @@ def compact(
 
             with stdout():
                 write_ply(sys.stdout.buffer, result.splats)
+            if result.checkpoint is not None:
+                result.checkpoint.unlink(missing_ok=True)
         elif not (quiet or as_json):
             from kissgs._tables import compaction_table
 

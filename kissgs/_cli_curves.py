@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 from rich.table import Column, Table
 
@@ -28,16 +28,18 @@ def compaction_curves(
     views: Views | None,
     learn_from: str,
     threads: int,
-) -> tuple[list[dict[str, Any]], Table]:
-    """All ways on all scenes: for machines, and as a table."""
-    from kissgs._plots import check_plot, compaction_plot
+) -> list[tuple[str, Point]]:
+    """All ways on all scenes. That ``plot`` can be drawn is seen to before; it is drawn when all else is told."""
+    from kissgs._plots import check_plot
     from kissgs.compaction.study import RATIOS, WAYS, Source, study
     from kissgs.scenes import load
 
     known = {way.name: way for way in WAYS}
     for name in names or []:
         if name not in known:
-            raise UnsupportedError(f"there is no way {name!r}; there are {', '.join(known)}")
+            raise UnsupportedError(f"there is no way {name!r}; there are: {'; '.join(known)}")
+    if 0 in (ratios or ()):
+        raise UnsupportedError("--ratio 0 keeps nothing; give a share above 0")
     source = cast(Source, choice("--learn-from", learn_from, Source))
     if views is None and source == "cameras":
         raise UnsupportedError("--learn-from cameras: say whose with --views")
@@ -60,12 +62,11 @@ def compaction_curves(
                 progress=progress,
             )
             rows += [(Path(scene).name, point) for point in found]
-    if plot is not None:
-        compaction_plot([point for _, point in rows], plot)
-    return [{"scene": scene, **point.as_dict()} for scene, point in rows], _table(rows)
+    return rows
 
 
-def _table(rows: list[tuple[str, Point]]) -> Table:
+def curves_table(rows: list[tuple[str, Point]]) -> Table:
+    """For people."""
     names = ("Gaussians", "PSNR", "SSIM", "bytes", "seconds", "CPU s")
     table = Table("scene", "way", *(Column(name, justify="right") for name in names), box=None, pad_edge=False)
     for scene, point in rows:

@@ -41,7 +41,7 @@ def check_plot(path: Path) -> str:
 
 
 CLOSE = 4.0
-"""Decibels below the input down to which the second panel shows what the first crowds."""
+"""Decibels below the best down to which the second panel shows what the first crowds."""
 
 
 def compaction_plot(points: Sequence[Point], path: Path) -> None:
@@ -61,7 +61,7 @@ def compaction_plot(points: Sequence[Point], path: Path) -> None:
     for axes in panels:
         _draw(axes, points, before)
     whole.set_ylabel("PSNR of held-out views, dB")
-    best = before.psnr if math.isfinite(before.psnr) else max(p.psnr for p in points if math.isfinite(p.psnr))
+    best = max((point.psnr for point in points if math.isfinite(point.psnr)), default=0.0)
     near.set_ylim(best - CLOSE, best + 0.1 * CLOSE)
     figure.legend(*whole.get_legend_handles_labels(), loc="outside right upper", fontsize="small")
     with rc_context({"svg.hashsalt": "kissgs"}), atomic_file(path, overwrite=True) as file:

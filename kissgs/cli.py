@@ -101,7 +101,7 @@ def compress(
         bool,
         typer.Option("--checkpoint", help="Keep the state of --compact beside the scene; see 'compact'."),
     ] = False,
-    device: Annotated[str, typer.Option(help="Trains for --compact: [bold]cpu[/] or [bold]cuda[/].")] = "cpu",
+    device: Annotated[str, typer.Option(help="Where --compact trains: [bold]cpu[/] or [bold]cuda[/].")] = "cpu",
     threads: ThreadsOption = 0,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -111,6 +111,8 @@ def compress(
     from kissgs.pipeline import compress as run
 
     budget = None if compact is None else budget_of(compact)
+    if compact is None and (checkpoint or device != "cpu"):
+        raise UnsupportedError("--checkpoint and --device are about training; they go with --compact")
     settings = chosen(preset, changes, budget=budget, seed=seed, psnr=psnr, target_size=target_size)
     if views is not None and not (evaluate or settings.encode.weigh or settings.compact.wanted):
         raise UnsupportedError(f"{preset} takes no pictures: --views only says from where to evaluate; add --evaluate")
@@ -138,6 +140,8 @@ def compress(
             )
         if piped:
             write_stdout(result.to_zip())
+            if result.checkpoint is not None:
+                result.checkpoint.unlink(missing_ok=True)
         elif not (quiet or as_json):
             from kissgs._tables import report_table
 

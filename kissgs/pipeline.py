@@ -37,11 +37,13 @@ class Compressed:
         files: name -> bytes.
         order: ``(M,)`` for every Gaussian of the container, in its order, the index it has in the cleaned scene.
         report: what it took and gave.
+        checkpoint: of the compaction, if it is still there because nothing was written.
     """
 
     files: Mapping[str, bytes]
     order: Int[np.ndarray, " M"]
     report: Report
+    checkpoint: Path | None = None
 
     def to_zip(self) -> bytes:
         """The container as one stored zip."""
@@ -211,7 +213,8 @@ def compress(
         evaluation=evaluation,
     )
     order = encoded.order if compacted is None else compacted.index[encoded.order]
-    return Compressed(encoded.files, order, report)
+    left = compacted.checkpoint if compacted is not None and target is None else None
+    return Compressed(encoded.files, order, report, left)
 
 
 def decompress(

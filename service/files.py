@@ -25,6 +25,9 @@ from service.settings import SettingsError
 BYTES_PER_GAUSSIAN = (68, 104, 164, 248)
 """Of a ``.ply``, by SH degree."""
 
+STEPS_BYTES = 300_000
+"""What a checkpoint tells of the steps done, if there are as many as settings allow."""
+
 UNFINISHED = ("work-*", ".*.part")
 """What a process that was ended leaves in its job's folder: a folder of its own, and the file that was to become the
 next checkpoint."""
@@ -36,7 +39,7 @@ def checkpoint_bytes(gaussians: int, sh_degree: int) -> int:
     It holds each parameter and the two moments of Adam, of no more Gaussians than the scene has. While it is written
     anew, the former one is still there.
     """
-    return 2 * (20_000 + 3 * BYTES_PER_GAUSSIAN[sh_degree] * gaussians)
+    return 2 * (STEPS_BYTES + 3 * BYTES_PER_GAUSSIAN[sh_degree] * gaussians)
 
 
 class Folders:

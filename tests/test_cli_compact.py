@@ -58,7 +58,7 @@ def test_the_preset_fast_only_prunes(folder: Path, tmp_path: Path) -> None:
 
 
 def test_a_search_tells_its_path(folder: Path, tmp_path: Path) -> None:
-    words = ["-p", "fast", "--set", "views=24", "--set", "view_size=48", "-o", tmp_path / "b.ply"]
+    words = ["-p", "fast", "--set", "views=96", "--set", "view_size=48", "-o", tmp_path / "b.ply"]
     done = run("compact", folder / "a.ply", "--max-psnr-drop", "1", *words)
     assert "searched: 375 lose" in done.stdout.decode()
     assert 1 < len(kissgs.load(tmp_path / "b.ply")) < 1500
@@ -136,6 +136,22 @@ def test_what_cannot_be_done_is_said(folder: Path, tmp_path: Path, words: list[s
         (tmp_path / "b.zip").write_text("in the way")
     assert sentence in failure("compact", folder / "a.ply", *words, cwd=tmp_path)
     assert not (tmp_path / "b.ply").exists()
+
+
+def test_what_is_about_training_goes_with_it(folder: Path, tmp_path: Path) -> None:
+    for word in (["--checkpoint"], ["--device", "cuda"]):
+        assert "they go with --compact" in failure("compress", folder / "a.ply", "-o", "b.zip", *word, cwd=tmp_path)
+
+
+def test_a_pipe_leaves_no_checkpoint(folder: Path, tmp_path: Path) -> None:
+    kissgs.save(SCENE, tmp_path / "s.ply")
+    words = ["-o", "-", "--checkpoint", *OPTIONS]
+    assert run("compact", tmp_path / "s.ply", "-n", "300", *words).stdout.startswith(b"ply")
+    short = [word for word in OPTIONS if word != "--set"]
+    options = [word for name in short for word in ("--set", f"compact.{name}")]
+    piped = run("compress", tmp_path / "s.ply", "--compact", "300", "-o", "-", "--checkpoint", "-p", "fast", *options)
+    assert piped.stdout.startswith(b"PK")
+    assert [path.name for path in tmp_path.iterdir()] == ["s.ply"]
 
 
 def test_nothing_is_overwritten(folder: Path, tmp_path: Path) -> None:

@@ -75,16 +75,16 @@ def compact_scene(
         raise UnsupportedError("how many Gaussians to keep is not said; give count, ratio or max_psnr_drop")
     if settings.max_psnr_drop is not None and checkpoint is not None:
         raise UnsupportedError("a search for a drop of PSNR keeps no checkpoint; give a count or a ratio with it")
+    count = settings.count or max(1, round(len(splats) * (settings.ratio or 0.0)))
+    if count >= len(splats):
+        return _unchanged(splats, "no more than asked for")
     if settings.trains and find_spec("torch") is None:
         raise UnsupportedError(
             "training is done with torch, which is missing: pip install 'kissgs[train]' (a CPU build will do); the "
             "preset fast only prunes, and needs none"
         )
-    if device == "cuda":
+    if settings.trains and device == "cuda":
         need_cuda()
-    count = settings.count or max(1, round(len(splats) * (settings.ratio or 0.0)))
-    if count >= len(splats):
-        return _unchanged(splats, "no more than asked for")
     taught = school(splats, views, settings, threads=threads, progress=progress)
     if settings.max_psnr_drop is None:
         return popspa(
@@ -134,7 +134,7 @@ class _Search:
         self.splats, self.settings, self.school = splats, settings, taught
         self.lessons: Lessons | None = None
         self.threads, self.device, self.progress = threads, device, progress
-        self.trials: list[tuple[int, float]] = []
+        self.trials: dict[int, float] = {}
         self.best: Compacted | None = None
 
     def run(self, allowed: float) -> Compacted:
@@ -148,10 +148,12 @@ class _Search:
         )
         modelled = "" if any(view.photo for view in self.school.test) else MODELLED
         note = "; ".join(filter(None, [best.report.note, modelled]))
-        return replace(best, report=replace(best.report, trials=tuple(self.trials), note=note))
+        return replace(best, report=replace(best.report, trials=tuple(self.trials.items()), note=note))
 
     def _drop(self, share: float, allowed: float) -> float:
-        count = max(1, round(len(self.splats) * 2**share))
+        count = min(max(1, round(len(self.splats) * 2**share)), len(self.splats) - 1)
+        if count in self.trials:
+            return self.trials[count]
         if self.lessons is None and self.settings.trains:
             from kissgs.training.lessons import lessons
 
@@ -175,7 +177,7 @@ class _Search:
             progress=as_stage("judge", self.progress),
         )
         drop = drop_of(compared)
-        self.trials.append((count, drop))
+        self.trials[count] = drop
         if drop <= allowed and (self.best is None or count < len(self.best.splats)):
             self.best = found
         return drop

@@ -37,6 +37,9 @@ MEANS_RATE = 1.6e-4
 RATES = {"scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 1.25e-4}
 """Learning rates of 3DGS; that of the means is in units of the cameras' extent."""
 
+ONE_PLACE = 1e-4
+"""Extent of cameras, in radii of the scene, that tells of rounding, or of a camera that only turned."""
+
 State = Mapping[str, np.ndarray]
 
 
@@ -65,10 +68,11 @@ def popspa(
         lessons: pictures from the school's views for training, if they are at hand.
         judges: measure PSNR, SSIM and bytes after every step.
         checkpoint: file to keep the state in, every half minute of training. If there is one of this very work, it is
-            taken up where it was left, and ends as if it had never been interrupted. It stays when all is done: whoever
-            has written the result elsewhere may delete it.
+            taken up where it was left, and ends (on the processor) as if it had never been interrupted. It stays when
+            all is done: whoever has written the result elsewhere may delete it.
         threads: 0 means one per processor; the result does not depend on it.
-        device: where it is trained; ``"cuda"`` needs the extra ``kissgs[cuda]``. Scores are always the processor's.
+        device: where it is trained; ``"cuda"`` needs the extra ``kissgs[cuda]``, and adds up in an order of chance: no
+            two results are quite the same. Scores are always the processor's.
         progress: receives "kernels", "score", "lessons", "sparsify", "refine" and "judge".
 
     Raises:
@@ -92,6 +96,7 @@ def _key(
     for view in (*school.train, *school.test):
         camera = view.camera
         key.update(camera.viewmat.tobytes() + camera.K.tobytes() + f"{camera.width} {camera.height}".encode())
+        key.update(f"{view.background} {view.bend}".encode())
         if view.photo is not None:
             with open_file(view.photo) as (file, _):
                 key.update(file.read())
@@ -184,7 +189,7 @@ class _Recipe:
 
         state = self.checkpoint.load()
         if state is not None:
-            told = json.loads(str(state["told"]))
+            told = json.loads(state["told"].tobytes())
             self.index, self.trainee = state["index"], Trainee.restored(state, self.device)
             self.steps = [CompactionStep(**step) for step in told["steps"]]
             self.since -= told["seconds"]
@@ -245,8 +250,9 @@ class _Recipe:
             self._done("prune", self.trainee.splats())
 
     def _extent(self, lessons: Lessons) -> float:
-        """By which lengths are measured: the cameras', or the scene's where all cameras stand in one place."""
-        return lessons.extent or anatomy(self.splats).radius
+        """By which lengths are measured: the cameras', or the scene's where all cameras stand in one place, about."""
+        radius = anatomy(self.splats).radius
+        return lessons.extent if lessons.extent > ONE_PLACE * radius else radius
 
     def _within(self, phases: list[_Phase], number: int) -> Progress:
         """Tells of all phases of one name as of one stage, with the prunings between them."""
@@ -277,7 +283,8 @@ class _Recipe:
             "seconds": time.perf_counter() - self.since,
             "steps": [asdict(step) for step in self.steps],
         }
-        state = {**self.trainee.state(), **extra, "index": self.index, "told": np.asarray(json.dumps(told))}
+        words = np.frombuffer(json.dumps(told).encode(), np.uint8)
+        state = {**self.trainee.state(), **extra, "index": self.index, "told": words}
         try:
             self.checkpoint.save(state)
         except OutputError as error:

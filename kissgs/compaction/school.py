@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -61,13 +61,16 @@ def school(
 
     Args:
         splats: finite.
-        views: of a capture.
+        views: of a capture. Where none is for training, virtual ones teach and these judge.
         settings: how many virtual views, and the size of pictures; smaller ones stay as they are.
         threads: 0 means one per processor.
         progress: receives the stage ``"cameras"``.
     """
     if views is None or not views.train:
-        return _virtual(splats, settings, threads, progress)
+        alone = _virtual(splats, settings, threads, progress)
+        if views is None or not views.test:
+            return alone
+        return replace(alone, test=_held_out(views, settings.view_size), background=views.background)
     size, train, source = settings.view_size, views.train, views.source
     if settings.around > 0:
         camera = views.train[0].camera.at_most(size)
@@ -80,14 +83,14 @@ def school(
     return School(
         train=sized,
         score=sized,
-        test=held_out(views, size),
+        test=_held_out(views, size),
         background=views.background,
         source=source,
         note="; ".join(filter(None, [views.note, unheld])),
     )
 
 
-def held_out(views: Views, size: int) -> tuple[View, ...]:
+def _held_out(views: Views, size: int) -> tuple[View, ...]:
     """Those of a capture to judge by, at most so large: all with photographs, or none."""
     return _sized(_some(_alike(views.test or views.train)), size)
 
@@ -113,7 +116,7 @@ def _virtual(splats: Splats, settings: CompactSettings, threads: int, progress: 
         score=found.train[::stride],
         test=tuple(_some(found.test or found.train)),
         background=found.background,
-        source=f"{len(found.train)} virtual cameras",
+        source=f"{len(found.train)} virtual camera{'' if len(found.train) == 1 else 's'}",
     )
 
 

@@ -26,21 +26,21 @@ class Sparsity:
     def __init__(self, opacities: Float[Tensor, " N"], count: int, rho: float, interval: int) -> None:
         """``opacities`` are logits, as stored."""
         self._count, self._rho, self._interval = count, rho, interval
-        activated = torch.sigmoid(opacities.detach())
+        activated = _sigmoid(opacities.detach())
         self.z, self.u = sparsest(activated, count), torch.zeros_like(activated)
 
     def penalty(self, step: int, parameters: Parameters) -> Tensor | None:
         """Every ``interval`` steps, as in the published code; nothing at the others."""
         if (step + 1) % self._interval:
             return None
-        return 0.5 * self._rho * (torch.sigmoid(parameters["opacities"]) - self.z + self.u).square().sum()
+        return 0.5 * self._rho * (_sigmoid(parameters["opacities"]) - self.z + self.u).square().sum()
 
     def update(self, step: int, parameters: Parameters) -> None:
         """Sparsify, and move the dual."""
         if (step + 1) % self._interval:
             return
         with torch.no_grad():
-            activated = torch.sigmoid(parameters["opacities"])
+            activated = _sigmoid(parameters["opacities"])
             self.z = sparsest(activated + self.u, self._count)
             self.u += activated - self.z
 
@@ -59,3 +59,8 @@ def sparsest(values: Float[Tensor, " N"], count: int) -> Float[Tensor, " N"]:
     sparse = torch.zeros_like(values)
     sparse[order] = values[order]
     return sparse
+
+
+def _sigmoid(logits: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
+    """torch's own differs in the last bit where threads share it."""
+    return 1 / (1 + torch.exp(-logits))

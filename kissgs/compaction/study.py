@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
@@ -12,8 +12,9 @@ import numpy as np
 from kissgs._typing import Int
 from kissgs.compaction.judging import judge
 from kissgs.compaction.popspa import popspa
-from kissgs.compaction.school import School, held_out, school
+from kissgs.compaction.school import School, school
 from kissgs.compaction.scoring import highest
+from kissgs.errors import InvalidSceneError
 from kissgs.progress import Progress, silent
 from kissgs.settings import CompactSettings
 from kissgs.splats import Splats
@@ -36,8 +37,8 @@ class Point:
         psnr: decibels, mean over held-out views: to photographs, or to the input's renderings where there are none.
         ssim: the same.
         bytes: of its container as the preset ``fast`` makes it.
-        seconds: wall time.
-        cpu_seconds: of all threads.
+        seconds: wall time, without that of taking the pictures to learn from, which all ways share.
+        cpu_seconds: the same of all threads.
     """
 
     way: str
@@ -53,21 +54,6 @@ class Point:
         return asdict(self)
 
 
-@dataclass(frozen=True, slots=True)
-class Way:
-    """One of them: whom it begins from, and what the recipe's settings are then.
-
-    Attributes:
-        name: for people.
-        start: which Gaussians, given the scene and the count; None for those that score best.
-        changes: of the settings, given the number of steps that all ways have.
-    """
-
-    name: str
-    start: Callable[[Splats, int], Int[np.ndarray, " M"]] | None = None
-    changes: Callable[[int], dict[str, Any]] = field(default=lambda steps: {})
-
-
 def by_chance(splats: Splats, count: int) -> Int[np.ndarray, " M"]:
     """Any, the same each time."""
     return np.sort(np.random.default_rng(0).permutation(len(splats))[:count])
@@ -78,33 +64,49 @@ def by_opacity(splats: Splats, count: int) -> Int[np.ndarray, " M"]:
     return highest(splats.opacities, count)
 
 
-def _no_steps(steps: int) -> dict[str, Any]:
-    return {"sparsify_steps": 0, "refine_steps": 0}
+@dataclass(frozen=True, slots=True)
+class Way:
+    """One of them.
+
+    Attributes:
+        name: for people.
+        training: none; after one pruning; or while Gaussians go, and after that.
+        start: which Gaussians are left, given the scene and the count; None for those that score best.
+        changes: of the settings.
+    """
+
+    name: str
+    training: Literal["none", "after", "along"]
+    start: Callable[[Splats, int], Int[np.ndarray, " M"]] | None = None
+    changes: Mapping[str, Any] = field(default_factory=dict)
+
+    def settings(self, chosen: CompactSettings) -> CompactSettings:
+        """Of the recipe, with as many steps in all as there were."""
+        steps = {"sparsify_steps": 0, "refine_steps": chosen.steps if self.training == "after" else 0}
+        return chosen.model_copy(update={**(steps if self.training != "along" else {}), **self.changes})
 
 
-def _refined(steps: int) -> dict[str, Any]:
-    return {"sparsify_steps": 0, "refine_steps": steps}
-
-
-RHO, NEEDLES = 5e-4, 0.01
+AT_ONCE, IN_ROUNDS = {"score_share": 0.0}, {"score_share": 0.8}
+ONE, FIVE = ({**IN_ROUNDS, "rounds": rounds, "rho": 0.0, "needle_weight": 0.0} for rounds in (1, 5))
+RHO, NEEDLES = {"rho": 5e-4}, {"needle_weight": 0.01}
 """Of GaussianSpa's and of effective rank's published code."""
 
 WAYS = (
-    Way("random", by_chance, _no_steps),
-    Way("opacity", by_opacity, _no_steps),
-    Way("POP", changes=lambda steps: {**_no_steps(steps), "score_share": 0.0}),
-    Way("POP in rounds", changes=_no_steps),
-    Way("opacity + refine", by_opacity, _refined),
-    Way("POP + refine", changes=lambda steps: {**_refined(steps), "score_share": 0.0}),
-    Way("POP in rounds + refine", changes=_refined),
-    Way("POP, train, POP, refine", changes=lambda steps: {"rounds": 1, "rho": 0.0}),
-    Way("POP, sparsify, POP, refine", changes=lambda steps: {"rounds": 1, "rho": RHO}),
-    Way("POPSpa", changes=lambda steps: {"rounds": 1, "rho": RHO, "needle_weight": NEEDLES}),
-    Way("prunings along the way", changes=lambda steps: {"rho": 0.0, "needle_weight": 0.0}),
-    Way("the same, sparsified", changes=lambda steps: {"rho": RHO, "needle_weight": 0.0}),
-    Way("the same, with erank", changes=lambda steps: {"rho": 0.0, "needle_weight": NEEDLES}),
+    Way("random", "none", by_chance),
+    Way("opacity", "none", by_opacity),
+    Way("POP", "none", changes=AT_ONCE),
+    Way("POP in rounds", "none", changes=IN_ROUNDS),
+    Way("opacity + refine", "after", by_opacity),
+    Way("POP + refine", "after", changes=AT_ONCE),
+    Way("POP in rounds + refine", "after", changes=IN_ROUNDS),
+    Way("POP + train + POP + refine", "along", changes=ONE),
+    Way("POP + sparsify + POP + refine", "along", changes={**ONE, **RHO}),
+    Way("POPSpa", "along", changes={**ONE, **RHO, **NEEDLES}),
+    Way("prunings along the way", "along", changes=FIVE),
+    Way("prunings along the way + sparsify", "along", changes={**FIVE, **RHO}),
+    Way("prunings along the way + erank", "along", changes={**FIVE, **NEEDLES}),
 )
-"""All of them, the cheapest first."""
+"""All of them, the cheapest first. What a name says does not depend on the settings; all else does."""
 
 
 def study(
@@ -122,16 +124,26 @@ def study(
 
     Args:
         splats: clean.
-        settings: of the recipe; ways that differ from it have as many steps in all.
+        settings: of the recipe; all ways that train have as many steps in all. Without steps, they are left out.
         views: a capture; by default virtual views, with the scene as the teacher.
         ratios: counts, as shares of the scene's.
         ways: some of :data:`WAYS`.
         learn_from: how much of the capture is learned from; its held-out views judge in any case.
         threads: 0 means one per processor.
         progress: receives the stages of the recipe.
+
+    Raises:
+        InvalidSceneError: there are no Gaussians.
     """
+    if not len(splats):
+        raise InvalidSceneError("the scene has no Gaussians, and cannot have fewer")
     taught = _taught(splats, settings, views, learn_from, threads, progress)
-    steps = settings.sparsify_steps + settings.refine_steps
+    ways = [way for way in ways if settings.trains or way.training == "none"]
+    taken = None
+    if any(way.training != "none" for way in ways):
+        from kissgs.training.lessons import lessons
+
+        taken = lessons(splats, taught.train, taught.background, threads=threads, progress=progress)
 
     def judged(way: str, scene: Splats, seconds: float, cpu_seconds: float) -> Point:
         likeness, size = judge(scene, splats, taught, threads, progress)
@@ -149,10 +161,15 @@ def study(
     for way in ways:
         for ratio in ratios:
             count = max(1, round(len(splats) * ratio))
-            chosen = CompactSettings(**{**settings.model_dump(), **way.changes(steps)})
             wall, cpu = time.perf_counter(), time.process_time()
             scene = splats if way.start is None else splats.select(way.start(splats, count))
-            found = popspa(scene, count, chosen, taught, teacher=splats, threads=threads, progress=progress)
+            found = popspa(
+                *(scene, count, way.settings(settings), taught),
+                teacher=splats,
+                lessons=taken,
+                threads=threads,
+                progress=progress,
+            )
             points.append(judged(way.name, found.splats, time.perf_counter() - wall, time.process_time() - cpu))
     return points
 
@@ -162,8 +179,6 @@ def _taught(
 ) -> School:
     if views is None or learn_from == "photos":
         return school(splats, views, settings, threads=threads, progress=progress)
-    if learn_from == "cameras":
-        bare = tuple(replace(view, photo=None) for view in views.train)
-        return school(splats, replace(views, train=bare), settings, threads=threads, progress=progress)
-    alone = school(splats, None, settings, threads=threads, progress=progress)
-    return replace(alone, test=held_out(views, settings.view_size), background=views.background)
+    bare = tuple(replace(view, photo=None) for view in views.train) if learn_from == "cameras" else ()
+    learned = replace(views, train=bare, test=views.test or views.train)
+    return school(splats, learned, settings, threads=threads, progress=progress)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +16,9 @@ from kissgs.splats import SH_REST_COUNTS, Splats
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+
+MISSING = "rendering on CUDA is gsplat's work, which is missing: pip install 'kissgs[cuda]'"
 
 
 def rasterize_on_cuda(
@@ -40,9 +44,7 @@ def rasterize_on_cuda(
     try:
         from gsplat import rasterization
     except ImportError as error:
-        raise UnsupportedError(
-            "rendering on CUDA is gsplat's work, which is missing: pip install 'kissgs[cuda]'"
-        ) from (error)
+        raise UnsupportedError(MISSING) from error
     device = means.device
     backgrounds = backgrounds.to(device, torch.float32)
     if not len(means):  # which gsplat does not promise to draw
@@ -85,7 +87,7 @@ def need_cuda() -> None:
     """See that there is a GPU to work on, before the work.
 
     Raises:
-        UnsupportedError: no torch or no CUDA here.
+        UnsupportedError: no torch, no CUDA or no gsplat here.
     """
     try:
         import torch
@@ -93,6 +95,8 @@ def need_cuda() -> None:
         raise UnsupportedError("work on CUDA needs torch, which is missing: pip install 'kissgs[cuda]'") from error
     if not torch.cuda.is_available():
         raise UnsupportedError("torch finds no CUDA device here; leave the work to the processor")
+    if find_spec("gsplat") is None:
+        raise UnsupportedError(MISSING)
 
 
 def render_on_cuda(

@@ -85,7 +85,9 @@ class CompactSettings(BaseModel):
         "view_size.",
     )
     view_size: int = Field(640, ge=16, le=8192, description="Longer side of pictures to learn from, pixels, at most.")
-    seed: int = Field(0, ge=0, lt=2**31, description="Of the order of the pictures. Same seed: same scene.")
+    seed: int = Field(
+        0, ge=0, lt=2**31, description="Of the order of the pictures, and of virtual cameras. Same seed: same scene."
+    )
 
     @property
     def wanted(self) -> bool:
@@ -93,9 +95,14 @@ class CompactSettings(BaseModel):
         return any(getattr(self, name) is not None for name in BUDGETS)
 
     @property
+    def steps(self) -> int:
+        """Of training, in all."""
+        return self.sparsify_steps + self.refine_steps
+
+    @property
     def trains(self) -> bool:
         """Whether what is left is fitted to pictures; else it is pruned and nothing more."""
-        return self.sparsify_steps + self.refine_steps > 0
+        return self.steps > 0
 
     @model_validator(mode="after")
     def _one_budget(self) -> Self:

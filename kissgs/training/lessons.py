@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -85,14 +85,13 @@ def lessons(
         InvalidViewsError: a photograph cannot be read.
         UnsupportedError: a picture would take too much memory.
     """
-    pictures = []
+    take, pictures = _camera_man(teacher, background, threads, device), []
     for done, view in enumerate(views):
         progress("lessons", done / len(views))
         if view.photo is not None:
             pictures.append(view.load_photo())
         else:
-            image, _ = render(teacher, view.camera, background=background.tolist(), threads=threads, device=device)
-            pictures.append(np.clip(image, 0, 1).astype(np.float16))
+            pictures.append(np.clip(take(view.camera), 0, 1).astype(np.float16))
     progress("lessons", 1.0)
     return Lessons(
         cameras=tuple(view.camera for view in views),
@@ -100,3 +99,31 @@ def lessons(
         background=background,
         taught_by="photos" if any(view.photo is not None for view in views) else "renderings",
     )
+
+
+def _camera_man(
+    teacher: Splats, background: Float32[np.ndarray, "3"], threads: int, device: Device
+) -> Callable[[Camera], Float32[np.ndarray, "H W 3"]]:
+    """Takes pictures; a GPU is given the scene once for all of them."""
+    if device == "cpu":
+        return lambda camera: render(teacher, camera, background=background.tolist(), threads=threads)[0]
+    import torch
+
+    from kissgs.rendering.differentiable import rasterize, tensors_of
+
+    parameters = tensors_of(teacher, device)
+
+    def take(camera: Camera) -> Float32[np.ndarray, "H W 3"]:
+        with torch.no_grad():
+            images, _ = rasterize(
+                **parameters,
+                viewmats=torch.from_numpy(camera.viewmat[None]),
+                Ks=torch.from_numpy(camera.K[None]),
+                width=camera.width,
+                height=camera.height,
+                backgrounds=torch.from_numpy(background)[None],
+                threads=threads,
+            )
+        return np.asarray(images[0].cpu().numpy())
+
+    return take

@@ -74,7 +74,7 @@ def train(
     """Fit a scene to pictures, from the step ``first`` on.
 
     The loss is that of Kerbl et al. 2023, equation 7, and what the plan adds to it. The same seed gives the same scene,
-    whatever the number of threads.
+    whatever the number of threads; not on a GPU.
 
     Args:
         trainee: changed in place.

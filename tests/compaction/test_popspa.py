@@ -14,9 +14,11 @@ from kissgs.compaction.budget import compact_scene
 from kissgs.compaction.popspa import popspa
 from kissgs.compaction.school import School, school
 from kissgs.compaction.scoring import show_most
+from kissgs.rendering.camera import look_at
 from kissgs.rendering.rasterizer import render
 from kissgs.splats import ATTRIBUTES
 from kissgs.training.checkpoint import Checkpoint
+from kissgs.training.lessons import lessons
 from kissgs.views.view import View, Views, black
 
 SHORT = {"sparsify_steps": 8, "refine_steps": 6, "rounds": 2, "score_share": 0.6, "interval": 3}
@@ -202,14 +204,22 @@ def test_where_nothing_is_trained_no_file_is_touched(tmp_path, compact):
     assert path.read_text() == "years of work"
 
 
-def test_all_cameras_in_one_place():
-    """A tripod: their extent is 0, and says nothing of the size of the world."""
-    (view,) = around(1)
-    turned = [View(f"{n}", kissgs.Camera(view.camera.viewmat, view.camera.K, 40 - n, 32)) for n in range(3)]
-    school_ = School(*[tuple(turned)] * 3, black(), "a tripod")
+@pytest.mark.parametrize("turn", [0.0, 0.1])
+def test_all_cameras_in_one_place(turn):
+    """A tripod: their extent is 0, or what rounding leaves of it, and says nothing of the size of the world."""
+    place, up = np.array([1.3, -2.7, 1.9]), np.array([0.0, -1, 0])
+    targets = [np.array([turn * n, 0.0, 0.0]) for n in range(5)]
+    cameras = [look_at(place, target, up, fov=0.9, width=40, height=32) for target in targets]
+    turned = tuple(View(f"{n}", camera) for n, camera in enumerate(cameras))
+    extent = lessons(cloud(5), turned, black()).extent
+    assert extent < 1e-10
+    assert (extent > 0) == (turn > 0)
     scene = cloud(60)
-    result = popspa(scene, 30, settings(flat_weight=1.0, needle_weight=0.1), school_)
+    result = popspa(
+        scene, 30, settings(flat_weight=1.0, needle_weight=0.1), School(turned, turned, turned, black(), "")
+    )
     assert np.abs(result.splats.means - scene.means[result.index]).max() > 1e-4
+    assert np.abs(result.splats.scales - scene.scales[result.index]).max() < 0.15, "and flatness has not run away"
 
 
 def test_the_scene_as_it_was_teaches_the_smaller_one():

@@ -74,3 +74,19 @@ def test_its_state_goes_on():
         sparsity.update(3, {"opacities": -logits})
     assert torch.equal(one.z, other.z)
     assert torch.equal(one.u, other.u)
+
+
+def test_threads_change_no_bit():
+    """torch's sigmoid does, of more than 32,768 numbers."""
+    logits = torch.linspace(-9, 9, 33_001)
+    states, before = [], torch.get_num_threads()
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        leaf = logits.clone().requires_grad_()
+        sparsity = Sparsity(leaf, 9000, 1e-3, 1)
+        sparsity.penalty(0, {"opacities": leaf}).backward()
+        sparsity.update(0, {"opacities": leaf})
+        states.append([leaf.grad.numpy(), *sparsity.state().values()])
+    torch.set_num_threads(before)
+    for other in states[1:]:
+        assert all(np.array_equal(a, b) for a, b in zip(states[0], other, strict=True))

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 from training_scenes import around, cloud
 
-from kissgs import CompactSettings, UnsupportedError
+from kissgs import CompactSettings, InvalidSceneError, UnsupportedError
 from kissgs._cli_curves import compaction_curves
 from kissgs._plots import check_plot, compaction_plot
 from kissgs.compaction.study import WAYS, study
@@ -48,9 +48,33 @@ def test_who_judges_does_not_depend_on_what_is_learned_from(tmp_path, learn_from
     before, after = study(cloud(80), short, views, ratios=[0.5], ways=[refined], learn_from=learn_from)
     (blank,) = study(cloud(80), short, views, ratios=[], ways=[])
     assert before.psnr == blank.psnr
+    unheld = replace(views, train=views.test, test=())
+    (seen,) = study(cloud(80), short, unheld, ratios=[], ways=[], learn_from=learn_from)
+    assert seen.psnr == blank.psnr, "where no view is held out, those to learn from judge"
     (cut,) = [way for way in WAYS if way.name == "POP"]
     pruned = study(cloud(80), short, views, ratios=[0.5], ways=[cut], learn_from=learn_from)[-1]
     assert (after.psnr > pruned.psnr + 1) == (learn_from == "photos")
+
+
+def test_names_mean_the_same_whatever_the_settings():
+    """The preset's own rounds and shares change nothing; without steps, ways that train are left out."""
+    scene, views = cloud(80), Views(around(5), around(3), black(), "five views")
+    usual = study(scene, SHORT, views, ratios=[0.3])
+    other = SHORT.model_copy(update={"rounds": 7, "score_share": 0.3, "rho": 0.1, "needle_weight": 1.0})
+    assert [point.psnr for point in study(scene, other, views, ratios=[0.3])] == [point.psnr for point in usual]
+    none = SHORT.model_copy(update={"sparsify_steps": 0, "refine_steps": 0})
+    ways = [point.way for point in study(scene, none, views, ratios=[0.3])]
+    assert ways == ["input", "random", "opacity", "POP", "POP in rounds"]
+
+
+def test_an_empty_scene_is_refused():
+    with pytest.raises(InvalidSceneError, match="has no Gaussians"):
+        study(cloud(1).select(slice(0)), SHORT)
+
+
+def test_a_plot_of_nothing_finite_is_drawn(tmp_path, points):
+    compaction_plot([replace(point, psnr=math.inf) for point in points], tmp_path / "p.svg")
+    assert (tmp_path / "p.svg").exists()
 
 
 def test_nobodys_cameras_cannot_be_learned_from():
@@ -58,6 +82,10 @@ def test_nobodys_cameras_cannot_be_learned_from():
         compaction_curves(["x.ply"], "fast", None, None, None, None, None, "cameras", 1)
     with pytest.raises(UnsupportedError, match="choose photos, cameras or scene"):
         compaction_curves(["x.ply"], "fast", None, None, None, None, None, "books", 1)
+    with pytest.raises(UnsupportedError, match="--ratio 0 keeps nothing"):
+        compaction_curves(["x.ply"], "fast", None, [0.5, 0.0], None, None, None, "photos", 1)
+    with pytest.raises(UnsupportedError, match="there is no way 'mine'; there are: random; opacity; "):
+        compaction_curves(["x.ply"], "fast", None, None, ["mine"], None, None, "photos", 1)
 
 
 @pytest.mark.parametrize("kind", ["png", "svg", "pdf"])
