@@ -5,15 +5,18 @@ import os
 import re
 import signal
 import time
+from dataclasses import asdict
 
 import numpy as np
 import pytest
 from serving import ROOT, SMALL, events, problem
 
 import kissgs
+from kissgs import CompactSettings
+from kissgs.compaction.result import CompactionStep
 from kissgs.errors import OutputError
 from service import child
-from service.files import checkpoint_bytes
+from service.files import STEPS_BYTES, checkpoint_bytes
 
 pytest.importorskip("torch")
 
@@ -164,6 +167,13 @@ def test_room_for_a_checkpoint_is_set_aside_until_the_job_has_ended(start_saving
     service.http.post(job["links"]["cancel"])
     assert not folder_of(service, job).exists()
     assert service.ended(service.submit())["state"] == "succeeded"
+
+
+def test_the_longest_story_of_a_training_has_room():
+    """A pruning and a training for each of as many rounds as there may be."""
+    step = asdict(CompactionStep(name="sparsify", count=20_000_000, seconds=123.456789012345))
+    (most,) = [limit.le for limit in CompactSettings.model_fields["rounds"].metadata if hasattr(limit, "le")]
+    assert len(json.dumps([step] * (2 * most + 3))) < STEPS_BYTES
 
 
 def test_training_tells_what_it_has_come_to(service):
