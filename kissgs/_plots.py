@@ -23,6 +23,9 @@ LINES, MARKERS = ("-", "--", ":"), ("o", "s", "^", "D", "v")
 COLOURS = 10
 """Of matplotlib, before they begin again: then the next kind of line is taken."""
 
+CLOSE = 4.0
+"""Decibels below the best down to which the second panel shows what the first crowds."""
+
 
 def check_plot(path: Path) -> str:
     """See that a plot can be drawn there, before the work that it is to show; returns its format.
@@ -38,10 +41,6 @@ def check_plot(path: Path) -> str:
         raise UnsupportedError("plots are matplotlib's, which is missing: pip install 'kissgs[bench]'")
     refuse_existing(path, overwrite=True)
     return kind
-
-
-CLOSE = 4.0
-"""Decibels below the best down to which the second panel shows what the first crowds."""
 
 
 def compaction_plot(points: Sequence[Point], path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
@@ -17,6 +17,12 @@ from kissgs.splats import SH_REST_COUNTS, Splats
 if TYPE_CHECKING:
     from torch import Tensor
 
+
+Picture = tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]
+"""Colours and alphas."""
+
+CameraMan = Callable[[Camera, Sequence[float]], Picture]
+"""Takes a picture over a background."""
 
 MISSING = "rendering on CUDA is gsplat's work, which is missing: pip install 'kissgs[cuda]'"
 
@@ -99,10 +105,8 @@ def need_cuda() -> None:
         raise UnsupportedError(MISSING)
 
 
-def render_on_cuda(
-    splats: Splats, camera: Camera, background: Sequence[float]
-) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]:
-    """:func:`kissgs.rendering.rasterizer.render` on CUDA.
+def camera_man(splats: Splats) -> CameraMan:
+    """Takes pictures of a scene that goes to the GPU once.
 
     Raises:
         UnsupportedError: no torch, no CUDA or no gsplat here.
@@ -112,13 +116,18 @@ def render_on_cuda(
 
     from kissgs.rendering.differentiable import tensors_of
 
-    with torch.no_grad():
-        images, alphas = rasterize_on_cuda(
-            **tensors_of(splats, "cuda"),
-            viewmats=torch.from_numpy(camera.viewmat[None]),
-            Ks=torch.from_numpy(camera.K[None]),
-            width=camera.width,
-            height=camera.height,
-            backgrounds=torch.tensor([list(background)]),
-        )
-    return images[0].cpu().numpy(), alphas[0].cpu().numpy()
+    parameters = tensors_of(splats, "cuda")
+
+    def take(camera: Camera, background: Sequence[float]) -> Picture:
+        with torch.no_grad():
+            images, alphas = rasterize_on_cuda(
+                **parameters,
+                viewmats=torch.from_numpy(camera.viewmat[None]),
+                Ks=torch.from_numpy(camera.K[None]),
+                width=camera.width,
+                height=camera.height,
+                backgrounds=torch.tensor([list(background)]),
+            )
+        return images[0].cpu().numpy(), alphas[0].cpu().numpy()
+
+    return take

@@ -45,9 +45,9 @@ def render(
         UnsupportedError: the picture would take too much memory; no CUDA here.
     """
     if device == "cuda":
-        from kissgs.rendering.gsplat_backend import render_on_cuda
+        from kissgs.rendering.gsplat_backend import camera_man
 
-        return render_on_cuda(splats, camera, background)
+        return camera_man(splats)(camera, background)
     from kissgs.rendering.cpu.frame import draw
 
     with Workers(threads) as pool:

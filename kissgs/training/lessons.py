@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,6 +11,7 @@ import numpy as np
 from kissgs._typing import Float32, Shaped
 from kissgs.progress import Progress, silent
 from kissgs.rendering.camera import Camera
+from kissgs.rendering.gsplat_backend import CameraMan, camera_man
 from kissgs.rendering.rasterizer import Device, render
 from kissgs.splats import Splats
 from kissgs.views.view import View
@@ -85,13 +86,13 @@ def lessons(
         InvalidViewsError: a photograph cannot be read.
         UnsupportedError: a picture would take too much memory.
     """
-    take, pictures = _camera_man(teacher, background, threads, device), []
+    take, pictures = _camera_man(teacher, threads, device), []
     for done, view in enumerate(views):
         progress("lessons", done / len(views))
         if view.photo is not None:
             pictures.append(view.load_photo())
         else:
-            pictures.append(np.clip(take(view.camera), 0, 1).astype(np.float16))
+            pictures.append(np.clip(take(view.camera, background.tolist())[0], 0, 1).astype(np.float16))
     progress("lessons", 1.0)
     return Lessons(
         cameras=tuple(view.camera for view in views),
@@ -101,29 +102,7 @@ def lessons(
     )
 
 
-def _camera_man(
-    teacher: Splats, background: Float32[np.ndarray, "3"], threads: int, device: Device
-) -> Callable[[Camera], Float32[np.ndarray, "H W 3"]]:
-    """Takes pictures; a GPU is given the scene once for all of them."""
-    if device == "cpu":
-        return lambda camera: render(teacher, camera, background=background.tolist(), threads=threads)[0]
-    import torch
-
-    from kissgs.rendering.differentiable import rasterize, tensors_of
-
-    parameters = tensors_of(teacher, device)
-
-    def take(camera: Camera) -> Float32[np.ndarray, "H W 3"]:
-        with torch.no_grad():
-            images, _ = rasterize(
-                **parameters,
-                viewmats=torch.from_numpy(camera.viewmat[None]),
-                Ks=torch.from_numpy(camera.K[None]),
-                width=camera.width,
-                height=camera.height,
-                backgrounds=torch.from_numpy(background)[None],
-                threads=threads,
-            )
-        return np.asarray(images[0].cpu().numpy())
-
-    return take
+def _camera_man(teacher: Splats, threads: int, device: Device) -> CameraMan:
+    if device == "cuda":
+        return camera_man(teacher)
+    return lambda camera, background: render(teacher, camera, background=background, threads=threads)
