@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import sys
+import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -52,8 +53,7 @@ class _Interrupted(BaseException):
 def main() -> None:
     """Entry point. Errors a user can cause end in one line and exit code 2, Ctrl-C in 130."""
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # torch's idle threads would take the processor from ours
-    signal.signal(signal.SIGINT, _interrupt)
-    signal.signal(signal.SIGTERM, _interrupt)
+    _listen()
     try:
         app()
     except KissgsError as error:
@@ -64,8 +64,22 @@ def main() -> None:
         os._exit(128 + reason.args[0])  # threads inside libwebp cannot be stopped, and need not be waited for
 
 
+def _listen() -> None:
+    signal.signal(signal.SIGINT, _interrupt)
+    signal.signal(signal.SIGTERM, _interrupt)
+    sys.unraisablehook = _again
+
+
 def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
     raise _Interrupted(number)
+
+
+def _again(lost: sys.UnraisableHookArgs) -> None:
+    """A signal that arrives inside a finalizer is printed and forgotten by Python: it is sent once more."""
+    if isinstance(lost.exc_value, _Interrupted):
+        threading.Timer(0.01, os.kill, (os.getpid(), lost.exc_value.args[0])).start()
+    else:
+        sys.__unraisablehook__(lost)
 
 
 @app.command()

@@ -177,6 +177,26 @@ def test_json_errors_have_a_code(tmp_path: Path) -> None:
     assert json.loads(done.stdout)["error"]["code"] == "invalid-scene"
 
 
+def test_an_interrupt_inside_a_finalizer_is_not_lost() -> None:
+    """Python prints what is raised there and goes on; numba and torch have such callbacks wherever they import."""
+    lines = (
+        "import signal, time, weakref; from kissgs import cli",
+        "class Thing: pass",
+        "def work():",
+        "    thing = Thing()",
+        "    watch = weakref.ref(thing, lambda _: signal.raise_signal(signal.SIGINT))",
+        "    del thing",
+        "    time.sleep(30)",
+        "cli.app = work",
+        "cli.main()",
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", "\n".join(lines)], check=False, capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 130
+    assert done.stderr == "kissgs: interrupted; nothing half-written is left\n"
+
+
 def test_interrupt_leaves_nothing(tmp_path: Path) -> None:
     scene, target = tmp_path / "scene.ply", tmp_path / "a.zip"
     kissgs.save(kissgs.sample_scene(60_000), scene)
