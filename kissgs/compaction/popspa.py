@@ -237,7 +237,7 @@ class _Recipe:
         plan = Plan(
             stage=phase.name,
             steps=phase.steps,
-            rates=self._rates(phase, self._extent(lessons)),
+            rates=self._rates(phase, lessons),
             ssim_weight=chosen.ssim_weight,
             seed=(chosen.seed, number),
             regularizers=tuple(wishes),
@@ -266,12 +266,14 @@ class _Recipe:
 
         return receive
 
-    def _rates(self, phase: _Phase, extent: float) -> Rates:
+    def _rates(self, phase: _Phase, lessons: Lessons) -> Rates:
         """Rates stay while Gaussians go, and fall exponentially, as 3DGS has it for the means, in the refinement."""
         from kissgs.training.loop import falling
 
         chosen = self.settings
-        base = {"means": MEANS_RATE * extent, **RATES}
+        base = {"means": MEANS_RATE * self._extent(lessons), **RATES}
+        if lessons.taught_by == "renderings":
+            base = {name: rate * chosen.renderings_rate for name, rate in base.items()}
         begin = {name: chosen.means_rate if name == "means" else chosen.rate for name in base}
         end = {name: chosen.means_rate_end if name == "means" else chosen.rate_end for name in base}
         return falling(base, begin, end if phase.name == "refine" else begin)

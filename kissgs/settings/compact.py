@@ -69,6 +69,13 @@ class CompactSettings(BaseModel):
         2.0, gt=0, le=100, description="All other learning rates, in units of those of 3DGS, until the last steps."
     )
     rate_end: float = Field(0.1, gt=0, le=100, description="The same at the end of the last steps.")
+    renderings_rate: float = Field(
+        0.5,
+        gt=0,
+        le=100,
+        description="All learning rates times this where renderings of the scene teach: they leave less to learn than "
+        "photographs do.",
+    )
     around: float = Field(
         0.1,
         ge=0,

@@ -62,6 +62,7 @@ COMPACT: dict[Preset, dict[str, Any]] = {
         "means_rate": 0.01,
         "rate": 1.0,
         "rate_end": 1.0,
+        "renderings_rate": 1.0,
         "means_rate_end": 0.00215,
     },
 }

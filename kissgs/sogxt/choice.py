@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from kissgs._typing import Int
 from kissgs.sogxt.codebook import Codebook
 from kissgs.sogxt.order import Grid
 from kissgs.sogxt.quantize import Quantized
@@ -17,6 +20,7 @@ class Choice:
         grid: which Gaussian sits where.
         fields: levels by field of the metadata, one row per cell; ``f_rest_centroids``, one per entry.
         codebook: which entry each Gaussian has.
+        classes: ``(M,)`` kind of each Gaussian, from 0; those of a kind have levels of their own.
         form_error: largest relative change of a covariance by the choice of its equivalent form.
         tamed: number of Gaussians whose base colour, an outlier, was pulled in.
         errors: largest error that the choices may cause, base colours' making up for others included; per field and
@@ -28,6 +32,7 @@ class Choice:
     grid: Grid
     fields: dict[str, Quantized]
     codebook: Codebook
+    classes: Int[np.ndarray, " M"]
     form_error: float
     tamed: int
     errors: dict[str, list[float]]

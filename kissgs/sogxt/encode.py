@@ -1,4 +1,4 @@
-"""``Splats`` -> SOG-XT files, readable top to bottom: choose, order, quantise, compress."""
+"""``Splats`` -> SOG-XT files, readable top to bottom: choose order and levels, draw them as images, compress."""
 
 from __future__ import annotations
 
@@ -62,7 +62,36 @@ def encode(
     threads: int = 0,
     progress: Progress = silent,
 ) -> Encoded:
-    """Encode a clean scene (:func:`kissgs.splats.clean`).
+    """Encode a clean scene (:func:`kissgs.splats.clean`): :func:`choose`, then :func:`write`.
+
+    Args:
+        splats: the scene.
+        settings: see :class:`EncodeSettings`.
+        importance: see :func:`choose`.
+        recolor: see the same.
+        cleaned: see :func:`write`.
+        compacted: see the same.
+        threads: to use; 0 means one per processor. The bytes do not depend on it.
+        progress: receives "kernels", "price", "order", "forms", "codebook", "sort codebook", "rounding" and "images".
+
+    Raises:
+        InvalidSceneError: ``importance`` does not fit the scene.
+        UnsupportedError: the scene is too large for one container.
+    """
+    choice = choose(splats, settings, importance=importance, recolor=recolor, threads=threads, progress=progress)
+    return write(*(choice, splats, settings), cleaned=cleaned, compacted=compacted, threads=threads, progress=progress)
+
+
+def choose(
+    splats: Splats,
+    settings: EncodeSettings,
+    *,
+    importance: Importance | None = None,
+    recolor: Recolor | None = None,
+    threads: int = 0,
+    progress: Progress = silent,
+) -> Choice:
+    """Choose order, forms, codebook and levels for a clean scene.
 
     Args:
         splats: the scene.
@@ -71,10 +100,8 @@ def encode(
             bit; without it, or where nothing was seen, steps are those of the settings.
         recolor: where choices are weighed: given the Gaussians as a decoder will find them, and their indices in the
             scene, returns better ``sh0``.
-        cleaned: what was mended before, for the metadata.
-        compacted: by how many Gaussians compaction has made the scene smaller before, for the metadata.
-        threads: to use; 0 means one per processor. The bytes do not depend on it.
-        progress: receives "kernels", "price", "order", "forms", "codebook", "sort codebook", "rounding" and "images".
+        threads: to use; 0 means one per processor.
+        progress: receives all stages of :func:`encode` but the last.
 
     Raises:
         InvalidSceneError: ``importance`` does not fit the scene.
@@ -83,19 +110,48 @@ def encode(
     if importance is not None:
         importance.check(splats)
     load_kernels(progress)
-    kept = np.arange(len(splats))
-    if settings.drop_invisible:
-        kept = np.flatnonzero(splats.opacities > np.float32(INVISIBLE_LOGIT))
+    kept = _candidates(splats, settings)
     with blas_workers(threads) as pool:
         if importance is not None and (importance.colors[kept] > 0).any():
-            choice = weigh(splats, kept, importance, recolor, settings, pool, progress)
-        else:
-            choice = choose_evenly(splats, kept, settings, pool, progress)
-        images = _draw(choice)
-        files = compress_images(images, settings, pool, _stage(progress, "images"))
+            return weigh(splats, kept, importance, recolor, settings, pool, progress)
+        return choose_evenly(splats, kept, settings, pool, progress)
 
-    count = int(choice.grid.mask.sum())
-    unseen = len(kept) - count
+
+def _candidates(splats: Splats, settings: EncodeSettings) -> Int[np.ndarray, " K"]:
+    """Those that any renderer draws."""
+    if not settings.drop_invisible:
+        return np.arange(len(splats))
+    return np.flatnonzero(splats.opacities > np.float32(INVISIBLE_LOGIT))
+
+
+def write(
+    choice: Choice,
+    splats: Splats,
+    settings: EncodeSettings,
+    *,
+    cleaned: Cleaned = NOTHING_CLEANED,
+    compacted: int = 0,
+    finetune_steps: int = 0,
+    threads: int = 0,
+    progress: Progress = silent,
+) -> Encoded:
+    """Make the files that show a choice.
+
+    Args:
+        choice: of :func:`choose`, or better.
+        splats: the scene for which it was made.
+        settings: with which.
+        cleaned: what was mended before, for the metadata.
+        compacted: by how many Gaussians compaction has made the scene smaller before, for the metadata.
+        finetune_steps: by which the choice became better, for the metadata.
+        threads: to use; 0 means one per processor. The bytes do not depend on it.
+        progress: receives "images".
+    """
+    images = _draw(choice)
+    with blas_workers(threads) as pool:
+        files = compress_images(images, settings, pool, _stage(progress, "images"))
+    kept, count = len(_candidates(splats, settings)), int(choice.grid.mask.sum())
+    made = {**settings.model_dump(exclude={"psnr", "target_size"}), "price": choice.price}
     layout = metadata.Layout(
         grid_side=choice.grid.side,
         codebook_side=choice.codebook.side,
@@ -107,13 +163,13 @@ def encode(
             count=count,
             source_count=len(splats) + compacted + cleaned.removed,
             changed={
-                "invisible": len(splats) - len(kept),
-                "negligible": unseen,
+                "invisible": len(splats) - kept,
+                "negligible": kept - count,
                 "tamed_colours": choice.tamed,
                 **({"compacted": compacted} if compacted else {}),
                 **cleaned.as_dict(),
             },
-            settings={**settings.model_dump(exclude={"psnr", "target_size"}), "price": choice.price},
+            settings={**made, **({"finetune_steps": finetune_steps} if finetune_steps else {})},
             sha256={name: hashlib.sha256(data).hexdigest() for name, data in files.items()},
         ),
         crc32={name: pixels_crc32(image) for name, image in images.items()},
@@ -123,8 +179,8 @@ def encode(
         files={names.YAML_NAME: layout.to_yaml(), names.SCENE_NAME: metadata.scene_json(files), **files},
         order=choice.grid.cells[choice.grid.mask],
         form_error=choice.form_error,
-        invisible=len(splats) - len(kept),
-        negligible=unseen,
+        invisible=len(splats) - kept,
+        negligible=kept - count,
         tamed=choice.tamed,
         errors=choice.errors,
         price=choice.price,

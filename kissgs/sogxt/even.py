@@ -48,6 +48,7 @@ def choose_evenly(
         grid=grid,
         fields=fields,
         codebook=codebook,
+        classes=np.zeros(len(chosen), np.int64),
         form_error=form_error,
         tamed=int((sh0 != shown.sh0).any(axis=1).sum()),
         errors={name: _half_steps(field, bits if name == "means" else 16) for name, field in fields.items()},

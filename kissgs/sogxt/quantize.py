@@ -7,12 +7,12 @@ in the image; :func:`anchor` makes them so, whatever happened to the levels in b
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil
 
 import numpy as np
 
-from kissgs._typing import Float, Float32, Float64, Int, UInt8, UInt16
+from kissgs._typing import Bool, Float, Float32, Float64, Int, UInt8, UInt16
 from kissgs.splats import Splats
 
 MEANS_TOP = 65_535
@@ -28,12 +28,27 @@ class Quantized:
         low: ``(C,)`` value of level 0.
         high: ``(C,)`` value of level ``top``.
         top: the level that ``high`` belongs to, whether it occurs or not.
+        spacing: which levels are meant for a row: those that are multiples of it once ``first`` is added. One for all,
+            or ``(N,)``. Single levels may be others.
+        first: how far multiples are shifted.
     """
 
     levels: UInt8[np.ndarray, "N C"] | UInt16[np.ndarray, "N C"]
     low: Float32[np.ndarray, " C"]
     high: Float32[np.ndarray, " C"]
     top: int
+    spacing: int | Int[np.ndarray, " N"] = 1
+    first: int = 0
+
+    def values(self) -> Float64[np.ndarray, "N C"]:
+        """What the levels stand for."""
+        low, high = self.low.astype(np.float64), self.high.astype(np.float64)
+        return np.asarray(low + self.levels * ((high - low) / self.top))
+
+    def take(self, rows: Int[np.ndarray, " M"] | Bool[np.ndarray, " N"]) -> Quantized:
+        """Those of the rows ``rows`` alone, in that order."""
+        spacing = self.spacing if isinstance(self.spacing, int) else self.spacing[rows]
+        return replace(self, levels=self.levels[rows], spacing=spacing)
 
 
 def quantize(values: Float[np.ndarray, "N C"], *, step: float, shared: bool = True, max_top: int = 255) -> Quantized:
@@ -94,11 +109,12 @@ def quantize_means(means: Float32[np.ndarray, "N 3"], *, bits: int | Int[np.ndar
     wide = signed_log(means)
     low32, high32 = _range(wide.reshape(-1, 1))
     low, high = np.repeat(low32, 3), np.repeat(high32, 3)
-    spacing = np.exp2(16 - np.reshape(bits, (-1, 1)))
-    levels = _levels(wide, low, high, MEANS_TOP, spacing)
+    spacing = np.exp2(16 - np.asarray(bits))
+    levels = _levels(wide, low, high, MEANS_TOP, spacing.reshape(-1, 1))
     if high[0] > low[0]:
         levels[wide == wide.max()] = MEANS_TOP  # rounding, to even or of the range, could stop just short of it
-    return Quantized(levels.astype(np.uint16), low, high, MEANS_TOP)
+    meant = int(spacing) if spacing.ndim == 0 else spacing.astype(np.int64)
+    return Quantized(levels.astype(np.uint16), low, high, MEANS_TOP, meant)
 
 
 def means_bits(splats: Splats, kept: Int[np.ndarray, " M"], tolerance: float) -> int:

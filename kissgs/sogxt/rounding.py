@@ -78,12 +78,13 @@ def quantize_by_class(
     )
     finest = max(float(steps.min()), widest / 255, 1e-30)
     top = int(min(max(ceil(widest / finest - 1e-3), 1), 255))
-    multiples = np.clip(np.rint(steps / finest), 1, 255)[classes][:, None]
+    spacing = np.clip(np.rint(steps / finest), 1, 255)[classes]
+    multiples = spacing[:, None]
     levels = np.rint((values - low) / finest / multiples) * multiples
     levels = np.where(levels > top, np.floor(top / multiples) * multiples, levels)
     extent = values.max(axis=0) - low
     high = np.where(extent > 0, low + top * finest, low).astype(np.float32)
-    return Quantized(np.clip(levels, 0, top).astype(np.uint8), low32, high, top)
+    return Quantized(np.clip(levels, 0, top).astype(np.uint8), low32, high, top, spacing.astype(np.int64))
 
 
 def round_shapes(
@@ -144,7 +145,7 @@ def _from_zero(levels: Int[np.ndarray, "M C"], part: Quantized) -> Quantized:
     low, high = part.low.astype(np.float64), part.high.astype(np.float64)
     each = (high - low) / part.top
     start, end = ((low + level * each).astype(np.float32) for level in (first, last))
-    return Quantized((levels - first).astype(np.uint8), start, end, last - first)
+    return Quantized((levels - first).astype(np.uint8), start, end, last - first, part.spacing, part.first + first)
 
 
 def _bits(levels: Int[np.ndarray, "M 8"], classes: Int[np.ndarray, " M"]) -> Float64[np.ndarray, "classes 8 256"]:

@@ -15,7 +15,7 @@ from kissgs.sogxt import kmeans
 from kissgs.sogxt.choice import Choice
 from kissgs.sogxt.codebook import COEFFICIENTS, Codebook, bounded, fit_codebook
 from kissgs.sogxt.economy import GLOSS, Costs, Gloss, paper_error, price_for, step
-from kissgs.sogxt.order import Grid, place
+from kissgs.sogxt.order import place
 from kissgs.sogxt.pras import choose_forms
 from kissgs.sogxt.quantize import MEANS_TOP, Quantized, quantize_means, signed_exp, signed_log, tame
 from kissgs.sogxt.rounding import COARSEST, quantize_by_class, round_shapes
@@ -97,15 +97,16 @@ def weigh(
         "quaternions": values[:, 4:],
         "f_dc": shown.sh0,
     }
-    errors = {name: np.abs(_values(fields[name]) - wanted[name]).max(axis=0).tolist() for name in wanted}
+    errors = {name: np.abs(fields[name].values() - wanted[name]).max(axis=0).tolist() for name in wanted}
     half = (codebook.centroids.high - codebook.centroids.low).astype(np.float64) / codebook.centroids.top / 2
     return Choice(
         grid=grid,
         fields={
-            **{name: _padded(field, grid) for name, field in fields.items()},
+            **{name: field.take(grid.rows) for name, field in fields.items()},  # one row for every cell
             "f_rest_centroids": codebook.centroids,
         },
         codebook=codebook,
+        classes=classes,
         form_error=form_error,
         tamed=tamed,
         errors={**errors, "f_rest_centroids": half.tolist()},
@@ -171,7 +172,7 @@ def _colors(
 def _gloss_of(codebook: Codebook, shown: Splats) -> Float32[np.ndarray, "M K 3"]:
     """SH rest as a decoder will find it."""
     kinds = shown.shN.shape[1]
-    entries = _values(codebook.centroids).reshape(-1, 3, COEFFICIENTS)[:, :, :kinds].transpose(0, 2, 1)
+    entries = codebook.centroids.values().reshape(-1, 3, COEFFICIENTS)[:, :, :kinds].transpose(0, 2, 1)
     return np.ascontiguousarray(entries.astype(np.float32)[codebook.labels[: len(shown)]])
 
 
@@ -179,23 +180,13 @@ def _decoded(
     fields: dict[str, Quantized], sh0: Float32[np.ndarray, "M 3"], shN: Float32[np.ndarray, "M K 3"]
 ) -> Splats:
     """As a decoder will find it."""
-    quats = _values(fields["quaternions"])
+    quats = fields["quaternions"].values()
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     return Splats(
-        means=signed_exp(_values(fields["means"])).astype(np.float32),
+        means=signed_exp(fields["means"].values()).astype(np.float32),
         quats=(quats / np.where(norms > 0, norms, 1)).astype(np.float32),
-        scales=_values(fields["scales"]).astype(np.float32),
-        opacities=_values(fields["opacities"])[:, 0].astype(np.float32),
+        scales=fields["scales"].values().astype(np.float32),
+        opacities=fields["opacities"].values()[:, 0].astype(np.float32),
         sh0=sh0,
         shN=shN,
     )
-
-
-def _values(field: Quantized) -> Float64[np.ndarray, "M C"]:
-    low, high = field.low.astype(np.float64), field.high.astype(np.float64)
-    return np.asarray(low + field.levels * ((high - low) / field.top))
-
-
-def _padded(field: Quantized, grid: Grid) -> Quantized:
-    """One row for every cell."""
-    return Quantized(field.levels[grid.rows], field.low, field.high, field.top)
