@@ -12,7 +12,6 @@ import numpy as np
 
 from kissgs.compaction.popspa import popspa
 from kissgs.compaction.result import Compacted, CompactionReport
-from kissgs.compaction.school import School, school
 from kissgs.errors import UnsupportedError
 from kissgs.evaluation.likeness import Evaluation
 from kissgs.evaluation.pictures import evaluate
@@ -22,6 +21,7 @@ from kissgs.rendering.rasterizer import Device
 from kissgs.search import seek
 from kissgs.settings import CompactSettings
 from kissgs.splats import Splats
+from kissgs.training.school import SCORED, School, school
 from kissgs.views.view import Views
 
 if TYPE_CHECKING:
@@ -85,7 +85,8 @@ def compact_scene(
         )
     if settings.trains and device == "cuda":
         need_cuda()
-    taught = school(splats, views, settings, threads=threads, progress=progress)
+    scored = SCORED if settings.trains else 1
+    taught = school(splats, views, settings, scored=scored, threads=threads, progress=progress)
     if settings.max_psnr_drop is None:
         return popspa(
             *(splats, count, settings, taught),

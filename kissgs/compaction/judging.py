@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from kissgs.compaction.school import School
 from kissgs.evaluation.likeness import Likeness
 from kissgs.evaluation.pictures import evaluate
 from kissgs.progress import Progress, as_stage, silent
@@ -10,6 +9,7 @@ from kissgs.settings import Preset, Settings
 from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.encode import encode
 from kissgs.splats import Splats
+from kissgs.training.school import School
 
 
 def judge(

@@ -17,7 +17,6 @@ from kissgs._typing import Int
 from kissgs._version import __version__
 from kissgs.compaction.judging import judge
 from kissgs.compaction.result import Compacted, CompactionReport, CompactionStep
-from kissgs.compaction.school import School
 from kissgs.compaction.scoring import show_most
 from kissgs.errors import OutputError
 from kissgs.progress import Progress, silent
@@ -25,6 +24,7 @@ from kissgs.rendering.rasterizer import Device, load_kernels
 from kissgs.settings import CompactSettings
 from kissgs.splats import ATTRIBUTES, Splats
 from kissgs.training.checkpoint import Checkpoint
+from kissgs.training.school import School
 from kissgs.views._files import open_file
 from kissgs.views.anatomy import anatomy
 

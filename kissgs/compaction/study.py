@@ -12,12 +12,12 @@ import numpy as np
 from kissgs._typing import Int
 from kissgs.compaction.judging import judge
 from kissgs.compaction.popspa import popspa
-from kissgs.compaction.school import School, school
 from kissgs.compaction.scoring import highest
 from kissgs.errors import InvalidSceneError
 from kissgs.progress import Progress, silent
 from kissgs.settings import CompactSettings
 from kissgs.splats import Splats
+from kissgs.training.school import SCORED, School, school
 from kissgs.views.view import Views
 
 RATIOS = (0.7, 0.5, 0.3, 0.2, 0.1, 0.05)
@@ -177,8 +177,9 @@ def study(
 def _taught(
     splats: Splats, settings: CompactSettings, views: Views | None, learn_from: Source, threads: int, progress: Progress
 ) -> School:
+    scored = SCORED if settings.trains else 1
     if views is None or learn_from == "photos":
-        return school(splats, views, settings, threads=threads, progress=progress)
+        return school(splats, views, settings, scored=scored, threads=threads, progress=progress)
     bare = tuple(replace(view, photo=None) for view in views.train) if learn_from == "cameras" else ()
     learned = replace(views, train=bare, test=views.test or views.train)
-    return school(splats, learned, settings, threads=threads, progress=progress)
+    return school(splats, learned, settings, scored=scored, threads=threads, progress=progress)

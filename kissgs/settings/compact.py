@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from kissgs.settings.school import SchoolSettings
 
 
-class CompactSettings(BaseModel):
+class CompactSettings(SchoolSettings):
     """How many Gaussians are left, and how they learn to do the work of the others."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     count: int | None = Field(None, ge=1, description="Keep so many Gaussians; a scene with fewer stays as it is.")
     ratio: float | None = Field(None, gt=0, le=1, description="Keep this share of the Gaussians.")
@@ -60,7 +60,6 @@ class CompactSettings(BaseModel):
         le=1000,
         description="Of the smallest extent of each Gaussian in the loss, in extents of the cameras.",
     )
-    ssim_weight: float = Field(0.2, ge=0, le=1, description="Of 1 - SSIM in the loss; the rest is absolute difference.")
     means_rate: float = Field(
         1.0, gt=0, le=100, description="Learning rate of positions, in units of that with which 3DGS begins."
     )
@@ -76,13 +75,6 @@ class CompactSettings(BaseModel):
         description="All learning rates times this where renderings of the scene teach: they leave less to learn than "
         "photographs do.",
     )
-    around: float = Field(
-        0.1,
-        ge=0,
-        le=0.9,
-        description="Where there is a capture: share of pictures from virtual cameras all around it, of the scene as "
-        "it was. What was never photographed must not fall apart.",
-    )
     views: int = Field(
         384,
         ge=1,
@@ -90,10 +82,6 @@ class CompactSettings(BaseModel):
         description="Virtual views where there is no capture to learn from, an eighth of them held out; every fourth "
         "of the rest scores. Without training a quarter of them, and all score. Their sides are three fifths of "
         "view_size.",
-    )
-    view_size: int = Field(640, ge=16, le=8192, description="Longer side of pictures to learn from, pixels, at most.")
-    seed: int = Field(
-        0, ge=0, lt=2**31, description="Of the order of the pictures, and of virtual cameras. Same seed: same scene."
     )
 
     @property

@@ -14,7 +14,6 @@ from kissgs.progress import Progress, silent
 from kissgs.rendering.differentiable import rasterize
 from kissgs.rendering.losses import photometric_loss
 from kissgs.training.lessons import Lessons
-from kissgs.training.trainee import Trainee
 
 try:
     import torch
@@ -28,6 +27,19 @@ SMOOTH = 0.98
 Parameters = Mapping[str, Tensor]
 Rates = Callable[[float], Mapping[str, float]]
 """Learning rates by parameter, given the share of the steps that are done."""
+
+
+class Learner(Protocol):
+    """What is fitted to pictures."""
+
+    def gaussians(self) -> dict[str, Tensor]:
+        """The scene as it is now, by the names in :class:`kissgs.splats.Splats`: gradients flow back from there."""
+
+    def step(self, rates: Mapping[str, float]) -> None:
+        """Move against the gradients that have come, at these learning rates, and forget them."""
+
+    def __len__(self) -> int:
+        """Number of Gaussians."""
 
 
 class Regularizer(Protocol):
@@ -46,11 +58,12 @@ class Plan:
 
     Attributes:
         stage: its name, for progress.
-        steps: how many, one picture each.
+        steps: how many.
         rates: learning rates.
         ssim_weight: of 1 - SSIM in the loss, from 0 to 1; the rest is for the mean absolute difference.
         seed: of the order of the pictures, one number or several.
         regularizers: beside the pictures.
+        batch: pictures in each step.
     """
 
     stage: str
@@ -59,10 +72,11 @@ class Plan:
     ssim_weight: float
     seed: Sequence[int]
     regularizers: tuple[Regularizer, ...] = ()
+    batch: int = 1
 
 
 def train(
-    trainee: Trainee,
+    learner: Learner,
     lessons: Lessons,
     plan: Plan,
     *,
@@ -77,45 +91,48 @@ def train(
     whatever the number of threads; not on a GPU.
 
     Args:
-        trainee: changed in place.
+        learner: changed in place.
         lessons: pictures.
         plan: what to do.
         first: steps that were done before.
         after: told the number of steps done, after each.
         threads: 0 means one per processor.
         progress: receives the plan's stage, with loss, PSNR to the lessons and count; what it raises leaves the
-            trainee as it was after a whole number of steps.
+            learner as it was after a whole number of steps.
     """
     cameras = [_as_tensors(camera.viewmat, camera.K, lessons.background) for camera in lessons.cameras]
-    order = islice(lessons.order(plan.seed, first), plan.steps - first)
-    told = Told()
+    order, told = lessons.order(plan.seed, first * plan.batch), Told()
     with _threads_of_torch(threads):
-        for step, n in enumerate(order, first):
-            progress(plan.stage, step / plan.steps, told.in_words(len(trainee)))
-            camera, device = lessons.cameras[n], trainee.parameters["means"].device
-            viewmat, K, background = cameras[n]
-            target = torch.from_numpy(lessons.picture(n))[None].to(device)
-            parameters = trainee.parameters
-            image, _ = rasterize(
-                **parameters,
-                viewmats=viewmat,
-                Ks=K,
-                width=camera.width,
-                height=camera.height,
-                backgrounds=background,
-                threads=threads,
-            )
-            loss = photometric_loss(image, target, ssim_weight=plan.ssim_weight, threads=threads)
-            told.hear(float(loss.detach()), float((image.detach() - target).square().mean()))
+        for step in range(first, plan.steps):
+            progress(plan.stage, step / plan.steps, told.in_words(len(learner)))
+            shown = learner.gaussians()
+            losses, errors = [], []
+            for n in islice(order, plan.batch):
+                camera, (viewmat, K, background) = lessons.cameras[n], cameras[n]
+                target = torch.from_numpy(lessons.picture(n))[None].to(shown["means"].device)
+                image, _ = rasterize(
+                    **shown,
+                    viewmats=viewmat,
+                    Ks=K,
+                    width=camera.width,
+                    height=camera.height,
+                    backgrounds=background,
+                    threads=threads,
+                )
+                losses.append(photometric_loss(image, target, ssim_weight=plan.ssim_weight, threads=threads))
+                errors.append(float((image.detach() - target).square().mean()))
+            loss = torch.stack(losses).mean()
+            told.hear(float(loss.detach()), sum(errors) / plan.batch)
             for regularizer in plan.regularizers:
-                penalty = regularizer.penalty(step, parameters)
+                penalty = regularizer.penalty(step, shown)
                 loss = loss if penalty is None else loss + penalty
             loss.backward()  # type: ignore[no-untyped-call]
-            trainee.step(plan.rates(step / plan.steps))
-            for regularizer in plan.regularizers:
-                regularizer.update(step, trainee.parameters)
+            learner.step(plan.rates(step / plan.steps))
+            with torch.no_grad():
+                for regularizer in plan.regularizers:
+                    regularizer.update(step, learner.gaussians())
             after(step + 1)
-    progress(plan.stage, 1.0, told.in_words(len(trainee)))
+    progress(plan.stage, 1.0, told.in_words(len(learner)))
 
 
 @dataclass(slots=True)

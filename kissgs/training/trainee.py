@@ -1,13 +1,14 @@
-"""``Trainee``: a scene whose parameters are being fitted, and what Adam remembers of each Gaussian."""
+"""``Trainee``: a scene whose parameters are being fitted."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from kissgs._typing import Int
-from kissgs.errors import UnsupportedError
 from kissgs.rendering.differentiable import tensors_of
 from kissgs.rendering.rasterizer import Device
 from kissgs.splats import (
@@ -20,14 +21,8 @@ from kissgs.splats import (
     Splats,
     clean,
 )
+from kissgs.training.leaves import Leaves
 
-try:
-    import torch
-    from torch import Tensor
-except ImportError as error:
-    raise UnsupportedError("training is torch's, which is missing: pip install 'kissgs[train]'") from error
-
-MOMENTS = ("exp_avg", "exp_avg_sq")
 BOUNDS = {
     "means": (-0.999 * MEAN_LIMIT, 0.999 * MEAN_LIMIT),  # float32 could round up
     "scales": (-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT),
@@ -36,28 +31,23 @@ BOUNDS = {
     "shN": (-SH_LIMIT, SH_LIMIT),
 }
 """What :func:`kissgs.splats.clean` would change or remove."""
-LARGEST = 1e15
-"""Of a gradient: its square is still a float32."""
 
 
 class Trainee:
-    """The stored parameters of a scene as leaves of torch, and the Adam that moves them.
-
-    Attributes:
-        parameters: by their names in :class:`kissgs.splats.Splats`, float32, with gradients.
-    """
+    """The stored parameters of a scene as leaves of torch, and the Adam that moves them."""
 
     def __init__(self, splats: Splats, device: Device = "cpu") -> None:
         """``splats`` is copied; it must be clean."""
-        leaves = {name: tensor.clone().requires_grad_() for name, tensor in tensors_of(splats, device).items()}
-        self._adam = torch.optim.Adam(
-            [{"params": [leaves[name]], "name": name} for name in ATTRIBUTES], lr=0.0, eps=1e-15, fused=True
-        )
+        self._leaves = Leaves(tensors_of(splats, device))
 
     @property
     def parameters(self) -> dict[str, Tensor]:
-        """By name, the leaves as they are now: :meth:`keep` replaces them."""
-        return {group["name"]: group["params"][0] for group in self._adam.param_groups}
+        """By their names in :class:`kissgs.splats.Splats`, float32, with gradients; :meth:`keep` replaces them."""
+        return self._leaves.by_name
+
+    def gaussians(self) -> dict[str, Tensor]:
+        """The parameters themselves."""
+        return self.parameters
 
     def __len__(self) -> int:
         return len(self.parameters["means"])
@@ -68,27 +58,14 @@ class Trainee:
         What a stored scene cannot hold is kept out: values stay within the bounds of :func:`kissgs.splats.clean`, and
         a gradient that is no number counts as none.
         """
-        for group in self._adam.param_groups:
-            group["lr"] = rates[group["name"]]
-            gradient = group["params"][0].grad
-            if gradient is not None:
-                gradient.nan_to_num_(0.0, 0.0, 0.0).clamp_(-LARGEST, LARGEST)
-        self._adam.step()
-        self._adam.zero_grad()
+        self._leaves.step(rates)
         with torch.no_grad():
             for name, (least, most) in BOUNDS.items():
                 self.parameters[name].clamp_(least, most)
 
     def keep(self, index: Int[np.ndarray, " M"]) -> None:
         """Leave all but the Gaussians at ``index`` out; what Adam remembers of these stays with them."""
-        for group in self._adam.param_groups:
-            old = group["params"][0]
-            rows = torch.from_numpy(index).to(old.device)
-            state = self._adam.state.pop(old, {})
-            leaf = old.detach()[rows].requires_grad_()
-            group["params"] = [leaf]
-            if state:
-                self._adam.state[leaf] = {"step": state["step"], **{name: state[name][rows] for name in MOMENTS}}
+        self._leaves.keep(index)
 
     def splats(self) -> Splats:
         """A clean copy of the scene as it is now."""
@@ -97,21 +74,11 @@ class Trainee:
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything, to go on from later: see :meth:`restored`."""
-        arrays = {}
-        for name, tensor in self.parameters.items():
-            arrays[name] = tensor.detach().cpu().numpy()
-            for part, value in self._adam.state.get(tensor, {}).items():
-                arrays[f"{name}.{part}"] = value.cpu().numpy()
-        return arrays
+        return self._leaves.state()
 
     @classmethod
     def restored(cls, state: Mapping[str, np.ndarray], device: Device = "cpu") -> Trainee:
         """One that goes on exactly as the one whose :meth:`state` this was."""
         trainee = cls(Splats(**{name: state[name] for name in ATTRIBUTES}), device)
-        for name, leaf in trainee.parameters.items():
-            parts = {part: state[f"{name}.{part}"] for part in ("step", *MOMENTS) if f"{name}.{part}" in state}
-            if parts:
-                trainee._adam.state[leaf] = {
-                    part: torch.from_numpy(value.copy()).to(device) for part, value in parts.items()
-                }
+        trainee._leaves.restore(state)
         return trainee

@@ -12,13 +12,13 @@ import kissgs
 from kissgs import CompactSettings, OutputError, UnsupportedError
 from kissgs.compaction.budget import compact_scene
 from kissgs.compaction.popspa import popspa
-from kissgs.compaction.school import School, school
 from kissgs.compaction.scoring import show_most
 from kissgs.rendering.camera import look_at
 from kissgs.rendering.rasterizer import render
 from kissgs.splats import ATTRIBUTES
 from kissgs.training.checkpoint import Checkpoint
 from kissgs.training.lessons import lessons
+from kissgs.training.school import School, school
 from kissgs.views.view import View, Views, black
 
 SHORT = {"sparsify_steps": 8, "refine_steps": 6, "rounds": 2, "score_share": 0.6, "interval": 3}
@@ -262,7 +262,7 @@ def test_virtual_views_teach_where_there_is_no_capture():
     found = school(scene, None, settings(views=64, view_size=50))
     assert (len(found.train), len(found.score), len(found.test)) == (56, 14, 8)
     assert all(max(view.camera.width, view.camera.height) <= 50 for view in found.train)
-    pruned = school(scene, None, settings(views=64, view_size=50, sparsify_steps=0, refine_steps=0))
+    pruned = school(scene, None, settings(views=64, view_size=50), scored=1)
     assert len(pruned.score) == len(found.score)
     result = popspa(scene, 100, settings(), found)
     assert result.report.taught_by == "renderings"

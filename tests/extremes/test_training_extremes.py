@@ -7,9 +7,9 @@ from training_scenes import around, cloud
 import kissgs
 from kissgs import CompactSettings
 from kissgs.compaction.popspa import popspa
-from kissgs.compaction.school import School
 from kissgs.rendering.rasterizer import render
 from kissgs.splats import ATTRIBUTES
+from kissgs.training.school import School
 from kissgs.views.view import View, black
 
 STEPS = {

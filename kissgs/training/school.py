@@ -1,4 +1,4 @@
-"""From where a scene is scored, fitted and judged while it is compacted."""
+"""From where a scene is scored, fitted and judged while it is compacted or fine-tuned."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from kissgs._typing import Float32
 from kissgs.progress import Progress, silent
-from kissgs.settings import CompactSettings
+from kissgs.settings.school import SchoolSettings
 from kissgs.splats import Splats
 from kissgs.views.view import View, Views
 from kissgs.views.virtual import virtual_views
@@ -52,8 +52,9 @@ class School:
 def school(
     splats: Splats,
     views: Views | None,
-    settings: CompactSettings,
+    settings: SchoolSettings,
     *,
+    scored: int = SCORED,
     threads: int = 0,
     progress: Progress = silent,
 ) -> School:
@@ -63,11 +64,13 @@ def school(
         splats: finite.
         views: of a capture. Where none is for training, virtual ones teach and these judge.
         settings: how many virtual views, and the size of pictures; smaller ones stay as they are.
+        scored: of virtual ones, one in so many scores; 1 where they are for nothing else, and :data:`SCORED` times
+            fewer will do.
         threads: 0 means one per processor.
         progress: receives the stage ``"cameras"``.
     """
     if views is None or not views.train:
-        alone = _virtual(splats, settings, threads, progress)
+        alone = _virtual(splats, settings, scored, threads, progress)
         if views is None or not views.test:
             return alone
         return replace(alone, test=_held_out(views, settings.view_size), background=views.background)
@@ -100,9 +103,8 @@ def _alike(views: Sequence[View]) -> Sequence[View]:
     return [view for view in views if view.photo is not None] or views
 
 
-def _virtual(splats: Splats, settings: CompactSettings, threads: int, progress: Progress) -> School:
+def _virtual(splats: Splats, settings: SchoolSettings, stride: int, threads: int, progress: Progress) -> School:
     """Where the scene is its own teacher, pictures of it cost nothing but time."""
-    stride = SCORED if settings.trains else 1
     found = wander(
         splats,
         side=settings.view_size * 3 // 5,
