@@ -66,6 +66,7 @@ def compact(
     from kissgs._console import progress_bar
     from kissgs.io.ply import write_ply
     from kissgs.pipeline import compact as run
+    from kissgs.pipeline import forget
 
     settings = chosen(
         preset,
@@ -102,8 +103,7 @@ def compact(
 
             with stdout():
                 write_ply(sys.stdout.buffer, result.splats)
-            if result.checkpoint is not None:
-                result.checkpoint.unlink(missing_ok=True)
+            forget(result.checkpoint)
         elif not (quiet or as_json):
             from kissgs._tables import compaction_table
 

@@ -20,6 +20,7 @@ def chosen(
     *,
     group: str = "encode",
     budget: Values | None = None,
+    finetune: str | None = None,
     **options: float | str | None,
 ) -> Settings:
     """A preset with ``NAME=VALUE`` changes; options of their own, where they are given, override these.
@@ -27,8 +28,9 @@ def chosen(
     Args:
         preset: its name.
         changes: of settings of ``group``, or of another one as ``GROUP.NAME=VALUE``.
-        group: "encode" or "compact".
+        group: "encode", "compact" or "finetune".
         budget: settings of "compact".
+        finetune: a number of steps, or "auto" for that of the preset.
         options: settings of ``group``; None is not given.
 
     Raises:
@@ -36,18 +38,41 @@ def chosen(
     """
     from kissgs.settings import Settings
 
-    values: dict[str, Values] = {"compact": {}, "encode": {}}
+    values: dict[str, Values] = {"compact": {}, "encode": {}, "finetune": {}}
     for change in changes or []:
         name, equals, value = change.partition("=")
         if not equals:
             raise UnsupportedError(f"--set {change!r}: write NAME=VALUE, for example --set means_bits=16")
         of, dot, inner = name.strip().partition(".")
         if dot and of not in values:
-            raise UnsupportedError(f"--set {change!r}: there are settings of compact and of encode")
+            raise UnsupportedError(f"--set {change!r}: there are settings of compact, encode and finetune")
         values[of if dot else group][inner if dot else of] = None if value.strip() == "auto" else value.strip()
     values["compact"].update(budget or {})
     values[group].update({name: value for name, value in options.items() if value is not None})
-    return Settings.from_preset(preset, compact=values["compact"], **values["encode"])
+    values["finetune"].update(_tuning(finetune))
+    return Settings.from_preset(preset, compact=values["compact"], finetune=values["finetune"], **values["encode"])
+
+
+FINETUNE = "--finetune"
+
+
+def spelled_out(words: list[str]) -> list[str]:
+    """A command line on which ``--finetune`` without a number means ``--finetune auto``: typer has no such options."""
+    told = list[str]()
+    for n, word in enumerate(words):
+        told.append(word)
+        following = words[n + 1] if n + 1 < len(words) else ""
+        if word == FINETUNE and not (following.isdecimal() or following == "auto"):
+            told.append("auto")
+    return told
+
+
+def _tuning(steps: str | None) -> Values:
+    if steps is None:
+        return {}
+    if steps != "auto" and not steps.isdecimal():
+        raise UnsupportedError(f"{FINETUNE} {steps}: write a number of steps, or nothing for that of the preset")
+    return {"wanted": True} if steps == "auto" else {"wanted": True, "steps": steps}
 
 
 def count_of(text: str) -> int:

@@ -14,7 +14,7 @@ import typer
 
 from kissgs import _cli_bench, _cli_compact, _cli_pictures, _cli_remote, _cli_render
 from kissgs._cli_files import beside, each, show, source, stdout, write_stdout
-from kissgs._cli_settings import budget_of, chosen
+from kissgs._cli_settings import budget_of, chosen, spelled_out
 from kissgs._version import __version__
 from kissgs.errors import KissgsError, UnsupportedError
 
@@ -55,7 +55,7 @@ def main() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # torch's idle threads would take the processor from ours
     _listen()
     try:
-        app()
+        app(spelled_out(sys.argv[1:]))
     except KissgsError as error:
         _fail(error)
     except _Interrupted as reason:
@@ -101,6 +101,14 @@ def compress(
         str | None,
         typer.Option(metavar="BUDGET", help="Fewer Gaussians first: 200k, 20% or 0.2dB; see 'compact'."),
     ] = None,
+    finetune: Annotated[
+        str | None,
+        typer.Option(
+            metavar="[STEPS]",
+            help="Then fit the numbers in the images to --views, or to pictures of the scene: fewer bytes at equal "
+            "PSNR, and a minute or two more. By default as many steps as the preset has.",
+        ),
+    ] = None,
     seed: SeedOption = None,
     unpacked: Annotated[bool, typer.Option("--unpacked", help="Write folders instead of zips.")] = False,
     evaluate: Annotated[bool, typer.Option("--evaluate", help="Measure PSNR and SSIM of the result.")] = False,
@@ -113,9 +121,13 @@ def compress(
     ] = False,
     checkpoint: Annotated[
         bool,
-        typer.Option("--checkpoint", help="Keep the state of --compact beside the scene; see 'compact'."),
+        typer.Option(
+            "--checkpoint", help="Keep the state of --compact and --finetune beside the scene; see 'compact'."
+        ),
     ] = False,
-    device: Annotated[str, typer.Option(help="Where --compact trains: [bold]cpu[/] or [bold]cuda[/].")] = "cpu",
+    device: Annotated[
+        str, typer.Option(help="Where --compact and --finetune train: [bold]cpu[/] or [bold]cuda[/].")
+    ] = "cpu",
     threads: ThreadsOption = 0,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -123,12 +135,14 @@ def compress(
 ) -> None:
     """Compress scenes, each into a container of its own."""
     from kissgs.pipeline import compress as run
+    from kissgs.pipeline import forget
 
     budget = None if compact is None else budget_of(compact)
-    if compact is None and (checkpoint or device != "cpu"):
-        raise UnsupportedError("--checkpoint and --device are about training; they go with --compact")
-    settings = chosen(preset, changes, budget=budget, seed=seed, psnr=psnr, target_size=target_size)
-    if views is not None and not (evaluate or settings.encode.weigh or settings.compact.wanted):
+    if compact is finetune is None and (checkpoint or device != "cpu"):
+        raise UnsupportedError("--checkpoint and --device are about training; they go with --compact and --finetune")
+    settings = chosen(preset, changes, budget=budget, finetune=finetune, seed=seed, psnr=psnr, target_size=target_size)
+    looks = evaluate or settings.encode.weigh or settings.compact.wanted or settings.finetune.wanted
+    if views is not None and not looks:
         raise UnsupportedError(f"{preset} takes no pictures: --views only says from where to evaluate; add --evaluate")
     capture, where = _cli_pictures.open_views(views), _cli_pictures.device_of(device)
 
@@ -154,8 +168,7 @@ def compress(
             )
         if piped:
             write_stdout(result.to_zip())
-            if result.checkpoint is not None:
-                result.checkpoint.unlink(missing_ok=True)
+            forget(*result.checkpoints)
         elif not (quiet or as_json):
             from kissgs._tables import report_table
 

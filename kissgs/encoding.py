@@ -1,10 +1,11 @@
-"""From a scene to a container, as the settings ask: look at it where bits are weighed; encode it, once or to a goal."""
+"""From a scene to a container, as the settings ask: look at it where bits are weighed, choose, fine-tune, write."""
 
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,113 +14,180 @@ import numpy as np
 from kissgs._typing import Float32, Int
 from kissgs._version import __version__
 from kissgs.errors import UnsupportedError
+from kissgs.goal import Container, Encoder, GoalSearch
 from kissgs.importance import Importance
 from kissgs.io.importance_file import read_importance, write_importance
-from kissgs.progress import Progress, silent
-from kissgs.search import Trial, seek
-from kissgs.settings import EncodeSettings
-from kissgs.sogxt.container import zip_bytes
-from kissgs.sogxt.decode import decode
-from kissgs.sogxt.encode import Encoded, encode
+from kissgs.progress import Progress
+from kissgs.rendering.gsplat_backend import need_cuda
+from kissgs.rendering.rasterizer import Device
+from kissgs.search import Trial
+from kissgs.settings import EncodeSettings, Settings
+from kissgs.sogxt.choice import Choice
+from kissgs.sogxt.encode import Encoded, choose, write
 from kissgs.sogxt.encode import load_kernels as load_encoder
 from kissgs.sogxt.weighed import Recolor
 from kissgs.splats import ATTRIBUTES, Cleaned, Splats
 from kissgs.views.view import Views
 
 if TYPE_CHECKING:
+    from kissgs.finetuning.tune import Tuner
     from kissgs.rendering.importance import Watch
 
 HEDGE = {True: 0.1, False: 0.55}
 """How little pictures say of others: those from a capture's cameras, and those from virtual ones."""
 
-NEAR_PSNR, PSNR_SLOPE = 0.1, -1.5
-"""Decibels above a wanted PSNR that are near enough; decibels per doubling of the price, about."""
-
-NEAR_SIZE, SIZE_SLOPE = -math.log2(0.97), 0.2
-"""The same of a wanted size, as powers of 2."""
-
-PRICES = (-70.0, -6.0)
-"""Between which prices are sought, as powers of 2."""
+Chooser = Callable[[EncodeSettings], Choice]
 
 
-def encode_scene(
-    splats: Splats,
-    settings: EncodeSettings,
-    importance: Importance | None,
-    cache: Path | None,
-    views: Views | None,
-    cleaned: Cleaned,
-    threads: int,
-    progress: Progress,
-    *,
-    original: Splats,
-) -> tuple[Encoded, tuple[Trial, ...]]:
-    """Encode a clean scene as the settings ask, and tell what was tried on the way if they name a goal.
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Encoding:
+    """A scene that shall become a container.
 
-    A goal's PSNR is that to pictures of ``original``, from which the scene may have been compacted.
-
-    Raises:
-        OutputError: ``cache`` is something else, or cannot be written.
-        UnsupportedError: the goal cannot be met; the scene is too large for one container.
+    Attributes:
+        splats: clean.
+        original: from which it was compacted, or the same: pictures of it are what a goal's PSNR is told by, and what
+            fine-tuning learns from where there are no photographs.
+        settings: of all stages.
+        importance: of ``splats``, if it was measured before.
+        cache: file to keep it in.
+        views: a capture.
+        cleaned: what was mended, for the metadata.
+        checkpoint: file for the state of fine-tuning; a search for a goal keeps none.
+        device: where fine-tuning trains.
+        threads: 0 means one per processor.
+        progress: receives the stages of all that is done.
     """
-    if not settings.weigh or len(splats) == 0:
-        compacted = len(original) - len(splats)
-        return encode(splats, settings, cleaned=cleaned, compacted=compacted, threads=threads, progress=progress), ()
-    encoder = _look(splats, settings, importance, cache, views, cleaned, len(original) - len(splats), threads, progress)
-    if settings.psnr is None and settings.target_size is None:
-        return encoder(settings), ()
-    return _Search(original, settings, encoder, views, threads, progress).run()
 
+    splats: Splats
+    original: Splats
+    settings: Settings
+    importance: Importance | None
+    cache: Path | None
+    views: Views | None
+    cleaned: Cleaned
+    checkpoint: Path | None
+    device: Device
+    threads: int
+    progress: Progress
 
-Encoder = Callable[[EncodeSettings], Encoded]
+    def run(self) -> tuple[Container, tuple[Trial, ...]]:
+        """The container, and what was tried on the way to it if the settings name a goal.
 
+        Raises:
+            InvalidViewsError: a photograph cannot be read.
+            OutputError: ``cache`` or ``checkpoint`` is something else, or cannot be written.
+            UnsupportedError: the goal cannot be met; the scene is too large for one container; no torch or no GPU to
+                train with.
+        """
+        wanted = self.settings.encode
+        if self.settings.finetune.wanted:
+            check_training(self.device)
+        weighs = wanted.weigh and len(self.splats) > 0
+        chooser = self._looking() if weighs else self._blind
+        goal = weighs and (wanted.psnr is not None or wanted.target_size is not None)
+        untuned = self._encoder(chooser, None, None)
+        if not goal:
+            return self._encoder(chooser, self._tuner(), self.checkpoint)(wanted), ()
 
-def _look(
-    splats: Splats,
-    settings: EncodeSettings,
-    importance: Importance | None,
-    cache: Path | None,
-    views: Views | None,
-    cleaned: Cleaned,
-    compacted: int,
-    threads: int,
-    progress: Progress,
-) -> Encoder:
-    """An encoder that weighs by pictures of the scene, which are taken once."""
-    from kissgs.rendering.rasterizer import load_kernels as load_rasterizer
-    from kissgs.views.watch import watch
+        def search(encoder: Encoder, price: float | None = None) -> tuple[Container, tuple[Trial, ...]]:
+            return GoalSearch(self.original, wanted, encoder, self.views, self.threads, self.progress).run(price)
 
-    if importance is not None:
-        importance.check(splats)
-    load_encoder(progress)
-    load_rasterizer()
-    captured = views is not None and len(views.train) > 0
-    recolor = None
-    if importance is None or (captured and settings.refit):
-        size = settings.view_size
-        watched = watch(splats, views, count=settings.views, size=size, threads=threads, progress=progress)
-        if importance is None:
-            hedge = settings.hedge if settings.hedge is not None else HEDGE[captured]
-            importance = _importance(splats, watched, hedge, cache, threads, progress)
-        if captured and settings.refit:  # virtual pictures would mislead it
-            recolor = _recolor(splats, watched, importance, settings.refit, threads, progress)
+        tuner = self._tuner()
+        if tuner is None:
+            return search(untuned)
+        if wanted.psnr is not None and tuner.lessons.taught_by == "photos":
+            raise UnsupportedError(
+                "psnr is that to the scene's own pictures, and fine-tuning by photographs leaves these for better "
+                "ones; ask for a size (--target-size), or fine-tune without photographs"
+            )
+        best, trials = search(untuned)
+        best, more = search(self._encoder(chooser, tuner, None), best.encoded.price)
+        return best, trials + more
 
-    def ready(stage: str, fraction: float, note: str = "") -> None:
-        if stage != "kernels":  # that was before
-            progress(stage, fraction)
+    def _encoder(self, chooser: Chooser, tuner: Tuner | None, checkpoint: Path | None) -> Encoder:
+        """Chooses, fine-tunes if there is a tuner, and writes."""
 
-    def encoder(chosen: EncodeSettings) -> Encoded:
-        return encode(
-            *(splats, chosen),
-            importance=importance,
-            recolor=recolor,
-            cleaned=cleaned,
-            compacted=compacted,
-            threads=threads,
-            progress=ready,
+        def encoder(chosen: EncodeSettings) -> Container:
+            def files(choice: Choice, finetune_steps: int = 0) -> Encoded:
+                return write(
+                    *(choice, self.splats, chosen),
+                    cleaned=self.cleaned,
+                    compacted=len(self.original) - len(self.splats),
+                    finetune_steps=finetune_steps,
+                    threads=self.threads,
+                    progress=self.progress,
+                )
+
+            choice = chooser(chosen)
+            if tuner is None or not choice.grid.mask.any():
+                return Container(files(choice))
+            return Container(*tuner(choice, self.splats.sh_degree, files, checkpoint))
+
+        return encoder
+
+    def _tuner(self) -> Tuner | None:
+        if not self.settings.finetune.wanted or len(self.splats) == 0:
+            return None
+        from kissgs.finetuning.tune import Tuner
+
+        return Tuner.of(
+            *(self.original, self.settings.finetune, self.views),
+            device=self.device,
+            threads=self.threads,
+            progress=self.progress,
         )
 
-    return encoder
+    def _blind(self, chosen: EncodeSettings) -> Choice:
+        return choose(self.splats, chosen, threads=self.threads, progress=self.progress)
+
+    def _looking(self) -> Chooser:
+        """Weighs by pictures of the scene, which are taken once."""
+        from kissgs.rendering.rasterizer import load_kernels as load_rasterizer
+        from kissgs.views.watch import watch
+
+        splats, views, settings = self.splats, self.views, self.settings.encode
+        importance, common = self.importance, (self.threads, self.progress)
+        if importance is not None:
+            importance.check(splats)
+        load_encoder(self.progress)
+        load_rasterizer()
+        captured = views is not None and len(views.train) > 0
+        recolor = None
+        if importance is None or (captured and settings.refit):
+            size = settings.view_size
+            watched = watch(
+                *(splats, views), count=settings.views, size=size, threads=self.threads, progress=self.progress
+            )
+            if importance is None:
+                hedge = settings.hedge if settings.hedge is not None else HEDGE[captured]
+                importance = _importance(splats, watched, hedge, self.cache, *common)
+            if captured and settings.refit:  # virtual pictures would mislead it
+                recolor = _recolor(splats, watched, importance, settings.refit, *common)
+
+        def ready(stage: str, fraction: float, note: str = "") -> None:
+            if stage != "kernels":  # that was before
+                self.progress(stage, fraction)
+
+        def chooser(chosen: EncodeSettings) -> Choice:
+            return choose(
+                *(splats, chosen), importance=importance, recolor=recolor, threads=self.threads, progress=ready
+            )
+
+        return chooser
+
+
+def check_training(device: Device) -> None:
+    """See that scenes can be trained here.
+
+    Raises:
+        UnsupportedError: no torch or no GPU.
+    """
+    if find_spec("torch") is None:
+        raise UnsupportedError(
+            "fine-tuning is done with torch, which is missing: pip install 'kissgs[train]' (a CPU build will do)"
+        )
+    if device == "cuda":
+        need_cuda()
 
 
 def _importance(
@@ -153,79 +221,3 @@ def _recolor(
         return refit_colors(decoded, splats, watched, *weights, steps=steps, threads=threads, progress=progress)
 
     return recolor
-
-
-class _Search:
-    """For the price at which a container meets the goal of the settings, and hardly more."""
-
-    def __init__(
-        self,
-        original: Splats,
-        settings: EncodeSettings,
-        encoder: Encoder,
-        views: Views | None,
-        threads: int,
-        progress: Progress,
-    ) -> None:
-        self.original, self.settings, self.encoder = original, settings, encoder
-        self.views, self.threads, self.progress = views, threads, progress
-        self.trials: list[Trial] = []
-        self.best: tuple[int, Encoded] | None = None
-
-    def run(self) -> tuple[Encoded, tuple[Trial, ...]]:
-        """All attempts.
-
-        Raises:
-            UnsupportedError: none meets the goal.
-        """
-        first = self.encoder(self.settings)
-        start = self._judge(first)
-        if first.price is not None:
-            by_size = self.settings.psnr is None
-            slope, near = (SIZE_SLOPE, NEAR_SIZE) if by_size else (PSNR_SLOPE, NEAR_PSNR)
-            begin = math.log2(first.price)
-            seek(lambda x: start if x == begin else self._try(2.0**x), begin, slope, near, PRICES)
-        if self.best is None:
-            raise UnsupportedError(self._regret())
-        return self.best[1], tuple(self.trials)
-
-    def _try(self, price: float) -> float:
-        chosen = {**self.settings.model_dump(), "price": price, "psnr": None, "target_size": None}
-        return self._judge(self.encoder(EncodeSettings(**chosen)))
-
-    def _judge(self, encoded: Encoded) -> float:
-        """What is to spare: at least 0 where the goal is met."""
-        size, psnr = len(zip_bytes(encoded.files)), None
-        if self.settings.psnr is not None:
-            psnr = self._psnr(encoded)
-            spare = min(psnr, 1e3) - self.settings.psnr
-        else:
-            spare = math.log2((self.settings.target_size or 1) / size)
-        self.trials.append(Trial(encoded.price or 0.0, size, psnr))
-        worth = -size if psnr is not None else size
-        if spare >= 0 and (self.best is None or worth > self.best[0]):
-            self.best = worth, encoded
-        return spare
-
-    def _psnr(self, encoded: Encoded) -> float:
-        from kissgs.evaluation.pictures import evaluate
-        from kissgs.views.virtual import virtual_views
-
-        self.progress("evaluate", 0.0)
-        if self.views is None:  # those that evaluate would take
-            self.views = virtual_views(self.original, threads=self.threads)
-        decoded = decode(encoded.files, max_gaussians=len(self.original), threads=self.threads)
-        return evaluate(self.original, decoded, self.views, threads=self.threads, progress=silent).mean.between.psnr
-
-    def _regret(self) -> str:
-        if self.settings.psnr is not None:
-            most = max(trial.psnr or 0.0 for trial in self.trials)
-            return (
-                f"no container of this scene that was found has {self.settings.psnr:g} dB, the best has {most:.2f}; "
-                "ask for no more than that"
-            )
-        least = min(trial.bytes for trial in self.trials)
-        return (
-            f"no container of this scene that was found has at most {self.settings.target_size:,} bytes, the smallest "
-            f"has {least:,}; ask for no less than that, or give fewer Gaussians"
-        )

@@ -37,13 +37,13 @@ class Compressed:
         files: name -> bytes.
         order: ``(M,)`` for every Gaussian of the container, in its order, the index it has in the cleaned scene.
         report: what it took and gave.
-        checkpoint: of the compaction, if it is still there because nothing was written.
+        checkpoints: of compaction and fine-tuning, if they are still there because nothing was written.
     """
 
     files: Mapping[str, bytes]
     order: Int[np.ndarray, " M"]
     report: Report
-    checkpoint: Path | None = None
+    checkpoints: tuple[Path, ...] = ()
 
     def to_zip(self) -> bytes:
         """The container as one stored zip."""
@@ -111,17 +111,18 @@ def compact(
     )
     if target is not None:
         save(result.splats, target, overwrite=overwrite, progress=clock)
-        _forget(result)
+        forget(result.checkpoint)
     clock.stop()
     report = replace(result.report, cleaned=cleaned, cpu_seconds=clock.cpu_seconds, peak_memory=peak_memory())
     return replace(result, report=report)
 
 
-def _forget(compacted: Compacted) -> None:
-    """Its checkpoint, now that what it led to is written."""
-    if compacted.checkpoint is not None:
-        with contextlib.suppress(OSError):
-            compacted.checkpoint.unlink(missing_ok=True)
+def forget(*checkpoints: Path | None) -> None:
+    """Delete them, now that what they led to is kept elsewhere."""
+    for path in checkpoints:
+        if path is not None:
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
 
 
 def compress(
@@ -145,7 +146,8 @@ def compress(
         source: a scene, or the path or the bytes of a ``.ply`` (a container is decoded and encoded anew).
         destination: ``.zip`` or folder to write; by default nothing is written.
         settings: by default those of the preset ``balanced``. If their group ``compact`` has a budget, the scene is
-            compacted first, see :func:`kissgs.compact`.
+            compacted first, see :func:`kissgs.compact`; if their group ``finetune`` is ``wanted``, the levels are then
+            fitted to photographs, or to pictures of the scene.
         importance: of a clean ``source``, measured before (:func:`kissgs.measure_importance`); by default it is
             measured if the settings ask for it.
         cache: ``.npz`` in which to keep the importance that was measured. Next time it is taken from there, if neither
@@ -154,10 +156,11 @@ def compress(
             of ``views`` if they have any; see :func:`kissgs.evaluate`. The report then has an ``evaluation``.
         views: a capture of the scene: its views for training are learned from and weigh the bits, those held out are
             for evaluation; by default virtual cameras for all.
-        checkpoint: of the compaction, see :func:`kissgs.compact`.
+        checkpoint: of the compaction, see :func:`kissgs.compact`. Fine-tuning has one of its own beside it, with
+            "-finetune" in its name; a search for a goal keeps none of that.
         overwrite: replace ``destination`` if it exists.
         threads: 0 means one per processor; the bytes do not depend on it.
-        device: of the compaction's training, likewise.
+        device: of compaction's and fine-tuning's training, likewise.
         progress: receives events; raise :class:`kissgs.Cancelled` from it to stop. Nothing is written then.
 
     Returns:
@@ -166,29 +169,41 @@ def compress(
     Raises:
         KissgsError: one of its children, with a sentence for the user.
     """
-    from kissgs.encoding import encode_scene
+    from kissgs.encoding import Encoding, check_training
 
     settings = settings or Settings()
     target = Path(destination) if destination is not None else None
     if target is not None:
         check_destination(target, overwrite=overwrite)
-    kept = Path(cache) if cache is not None else None
+    if settings.finetune.wanted:
+        check_training(device)
     clock = Clock(progress)
     original, cleaned, source_bytes = open_scene(source, threads, clock)
     compacted = None
     if settings.compact.wanted:
         compacted = _compact(original, settings, importance, views, checkpoint, threads, device, clock)
-    splats = original if compacted is None else compacted.splats
-    encoded, trials = encode_scene(
-        splats, settings.encode, importance, kept, views, cleaned, threads, clock, original=original
+    encoding = Encoding(
+        splats=original if compacted is None else compacted.splats,
+        original=original,
+        settings=settings,
+        importance=importance,
+        cache=Path(cache) if cache is not None else None,
+        views=views,
+        cleaned=cleaned,
+        checkpoint=_beside(checkpoint) if settings.finetune.wanted else None,
+        device=device,
+        threads=threads,
+        progress=clock,
     )
+    container, trials = encoding.run()
+    encoded = container.encoded
     archive_bytes = len(zip_bytes(encoded.files))
     evaluation = _evaluate(original, encoded.files, views, threads, clock) if evaluate else None
+    checkpoints = (None if compacted is None else compacted.checkpoint, encoding.checkpoint)
     if target is not None:
         clock("write", 0.0)
         write_container(encoded.files, target, overwrite=overwrite)
-        if compacted is not None:
-            _forget(compacted)
+        forget(*checkpoints)
     clock.stop()
     report = Report(
         source_count=len(original) + cleaned.removed,
@@ -199,6 +214,7 @@ def compress(
         file_bytes={name: len(data) for name, data in encoded.files.items()},
         cleaned=cleaned,
         compaction=None if compacted is None else compacted.report,
+        finetuning=container.finetuning,
         invisible=encoded.invisible,
         negligible=encoded.negligible,
         tamed_colours=encoded.tamed,
@@ -213,8 +229,16 @@ def compress(
         evaluation=evaluation,
     )
     order = encoded.order if compacted is None else compacted.index[encoded.order]
-    left = compacted.checkpoint if compacted is not None and target is None else None
+    left = () if target is not None else tuple(path for path in checkpoints if path is not None)
     return Compressed(encoded.files, order, report, left)
+
+
+def _beside(checkpoint: AnyPath | None) -> Path | None:
+    """Where fine-tuning keeps its state."""
+    if checkpoint is None:
+        return None
+    path = Path(checkpoint)
+    return path.with_name(f"{path.stem}-finetune{path.suffix}")
 
 
 def decompress(

@@ -7,6 +7,7 @@ from typing import Any
 
 from kissgs.compaction.result import CompactionReport
 from kissgs.evaluation.likeness import Evaluation
+from kissgs.finetuning.result import FinetuneReport
 from kissgs.search import Trial
 from kissgs.splats import Cleaned
 
@@ -24,6 +25,7 @@ class Report:
         file_bytes: per file of the container.
         cleaned: what was wrong with the input (:class:`kissgs.splats.Cleaned`).
         compaction: of the scene before it was encoded; None unless it was asked for.
+        finetuning: of the levels after they were chosen; None unless it was asked for.
         invisible: Gaussians left out because no renderer would draw them.
         negligible: Gaussians left out because their bytes would cost more than they show.
         tamed_colours: Gaussians whose base colour is such an outlier that it was pulled in, for the others' sake.
@@ -46,6 +48,7 @@ class Report:
     file_bytes: dict[str, int]
     cleaned: Cleaned
     compaction: CompactionReport | None
+    finetuning: FinetuneReport | None
     invisible: int
     negligible: int
     tamed_colours: int
@@ -79,4 +82,6 @@ class Report:
         derived = {"ratio": self.ratio, "bytes_per_gaussian": self.bytes_per_gaussian}
         evaluation = None if self.evaluation is None else self.evaluation.as_dict()
         compaction = None if self.compaction is None else self.compaction.as_dict()
-        return {**asdict(self), **derived, "compaction": compaction, "evaluation": evaluation}
+        finetuning = None if self.finetuning is None else self.finetuning.as_dict()
+        parts = {"compaction": compaction, "finetuning": finetuning, "evaluation": evaluation}
+        return {**asdict(self), **derived, **parts}

@@ -3,6 +3,7 @@
 from kissgs.settings.all import Settings
 from kissgs.settings.compact import CompactSettings
 from kissgs.settings.encode import EncodeSettings
+from kissgs.settings.finetune import FinetuneSettings
 from kissgs.settings.presets import PRESETS, Preset
 
-__all__ = ["PRESETS", "CompactSettings", "EncodeSettings", "Preset", "Settings"]
+__all__ = ["PRESETS", "CompactSettings", "EncodeSettings", "FinetuneSettings", "Preset", "Settings"]

@@ -10,9 +10,14 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from kissgs.errors import UnsupportedError
 from kissgs.settings.compact import CompactSettings
 from kissgs.settings.encode import EncodeSettings
+from kissgs.settings.finetune import FinetuneSettings
 from kissgs.settings.presets import PRESETS, Preset
 
-GROUPS: dict[str, type[BaseModel]] = {"compact": CompactSettings, "encode": EncodeSettings}
+GROUPS: dict[str, type[BaseModel]] = {
+    "compact": CompactSettings,
+    "encode": EncodeSettings,
+    "finetune": FinetuneSettings,
+}
 
 
 class Settings(BaseModel):
@@ -23,6 +28,7 @@ class Settings(BaseModel):
     preset: Preset = Field(Preset.BALANCED, description="Where settings that are not given come from.")
     compact: CompactSettings = CompactSettings()
     encode: EncodeSettings = EncodeSettings()
+    finetune: FinetuneSettings = FinetuneSettings()
 
     @model_validator(mode="before")
     @classmethod
@@ -38,9 +44,10 @@ class Settings(BaseModel):
         preset: Preset | str = Preset.BALANCED,
         *,
         compact: Mapping[str, Any] | CompactSettings | None = None,
+        finetune: Mapping[str, Any] | FinetuneSettings | None = None,
         **encode: Any,  # noqa: ANN401
     ) -> Settings:
-        """Settings of a preset, with single ones of the encoder replaced, and those of ``compact`` of the compaction.
+        """Settings of a preset, with single ones of the encoder replaced, and of ``compact`` and ``finetune``.
 
         Raises:
             UnsupportedError: no such preset or setting, or a value that is not possible.
@@ -53,6 +60,7 @@ class Settings(BaseModel):
                     "preset": preset,
                     "compact": compact if isinstance(compact, CompactSettings) else dict(compact or {}),
                     "encode": encode,
+                    "finetune": finetune if isinstance(finetune, FinetuneSettings) else dict(finetune or {}),
                 }
             )
         except ValidationError as error:

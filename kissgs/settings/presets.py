@@ -67,5 +67,14 @@ COMPACT: dict[Preset, dict[str, Any]] = {
     },
 }
 
-PRESETS = {preset: {"compact": COMPACT[preset], "encode": ENCODE[preset]} for preset in Preset}
+FINETUNE: dict[Preset, dict[str, Any]] = {
+    Preset.FAST: {"steps": 200},
+    Preset.BALANCED: {},
+    Preset.SMALL: {"steps": 2000},
+    Preset.PAPER: {"steps": 4000, "batch": 8, "code_length": 0.0, "smoothness": 1.0, "around": 0.0},
+}
+
+PRESETS = {
+    preset: {"compact": COMPACT[preset], "encode": ENCODE[preset], "finetune": FINETUNE[preset]} for preset in Preset
+}
 """By preset and group."""

@@ -189,6 +189,11 @@ def price_for(error: float, costs: Costs, gloss: Gloss, drop: float, ratio: floa
     return float(np.exp(low))
 
 
+def implied_price(error: float, count: int) -> float:
+    """The price in balance with the mean squared error at which rounding has left ``count`` Gaussians."""
+    return 2 * float(np.log(2)) * error / (GROWTH * DIMENSIONS * max(count, 1))
+
+
 def _floored(cost: Float64[np.ndarray, " M"]) -> Float64[np.ndarray, " M"]:
     seen = cost[cost > 0]
     return np.maximum(cost, max(FLOOR * float(np.median(seen)), 1e-30) if len(seen) else 1e-30)

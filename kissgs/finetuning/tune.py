@@ -1,0 +1,220 @@
+"""Fine-tuning: from a container as it was chosen to a better one of the same layout (KISS-GS, appendix)."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from kissgs._version import __version__
+from kissgs.evaluation.pictures import evaluate
+from kissgs.finetuning.losses import CodeLength, Smoothness
+from kissgs.finetuning.result import FinetuneReport
+from kissgs.finetuning.roundtrip import FIELDS, RoundTrip
+from kissgs.progress import Progress, as_stage, silent
+from kissgs.rendering.differentiable import rasterize
+from kissgs.rendering.losses import photometric_loss
+from kissgs.rendering.rasterizer import Device
+from kissgs.settings import FinetuneSettings
+from kissgs.sogxt.choice import Choice
+from kissgs.sogxt.container import zip_bytes
+from kissgs.sogxt.decode import decode
+from kissgs.sogxt.economy import implied_price
+from kissgs.sogxt.encode import Encoded
+from kissgs.splats import ATTRIBUTES, Splats
+from kissgs.training.checkpoint import Checkpoint
+from kissgs.training.lessons import Lessons, lessons
+from kissgs.training.loop import Plan, falling, train
+from kissgs.training.school import School, school
+from kissgs.views.view import Views
+
+LOOKS = 16
+"""Lessons from which the loss at the beginning is told."""
+
+Write = Callable[[Choice, int], Encoded]
+"""The files that show a choice, which became better in so many steps."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tuner:
+    """Improves choices for one scene.
+
+    Attributes:
+        original: the scene as it was, clean: the teacher where there are no photographs.
+        settings: how.
+        school: views to learn from, and to judge by.
+        lessons: what they should show.
+        device: where it is trained.
+        threads: 0 means one per processor; the result does not depend on it.
+        progress: receives "judge", "finetune" and what writing tells.
+    """
+
+    original: Splats
+    settings: FinetuneSettings
+    school: School
+    lessons: Lessons
+    device: Device
+    threads: int
+    progress: Progress
+
+    @classmethod
+    def of(
+        cls,
+        original: Splats,
+        settings: FinetuneSettings,
+        views: Views | None,
+        *,
+        device: Device = "cpu",
+        threads: int = 0,
+        progress: Progress = silent,
+    ) -> Tuner:
+        """With the photographs of ``views``, or with pictures of the original from virtual cameras.
+
+        Raises:
+            InvalidViewsError: a photograph cannot be read.
+            UnsupportedError: a picture would take too much memory.
+        """
+        found = school(original, views, settings, threads=threads, progress=progress)
+        taught = lessons(*(original, found.train, found.background), threads=threads, device=device, progress=progress)
+        return cls(original, settings, found, taught, device, threads, progress)
+
+    def __call__(
+        self, choice: Choice, sh_degree: int, write: Write, checkpoint: Path | None = None
+    ) -> tuple[Encoded, FinetuneReport]:
+        """Fine-tune, and keep what is better: the container as it was chosen, or the new one.
+
+        Args:
+            choice: of at least one Gaussian.
+            sh_degree: of the scene.
+            write: makes the files.
+            checkpoint: file to keep the state in, every half minute. If there is one of this very work, it is taken up
+                where it was left.
+
+        Raises:
+            OutputError: ``checkpoint`` is of other work, or cannot be written.
+        """
+        begun = time.perf_counter()
+        before = write(choice, 0)
+        first = self._judge(before)
+        price = choice.price or implied_price(first.between, int(choice.grid.mask.sum()))
+        after = write(self._train(choice, sh_degree, price, checkpoint), self.settings.steps)
+        second = self._judge(after)
+        cost, new_cost = (told.error + 8 * told.bytes * price for told in (first, second))
+        kept = new_cost < cost
+        report = FinetuneReport(
+            steps=self.settings.steps,
+            taught_by=self.lessons.taught_by,
+            source=self.school.source,
+            psnr_before=first.psnr,
+            psnr_after=second.psnr,
+            bytes_before=first.bytes,
+            bytes_after=second.bytes,
+            kept=kept,
+            seconds=time.perf_counter() - begun,
+            note="" if kept else "fine-tuning did not help; the container is as it was without it",
+        )
+        return (after if kept else before), report
+
+    def _judge(self, encoded: Encoded) -> _Mark:
+        decoded = decode(encoded.files, max_gaussians=max(len(self.original), 1), threads=self.threads)
+        compared = evaluate(
+            *(self.original, decoded, self.school.exam),
+            threads=self.threads,
+            progress=as_stage("judge", self.progress),
+        )
+        pairs = [view.comparison for view in compared.views]
+        return _Mark(
+            bytes=len(zip_bytes(encoded.files)),
+            psnr=compared.mean.candidate.psnr,
+            error=float(np.mean([_squared(pair.candidate.psnr) for pair in pairs])),
+            between=float(np.mean([_squared(pair.between.psnr) for pair in pairs])),
+        )
+
+    def _train(self, choice: Choice, sh_degree: int, price: float, path: Path | None) -> Choice:
+        chosen, work = self.settings, RoundTrip(choice, sh_degree, self.device)
+        kept = Checkpoint(path, self._key(choice, sh_degree))
+        state = kept.load()
+        weight = chosen.code_length * price * self._steepness(work)
+        lengths = CodeLength(work, weight)
+        done = 0
+        if state is not None:
+            done = int(state["done"])
+            work.restore(state)
+            lengths.restore(state)
+
+        def after(step: int) -> None:
+            if kept.due:
+                kept.save({**work.state(), **lengths.state(), "done": np.asarray(step)})
+
+        base = {name: chosen.entry_rate if name == "f_rest_centroids" else chosen.rate for name in FIELDS}
+        plan = Plan(
+            stage="finetune",
+            steps=chosen.steps,
+            rates=falling(base, dict.fromkeys(FIELDS, 1.0), dict.fromkeys(FIELDS, chosen.rate_end)),
+            ssim_weight=chosen.ssim_weight,
+            seed=(chosen.seed,),
+            regularizers=(lengths, Smoothness(work, chosen.smoothness, chosen.steps)),
+            batch=chosen.batch,
+        )
+        train(work, self.lessons, plan, first=done, after=after, threads=self.threads, progress=self.progress)
+        if path is not None:
+            kept.save({**work.state(), **lengths.state(), "done": np.asarray(chosen.steps)})
+        return work.choice()
+
+    def _steepness(self, work: RoundTrip) -> float:
+        """How much the loss grows with the mean squared error of pictures.
+
+        As if it were proportional to its root, which holds for errors that come on top of those of photographs.
+        """
+        losses, errors = [], []
+        with torch.no_grad():
+            shown = work.gaussians()
+            for n in islice(self.lessons.order((self.settings.seed,)), min(LOOKS, len(self.lessons))):
+                camera = self.lessons.cameras[n]
+                target = torch.from_numpy(self.lessons.picture(n))[None].to(shown["means"].device)
+                image, _ = rasterize(
+                    **shown,
+                    viewmats=torch.from_numpy(camera.viewmat)[None].float(),
+                    Ks=torch.from_numpy(camera.K)[None].float(),
+                    width=camera.width,
+                    height=camera.height,
+                    backgrounds=torch.from_numpy(self.lessons.background)[None],
+                    threads=self.threads,
+                )
+                loss = photometric_loss(image, target, ssim_weight=self.settings.ssim_weight, threads=self.threads)
+                losses.append(float(loss))
+                errors.append(float((image - target).square().mean()))
+        return float(np.mean(losses)) / (2 * max(float(np.mean(errors)), 1e-10))
+
+    def _key(self, choice: Choice, sh_degree: int) -> str:
+        """Of the work: equal only where the result is equal."""
+        told = f"{__version__} {self.device} {sh_degree} {self.settings.model_dump_json()} {choice.price}"
+        key = hashlib.sha256(told.encode())
+        for name, field in choice.fields.items():
+            key.update(name.encode() + field.levels.tobytes() + field.low.tobytes() + field.high.tobytes())
+        key.update(choice.codebook.labels.tobytes())
+        for camera, picture in zip(self.lessons.cameras, self.lessons.pictures, strict=True):
+            key.update(camera.viewmat.tobytes() + camera.K.tobytes() + picture.tobytes())
+        for name in ATTRIBUTES:
+            key.update(getattr(self.original, name).tobytes())
+        return key.hexdigest()
+
+
+@dataclass(frozen=True, slots=True)
+class _Mark:
+    """Of one container: bytes of its zip; PSNR and squared error of its pictures; the latter to the original's too."""
+
+    bytes: int
+    psnr: float
+    error: float
+    between: float
+
+
+def _squared(psnr: float) -> float:
+    return float(10 ** (-psnr / 10))

@@ -1,0 +1,34 @@
+"""``FinetuneSettings``: how levels become better when all else is chosen."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from kissgs.settings.school import SchoolSettings
+
+
+class FinetuneSettings(SchoolSettings):
+    """How the numbers in the images are improved against pictures of what a decoder makes of them."""
+
+    wanted: bool = Field(False, description="Fine-tune. Takes pictures to learn from: photographs are the best.")
+    steps: int = Field(500, ge=1, le=1_000_000, description="Of training.")
+    batch: int = Field(1, ge=1, le=64, description="Pictures in each step.")
+    rate: float = Field(
+        0.02, gt=0, le=10, description="Learning rate at the beginning, in steps of each attribute; SH's entries apart."
+    )
+    entry_rate: float = Field(0.05, gt=0, le=10, description="The same of the SH codebook's entries.")
+    rate_end: float = Field(0.05, gt=0, le=1, description="What is left of both at the end.")
+    code_length: float = Field(
+        1.0,
+        ge=0,
+        le=100,
+        description="Weight of bytes against errors: 1 is that by which levels were chosen. Levels become such as many "
+        "others have.",
+    )
+    smoothness: float = Field(
+        0.0,
+        ge=0,
+        le=100,
+        description="Weight of differences between neighbouring pixels of the images, in units of the paper's; from "
+        "0.35 to 0.6 of the steps it grows from nothing.",
+    )

@@ -1,0 +1,37 @@
+"""Choices to fine-tune, and what they are made of."""
+
+import numpy as np
+from training_scenes import around, cloud
+
+from kissgs import Settings
+from kissgs.rendering.importance import Watch, measure_importance
+from kissgs.sogxt.encode import choose
+from kissgs.views.view import black
+
+FIELDS = ("means", "opacities", "scales", "quaternions", "f_dc", "f_rest_centroids")
+
+
+def chosen(scene, preset="balanced", **changes):
+    """As ``compress`` would choose."""
+    settings = Settings.from_preset(preset, **changes).encode
+    importance = None
+    if settings.weigh:
+        cameras = [view.camera for view in around(4)]
+        importance = measure_importance(scene, Watch(cameras, [1.0] * len(cameras), black()), hedge=0.3)
+    return choose(scene, settings, importance=importance, threads=1)
+
+
+def choices():
+    """Of all kinds: weighed or not, of every degree, of few and many, with nothing to choose."""
+    found = [(cloud(count, degree, seed=count), "balanced") for count in (1, 7, 8, 9) for degree in (0, 1, 2, 3)]
+    found += [(cloud(300, degree), preset) for degree in (0, 3) for preset in ("fast", "balanced", "paper")]
+    constant = cloud(40, 1).select(np.zeros(40, int))
+    return [*found, (constant, "balanced"), (constant, "paper")]
+
+
+def shuffled(work, seed=0, far=3.0):
+    """Move all latents somewhere."""
+    rng = np.random.default_rng(seed)
+    for name, latents in work.latents.items():
+        latents.data += latents.new_tensor(rng.normal(0, far, latents.shape))
+        latents.data.clamp_(work.planes[name].least, work.planes[name].most)
