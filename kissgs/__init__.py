@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     )
     from kissgs.evaluation.likeness import Evaluation
     from kissgs.evaluation.pictures import evaluate
+    from kissgs.finetuning.result import FinetuneReport
     from kissgs.importance import Importance
     from kissgs.io.ply import PlyInfo, read_ply_info
     from kissgs.pipeline import Compressed, compact, compress, decompress
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from kissgs.report import Report
     from kissgs.sample import sample_scene
     from kissgs.scenes import load, save
-    from kissgs.settings import CompactSettings, EncodeSettings, Preset, Settings
+    from kissgs.settings import CompactSettings, EncodeSettings, FinetuneSettings, Preset, Settings
     from kissgs.splats import Splats, clean
     from kissgs.views.load import load_views
     from kissgs.views.view import View, Views
@@ -52,6 +53,8 @@ _HOMES = {
     "Compressed": "pipeline",
     "EncodeSettings": "settings",
     "Evaluation": "evaluation.likeness",
+    "FinetuneReport": "finetuning.result",
+    "FinetuneSettings": "settings",
     "Importance": "importance",
     "InvalidContainerError": "errors",
     "InvalidSceneError": "errors",
@@ -94,6 +97,8 @@ __all__ = [
     "Compressed",
     "EncodeSettings",
     "Evaluation",
+    "FinetuneReport",
+    "FinetuneSettings",
     "Importance",
     "InvalidContainerError",
     "InvalidSceneError",

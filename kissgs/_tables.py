@@ -12,6 +12,7 @@ from kissgs.bench import RoundTrip
 from kissgs.compaction.result import CompactionReport
 from kissgs.evaluation.likeness import Evaluation, spell
 from kissgs.evaluation.peers import PeerResult
+from kissgs.finetuning.result import FinetuneReport
 from kissgs.info import Info
 from kissgs.report import Report
 from kissgs.search import Trial
@@ -61,9 +62,9 @@ def report_table(report: Report, target: str) -> RenderableType:
     pictures = [] if report.evaluation is None else [_pictures(report.evaluation)]
     changes = _changes(changed)
     compaction = [] if report.compaction is None else _compaction(report.compaction)
-    return Group(
-        head, Text(body), *compaction, *searched, *pictures, parts_table(report.file_bytes, report.count), *changes
-    )
+    finetuning = [] if report.finetuning is None else _finetuning(report.finetuning)
+    told = [*compaction, *searched, *finetuning, *pictures]
+    return Group(head, Text(body), *told, parts_table(report.file_bytes, report.count), *changes)
 
 
 def compaction_table(report: CompactionReport, target: str) -> RenderableType:
@@ -98,6 +99,16 @@ def _compaction(report: CompactionReport) -> list[RenderableType]:
             cells += [spell(step.psnr, 2), spell(step.ssim, 4), f"{step.bytes:,}"]
         table.add_row(step.name, *cells)
     return [*lines, table]
+
+
+def _finetuning(report: FinetuneReport) -> list[Text]:
+    """What it gave, in a line."""
+    taught = "photographs" if report.taught_by == "photos" else "the scene itself"
+    told = (
+        f"fine-tuned by {taught}: {size(report.bytes_before)} -> {size(report.bytes_after)}, held-out PSNR "
+        f"{spell(report.psnr_before, 2)} -> {spell(report.psnr_after, 2)} dB, in {report.seconds:.0f} s"
+    )
+    return [Text(told), *([Text(report.note, style="yellow")] if report.note else [])]
 
 
 def _path(trials: Iterable[Trial]) -> str:

@@ -108,19 +108,19 @@ class Encoding:
         """Chooses, fine-tunes if there is a tuner, and writes."""
 
         def encoder(chosen: EncodeSettings) -> Container:
-            def files(choice: Choice, finetune_steps: int = 0) -> Encoded:
+            def files(choice: Choice, finetune_steps: int, progress: Progress) -> Encoded:
                 return write(
                     *(choice, self.splats, chosen),
                     cleaned=self.cleaned,
                     compacted=len(self.original) - len(self.splats),
                     finetune_steps=finetune_steps,
                     threads=self.threads,
-                    progress=self.progress,
+                    progress=progress,
                 )
 
             choice = chooser(chosen)
             if tuner is None or not choice.grid.mask.any():
-                return Container(files(choice))
+                return Container(files(choice, 0, self.progress))
             return Container(*tuner(choice, self.splats.sh_degree, files, checkpoint))
 
         return encoder

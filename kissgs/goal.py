@@ -12,7 +12,7 @@ from kissgs.progress import Progress, silent
 from kissgs.search import Trial, seek
 from kissgs.settings import EncodeSettings
 from kissgs.sogxt.container import zip_bytes
-from kissgs.sogxt.decode import decode
+from kissgs.sogxt.decode import MAX_GAUSSIANS, decode
 from kissgs.sogxt.encode import Encoded
 from kissgs.splats import Splats
 from kissgs.views.view import Views
@@ -100,7 +100,7 @@ class GoalSearch:
         self.progress("evaluate", 0.0)
         if self.views is None:  # those that evaluate would take
             self.views = virtual_views(self.original, threads=self.threads)
-        decoded = decode(encoded.files, max_gaussians=len(self.original), threads=self.threads)
+        decoded = decode(encoded.files, max_gaussians=max(len(self.original), MAX_GAUSSIANS), threads=self.threads)
         return evaluate(self.original, decoded, self.views, threads=self.threads, progress=silent).mean.between.psnr
 
     def _regret(self) -> str:

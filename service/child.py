@@ -71,6 +71,7 @@ def _compress(order: dict[str, Any], send: Send) -> dict[str, Any]:
         "files": files,
         "count": report["count"],
         "compacted": result.report.compacted,
+        "finetuning": report["finetuning"],
         "invisible": report["invisible"],
         "cleaned": report["cleaned"],
         "seconds": report["seconds"],
@@ -95,7 +96,7 @@ def _compressed(order: dict[str, Any], send: Send) -> kissgs.Compressed:
     if order["checkpoint"] is not None:  # as seen from here: the report may name it, and is the client's to read
         checkpoint = Path(os.path.relpath(order["checkpoint"], order["work"]))
     while True:
-        found = checkpoint is not None and checkpoint.exists()
+        kept = [] if checkpoint is None else list(checkpoint.parent.glob(f"{checkpoint.stem}*{checkpoint.suffix}"))
         try:
             return kissgs.compress(
                 Path(order["source"]),
@@ -108,8 +109,9 @@ def _compressed(order: dict[str, Any], send: Send) -> kissgs.Compressed:
         except kissgs.OutputError:  # the checkpoint's: nothing else is written yet
             if checkpoint is None:
                 raise
-            checkpoint.unlink(missing_ok=True)
-            checkpoint = checkpoint if found else None
+            for path in kept:
+                path.unlink(missing_ok=True)
+            checkpoint = checkpoint if kept else None
 
 
 def _decode(order: dict[str, Any], send: Send) -> dict[str, Any]:

@@ -3,7 +3,7 @@
     incoming/TOKEN.part          an upload as it arrives
     jobs/ID/scene.ply            the upload, whole
     jobs/ID/work-TOKEN/          what a running job has written so far
-    jobs/ID/checkpoint.npz       where its training stands: all that outlives its process, until the job has ended
+    jobs/ID/checkpoint*.npz      where its training stands: all that outlives its process, until the job has ended
     jobs/ID/result/              the result, renamed into place once it is whole and on the disk
         scene.zip  report.json  files/NAME
     jobs/ID/decoded.ply          made when first asked for; decoded.json has its size and checksum
@@ -36,10 +36,10 @@ next checkpoint."""
 def checkpoint_bytes(gaussians: int, sh_degree: int) -> int:
     """What the checkpoint of a scene's training takes at most.
 
-    It holds each parameter and the two moments of Adam, of no more Gaussians than the scene has. While it is written
-    anew, the former one is still there.
+    That of compaction holds each parameter and the two moments of Adam, of no more Gaussians than the scene has; that
+    of fine-tuning, which may stand beside it, no more. While one is written anew, the former one is still there.
     """
-    return 2 * (STEPS_BYTES + 3 * BYTES_PER_GAUSSIAN[sh_degree] * gaussians)
+    return 3 * (STEPS_BYTES + 3 * BYTES_PER_GAUSSIAN[sh_degree] * gaussians)
 
 
 class Folders:
@@ -98,6 +98,11 @@ class Folders:
     def checkpoint(self, job_id: str) -> Path:
         """Where the job's training keeps its state."""
         return self.jobs / job_id / "checkpoint.npz"
+
+    def discard_checkpoints(self, job_id: str) -> None:
+        """They are of no more use."""
+        for path in (self.jobs / job_id).glob("checkpoint*.npz"):
+            self.discard(path)
 
     def spare(self, job_id: str) -> list[Path]:
         """What an ended job can do without: its upload and its decoded scene, as far as they are there."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 
 import kissgs
-from service.schemas import COMPACTED, PresetFacts, Presets
+from service.schemas import COMPACTED, TUNED, PresetFacts, Presets
 
 MEASURED_ON = "fox, 79,451 Gaussians of SH degree 3, seven held-out photographs"
 MEASURED_BY = "kissgs compress fox.ply, kissgs evaluate fox.ply fox.zip --views fox"
@@ -58,19 +58,30 @@ TRAINING = {
 """CPU seconds of a compaction to a fifth, roughly: of any, and per million Gaussians."""
 
 
+TUNING = {
+    kissgs.Preset.FAST: (50.0, 300.0),
+    kissgs.Preset.BALANCED: (60.0, 600.0),
+    kissgs.Preset.SMALL: (120.0, 2400.0),
+    kissgs.Preset.PAPER: (1000.0, 40_000.0),
+}
+"""The same of fine-tuning all Gaussians."""
+
+
 def usual_seconds(kind: str, evaluate: bool, gaussians: int) -> float:
     """Wall time of a job on a small server, until this one has its own experience.
 
     ``kind`` is that of :class:`service.schemas.JobOptions`.
     """
-    preset, millions = kissgs.Preset(kind.removesuffix(COMPACTED)), gaussians / 1e6
+    name, *stages = kind.split("+")
+    preset, millions = kissgs.Preset(name), gaussians / 1e6
     cpu = (_FACTS[preset][4] + evaluate * EVALUATION) * millions
-    if kind.endswith(COMPACTED):
-        whatever, each = TRAINING[preset]
-        cpu += whatever + each * millions
+    for suffix, costs in ((COMPACTED, TRAINING), (TUNED, TUNING)):
+        if suffix.removeprefix("+") in stages:
+            whatever, each = costs[preset]
+            cpu += whatever + each * millions
     return START_SECONDS + cpu / BUSY_CORES
 
 
 def can_train() -> bool:
-    """Whether there is a torch, which compaction needs for all but pruning."""
+    """Whether there is a torch, which fine-tuning needs, and compaction for all but pruning."""
     return find_spec("torch") is not None

@@ -12,6 +12,7 @@ from service.models import NOTE_CHARS, State
 from service.problems import Problem
 
 COMPACTED = "+compact"
+TUNED = "+finetune"
 """After the preset, in the kind of a job."""
 
 
@@ -25,6 +26,7 @@ class JobOptions(kissgs.Settings):
                 {"preset": "balanced"},
                 {"preset": "small", "encode": {"seed": 7}},
                 {"compact": {"ratio": 0.2}},
+                {"finetune": {"wanted": True}},
             ]
         },
     )
@@ -33,17 +35,18 @@ class JobOptions(kissgs.Settings):
 
     @property
     def kind(self) -> str:
-        """What its duration depends on beside the scene: the preset, and whether Gaussians are to go."""
-        return f"{self.preset}{COMPACTED if self.compact.wanted else ''}"
+        """What its duration depends on beside the scene: the preset, whether Gaussians go, and whether levels learn."""
+        compacted, tuned = COMPACTED if self.compact.wanted else "", TUNED if self.finetune.wanted else ""
+        return f"{self.preset}{compacted}{tuned}"
 
     @property
     def trains(self) -> bool:
-        """Whether what is left of the scene is to be fitted to pictures of it."""
-        return self.compact.wanted and self.compact.trains
+        """Whether anything is to be fitted to pictures of the scene."""
+        return self.finetune.wanted or (self.compact.wanted and self.compact.trains)
 
     @property
     def resumable(self) -> bool:
-        """Whether its training can be taken up where it was left: a search, which trains several times, cannot."""
+        """Whether its training can be taken up where it was left: a search for a count, which trains often, cannot."""
         return self.trains and self.compact.max_psnr_drop is None
 
 
@@ -126,6 +129,9 @@ class JobStatus(Wire):
     invisible: int | None = Field(None, description="Gaussians left out because no renderer would draw them.")
     cleaned: dict[str, int] | None = Field(None, description="What was wrong with the upload and was mended, counted.")
     evaluation: dict[str, Any] | None = Field(None, description="PSNR and SSIM to the upload's own renderings.")
+    finetuning: dict[str, Any] | None = Field(
+        None, description="What fine-tuning gave: PSNR and bytes before and after, and whether it was kept."
+    )
     sizes: Sizes | None = None
     timings: Timings
     starts: int = Field(description="How often its work was begun: more than once after a crash or a restart.")
@@ -158,7 +164,9 @@ class Limits(Wire):
     sync_seconds: float
     max_wait_seconds: float
     keys_required: bool
-    training: bool = Field(description="Whether compaction can train here; where not, only the preset fast compacts.")
+    training: bool = Field(
+        description="Whether anything can train here; if not, nothing is fine-tuned and only the preset fast compacts."
+    )
 
 
 class PresetFacts(Wire):

@@ -75,6 +75,7 @@ def status_of(job: Job, outlook: Outlook) -> JobStatus:
         sh_degree=job.sh_degree,
         kept=result.get("count"),
         compacted=result.get("compacted"),
+        finetuning=result.get("finetuning"),
         invisible=result.get("invisible"),
         cleaned=result.get("cleaned"),
         evaluation=result.get("evaluation"),

@@ -115,8 +115,8 @@ def parse_options(text: str | bytes) -> JobOptions:
     if options.trains and not can_train():
         raise ProblemError(
             "invalid-request",
-            "this service has no torch to train with, so it compacts with the preset fast only; whoever runs it can "
-            "install kissgs[train]",
+            "this service has no torch to train with, so it fine-tunes nothing and compacts with the preset fast only; "
+            "whoever runs it can install kissgs[train]",
         )
     return options
 

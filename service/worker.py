@@ -224,7 +224,7 @@ class Worker:
         self.store.move(job.number, State.QUEUED, starts=job.starts - 1)
 
     def _succeed(self, job: Job, summary: dict[str, Any]) -> None:
-        self.folders.discard(self.folders.checkpoint(job.id))
+        self.folders.discard_checkpoints(job.id)
         if not self.settings.keep_uploads:
             self.folders.discard(self.folders.upload(job.id))
         values = {

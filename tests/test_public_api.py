@@ -19,6 +19,8 @@ PUBLIC = [
     "Compressed",
     "EncodeSettings",
     "Evaluation",
+    "FinetuneReport",
+    "FinetuneSettings",
     "Importance",
     "InvalidContainerError",
     "InvalidSceneError",

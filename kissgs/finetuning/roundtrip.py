@@ -1,9 +1,15 @@
 """The codec as a differentiable function: levels that gradients can move, and what a decoder makes of them.
 
-Every level is ``spacing * round(symbol + latent)``, the symbol being the multiple that was chosen. Latents begin at 0
-and are what is learned, in units of the step that the row's class of Gaussians has. Rounding passes gradients straight
-through (Bengio et al. 2013): what the loss says of a decoded value moves its latent. Order, forms, labels and ranges
-stay as they were chosen; the images that are written hold these very levels.
+Every level is ``spacing * round(symbol + latent)``, the symbol being the multiple that was chosen. Latents are what is
+learned, in units of the step that the row's class of Gaussians has. Rounding passes gradients straight through (Bengio
+et al. 2013): what the loss says of a decoded value is said of its latent. Order, forms, labels and ranges stay as they
+were chosen; the images that are written hold these very levels.
+
+Latents do not run along the gradient until they cross to the next level, as straight-through training by Adam has it:
+where the best value lies between two levels, they would go to and fro for ever, and end at the worse one as often as
+at the better. Each is a running mean of where one Newton step from its level as it is would lead,
+``level - slope / bend``: that stays where it is, whichever of the two levels is taken, and is rounded to the nearer
+one. How fast the loss bends is known from what errors cost in pictures (:class:`kissgs.sogxt.economy.Costs`).
 """
 
 from __future__ import annotations
@@ -21,12 +27,18 @@ from kissgs._typing import Float, Float32, Float64, Int
 from kissgs.rendering.rasterizer import Device
 from kissgs.sogxt.choice import Choice
 from kissgs.sogxt.codebook import COEFFICIENTS
+from kissgs.sogxt.economy import Costs
 from kissgs.sogxt.quantize import MEANS_TOP, Quantized, signed_exp
 from kissgs.splats import SH_REST_COUNTS
-from kissgs.training.leaves import Leaves
 
 ATTRIBUTE = {"quats": "quaternions", "scales": "scales", "sh0": "f_dc"}
 """Attributes whose values are those of a field as they are, by field."""
+
+CARE = 2.0
+"""How much more than each alone the loss is taken to bend: many latents move at once, and errors meet in pixels."""
+
+FAR = 3.0
+"""Steps from its level that a latent is drawn at most."""
 
 FIELDS = ("means", "opacities", "scales", "quaternions", "f_dc", "f_rest_centroids")
 
@@ -94,6 +106,7 @@ class RoundTrip:
         planes: by field of the metadata.
         classes: ``(M,)`` kind of each Gaussian.
         grid: which Gaussian sits where.
+        latents: by field, what is learned.
     """
 
     def __init__(self, choice: Choice, sh_degree: int, device: Device = "cpu") -> None:
@@ -109,12 +122,30 @@ class RoundTrip:
         }
         self.classes, self.grid = choice.classes, choice.grid
         self._labels = _Labels(choice.codebook.labels[:count], choice.codebook.side**2, device)
-        self._leaves = Leaves({name: torch.zeros_like(plane.least) for name, plane in self.planes.items()})
+        self.latents = {name: torch.zeros_like(plane.least).requires_grad_() for name, plane in self.planes.items()}
+        self._bend = {name: torch.ones_like(plane.least) for name, plane in self.planes.items()}
 
-    @property
-    def latents(self) -> dict[str, Tensor]:
-        """What is learned, by field."""
-        return self._leaves.by_name
+    def learn_curvatures(self, costs: Costs, steepness: float) -> None:
+        """See how fast the loss grows as latents leave their best place: by what errors cost in pictures.
+
+        Args:
+            costs: mean squared error of pictures by an error of one unit, ``(M,)`` for each attribute.
+            steepness: how much the loss grows with that error.
+        """
+        labels = self._labels
+        # An error of a coefficient of gloss costs what one of the base colour does: all are of one norm.
+        entries = np.bincount(labels.index.cpu().numpy(), costs.color, labels.entries)
+        of = {
+            "means": costs.place,
+            "opacities": costs.opacity,
+            "scales": costs.scale,
+            "quaternions": 3 * costs.turn,  # a quaternion's change of 1 turns by 2
+            "f_dc": costs.color,
+            "f_rest_centroids": entries,
+        }
+        for name, plane in self.planes.items():
+            cost = torch.from_numpy(np.ascontiguousarray(of[name])).to(plane.step.device)[:, None]
+            self._bend[name] = (2 * steepness * cost * (plane.step * plane.spacing) ** 2).float()
 
     def __len__(self) -> int:
         return len(self.latents["means"])
@@ -131,11 +162,19 @@ class RoundTrip:
         return shown
 
     def step(self, rates: Mapping[str, float]) -> None:
-        """Move the latents, as far as the images can hold their levels."""
-        self._leaves.step(rates)
+        """Move latents towards where one Newton step from the levels as they are would lead, by the share ``rates``.
+
+        No further than the images can hold their levels. A gradient that is no number counts as none.
+        """
         with torch.no_grad():
             for name, latents in self.latents.items():
-                latents.clamp_(self.planes[name].least, self.planes[name].most)
+                if latents.grad is None:
+                    continue
+                plane = self.planes[name]
+                level = (torch.round(plane.symbols + latents) - plane.symbols).float()
+                newton = torch.nan_to_num(latents.grad / (CARE * self._bend[name]), nan=0.0).clamp(-FAR, FAR)
+                latents.lerp_(level - newton, rates[name]).clamp_(plane.least, plane.most)
+                latents.grad = None
 
     def choice(self) -> Choice:
         """The choice with the levels as they are now."""
@@ -155,11 +194,13 @@ class RoundTrip:
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything, to go on from later."""
-        return self._leaves.state()
+        return {name: latents.detach().cpu().numpy() for name, latents in self.latents.items()}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Go on from there."""
-        self._leaves.restore(state)
+        with torch.no_grad():
+            for name, latents in self.latents.items():
+                latents.copy_(torch.from_numpy(state[name]))
 
 
 class _SignedExp(torch.autograd.Function):

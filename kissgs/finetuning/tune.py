@@ -13,32 +13,42 @@ import numpy as np
 import torch
 
 from kissgs._version import __version__
+from kissgs.errors import OutputError
 from kissgs.evaluation.pictures import evaluate
 from kissgs.finetuning.losses import CodeLength, Smoothness
 from kissgs.finetuning.result import FinetuneReport
 from kissgs.finetuning.roundtrip import FIELDS, RoundTrip
 from kissgs.progress import Progress, as_stage, silent
 from kissgs.rendering.differentiable import rasterize
+from kissgs.rendering.importance import Watch, measure_importance
 from kissgs.rendering.losses import photometric_loss
 from kissgs.rendering.rasterizer import Device
 from kissgs.settings import FinetuneSettings
 from kissgs.sogxt.choice import Choice
 from kissgs.sogxt.container import zip_bytes
-from kissgs.sogxt.decode import decode
-from kissgs.sogxt.economy import implied_price
+from kissgs.sogxt.decode import MAX_GAUSSIANS, decode
+from kissgs.sogxt.economy import Costs, implied_price
 from kissgs.sogxt.encode import Encoded
-from kissgs.splats import ATTRIBUTES, Splats
+from kissgs.splats import ATTRIBUTES, Splats, clean
 from kissgs.training.checkpoint import Checkpoint
 from kissgs.training.lessons import Lessons, lessons
 from kissgs.training.loop import Plan, falling, train
 from kissgs.training.school import School, school
 from kissgs.views.view import Views
 
+WATCHED = 64
+"""Lessons from which costs of errors are told, about."""
+
+HEDGE = 0.1
+"""How little they say of other places, see :class:`kissgs.Importance`."""
+
 LOOKS = 16
 """Lessons from which the loss at the beginning is told."""
 
-Write = Callable[[Choice, int], Encoded]
-"""The files that show a choice, which became better in so many steps."""
+NO_HELP = "fine-tuning did not help; the container is as it was without it"
+
+Write = Callable[[Choice, int, Progress], Encoded]
+"""The files that show a choice, which became better in so many steps; and who is told of it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +62,7 @@ class Tuner:
         lessons: what they should show.
         device: where it is trained.
         threads: 0 means one per processor; the result does not depend on it.
-        progress: receives "judge", "finetune" and what writing tells.
+        progress: receives "finetune", and then what writing tells.
     """
 
     original: Splats
@@ -92,7 +102,7 @@ class Tuner:
         Args:
             choice: of at least one Gaussian.
             sh_degree: of the scene.
-            write: makes the files.
+            write: makes the files, and tells of it.
             checkpoint: file to keep the state in, every half minute. If there is one of this very work, it is taken up
                 where it was left.
 
@@ -100,11 +110,13 @@ class Tuner:
             OutputError: ``checkpoint`` is of other work, or cannot be written.
         """
         begun = time.perf_counter()
-        before = write(choice, 0)
-        first = self._judge(before)
+        at_first = as_stage("finetune", self.progress)
+        before = write(choice, 0, at_first)
+        first = self._judge(before, at_first)
         price = choice.price or implied_price(first.between, int(choice.grid.mask.sum()))
-        after = write(self._train(choice, sh_degree, price, checkpoint), self.settings.steps)
-        second = self._judge(after)
+        better, trouble = self._train(choice, sh_degree, price, checkpoint)
+        after = write(better, self.settings.steps, self.progress)
+        second = self._judge(after, self._at_last)
         cost, new_cost = (told.error + 8 * told.bytes * price for told in (first, second))
         kept = new_cost < cost
         report = FinetuneReport(
@@ -117,17 +129,16 @@ class Tuner:
             bytes_after=second.bytes,
             kept=kept,
             seconds=time.perf_counter() - begun,
-            note="" if kept else "fine-tuning did not help; the container is as it was without it",
+            note="; ".join(filter(None, ["" if kept else NO_HELP, trouble])),
         )
         return (after if kept else before), report
 
-    def _judge(self, encoded: Encoded) -> _Mark:
-        decoded = decode(encoded.files, max_gaussians=max(len(self.original), 1), threads=self.threads)
-        compared = evaluate(
-            *(self.original, decoded, self.school.exam),
-            threads=self.threads,
-            progress=as_stage("judge", self.progress),
-        )
+    def _at_last(self, stage: str, fraction: float, note: str = "") -> None:
+        self.progress("images", 1.0)
+
+    def _judge(self, encoded: Encoded, progress: Progress) -> _Mark:
+        decoded = decode(encoded.files, max_gaussians=max(len(self.original), MAX_GAUSSIANS), threads=self.threads)
+        compared = evaluate(*(self.original, decoded, self.school.exam), threads=self.threads, progress=progress)
         pairs = [view.comparison for view in compared.views]
         return _Mark(
             bytes=len(zip_bytes(encoded.files)),
@@ -136,21 +147,28 @@ class Tuner:
             between=float(np.mean([_squared(pair.between.psnr) for pair in pairs])),
         )
 
-    def _train(self, choice: Choice, sh_degree: int, price: float, path: Path | None) -> Choice:
+    def _train(self, choice: Choice, sh_degree: int, price: float, path: Path | None) -> tuple[Choice, str]:
+        """A better choice, and what went wrong with the checkpoint on the way to it."""
         chosen, work = self.settings, RoundTrip(choice, sh_degree, self.device)
-        kept = Checkpoint(path, self._key(choice, sh_degree))
+        kept, done, trouble = Checkpoint(path, "" if path is None else self._key(choice, sh_degree)), 0, ""
+        steepness = self._steepness(work)
+        work.learn_curvatures(choice.costs or self._costs(work), steepness)
+        lengths = CodeLength(work, chosen.code_length * price * steepness)
         state = kept.load()
-        weight = chosen.code_length * price * self._steepness(work)
-        lengths = CodeLength(work, weight)
-        done = 0
-        if state is not None:
+        if state is None:
+            kept.save(_state(work, lengths, 0))  # if that cannot be, it is better known before the work than after
+        else:
             done = int(state["done"])
             work.restore(state)
             lengths.restore(state)
 
         def after(step: int) -> None:
-            if kept.due:
-                kept.save({**work.state(), **lengths.state(), "done": np.asarray(step)})
+            nonlocal trouble
+            if kept.due or (path is not None and step == chosen.steps):
+                try:
+                    kept.save(_state(work, lengths, step))
+                except OutputError as error:
+                    trouble = f"the work went on without a checkpoint: {error}"
 
         base = {name: chosen.entry_rate if name == "f_rest_centroids" else chosen.rate for name in FIELDS}
         plan = Plan(
@@ -163,9 +181,7 @@ class Tuner:
             batch=chosen.batch,
         )
         train(work, self.lessons, plan, first=done, after=after, threads=self.threads, progress=self.progress)
-        if path is not None:
-            kept.save({**work.state(), **lengths.state(), "done": np.asarray(chosen.steps)})
-        return work.choice()
+        return work.choice(), trouble
 
     def _steepness(self, work: RoundTrip) -> float:
         """How much the loss grows with the mean squared error of pictures.
@@ -192,6 +208,14 @@ class Tuner:
                 errors.append(float((image - target).square().mean()))
         return float(np.mean(losses)) / (2 * max(float(np.mean(errors)), 1e-10))
 
+    def _costs(self, work: RoundTrip) -> Costs:
+        """What errors of the Gaussians cost in the pictures that are learned from, where nobody has looked before."""
+        with torch.no_grad():
+            scene = clean(Splats(**{name: value.cpu().numpy() for name, value in work.gaussians().items()}))[0]
+        cameras = self.lessons.cameras[:: max(1, len(self.lessons) // WATCHED)]
+        watch = Watch(cameras, [1.0] * len(cameras), self.lessons.background)
+        return Costs.of(measure_importance(scene, watch, hedge=HEDGE, threads=self.threads), scene)
+
     def _key(self, choice: Choice, sh_degree: int) -> str:
         """Of the work: equal only where the result is equal."""
         told = f"{__version__} {self.device} {sh_degree} {self.settings.model_dump_json()} {choice.price}"
@@ -204,6 +228,10 @@ class Tuner:
         for name in ATTRIBUTES:
             key.update(getattr(self.original, name).tobytes())
         return key.hexdigest()
+
+
+def _state(work: RoundTrip, lengths: CodeLength, done: int) -> dict[str, np.ndarray]:
+    return {**work.state(), **lengths.state(), "done": np.asarray(done)}
 
 
 @dataclass(frozen=True, slots=True)

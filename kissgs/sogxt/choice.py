@@ -8,6 +8,7 @@ import numpy as np
 
 from kissgs._typing import Int
 from kissgs.sogxt.codebook import Codebook
+from kissgs.sogxt.economy import Costs
 from kissgs.sogxt.order import Grid
 from kissgs.sogxt.quantize import Quantized
 
@@ -26,6 +27,7 @@ class Choice:
         errors: largest error that the choices may cause, base colours' making up for others included; per field and
             channel, in the field's own unit (positions: of their signed logarithm; f_rest_centroids: of the codebook's
             entries).
+        costs: of one unit in each attribute, ``(M,)`` each; None where bits were not weighed.
         price: of a bit, squared error; None where bits were not weighed.
     """
 
@@ -36,4 +38,5 @@ class Choice:
     form_error: float
     tamed: int
     errors: dict[str, list[float]]
+    costs: Costs | None = None
     price: float | None = None

@@ -110,6 +110,7 @@ def weigh(
         form_error=form_error,
         tamed=tamed,
         errors={**errors, "f_rest_centroids": half.tolist()},
+        costs=costs,
         price=price,
     )
 

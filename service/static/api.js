@@ -9,7 +9,9 @@
  * @typedef {{id: string, name: string, state: string, position?: number, progress?: Progress,
  *   estimate?: {seconds_left: number}, options: {preset: string, encode: {weigh: boolean}, evaluate: boolean,
  *     compact: {count: number | null, ratio: number | null, max_psnr_drop: number | null, sparsify_steps: number,
- *     refine_steps: number}},
+ *     refine_steps: number}, finetune: {wanted: boolean}},
+ *   finetuning?: {kept: boolean, psnr_before: number | null, psnr_after: number | null, bytes_before: number,
+ *     bytes_after: number},
  *   upload_bytes: number, gaussians: number, sh_degree: number, kept?: number, compacted?: number, invisible?: number, cleaned?: Record<string, number>,
  *   evaluation?: {psnr?: number | null, ssim: number}, sizes?: Sizes, timings: Timings, starts: number,
  *   problem?: ProblemDocument, links: Record<string, string>, expires_at?: string}} Status

@@ -6,7 +6,8 @@ import { Unsuitable, inspect } from "./ply.js";
 import { presetList } from "./presets.js";
 
 /**
- * @typedef {{preset: string, evaluate: boolean, compact?: {ratio?: number | null}}} Options
+ * @typedef {{preset: string, evaluate: boolean, compact?: {ratio?: number | null},
+ *   finetune?: {wanted?: boolean}}} Options
  * @typedef {{file: File, options: Options}} Order
  */
 
@@ -29,6 +30,11 @@ export function composer(limits, presets, submit) {
   byId("keep-note").textContent = limits.training
     ? "Those that stay learn to do the work of the others: a smaller file, after some minutes of training."
     : "This server has no torch: choose Fast to have fewer. Nothing is trained then, and pictures become rougher.";
+
+  byId("finetune").disabled = !limits.training;
+  byId("finetune-note").textContent = limits.training
+    ? "Fits what was rounded to pictures of the scene: a better file of the same size, after a minute or two of training."
+    : "This server has no torch to train with.";
 
   /** @param {File} file */
   async function take(file) {
@@ -57,8 +63,12 @@ export function composer(limits, presets, submit) {
   form.addEventListener("submit", (/** @type {SubmitEvent} */ event) => {
     event.preventDefault();
     const [preset, evaluate, share] = [list.chosen(), byId("evaluate").checked, Number(byId("keep").value)];
+    const [compact, finetune] = [share && { ratio: share }, byId("finetune").checked && { wanted: true }];
     if (chosen)
-      return submit({ file: chosen, options: { preset, evaluate, ...(share && { compact: { ratio: share } }) } });
+      return submit({
+        file: chosen,
+        options: { preset, evaluate, ...(compact && { compact }), ...(finetune && { finetune }) },
+      });
     say("Choose a .ply first.");
     input.focus();
   });
@@ -73,6 +83,7 @@ export function composer(limits, presets, submit) {
     prefer(options) {
       list.choose(options.preset);
       byId("evaluate").checked = options.evaluate;
+      byId("finetune").checked = limits.training && (options.finetune?.wanted ?? false);
       const [keep, ratio] = [/** @type {HTMLSelectElement} */ (byId("keep")), options.compact?.ratio ?? null];
       if (ratio !== null && ![...keep.options].some(({ value }) => Number(value) === ratio))
         keep.add(new Option(`Keep ${Math.round(100 * ratio)} %`, String(ratio)));

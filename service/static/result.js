@@ -46,7 +46,7 @@ function ratio(status) {
 
 /** @param {Status & {sizes: Sizes}} status */
 function figures(status) {
-  const { sizes, timings, evaluation } = status;
+  const { sizes, timings, evaluation, finetuning } = status;
   const [waited, kept] = [timings.queue_seconds ?? 0, status.kept ?? status.gaussians];
   /** @type {[string, string, string?][]} */
   const pairs = [
@@ -55,6 +55,7 @@ function figures(status) {
     ["Time", duration(timings.run_seconds ?? 0), waited >= 1 ? `after ${duration(waited)} in the queue` : undefined],
     ["Preset", status.options.preset],
   ];
+  if (finetuning) pairs.push(["Fine-tuning", gain(finetuning), "on views that were held out"]);
   if (evaluation) {
     const { psnr, ssim } = evaluation; // no PSNR: there is no noise at all
     pairs.push([
@@ -65,6 +66,13 @@ function figures(status) {
     pairs.push(["SSIM", ssim.toFixed(4), "1 is identical"]);
   }
   return facts(pairs);
+}
+
+/** @param {NonNullable<Status["finetuning"]>} finetuning */
+function gain({ kept, psnr_before: before, psnr_after: after, bytes_before: whole, bytes_after: part }) {
+  if (!kept || before === null || after === null) return kept ? "kept" : "no help here";
+  const [psnr, share] = [after - before, (100 * part) / whole - 100];
+  return `${psnr < 0 ? "−" : "+"}${Math.abs(psnr).toFixed(2)} dB, ${share < 0 ? "−" : "+"}${Math.abs(share).toFixed(1)} %`;
 }
 
 /** @param {Sizes} sizes */

@@ -32,6 +32,7 @@ const STAGES = {
   "sort codebook": "Sorting the codebook",
   rounding: "Rounding by price",
   refit: "Refitting colours",
+  finetune: "Fine-tuning",
   images: "Compressing images",
   write: "Writing the container",
   evaluate: "Measuring quality",
@@ -88,6 +89,7 @@ export function plannedStages(status) {
     if (sparsify_steps > 0) planned.add("sparsify");
     if (refine_steps > 0) planned.add("refine");
   }
+  if (status.options.finetune.wanted) ["cameras", "lessons", "finetune"].forEach((stage) => planned.add(stage));
   if (status.sh_degree > 0) WITH_COLOURS_BY_ANGLE.forEach((stage) => planned.add(stage));
   if (status.options.evaluate) planned.add("evaluate");
   return Object.keys(STAGES).filter((stage) => planned.has(stage));

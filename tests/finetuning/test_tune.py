@@ -1,0 +1,187 @@
+"""Oracle: the same work without interruption, the pictures before, and the container as it was chosen."""
+
+import itertools
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from training_scenes import around, cloud
+from tuning_scenes import chosen
+
+import kissgs
+from kissgs import FinetuneSettings, OutputError, Settings, UnsupportedError, decompress
+from kissgs.finetuning.tune import Tuner
+from kissgs.info import describe
+from kissgs.sogxt.container import zip_bytes
+from kissgs.sogxt.encode import write
+from kissgs.training.checkpoint import Checkpoint
+from kissgs.views.view import Views, black
+
+SHORT = {"wanted": True, "steps": 12, "rate": 0.2, "entry_rate": 0.3, "views": 16, "view_size": 60}
+COARSE = {"scale_step": 0.4, "opacity_step": 1.0, "sh0_step": 0.3, "quat_step": 0.1}
+
+
+def tuner(scene, **changes):
+    capture = Views(around(12), around(7)[1:3], black(), "circle")
+    return Tuner.of(scene, FinetuneSettings(**{**SHORT, "around": 0.0, **changes}), capture, threads=1)
+
+
+def written(scene, settings):
+    def files(choice, steps=0, progress=None):
+        return write(choice, scene, settings, finetune_steps=steps, threads=1)
+
+    return files
+
+
+def tuned(scene, *, checkpoint=None, progress=None, preset="fast", encode=COARSE, **changes):
+    work = tuner(scene, **changes)
+    if progress is not None:
+        work = replace(work, progress=progress)
+    settings = Settings.from_preset(preset, **encode).encode
+    choice = chosen(scene, preset, **encode)
+    return work(choice, scene.sh_degree, written(scene, settings), checkpoint)
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_pictures_come_nearer_to_those_of_the_scene_as_it_was(degree):
+    scene = cloud(150, degree)
+    encoded, report = tuned(scene, steps=150)
+    assert report.kept
+    assert report.psnr_after > report.psnr_before + 2
+    assert report.taught_by == "renderings"
+    assert report.bytes_after == len(zip_bytes(encoded.files))
+    assert len(decompress(encoded.files)) == 150
+
+
+def test_bytes_become_fewer_where_they_weigh_more():
+    scene = cloud(400, 1)
+    found = [tuned(scene, code_length=weight, steps=60)[1] for weight in (0.0, 3.0, 30.0)]
+    assert found[2].bytes_after < found[1].bytes_after < found[0].bytes_after
+    assert found[2].psnr_after < found[0].psnr_after
+
+
+def test_what_does_not_help_is_not_kept():
+    scene = cloud(80)
+    encoded, report = tuned(scene, rate=5.0, entry_rate=5.0, rate_end=1.0)
+    assert not report.kept
+    assert "did not help" in report.note
+    assert report.psnr_after < report.psnr_before
+    settings = Settings.from_preset("fast", **COARSE).encode
+    assert encoded.files == written(scene, settings)(chosen(scene, "fast", **COARSE)).files
+
+
+@pytest.mark.parametrize("batch", [1, 3])
+def test_threads_change_no_bit_and_the_seed_does(batch):
+    scene = cloud(200, 1)
+    found = []
+    for threads in (1, 2, 3):
+        work = replace(tuner(scene, batch=batch), threads=threads)
+        settings = Settings.from_preset("fast").encode
+        found.append(work(chosen(scene, "fast"), 1, written(scene, settings))[0].files)
+    assert found[0] == found[1] == found[2]
+    assert found[0] != tuned(scene, encode={}, batch=batch, seed=1)[0].files
+
+
+class Interrupted(Exception):
+    pass
+
+
+def stopping_after(steps):
+    left = itertools.count(steps - 1, -1)
+
+    def progress(stage, fraction, note=""):
+        if stage == "finetune" and note and next(left) < 0:
+            raise Interrupted
+
+    return progress
+
+
+@pytest.mark.parametrize("steps", [0, 1, 5, 11, 12])
+def test_what_was_interrupted_ends_as_if_it_had_not_been(tmp_path, monkeypatch, steps):
+    monkeypatch.setattr(Checkpoint, "due", True)
+    scene, path = cloud(150, 1), tmp_path / "c.npz"
+    whole = tuned(scene)[0]
+    with pytest.raises(Interrupted):
+        tuned(scene, checkpoint=path, progress=stopping_after(steps))
+    assert path.exists()
+    done = []
+    again = tuned(scene, checkpoint=path, progress=lambda stage, fraction, note="": done.append(bool(note)))[0]
+    assert again.files == whole.files
+    assert done.count(True) == 12 - steps + 1
+
+
+def test_a_checkpoint_of_other_work_is_not_taken_up(tmp_path, monkeypatch):
+    monkeypatch.setattr(Checkpoint, "due", True)
+    path = tmp_path / "c.npz"
+    with pytest.raises(Interrupted):
+        tuned(cloud(60), checkpoint=path, progress=stopping_after(3))
+    for other in (
+        partial(tuned, cloud(60), rate=0.03),
+        partial(tuned, cloud(61)),
+        partial(tuned, cloud(60), preset="paper", encode={}),
+    ):
+        with pytest.raises(OutputError, match="other work"):
+            other(checkpoint=path)
+
+
+def test_a_disk_that_fills_later_does_not_end_the_work(tmp_path, monkeypatch):
+    monkeypatch.setattr(Checkpoint, "due", True)
+    saves, whole, expected = [], Checkpoint.save, tuned(cloud(60))[0].files
+
+    def save(self, state):
+        saves.append(1)
+        if len(saves) > 3:
+            raise OutputError("no space left")
+        whole(self, state)
+
+    monkeypatch.setattr(Checkpoint, "save", save)
+    found, report = tuned(cloud(60), checkpoint=tmp_path / "c.npz")
+    assert "went on without a checkpoint: no space left" in report.note
+    assert found.files == expected
+
+
+def test_compress_does_it_and_says_so(tmp_path):
+    settings = Settings.from_preset("fast", finetune=SHORT)
+    result = kissgs.compress(cloud(200), tmp_path / "a.zip", settings=settings, checkpoint=tmp_path / "c.npz")
+    report = result.report
+    assert report.finetuning.steps == 12
+    assert report.as_dict()["finetuning"]["taught_by"] == "renderings"
+    assert report.finetuning.source.endswith("virtual cameras")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.zip"]
+    again = kissgs.compress(cloud(200), settings=settings, checkpoint=tmp_path / "c.npz")
+    assert again.to_zip() == result.to_zip()
+    assert [path.name for path in again.checkpoints] == ["c-finetune.npz"]
+    told = describe(tmp_path / "a.zip").details["settings"]
+    assert told.get("finetune_steps", 0) == (12 if report.finetuning.kept else 0)
+
+
+def test_a_size_is_met_by_the_fine_tuned_container():
+    scene = cloud(600, 1)
+    plain = kissgs.compress(scene, settings=Settings(encode={"views": 4, "view_size": 60}))
+    size = int(0.8 * plain.report.container_bytes)
+    settings = Settings.from_preset("balanced", finetune=SHORT, target_size=size, views=4, view_size=60)
+    found = kissgs.compress(scene, settings=settings)
+    assert found.report.container_bytes <= size
+    assert found.report.finetuning is not None
+
+
+def test_a_psnr_to_the_scene_is_not_sought_where_photographs_teach(tmp_path):
+    from PIL import Image
+
+    views = []
+    for view in around(3):
+        Image.new("RGB", (view.camera.width, view.camera.height)).save(tmp_path / f"{view.name}.png")
+        views.append(replace(view, photo=tmp_path / f"{view.name}.png"))
+    settings = Settings.from_preset("balanced", finetune=SHORT, psnr=30.0, views=4, view_size=60)
+    with pytest.raises(UnsupportedError, match="ask for a size"):
+        kissgs.compress(cloud(60), settings=settings, views=Views(tuple(views), (), black(), "photos"))
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_nothing_and_nearly_nothing_to_tune(count):
+    scene = cloud(9).select(np.arange(count))
+    for preset in ("fast", "balanced"):
+        result = kissgs.compress(scene, settings=Settings.from_preset(preset, finetune=SHORT))
+        assert (result.report.finetuning is None) == (count == 0)
+        assert len(decompress(result.to_zip())) == count
