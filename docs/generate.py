@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pydantic import ByteSize
 
-from kissgs.settings import PRESETS, CompactSettings, EncodeSettings, Preset
+from kissgs.settings import PRESETS, CompactSettings, EncodeSettings, FinetuneSettings, Preset
 from kissgs.settings.compact import BUDGETS
 from kissgs.sogxt.metadata import ContainerMeta
 from service.app import create_app
@@ -34,6 +34,12 @@ GROUPS = {
         "`kissgs compact --set NAME=VALUE`, "
         '`kissgs compress --set compact.NAME=VALUE`, or `Settings.from_preset("balanced", compact={"NAME": VALUE})` '
         "in Python, changes one.",
+    ),
+    "finetune": (
+        FinetuneSettings,
+        "How levels become better once all else is chosen ([finetuning.md](finetuning.md)). "
+        "`kissgs compress --finetune --set finetune.NAME=VALUE`, or "
+        '`Settings.from_preset("balanced", finetune={"wanted": True, "NAME": VALUE})` in Python, changes one.',
     ),
 }
 
