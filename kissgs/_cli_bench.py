@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from kissgs.compaction.study import Point
+    from kissgs.curves import RatePoint
     from kissgs.views.view import Views
 
 ThreadsOption = Annotated[int, typer.Option(min=0, help="0: one per processor.")]
@@ -42,6 +43,14 @@ def bench(
         bool,
         typer.Option("--compaction", help="Measure ways to have fewer Gaussians instead, with each preset's training."),
     ] = False,
+    finetuning: Annotated[
+        bool,
+        typer.Option("--finetuning", help="Measure bytes and PSNR with fine-tuning and without instead."),
+    ] = False,
+    fidelities: Annotated[
+        list[float] | None,
+        typer.Option("--fidelity", min=-30, max=30, help="With --finetuning: at this one. Repeat for several."),
+    ] = None,
     ratios: Annotated[
         list[float] | None,
         typer.Option("--ratio", min=0, max=1, help="With --compaction: keep this share. Repeat for several."),
@@ -53,12 +62,13 @@ def bench(
         str,
         typer.Option(
             metavar="WHAT",
-            help="With --compaction: from the [bold]photos[/] of --views, from its [bold]cameras[/] alone, or from the "
+            help="With these two: from the [bold]photos[/] of --views, from its [bold]cameras[/] alone, or from the "
             "[bold]scene[/] alone. --views judges in any case.",
         ),
     ] = "photos",
     plot: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="With --compaction: PSNR over count, as .svg, .png or .pdf.")
+        Path | None,
+        typer.Option(metavar="FILE", help="With these two: PSNR over count or bytes, as .svg, .png or .pdf."),
     ] = None,
     gaussians: Annotated[
         list[int] | None,
@@ -76,14 +86,28 @@ def bench(
     rows: list[dict[str, Any]]
     table: RenderableType
     curves: list[tuple[str, Point]] = []
-    if not compaction and (ratios or ways or plot or learn_from != "photos"):
-        raise UnsupportedError("--ratio, --way, --learn-from and --plot go with --compaction")
-    if compaction:
+    drawn: list[tuple[str, RatePoint]] = []
+    if not compaction and (ratios or ways):
+        raise UnsupportedError("--ratio and --way go with --compaction")
+    if not finetuning and fidelities:
+        raise UnsupportedError("--fidelity goes with --finetuning; for a preset, --set fidelity=…")
+    if not (compaction or finetuning) and (plot or learn_from != "photos"):
+        raise UnsupportedError("--learn-from and --plot go with --compaction or --finetuning")
+    if (compaction or finetuning) and (rendering or peers or gaussians or len(presets or []) > 1):
+        what = "--compaction" if compaction else "--finetuning"
+        raise UnsupportedError(f"{what} goes with one --preset, and with nothing else that is measured")
+    preset = (presets or ["balanced"])[0]
+    if compaction and finetuning:
+        raise UnsupportedError("--compaction and --finetuning are two measurements; make one after the other")
+    if finetuning:
+        from kissgs._cli_curves import finetuning_curves, finetuning_table
+
+        drawn = finetuning_curves(expand(scenes), preset, changes, fidelities, plot, capture, learn_from, threads)
+        rows = [{"scene": scene, **point.as_dict()} for scene, point in drawn]
+        table = finetuning_table(drawn)
+    elif compaction:
         from kissgs._cli_curves import compaction_curves, curves_table
 
-        if rendering or peers or gaussians or len(presets or []) > 1:
-            raise UnsupportedError("--compaction goes with one --preset, and with nothing else that is measured")
-        preset = (presets or ["balanced"])[0]
         curves = compaction_curves(expand(scenes), preset, changes, ratios, ways, plot, capture, learn_from, threads)
         rows = [{"scene": scene, **point.as_dict()} for scene, point in curves]
         table = curves_table(curves)
@@ -104,9 +128,12 @@ def bench(
     else:
         show(table)
     if plot is not None:  # last: what it shows has taken long to find
-        from kissgs._plots import compaction_plot
+        from kissgs._plots import compaction_plot, finetuning_plot
 
-        compaction_plot([point for _, point in curves], plot)
+        if finetuning:
+            finetuning_plot([point for _, point in drawn], plot)
+        else:
+            compaction_plot([point for _, point in curves], plot)
 
 
 def _compression(

@@ -1,11 +1,13 @@
-"""``kissgs bench --compaction``: ways to have fewer Gaussians, as a table and a plot."""
+"""``kissgs bench --compaction`` and ``--finetuning``: curves as tables and plots."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
+from rich.console import Group
 from rich.table import Column, Table
+from rich.text import Text
 
 from kissgs._cli_pictures import choice
 from kissgs._cli_settings import chosen
@@ -14,7 +16,10 @@ from kissgs.errors import UnsupportedError
 from kissgs.evaluation.likeness import spell
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
+
     from kissgs.compaction.study import Point
+    from kissgs.curves import RatePoint
     from kissgs.views.view import Views
 
 
@@ -31,8 +36,9 @@ def compaction_curves(
 ) -> list[tuple[str, Point]]:
     """All ways on all scenes. That ``plot`` can be drawn is seen to before; it is drawn when all else is told."""
     from kissgs._plots import check_plot
-    from kissgs.compaction.study import RATIOS, WAYS, Source, study
+    from kissgs.compaction.study import RATIOS, WAYS, study
     from kissgs.scenes import load
+    from kissgs.views.view import Source
 
     known = {way.name: way for way in WAYS}
     for name in names or []:
@@ -73,3 +79,61 @@ def curves_table(rows: list[tuple[str, Point]]) -> Table:
         figures = f"{point.count:,}", spell(point.psnr, 2), spell(point.ssim, 4), f"{point.bytes:,}"
         table.add_row(scene, point.way, *figures, f"{point.seconds:.1f}", f"{point.cpu_seconds:.1f}")
     return table
+
+
+def finetuning_curves(
+    scenes: list[str],
+    preset: str,
+    changes: list[str] | None,
+    fidelities: list[float] | None,
+    plot: Path | None,
+    views: Views | None,
+    learn_from: str,
+    threads: int,
+) -> list[tuple[str, RatePoint]]:
+    """With fine-tuning and without, at all fidelities on all scenes."""
+    from kissgs._plots import check_plot
+    from kissgs.curves import FIDELITIES, rate_curves
+    from kissgs.scenes import load
+    from kissgs.views.view import Source
+
+    source = cast(Source, choice("--learn-from", learn_from, Source))
+    if views is None and source == "cameras":
+        raise UnsupportedError("--learn-from cameras: say whose with --views")
+    if plot is not None:
+        if len(scenes) > 1:
+            raise UnsupportedError("--plot draws one scene; name one")
+        check_plot(plot)
+    settings = chosen(preset, changes, group="finetune")
+    rows: list[tuple[str, RatePoint]] = []
+    with progress_bar(False) as progress:
+        for scene in scenes:
+            found = rate_curves(
+                *(load(scene, threads=threads, progress=progress), settings, views),
+                fidelities=fidelities or FIDELITIES,
+                learn_from=source,
+                threads=threads,
+                progress=progress,
+            )
+            rows += [(Path(scene).name, point) for point in found]
+    return rows
+
+
+def finetuning_table(rows: list[tuple[str, RatePoint]]) -> RenderableType:
+    """For people."""
+    from kissgs.curves import saved
+
+    names = ("fidelity", "bytes", "PSNR", "SSIM", "to the scene", "seconds", "CPU s", "MB")
+    table = Table("scene", "way", *(Column(name, justify="right") for name in names), box=None, pad_edge=False)
+    lines = []
+    for scene in dict.fromkeys(name for name, _ in rows):
+        points = [point for name, point in rows if name == scene]
+        for point in points:
+            quality = spell(point.psnr, 2), spell(point.ssim, 4), spell(point.between, 2)
+            took = f"{point.seconds:.1f}", f"{point.cpu_seconds:.1f}", f"{point.peak_memory / 1e6:.0f}"
+            table.add_row(scene, point.way, f"{point.fidelity:g}", f"{point.bytes:,}", *quality, *took)
+        shares = [
+            (figure, saved(points, name)) for figure, name in (("PSNR", "psnr"), ("that to the scene", "between"))
+        ]
+        lines += [f"{scene}: {100 * share:.1f} % fewer bytes at equal {figure}" for figure, share in shares if share]
+    return Group(table, *(Text(line) for line in lines))

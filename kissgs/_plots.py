@@ -13,8 +13,10 @@ from kissgs.io.atomic import atomic_file, refuse_existing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
     from kissgs.compaction.study import Point
+    from kissgs.curves import RatePoint
 
 FORMATS = ("svg", "png", "pdf")
 
@@ -51,7 +53,6 @@ def compaction_plot(points: Sequence[Point], path: Path) -> None:
         UnsupportedError: there is no matplotlib, or no such format.
     """
     kind = check_plot(path)
-    from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 4.5), layout="constrained")
@@ -63,6 +64,37 @@ def compaction_plot(points: Sequence[Point], path: Path) -> None:
     best = max((point.psnr for point in points if math.isfinite(point.psnr)), default=0.0)
     near.set_ylim(best - CLOSE, best + 0.1 * CLOSE)
     figure.legend(*whole.get_legend_handles_labels(), loc="outside right upper", fontsize="small")
+    _save(figure, path, kind)
+
+
+def finetuning_plot(points: Sequence[RatePoint], path: Path) -> None:
+    """PSNR over bytes, a curve for each way: of held-out views, and of pictures of the scene as it was.
+
+    Raises:
+        OutputError: the file system refuses.
+        UnsupportedError: there is no matplotlib, or no such format.
+    """
+    kind = check_plot(path)
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    titles = (("psnr", "PSNR of held-out views, dB"), ("between", "PSNR to the scene's own pictures, dB"))
+    panels = figure.subplots(1, 2)
+    for axes, (name, title) in zip(panels, titles, strict=True):
+        for way, marker in zip(dict.fromkeys(point.way for point in points), MARKERS, strict=False):
+            curve = sorted((point.bytes / 1000, getattr(point, name)) for point in points if point.way == way)
+            axes.plot(*zip(*curve, strict=True), marker=marker, markersize=4, label=way)
+        axes.set_xlabel("kilobytes")
+        axes.set_ylabel(title)
+        axes.grid(alpha=0.3)
+    panels[0].legend()
+    _save(figure, path, kind)
+
+
+def _save(figure: Figure, path: Path, kind: str) -> None:
+    """The same bytes each time."""
+    from matplotlib import rc_context
+
     with rc_context({"svg.hashsalt": "kissgs"}), atomic_file(path, overwrite=True) as file:
         figure.savefig(file, format=kind, metadata={"Date": None} if kind == "svg" else None, dpi=150)
 

@@ -125,7 +125,7 @@ def test_ctrl_c_leaves_a_checkpoint_to_go_on_from(folder: Path, tmp_path: Path) 
         (["--ratio", "20", "-o", "b.ply"], "setting ratio: input should be less than or equal to 1, not 20.0"),
         (["-n", "9", "--ratio", "0.2", "-o", "b.ply"], "count and ratio cannot both be met; give one"),
         (["-n", "9", "-o", "b.ply", "--set", "speed=9"], "there is no setting 'speed' of compact; there are count, "),
-        (["-n", "9", "-o", "b.ply", "--set", "no.speed=9"], "there are settings of compact and of encode"),
+        (["-n", "9", "-o", "b.ply", "--set", "no.speed=9"], "there are settings of compact, encode and finetune"),
         (["-n", "9", "-o", "b.zip/"], "b.zip"),
         (["--max-psnr-drop", "1", "-o", "b.ply", "--checkpoint"], "keeps no checkpoint"),
         (["-n", "9", "-o", "b.ply", "--device", "tpu"], "--device tpu: choose cpu or cuda"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -18,13 +18,9 @@ from kissgs.progress import Progress, silent
 from kissgs.settings import CompactSettings
 from kissgs.splats import Splats
 from kissgs.training.school import SCORED, School, school
-from kissgs.views.view import Views
+from kissgs.views.view import Source, Views
 
 RATIOS = (0.7, 0.5, 0.3, 0.2, 0.1, 0.05)
-
-Source = Literal["photos", "cameras", "scene"]
-"""What to learn from: a capture's photographs; its cameras alone, with pictures of the scene as it was; or the scene
-alone, from virtual cameras."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -178,8 +174,5 @@ def _taught(
     splats: Splats, settings: CompactSettings, views: Views | None, learn_from: Source, threads: int, progress: Progress
 ) -> School:
     scored = SCORED if settings.trains else 1
-    if views is None or learn_from == "photos":
-        return school(splats, views, settings, scored=scored, threads=threads, progress=progress)
-    bare = tuple(replace(view, photo=None) for view in views.train) if learn_from == "cameras" else ()
-    learned = replace(views, train=bare, test=views.test or views.train)
+    learned = None if views is None else views.to_learn(learn_from)
     return school(splats, learned, settings, scored=scored, threads=threads, progress=progress)

@@ -5,11 +5,11 @@ learned, in units of the step that the row's class of Gaussians has. Rounding pa
 et al. 2013): what the loss says of a decoded value is said of its latent. Order, forms, labels and ranges stay as they
 were chosen; the images that are written hold these very levels.
 
-Latents do not run along the gradient until they cross to the next level, as straight-through training by Adam has it:
-where the best value lies between two levels, they would go to and fro for ever, and end at the worse one as often as
-at the better. Each is a running mean of where one Newton step from its level as it is would lead,
-``level - slope / bend``: that stays where it is, whichever of the two levels is taken, and is rounded to the nearer
-one. How fast the loss bends is known from what errors cost in pictures (:class:`kissgs.sogxt.economy.Costs`).
+Straight-through training alone does not settle: where the best value lies between two levels, its latent crosses to
+and fro, and ends at the worse one as often as at the better. So each latent hangs on a spring at its level, as stiff as
+the loss bends there. It comes to rest where one Newton step from the level would lead, ``level - slope / bend``: that
+is one place, whichever of the two levels is taken, and it is rounded to the nearer one. How fast the loss bends is
+known from what errors cost in pictures (:class:`kissgs.sogxt.economy.Costs`).
 """
 
 from __future__ import annotations
@@ -30,15 +30,10 @@ from kissgs.sogxt.codebook import COEFFICIENTS
 from kissgs.sogxt.economy import Costs
 from kissgs.sogxt.quantize import MEANS_TOP, Quantized, signed_exp
 from kissgs.splats import SH_REST_COUNTS
+from kissgs.training.leaves import Leaves
 
 ATTRIBUTE = {"quats": "quaternions", "scales": "scales", "sh0": "f_dc"}
 """Attributes whose values are those of a field as they are, by field."""
-
-CARE = 2.0
-"""How much more than each alone the loss is taken to bend: many latents move at once, and errors meet in pixels."""
-
-FAR = 3.0
-"""Steps from its level that a latent is drawn at most."""
 
 FIELDS = ("means", "opacities", "scales", "quaternions", "f_dc", "f_rest_centroids")
 
@@ -106,7 +101,6 @@ class RoundTrip:
         planes: by field of the metadata.
         classes: ``(M,)`` kind of each Gaussian.
         grid: which Gaussian sits where.
-        latents: by field, what is learned.
     """
 
     def __init__(self, choice: Choice, sh_degree: int, device: Device = "cpu") -> None:
@@ -122,11 +116,16 @@ class RoundTrip:
         }
         self.classes, self.grid = choice.classes, choice.grid
         self._labels = _Labels(choice.codebook.labels[:count], choice.codebook.side**2, device)
-        self.latents = {name: torch.zeros_like(plane.least).requires_grad_() for name, plane in self.planes.items()}
-        self._bend = {name: torch.ones_like(plane.least) for name, plane in self.planes.items()}
+        self._leaves = Leaves({name: torch.zeros_like(plane.least) for name, plane in self.planes.items()})
+        self._bend = {name: torch.zeros_like(plane.least) for name, plane in self.planes.items()}
 
-    def learn_curvatures(self, costs: Costs, steepness: float) -> None:
-        """See how fast the loss grows as latents leave their best place: by what errors cost in pictures.
+    @property
+    def latents(self) -> dict[str, Tensor]:
+        """What is learned, by field."""
+        return self._leaves.by_name
+
+    def hang(self, costs: Costs, steepness: float) -> None:
+        """Make the springs as stiff as the loss bends: by what errors cost in pictures. Before, there are none.
 
         Args:
             costs: mean squared error of pictures by an error of one unit, ``(M,)`` for each attribute.
@@ -162,19 +161,21 @@ class RoundTrip:
         return shown
 
     def step(self, rates: Mapping[str, float]) -> None:
-        """Move latents towards where one Newton step from the levels as they are would lead, by the share ``rates``.
+        """Move the latents against their gradients and springs, as far as the images can hold their levels.
 
-        No further than the images can hold their levels. A gradient that is no number counts as none.
+        Args:
+            rates: learning rates by field; and ``"spring"``, the share of the springs' strength.
         """
         with torch.no_grad():
             for name, latents in self.latents.items():
-                if latents.grad is None:
-                    continue
-                plane = self.planes[name]
-                level = (torch.round(plane.symbols + latents) - plane.symbols).float()
-                newton = torch.nan_to_num(latents.grad / (CARE * self._bend[name]), nan=0.0).clamp(-FAR, FAR)
-                latents.lerp_(level - newton, rates[name]).clamp_(plane.least, plane.most)
-                latents.grad = None
+                if latents.grad is not None:
+                    plane = self.planes[name]
+                    level = (torch.round(plane.symbols + latents) - plane.symbols).float()
+                    latents.grad += rates["spring"] * self._bend[name] * (latents - level)
+        self._leaves.step(rates)
+        with torch.no_grad():
+            for name, latents in self.latents.items():
+                latents.clamp_(self.planes[name].least, self.planes[name].most)
 
     def choice(self) -> Choice:
         """The choice with the levels as they are now."""
@@ -194,13 +195,11 @@ class RoundTrip:
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything, to go on from later."""
-        return {name: latents.detach().cpu().numpy() for name, latents in self.latents.items()}
+        return self._leaves.state()
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Go on from there."""
-        with torch.no_grad():
-            for name, latents in self.latents.items():
-                latents.copy_(torch.from_numpy(state[name]))
+        self._leaves.restore(state)
 
 
 class _SignedExp(torch.autograd.Function):

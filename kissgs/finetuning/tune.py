@@ -32,7 +32,7 @@ from kissgs.sogxt.encode import Encoded
 from kissgs.splats import ATTRIBUTES, Splats, clean
 from kissgs.training.checkpoint import Checkpoint
 from kissgs.training.lessons import Lessons, lessons
-from kissgs.training.loop import Plan, falling, train
+from kissgs.training.loop import Plan, Rates, falling, train
 from kissgs.training.school import School, school
 from kissgs.views.view import Views
 
@@ -44,6 +44,9 @@ HEDGE = 0.1
 
 LOOKS = 16
 """Lessons from which the loss at the beginning is told."""
+
+SETTLE = 0.5
+"""Share of the steps after which levels begin to settle."""
 
 NO_HELP = "fine-tuning did not help; the container is as it was without it"
 
@@ -152,7 +155,7 @@ class Tuner:
         chosen, work = self.settings, RoundTrip(choice, sh_degree, self.device)
         kept, done, trouble = Checkpoint(path, "" if path is None else self._key(choice, sh_degree)), 0, ""
         steepness = self._steepness(work)
-        work.learn_curvatures(choice.costs or self._costs(work), steepness)
+        work.hang(choice.costs or self._costs(work), steepness)
         lengths = CodeLength(work, chosen.code_length * price * steepness)
         state = kept.load()
         if state is None:
@@ -170,11 +173,10 @@ class Tuner:
                 except OutputError as error:
                     trouble = f"the work went on without a checkpoint: {error}"
 
-        base = {name: chosen.entry_rate if name == "f_rest_centroids" else chosen.rate for name in FIELDS}
         plan = Plan(
             stage="finetune",
             steps=chosen.steps,
-            rates=falling(base, dict.fromkeys(FIELDS, 1.0), dict.fromkeys(FIELDS, chosen.rate_end)),
+            rates=_rates(chosen),
             ssim_weight=chosen.ssim_weight,
             seed=(chosen.seed,),
             regularizers=(lengths, Smoothness(work, chosen.smoothness, chosen.steps)),
@@ -228,6 +230,17 @@ class Tuner:
         for name in ATTRIBUTES:
             key.update(getattr(self.original, name).tobytes())
         return key.hexdigest()
+
+
+def _rates(chosen: FinetuneSettings) -> Rates:
+    """Learning rates that fall exponentially, and springs that grow from nothing once most is learned."""
+    base = {name: chosen.entry_rate if name == "f_rest_centroids" else chosen.rate for name in FIELDS}
+    learning = falling(base, dict.fromkeys(FIELDS, 1.0), dict.fromkeys(FIELDS, chosen.rate_end))
+
+    def rates(done: float) -> dict[str, float]:
+        return {**learning(done), "spring": max(done - SETTLE, 0.0) / (1 - SETTLE)}
+
+    return rates
 
 
 def _state(work: RoundTrip, lengths: CodeLength, done: int) -> dict[str, np.ndarray]:

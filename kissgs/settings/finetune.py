@@ -19,7 +19,7 @@ class FinetuneSettings(SchoolSettings):
     entry_rate: float = Field(0.05, gt=0, le=10, description="The same of the SH codebook's entries.")
     rate_end: float = Field(0.05, gt=0, le=1, description="What is left of both at the end.")
     code_length: float = Field(
-        1.0,
+        2.0,
         ge=0,
         le=100,
         description="Weight of bytes against errors: 1 is that by which levels were chosen. Levels become such as many "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -73,6 +74,11 @@ class View:
         return undistort(read_photo(self.photo, lens.width, lens.height, self.background), lens, self.bend.window)
 
 
+Source = Literal["photos", "cameras", "scene"]
+"""What to learn from: a capture's photographs; its cameras alone, with pictures of the scene as it was; or the scene
+alone, from virtual cameras."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Views:
     """The views of a capture, each part sorted by name.
@@ -95,3 +101,10 @@ class Views:
     def all(self) -> tuple[View, ...]:
         """Both parts, sorted by name."""
         return tuple(sorted(self.train + self.test, key=lambda view: view.name))
+
+    def to_learn(self, source: Source) -> Views:
+        """With so much of the capture to learn from; what is held out, or all where nothing is, still judges."""
+        if source == "photos":
+            return self
+        bare = tuple(replace(view, photo=None) for view in self.train) if source == "cameras" else ()
+        return replace(self, train=bare, test=self.test or self.train)

@@ -1,0 +1,53 @@
+"""Oracle: finite numbers, and a container that decoders read, from Gaussians as no training leaves them."""
+
+import numpy as np
+import pytest
+from test_training_extremes import SCENES, changed
+from training_scenes import around, cloud
+
+import kissgs
+from kissgs import Settings
+from kissgs.splats import ATTRIBUTES
+from kissgs.views.view import Views, black
+
+QUICK = {"wanted": True, "steps": 40, "rate": 0.1, "view_size": 48}
+
+
+def check(scene, preset="balanced", **changes):
+    settings = Settings.from_preset(preset, finetune={**QUICK, **changes}, view_size=48)
+    views = Views(around(5), around(3), black(), "circle")
+    result = kissgs.compress(scene, settings=settings, views=views)
+    found = kissgs.decompress(result.to_zip())
+    for name in ATTRIBUTES:
+        assert np.isfinite(getattr(found, name)).all(), name
+    told = result.report.finetuning
+    assert told is None or not np.isnan([told.psnr_before, told.psnr_after]).any()
+    return result
+
+
+@pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.__name__)
+def test_degenerate_scenes_are_tuned_without_nan(scene):
+    check(scene())
+
+
+def test_all_of_the_papers_wishes_together():
+    check(changed(cloud(60), scales=np.tile([0.5, -30, -30], (60, 1))), "paper", batch=2, steps=20)
+
+
+@pytest.mark.parametrize("size", [1e-6, 1e6])
+def test_worlds_of_any_size(size):
+    scene = cloud(60)
+    check(changed(scene, means=scene.means * size, scales=scene.scales + np.log(size)))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("count", [1, 7, 8, 9])
+def test_few_gaussians_of_any_degree(count, degree):
+    result = check(cloud(count, degree, seed=count), steps=5)
+    assert len(result.order) <= count
+
+
+def test_saturated_opacities_and_constant_channels():
+    scene = cloud(60)
+    check(changed(scene, opacities=np.where(np.arange(60) % 2, np.inf, -np.inf), sh0=np.zeros((60, 3))))
+    check(changed(scene, quats=np.tile([1, 0, 0, 0], (60, 1)), scales=np.full((60, 3), -2.0)), "fast")
