@@ -33,13 +33,13 @@ UNFINISHED = ("work-*", ".*.part")
 next checkpoint."""
 
 
-def checkpoint_bytes(gaussians: int, sh_degree: int) -> int:
-    """What the checkpoint of a scene's training takes at most.
+def checkpoint_bytes(gaussians: int, sh_degree: int, trainings: int = 1) -> int:
+    """What the checkpoints of a scene's trainings take at most.
 
     That of compaction holds each parameter and the two moments of Adam, of no more Gaussians than the scene has; that
-    of fine-tuning, which may stand beside it, no more. While one is written anew, the former one is still there.
+    of fine-tuning, beside it, no more. While one is written anew, the former one is still there.
     """
-    return 3 * (STEPS_BYTES + 3 * BYTES_PER_GAUSSIAN[sh_degree] * gaussians)
+    return (trainings + 1) * (STEPS_BYTES + 3 * BYTES_PER_GAUSSIAN[sh_degree] * gaussians)
 
 
 class Folders:

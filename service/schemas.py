@@ -40,14 +40,14 @@ class JobOptions(kissgs.Settings):
         return f"{self.preset}{compacted}{tuned}"
 
     @property
-    def trains(self) -> bool:
-        """Whether anything is to be fitted to pictures of the scene."""
-        return self.finetune.wanted or (self.compact.wanted and self.compact.trains)
+    def trainings(self) -> int:
+        """How often something is to be fitted to pictures of the scene: Gaussians that stay, and levels."""
+        return (self.compact.wanted and self.compact.trains) + self.finetune.wanted
 
     @property
     def resumable(self) -> bool:
         """Whether its training can be taken up where it was left: a search for a count, which trains often, cannot."""
-        return self.trains and self.compact.max_psnr_drop is None
+        return self.trainings > 0 and self.compact.max_psnr_drop is None
 
 
 class Wire(BaseModel):

@@ -112,7 +112,7 @@ def parse_options(text: str | bytes) -> JobOptions:
         raise ProblemError(
             "invalid-request", f"the options cannot be used: {named}; GET /v1/presets shows all settings", errors=found
         ) from error
-    if options.trains and not can_train():
+    if options.trainings and not can_train():
         raise ProblemError(
             "invalid-request",
             "this service has no torch to train with, so it fine-tunes nothing and compacts with the preset fast only; "
@@ -206,7 +206,11 @@ def _queue(context: Context, submission: Submission, owner: str) -> tuple[Job, b
         sh_degree=received.info.sh_degree,
         upload_bytes=received.size,
         disk_bytes=received.size,
-        work_bytes=checkpoint_bytes(received.info.count, received.info.sh_degree) if options.resumable else 0,
+        work_bytes=(
+            checkpoint_bytes(received.info.count, received.info.sh_degree, options.trainings)
+            if options.resumable
+            else 0
+        ),
         upload_sha256=received.sha256,
         fingerprint=submission.fingerprint,
         idempotency_key=submission.key,

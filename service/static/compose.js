@@ -33,7 +33,7 @@ export function composer(limits, presets, submit) {
 
   byId("finetune").disabled = !limits.training;
   byId("finetune-note").textContent = limits.training
-    ? "Fits what was rounded to pictures of the scene: a better file of the same size, after a minute or two of training."
+    ? "Fits what was rounded to pictures of the scene: better at the same size, after a minute or two."
     : "This server has no torch to train with.";
 
   /** @param {File} file */

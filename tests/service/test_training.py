@@ -185,3 +185,25 @@ def test_training_tells_what_it_has_come_to(service):
     heard = [data for _, kind, data in events(service.http.get(job["links"]["events"]).text) if kind == "progress"]
     assert {data["stage"] for data in heard if "note" in data} == {"sparsify", "refine"}
     assert any(data.get("note") == note for data in heard)
+
+
+TUNED = {"preset": "fast", "finetune": {"wanted": True, "steps": 300, "views": 24, "view_size": 48}}
+
+
+def test_fine_tuning_is_taken_up_where_it_was_left_and_its_gain_is_told(start_saving):
+    service = start_saving(KISSGS_DRAIN_SECONDS=0)
+    job = service.submit(options=json.dumps(TUNED))
+    kept = folder_of(service, job) / "checkpoint-finetune.npz"
+    while not (kept.exists() and service.running(job, "finetune")["progress"]["fraction"] > 0.3):
+        time.sleep(0.02)
+    assert 2 * kept.stat().st_size <= checkpoint_bytes(300, 1)
+    kill_the_service(service)
+    status = service.ended(job)
+    assert status["state"] == "succeeded", status
+    expected = kissgs.compress(SMALL, settings=kissgs.Settings.model_validate(TUNED))
+    assert service.http.get(status["links"]["result"]).content == expected.to_zip()
+    told = expected.report.finetuning.as_dict()
+    assert {**status["finetuning"], "seconds": 0} == {**told, "seconds": 0}
+    second = [data for _, kind, data in events(service.http.get(job["links"]["events"]).text) if kind == "progress"]
+    assert max(data["fraction"] for data in second if data["stage"] == "finetune") > 0.3
+    assert sorted(path.name for path in folder_of(service, job).iterdir()) == ["result", "scene.ply"]
