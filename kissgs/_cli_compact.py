@@ -66,7 +66,7 @@ def compact(
     from kissgs._console import progress_bar
     from kissgs.io.ply import write_ply
     from kissgs.pipeline import compact as run
-    from kissgs.pipeline import forget
+    from kissgs.training.checkpoint import forget
 
     settings = chosen(
         preset,

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from kissgs.compaction.study import Point
     from kissgs.curves import RatePoint
-    from kissgs.views.view import Views
+    from kissgs.views.view import Source, Views
 
 
 def compaction_curves(
@@ -35,10 +35,8 @@ def compaction_curves(
     threads: int,
 ) -> list[tuple[str, Point]]:
     """All ways on all scenes. That ``plot`` can be drawn is seen to before; it is drawn when all else is told."""
-    from kissgs._plots import check_plot
     from kissgs.compaction.study import RATIOS, WAYS, study
     from kissgs.scenes import load
-    from kissgs.views.view import Source
 
     known = {way.name: way for way in WAYS}
     for name in names or []:
@@ -46,13 +44,7 @@ def compaction_curves(
             raise UnsupportedError(f"there is no way {name!r}; there are: {'; '.join(known)}")
     if 0 in (ratios or ()):
         raise UnsupportedError("--ratio 0 keeps nothing; give a share above 0")
-    source = cast(Source, choice("--learn-from", learn_from, Source))
-    if views is None and source == "cameras":
-        raise UnsupportedError("--learn-from cameras: say whose with --views")
-    if plot is not None:
-        if len(scenes) > 1:
-            raise UnsupportedError("--plot draws one scene; name one")
-        check_plot(plot)
+    source = _checked(scenes, plot, views, learn_from)
     settings = chosen(preset, changes, group="compact").compact
     rows: list[tuple[str, Point]] = []
     with progress_bar(False) as progress:
@@ -69,6 +61,21 @@ def compaction_curves(
             )
             rows += [(Path(scene).name, point) for point in found]
     return rows
+
+
+def _checked(scenes: list[str], plot: Path | None, views: Views | None, learn_from: str) -> Source:
+    """What to learn from, once it is known that it can be, and that a plot can be drawn."""
+    from kissgs._plots import check_plot
+    from kissgs.views.view import Source
+
+    source = cast(Source, choice("--learn-from", learn_from, Source))
+    if views is None and source == "cameras":
+        raise UnsupportedError("--learn-from cameras: say whose with --views")
+    if plot is not None:
+        if len(scenes) > 1:
+            raise UnsupportedError("--plot draws one scene; name one")
+        check_plot(plot)
+    return source
 
 
 def curves_table(rows: list[tuple[str, Point]]) -> Table:
@@ -92,18 +99,10 @@ def finetuning_curves(
     threads: int,
 ) -> list[tuple[str, RatePoint]]:
     """With fine-tuning and without, at all fidelities on all scenes."""
-    from kissgs._plots import check_plot
     from kissgs.curves import FIDELITIES, rate_curves
     from kissgs.scenes import load
-    from kissgs.views.view import Source
 
-    source = cast(Source, choice("--learn-from", learn_from, Source))
-    if views is None and source == "cameras":
-        raise UnsupportedError("--learn-from cameras: say whose with --views")
-    if plot is not None:
-        if len(scenes) > 1:
-            raise UnsupportedError("--plot draws one scene; name one")
-        check_plot(plot)
+    source = _checked(scenes, plot, views, learn_from)
     settings = chosen(preset, changes, group="finetune")
     rows: list[tuple[str, RatePoint]] = []
     with progress_bar(False) as progress:
@@ -132,8 +131,12 @@ def finetuning_table(rows: list[tuple[str, RatePoint]]) -> RenderableType:
             quality = spell(point.psnr, 2), spell(point.ssim, 4), spell(point.between, 2)
             took = f"{point.seconds:.1f}", f"{point.cpu_seconds:.1f}", f"{point.peak_memory / 1e6:.0f}"
             table.add_row(scene, point.way, f"{point.fidelity:g}", f"{point.bytes:,}", *quality, *took)
-        shares = [
-            (figure, saved(points, name)) for figure, name in (("PSNR", "psnr"), ("that to the scene", "between"))
-        ]
-        lines += [f"{scene}: {100 * share:.1f} % fewer bytes at equal {figure}" for figure, share in shares if share]
+        kinds = {"PSNR": "psnr", "SSIM": "ssim", "PSNR to the scene's own pictures": "between"}
+        if all(point.psnr == point.between for point in points):
+            kinds.pop("PSNR to the scene's own pictures")
+        for figure, name in kinds.items():
+            share = saved(points, name)
+            if share is not None:
+                word = "fewer" if share >= 0 else "more"
+                lines.append(f"{scene}: {100 * abs(share):.1f} % {word} bytes at equal {figure}, on average")
     return Group(table, *(Text(line) for line in lines))

@@ -36,6 +36,9 @@ def compress(
     compact: Annotated[
         str | None, typer.Option(metavar="BUDGET", help="Fewer Gaussians first: 200k, 20% or 0.2dB.")
     ] = None,
+    finetune: Annotated[
+        str | None, typer.Option(metavar="[STEPS]", help="Then fit the numbers in the images to pictures of the scene.")
+    ] = None,
     evaluate: Annotated[bool, typer.Option("--evaluate", help="Measure PSNR and SSIM of the result.")] = False,
     force: Annotated[bool, typer.Option("--force", "-f", help="Overwrite files that exist.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print what the service reports as JSON.")] = False,
@@ -49,7 +52,7 @@ def compress(
 
     if "-" in scenes or str(output) == "-":
         raise UnsupportedError("remote compression reads and writes files; name them")
-    settings = chosen(preset, changes, budget=None if compact is None else budget_of(compact))
+    settings = chosen(preset, changes, budget=None if compact is None else budget_of(compact), finetune=finetune)
     with Remote(server, key=key) as remote:
 
         def work(scene: str, target: Path) -> dict[str, Any]:

@@ -50,6 +50,9 @@ def chosen(
     values["compact"].update(budget or {})
     values[group].update({name: value for name, value in options.items() if value is not None})
     values["finetune"].update(_tuning(finetune))
+    if group == "encode" and options.get("seed") is not None:
+        for other in ("compact", "finetune"):
+            values[other].setdefault("seed", options["seed"])
     return Settings.from_preset(preset, compact=values["compact"], finetune=values["finetune"], **values["encode"])
 
 
@@ -60,6 +63,8 @@ def spelled_out(words: list[str]) -> list[str]:
     """A command line on which ``--finetune`` without a number means ``--finetune auto``: typer has no such options."""
     told = list[str]()
     for n, word in enumerate(words):
+        if word == "--":
+            return told + words[n:]
         told.append(word)
         following = words[n + 1] if n + 1 < len(words) else ""
         if word == FINETUNE and not (following.isdecimal() or following == "auto"):

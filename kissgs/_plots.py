@@ -82,7 +82,8 @@ def finetuning_plot(points: Sequence[RatePoint], path: Path) -> None:
     panels = figure.subplots(1, 2)
     for axes, (name, title) in zip(panels, titles, strict=True):
         for way, marker in zip(dict.fromkeys(point.way for point in points), MARKERS, strict=False):
-            curve = sorted((point.bytes / 1000, getattr(point, name)) for point in points if point.way == way)
+            of = [(point.bytes / 1000, getattr(point, name)) for point in points if point.way == way]
+            curve = sorted(place for place in of if math.isfinite(place[1])) or [(math.nan, math.nan)]
             axes.plot(*zip(*curve, strict=True), marker=marker, markersize=4, label=way)
         axes.set_xlabel("kilobytes")
         axes.set_ylabel(title)

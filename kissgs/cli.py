@@ -135,12 +135,12 @@ def compress(
 ) -> None:
     """Compress scenes, each into a container of its own."""
     from kissgs.pipeline import compress as run
-    from kissgs.pipeline import forget
+    from kissgs.training.checkpoint import forget
 
     budget = None if compact is None else budget_of(compact)
-    if compact is finetune is None and (checkpoint or device != "cpu"):
-        raise UnsupportedError("--checkpoint and --device are about training; they go with --compact and --finetune")
     settings = chosen(preset, changes, budget=budget, finetune=finetune, seed=seed, psnr=psnr, target_size=target_size)
+    if not (settings.compact.wanted or settings.finetune.wanted) and (checkpoint or device != "cpu"):
+        raise UnsupportedError("--checkpoint and --device are about training; they go with --compact and --finetune")
     looks = evaluate or settings.encode.weigh or settings.compact.wanted or settings.finetune.wanted
     if views is not None and not looks:
         raise UnsupportedError(f"{preset} takes no pictures: --views only says from where to evaluate; add --evaluate")

@@ -13,7 +13,7 @@ from kissgs.errors import UnsupportedError
 from kissgs.evaluation.pictures import evaluate
 from kissgs.pipeline import compress, decompress
 from kissgs.progress import Progress, as_stage, silent
-from kissgs.settings import Settings
+from kissgs.settings import EncodeSettings, Settings
 from kissgs.splats import Splats
 from kissgs.views.view import Source, Views
 from kissgs.views.virtual import virtual_views
@@ -75,15 +75,18 @@ def rate_curves(
         progress: receives the stages of compression.
 
     Raises:
-        UnsupportedError: the settings weigh no bits, and so know no fidelity.
+        UnsupportedError: the settings weigh no bits, and so know no fidelity; or ask for fewer Gaussians.
     """
     if not settings.encode.weigh:
         raise UnsupportedError(f"the preset {settings.preset} weighs no bits, and knows no fidelity; choose another")
+    if settings.compact.wanted:
+        raise UnsupportedError("fine-tuning is measured on a scene as it is; compact it first: kissgs compact")
     judges = views or virtual_views(splats, threads=threads, progress=progress)
     taught = None if views is None or learn_from == "scene" else views.to_learn(learn_from)
     points = []
     for fidelity in fidelities:
-        encode = settings.encode.model_copy(update={"fidelity": fidelity, "psnr": None, "target_size": None})
+        asked = {"fidelity": fidelity, "price": None, "psnr": None, "target_size": None}
+        encode = EncodeSettings(**{**settings.encode.model_dump(), **asked})
         for way in (CHOSEN, TUNED):
             finetune = settings.finetune.model_copy(update={"wanted": way == TUNED})
             chosen = settings.model_copy(update={"encode": encode, "finetune": finetune})
@@ -109,7 +112,7 @@ def rate_curves(
 
 
 def saved(points: Sequence[RatePoint], figure: str = "psnr") -> float | None:
-    """By what share fine-tuned containers are smaller than others of the same quality, on average; below 0 if larger.
+    """By what share fine-tuned containers are smaller than others of the same quality, on average; negative if larger.
 
     Bjøntegaard's measure (VCEG-M33), with straight lines between the points: the mean difference of the logarithms of
     bytes over the range of ``figure`` that both curves cover. None where there is no such range.

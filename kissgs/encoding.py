@@ -36,6 +36,9 @@ if TYPE_CHECKING:
 HEDGE = {True: 0.1, False: 0.55}
 """How little pictures say of others: those from a capture's cameras, and those from virtual ones."""
 
+TUNED_ATTEMPTS = 4
+"""Containers that are fine-tuned on the way to a goal, at most: each takes a training."""
+
 Chooser = Callable[[EncodeSettings], Choice]
 
 
@@ -75,34 +78,20 @@ class Encoding:
 
         Raises:
             InvalidViewsError: a photograph cannot be read.
-            OutputError: ``cache`` or ``checkpoint`` is something else, or cannot be written.
-            UnsupportedError: the goal cannot be met; the scene is too large for one container; no torch or no GPU to
-                train with.
+            OutputError: ``cache`` or ``checkpoint`` is something else, or ``cache`` cannot be written.
+            UnsupportedError: the goal cannot be met; the scene is too large for one container.
         """
         wanted = self.settings.encode
-        if self.settings.finetune.wanted:
-            check_training(self.device)
         weighs = wanted.weigh and len(self.splats) > 0
-        chooser = self._looking() if weighs else self._blind
-        goal = weighs and (wanted.psnr is not None or wanted.target_size is not None)
-        untuned = self._encoder(chooser, None, None)
-        if not goal:
-            return self._encoder(chooser, self._tuner(), self.checkpoint)(wanted), ()
-
-        def search(encoder: Encoder, price: float | None = None) -> tuple[Container, tuple[Trial, ...]]:
-            return GoalSearch(self.original, wanted, encoder, self.views, self.threads, self.progress).run(price)
-
-        tuner = self._tuner()
-        if tuner is None:
-            return search(untuned)
-        if wanted.psnr is not None and tuner.lessons.taught_by == "photos":
-            raise UnsupportedError(
-                "psnr is that to the scene's own pictures, and fine-tuning by photographs leaves these for better "
-                "ones; ask for a size (--target-size), or fine-tune without photographs"
-            )
-        best, trials = search(untuned)
-        best, more = search(self._encoder(chooser, tuner, None), best.encoded.price)
-        return best, trials + more
+        chooser, tuner = self._looking() if weighs else self._blind, self._tuner()
+        if not (weighs and wanted.has_goal):
+            return self._encoder(chooser, tuner, self.checkpoint)(wanted), ()
+        search = GoalSearch(self.original, wanted, self.views, self.threads, self.progress)
+        search.run(self._encoder(chooser, None, None))
+        if tuner is not None:
+            price = None if search.best is None else search.best.encoded.price
+            search.run(self._encoder(chooser, tuner, None), price, TUNED_ATTEMPTS)
+        return search.found()
 
     def _encoder(self, chooser: Chooser, tuner: Tuner | None, checkpoint: Path | None) -> Encoder:
         """Chooses, fine-tunes if there is a tuner, and writes."""
@@ -121,7 +110,7 @@ class Encoding:
             choice = chooser(chosen)
             if tuner is None or not choice.grid.mask.any():
                 return Container(files(choice, 0, self.progress))
-            return Container(*tuner(choice, self.splats.sh_degree, files, checkpoint))
+            return Container(*tuner(choice, self.splats, files, checkpoint))
 
         return encoder
 
@@ -176,11 +165,11 @@ class Encoding:
         return chooser
 
 
-def check_training(device: Device) -> None:
-    """See that scenes can be trained here.
+def check_finetuning(settings: Settings, views: Views | None, device: Device) -> None:
+    """See that levels can be fine-tuned here, before the work that comes before.
 
     Raises:
-        UnsupportedError: no torch or no GPU.
+        UnsupportedError: no torch or no GPU; a goal that it would miss.
     """
     if find_spec("torch") is None:
         raise UnsupportedError(
@@ -188,6 +177,11 @@ def check_training(device: Device) -> None:
         )
     if device == "cuda":
         need_cuda()
+    if settings.encode.psnr is not None and views is not None and any(view.photo for view in views.train):
+        raise UnsupportedError(
+            "psnr is that to the scene's own pictures, and fine-tuning by photographs leaves these for better ones; "
+            "ask for a size (--target-size), or fine-tune without photographs"
+        )
 
 
 def _importance(

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from kissgs.errors import UnsupportedError
 from kissgs.finetuning.result import FinetuneReport
 from kissgs.progress import Progress, silent
-from kissgs.search import Trial, seek
+from kissgs.search import ATTEMPTS, Trial, seek
 from kissgs.settings import EncodeSettings
 from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.decode import MAX_GAUSSIANS, decode
@@ -39,38 +39,50 @@ Encoder = Callable[[EncodeSettings], Container]
 
 
 class GoalSearch:
-    """For the price at which a container meets the goal of the settings, and hardly more."""
+    """For the price at which a container meets the goal of the settings, and hardly more.
+
+    Among those that meet it the best is the largest, where a size is the goal, or the smallest; a fine-tuned one before
+    one that fine-tuning could not improve, whose report says so.
+
+    Attributes:
+        trials: all attempts.
+        best: of them; None if none met the goal.
+    """
 
     def __init__(
         self,
         original: Splats,
         settings: EncodeSettings,
-        encoder: Encoder,
         views: Views | None,
         threads: int,
         progress: Progress,
     ) -> None:
-        self.original, self.settings, self.encoder = original, settings, encoder
+        self.original, self.settings = original, settings
         self.views, self.threads, self.progress = views, threads, progress
         self.trials: list[Trial] = []
-        self.best: tuple[int, Container] | None = None
+        self.best: Container | None = None
+        self._worth = (False, -math.inf, False)
 
-    def run(self, price: float | None = None) -> tuple[Container, tuple[Trial, ...]]:
-        """All attempts, the first at ``price`` if one is given.
-
-        Raises:
-            UnsupportedError: none meets the goal.
-        """
+    def run(self, encoder: Encoder, price: float | None = None, attempts: int = ATTEMPTS) -> None:
+        """So many attempts at most, the first at ``price`` if one is given."""
+        self.encoder = encoder
         first = self.encoder(self.settings if price is None else self._at(price))
         start = self._judge(first)
         if first.encoded.price is not None:
             by_size = self.settings.psnr is None
             slope, near = (SIZE_SLOPE, NEAR_SIZE) if by_size else (PSNR_SLOPE, NEAR_PSNR)
             begin = math.log2(first.encoded.price)
-            seek(lambda x: start if x == begin else self._try(2.0**x), begin, slope, near, PRICES)
+            seek(*(lambda x: start if x == begin else self._try(2.0**x), begin, slope, near, PRICES), attempts=attempts)
+
+    def found(self) -> tuple[Container, tuple[Trial, ...]]:
+        """The best, and all attempts.
+
+        Raises:
+            UnsupportedError: none met the goal.
+        """
         if self.best is None:
             raise UnsupportedError(self._regret())
-        return self.best[1], tuple(self.trials)
+        return self.best, tuple(self.trials)
 
     def _at(self, price: float) -> EncodeSettings:
         return EncodeSettings(**{**self.settings.model_dump(), "price": price, "psnr": None, "target_size": None})
@@ -88,9 +100,10 @@ class GoalSearch:
         else:
             spare = math.log2((self.settings.target_size or 1) / size)
         self.trials.append(Trial(encoded.price or 0.0, size, psnr))
-        worth = -size if psnr is not None else size
-        if spare >= 0 and (self.best is None or worth > self.best[0]):
-            self.best = worth, container
+        improved = container.finetuning is not None and container.finetuning.kept
+        worth = (improved, -size if psnr is not None else size, container.finetuning is not None)
+        if spare >= 0 and worth > self._worth:
+            self.best, self._worth = container, worth
         return spare
 
     def _psnr(self, encoded: Encoded) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +22,7 @@ from kissgs.settings import Settings
 from kissgs.sogxt.container import check_destination, write_container, zip_bytes
 from kissgs.sogxt.decode import MAX_GAUSSIANS, decode
 from kissgs.splats import Splats
+from kissgs.training.checkpoint import beside, forget
 
 if TYPE_CHECKING:
     from kissgs.evaluation.likeness import Evaluation
@@ -117,14 +117,6 @@ def compact(
     return replace(result, report=report)
 
 
-def forget(*checkpoints: Path | None) -> None:
-    """Delete them, now that what they led to is kept elsewhere."""
-    for path in checkpoints:
-        if path is not None:
-            with contextlib.suppress(OSError):
-                path.unlink(missing_ok=True)
-
-
 def compress(
     source: Splats | AnyPath | bytes,
     destination: AnyPath | None = None,
@@ -169,14 +161,17 @@ def compress(
     Raises:
         KissgsError: one of its children, with a sentence for the user.
     """
-    from kissgs.encoding import Encoding, check_training
+    from kissgs.encoding import Encoding, check_finetuning
 
     settings = settings or Settings()
     target = Path(destination) if destination is not None else None
     if target is not None:
         check_destination(target, overwrite=overwrite)
+    kept = None
     if settings.finetune.wanted:
-        check_training(device)
+        check_finetuning(settings, views, device)
+        if checkpoint is not None and not settings.encode.has_goal:
+            kept = beside(Path(checkpoint))
     clock = Clock(progress)
     original, cleaned, source_bytes = open_scene(source, threads, clock)
     compacted = None
@@ -190,7 +185,7 @@ def compress(
         cache=Path(cache) if cache is not None else None,
         views=views,
         cleaned=cleaned,
-        checkpoint=_beside(checkpoint) if settings.finetune.wanted else None,
+        checkpoint=kept,
         device=device,
         threads=threads,
         progress=clock,
@@ -199,7 +194,7 @@ def compress(
     encoded = container.encoded
     archive_bytes = len(zip_bytes(encoded.files))
     evaluation = _evaluate(original, encoded.files, views, threads, clock) if evaluate else None
-    checkpoints = (None if compacted is None else compacted.checkpoint, encoding.checkpoint)
+    checkpoints = (None if compacted is None else compacted.checkpoint, kept)
     if target is not None:
         clock("write", 0.0)
         write_container(encoded.files, target, overwrite=overwrite)
@@ -231,14 +226,6 @@ def compress(
     order = encoded.order if compacted is None else compacted.index[encoded.order]
     left = () if target is not None else tuple(path for path in checkpoints if path is not None)
     return Compressed(encoded.files, order, report, left)
-
-
-def _beside(checkpoint: AnyPath | None) -> Path | None:
-    """Where fine-tuning keeps its state."""
-    if checkpoint is None:
-        return None
-    path = Path(checkpoint)
-    return path.with_name(f"{path.stem}-finetune{path.suffix}")
 
 
 def decompress(

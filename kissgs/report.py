@@ -25,7 +25,7 @@ class Report:
         file_bytes: per file of the container.
         cleaned: what was wrong with the input (:class:`kissgs.splats.Cleaned`).
         compaction: of the scene before it was encoded; None unless it was asked for.
-        finetuning: of the levels after they were chosen; None unless it was asked for.
+        finetuning: of the levels after they were chosen; None unless it was asked for, and there was a Gaussian.
         invisible: Gaussians left out because no renderer would draw them.
         negligible: Gaussians left out because their bytes would cost more than they show.
         tamed_colours: Gaussians whose base colour is such an outlier that it was pulled in, for the others' sake.

@@ -32,6 +32,7 @@ def seek(
     tolerance: float,
     bounds: tuple[float, float],
     grain: float = 0.0,
+    attempts: int = ATTEMPTS,
 ) -> float | None:
     """Where a monotone function is hardly above zero.
 
@@ -45,13 +46,14 @@ def seek(
         tolerance: at most so much above 0 is near enough.
         bounds: attempts stay between these.
         grain: attempts are whole multiples of this; 0 for any number.
+        attempts: how many at most.
 
     Returns:
-        The best attempt that met the goal; None if none did in :data:`ATTEMPTS`, or the function does not go on rising.
+        The best attempt that met the goal; None if none did, or the function does not go on rising.
     """
     known: dict[float, float] = {}
     x = _whole(start, grain)
-    while len(known) < ATTEMPTS and x not in known:
+    while len(known) < attempts and x not in known:
         known[x] = spare(x)
         if 0 <= known[x] <= tolerance or _flat(known, tolerance):
             break

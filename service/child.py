@@ -96,7 +96,7 @@ def _compressed(order: dict[str, Any], send: Send) -> kissgs.Compressed:
     if order["checkpoint"] is not None:  # as seen from here: the report may name it, and is the client's to read
         checkpoint = Path(os.path.relpath(order["checkpoint"], order["work"]))
     while True:
-        kept = [] if checkpoint is None else list(checkpoint.parent.glob(f"{checkpoint.stem}*{checkpoint.suffix}"))
+        kept = [] if checkpoint is None else sorted(checkpoint.parent.glob(f"{checkpoint.stem}*{checkpoint.suffix}"))
         try:
             return kissgs.compress(
                 Path(order["source"]),
@@ -109,9 +109,10 @@ def _compressed(order: dict[str, Any], send: Send) -> kissgs.Compressed:
         except kissgs.OutputError:  # the checkpoint's: nothing else is written yet
             if checkpoint is None:
                 raise
-            for path in kept:
-                path.unlink(missing_ok=True)
-            checkpoint = checkpoint if kept else None
+            if kept:  # the latest work's first: what led to it may be sound
+                kept[0].unlink(missing_ok=True)
+            else:
+                checkpoint = None
 
 
 def _decode(order: dict[str, Any], send: Send) -> dict[str, Any]:

@@ -71,7 +71,7 @@ class Job(Base):
     name: Mapped[str] = mapped_column(String(200))
     state: Mapped[str] = mapped_column(String(16), default=State.QUEUED)
     options: Mapped[dict[str, Any]] = mapped_column(JSON)
-    preset: Mapped[str] = mapped_column(String(16))
+    preset: Mapped[str] = mapped_column(String(40))
     evaluate: Mapped[bool]
     gaussians: Mapped[int] = mapped_column(Integer)
     sh_degree: Mapped[int] = mapped_column(Integer)

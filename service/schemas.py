@@ -40,14 +40,20 @@ class JobOptions(kissgs.Settings):
         return f"{self.preset}{compacted}{tuned}"
 
     @property
-    def trainings(self) -> int:
-        """How often something is to be fitted to pictures of the scene: Gaussians that stay, and levels."""
-        return (self.compact.wanted and self.compact.trains) + self.finetune.wanted
+    def retrains(self) -> bool:
+        """Whether Gaussians that stay are to be fitted to pictures of the scene."""
+        return self.compact.wanted and self.compact.trains
+
+    @property
+    def trains(self) -> bool:
+        """Whether these are, or levels."""
+        return self.retrains or self.finetune.wanted
 
     @property
     def resumable(self) -> bool:
-        """Whether its training can be taken up where it was left: a search for a count, which trains often, cannot."""
-        return self.trainings > 0 and self.compact.max_psnr_drop is None
+        """Whether its training can be taken up where it was left: searches, which train several times, cannot."""
+        tunes_once = self.finetune.wanted and not self.encode.has_goal
+        return self.compact.max_psnr_drop is None and (self.retrains or tunes_once)
 
 
 class Wire(BaseModel):

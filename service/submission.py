@@ -112,7 +112,7 @@ def parse_options(text: str | bytes) -> JobOptions:
         raise ProblemError(
             "invalid-request", f"the options cannot be used: {named}; GET /v1/presets shows all settings", errors=found
         ) from error
-    if options.trainings and not can_train():
+    if options.trains and not can_train():
         raise ProblemError(
             "invalid-request",
             "this service has no torch to train with, so it fine-tunes nothing and compacts with the preset fast only; "
@@ -207,7 +207,11 @@ def _queue(context: Context, submission: Submission, owner: str) -> tuple[Job, b
         upload_bytes=received.size,
         disk_bytes=received.size,
         work_bytes=(
-            checkpoint_bytes(received.info.count, received.info.sh_degree, options.trainings)
+            checkpoint_bytes(
+                *(received.info.count, received.info.sh_degree),
+                compact=options.retrains,
+                finetune=options.finetune.wanted,
+            )
             if options.resumable
             else 0
         ),

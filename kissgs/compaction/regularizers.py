@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from kissgs._typing import Float
-from kissgs.training.loop import Parameters
+from kissgs.training.loop import Learner, Parameters
 
 EPSILON = 1e-7
 """Added to effective rank - 1: the loss of a perfect needle is 16.1."""
@@ -47,5 +47,5 @@ class Shape:
         loss = self._needle_weight * needle_loss(scales).mean()
         return loss + self._flat_weight * scales.amin(dim=1).exp().mean()
 
-    def update(self, step: int, parameters: Parameters) -> None:
+    def update(self, step: int, learner: Learner) -> None:
         """Nothing is remembered."""

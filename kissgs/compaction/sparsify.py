@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kissgs._typing import Float
-from kissgs.training.loop import Parameters
+from kissgs.training.loop import Learner, Parameters
 
 
 class Sparsity:
@@ -35,12 +35,12 @@ class Sparsity:
             return None
         return 0.5 * self._rho * (_sigmoid(parameters["opacities"]) - self.z + self.u).square().sum()
 
-    def update(self, step: int, parameters: Parameters) -> None:
+    def update(self, step: int, learner: Learner) -> None:
         """Sparsify, and move the dual."""
         if (step + 1) % self._interval:
             return
         with torch.no_grad():
-            activated = _sigmoid(parameters["opacities"])
+            activated = _sigmoid(learner.gaussians()["opacities"])
             self.z = sparsest(activated + self.u, self._count)
             self.u += activated - self.z
 

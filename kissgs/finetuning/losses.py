@@ -12,7 +12,7 @@ from kissgs._typing import Float32, Float64, Int
 from kissgs.finetuning.roundtrip import Plane, RoundTrip
 from kissgs.sogxt.order import Grid
 from kissgs.sogxt.rounding import UNUSED
-from kissgs.training.loop import Parameters
+from kissgs.training.loop import Learner, Parameters
 
 COUNTED = ("opacities", "scales", "quaternions", "f_dc")
 """Fields whose bits are told from how many have a level. Positions have nearly as many levels as Gaussians."""
@@ -45,7 +45,7 @@ class CodeLength:
             (coder.bits(latents[name]) for name, coder in self._coders.items()), torch.tensor(0.0)
         )
 
-    def update(self, step: int, parameters: Parameters) -> None:
+    def update(self, step: int, learner: Learner) -> None:
         """Nothing."""
 
     def state(self) -> dict[str, np.ndarray]:
@@ -91,7 +91,7 @@ class Smoothness:
                 total = total + share * (image[self._one] - image[self._other]).abs().mean()
         return weight * total
 
-    def update(self, step: int, parameters: Parameters) -> None:
+    def update(self, step: int, learner: Learner) -> None:
         """Nothing is remembered."""
 
 
@@ -126,14 +126,16 @@ class _Coder:
         self._first = int(np.floor(whole + plane.least.cpu().numpy()).min(initial=0))
         self._symbols = int(np.ceil(whole + plane.most.cpu().numpy()).max(initial=0)) - self._first + 1
         self._kinds, self._channels = int(classes.max(initial=0)) + 1, whole.shape[1]
-        self._rows = (classes[:, None] * self._channels + np.arange(self._channels)) * (self._symbols + 1)
+        rows = (classes[:, None] * self._channels + np.arange(self._channels)) * (self._symbols + 1)
+        self._rows = torch.from_numpy(rows).to(plane.symbols.device)
         self._begun: Float64[Tensor, "M C"] = plane.symbols - self._first
         self.table = np.zeros((self._kinds, self._channels, self._symbols + 1), np.float32)
 
     def count(self, latents: Float32[Tensor, "M C"]) -> None:
         """Set the table by the levels as they are."""
         symbols = np.rint(self._begun.cpu().numpy() + latents.detach().cpu().numpy()).astype(np.int64)
-        counts = np.bincount((self._rows + symbols).reshape(-1), minlength=self.table.size).reshape(self.table.shape)
+        rows = self._rows.cpu().numpy() + symbols
+        counts = np.bincount(rows.reshape(-1), minlength=self.table.size).reshape(self.table.shape)
         likely = counts[:, :, :-1] + UNUSED
         self.table[:, :, :-1] = np.log2(likely.sum(axis=2, keepdims=True)) - np.log2(likely)
         self.table[:, :, -1] = self.table[:, :, -2]
@@ -142,7 +144,7 @@ class _Coder:
         """Of all levels together."""
         place = self._begun + latents
         below = torch.floor(place.detach()).clamp(0, self._symbols - 1)
-        index = torch.from_numpy(self._rows).to(latents.device) + below.long()
+        index = self._rows + below.long()
         table = torch.from_numpy(self.table.reshape(-1)).to(latents.device)
         here, next_ = table[index], table[index + 1]
         return (here + (place - below).float() * (next_ - here)).sum()

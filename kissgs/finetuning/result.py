@@ -14,14 +14,14 @@ class FinetuneReport:
         steps: of training.
         taught_by: what the levels were fitted to: "photos", or "renderings" of the scene as it was.
         source: of the views, for people.
-        psnr_before: decibels, mean over views that were not learned from, to their photographs or, where there are
-            none, to renderings: of the container as it was chosen.
+        psnr_before: decibels, mean over held-out views (over those that were learned from, if none are), to their
+            photographs or, where there are none, to renderings: of the container as it was chosen.
         psnr_after: the same after fine-tuning.
         bytes_before: of the container as it was chosen.
         bytes_after: the same after fine-tuning.
         kept: whether the fine-tuned container is the better one, and is what was written: less squared error than the
             other, once bytes are paid for at the price at which levels were chosen.
-        seconds: wall time, all included.
+        seconds: wall time, judging included; without that of taking the pictures to learn from.
         note: a sentence for people about what they may not have expected, without a capital and a full stop; or none.
     """
 

@@ -32,7 +32,7 @@ from kissgs.sogxt.encode import Encoded
 from kissgs.splats import ATTRIBUTES, Splats, clean
 from kissgs.training.checkpoint import Checkpoint
 from kissgs.training.lessons import Lessons, lessons
-from kissgs.training.loop import Plan, Rates, falling, train
+from kissgs.training.loop import Plan, Rates, falling, threads_of_torch, train
 from kissgs.training.school import School, school
 from kissgs.views.view import Views
 
@@ -98,26 +98,27 @@ class Tuner:
         return cls(original, settings, found, taught, device, threads, progress)
 
     def __call__(
-        self, choice: Choice, sh_degree: int, write: Write, checkpoint: Path | None = None
+        self, choice: Choice, scene: Splats, write: Write, checkpoint: Path | None = None
     ) -> tuple[Encoded, FinetuneReport]:
         """Fine-tune, and keep what is better: the container as it was chosen, or the new one.
 
         Args:
             choice: of at least one Gaussian.
-            sh_degree: of the scene.
+            scene: for which it was made.
             write: makes the files, and tells of it.
             checkpoint: file to keep the state in, every half minute. If there is one of this very work, it is taken up
                 where it was left.
 
         Raises:
-            OutputError: ``checkpoint`` is of other work, or cannot be written.
+            InvalidViewsError: a photograph cannot be read.
+            OutputError: ``checkpoint`` is of other work.
         """
         begun = time.perf_counter()
         at_first = as_stage("finetune", self.progress)
         before = write(choice, 0, at_first)
         first = self._judge(before, at_first)
-        price = choice.price or implied_price(first.between, int(choice.grid.mask.sum()))
-        better, trouble = self._train(choice, sh_degree, price, checkpoint)
+        price = choice.price or implied_price(self._rounding(before, scene, at_first), int(choice.grid.mask.sum()))
+        better, trouble = self._train(choice, scene.sh_degree, price, checkpoint)
         after = write(better, self.settings.steps, self.progress)
         second = self._judge(after, self._at_last)
         cost, new_cost = (told.error + 8 * told.bytes * price for told in (first, second))
@@ -132,7 +133,7 @@ class Tuner:
             bytes_after=second.bytes,
             kept=kept,
             seconds=time.perf_counter() - begun,
-            note="; ".join(filter(None, ["" if kept else NO_HELP, trouble])),
+            note="; ".join(filter(None, [self.school.note, "" if kept else NO_HELP, trouble])),
         )
         return (after if kept else before), report
 
@@ -141,14 +142,22 @@ class Tuner:
 
     def _judge(self, encoded: Encoded, progress: Progress) -> _Mark:
         decoded = decode(encoded.files, max_gaussians=max(len(self.original), MAX_GAUSSIANS), threads=self.threads)
-        compared = evaluate(*(self.original, decoded, self.school.exam), threads=self.threads, progress=progress)
-        pairs = [view.comparison for view in compared.views]
+        compared = evaluate(
+            *(self.original, decoded, self.school.exam), device=self.device, threads=self.threads, progress=progress
+        )
         return _Mark(
             bytes=len(zip_bytes(encoded.files)),
             psnr=compared.mean.candidate.psnr,
-            error=float(np.mean([_squared(pair.candidate.psnr) for pair in pairs])),
-            between=float(np.mean([_squared(pair.between.psnr) for pair in pairs])),
+            error=float(np.mean([_squared(view.comparison.candidate.psnr) for view in compared.views])),
         )
+
+    def _rounding(self, encoded: Encoded, scene: Splats, progress: Progress) -> float:
+        """Squared error by which pictures of a container differ from those of the scene that it was made of."""
+        decoded = decode(encoded.files, max_gaussians=max(len(scene), MAX_GAUSSIANS), threads=self.threads)
+        compared = evaluate(
+            *(scene, decoded, self.school.exam), device=self.device, threads=self.threads, progress=progress
+        )
+        return float(np.mean([_squared(view.comparison.between.psnr) for view in compared.views]))
 
     def _train(self, choice: Choice, sh_degree: int, price: float, path: Path | None) -> tuple[Choice, str]:
         """A better choice, and what went wrong with the checkpoint on the way to it."""
@@ -158,9 +167,7 @@ class Tuner:
         work.hang(choice.costs or self._costs(work), steepness)
         lengths = CodeLength(work, chosen.code_length * price * steepness)
         state = kept.load()
-        if state is None:
-            kept.save(_state(work, lengths, 0))  # if that cannot be, it is better known before the work than after
-        else:
+        if state is not None:
             done = int(state["done"])
             work.restore(state)
             lengths.restore(state)
@@ -191,9 +198,10 @@ class Tuner:
         As if it were proportional to its root, which holds for errors that come on top of those of photographs.
         """
         losses, errors = [], []
-        with torch.no_grad():
+        with torch.no_grad(), threads_of_torch(1):  # its sums depend on them
             shown = work.gaussians()
             for n in islice(self.lessons.order((self.settings.seed,)), min(LOOKS, len(self.lessons))):
+                self.progress("finetune", 0.0)
                 camera = self.lessons.cameras[n]
                 target = torch.from_numpy(self.lessons.picture(n))[None].to(shown["means"].device)
                 image, _ = rasterize(
@@ -216,16 +224,24 @@ class Tuner:
             scene = clean(Splats(**{name: value.cpu().numpy() for name, value in work.gaussians().items()}))[0]
         cameras = self.lessons.cameras[:: max(1, len(self.lessons) // WATCHED)]
         watch = Watch(cameras, [1.0] * len(cameras), self.lessons.background)
-        return Costs.of(measure_importance(scene, watch, hedge=HEDGE, threads=self.threads), scene)
+        progress = as_stage("finetune", self.progress)
+        return Costs.of(measure_importance(scene, watch, hedge=HEDGE, threads=self.threads, progress=progress), scene)
 
     def _key(self, choice: Choice, sh_degree: int) -> str:
         """Of the work: equal only where the result is equal."""
-        told = f"{__version__} {self.device} {sh_degree} {self.settings.model_dump_json()} {choice.price}"
-        key = hashlib.sha256(told.encode())
+        taught = self.lessons
+        told = f"{__version__} {self.device} {sh_degree} {self.settings.model_dump_json()} {choice.price} "
+        key = hashlib.sha256(f"{told}{taught.background}".encode())
         for name, field in choice.fields.items():
-            key.update(name.encode() + field.levels.tobytes() + field.low.tobytes() + field.high.tobytes())
-        key.update(choice.codebook.labels.tobytes())
-        for camera, picture in zip(self.lessons.cameras, self.lessons.pictures, strict=True):
+            key.update(f"{name} {field.top} {field.first} {field.levels.shape}".encode())
+            for array in (field.levels, field.low, field.high, np.asarray(field.spacing)):
+                key.update(array.tobytes())
+        for array in (choice.codebook.labels, choice.classes, choice.grid.mask):
+            key.update(array.tobytes())
+        for name in Costs.__slots__ if choice.costs is not None else ():
+            key.update(getattr(choice.costs, name).tobytes())
+        for camera, picture in zip(taught.cameras, taught.pictures, strict=True):
+            key.update(f"{picture.shape} {picture.dtype}".encode())
             key.update(camera.viewmat.tobytes() + camera.K.tobytes() + picture.tobytes())
         for name in ATTRIBUTES:
             key.update(getattr(self.original, name).tobytes())
@@ -249,12 +265,11 @@ def _state(work: RoundTrip, lengths: CodeLength, done: int) -> dict[str, np.ndar
 
 @dataclass(frozen=True, slots=True)
 class _Mark:
-    """Of one container: bytes of its zip; PSNR and squared error of its pictures; the latter to the original's too."""
+    """Of one container: bytes of its zip; PSNR and squared error of its pictures."""
 
     bytes: int
     psnr: float
     error: float
-    between: float
 
 
 def _squared(psnr: float) -> float:

@@ -158,6 +158,11 @@ class EncodeSettings(BaseModel):
         0, ge=0, lt=2**31, description="Of all random choices. Same input, settings and seed: same bytes."
     )
 
+    @property
+    def has_goal(self) -> bool:
+        """Whether a PSNR or a size is sought."""
+        return self.psnr is not None or self.target_size is not None
+
     @model_validator(mode="after")
     def _only_what_counts(self) -> Self:
         unused = [name for name in UNWEIGHED if self.weigh and getattr(self, name) != _default(name)]

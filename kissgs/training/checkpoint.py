@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 import zipfile
 from collections.abc import Mapping
@@ -79,3 +80,21 @@ class Checkpoint:
         """What it led to is kept elsewhere."""
         if self._path is not None:
             self._path.unlink(missing_ok=True)
+
+
+def forget(*checkpoints: Path | None) -> None:
+    """Delete them, now that what they led to is kept elsewhere."""
+    for path in checkpoints:
+        if path is not None:
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
+
+
+def beside(checkpoint: Path) -> Path:
+    """Where fine-tuning keeps its state if compaction keeps its own in this file.
+
+    Raises:
+        OutputError: it is a folder.
+    """
+    refuse_existing(checkpoint, overwrite=True)
+    return checkpoint.with_name(f"{checkpoint.stem}-finetune{checkpoint.suffix}")

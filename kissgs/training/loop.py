@@ -48,7 +48,7 @@ class Regularizer(Protocol):
     def penalty(self, step: int, parameters: Parameters) -> Tensor | None:
         """To be added to the loss of ``step``; None for nothing."""
 
-    def update(self, step: int, parameters: Parameters) -> None:
+    def update(self, step: int, learner: Learner) -> None:
         """What is to be done after ``step``."""
 
 
@@ -102,7 +102,7 @@ def train(
     """
     cameras = [_as_tensors(camera.viewmat, camera.K, lessons.background) for camera in lessons.cameras]
     order, told = lessons.order(plan.seed, first * plan.batch), Told()
-    with _threads_of_torch(threads):
+    with threads_of_torch(threads):
         for step in range(first, plan.steps):
             progress(plan.stage, step / plan.steps, told.in_words(len(learner)))
             shown = learner.gaussians()
@@ -128,9 +128,8 @@ def train(
                 loss = loss if penalty is None else loss + penalty
             loss.backward()  # type: ignore[no-untyped-call]
             learner.step(plan.rates(step / plan.steps))
-            with torch.no_grad():
-                for regularizer in plan.regularizers:
-                    regularizer.update(step, learner.gaussians())
+            for regularizer in plan.regularizers:
+                regularizer.update(step, learner)
             after(step + 1)
     progress(plan.stage, 1.0, told.in_words(len(learner)))
 
@@ -161,7 +160,7 @@ def _as_tensors(*arrays: object) -> tuple[Tensor, ...]:
 
 
 @contextlib.contextmanager
-def _threads_of_torch(threads: int) -> Iterator[None]:
+def threads_of_torch(threads: int) -> Iterator[None]:
     """For its own loops, the number that the rasteriser has."""
     before = torch.get_num_threads()
     if threads > 0:

@@ -17,6 +17,16 @@ def test_exactly_so_many_are_left_whatever_the_ties(values, count):
     assert all(found[n] == (values[n] if n in order else 0) for n in range(len(values)))
 
 
+class Shown:
+    """A learner with these opacities."""
+
+    def __init__(self, logits):
+        self.logits = logits
+
+    def gaussians(self):
+        return {"opacities": self.logits}
+
+
 def naive(opacity_steps, count, rho, interval):
     """Penalties and the last z, u; ``opacity_steps`` are opacities at each step, before and after it."""
     o = opacity_steps[0]
@@ -49,7 +59,7 @@ def test_it_is_admm(interval):
     for step in range(9):
         penalty = sparsity.penalty(step, {"opacities": torch.tensor(logits[step])})
         penalties.append(0.0 if penalty is None else float(penalty))
-        sparsity.update(step, {"opacities": torch.tensor(logits[step + 1])})
+        sparsity.update(step, Shown(torch.tensor(logits[step + 1])))
     expected, z, u = naive(1 / (1 + np.exp(-logits.astype(np.float64))), 8, 0.01, interval)
     np.testing.assert_allclose(penalties, expected, rtol=1e-5)
     np.testing.assert_allclose(sparsity.z.numpy(), z, atol=1e-5)
@@ -68,10 +78,10 @@ def test_its_state_goes_on():
     logits = torch.randn(20)
     one, other = Sparsity(logits, 5, 0.1, 1), Sparsity(torch.zeros(20), 5, 0.1, 1)
     for step in range(3):
-        one.update(step, {"opacities": logits + step})
+        one.update(step, Shown(logits + step))
     other.restore(one.state())
     for sparsity in (one, other):
-        sparsity.update(3, {"opacities": -logits})
+        sparsity.update(3, Shown(-logits))
     assert torch.equal(one.z, other.z)
     assert torch.equal(one.u, other.u)
 
@@ -85,7 +95,7 @@ def test_threads_change_no_bit():
         leaf = logits.clone().requires_grad_()
         sparsity = Sparsity(leaf, 9000, 1e-3, 1)
         sparsity.penalty(0, {"opacities": leaf}).backward()
-        sparsity.update(0, {"opacities": leaf})
+        sparsity.update(0, Shown(leaf))
         states.append([leaf.grad.numpy(), *sparsity.state().values()])
     torch.set_num_threads(before)
     for other in states[1:]:

@@ -159,14 +159,17 @@ def test_what_must_stay_stays_and_no_level_leaves_its_image():
         for _ in range(5):
             for latents in work.latents.values():
                 latents.grad = torch.full_like(latents, 1e9 * sign)
-            work.step({**dict.fromkeys(FIELDS, 1.0), "spring": 0.0})
+            work.step({**dict.fromkeys(FIELDS, 1e5), "spring": 0.0})
         found = work.choice()
         assert (found.fields["means"].levels[choice.grid.mask][pinned] == 65535).all()
         for name, field in found.fields.items():
             assert field.levels.max() <= field.top, name
-            levels = field.levels.astype(int) + field.first
-            spacing = np.reshape(field.spacing, (-1, 1))
-            assert ((levels % spacing == 0) | (work.planes[name].least.numpy() == 0).all()).any()
+            plane, levels = work.planes[name], work.planes[name].levels(work.latents[name]).detach().numpy()
+            free = (plane.least < plane.most).numpy()
+            multiples = (levels + plane.field.first) / plane.spacing.numpy()
+            assert (multiples[free] == np.rint(multiples[free])).all(), name
+            if sign > 0:
+                assert (work.latents[name] == plane.least).all(), name
 
 
 def test_latents_settle_at_the_level_nearest_to_the_best_value_and_stay_there():
@@ -199,7 +202,7 @@ def test_gradients_that_are_no_numbers_move_nothing():
             latents.grad = torch.full_like(latents, bad)
         work.step({**dict.fromkeys(FIELDS, 0.1), "spring": 1.0})
         assert all(torch.isfinite(latents).all() for latents in work.latents.values())
-        assert bad == np.inf or all((latents == 0).all() for latents in work.latents.values())
+        assert all((latents == 0).all() for latents in work.latents.values())
 
 
 def test_no_bit_depends_on_torchs_threads():

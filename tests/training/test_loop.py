@@ -98,8 +98,8 @@ class Pull:
         self.asked.append(step)
         return parameters["means"].square().sum() if step % 2 else None
 
-    def update(self, step, parameters):
-        self.updated.append((step, float(parameters["means"].detach().square().sum())))
+    def update(self, step, learner):
+        self.updated.append((step, float(learner.gaussians()["means"].detach().square().sum())))
 
 
 def test_regularizers_have_their_say():
