@@ -182,7 +182,7 @@ def test_an_interrupt_inside_a_finalizer_is_not_lost() -> None:
     lines = (
         "import signal, time, weakref; from kissgs import cli",
         "class Thing: pass",
-        "def work():",
+        "def work(words):",
         "    thing = Thing()",
         "    watch = weakref.ref(thing, lambda _: signal.raise_signal(signal.SIGINT))",
         "    del thing",
