@@ -67,7 +67,7 @@ class Settings(BaseModel):
             problem = error.errors()[0]
             group, name = str(problem["loc"][0]), str(problem["loc"][-1])
             if problem["type"] == "extra_forbidden":
-                known = ", ".join(GROUPS[group].model_fields)
+                known = ", ".join(dict.fromkeys([*GROUPS[group].__annotations__, *GROUPS[group].model_fields]))
                 raise UnsupportedError(f"there is no setting {name!r} of {group}; there are {known}") from error
             if problem["type"] == "value_error":
                 raise UnsupportedError(str(problem["ctx"]["error"])) from error
