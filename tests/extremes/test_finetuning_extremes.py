@@ -10,7 +10,7 @@ from kissgs import Settings
 from kissgs.splats import ATTRIBUTES
 from kissgs.views.view import Views, black
 
-QUICK = {"wanted": True, "steps": 40, "rate": 0.1, "view_size": 48}
+QUICK = {"wanted": True, "steps": 25, "rate": 0.1, "view_size": 48}
 
 
 def check(scene, preset="balanced", **changes):
@@ -40,8 +40,7 @@ def test_worlds_of_any_size(size):
     check(changed(scene, means=scene.means * size, scales=scene.scales + np.log(size)))
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("count", [1, 7, 8, 9])
+@pytest.mark.parametrize(("count", "degree"), [(1, 0), (1, 3), (7, 1), (8, 2), (9, 3)])
 def test_few_gaussians_of_any_degree(count, degree):
     result = check(cloud(count, degree, seed=count), steps=5)
     assert len(result.order) <= count
