@@ -10,9 +10,9 @@ A Gaussian with mean m, rotation R, standard deviations s and opacity o is drawn
    none where that is below :data:`ALPHA_MIN`. The box and tiles that renderers put around a footprint leave out only
    pixels where this holds, so they are no part of the picture.
 4. Its colour is max(0, ½ + SH(direction from the camera's centre to m)).
-5. Front to back by depth z' (equal depths in the scene's order): colour += T alpha colour, T *= 1 - alpha. The first
-   one that would take T to :data:`TRANSMITTANCE_MIN` or below is not drawn, nor is anything behind it. What is left of
-   T shows the background.
+5. Front to back by depth z' as a float32 (equal depths in the scene's order): colour += T alpha colour, T *= 1 - alpha.
+   The first one that would take T to :data:`TRANSMITTANCE_MIN` or below is not drawn, nor is anything behind it. What
+   is left of T shows the background.
 
 gsplat up to 1.5.3 has 0.999 for :data:`ALPHA_MAX`; later versions, like the original 3DGS, 0.99.
 """

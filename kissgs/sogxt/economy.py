@@ -164,6 +164,9 @@ UNKNOWN = 9.5
 in these; per unit of hedge. Codebooks hardly follow the pictures once they are hedged, so gloss is not among them."""
 
 
+NEARLY = 1.1
+"""Times the least error that a scene can be left at: the last 0.4 dB would take the last bit of everything."""
+
 KNOWN_GLOSS, UNKNOWN_GLOSS = 0.2, 2.7
 """What is left of errors of gloss once base colours make up for them, and how much more per unit of hedge. Measured."""
 
@@ -180,8 +183,12 @@ def error_at(price: float, costs: Costs, gloss: Gloss, drop: float, ratio: float
 
 
 def price_for(error: float, costs: Costs, gloss: Gloss, drop: float, ratio: float, hedge: float) -> float:
-    """The price at which a scene is left at about this mean squared error."""
+    """The price at which a scene is left at about this mean squared error, or a little more than the least there is.
+
+    The codebook has a largest size, so no price leaves less than its error.
+    """
     low, high = np.log(1e-22), np.log(1e-2)
+    error = max(error, NEARLY * error_at(1e-22, costs, gloss, drop, ratio, hedge))
     for _ in range(60):
         middle = 0.5 * (low + high)
         small = error_at(float(np.exp(middle)), costs, gloss, drop, ratio, hedge) < error

@@ -147,7 +147,7 @@ def write(
         threads: to use; 0 means one per processor. The bytes do not depend on it.
         progress: receives "images".
     """
-    images = _draw(choice)
+    images = draw(choice)
     with blas_workers(threads) as pool:
         files = compress_images(images, settings, pool, _stage(progress, "images"))
     kept, count = len(_candidates(splats, settings)), int(choice.grid.mask.sum())
@@ -187,15 +187,7 @@ def write(
     )
 
 
-def load_kernels(progress: Progress = silent) -> None:
-    """Compile the encoder's kernels, or load them from numba's cache of earlier times."""
-    progress("kernels", 0.0)
-    from kissgs.sogxt import kernels  # noqa: F401
-
-    progress("kernels", 1.0)
-
-
-def _draw(choice: Choice) -> dict[str, UInt8[np.ndarray, "H W C"]]:
+def draw(choice: Choice) -> dict[str, UInt8[np.ndarray, "H W C"]]:
     """The nine images, by file name."""
     fields, grid, codebook = choice.fields, choice.grid, choice.codebook
     means = fields["means"].levels
@@ -210,6 +202,14 @@ def _draw(choice: Choice) -> dict[str, UInt8[np.ndarray, "H W C"]]:
     }
     images = {f"{name}.webp": levels.reshape(grid.side, grid.side, -1) for name, levels in rows.items()}
     return {**images, "f_rest_centroids.webp": codebook.tiles()}
+
+
+def load_kernels(progress: Progress = silent) -> None:
+    """Compile the encoder's kernels, or load them from numba's cache of earlier times."""
+    progress("kernels", 0.0)
+    from kissgs.sogxt import kernels  # noqa: F401
+
+    progress("kernels", 1.0)
 
 
 def _ranges(fields: dict[str, Quantized]) -> dict[str, tuple[list[float], list[float]]]:

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import Protocol
 
+import numpy as np
+
 from kissgs.errors import UnsupportedError
 from kissgs.progress import Progress, silent
 from kissgs.rendering.differentiable import rasterize
@@ -155,8 +157,9 @@ class Told:
         return f"{count:,} Gaussians, loss {self.loss:.4f}, PSNR {psnr:.2f}"
 
 
-def _as_tensors(*arrays: object) -> tuple[Tensor, ...]:
-    return tuple(torch.as_tensor(array, dtype=torch.float32)[None] for array in arrays)
+def _as_tensors(*arrays: np.ndarray) -> tuple[Tensor, ...]:
+    """Of the type they have: the pose of a camera far from the origin is more than float32 can say."""
+    return tuple(torch.as_tensor(array)[None] for array in arrays)
 
 
 @contextlib.contextmanager

@@ -1,6 +1,7 @@
-"""The extremes are tested with the codec's oracle and scenes."""
+"""The extremes are tested with the oracles and scenes of all stages."""
 
 import sys
 from pathlib import Path
 
-sys.path.append(str(Path(__file__).parents[1] / "sogxt"))
+TESTS = Path(__file__).parents[1]
+sys.path += [str(TESTS / name) for name in ("sogxt", "rendering", "web")]

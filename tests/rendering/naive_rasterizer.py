@@ -4,6 +4,7 @@ It shares no code with the renderer under test, and of its formulas only the def
 """
 
 from dataclasses import dataclass
+from decimal import Decimal, localcontext
 
 import numpy as np
 
@@ -30,10 +31,25 @@ def rotation(quat):
     )
 
 
-def sh_values(direction, count):
-    x, y, z = direction
+def inverse(covariance, transform, R, scales):
+    """Of a footprint's covariance; where float64 cannot tell it, from 120 digits of the same formula."""
+    if scales.max() - scales.min() < 7 and scales.max() < 7:
+        return np.linalg.inv(covariance)
+    with localcontext() as context:
+        context.prec = 120
+        exact = np.vectorize(lambda value: Decimal(float(value)), otypes=[object])
+        turned = exact(transform) @ exact(R)
+        squares = np.array([(2 * Decimal(float(scale))).exp() for scale in scales])
+        dilation = Decimal("0.3")
+        a, b, d = ((turned[i] * turned[j] * squares).sum() + dilation * (i == j) for i, j in ((0, 0), (0, 1), (1, 1)))
+        det = a * d - b * b
+        return np.array([[d / det, -b / det], [-b / det, a / det]], np.float64)
+
+
+def harmonics(x, y, z):
+    """The real ones of bands 1 to 3."""
     xx, yy, zz = x * x, y * y, z * z
-    values = [
+    return [
         -0.4886025119029199 * y,
         0.4886025119029199 * z,
         -0.4886025119029199 * x,
@@ -50,7 +66,10 @@ def sh_values(direction, count):
         1.445305721320277 * z * (xx - yy),
         -0.5900435899266435 * x * (xx - 3 * yy),
     ]
-    return np.array(values[:count])
+
+
+def sh_values(direction, count):
+    return np.array(harmonics(*direction)[:count])
 
 
 def draw(params, camera, background, frozen=None, removed=None, alpha_max=0.99):
@@ -66,7 +85,11 @@ def draw(params, camera, background, frozen=None, removed=None, alpha_max=0.99):
     height, width = camera.height, camera.width
     ys, xs = np.mgrid[0:height, 0:width] + 0.5
     in_camera = means @ W.T + t
-    order = [entry[0] for entry in frozen] if frozen is not None else np.argsort(in_camera[:, 2], kind="stable")
+    order = (
+        [entry[0] for entry in frozen]
+        if frozen is not None
+        else np.argsort(in_camera[:, 2].astype(np.float32), kind="stable")
+    )
     image = np.zeros((height, width, 3))
     left = np.ones((height, width))
     ended = np.zeros((height, width), bool)
@@ -84,7 +107,7 @@ def draw(params, camera, background, frozen=None, removed=None, alpha_max=0.99):
         R = rotation(quats[n])
         covariance = R @ np.diag(np.exp(2 * scales[n])) @ R.T
         flat = J @ W @ covariance @ W.T @ J.T + 0.3 * np.eye(2)
-        conic = np.linalg.inv(flat)
+        conic = inverse(flat, J @ W, R, scales[n])
         dx, dy = xs - (fx * x / z + cx), ys - (fy * y / z + cy)
         exponent = 0.5 * (conic[0, 0] * dx * dx + conic[1, 1] * dy * dy) + conic[0, 1] * dx * dy
         raw = opacity * np.exp(-exponent)

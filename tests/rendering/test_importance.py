@@ -77,6 +77,18 @@ def test_forms_are_those_of_the_pictures_derivatives(seed):
         np.testing.assert_allclose(found.shapes[n], wanted, rtol=2e-3, atol=2e-3 * np.abs(wanted).max())
 
 
+@pytest.mark.parametrize("scale", [(30, -30, -30), (15, -3, -15), (30, 30, -30), (9, -3, -3)])
+def test_forms_of_needles_lose_no_digits(scale):
+    """As sums of terms as large as a footprint is long, costs once were off by 26 orders of magnitude."""
+    splats = together(*(one(quat=(1, 0.1 * i, 0.2, 0.5 * i), scale=scale, opacity=1.0) for i in range(-1, 2)))
+    splats, view = clean(splats)[0], camera(25, 19)
+    found = measure_importance(splats, looked_at(view))
+    for n in range(len(splats)):
+        shape, _ = differences(splats, view, n)
+        wanted = (shape @ shape.T / (3 * 25 * 19))[np.triu_indices(7)]
+        np.testing.assert_allclose(found.shapes[n], wanted, rtol=2e-3, atol=2e-3 * np.abs(wanted).max())
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_forms_of_positions_are_those_of_small_gaussians(seed):
     """A move also changes a footprint's shape a little, which is left out: the less, the smaller it is."""

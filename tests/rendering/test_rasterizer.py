@@ -122,6 +122,10 @@ def test_gradients_are_finite_differences(device):
         "around the camera": (blobs(14, 1, spread=1.0), camera(21, 17, distance=0.5)),
         "off screen": (together(one(mean=(30, 0, 0)), one(mean=(0, 1.4, 0), scale=(-1, -1, -1))), camera(21, 17)),
         "needles": (together(one(scale=(1, -9, -9), quat=(1, 2, 3, 4)), one(scale=(-9, 0, -9))), camera(21, 17)),
+        "needles of 1e13": (
+            together(one(scale=(30, -30, -30), quat=(1, 2, 3, 4)), one(scale=(-3, 15, -9))),
+            camera(21, 17),
+        ),
         "transparent": (together(one(opacity=-5.4), one(opacity=-30.0), one(opacity=-6.0)), camera(21, 17)),
         "opaque": (together(one(opacity=9.0), one(mean=(0, 0, 1), scale=(0, 0, 0), opacity=30.0)), camera(21, 17)),
         "black": (together(one(sh0=(-3, 1, -3)), one(mean=(0.1, 0, 1), sh0=(1, -9, 1))), camera(21, 17)),

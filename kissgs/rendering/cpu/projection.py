@@ -131,6 +131,17 @@ def _cholesky(w: Vector, v: Vector, dilation: float) -> tuple[float, float, floa
     return l0, -_dot(w, v) / (vv + dilation) * l0, 1.0 / np.sqrt(2 * (vv + dilation))
 
 
+@_helper
+def _whitened(w: Vector, v: Vector, dilation: float) -> tuple[Vector, Vector]:
+    """The rows of L W, which has no entry above 1/√2: l0 w + l1 v, and l2 v.
+
+    Of a needle, the terms of that sum are as large as it is long and cancel: w (v v) - v (w v) is v × (w × v).
+    """
+    l0, _, l2 = _cholesky(w, v, dilation)
+    scale = l0 / (_dot(v, v) + dilation)
+    return _mix(scale * dilation, w, scale, _cross(v, _cross(w, v))), _scaled(v, (l2, l2, l2))
+
+
 @compiled(
     "int64(float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[::1],"
     " int64, int64, float64[:, ::1], float64[:, ::1], int64, int64, float64[::1],"
@@ -279,16 +290,14 @@ def project_backward(
         w, v = _scaled(_times(p, R), s), _scaled(_times(q, R), s)
         l0, l1, l2 = _cholesky(w, v, dilation)
 
-        # By the centre: -2 Lᵀ (Σ u, Σ v). By the covariance: -2 Lᵀ (Σ uu, Σ uv; Σ uv, Σ vv) L.
+        # By the centre: -2 Lᵀ (Σ u, Σ v). By W: -4 Lᵀ S L W, S = (Σ uu, Σ uv; Σ uv, Σ vv); then by p and q (a scale is
+        # its own derivative by its logarithm).
         by_x, by_y = -2 * l0 * sums[1], -2 * (l1 * sums[1] + l2 * sums[2])
-        by_xx = -2 * l0 * l0 * sums[3]
-        by_xy = -2 * l0 * (l1 * sums[3] + l2 * sums[4])
-        by_yy = -2 * (l1 * (l1 * sums[3] + l2 * sums[4]) + l2 * (l1 * sums[4] + l2 * sums[5]))
-        # By w and v, from the covariance; then by p and q (a scale is its own derivative by its logarithm).
-        by_w, by_v = _mix(2 * by_xx, w, 2 * by_xy, v), _mix(2 * by_xy, w, 2 * by_yy, v)
-        v_scales[n, 0] = by_w[0] * w[0] + by_v[0] * v[0]
-        v_scales[n, 1] = by_w[1] * w[1] + by_v[1] * v[1]
-        v_scales[n, 2] = by_w[2] * w[2] + by_v[2] * v[2]
+        u_rows, v_rows = _whitened(w, v, dilation)
+        spread_u, spread_v = _mix(sums[3], u_rows, sums[4], v_rows), _mix(sums[4], u_rows, sums[5], v_rows)
+        for c in range(3):
+            v_scales[n, c] = -4 * (spread_u[c] * u_rows[c] + spread_v[c] * v_rows[c])
+        by_w, by_v = _mix(-4 * l0, spread_u, 0.0, spread_v), _mix(-4 * l1, spread_u, -4 * l2, spread_v)
         by_w, by_v = _scaled(by_w, s), _scaled(by_v, s)
         by_p, by_q = _applied(R, by_w), _applied(R, by_v)
 

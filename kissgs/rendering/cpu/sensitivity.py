@@ -28,6 +28,7 @@ from kissgs.rendering.cpu.projection import (
     _scaled,
     _times,
     _unit_quat,
+    _whitened,
 )
 from kissgs.rendering.cpu.shading import _harmonics
 
@@ -233,9 +234,9 @@ def add_to_parameters(
         q = _mix(fy / z, turn[1], -fy / z * min(low, max(high, y)), turn[2])
         qw, qx, qy, qz, _ = _unit_quat(quats, n)
         R, s = _rotation(qw, qx, qy, qz), _deviations(scales, n)
-        a, b = _times(p, R), _times(q, R)
-        w, v = _scaled(a, s), _scaled(b, s)
+        w, v = _scaled(_times(p, R), s), _scaled(_times(q, R), s)
         l0, l1, l2 = _cholesky(w, v, dilation)
+        u_rows, v_rows = _whitened(w, v, dilation)
 
         # ln alpha by the position: 2 (u, v) L dc, c being the centre.
         across, down = _mix(fx / z, turn[0], -fx / z * x, turn[2]), _mix(fy / z, turn[1], -fy / z * y, turn[2])
@@ -254,15 +255,13 @@ def add_to_parameters(
         by_shape[0, 0] = 1.0 / (1.0 + np.exp(np.float64(opacities[n])))
         for c in range(6):
             if c < 3:
-                xx, xy, yy = 2 * w[c] * w[c], 2 * w[c] * v[c], 2 * v[c] * v[c]
+                d, e, size = c, c, 2.0
             else:
                 d, e = (c - 2) % 3, (c - 1) % 3  # the two axes that turn about axis c - 3
-                apart = s[d] * s[d] - s[e] * s[e]
-                xx, xy = 2 * a[d] * a[e] * apart, (a[d] * b[e] + a[e] * b[d]) * apart
-                yy = 2 * b[d] * b[e] * apart
-            by_shape[1 + c, 3] = 2 * (l0 * l0 * xx + 2 * l0 * l1 * xy + l1 * l1 * yy)
-            by_shape[1 + c, 4] = 4 * l2 * (l0 * xy + l1 * yy)
-            by_shape[1 + c, 5] = 2 * l2 * l2 * yy
+                size = 2 * (s[d] / s[e] - s[e] / s[d])
+            by_shape[1 + c, 3] = 2 * size * u_rows[d] * u_rows[e]
+            by_shape[1 + c, 4] = 2 * size * (u_rows[d] * v_rows[e] + v_rows[d] * u_rows[e])
+            by_shape[1 + c, 5] = 2 * size * v_rows[d] * v_rows[e]
         for c in range(7):
             for d in range(6):
                 half[c, d] = by_shape[c, 0] * form[0, d]

@@ -1,0 +1,187 @@
+"""Oracle: float64 once more (exact.py, the naive rasteriser, decoder and training): every stage at every extreme."""
+
+import re
+import runpy
+from pathlib import Path
+
+import exact
+import naive_rasterizer
+import numpy as np
+import pytest
+import stages
+import torch
+from extreme_containers import BACKGROUND, BY_NAME, given, scene
+from extremes import BOUNDS, EXTREMES
+from naive_training import adam
+from render_scenes import in_float64
+from stages import STAGES, measured
+
+from kissgs.compaction import regularizers
+from kissgs.splats import ATTRIBUTES
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "numerics.md"
+NAMES = list(BY_NAME)
+HERE = [stage for stage in STAGES if stage != "browser"]
+
+
+@pytest.mark.parametrize("stage", HERE)
+@pytest.mark.parametrize("name", NAMES)
+def test_a_stage_keeps_its_promise(name, stage):
+    assert measured(name, stage) <= BY_NAME[name].bound(stage)
+
+
+def test_the_javascript_decoder_keeps_its_promise():
+    """In one process of Node for all rows."""
+    assert {name: measured(name, "browser") for name in NAMES if measured(name, "browser") > BOUNDS["browser"]} == {}
+
+
+def test_names_are_unique_and_rows_have_bounds_of_stages():
+    assert len(BY_NAME) == len(EXTREMES)
+    assert set(BOUNDS) == set(STAGES)
+    assert all(set(extreme.bounds) <= set(STAGES) for extreme in EXTREMES)
+
+
+UNSEEN = {"transparent", "count-0", "beside"}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_oracles_agree_and_there_is_something_to_see(name):
+    """The picture that torch differentiates is that of the naive rasteriser, and shows what the row is about."""
+    splats, view = scene(name)[0], BY_NAME[name].camera()
+    found = exact.draw(exact.tensors(splats), view, BACKGROUND)
+    naive = naive_rasterizer.draw(in_float64(splats), view, np.array(BACKGROUND))
+    bright = max([1.0, *(layer[3].max() for layer in naive.layers)])
+    sure = found.sure & ~naive.doubtful
+    np.testing.assert_allclose(found.image.numpy()[sure] / bright, naive.image[sure] / bright, atol=1e-9)
+    assert (naive.alpha.max() > 0.1) == (name not in UNSEEN)
+    assert found.ended.any() == (name in ("opaque", "layers"))
+
+
+def test_the_oracles_gradient_is_that_of_differences():
+    splats, view = scene("degree-2")[0], BY_NAME["degree-2"].camera()
+    leaves, rng = exact.tensors(splats, leaf=True), np.random.default_rng(0)
+    v_image, v_alpha = rng.normal(size=(32, 48, 3)), rng.normal(size=(32, 48))
+    found = exact.draw(leaves, view, BACKGROUND)
+    ((found.image * torch.from_numpy(v_image)).sum() + (found.alpha * torch.from_numpy(v_alpha)).sum()).backward()
+    wanted = naive_rasterizer.gradient_by_differences(in_float64(splats), view, np.array(BACKGROUND), v_image, v_alpha)
+    for name in ATTRIBUTES:
+        np.testing.assert_allclose(
+            leaves[name].grad.numpy(), wanted[name], rtol=1e-5, atol=1e-6 * np.abs(wanted[name]).max()
+        )
+
+
+def test_the_oracles_removal_is_a_picture_without():
+    splats, view, background = scene("ordinary")[0], BY_NAME["ordinary"].camera(), np.array(BACKGROUND)
+    params = in_float64(splats)
+    whole = naive_rasterizer.draw(params, view, background).image
+    others = [naive_rasterizer.draw(params, view, background, removed=n).image for n in range(len(splats))]
+    wanted = [np.square(image - whole).sum() for image in others]
+    found = exact.removed(exact.draw(exact.tensors(splats), view, background), len(splats), background)
+    np.testing.assert_allclose(found, wanted, rtol=1e-9)
+
+
+def test_the_oracles_adam_is_that_of_torch():
+    rng = np.random.default_rng(0)
+    leaf = torch.from_numpy(rng.normal(size=9)).requires_grad_()
+    mine, moments = leaf.detach().clone(), (torch.zeros(9).double(), torch.zeros(9).double())
+    theirs = torch.optim.Adam([leaf], lr=0.1, eps=1e-15)
+    for step in range(1, 6):
+        leaf.grad = torch.from_numpy(rng.normal(size=9))
+        mine = adam(mine, leaf.grad, moments, step, 0.1)
+        theirs.step()
+    torch.testing.assert_close(mine, leaf.detach(), rtol=1e-12, atol=0)
+
+
+# The table can fail: what was once wrong, or could be, is noticed at the rows that are about it.
+
+
+@pytest.fixture
+def anew():
+    """Nothing is remembered of what was measured before, nor after."""
+    for function in (given, scene):
+        function.cache_clear()
+    yield
+    for function in (given, scene):
+        function.cache_clear()
+
+
+def broken(stage):
+    """Rows whose promise a stage breaks."""
+    return {name for name, extreme in BY_NAME.items() if not STAGES[stage](name) <= extreme.bound(stage)}
+
+
+@pytest.mark.usefixtures("anew")
+def test_a_lost_limit_of_positions_is_noticed(monkeypatch):
+    monkeypatch.setattr("kissgs.splats.MEAN_LIMIT", 3e38)
+    assert broken("clean") == {"beyond-1e15"}
+
+
+@pytest.mark.usefixtures("anew")
+def test_rotations_normalised_in_float32_are_noticed(monkeypatch):
+    def hasty(quats):
+        with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+            norm = np.sqrt((quats * quats).sum(axis=1))
+            unit = np.where(norm[:, None] > 0, quats / np.where(norm > 0, norm, 1)[:, None], np.float32([1, 0, 0, 0]))
+        return unit, int((norm == 0).sum()), int(((norm > 0) & (np.abs(norm - 1) > 1e-3)).sum())
+
+    monkeypatch.setattr("kissgs.splats._unit_quats", hasty)
+    assert broken("clean") == {"short-quaternions", "long-quaternions", "denormal"}
+
+
+def test_effective_rank_by_the_book_is_noticed(monkeypatch):
+    """As the paper writes it, from squares of float32."""
+
+    def by_the_book(scales):
+        squares = (2 * scales).exp()
+        share = squares / squares.sum(dim=1, keepdim=True)
+        entropy = -(share * share.log()).sum(dim=1)
+        return (-torch.log(entropy.exp() - 1 + regularizers.EPSILON)).clamp_min(0)
+
+    monkeypatch.setattr(stages, "needle_loss", by_the_book)
+    assert broken("rank") >= {"needles", "cauchy"}
+
+
+# The page
+
+
+def table():
+    """Of the page: row -> column -> text."""
+    text = PAGE.read_text(encoding="utf-8").partition("<!-- measured -->")[2].partition("<!-- end -->")[0]
+    head, _, *rows = [[cell.strip() for cell in line[1:-1].split(" | ")] for line in text.strip().splitlines()]
+    return {row[0].strip("` "): dict(zip(head, row, strict=True)) for row in rows}
+
+
+def test_the_page_has_every_row_and_column_within_what_is_promised():
+    found = table()
+    assert list(found) == ["", *NAMES]
+    for name, cells in found.items():
+        assert [head for head in cells if head in STAGES] == list(STAGES), "run: python docs/numerics.py"
+        for stage in STAGES:
+            bound = BY_NAME[name].bound(stage) if name else BOUNDS[stage]
+            figure, _, own = cells[stage].partition("≤ ")
+            assert not name or float(figure) <= bound, f"{name}, {stage}"
+            assert float(own or BOUNDS[stage]) == bound, f"{name}, {stage}"
+        if name:
+            assert (cells["given"], cells["promise"]) == (BY_NAME[name].given, BY_NAME[name].promise)
+
+
+def test_the_page_is_what_the_command_writes():
+    """Given its own figures, which are those of the machine that measured them last."""
+    write, cells = runpy.run_path(str(ROOT / "docs" / "numerics.py"))["table"], table()
+    text = PAGE.read_text(encoding="utf-8").partition("<!-- measured -->\n")[2].partition("<!-- end -->")[0]
+    assert write(lambda name, stage: float(cells[name][stage].partition(" ≤")[0])) == text
+
+
+def test_every_promise_of_the_page_names_a_test_that_exists():
+    """The last cell of each row of the other tables: `file::test`, several with commas."""
+    text = PAGE.read_text(encoding="utf-8")
+    rows = [line for line in text.partition("<!-- end -->")[2].splitlines() if line.startswith("|")]
+    rows = [row for row in rows if not row.endswith("| test |") and not re.match(r"\|[-|]+\|$", row)]
+    assert len(rows) > 20
+    for row in rows:
+        named = re.findall(r"`(\w+)::(\w+)`", row.rsplit(" | ", 1)[1])
+        assert named, row
+        for module, function in named:
+            (file,) = (ROOT / "tests").glob(f"**/{module}.py")
+            assert f"def {function}(" in file.read_text(encoding="utf-8"), f"{module}::{function}"

@@ -1,0 +1,131 @@
+"""What docs/numerics.md promises beside the table; oracle: the numbers that stand there."""
+
+import numpy as np
+import pytest
+import torch
+from codec_scenes import GLANCE, random_scene, replaced
+from render_scenes import blobs, camera, one, together
+from test_rasterizer import pictures
+from training_scenes import cloud
+
+import kissgs
+from kissgs import Settings
+from kissgs.importance import LARGEST, OPACITY, ROTATION, SCALES, Importance
+from kissgs.parallel import Workers
+from kissgs.rendering.camera import look_at
+from kissgs.rendering.cpu.frame import draw
+from kissgs.rendering.importance import Watch, _bound, measure_importance
+from kissgs.sogxt.encode import encode
+from kissgs.splats import ATTRIBUTES
+from kissgs.training.leaves import Leaves
+from kissgs.training.trainee import BOUNDS, Trainee
+from kissgs.views.view import black
+
+
+def compressed(splats, preset="fast"):
+    return kissgs.compress(splats, settings=Settings.from_preset(preset, **GLANCE))
+
+
+def test_steps_of_a_world_1e6_across():
+    """ln(1 + 5e5) on either side, in 65535 steps."""
+    means = np.random.default_rng(0).uniform(-5e5, 5e5, (300, 3))
+    means[:2] = [[5e5] * 3, [-5e5] * 3]
+    steps = 2 * np.array(compressed(replaced(random_scene(300), means=means)).report.half_steps["means"])
+    assert steps == pytest.approx(4e-4, rel=0.01)
+
+
+def test_what_no_picture_shows_has_the_steps_of_the_settings():
+    scene, settings = kissgs.clean(random_scene(200, 1))[0], Settings.from_preset("balanced").encode
+    unseen = encode(scene, settings, importance=Importance.none(200, 1))
+    assert unseen.price is None
+    assert unseen.files == encode(scene, settings).files
+
+
+def test_details_of_a_tiny_scene_are_kept_by_fast_alone():
+    """All of 300 Gaussians, and shapes as in a scene of common size; pictures taken from 0.01 away show fewer."""
+    scene = cloud(300)
+    tiny = replaced(scene, means=scene.means * 1e-4, scales=scene.scales + np.log(1e-4))
+    for preset, worse in (("fast", False), ("balanced", True)):
+        common, small = compressed(scene, preset).report, compressed(tiny, preset).report
+        assert max(small.half_steps["means"]) < 1e-2 * 1e-4
+        assert (max(small.half_steps["scales"]) > 1.2 * max(common.half_steps["scales"])) == worse
+        assert (small.count < common.count - 5) == worse
+
+
+def test_costs_are_cut_off():
+    """By hand, as no scene of today's has costs that overflow; and of giants, as they come."""
+    forms = np.zeros((3, 28), np.float32)
+    forms[0], forms[1, OPACITY[0]], forms[2, SCALES[0]] = 3e38, np.nan, 7
+    _bound(forms, OPACITY + SCALES + ROTATION)
+    assert np.isfinite(forms).all()
+    assert forms.max() == np.float32(LARGEST)
+    assert forms[1, OPACITY[0]] == np.float32(LARGEST)
+    assert (forms[2] == np.eye(28)[SCALES[0]] * 7).all()
+    for size in (-30, 30):
+        giants = replaced(cloud(20), scales=np.full((20, 3), size))
+        found = measure_importance(giants, Watch([camera()], [1.0], black()), hedge=0.3)
+        assert all(
+            0 <= np.abs(values).max() <= np.float32(LARGEST) for values in (found.places, found.shapes, found.colors)
+        )
+
+
+def test_gradients_above_1e15_count_as_that():
+    leaves = Leaves({"a": torch.zeros(4, 1)})
+    leaves.by_name["a"].grad = torch.tensor([[1e30], [1e15], [-np.inf], [-3e38]])
+    leaves.step({"a": 1.0})
+    assert leaves.state()["a.exp_avg"].ravel() / 1e14 == pytest.approx([1, 1, 0, -1])
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_values_stay_within_what_a_scene_can_hold(sign):
+    trainee = Trainee(cloud(5))
+    for _ in range(3):
+        for leaf in trainee.parameters.values():
+            leaf.grad = torch.full_like(leaf, -sign)
+        trainee.step(dict.fromkeys(ATTRIBUTES, 1e16))
+    for name, (least, most) in BOUNDS.items():
+        assert (trainee.parameters[name].detach().numpy() == np.float32(most if sign > 0 else least)).all(), name
+    assert len(trainee.splats()) == 5
+
+
+@pytest.mark.parametrize("length", [1e-38, 0.9e-12, 1.1e-12, 1e-6, 1e6, 1e18])
+def test_rotations_of_any_length_in_pictures(length):
+    """Handed to the rasteriser as they are. No rotation is that of 1, 0, 0, 0."""
+    unit = np.array([0.5, -0.5, 0.1, 0.7]) / 1.0
+    unit /= np.linalg.norm(unit)
+    shape = {"scale": (0, -1, -3), "opacity": 1.0}
+    found, _, tensors = pictures(one(quat=unit * length, **shape), [camera()])
+    wanted, _, _ = pictures(one(quat=unit if length > 1e-12 else (1, 0, 0, 0), **shape), [camera()])
+    torch.testing.assert_close(found, wanted, atol=2e-6, rtol=0)
+    found.sum().backward()
+    assert bool(tensors["quats"].grad.any()) == (length > 1e-12)
+
+
+def test_what_is_nearer_than_the_near_plane_has_no_part_in_it():
+    view = camera()
+    ahead = [(depth, one(mean=view.position + depth * view.viewmat[2, :3])) for depth in (-1, 0, 0.0099, 0.0101, 1)]
+    for depth, splats in ahead:
+        images, alphas, tensors = pictures(together(splats, blobs(3, 0)), [view])
+        (images.sum() + alphas.sum()).backward()
+        assert any(bool(tensor.grad[0].any()) for tensor in tensors.values()) == (depth > 0.01), depth
+    with_it, _, _ = pictures(together(ahead[2][1], blobs(3, 0)), [view])
+    without, _, _ = pictures(blobs(3, 0), [view])
+    assert torch.equal(with_it, without)
+
+
+@pytest.mark.parametrize("size", [1e-6, 1, 1e6])
+def test_centres_of_footprints_are_right_to_a_ten_thousandth_of_a_pixel(size):
+    distance = max(3 * size, 0.02)
+    place = np.array([0.2, -0.3, -1]) / np.linalg.norm([0.2, -0.3, -1]) * distance
+    fov = 2 * np.arctan(size / distance)
+    view = look_at(place, np.zeros(3), np.array([0.0, -1, 0]), fov=fov, width=1600, height=1200)
+    means = np.random.default_rng(0).uniform(-0.7, 0.7, (500, 3)) * size
+    scene = replaced(
+        blobs(500), means=means, scales=np.full((500, 3), np.log(size * 1e-3)), opacities=np.full(500, 2.0)
+    )
+    with Workers(1) as pool:
+        prints = draw(scene, view, np.zeros(3), pool).footprints
+    there = scene.means[prints.visible].astype(np.float64) @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+    wanted = (there / there[:, 2:]) @ view.K.T
+    assert len(wanted) > 300
+    assert np.abs(prints.records[:, :2] - wanted[:, :2]).max() < 1e-4
