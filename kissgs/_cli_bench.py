@@ -2,22 +2,35 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from kissgs._cli_files import expand, print_json, show
 from kissgs._cli_pictures import ImagesOption, ResolutionOption, ScaleOption, ViewsOption, open_views
-from kissgs._cli_settings import chosen
+from kissgs._cli_study import Asked
 from kissgs.errors import UnsupportedError
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
+    from collections.abc import Mapping
 
-    from kissgs.compaction.study import Point
-    from kissgs.curves import RatePoint
-    from kissgs.views.view import Views
+GOES_WITH = {
+    "--preset": ("", "--ablate", "--compaction", "--finetuning"),
+    "--set": ("", "--ablate", "--compaction", "--finetuning"),
+    "--peer": ("",),
+    "--sog-iterations": ("",),
+    "--repeats": ("",),
+    "--pictures": ("",),
+    "--fidelity": ("", "--finetuning"),
+    "--ratio": ("--compaction", "--finetuning"),
+    "--way": ("--compaction",),
+    "--learn-from": ("--compaction", "--finetuning"),
+    "--plot": ("", "--compaction", "--finetuning"),
+    "--gaussians": ("", "--rendering"),
+}
+"""Options that not all measurements have; "" is the one that none of the others asks for."""
 
 ThreadsOption = Annotated[int, typer.Option(min=0, help="0: one per processor.")]
 
@@ -35,7 +48,16 @@ def bench(
     sog_iterations: Annotated[
         int | None, typer.Option(min=1, help="Of .sog's SH k-means: without a GPU each takes minutes.")
     ] = None,
-    pictures: Annotated[bool, typer.Option("--pictures", help="Compare pictures too; implied by --views.")] = False,
+    repeats: Annotated[
+        int, typer.Option(min=1, max=1000, help="Measure each preset so often: medians of times, the most of memory.")
+    ] = 1,
+    pictures: Annotated[
+        bool, typer.Option("--pictures", help="Compare pictures too; implied by --views, --fidelity and --plot.")
+    ] = False,
+    ablate: Annotated[
+        bool,
+        typer.Option("--ablate", help="Measure what each part of paper and balanced is worth instead: leave one out."),
+    ] = False,
     rendering: Annotated[
         bool, typer.Option("--rendering", help="Measure the rasteriser instead: pictures, gradients, loss, scores.")
     ] = False,
@@ -49,11 +71,21 @@ def bench(
     ] = False,
     fidelities: Annotated[
         list[float] | None,
-        typer.Option("--fidelity", min=-30, max=30, help="With --finetuning: at this one. Repeat for several."),
+        typer.Option(
+            "--fidelity",
+            min=-30,
+            max=30,
+            help="Measure balanced, or the presets that are named, at this one too. Repeat for a curve.",
+        ),
     ] = None,
     ratios: Annotated[
         list[float] | None,
-        typer.Option("--ratio", min=0, max=1, help="With --compaction: keep this share. Repeat for several."),
+        typer.Option(
+            "--ratio",
+            min=0,
+            max=1,
+            help="With --compaction, --finetuning: keep this share. Repeat for several.",
+        ),
     ] = None,
     ways: Annotated[
         list[str] | None, typer.Option("--way", help="With --compaction: only this way. Repeat for several.")
@@ -62,17 +94,17 @@ def bench(
         str,
         typer.Option(
             metavar="WHAT",
-            help="With these two: from the [bold]photos[/] of --views, from its [bold]cameras[/] alone, or from the "
-            "[bold]scene[/] alone. --views judges in any case.",
+            help="With --compaction and --finetuning: from the [bold]photos[/] of --views, from its [bold]cameras[/] "
+            "alone, or from the [bold]scene[/] alone. --views judges in any case.",
         ),
     ] = "photos",
     plot: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="With these two: PSNR over count or bytes, as .svg, .png or .pdf."),
+        typer.Option(metavar="FILE", help="Draw what was measured of one scene, as .svg, .png or .pdf."),
     ] = None,
     gaussians: Annotated[
         list[int] | None,
-        typer.Option(min=1, help="With --rendering: resample the scene to so many. Repeat for several."),
+        typer.Option(min=1, help="Resample the scene to so many, to see how times grow. Repeat for several."),
     ] = None,
     views: ViewsOption = None,
     scale: ScaleOption = None,
@@ -82,111 +114,87 @@ def bench(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Measure bytes, time, memory and errors of presets and of other tools, each in a process of its own."""
+    studies = {"--ablate": ablate, "--compaction": compaction, "--finetuning": finetuning, "--rendering": rendering}
+    given = {
+        "--preset": presets,
+        "--set": changes,
+        "--peer": peers,
+        "--sog-iterations": sog_iterations,
+        "--repeats": repeats > 1,
+        "--pictures": pictures,
+        "--fidelity": fidelities,
+        "--ratio": ratios,
+        "--way": ways,
+        "--learn-from": learn_from != "photos",
+        "--plot": plot,
+        "--gaussians": gaussians,
+    }
+    study = _only_one([name for name, wanted in studies.items() if wanted])
+    _check_options(study, given)
+    if study in ("--compaction", "--finetuning") and len(presets or []) > 1:
+        raise UnsupportedError(f"{study} goes with one --preset")
     capture = open_views(views, scale=scale, images=images, resolution=resolution)
-    rows: list[dict[str, Any]]
-    table: RenderableType
-    curves: list[tuple[str, Point]] = []
-    drawn: list[tuple[str, RatePoint]] = []
-    if not compaction and (ratios or ways):
-        raise UnsupportedError("--ratio and --way go with --compaction")
-    if not finetuning and fidelities:
-        raise UnsupportedError("--fidelity goes with --finetuning; for a preset, --set fidelity=…")
-    if not (compaction or finetuning) and (plot or learn_from != "photos"):
-        raise UnsupportedError("--learn-from and --plot go with --compaction or --finetuning")
-    if (compaction or finetuning) and (rendering or peers or gaussians or len(presets or []) > 1):
-        what = "--compaction" if compaction else "--finetuning"
-        raise UnsupportedError(f"{what} goes with one --preset, and with nothing else that is measured")
-    preset = (presets or ["balanced"])[0]
-    if compaction and finetuning:
-        raise UnsupportedError("--compaction and --finetuning are two measurements; make one after the other")
-    if finetuning:
-        from kissgs._cli_curves import finetuning_curves, finetuning_table
+    asked = Asked(
+        scenes=expand(scenes),
+        presets=presets or [],
+        changes=changes,
+        peers=peers or [],
+        splat_transform=splat_transform,
+        sog_iterations=sog_iterations,
+        repeats=repeats,
+        pictures=pictures,
+        fidelities=fidelities or [],
+        ratios=ratios or [],
+        ways=ways or [],
+        learn_from=learn_from,
+        plot=plot,
+        gaussians=gaussians or [],
+        views=capture,
+        threads=threads,
+    )
+    _measure(study, asked, as_json)
 
-        drawn = finetuning_curves(expand(scenes), preset, changes, fidelities, plot, capture, learn_from, threads)
-        rows = [{"scene": scene, **point.as_dict()} for scene, point in drawn]
-        table = finetuning_table(drawn)
-    elif compaction:
-        from kissgs._cli_curves import compaction_curves, curves_table
 
-        curves = compaction_curves(expand(scenes), preset, changes, ratios, ways, plot, capture, learn_from, threads)
-        rows = [{"scene": scene, **point.as_dict()} for scene, point in curves]
-        table = curves_table(curves)
-    elif rendering:
-        if presets or peers:
-            raise UnsupportedError("--rendering measures the rasteriser, no presets and no peers")
-        rows, table = _rendering(expand(scenes), gaussians, capture, threads)
-    else:
-        if gaussians:
-            raise UnsupportedError("--gaussians goes with --rendering; to compress, make a scene: kissgs sample")
-        compared = pictures or capture is not None
-        peer_options = {"command": splat_transform, "sh_iterations": sog_iterations}
-        rows, table = _compression(
-            expand(scenes), presets, changes, peers or [], peer_options, compared, capture, threads
-        )
+def _measure(study: str, asked: Asked, as_json: bool) -> None:
+    from kissgs import _cli_compare, _cli_curves
+
+    if asked.plot is not None:  # before the work that it is to show
+        from kissgs._plots import check_plot
+
+        if len(asked.scenes) > 1:
+            raise UnsupportedError("--plot draws one scene; name one")
+        check_plot(asked.plot)
+    measure = {
+        "": _cli_compare.comparison,
+        "--ablate": _cli_compare.ablation,
+        "--compaction": _cli_curves.compaction,
+        "--finetuning": _cli_curves.finetuning,
+        "--rendering": _cli_compare.rendering,
+    }[study]
+    outcome = measure(asked)
     if as_json:
-        print_json(rows)
+        print_json(outcome.rows)
     else:
-        show(table)
-    if plot is not None:  # last: what it shows has taken long to find
-        from kissgs._plots import compaction_plot, finetuning_plot
-
-        if finetuning:
-            finetuning_plot([point for _, point in drawn], plot)
-        else:
-            compaction_plot([point for _, point in curves], plot)
-
-
-def _compression(
-    scenes: list[str],
-    presets: list[str] | None,
-    changes: list[str] | None,
-    peers: list[str],
-    peer_options: dict[str, Any],
-    pictures: bool,
-    views: Views | None,
-    threads: int,
-) -> tuple[list[dict[str, Any]], RenderableType]:
-    import shlex
-
-    from kissgs._tables import bench_table
-    from kissgs.bench import isolated_roundtrip
-    from kissgs.evaluation.peers import measure_peer
-    from kissgs.settings import Preset
-
-    all_settings = [chosen(name, changes) for name in presets or list(Preset)]
-    command, iterations = shlex.split(peer_options["command"]), peer_options["sh_iterations"]
-    rows: list[tuple[str, str, Any]] = []
-    for scene in expand(scenes):
-        path = Path(scene)
-        for settings in all_settings:
-            result = isolated_roundtrip(path, settings, pictures=pictures, views=views, threads=threads)
-            rows.append((path.name, str(settings.preset), result))
-        for peer in peers:
-            peer_iterations = iterations if peer == "sog" else None
-            other = measure_peer(
-                path, peer, command=command, sh_iterations=peer_iterations, pictures=pictures, views=views
-            )
-            rows.append((path.name, peer, other))
-    numbers = [{"scene": scene, "encoder": name, **result.as_dict()} for scene, name, result in rows]
-    return numbers, bench_table(rows)
+        show(outcome.table)
+    if asked.plot is not None and outcome.draw is not None:  # last: what it shows has taken long to find
+        outcome.draw(asked.plot)
+    for failure in outcome.failures:
+        sys.stderr.write(f"kissgs: {failure}\n")
+    if outcome.failures:
+        raise typer.Exit(2)
 
 
-def _rendering(
-    scenes: list[str], counts: list[int] | None, views: Views | None, threads: int
-) -> tuple[list[dict[str, Any]], RenderableType]:
-    from kissgs._console import progress_bar
-    from kissgs._picture_tables import rendering_table
-    from kissgs.evaluation.speed import rendering_cost, resampled
-    from kissgs.scenes import load
-    from kissgs.views.virtual import virtual_views
+def _only_one(studies: list[str]) -> str:
+    if len(studies) > 1:
+        raise UnsupportedError(f"{' and '.join(studies)} are several measurements; make one after the other")
+    return studies[0] if studies else ""
 
-    rows = []
-    with progress_bar(False) as progress:
-        for scene in scenes:
-            splats = load(scene, threads=threads, progress=progress)
-            chosen = views or virtual_views(splats, threads=threads, progress=progress)
-            cameras = [view.camera for view in chosen.test or chosen.train]
-            for count in counts or [len(splats)]:
-                cost = rendering_cost(resampled(splats, count), cameras, threads=threads, progress=progress)
-                rows.append((Path(scene).name, cost))
-    return [{"scene": scene, **cost.as_dict()} for scene, cost in rows], rendering_table(rows)
+
+def _check_options(study: str, given: Mapping[str, object]) -> None:
+    """Whether all that is given means something to this measurement."""
+    if study == "--rendering" and (given["--preset"] or given["--peer"]):
+        raise UnsupportedError("--rendering measures the rasteriser, no presets and no peers")
+    for option, value in given.items():
+        if value and study not in GOES_WITH[option]:
+            others = " or ".join(filter(None, GOES_WITH[option]))
+            raise UnsupportedError(f"{option} does not go with {study}" if study else f"{option} goes with {others}")

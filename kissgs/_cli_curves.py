@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -11,6 +12,7 @@ from rich.text import Text
 
 from kissgs._cli_pictures import choice
 from kissgs._cli_settings import chosen
+from kissgs._cli_study import Asked, Outcome
 from kissgs._console import progress_bar
 from kissgs.errors import UnsupportedError
 from kissgs.evaluation.likeness import spell
@@ -20,61 +22,49 @@ if TYPE_CHECKING:
 
     from kissgs.compaction.study import Point
     from kissgs.curves import RatePoint
-    from kissgs.views.view import Source, Views
+    from kissgs.views.view import Source
 
 
-def compaction_curves(
-    scenes: list[str],
-    preset: str,
-    changes: list[str] | None,
-    ratios: list[float] | None,
-    names: list[str] | None,
-    plot: Path | None,
-    views: Views | None,
-    learn_from: str,
-    threads: int,
-) -> list[tuple[str, Point]]:
-    """All ways on all scenes. That ``plot`` can be drawn is seen to before; it is drawn when all else is told."""
+def compaction(asked: Asked) -> Outcome:
+    """All ways to have fewer Gaussians on all scenes."""
+    from kissgs._plots import compaction_plot
     from kissgs.compaction.study import RATIOS, WAYS, study
     from kissgs.scenes import load
 
     known = {way.name: way for way in WAYS}
-    for name in names or []:
+    for name in asked.ways:
         if name not in known:
             raise UnsupportedError(f"there is no way {name!r}; there are: {'; '.join(known)}")
-    if 0 in (ratios or ()):
-        raise UnsupportedError("--ratio 0 keeps nothing; give a share above 0")
-    source = _checked(scenes, plot, views, learn_from)
-    settings = chosen(preset, changes, group="compact").compact
+    source = _teacher(asked)
+    settings = chosen(asked.preset, asked.changes, group="compact").compact
     rows: list[tuple[str, Point]] = []
     with progress_bar(False) as progress:
-        for scene in scenes:
+        for scene in asked.scenes:
             found = study(
-                load(scene, threads=threads, progress=progress),
-                settings,
-                views,
-                ratios=ratios or RATIOS,
-                ways=[known[name] for name in names or known],
+                *(load(scene, threads=asked.threads, progress=progress), settings, asked.views),
+                ratios=asked.ratios or RATIOS,
+                ways=[known[name] for name in asked.ways or known],
                 learn_from=source,
-                threads=threads,
+                threads=asked.threads,
                 progress=progress,
             )
             rows += [(Path(scene).name, point) for point in found]
-    return rows
+    return Outcome(
+        rows=[{"scene": scene, **point.as_dict()} for scene, point in rows],
+        table=curves_table(rows),
+        draw=partial(compaction_plot, [point for _, point in rows]),
+    )
 
 
-def _checked(scenes: list[str], plot: Path | None, views: Views | None, learn_from: str) -> Source:
-    """What to learn from, once it is known that it can be, and that a plot can be drawn."""
-    from kissgs._plots import check_plot
+def _teacher(asked: Asked) -> Source:
+    """What to learn from, once it is known that it can be, and that something will be left to teach."""
     from kissgs.views.view import Source
 
-    source = cast(Source, choice("--learn-from", learn_from, Source))
-    if views is None and source == "cameras":
+    if 0 in asked.ratios:
+        raise UnsupportedError("--ratio 0 keeps nothing; give a share above 0")
+    source = cast(Source, choice("--learn-from", asked.learn_from, Source))
+    if asked.views is None and source == "cameras":
         raise UnsupportedError("--learn-from cameras: say whose with --views")
-    if plot is not None:
-        if len(scenes) > 1:
-            raise UnsupportedError("--plot draws one scene; name one")
-        check_plot(plot)
     return source
 
 
@@ -88,41 +78,38 @@ def curves_table(rows: list[tuple[str, Point]]) -> Table:
     return table
 
 
-def finetuning_curves(
-    scenes: list[str],
-    preset: str,
-    changes: list[str] | None,
-    fidelities: list[float] | None,
-    plot: Path | None,
-    views: Views | None,
-    learn_from: str,
-    threads: int,
-) -> list[tuple[str, RatePoint]]:
+def finetuning(asked: Asked) -> Outcome:
     """With fine-tuning and without, at all fidelities on all scenes."""
-    from kissgs.curves import FIDELITIES, rate_curves
+    from kissgs._plots import finetuning_plot
+    from kissgs.curves import rate_curves
     from kissgs.scenes import load
 
-    source = _checked(scenes, plot, views, learn_from)
-    settings = chosen(preset, changes, group="finetune")
+    source = _teacher(asked)
+    settings = chosen(asked.preset, asked.changes, group="finetune")
     rows: list[tuple[str, RatePoint]] = []
     with progress_bar(False) as progress:
-        for scene in scenes:
+        for scene in asked.scenes:
             found = rate_curves(
-                *(load(scene, threads=threads, progress=progress), settings, views),
-                fidelities=fidelities or FIDELITIES,
+                *(load(scene, threads=asked.threads, progress=progress), settings, asked.views),
+                fidelities=asked.fidelities or None,
+                ratios=asked.ratios,
                 learn_from=source,
-                threads=threads,
+                threads=asked.threads,
                 progress=progress,
             )
             rows += [(Path(scene).name, point) for point in found]
-    return rows
+    return Outcome(
+        rows=[{"scene": scene, **point.as_dict()} for scene, point in rows],
+        table=finetuning_table(rows),
+        draw=partial(finetuning_plot, [point for _, point in rows]),
+    )
 
 
 def finetuning_table(rows: list[tuple[str, RatePoint]]) -> RenderableType:
     """For people."""
     from kissgs.curves import saved
 
-    names = ("fidelity", "bytes", "PSNR", "SSIM", "to the scene", "seconds", "CPU s", "MB")
+    names = ("Gaussians", "fidelity", "bytes", "PSNR", "SSIM", "to the scene", "seconds", "CPU s", "MB")
     table = Table("scene", "way", *(Column(name, justify="right") for name in names), box=None, pad_edge=False)
     lines = []
     for scene in dict.fromkeys(name for name, _ in rows):
@@ -130,7 +117,9 @@ def finetuning_table(rows: list[tuple[str, RatePoint]]) -> RenderableType:
         for point in points:
             quality = spell(point.psnr, 2), spell(point.ssim, 4), spell(point.between, 2)
             took = f"{point.seconds:.1f}", f"{point.cpu_seconds:.1f}", f"{point.peak_memory / 1e6:.0f}"
-            table.add_row(scene, point.way, f"{point.fidelity:g}", f"{point.bytes:,}", *quality, *took)
+            table.add_row(
+                scene, point.way, f"{point.count:,}", f"{point.fidelity:g}", f"{point.bytes:,}", *quality, *took
+            )
         kinds = {"PSNR": "psnr", "SSIM": "ssim", "PSNR to the scene's own pictures": "between"}
         if all(point.psnr == point.between for point in points):
             kinds.pop("PSNR to the scene's own pictures")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -52,19 +53,15 @@ def compaction_plot(points: Sequence[Point], path: Path) -> None:
         OutputError: the file system refuses.
         UnsupportedError: there is no matplotlib, or no such format.
     """
-    kind = check_plot(path)
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10, 4.5), layout="constrained")
-    whole, near = panels = figure.subplots(1, 2)
     (before,) = (point for point in points if point.way == "input")
-    for axes in panels:
-        _draw(axes, points, before)
-    whole.set_ylabel("PSNR of held-out views, dB")
-    best = max((point.psnr for point in points if math.isfinite(point.psnr)), default=0.0)
-    near.set_ylim(best - CLOSE, best + 0.1 * CLOSE)
-    figure.legend(*whole.get_legend_handles_labels(), loc="outside right upper", fontsize="small")
-    _save(figure, path, kind)
+    with new_figure(path, 10, 4.5) as figure:
+        whole, near = panels = figure.subplots(1, 2)
+        for axes in panels:
+            _draw(axes, points, before)
+        whole.set_ylabel("PSNR of held-out views, dB")
+        best = max((point.psnr for point in points if math.isfinite(point.psnr)), default=0.0)
+        near.set_ylim(best - CLOSE, best + 0.1 * CLOSE)
+        figure.legend(*whole.get_legend_handles_labels(), loc="outside right upper", fontsize="small")
 
 
 def finetuning_plot(points: Sequence[RatePoint], path: Path) -> None:
@@ -74,30 +71,37 @@ def finetuning_plot(points: Sequence[RatePoint], path: Path) -> None:
         OutputError: the file system refuses.
         UnsupportedError: there is no matplotlib, or no such format.
     """
+    titles = (("psnr", "PSNR of held-out views, dB"), ("between", "PSNR to the scene's own pictures, dB"))
+    with new_figure(path, 10, 4) as figure:
+        panels = figure.subplots(1, 2)
+        for axes, (name, title) in zip(panels, titles, strict=True):
+            for way, marker in zip(dict.fromkeys(point.way for point in points), MARKERS, strict=False):
+                of = [(point.bytes / 1000, getattr(point, name)) for point in points if point.way == way]
+                curve = sorted(place for place in of if math.isfinite(place[1])) or [(math.nan, math.nan)]
+                axes.plot(*zip(*curve, strict=True), marker=marker, markersize=4, label=way)
+            axes.set_xlabel("kilobytes")
+            axes.set_ylabel(title)
+            axes.grid(alpha=0.3)
+        panels[0].legend()
+
+
+@contextmanager
+def new_figure(path: Path, width: float, height: float) -> Iterator[Figure]:
+    """A figure of so many inches, which is then written to ``path``: the same bytes each time.
+
+    Raises:
+        OutputError: the file system refuses.
+        UnsupportedError: there is no matplotlib, or no such format.
+    """
     kind = check_plot(path)
+    from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10, 4), layout="constrained")
-    titles = (("psnr", "PSNR of held-out views, dB"), ("between", "PSNR to the scene's own pictures, dB"))
-    panels = figure.subplots(1, 2)
-    for axes, (name, title) in zip(panels, titles, strict=True):
-        for way, marker in zip(dict.fromkeys(point.way for point in points), MARKERS, strict=False):
-            of = [(point.bytes / 1000, getattr(point, name)) for point in points if point.way == way]
-            curve = sorted(place for place in of if math.isfinite(place[1])) or [(math.nan, math.nan)]
-            axes.plot(*zip(*curve, strict=True), marker=marker, markersize=4, label=way)
-        axes.set_xlabel("kilobytes")
-        axes.set_ylabel(title)
-        axes.grid(alpha=0.3)
-    panels[0].legend()
-    _save(figure, path, kind)
-
-
-def _save(figure: Figure, path: Path, kind: str) -> None:
-    """The same bytes each time."""
-    from matplotlib import rc_context
-
+    figure = Figure(figsize=(width, height), layout="constrained")
+    yield figure
+    undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
     with rc_context({"svg.hashsalt": "kissgs"}), atomic_file(path, overwrite=True) as file:
-        figure.savefig(file, format=kind, metadata={"Date": None} if kind == "svg" else None, dpi=150)
+        figure.savefig(file, format=kind, metadata=undated, dpi=150)
 
 
 def _draw(axes: Axes, points: Sequence[Point], before: Point) -> None:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 
 from rich.console import Group, RenderableType
 from rich.table import Column, Table
 from rich.text import Text
 
-from kissgs.bench import RoundTrip
 from kissgs.compaction.result import CompactionReport
 from kissgs.evaluation.likeness import Evaluation, spell
-from kissgs.evaluation.peers import PeerResult
 from kissgs.finetuning.result import FinetuneReport
 from kissgs.info import Info
 from kissgs.report import Report
@@ -111,9 +109,15 @@ def _finetuning(report: FinetuneReport) -> list[Text]:
     return [Text(told), *([Text(report.note, style="yellow")] if report.note else [])]
 
 
-def _path(trials: Iterable[Trial]) -> str:
+def _path(trials: Sequence[Trial]) -> str:
     """What a search tried, in order."""
-    return ", ".join(size(t.bytes) + ("" if t.psnr is None else f" at {spell(t.psnr, 2)} dB") for t in trials)
+    told, count = list[str](), next(iter(trials)).count
+    for trial in trials:
+        if trial.count != count:
+            told.append(f"of {trial.count:,} Gaussians")
+            count = trial.count
+        told.append(trial.spelled())
+    return ", ".join(told)
 
 
 def _pictures(evaluation: Evaluation) -> Text:
@@ -157,55 +161,6 @@ def info_table(info: Info) -> RenderableType:
         grid, book = made["grid_side"], made["codebook_side"]
         blocks.append(Text(f"grid {grid} x {grid}, codebook {book} x {book}; encoder: {origin}"))
     return Group(*blocks, *_changes(info.changed))
-
-
-def bench_table(rows: Iterable[tuple[str, str, RoundTrip | PeerResult]]) -> Table:
-    """Scenes × presets and peers."""
-    rows = list(rows)
-    seen = any(result.pictures is not None for _, _, result in rows)
-    photographed = any(
-        result.pictures is not None and result.pictures.mean.reference is not None for *_, result in rows
-    )
-    pictures = (*(["PSNR to photo", "change dB", "SSIM"] * photographed), "PSNR to original", "SSIM") if seen else ()
-    right = (
-        "B/Gaussian",
-        "bytes",
-        "encode CPU s",
-        "wall s",
-        "decode CPU s",
-        "peak MB",
-        "rotation °",
-        "log-scale",
-        "SH RMSE",
-    )
-    table = Table("scene", "encoder", *map(_right, [*right, *pictures]), box=None, pad_edge=False)
-    for scene, name, result in rows:
-        errors = result.errors
-        lost = f"{errors.rotation_degrees.rmse:.2f}", f"{errors.scales.rmse:.3f}", f"{errors.shN.rmse:.4f}"
-        if isinstance(result, RoundTrip):
-            report = result.report
-            cells = (
-                f"{report.bytes_per_gaussian:.2f}",
-                f"{report.container_bytes:,}",
-                f"{report.cpu_seconds:.1f}",
-                f"{sum(report.seconds.values()):.1f}",
-                f"{result.decode_cpu_seconds:.2f}",
-                f"{result.peak_memory / 1e6:.0f}",
-            )
-        else:
-            encode, decode = f"{result.encode_cpu_seconds:.1f}", f"{result.decode_cpu_seconds:.2f}"
-            cells = f"{result.bytes_per_gaussian:.2f}", f"{result.bytes:,}", encode, "", decode, ""
-        table.add_row(scene, name, *cells, *lost, *_picture_cells(result.pictures, photographed))
-    return table
-
-
-def _picture_cells(evaluation: Evaluation | None, photographed: bool) -> list[str]:
-    if evaluation is None:
-        return []
-    mean = evaluation.mean
-    change = "" if mean.change is None else spell(mean.change, 2, signed=True)
-    to_photo = [spell(mean.candidate.psnr, 2), change, spell(mean.candidate.ssim, 4)]
-    return [*(to_photo if photographed else []), spell(mean.between.psnr, 2), spell(mean.between.ssim, 4)]
 
 
 def _changes(changed: Mapping[str, int]) -> list[Text]:

@@ -10,7 +10,9 @@ from kissgs import Settings, UnsupportedError
 from kissgs.curves import CHOSEN, TUNED, RatePoint, rate_curves, saved
 from kissgs.views.view import Views, black
 
-POINT = RatePoint(way=CHOSEN, fidelity=0, bytes=1, psnr=0, ssim=0, between=0, seconds=0, cpu_seconds=0, peak_memory=0)
+POINT = RatePoint(
+    way=CHOSEN, count=1, fidelity=0, bytes=1, psnr=0, ssim=0, between=0, seconds=0, cpu_seconds=0, peak_memory=0
+)
 QUICK = {"steps": 5, "views": 16, "view_size": 60}
 
 
@@ -55,3 +57,18 @@ def test_a_scene_that_teaches_itself_never_sees_the_capture():
     plain = settings.model_copy(update={"encode": settings.encode.model_copy(update={"fidelity": -3.0})})
     assert chosen.bytes == kissgs.compress(scene, settings=plain).report.container_bytes
     assert tuned.bytes > 0
+
+
+def test_budgets_are_compacted_first():
+    scene, views = cloud(120, 0), Views(around(8), around(6)[1:3], black(), "circle")
+    few = {"sparsify_steps": 0, "refine_steps": 0, "score_share": 0.6}
+    settings = Settings.from_preset("balanced", finetune=QUICK, compact=few, views=4, view_size=60)
+    points = rate_curves(scene, settings, views, ratios=(0.5, 0.25), threads=1)
+    assert [(point.way, point.count) for point in points] == [(w, n) for n in (60, 30) for w in (CHOSEN, TUNED)]
+    assert {point.fidelity for point in points} == {settings.encode.fidelity}
+    half = kissgs.compact(
+        scene, settings=Settings.from_preset("balanced", compact={**few, "ratio": 0.5}), views=views
+    ).splats
+    plain = kissgs.compress(half, settings=settings, views=views)
+    assert points[0].bytes == plain.report.container_bytes
+    assert points[0].psnr == kissgs.evaluate(scene, kissgs.decompress(plain.files), views).mean.candidate.psnr

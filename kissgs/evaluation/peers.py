@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
+import sys
 import tempfile
+import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from kissgs.errors import InvalidSceneError, UnsupportedError
 from kissgs.evaluation.attributes import AttributeErrors, attribute_errors, sigmoid
 from kissgs.evaluation.likeness import Evaluation
 from kissgs.evaluation.pairing import pair
 from kissgs.evaluation.pictures import evaluate
+from kissgs.io.atomic import reason_of
 from kissgs.io.ply import read_ply
 from kissgs.splats import Splats, clean
 from kissgs.views.view import Views
@@ -35,9 +39,14 @@ class PeerResult:
     kept: int
     """in the peer's file"""
     bytes: int
+    encode_seconds: float
+    decode_seconds: float
+    """both: wall time of the tool's process, start-up and .ply included"""
     encode_cpu_seconds: float
     decode_cpu_seconds: float
-    """both: user and system time of the tool's processes, all threads together, start-up and .ply included"""
+    """the same of all threads, user and system time"""
+    peak_memory: int
+    """bytes, the largest resident set of the tool's processes"""
     errors: AttributeErrors
     """of the Gaussians that show: an opacity of at most 1/255 no renderer draws, and tools scramble what it hides"""
     pictures: Evaluation | None = None
@@ -65,8 +74,7 @@ def measure_peer(
 ) -> PeerResult:
     """Write ``scene`` in a peer's format, read it back by the same tool, and compare.
 
-    Without a GPU, ``.sog`` of a scene of SH degree 3 takes 20 minutes and more per SH iteration. Other processes that
-    this one starts meanwhile are added to the times.
+    Without a GPU, ``.sog`` of a scene of SH degree 3 takes 10 minutes and more per SH iteration.
 
     Args:
         scene: A ``.ply`` file.
@@ -78,18 +86,18 @@ def measure_peer(
 
     Raises:
         InvalidSceneError: ``scene``, or what the tool made of it, cannot be read or has no usable Gaussian.
-        UnsupportedError: unknown format; the tool is missing or failed; SciPy is not installed.
+        UnsupportedError: unknown format; the tool is missing or failed; SciPy is not installed; this is Windows,
+            which does not say what a process took.
     """
-    if format not in PEER_FORMATS:
-        raise UnsupportedError(f"unknown peer format {format!r}; there are {', '.join(PEER_FORMATS)}")
+    check_peer(format, command)
     reference, _ = clean(read_ply(scene))
     if not len(reference):
         raise InvalidSceneError(f"{scene} has no usable Gaussian")
     iterations = [] if sh_iterations is None else ["-i", str(sh_iterations)]
     with tempfile.TemporaryDirectory(prefix="kissgs-peer-") as folder:
         packed, unpacked = Path(folder, f"scene.{format}"), Path(folder, "unpacked.ply")
-        encode_seconds = _convert(command, scene.resolve(), packed, iterations)
-        decode_seconds = _convert(command, packed, unpacked, [])
+        encoding = _convert(command, scene.resolve(), packed, iterations)
+        decoding = _convert(command, packed, unpacked, [])
         size = packed.stat().st_size
         candidate, _ = clean(read_ply(unpacked))
     return PeerResult(
@@ -97,11 +105,29 @@ def measure_peer(
         gaussians=len(reference),
         kept=len(candidate),
         bytes=size,
-        encode_cpu_seconds=encode_seconds,
-        decode_cpu_seconds=decode_seconds,
+        encode_seconds=encoding.wall,
+        decode_seconds=decoding.wall,
+        encode_cpu_seconds=encoding.cpu,
+        decode_cpu_seconds=decoding.cpu,
+        peak_memory=max(encoding.memory, decoding.memory),
         errors=_errors_of_visible(reference, candidate),
         pictures=evaluate(reference, candidate, views) if pictures else None,
     )
+
+
+def check_peer(format: str, command: Sequence[str]) -> None:
+    """See that a peer can be measured, before work that comes before.
+
+    Raises:
+        UnsupportedError: unknown format, or the tool is missing.
+    """
+    if format not in PEER_FORMATS:
+        raise UnsupportedError(f"unknown peer format {format!r}; there are {', '.join(PEER_FORMATS)}")
+    if not command or shutil.which(command[0]) is None:
+        raise UnsupportedError(
+            f"cannot start {' '.join(command[:1]) or 'nothing'}: install it with "
+            "npm install -g @playcanvas/splat-transform, or say how to start it (--splat-transform)"
+        )
 
 
 def _errors_of_visible(reference: Splats, candidate: Splats) -> AttributeErrors:
@@ -110,23 +136,48 @@ def _errors_of_visible(reference: Splats, candidate: Splats) -> AttributeErrors:
     return attribute_errors(paired.select(visible), candidate.select(visible))
 
 
-def _convert(command: Sequence[str], source: Path, target: Path, options: list[str]) -> float:
-    """Run the tool; returns the CPU seconds that it took."""
+@dataclass(frozen=True, slots=True)
+class _Cost:
+    """Of one process: seconds, seconds of all threads, bytes."""
+
+    wall: float
+    cpu: float
+    memory: int
+
+
+def _convert(command: Sequence[str], source: Path, target: Path, options: list[str]) -> _Cost:
+    """Run the tool; returns what it took."""
     call = [*command, "-g", "cpu", "-w", *options, str(source), str(target)]
-    before = os.times()
+    with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as errors:
+        try:
+            status, cost = _run(call, output, errors)
+        except OSError as error:
+            raise UnsupportedError(f"cannot start {command[0]}: {reason_of(error)}") from error
+        if status != 0 or not target.is_file():
+            last = (_told(errors) or _told(output) or "no message").splitlines()[-1]
+            raise UnsupportedError(
+                f"{command[0]} could not turn {source.name} into {target.suffix} (status {status}): {last}"
+            )
+    return cost
+
+
+def _told(file: IO[bytes]) -> str:
+    file.seek(0)
+    return file.read().decode(errors="replace").strip()
+
+
+def _run(call: Sequence[str], output: IO[bytes], errors: IO[bytes]) -> tuple[int, _Cost]:
+    """The exit status of a process, and what it and those it has waited for took."""
+    if sys.platform == "win32":
+        raise UnsupportedError("Windows does not say what a process took: measure other tools elsewhere")
+    begin = time.perf_counter()
+    process = subprocess.Popen(call, stdin=subprocess.DEVNULL, stdout=output, stderr=errors)
     try:
-        done = subprocess.run(
-            call, check=False, stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace"
-        )
-    except OSError as error:
-        raise UnsupportedError(
-            f"cannot start {command[0]} ({error.strerror}): install it with "
-            "npm install -g @playcanvas/splat-transform, or say how to start it"
-        ) from error
-    after = os.times()
-    if done.returncode != 0 or not target.is_file():
-        last = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()[-1]
-        raise UnsupportedError(
-            f"{command[0]} could not turn {source.name} into {target.suffix} (status {done.returncode}): {last}"
-        )
-    return after.children_user + after.children_system - before.children_user - before.children_system
+        _, status, usage = os.wait4(process.pid, 0)
+    except BaseException:  # an interrupt, too, must not leave it running
+        process.kill()
+        process.wait()
+        raise
+    process.returncode = os.waitstatus_to_exitcode(status)
+    resident = usage.ru_maxrss if sys.platform == "darwin" else usage.ru_maxrss * 1024
+    return process.returncode, _Cost(time.perf_counter() - begin, usage.ru_utime + usage.ru_stime, resident)

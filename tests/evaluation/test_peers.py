@@ -92,7 +92,7 @@ def test_how_the_tool_is_called(scene, tmp_path):
 
 
 def test_a_missing_tool_is_named(scene):
-    with pytest.raises(UnsupportedError, match=r"cannot start no-such-tool .*npm install"):
+    with pytest.raises(UnsupportedError, match=r"cannot start no-such-tool: .*npm install"):
         measure_peer(scene, "spz", command=["no-such-tool"])
 
 

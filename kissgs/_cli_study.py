@@ -1,0 +1,50 @@
+"""What the measurements of ``kissgs bench`` share: what was asked for, and what came of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from kissgs.views.view import Views
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Asked:
+    """The options, as the command line has them; those of other measurements are empty."""
+
+    scenes: list[str]
+    presets: list[str] = field(default_factory=list)
+    changes: list[str] | None = None
+    peers: list[str] = field(default_factory=list)
+    splat_transform: str = "splat-transform"
+    sog_iterations: int | None = None
+    repeats: int = 1
+    pictures: bool = False
+    fidelities: list[float] = field(default_factory=list)
+    ratios: list[float] = field(default_factory=list)
+    ways: list[str] = field(default_factory=list)
+    learn_from: str = "photos"
+    plot: Path | None = None
+    gaussians: list[int] = field(default_factory=list)
+    views: Views | None = None
+    threads: int = 0
+
+    @property
+    def preset(self) -> str:
+        """Where a measurement is of one."""
+        return self.presets[0] if self.presets else "balanced"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outcome:
+    """For machines, for people, how it is drawn, if it is, and a sentence for each part that failed."""
+
+    rows: list[dict[str, Any]]
+    table: RenderableType
+    draw: Callable[[Path], None] | None = None
+    failures: list[str] = field(default_factory=list)

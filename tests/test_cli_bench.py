@@ -1,0 +1,82 @@
+"""``kissgs bench`` as a user runs it; oracle: the library's own functions, and sentences for what cannot be."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from test_cli import failure, run
+
+import kissgs
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("bench") / "scene.ply"
+    kissgs.save(kissgs.sample_scene(600, sh_degree=1), path)
+    return path
+
+
+def test_each_preset_is_measured(scene: Path) -> None:
+    rows = json.loads(run("bench", scene, "-p", "fast", "-p", "paper", "--repeats", 2, "--json").stdout)
+    assert [(row["encoder"], len(row["runs"])) for row in rows] == [("fast", 2), ("paper", 2)]
+    for row in rows:
+        result = kissgs.compress(scene, settings=kissgs.Settings(preset=row["encoder"]))
+        assert row["report"]["container_bytes"] == row["bytes"] == len(result.to_zip())
+        assert row["file_bytes"] == result.report.file_bytes
+        assert row["steady"] is True
+        assert row["pictures"] is None
+        assert sum(row["runs"][0]["stage_seconds"].values()) == pytest.approx(row["runs"][0]["encode_seconds"])
+
+
+def test_a_curve_is_drawn_and_pictures_are_compared(scene: Path, tmp_path: Path) -> None:
+    quick = ["--set", "views=4", "--set", "view_size=60"]
+    words = ["-p", "balanced", "--fidelity", -3, *quick, "--plot", tmp_path / "p.svg"]
+    done = run("bench", scene, *words)
+    assert done.returncode == 0, done.stderr
+    assert "balanced at -3" in done.stdout.decode()
+    assert "f_rest_centroids.webp" in done.stdout.decode()
+    assert (tmp_path / "p.svg").read_bytes().startswith(b"<?xml")
+
+
+def test_other_sizes_are_measured_and_drawn(scene: Path, tmp_path: Path) -> None:
+    words = ["-p", "fast", "--gaussians", 200, "--gaussians", 900, "--json", "--plot", tmp_path / "p.png"]
+    done = run("bench", scene, *words)
+    assert done.returncode == 0, done.stderr
+    assert [row["gaussians"] for row in json.loads(done.stdout)] == [200, 900]
+    assert (tmp_path / "p.png").stat().st_size > 10_000
+
+
+def test_pictures_are_compared_and_the_rasteriser_is_measured(scene: Path) -> None:
+    rows = json.loads(run("bench", scene, "-p", "fast", "--pictures", "--json").stdout)
+    assert rows[0]["pictures"]["mean"]["between"]["psnr"] > 20
+    rows = json.loads(run("bench", scene, "--rendering", "--gaussians", 100, "--json").stdout)
+    assert [row["gaussians"] for row in rows] == [100]
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("--rendering -p fast", "no presets and no peers"),
+        ("--rendering --ablate", "--ablate and --rendering are several measurements"),
+        ("--rendering --repeats 2", "--repeats does not go with --rendering"),
+        ("--gaussians 5 --peer spz", "without --peer and --fidelity"),
+        ("--gaussians 5 --compaction", "--gaussians does not go with --compaction"),
+        ("--fidelity 1 -p fast", "--fidelity is of presets that weigh bits"),
+        ("--fidelity 1 --ablate", "--fidelity does not go with --ablate"),
+        ("--ablate -p fast", "not of fast"),
+        ("--ratio 0.5", "--ratio goes with --compaction"),
+        ("--learn-from scene", "--learn-from goes with --compaction or --finetuning"),
+        ("--compaction -p fast -p paper", "--compaction goes with one --preset"),
+        ("--plot curve.jpg", "plots are svg, png, pdf"),
+        ("--scale 4", "--views"),
+        ("--peer rar -p fast", "unknown peer format 'rar'; there are sog, spz"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(scene: Path, words: str, sentence: str) -> None:
+    assert sentence in failure("bench", scene, *words.split())
+
+
+def test_two_scenes_are_not_one_plot(scene: Path, tmp_path: Path) -> None:
+    assert "--plot draws one scene" in failure("bench", scene, scene, "--plot", tmp_path / "p.svg")
