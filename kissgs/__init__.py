@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from kissgs.compaction.result import Compacted, CompactionReport
     from kissgs.errors import (
         Cancelled,
+        Enough,
         InvalidContainerError,
         InvalidSceneError,
         InvalidViewsError,
@@ -52,6 +53,7 @@ _HOMES = {
     "CompactionReport": "compaction.result",
     "Compressed": "pipeline",
     "EncodeSettings": "settings",
+    "Enough": "errors",
     "Evaluation": "evaluation.likeness",
     "FinetuneReport": "finetuning.result",
     "FinetuneSettings": "settings",
@@ -96,6 +98,7 @@ __all__ = [
     "CompactionReport",
     "Compressed",
     "EncodeSettings",
+    "Enough",
     "Evaluation",
     "FinetuneReport",
     "FinetuneSettings",

@@ -33,8 +33,18 @@ def compress(
     changes: Annotated[
         list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change one setting of the preset.")
     ] = None,
+    psnr: Annotated[
+        float | None, typer.Option(metavar="DB", help="The smallest container with this PSNR to the scene's pictures.")
+    ] = None,
+    target_size: Annotated[
+        str | None, typer.Option(metavar="SIZE", help="The best container of at most this size: 800kB, 2.5MB.")
+    ] = None,
+    max_psnr_drop: Annotated[
+        float | None, typer.Option(metavar="DB", help="The smallest container whose pictures lose no more: 0.1.")
+    ] = None,
     compact: Annotated[
-        str | None, typer.Option(metavar="BUDGET", help="Fewer Gaussians first: 200k, 20% or 0.2dB.")
+        str | None,
+        typer.Option(metavar="BUDGET", help="Fewer Gaussians first: 200k, 20% or 0.2dB; auto: as the goal needs."),
     ] = None,
     finetune: Annotated[
         str | None, typer.Option(metavar="[STEPS]", help="Then fit the numbers in the images to pictures of the scene.")
@@ -52,7 +62,14 @@ def compress(
 
     if "-" in scenes or str(output) == "-":
         raise UnsupportedError("remote compression reads and writes files; name them")
-    settings = chosen(preset, changes, budget=None if compact is None else budget_of(compact), finetune=finetune)
+    settings = chosen(
+        *(preset, changes),
+        budget=None if compact is None else budget_of(compact),
+        finetune=finetune,
+        psnr=psnr,
+        target_size=target_size,
+        max_psnr_drop=max_psnr_drop,
+    )
     with Remote(server, key=key) as remote:
 
         def work(scene: str, target: Path) -> dict[str, Any]:

@@ -97,12 +97,14 @@ def count_of(text: str) -> int:
 
 
 def budget_of(text: str) -> Values:
-    """A budget in one word: a count such as 200k, a share such as 20%, or a loss such as 0.2dB.
+    """A budget in one word: a count such as 200k, a share such as 20%, a loss such as 0.2dB; auto: what a goal needs.
 
     Raises:
         UnsupportedError: it is none of these.
     """
     word = text.strip().lower().replace(" ", "")
+    if word == "auto":
+        return {"by_goal": True}
     for ending, name, unit in (("%", "ratio", 0.01), ("db", "max_psnr_drop", 1.0)):
         number = word.removesuffix(ending)
         if word.endswith(ending) and re.fullmatch(r"[0-9]*\.?[0-9]+", number):
@@ -112,5 +114,5 @@ def budget_of(text: str) -> Values:
     except UnsupportedError as error:
         raise UnsupportedError(
             f"--compact {text}: say how many Gaussians to keep (200k), which share (20%), or how much PSNR may be "
-            "lost (0.2dB)"
+            "lost (0.2dB); or auto, with a goal"
         ) from error

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import sys
-import threading
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 
 from kissgs import _cli_bench, _cli_compact, _cli_pictures, _cli_remote, _cli_render
 from kissgs._cli_files import beside, each, show, source, stdout, write_stdout
 from kissgs._cli_settings import budget_of, chosen, spelled_out
+from kissgs._cli_signals import Interrupted, listen, stoppable
 from kissgs._version import __version__
 from kissgs.errors import KissgsError, UnsupportedError
-
-if TYPE_CHECKING:
-    from types import FrameType
 
 app = typer.Typer(
     name="kissgs",
@@ -46,40 +42,18 @@ QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing 
 ThreadsOption = Annotated[int, typer.Option(min=0, help="0: one per processor. The bytes do not depend on it.")]
 
 
-class _Interrupted(BaseException):
-    """Ctrl-C or a request to end: unwinds everything, so that no half-written file stays."""
-
-
 def main() -> None:
     """Entry point. Errors a user can cause end in one line and exit code 2, Ctrl-C in 130."""
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # torch's idle threads would take the processor from ours
-    _listen()
+    listen()
     try:
         app(spelled_out(sys.argv[1:]))
     except KissgsError as error:
         _fail(error)
-    except _Interrupted as reason:
+    except Interrupted as reason:
         sys.stderr.write("kissgs: interrupted; nothing half-written is left\n")
         sys.stderr.flush()
         os._exit(128 + reason.args[0])  # threads inside libwebp cannot be stopped, and need not be waited for
-
-
-def _listen() -> None:
-    signal.signal(signal.SIGINT, _interrupt)
-    signal.signal(signal.SIGTERM, _interrupt)
-    sys.unraisablehook = _again
-
-
-def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
-    raise _Interrupted(number)
-
-
-def _again(lost: sys.UnraisableHookArgs) -> None:
-    """A signal that arrives inside a finalizer is printed and forgotten by Python: it is sent once more."""
-    if isinstance(lost.exc_value, _Interrupted):
-        threading.Timer(0.01, os.kill, (os.getpid(), lost.exc_value.args[0])).start()
-    else:
-        sys.__unraisablehook__(lost)
 
 
 @app.command()
@@ -97,9 +71,19 @@ def compress(
     target_size: Annotated[
         str | None, typer.Option(metavar="SIZE", help="The best container of at most this size: 800kB, 2.5MB.")
     ] = None,
+    max_psnr_drop: Annotated[
+        float | None,
+        typer.Option(
+            metavar="DB", help="The smallest container whose pictures lose no more: 0.1; better with --views."
+        ),
+    ] = None,
     compact: Annotated[
         str | None,
-        typer.Option(metavar="BUDGET", help="Fewer Gaussians first: 200k, 20% or 0.2dB; see 'compact'."),
+        typer.Option(
+            metavar="BUDGET",
+            help="Fewer Gaussians first: 200k, 20% or 0.2dB, see 'compact'; or [bold]auto[/]: as many as serve "
+            "--target-size, --max-psnr-drop or --psnr best.",
+        ),
     ] = None,
     finetune: Annotated[
         str | None,
@@ -138,7 +122,15 @@ def compress(
     from kissgs.training.checkpoint import forget
 
     budget = None if compact is None else budget_of(compact)
-    settings = chosen(preset, changes, budget=budget, finetune=finetune, seed=seed, psnr=psnr, target_size=target_size)
+    settings = chosen(
+        *(preset, changes),
+        budget=budget,
+        finetune=finetune,
+        seed=seed,
+        psnr=psnr,
+        target_size=target_size,
+        max_psnr_drop=max_psnr_drop,
+    )
     if not (settings.compact.wanted or settings.finetune.wanted) and (checkpoint or device != "cpu"):
         raise UnsupportedError("--checkpoint and --device are about training; they go with --compact and --finetune")
     looks = evaluate or settings.encode.weigh or settings.compact.wanted or settings.finetune.wanted
@@ -148,7 +140,7 @@ def compress(
 
     def work(scene: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"
-        with _progress(quiet or as_json) as progress:
+        with _progress(quiet or as_json) as bar, stoppable(bar, settings.encode.has_goal) as progress:
             if evaluate:  # announced here, because it is no stage of the evaluation
                 from kissgs.rendering.rasterizer import load_kernels
 

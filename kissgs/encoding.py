@@ -17,7 +17,7 @@ from kissgs.errors import UnsupportedError
 from kissgs.goal import Container, Encoder, GoalSearch
 from kissgs.importance import Importance
 from kissgs.io.importance_file import read_importance, write_importance
-from kissgs.progress import Progress
+from kissgs.progress import Annotated, Progress
 from kissgs.rendering.gsplat_backend import need_cuda
 from kissgs.rendering.rasterizer import Device
 from kissgs.search import Trial
@@ -58,7 +58,7 @@ class Encoding:
         checkpoint: file for the state of fine-tuning; a search for a goal keeps none.
         device: where fine-tuning trains.
         threads: 0 means one per processor.
-        progress: receives the stages of all that is done.
+        progress: receives the stages of all that is done; its note tells where a search stands.
     """
 
     splats: Splats
@@ -71,7 +71,7 @@ class Encoding:
     checkpoint: Path | None
     device: Device
     threads: int
-    progress: Progress
+    progress: Annotated
 
     def run(self) -> tuple[Container, tuple[Trial, ...]]:
         """The container, and what was tried on the way to it if the settings name a goal.
@@ -86,12 +86,24 @@ class Encoding:
         chooser, tuner = self._looking() if weighs else self._blind, self._tuner()
         if not (weighs and wanted.has_goal):
             return self._encoder(chooser, tuner, self.checkpoint)(wanted), ()
-        search = GoalSearch(self.original, wanted, self.views, self.threads, self.progress)
-        search.run(self._encoder(chooser, None, None))
-        if tuner is not None:
+        search = self.search(chooser)
+        if tuner is not None and not search.stopped:
             price = None if search.best is None else search.best.encoded.price
-            search.run(self._encoder(chooser, tuner, None), price, TUNED_ATTEMPTS)
+            search.run(self._encoder(chooser, tuner, None), price, min(TUNED_ATTEMPTS, wanted.attempts))
         return search.found()
+
+    def search(self, chooser: Chooser | None = None) -> GoalSearch:
+        """For the goal of the settings, without fine-tuning; for bits that are weighed, of one Gaussian or more."""
+        search = GoalSearch(
+            *(self.original, self.settings.encode, self.views, self.threads, self.progress), count=len(self.splats)
+        )
+        encoder = self._encoder(chooser or self._looking(), None, None)
+        search.run(encoder)
+        left = search.settings.attempts - len(search.trials)
+        if search.best is None and not search.goal.by_size and search.settings.sh_ratio > 1 and left > 0:
+            search.settings = search.settings.model_copy(update={"sh_ratio": 1.0})  # a codebook as large as it takes
+            search.run(encoder, attempts=left)
+        return search
 
     def _encoder(self, chooser: Chooser, tuner: Tuner | None, checkpoint: Path | None) -> Encoder:
         """Chooses, fine-tunes if there is a tuner, and writes."""

@@ -8,6 +8,7 @@ KissgsError
 ├─ RemoteError              a kissgs service cannot be reached, or refuses what it was asked
 ├─ OutputError              the result could not be written: it exists already, no space, no permission
 └─ Cancelled                the caller stopped the work through its progress callback
+   └─ Enough                its search for a goal: what was found so far will do
 
 The message is one sentence for the user: what is wrong, where, and how to mend it.
 ``code`` is stable: the command line's ``--json`` output and the service use it.
@@ -68,3 +69,10 @@ class Cancelled(KissgsError):
     """The caller stopped the work; nothing was written."""
 
     code = "cancelled"
+
+
+class Enough(Cancelled):
+    """Raised from a progress callback: a search for a goal ends with the best that it has found.
+
+    Where nothing that meets the goal has been found yet, or nothing is searched for, the work is cancelled.
+    """

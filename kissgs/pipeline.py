@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from kissgs.clock import Clock, peak_memory
 from kissgs.compaction.result import Compacted
 from kissgs.errors import UnsupportedError
 from kissgs.importance import Importance
-from kissgs.progress import Progress, as_stage, silent
+from kissgs.progress import Annotated, Progress, as_stage, silent
 from kissgs.rendering.rasterizer import Device
 from kissgs.report import Report
 from kissgs.scenes import AnyPath, check_ply, open_scene, save
@@ -25,7 +25,10 @@ from kissgs.splats import Splats
 from kissgs.training.checkpoint import beside, forget
 
 if TYPE_CHECKING:
+    from kissgs.encoding import Encoding
     from kissgs.evaluation.likeness import Evaluation
+    from kissgs.goal import Container
+    from kissgs.search import Trial
     from kissgs.views.view import Views
 
 
@@ -174,11 +177,8 @@ def compress(
             kept = beside(Path(checkpoint))
     clock = Clock(progress)
     original, cleaned, source_bytes = open_scene(source, threads, clock)
-    compacted = None
-    if settings.compact.wanted:
-        compacted = _compact(original, settings, importance, views, checkpoint, threads, device, clock)
     encoding = Encoding(
-        splats=original if compacted is None else compacted.splats,
+        splats=original,
         original=original,
         settings=settings,
         importance=importance,
@@ -188,9 +188,13 @@ def compress(
         checkpoint=kept,
         device=device,
         threads=threads,
-        progress=clock,
+        progress=Annotated(clock),
     )
-    container, trials = encoding.run()
+    compacted, container, trials = _compacted(encoding, checkpoint)
+    if container is None:
+        chosen = encoding if compacted is None else replace(encoding, splats=compacted.splats)
+        container, more = chosen.run()
+        trials += more
     encoded = container.encoded
     archive_bytes = len(zip_bytes(encoded.files))
     evaluation = _evaluate(original, encoded.files, views, threads, clock) if evaluate else None
@@ -264,24 +268,32 @@ def decompress(
     return splats
 
 
-def _compact(
-    splats: Splats,
-    settings: Settings,
-    importance: Importance | None,
-    views: Views | None,
-    checkpoint: AnyPath | None,
-    threads: int,
-    device: Device,
-    progress: Progress,
-) -> Compacted:
-    from kissgs.compaction.budget import compact_scene
+class _Common(TypedDict):
+    threads: int
+    device: Device
+    progress: Progress
 
-    if importance is not None:
+
+def _compacted(
+    encoding: Encoding, checkpoint: AnyPath | None
+) -> tuple[Compacted | None, Container | None, tuple[Trial, ...]]:
+    """What compaction leaves, if it is asked for; a container that was made on the way, and all attempts."""
+    from kissgs.compaction.budget import NO_CHECKPOINT, Compactor, compact_scene, unchanged
+    from kissgs.tradeoff import Tradeoff
+
+    splats, chosen, kept = encoding.splats, encoding.settings.compact, Path(checkpoint) if checkpoint else None
+    if not chosen.wanted:
+        return None, None, ()
+    if encoding.importance is not None:
         raise UnsupportedError("importance is that of a scene before its compaction; compact first, then measure")
-    kept = Path(checkpoint) if checkpoint is not None else None
-    return compact_scene(
-        *(splats, settings.compact, views), checkpoint=kept, threads=threads, device=device, progress=progress
-    )
+    common: _Common = {"threads": encoding.threads, "device": encoding.device, "progress": encoding.progress}
+    if not chosen.by_goal:
+        return compact_scene(splats, chosen, encoding.views, checkpoint=kept, **common), None, ()
+    if kept is not None:
+        raise UnsupportedError(NO_CHECKPOINT.format("goal"))
+    if len(splats) < 2:
+        return unchanged(splats, "and none to spare"), None, ()
+    return Tradeoff(encoding, Compactor.of(splats, chosen, encoding.views, **common)).run()
 
 
 def _evaluate(

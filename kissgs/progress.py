@@ -5,12 +5,17 @@ from typing import Protocol, runtime_checkable
 
 @runtime_checkable
 class Progress(Protocol):
-    """Receives progress events. To stop the work, raise :class:`kissgs.Cancelled` from the call."""
+    """Receives progress events.
+
+    To stop the work, raise :class:`kissgs.Cancelled` from the call; to end a search for a goal with the best that it
+    has found, :class:`kissgs.Enough`.
+    """
 
     def __call__(self, stage: str, fraction: float, note: str = "", /) -> None:
         """``stage`` names what is being done ("read", "order", "codebook", …); ``fraction`` of that stage, 0 to 1.
 
-        ``note`` is for people: what training has come to (Gaussians, loss, PSNR). Other stages say nothing.
+        ``note`` is for people: what training has come to (Gaussians, loss, PSNR), and where a search for a goal stands.
+        Other stages say nothing.
         """
 
 
@@ -25,3 +30,19 @@ def as_stage(stage: str, progress: Progress) -> Progress:
         progress(stage, fraction if inner == stage else 0.0)
 
     return receive
+
+
+class Annotated:
+    """Passes everything on, with a word of where a search stands before the work's own.
+
+    Attributes:
+        note: that word.
+    """
+
+    def __init__(self, progress: Progress) -> None:
+        self.note = ""
+        self._progress = progress
+
+    def __call__(self, stage: str, fraction: float, note: str = "") -> None:
+        """See :class:`Progress`."""
+        self._progress(stage, fraction, "; ".join(filter(None, [self.note, note])))

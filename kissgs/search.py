@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 ATTEMPTS = 10
+FINEST = 0.2
+"""Of :func:`lowest`: steps are halved no further."""
+
 REACH = 4.0
 """How far from all that is known an attempt may be, octaves."""
 
@@ -15,14 +19,23 @@ class Trial:
     """A container that was made on the way to the one that was asked for.
 
     Attributes:
+        count: Gaussians of the scene that was encoded.
         price: squared error per bit.
         bytes: of its zip.
-        psnr: of its pictures, decibels; None where it did not matter.
+        psnr: of its pictures to those of the scene, decibels; None where it was not asked for.
+        drop: decibels that they have lost; the same.
     """
 
+    count: int
     price: float
     bytes: int
     psnr: float | None = None
+    drop: float | None = None
+
+    def spelled(self) -> str:
+        """For people."""
+        pictures = "" if self.psnr is None else f" at {self.psnr:.2f} dB"
+        return f"{self.bytes / 1000:,.0f} kB{pictures}" + ("" if self.drop is None else f" (-{self.drop:.2f})")
 
 
 def seek(
@@ -60,6 +73,49 @@ def seek(
         x = min(max(_whole(_next(known, slope, tolerance / 2), grain), bounds[0]), bounds[1])
     met = [x for x, found in known.items() if found >= 0]
     return min(met, key=lambda x: known[x]) if met else None
+
+
+def lowest(
+    cost: Callable[[float], float],
+    known: dict[float, float],
+    start: float,
+    step: float,
+    bounds: tuple[float, float],
+    way_out: float,
+    attempts: int,
+) -> None:
+    """Look for where a function with one valley is lowest, in few attempts: downhill, and then in half as long steps.
+
+    Args:
+        cost: infinite where something is not possible at all.
+        known: what is known of it; every attempt is added.
+        start: first attempt.
+        step: to the next; the first goes down from there.
+        bounds: attempts stay between these.
+        way_out: where something is not possible, it may be further up (1) or further down (-1).
+        attempts: how many at most.
+    """
+    x: float | None = min(max(start, bounds[0]), bounds[1])
+    for _ in range(attempts):
+        if x is None:
+            break
+        known[x] = cost(x)
+        x, step = _beside(known, step, bounds, way_out)
+
+
+def _beside(
+    known: dict[float, float], step: float, bounds: tuple[float, float], way_out: float
+) -> tuple[float | None, float]:
+    """Where to look next to the best that is known, and how far that is; None where all that is near is known."""
+    best = min(known, key=lambda x: (known[x], -way_out * x))
+    ways = (way_out,) if math.isinf(known[best]) else (-1.0, 1.0)
+    while step >= FINEST:
+        for way in ways:
+            x = min(max(best + way * step, bounds[0]), bounds[1])
+            if min(abs(x - other) for other in known) > step / 2:
+                return x, step
+        step /= 2
+    return None, step
 
 
 def _whole(x: float, grain: float) -> float:

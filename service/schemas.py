@@ -53,7 +53,8 @@ class JobOptions(kissgs.Settings):
     def resumable(self) -> bool:
         """Whether its training can be taken up where it was left: searches, which train several times, cannot."""
         tunes_once = self.finetune.wanted and not self.encode.has_goal
-        return self.compact.max_psnr_drop is None and (self.retrains or tunes_once)
+        searches = self.compact.max_psnr_drop is not None or self.compact.by_goal
+        return not searches and (self.retrains or tunes_once)
 
 
 class Wire(BaseModel):

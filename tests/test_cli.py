@@ -214,35 +214,6 @@ def test_sample(tmp_path: Path) -> None:
     assert len(kissgs.load(tmp_path / "s.ply")) == 500
 
 
-def test_bench_measures_each_preset(scene: Path) -> None:
-    rows = json.loads(run("bench", scene, "-p", "fast", "-p", "small", "--json").stdout)
-    assert [row["encoder"] for row in rows] == ["fast", "small"]
-    assert rows[0]["report"]["container_bytes"] == len(
-        kissgs.compress(scene, settings=kissgs.Settings(preset="fast")).to_zip()
-    )
-
-
-def test_bench_compares_pictures_and_measures_the_rasteriser(scene: Path) -> None:
-    rows = json.loads(run("bench", scene, "-p", "fast", "--pictures", "--json").stdout)
-    assert rows[0]["pictures"]["mean"]["between"]["psnr"] > 20
-    rows = json.loads(run("bench", scene, "--rendering", "--gaussians", 100, "--json").stdout)
-    assert [row["gaussians"] for row in rows] == [100]
-
-
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (["--rendering", "-p", "fast"], b"no presets and no peers"),
-        (["--gaussians", "5"], b"goes with --rendering"),
-        (["--scale", "4"], b"--views"),
-    ],
-)
-def test_bench_refuses_what_does_not_go_together(scene: Path, words: list[str], sentence: bytes) -> None:
-    done = run("bench", scene, *words)
-    assert done.returncode == 2
-    assert sentence in done.stderr
-
-
 def test_help_starts_at_once() -> None:
     best = min(_seconds("--help") for _ in range(3))
     assert best < 0.5

@@ -13,6 +13,7 @@ from kissgs import errors
 PUBLIC = [
     "Camera",
     "Cancelled",
+    "Enough",
     "CompactSettings",
     "Compacted",
     "CompactionReport",
@@ -123,7 +124,7 @@ def test_importing_is_quick(module, seconds):
 def test_errors_form_one_tree_with_codes_of_their_own():
     kinds = [value for value in vars(errors).values() if isinstance(value, type)]
     assert {kind.__name__ for kind in kinds} == {
-        name for name in PUBLIC if name.endswith("Error") or name == "Cancelled"
+        name for name in PUBLIC if name.endswith("Error") or name in ("Cancelled", "Enough")
     }
     assert all(issubclass(kind, errors.KissgsError) for kind in kinds)
     assert len({kind.code for kind in kinds}) == len(kinds)

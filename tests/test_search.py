@@ -141,7 +141,7 @@ def test_goals_that_make_no_sense_are_refused(preset, goal, told):
 def test_a_search_can_be_stopped(tmp_path):
     encodings = 0
 
-    def stop(stage, fraction):
+    def stop(stage, fraction, note=""):
         nonlocal encodings
         encodings += stage == "price"
         if encodings == 2:

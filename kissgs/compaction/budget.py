@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,8 +12,8 @@ import numpy as np
 
 from kissgs.compaction.popspa import popspa
 from kissgs.compaction.result import Compacted, CompactionReport
-from kissgs.errors import UnsupportedError
-from kissgs.evaluation.likeness import Evaluation
+from kissgs.errors import Enough, UnsupportedError
+from kissgs.evaluation.drop import MODELLED, drop_of
 from kissgs.evaluation.pictures import evaluate
 from kissgs.progress import Progress, as_stage, silent
 from kissgs.rendering.gsplat_backend import need_cuda
@@ -27,19 +27,16 @@ from kissgs.views.view import Views
 if TYPE_CHECKING:
     from kissgs.training.lessons import Lessons
 
-USUAL = 30.0
-"""Decibels between a scene's pictures and photographs, where there are none to ask: about that of good captures."""
-
 START, SLOPE, LARGEST = -2.0, 0.4, -0.1
 """First share that is tried, decibels that doubling it is about worth, and the largest share; powers of 2."""
-
-MODELLED = f"without photographs, the drop is that of a scene {USUAL:g} dB from them to which the new errors are added"
 
 GRAIN = 1 / 64
 """Of shares, the same: counts that are nearer to each other than 1 % are not told apart."""
 
 NEAR = 0.02
 """Decibels to spare that are near enough."""
+
+NO_CHECKPOINT = "a search for a {} keeps no checkpoint; give a count or a ratio with it"
 
 
 def compact_scene(
@@ -73,33 +70,23 @@ def compact_scene(
     """
     if not settings.wanted:
         raise UnsupportedError("how many Gaussians to keep is not said; give count, ratio or max_psnr_drop")
+    if settings.by_goal:
+        raise UnsupportedError(
+            "a goal is that of a container: kissgs compress; here give count, ratio or max_psnr_drop"
+        )
     if settings.max_psnr_drop is not None and checkpoint is not None:
-        raise UnsupportedError("a search for a drop of PSNR keeps no checkpoint; give a count or a ratio with it")
+        raise UnsupportedError(NO_CHECKPOINT.format("drop of PSNR"))
     count = settings.count or max(1, round(len(splats) * (settings.ratio or 0.0)))
     if count >= len(splats):
-        return _unchanged(splats, "no more than asked for")
-    if settings.trains and find_spec("torch") is None:
-        raise UnsupportedError(
-            "training is done with torch, which is missing: pip install 'kissgs[train]' (a CPU build will do); the "
-            "preset fast only prunes, and needs none"
-        )
-    if settings.trains and device == "cuda":
-        need_cuda()
-    scored = SCORED if settings.trains else 1
-    taught = school(splats, views, settings, scored=scored, threads=threads, progress=progress)
+        return unchanged(splats, "no more than asked for")
+    compactor = Compactor.of(splats, settings, views, threads=threads, device=device, progress=progress)
     if settings.max_psnr_drop is None:
-        return popspa(
-            *(splats, count, settings, taught),
-            judges=judges,
-            checkpoint=checkpoint,
-            threads=threads,
-            device=device,
-            progress=progress,
-        )
-    return _Search(splats, settings, taught, threads, device, progress).run(settings.max_psnr_drop)
+        return compactor(count, judges=judges, checkpoint=checkpoint)
+    return _Search(compactor).run(settings.max_psnr_drop)
 
 
-def _unchanged(splats: Splats, why: str) -> Compacted:
+def unchanged(splats: Splats, why: str) -> Compacted:
+    """All of them."""
     count = f"{len(splats):,} Gaussian{'' if len(splats) == 1 else 's'}"
     note = f"the scene has {count}, {why}: it stays as it is"
     report = CompactionReport(
@@ -108,77 +95,117 @@ def _unchanged(splats: Splats, why: str) -> Compacted:
     return Compacted(splats, np.arange(len(splats)), report)
 
 
-def drop_of(evaluation: Evaluation) -> float:
-    """By how many decibels a scene's pictures have become worse.
+@dataclass(slots=True, eq=False)
+class Compactor:
+    """Compacts one scene, to several counts if need be: what is learned from is drawn or read once.
 
-    Where there are no photographs to ask, as if the scene had been :data:`USUAL` decibels from them and the new errors
-    were independent of those: squared errors then add up. (Of fox it predicts 0.40 dB where 0.38 are measured.)
+    Attributes:
+        splats: clean.
+        settings: of the recipe.
+        school: views to learn from, and to judge by.
+        threads: see :func:`compact_scene`.
+        device: see the same.
+        progress: see the same.
     """
-    change = evaluation.mean.change
-    if change is not None:
-        return -change
-    return 10 * math.log10(1 + 10 ** ((USUAL - min(evaluation.mean.between.psnr, 1e3)) / 10))
+
+    splats: Splats
+    settings: CompactSettings
+    school: School
+    threads: int
+    device: Device
+    progress: Progress
+    _lessons: Lessons | None = None
+
+    @classmethod
+    def of(
+        cls,
+        splats: Splats,
+        settings: CompactSettings,
+        views: Views | None,
+        *,
+        threads: int = 0,
+        device: Device = "cpu",
+        progress: Progress = silent,
+    ) -> Compactor:
+        """See :func:`compact_scene` for arguments and errors."""
+        if settings.trains and find_spec("torch") is None:
+            raise UnsupportedError(
+                "training is done with torch, which is missing: pip install 'kissgs[train]' (a CPU build will do); the "
+                "preset fast only prunes, and needs none"
+            )
+        if settings.trains and device == "cuda":
+            need_cuda()
+        scored = SCORED if settings.trains else 1
+        taught = school(splats, views, settings, scored=scored, threads=threads, progress=progress)
+        return cls(splats, settings, taught, threads, device, progress)
+
+    def __call__(self, count: int, *, judges: bool = False, checkpoint: Path | None = None) -> Compacted:
+        """Down to ``count``, which is less than the scene has."""
+        if self._lessons is None and self.settings.trains:
+            from kissgs.training.lessons import lessons
+
+            self._lessons = lessons(
+                *(self.splats, self.school.train, self.school.background),
+                threads=self.threads,
+                device=self.device,
+                progress=self.progress,
+            )
+        return popspa(
+            *(self.splats, count, self.settings, self.school),
+            lessons=self._lessons,
+            judges=judges,
+            checkpoint=checkpoint,
+            threads=self.threads,
+            device=self.device,
+            progress=self.progress,
+        )
+
+    def drop(self, found: Compacted) -> float:
+        """Decibels that pictures from held-out views have lost."""
+        progress = as_stage("judge", self.progress)
+        return drop_of(evaluate(self.splats, found.splats, self.school.exam, threads=self.threads, progress=progress))
+
+    @property
+    def note(self) -> str:
+        """How a drop is told, where that needs to be said."""
+        return "" if any(view.photo for view in self.school.test) else MODELLED
 
 
 class _Search:
     """For the fewest Gaussians whose pictures lose no more than is allowed."""
 
-    def __init__(
-        self,
-        splats: Splats,
-        settings: CompactSettings,
-        taught: School,
-        threads: int,
-        device: Device,
-        progress: Progress,
-    ) -> None:
-        self.splats, self.settings, self.school = splats, settings, taught
-        self.lessons: Lessons | None = None
-        self.threads, self.device, self.progress = threads, device, progress
+    def __init__(self, compactor: Compactor) -> None:
+        self.compactor = compactor
         self.trials: dict[int, float] = {}
         self.best: Compacted | None = None
 
     def run(self, allowed: float) -> Compacted:
         """All attempts; the scene as it was where none loses so little."""
-        least = -math.log2(len(self.splats))
-        seek(
-            lambda share: allowed - self._drop(share, allowed), max(START, least), SLOPE, NEAR, (least, LARGEST), GRAIN
-        )
-        best = self.best or _unchanged(
-            self.splats, f"and every smaller one that was tried loses more than {allowed:g} dB"
-        )
-        modelled = "" if any(view.photo for view in self.school.test) else MODELLED
-        note = "; ".join(filter(None, [best.report.note, modelled]))
+        splats = self.compactor.splats
+        least = -math.log2(len(splats))
+        try:
+            seek(
+                lambda share: allowed - self._drop(share, allowed),
+                max(START, least),
+                SLOPE,
+                NEAR,
+                (least, LARGEST),
+                GRAIN,
+            )
+        except Enough:
+            if self.best is None:
+                raise
+        best = self.best or unchanged(splats, f"and every smaller one that was tried loses more than {allowed:g} dB")
+        note = "; ".join(filter(None, [best.report.note, self.compactor.note]))
         return replace(best, report=replace(best.report, trials=tuple(self.trials.items()), note=note))
 
     def _drop(self, share: float, allowed: float) -> float:
-        count = min(max(1, round(len(self.splats) * 2**share)), len(self.splats) - 1)
+        everything = len(self.compactor.splats)
+        count = min(max(1, round(everything * 2**share)), everything - 1)
         if count in self.trials:
             return self.trials[count]
-        if self.lessons is None and self.settings.trains:
-            from kissgs.training.lessons import lessons
-
-            taught = self.school
-            self.lessons = lessons(
-                *(self.splats, taught.train, taught.background),
-                threads=self.threads,
-                device=self.device,
-                progress=self.progress,
-            )
-        found = popspa(
-            *(self.splats, count, self.settings, self.school),
-            lessons=self.lessons,
-            threads=self.threads,
-            device=self.device,
-            progress=self.progress,
-        )
-        compared = evaluate(
-            *(self.splats, found.splats, self.school.exam),
-            threads=self.threads,
-            progress=as_stage("judge", self.progress),
-        )
-        drop = drop_of(compared)
-        self.trials[count] = drop
+        found = self.compactor(count)
+        drop = self.trials[count] = self.compactor.drop(found)
         if drop <= allowed and (self.best is None or count < len(self.best.splats)):
             self.best = found
         return drop

@@ -183,7 +183,7 @@ class Tuner:
         plan = Plan(
             stage="finetune",
             steps=chosen.steps,
-            rates=_rates(chosen),
+            rates=_rates(chosen, self.lessons),
             ssim_weight=chosen.ssim_weight,
             seed=(chosen.seed,),
             regularizers=(lengths, Smoothness(work, chosen.smoothness, chosen.steps)),
@@ -206,8 +206,8 @@ class Tuner:
                 target = torch.from_numpy(self.lessons.picture(n))[None].to(shown["means"].device)
                 image, _ = rasterize(
                     **shown,
-                    viewmats=torch.from_numpy(camera.viewmat)[None].float(),
-                    Ks=torch.from_numpy(camera.K)[None].float(),
+                    viewmats=torch.from_numpy(camera.viewmat)[None],
+                    Ks=torch.from_numpy(camera.K)[None],
                     width=camera.width,
                     height=camera.height,
                     backgrounds=torch.from_numpy(self.lessons.background)[None],
@@ -248,9 +248,10 @@ class Tuner:
         return key.hexdigest()
 
 
-def _rates(chosen: FinetuneSettings) -> Rates:
+def _rates(chosen: FinetuneSettings, lessons: Lessons) -> Rates:
     """Learning rates that fall exponentially, and springs that grow from nothing once most is learned."""
-    base = {name: chosen.entry_rate if name == "f_rest_centroids" else chosen.rate for name in FIELDS}
+    share = 1.0 if lessons.taught_by == "photos" else chosen.renderings_rate
+    base = {name: share * (chosen.entry_rate if name == "f_rest_centroids" else chosen.rate) for name in FIELDS}
     learning = falling(base, dict.fromkeys(FIELDS, 1.0), dict.fromkeys(FIELDS, chosen.rate_end))
 
     def rates(done: float) -> dict[str, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -29,6 +29,15 @@ class Settings(BaseModel):
     compact: CompactSettings = CompactSettings()
     encode: EncodeSettings = EncodeSettings()
     finetune: FinetuneSettings = FinetuneSettings()
+
+    @model_validator(mode="after")
+    def _a_goal_to_go_by(self) -> Self:
+        if self.compact.by_goal and not self.encode.has_goal:
+            raise ValueError(
+                "compaction by a goal needs one: give target_size, max_psnr_drop or psnr, or say how many Gaussians to "
+                "keep"
+            )
+        return self
 
     @model_validator(mode="before")
     @classmethod
@@ -65,12 +74,12 @@ class Settings(BaseModel):
             )
         except ValidationError as error:
             problem = error.errors()[0]
+            if problem["type"] == "value_error":
+                raise UnsupportedError(str(problem["ctx"]["error"])) from error
             group, name = str(problem["loc"][0]), str(problem["loc"][-1])
             if problem["type"] == "extra_forbidden":
                 known = ", ".join(dict.fromkeys([*GROUPS[group].__annotations__, *GROUPS[group].model_fields]))
                 raise UnsupportedError(f"there is no setting {name!r} of {group}; there are {known}") from error
-            if problem["type"] == "value_error":
-                raise UnsupportedError(str(problem["ctx"]["error"])) from error
             raise UnsupportedError(f"setting {name}: {problem['msg'].lower()}, not {problem['input']!r}") from error
 
 

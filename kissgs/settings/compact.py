@@ -21,6 +21,11 @@ class CompactSettings(SchoolSettings):
         description="Keep as few as are found whose pictures from held-out views lose at most so many decibels. "
         "Takes several compactions. Without photographs, as if the scene were 30 dB from them.",
     )
+    by_goal: bool = Field(
+        False,
+        description="Keep as many as serve the goal of encode best: where target_size, psnr or max_psnr_drop is given.",
+    )
+    attempts: int = Field(3, ge=1, le=20, description="Where by_goal is true: compactions that are tried, at most.")
     score_share: float = Field(
         0.8,
         ge=0,
@@ -87,7 +92,7 @@ class CompactSettings(SchoolSettings):
     @property
     def wanted(self) -> bool:
         """Whether a budget is given: without one, a scene keeps all its Gaussians."""
-        return any(getattr(self, name) is not None for name in BUDGETS)
+        return bool(self._given)
 
     @property
     def steps(self) -> int:
@@ -101,10 +106,14 @@ class CompactSettings(SchoolSettings):
 
     @model_validator(mode="after")
     def _one_budget(self) -> Self:
-        given = [name for name in BUDGETS if getattr(self, name) is not None]
+        given = self._given
         if len(given) > 1:
             raise ValueError(f"{given[0]} and {given[1]} cannot both be met; give one")
         return self
 
+    @property
+    def _given(self) -> list[str]:
+        return [name for name in BUDGETS if getattr(self, name) not in (None, False)]
 
-BUDGETS = ("count", "ratio", "max_psnr_drop")
+
+BUDGETS = ("count", "ratio", "max_psnr_drop", "by_goal")

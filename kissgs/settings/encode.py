@@ -41,6 +41,16 @@ class EncodeSettings(BaseModel):
         description="Where bits are weighed: search for the best container of at most so many bytes, such as 800kB or "
         "2.5MB; hardly smaller where that can be. Takes a few encodings.",
     )
+    max_psnr_drop: float | None = Field(
+        None,
+        gt=0,
+        le=20,
+        description="Where bits are weighed: search for the smallest container whose pictures from held-out views lose "
+        "at most so many decibels. Takes a few encodings. Without photographs, as if the scene were 30 dB from them.",
+    )
+    attempts: int = Field(
+        10, ge=1, le=100, description="On the way to a goal: containers that are made of one scene, at most."
+    )
     drop: float = Field(
         10.0,
         ge=0,
@@ -160,8 +170,8 @@ class EncodeSettings(BaseModel):
 
     @property
     def has_goal(self) -> bool:
-        """Whether a PSNR or a size is sought."""
-        return self.psnr is not None or self.target_size is not None
+        """Whether a PSNR, a loss of it or a size is sought."""
+        return any(getattr(self, name) is not None for name in GOALS)
 
     @model_validator(mode="after")
     def _only_what_counts(self) -> Self:
@@ -174,13 +184,15 @@ class EncodeSettings(BaseModel):
 
     @model_validator(mode="after")
     def _one_goal(self) -> Self:
-        goals = [name for name in ("price", "psnr", "target_size") if getattr(self, name) is not None]
+        goals = [name for name in ("price", *GOALS) if getattr(self, name) is not None]
         if len(goals) > 1:
             raise ValueError(f"{goals[0]} and {goals[1]} cannot both be met; give one")
         if goals and not self.weigh:
             raise ValueError(f"{goals[0]} needs bits that are weighed: choose balanced or small, or set weigh=true")
         return self
 
+
+GOALS = ("psnr", "target_size", "max_psnr_drop")
 
 UNWEIGHED = (
     *("shared_steps", "means_bits", "means_tolerance", "opacity_step", "scale_step", "quat_step", "sh0_step"),

@@ -14,9 +14,15 @@ class FinetuneSettings(SchoolSettings):
     steps: int = Field(500, ge=1, le=1_000_000, description="Of training.")
     batch: int = Field(1, ge=1, le=64, description="Pictures in each step.")
     rate: float = Field(
-        0.02, gt=0, le=10, description="Learning rate at the beginning, in steps of each attribute; SH's entries apart."
+        0.06, gt=0, le=10, description="Learning rate at the beginning, in steps of each attribute; SH's entries apart."
     )
-    entry_rate: float = Field(0.05, gt=0, le=10, description="The same of the SH codebook's entries.")
+    entry_rate: float = Field(0.2, gt=0, le=10, description="The same of the SH codebook's entries.")
+    renderings_rate: float = Field(
+        0.3,
+        gt=0,
+        le=10,
+        description="Both times this where renderings of the scene teach: they leave less to learn.",
+    )
     rate_end: float = Field(0.05, gt=0, le=1, description="What is left of both at the end.")
     code_length: float = Field(
         2.0,

@@ -2,12 +2,13 @@
 
 import { announce, byId, el } from "./dom.js";
 import { bytes, count } from "./format.js";
+import { goalField } from "./goal.js";
 import { Unsuitable, inspect } from "./ply.js";
 import { presetList } from "./presets.js";
 
 /**
- * @typedef {{preset: string, evaluate: boolean, compact?: {ratio?: number | null},
- *   finetune?: {wanted?: boolean}}} Options
+ * @typedef {{preset: string, evaluate: boolean, encode?: import("./goal.js").Goals,
+ *   compact?: {ratio?: number | null, by_goal?: boolean}, finetune?: {wanted?: boolean}}} Options
  * @typedef {{file: File, options: Options}} Order
  */
 
@@ -20,6 +21,7 @@ import { presetList } from "./presets.js";
 export function composer(limits, presets, submit) {
   const [form, input] = [byId("compose"), byId("file")];
   const list = presetList(presets);
+  const goal = goalField(presets, list.chosen);
   /** @type {File | null} */
   let chosen = null;
   let looks = 0; // at files: only the latest look may speak
@@ -62,13 +64,10 @@ export function composer(limits, presets, submit) {
   });
   form.addEventListener("submit", (/** @type {SubmitEvent} */ event) => {
     event.preventDefault();
-    const [preset, evaluate, share] = [list.chosen(), byId("evaluate").checked, Number(byId("keep").value)];
-    const [compact, finetune] = [share && { ratio: share }, byId("finetune").checked && { wanted: true }];
-    if (chosen)
-      return submit({
-        file: chosen,
-        options: { preset, evaluate, ...(compact && { compact }), ...(finetune && { finetune }) },
-      });
+    const [preset, evaluate, encode] = [list.chosen(), byId("evaluate").checked, goal.chosen()];
+    const [compact, finetune] = [budget(byId("keep").value), byId("finetune").checked && { wanted: true }];
+    const asked = { ...(encode && { encode }), ...(compact && { compact }), ...(finetune && { finetune }) };
+    if (chosen) return submit({ file: chosen, options: { preset, evaluate, ...asked } });
     say("Choose a .ply first.");
     input.focus();
   });
@@ -82,15 +81,22 @@ export function composer(limits, presets, submit) {
     /** As they were the last time, for another try. @param {Options} options */
     prefer(options) {
       list.choose(options.preset);
+      goal.prefer(options.encode ?? {});
       byId("evaluate").checked = options.evaluate;
       byId("finetune").checked = limits.training && (options.finetune?.wanted ?? false);
       const [keep, ratio] = [/** @type {HTMLSelectElement} */ (byId("keep")), options.compact?.ratio ?? null];
       if (ratio !== null && ![...keep.options].some(({ value }) => Number(value) === ratio))
         keep.add(new Option(`Keep ${Math.round(100 * ratio)} %`, String(ratio)));
-      keep.value = [...keep.options].find(({ value }) => Number(value) === ratio)?.value ?? "";
+      const known = options.compact?.by_goal
+        ? "auto"
+        : [...keep.options].find(({ value }) => Number(value) === ratio)?.value;
+      keep.value = known ?? "";
     },
   };
 }
+
+/** @param {string} kept how many Gaussians: a share, "auto", or nothing for all */
+const budget = (kept) => (kept === "auto" ? { by_goal: true } : kept ? { ratio: Number(kept) } : null);
 
 /** @param {string} text */
 function say(text) {

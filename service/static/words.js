@@ -82,8 +82,8 @@ export const stageWord = (stage) => STAGES[stage] ?? stage;
 export function plannedStages(status) {
   const planned = new Set(ALWAYS);
   if (status.options.encode.weigh) WEIGHED.forEach((stage) => planned.add(stage));
-  const { count: wanted, ratio, max_psnr_drop: drop, sparsify_steps, refine_steps } = status.options.compact;
-  if (wanted !== null || ratio !== null || drop !== null) {
+  const { count: wanted, ratio, max_psnr_drop: drop, by_goal, sparsify_steps, refine_steps } = status.options.compact;
+  if (wanted !== null || ratio !== null || drop !== null || by_goal) {
     COMPACTED.forEach((stage) => planned.add(stage));
     if (sparsify_steps + refine_steps > 0) planned.add("lessons");
     if (sparsify_steps > 0) planned.add("sparsify");

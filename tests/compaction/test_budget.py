@@ -9,7 +9,8 @@ from training_scenes import around, cloud, same
 
 import kissgs
 from kissgs import CompactSettings, UnsupportedError
-from kissgs.compaction.budget import USUAL, compact_scene, drop_of
+from kissgs.compaction.budget import compact_scene
+from kissgs.evaluation.drop import USUAL, drop_of
 from kissgs.evaluation.pictures import evaluate
 from kissgs.rendering.rasterizer import render
 from kissgs.views.view import View, Views, black

@@ -21,7 +21,8 @@ from kissgs.sogxt.names import YAML_NAME
 from kissgs.training.checkpoint import Checkpoint
 from kissgs.views.view import Views, black
 
-SHORT = {"wanted": True, "steps": 12, "rate": 0.2, "entry_rate": 0.3, "views": 16, "view_size": 60}
+SHORT = {"wanted": True, "steps": 12, "rate": 0.2, "entry_rate": 0.3, "renderings_rate": 1.0}
+SHORT |= {"views": 16, "view_size": 60}
 GENTLE = {"steps": 60, "rate": 0.05, "entry_rate": 0.05}
 COARSE = {"scale_step": 0.4, "opacity_step": 1.0, "sh0_step": 0.3, "quat_step": 0.1}
 

@@ -69,7 +69,8 @@ def test_training_in_a_job(service):
 
 
 @pytest.mark.parametrize(
-    "compact", [{"ratio": 2}, {"count": 0}, {"count": 5, "ratio": 0.1}, {"max_psnr_drop": -1}, {"speed": 1}]
+    "compact",
+    [{"ratio": 2}, {"count": 0}, {"count": 5, "ratio": 0.1}, {"max_psnr_drop": -1}, {"speed": 1}, {"by_goal": True}],
 )
 def test_impossible_budgets_are_refused(service, compact):
     answer = service.http.post("/v1/jobs", content=SMALL, params={"options": json.dumps({"compact": compact})})
@@ -91,6 +92,19 @@ def test_a_service_without_torch_does_not_accept_what_it_cannot_do(monkeypatch):
 def test_which_training_can_be_taken_up(compact, resumable):
     assert parse_options(json.dumps({"compact": compact})).resumable == resumable
     assert not parse_options(json.dumps({"preset": "fast", "compact": compact})).resumable
+
+
+def test_a_goal_and_as_many_gaussians_as_it_needs(service):
+    prune = {"by_goal": True, "attempts": 1, "sparsify_steps": 0, "refine_steps": 0, "views": 24, "view_size": 48}
+    options = {"encode": {"target_size": "10.5kB", "views": 4, "view_size": 48}, "compact": prune}
+    assert not parse_options(json.dumps(options)).resumable
+    status = service.ended(service.submit(options=json.dumps(options)))
+    assert status["state"] == "succeeded", status
+    assert status["sizes"]["container"] <= 10_500
+    report = service.http.get(status["links"]["report"]).json()
+    assert len({trial["count"] for trial in report["trials"]}) > 1
+    lost = service.ended(service.submit(options=json.dumps({"encode": {"max_psnr_drop": 0.5, "views": 4}})))
+    assert lost["state"] == "succeeded", lost
 
 
 def test_limits_tell_whether_it_trains(service):

@@ -99,6 +99,33 @@ def test_by_keyboard_alone(visit, service):
     assert newest(service)["options"]["preset"] == "fast"
 
 
+def test_a_size_is_asked_for(visit, service):
+    page = visit()
+    choose(page)
+    page.get_by_text("300 Gaussians").wait_for()
+    goal, keep = page.get_by_label("Goal"), page.get_by_label("Gaussians", exact=True)
+    auto = keep.locator("option[value=auto]")
+    page.get_by_label("Fast").check()
+    assert goal.is_disabled()  # it weighs no bits
+    page.get_by_label("Balanced").check()
+    assert auto.is_disabled()
+    goal.select_option("A size of at most")
+    assert (page.locator("#amount").input_value(), page.locator("#unit").inner_text()) == ("3", "MB")
+    assert auto.is_enabled()
+    keep.select_option("auto")
+    goal.select_option("A loss of at most")
+    assert (page.locator("#amount").input_value(), page.locator("#unit").inner_text()) == ("0.1", "dB")
+    goal.select_option("As the preset has it")
+    assert keep.input_value() == ""
+    goal.select_option("A size of at most")
+    page.locator("#amount").fill("0.0145")
+    page.get_by_role("button", name="Compress").click()
+    page.get_by_text("smaller").first.wait_for()
+    job = newest(service)
+    assert job["options"]["encode"]["target_size"] == 14_500
+    assert 0.9 * 14_500 <= job["sizes"]["container"] <= 14_500
+
+
 @pytest.mark.parametrize(
     ("data", "said"), [(b"hello " * 99, "ply"), (SMALL.replace(b"vertex 300\n", b"vertex 99999\n"), "99,999")]
 )

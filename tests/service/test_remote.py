@@ -204,6 +204,13 @@ def test_the_command(service, scene, tmp_path):
     assert json.loads(as_json.stdout)["state"] == "succeeded"
 
 
+def test_the_command_with_a_goal(service, scene, tmp_path):
+    words = ("--server", service.url, "--target-size", "14.5kB", "--set", "views=4", "-f", "-q")
+    done = kissgs_command("compress", scene, *words)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (tmp_path / "Schloß 1.zip").stat().st_size <= 14_500
+
+
 def test_the_command_with_keys(start, scene):
     service = start(KISSGS_KEYS=f"alice:{hashlib.sha256(b'secret').hexdigest()}")
     without = kissgs_command("compress", scene, "--server", service.url)

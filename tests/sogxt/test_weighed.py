@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from kissgs import Settings, compress, decompress
 from kissgs.importance import Importance
 from kissgs.parallel import Workers
-from kissgs.sogxt.economy import Costs, Gloss, error_at, price_for, step
+from kissgs.sogxt.economy import NEARLY, Costs, Gloss, error_at, price_for, step
 from kissgs.sogxt.encode import encode
 from kissgs.sogxt.pras import ROTATIONS, apply_forms
 from kissgs.sogxt.quantize import quantize
@@ -61,6 +61,9 @@ def test_prices_are_found_for_the_error_asked_for():
     for error in (1e-6, 1e-4):
         price = price_for(error, costs, gloss, 10, 7, 0.2)
         np.testing.assert_allclose(error_at(price, costs, gloss, 10, 7, 0.2), error, rtol=0.05)
+    least = error_at(1e-22, costs, gloss, 10, 7, 0.2)  # what the largest codebook leaves
+    price = price_for(least / 100, costs, gloss, 10, 7, 0.2)
+    np.testing.assert_allclose(error_at(price, costs, gloss, 10, 7, 0.2), NEARLY * least, rtol=0.05)
     sizes = [gloss.best_size(price, 100_000, 7) for price in (1e-14, 1e-12, 1e-10)]
     assert sizes == sorted(sizes, reverse=True)
     assert sizes[0] <= round(100_000 / 7)

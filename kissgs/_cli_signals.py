@@ -1,0 +1,69 @@
+"""Ctrl-C and requests to end, on the command line."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, NoReturn
+
+from kissgs.errors import Enough
+
+if TYPE_CHECKING:
+    from types import FrameType
+
+    from kissgs.progress import Progress
+
+
+class Interrupted(BaseException):
+    """Ctrl-C or a request to end: unwinds everything, so that no half-written file stays."""
+
+
+def listen() -> None:
+    """Have requests to end unwind everything."""
+    signal.signal(signal.SIGINT, _interrupt)
+    signal.signal(signal.SIGTERM, _interrupt)
+    sys.unraisablehook = _again
+
+
+def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
+    raise Interrupted(number)
+
+
+def _again(lost: sys.UnraisableHookArgs) -> None:
+    """A signal that arrives inside a finalizer is printed and forgotten by Python: it is sent once more."""
+    if isinstance(lost.exc_value, Interrupted):
+        threading.Timer(0.01, os.kill, (os.getpid(), lost.exc_value.args[0])).start()
+    else:
+        sys.__unraisablehook__(lost)
+
+
+@contextlib.contextmanager
+def stoppable(progress: Progress, searches: bool) -> Iterator[Progress]:
+    """While a goal is sought, the first Ctrl-C ends the search with what it has found; another one ends all."""
+    if not searches:
+        yield progress
+        return
+    told: list[int] = []
+
+    def heard(number: int, frame: FrameType | None) -> None:
+        told.append(number)
+        signal.signal(signal.SIGINT, before)
+
+    def receive(stage: str, fraction: float, note: str = "") -> None:
+        if told:
+            sys.stderr.write("kissgs: enough: the best so far is taken, if there is one; Ctrl-C again: nothing is\n")
+            told.clear()
+            raise Enough
+        progress(stage, fraction, note)
+
+    before = signal.signal(signal.SIGINT, heard)
+    try:
+        yield receive
+    except Enough as error:
+        raise Interrupted(signal.SIGINT) from error
+    finally:
+        signal.signal(signal.SIGINT, before)
