@@ -24,10 +24,11 @@ def bench_tables(rows: Sequence[Measured], equals: Sequence[Equal]) -> Renderabl
         repeats = max(len(row.runs) for row in here)
         medians = f"; times are medians of {repeats} runs, memory the most" if repeats > 1 else ""
         blocks += [Text.assemble((scene, "bold"), f"  {_counts(here)} Gaussians{medians}"), _figures(here)]
-        if whole:
-            names = _names(whole)
-            blocks.append(_columns("seconds", names, [row.took.stage_seconds for row in whole], "{:.2f}"))
-            blocks.append(_columns("bytes", names, [row.file_bytes for row in whole], "{:,}"))
+        for count in dict.fromkeys(row.gaussians for row in whole):
+            of = [row for row in whole if row.gaussians == count]
+            at, names = ("" if len(of) == len(whole) else f", {count:,}"), [row.name for row in of]
+            blocks.append(_columns(f"seconds{at}", names, [row.took.stage_seconds for row in of], "{:.2f}"))
+            blocks.append(_columns(f"bytes{at}", names, [row.file_bytes for row in of], "{:,}"))
         blocks += [Text(_equal(equal)) for equal in equals if equal.scene == scene]
         blocks += [Text(_unsteady(row), style="red") for row in here if not row.steady]
     return Group(*blocks)
@@ -87,7 +88,7 @@ def _counts(rows: Sequence[Measured]) -> str:
 def _names(rows: Sequence[Measured]) -> list[str]:
     """Of encoders, with the number of Gaussians where that is not always the same."""
     several = len({row.gaussians for row in rows}) > 1
-    return [f"{row.name}\n{row.gaussians:,}" if several else row.name for row in rows]
+    return [f"{row.name}, {row.gaussians:,}" if several else row.name for row in rows]
 
 
 def _figures(rows: Sequence[Measured]) -> Table:
@@ -107,7 +108,7 @@ def _figures(rows: Sequence[Measured]) -> Table:
             *(f"{took.encode_seconds:.1f}", f"{took.decode_cpu_seconds:.2f}", f"{took.peak_memory / 1e6:.0f}"),
             *(f"{errors.rotation_degrees.rmse:.2f}", f"{errors.scales.rmse:.3f}", f"{errors.shN.rmse:.4f}"),
         )
-        table.add_row(name.replace("\n", ", "), *cells, *_picture_cells(row.pictures, photographed))
+        table.add_row(name, *cells, *_picture_cells(row.pictures, photographed))
     return table
 
 

@@ -76,3 +76,5 @@ class Enough(Cancelled):
 
     Where nothing that meets the goal has been found yet, or nothing is searched for, the work is cancelled.
     """
+
+    code = "enough"

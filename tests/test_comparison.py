@@ -68,8 +68,12 @@ def test_bytes_at_equal_psnr_lie_on_the_curve():
     assert "at the PSNR of .spz to photographs (20.00 dB): beyond the curve of balanced" in told
 
 
-def test_tables_fit_the_page():
-    lines = text(bench_tables(many(photo=True), []), width=300).splitlines()
+SIZES = [measured(f"preset{n}", 1, 30.0, gaussians=size) for size in (10**5, 10**6, 10**7) for n in range(4)]
+
+
+@pytest.mark.parametrize("rows", [many(photo=True), SIZES])
+def test_tables_fit_the_page(rows):
+    lines = text(bench_tables(rows, []), width=300).splitlines()
     assert max(map(len, map(str.rstrip, lines))) <= 120
 
 

@@ -13,12 +13,12 @@ from kissgs import errors
 PUBLIC = [
     "Camera",
     "Cancelled",
-    "Enough",
     "CompactSettings",
     "Compacted",
     "CompactionReport",
     "Compressed",
     "EncodeSettings",
+    "Enough",
     "Evaluation",
     "FinetuneReport",
     "FinetuneSettings",
