@@ -278,12 +278,12 @@ def _compacted(
     encoding: Encoding, checkpoint: AnyPath | None
 ) -> tuple[Compacted | None, Container | None, tuple[Trial, ...]]:
     """What compaction leaves, if it is asked for; a container that was made on the way, and all attempts."""
-    from kissgs.compaction.budget import NO_CHECKPOINT, Compactor, compact_scene, unchanged
-    from kissgs.tradeoff import Tradeoff
-
     splats, chosen, kept = encoding.splats, encoding.settings.compact, Path(checkpoint) if checkpoint else None
     if not chosen.wanted:
         return None, None, ()
+    from kissgs.compaction.budget import NO_CHECKPOINT, Compactor, compact_scene, unchanged
+    from kissgs.tradeoff import Tradeoff
+
     if encoding.importance is not None:
         raise UnsupportedError("importance is that of a scene before its compaction; compact first, then measure")
     common: _Common = {"threads": encoding.threads, "device": encoding.device, "progress": encoding.progress}

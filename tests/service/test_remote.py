@@ -238,6 +238,7 @@ def test_interrupting_the_command_cancels_the_job(start, tmp_path):
     )
     while not service.children():
         time.sleep(0.05)
+    time.sleep(2)  # until the answer has reached the client: before, it knows of no job
     running.send_signal(signal.SIGINT)
     assert running.wait(20) == 130
     assert "interrupted" in running.stderr.read()
