@@ -19,7 +19,7 @@ from kissgs.rendering.rasterizer import Device
 from kissgs.report import Report
 from kissgs.scenes import AnyPath, check_ply, open_scene, save
 from kissgs.settings import Settings
-from kissgs.sogxt.container import check_destination, write_container, zip_bytes
+from kissgs.sogxt.container import check_destination, open_source, write_container, zip_bytes
 from kissgs.sogxt.decode import MAX_GAUSSIANS, decode
 from kissgs.splats import Splats
 from kissgs.training.checkpoint import beside, forget
@@ -49,7 +49,7 @@ class Compressed:
     checkpoints: tuple[Path, ...] = ()
 
     def to_zip(self) -> bytes:
-        """The container as one stored zip."""
+        """The container as one zip."""
         return zip_bytes(self.files)
 
     def save(self, path: AnyPath, *, overwrite: bool = False) -> None:
@@ -196,7 +196,7 @@ def compress(
         container, more = chosen.run()
         trials += more
     encoded = container.encoded
-    archive_bytes = len(zip_bytes(encoded.files))
+    archive_bytes, file_bytes = _sizes(encoded.files)
     evaluation = _evaluate(original, encoded.files, views, threads, clock) if evaluate else None
     checkpoints = (None if compacted is None else compacted.checkpoint, kept)
     if target is not None:
@@ -210,7 +210,7 @@ def compress(
         sh_degree=original.sh_degree,
         source_bytes=source_bytes,
         container_bytes=archive_bytes,
-        file_bytes={name: len(data) for name, data in encoded.files.items()},
+        file_bytes=file_bytes,
         cleaned=cleaned,
         compaction=None if compacted is None else compacted.report,
         finetuning=container.finetuning,
@@ -230,6 +230,13 @@ def compress(
     order = encoded.order if compacted is None else compacted.index[encoded.order]
     left = () if target is not None else tuple(path for path in checkpoints if path is not None)
     return Compressed(encoded.files, order, report, left)
+
+
+def _sizes(files: Mapping[str, bytes]) -> tuple[int, dict[str, int]]:
+    """Of the zip, and of each file in it."""
+    archive = zip_bytes(files)
+    with open_source(archive) as stored:
+        return len(archive), {name: stored.size(name) for name in files}
 
 
 def decompress(

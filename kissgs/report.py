@@ -22,7 +22,7 @@ class Report:
         sh_degree: 0 to 3.
         source_bytes: of the scene file; of the arrays if there was none.
         container_bytes: of the zip.
-        file_bytes: per file of the container.
+        file_bytes: per file of the container, as its zip stores it.
         cleaned: what was wrong with the input (:class:`kissgs.splats.Cleaned`).
         compaction: of the scene before it was encoded; None unless it was asked for.
         finetuning: of the levels after they were chosen; None unless it was asked for, and there was a Gaussian.

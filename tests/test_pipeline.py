@@ -105,7 +105,8 @@ def test_the_report_adds_up(tmp_path, ply):
     assert report.cleaned.unnormalised_quats == 1
     assert report.source_bytes == ply.stat().st_size
     assert report.container_bytes == (tmp_path / "scene.zip").stat().st_size == len(result.to_zip())
-    assert report.file_bytes == {name: len(data) for name, data in result.files.items()}
+    with zipfile.ZipFile(io.BytesIO(result.to_zip())) as archive:
+        assert report.file_bytes == {entry.filename: entry.compress_size for entry in archive.infolist()}
     assert report.container_bytes > sum(report.file_bytes.values())
     assert report.ratio == report.source_bytes / report.container_bytes
     assert report.bytes_per_gaussian == report.container_bytes / 120

@@ -17,6 +17,7 @@ from kissgs.parallel import blas_workers
 from kissgs.settings import EncodeSettings
 from kissgs.sogxt.choice import Choice
 from kissgs.sogxt.codebook import PAPER_TOP
+from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.decode import decode
 from kissgs.sogxt.encode import choose, draw, write
 from kissgs.sogxt.planes import compress_images
@@ -37,7 +38,7 @@ class Coded:
         splats: the scene that was encoded.
         choice: what was chosen for it.
         images: that WebP compresses, by file name.
-        stored: bytes that are stored as they are, by name.
+        stored: what is no image, by name.
         exact: what is in the container, in the order of the grid and in the forms that were chosen, as it was.
         decoded: what a decoder finds.
     """
@@ -50,10 +51,10 @@ class Coded:
     decoded: Splats
 
     def size(self, settings: EncodeSettings, threads: int) -> int:
-        """Bytes of all parts, compressed."""
+        """Bytes of a zip of all parts, compressed."""
         with blas_workers(threads) as pool:
             files = compress_images(self.images, settings, pool, lambda fraction: None)
-        return sum(map(len, (*files.values(), *self.stored.values())))
+        return len(zip_bytes({**files, **self.stored}))
 
     def without(self, *names: str) -> dict[str, UInt8[np.ndarray, "H W C"]]:
         """All images but these."""

@@ -1,4 +1,4 @@
-"""A set of named byte strings: a directory, a stored zip, in memory. Names and sizes are checked before reading."""
+"""A set of named byte strings: a directory, a zip, in memory. Names and sizes are checked before reading."""
 
 from __future__ import annotations
 
@@ -148,14 +148,15 @@ def open_source(source: Path | bytes | Mapping[str, bytes]) -> Iterator[Source]:
 
 
 def zip_bytes(files: Mapping[str, bytes]) -> bytes:
-    """The files as one stored zip; equal files give equal bytes (no time, no system)."""
+    """The files as one zip, images as they are and text deflated; equal files give equal bytes (no time, no system)."""
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+    with zipfile.ZipFile(buffer, "w") as archive:
         for name, data in files.items():
             entry = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
+            entry.compress_type = zipfile.ZIP_STORED if name.endswith(".webp") else zipfile.ZIP_DEFLATED
             entry.create_system = 3
             entry.external_attr = 0o644 << 16
-            archive.writestr(entry, data)
+            archive.writestr(entry, data, compresslevel=9)
     return buffer.getvalue()
 
 
