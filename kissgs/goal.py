@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 PRICES = (-70.0, -6.0)
 """Between which prices are sought, as powers of 2."""
 
+JUMP = 1 / 32
+"""Powers of 2: a size that jumps between prices as near as this jumps for good, and is not looked for any finer."""
+
 
 @dataclass(frozen=True, slots=True)
 class Container:
@@ -159,6 +162,7 @@ class GoalSearch:
                 lambda x: start if x == begin else self._try(2.0**x),
                 *(begin, self.goal.slope, self.goal.near, PRICES),
                 attempts=attempts,
+                jump=JUMP,
             )
 
     def _at(self, price: float) -> EncodeSettings:
@@ -176,7 +180,7 @@ class GoalSearch:
             seen = self.pictures(encoded)
             trial = replace(trial, psnr=seen.mean.between.psnr, drop=drop_of(seen))
         self.trials.append(trial)
-        self.overhead = sum(len(data) for name, data in encoded.files.items() if not name.endswith(".webp"))
+        self.overhead = trial.bytes - sum(len(data) for name, data in encoded.files.items() if name.endswith(".webp"))
         self.progress.note = f"try {len(self.trials) + 1}, after {trial.spelled()}"
         improved = container.finetuning is not None and container.finetuning.kept
         size = trial.bytes if self.goal.by_size else -trial.bytes

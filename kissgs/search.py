@@ -46,6 +46,7 @@ def seek(
     bounds: tuple[float, float],
     grain: float = 0.0,
     attempts: int = ATTEMPTS,
+    jump: float = 0.0,
 ) -> float | None:
     """Where a monotone function is hardly above zero.
 
@@ -60,6 +61,7 @@ def seek(
         bounds: attempts stay between these.
         grain: attempts are whole multiples of this; 0 for any number.
         attempts: how many at most.
+        jump: an attempt that met the goal, and one that did not, so near to each other leave nothing to find between.
 
     Returns:
         The best attempt that met the goal; None if none did, or the function does not go on rising.
@@ -68,7 +70,7 @@ def seek(
     x = _whole(start, grain)
     while len(known) < attempts and x not in known:
         known[x] = spare(x)
-        if 0 <= known[x] <= tolerance or _flat(known, tolerance):
+        if 0 <= known[x] <= tolerance or _flat(known, tolerance) or _gap(known) < jump:
             break
         x = min(max(_whole(_next(known, slope, tolerance / 2), grain), bounds[0]), bounds[1])
     met = [x for x, found in known.items() if found >= 0]
@@ -135,6 +137,13 @@ def _next(known: dict[float, float], slope: float, aim: float) -> float:
         measured = (known[last] - known[before[-1]]) / (last - before[-1])
         slope *= min(max(measured / slope, 0.1), 10.0)
     return last + min(max((aim - known[last]) / slope, -REACH), REACH)
+
+
+def _gap(known: dict[float, float]) -> float:
+    """Between the nearest two of which one met the goal and the other did not."""
+    met = [x for x, found in known.items() if found >= 0]
+    unmet = [x for x, found in known.items() if found < 0]
+    return min((abs(one - other) for one in met for other in unmet), default=math.inf)
 
 
 def _flat(known: dict[float, float], tolerance: float) -> bool:

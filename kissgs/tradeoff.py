@@ -92,7 +92,8 @@ class Tradeoff:
         offer = self._offers[best]
         if offer.container is None:
             raise UnsupportedError(self.goal.regret(self.trials, all_stay=False))
-        compacted = offer.compacted or unchanged(splats, "and no smaller one that was tried serves the goal better")
+        tried = "and no smaller number that was tried serves the goal better"
+        compacted = offer.compacted or unchanged(splats, tried if self._drops else "and there is room for all of them")
         notes = filter(None, [compacted.report.note, self.compactor.note])
         report = replace(compacted.report, trials=tuple(self._drops.items()), note="; ".join(notes))
         tunes = self.encoding.settings.finetune.wanted and not self._stopped

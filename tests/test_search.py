@@ -42,6 +42,15 @@ def test_steps_are_lived_with():
     assert spare(found) == pytest.approx(0.6)
 
 
+def test_a_jump_is_not_looked_into_any_finer():
+    spare = Counted(lambda x: (1.0 if x < 0.3 else -1.0) - 0.1 * x)
+    found = seek(spare, 1.0, -1.0, 0.01, (-9, 9), jump=1 / 32)
+    assert found is not None
+    assert 0.3 - 1 / 32 < found < 0.3
+    assert len(spare.asked) < ATTEMPTS - 1
+    assert seek(Counted(spare.function), 1.0, -1.0, 0.01, (-9, 9)) == pytest.approx(0.3, abs=1 / 32)
+
+
 def test_it_goes_on_where_nearer_attempts_are_no_better():
     """A function that is not quite monotone: the same place is not tried twice."""
     spare = Counted(lambda x: 0.9 - 0.3 * x if x < 0.1 else -0.1 - 0.02 * (1 - x) if x < 1 else -x)
