@@ -17,7 +17,7 @@ from kissgs.errors import UnsupportedError
 from kissgs.goal import Container, Encoder, GoalSearch
 from kissgs.importance import Importance
 from kissgs.io.importance_file import read_importance, write_importance
-from kissgs.progress import Annotated, Progress
+from kissgs.progress import Annotated, Progress, as_stage
 from kissgs.rendering.gsplat_backend import need_cuda
 from kissgs.rendering.rasterizer import Device
 from kissgs.search import Trial
@@ -39,7 +39,7 @@ HEDGE = {True: 0.1, False: 0.55}
 TUNED_ATTEMPTS = 4
 """Containers that are fine-tuned on the way to a goal, at most: each takes a training."""
 
-Chooser = Callable[[EncodeSettings], Choice]
+Chooser = Callable[[EncodeSettings, Progress], Choice]
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -109,9 +109,11 @@ class Encoding:
         """Chooses, fine-tunes if there is a tuner, and writes."""
 
         def encoder(chosen: EncodeSettings) -> Container:
+            bold = self._bold(chosen)
+
             def files(choice: Choice, finetune_steps: int, progress: Progress) -> Encoded:
                 return write(
-                    *(choice, self.splats, chosen),
+                    *(choice, self.splats, bold if finetune_steps else chosen),
                     cleaned=self.cleaned,
                     compacted=len(self.original) - len(self.splats),
                     finetune_steps=finetune_steps,
@@ -119,12 +121,19 @@ class Encoding:
                     progress=progress,
                 )
 
-            choice = chooser(chosen)
+            choice = chooser(chosen, self.progress)
             if tuner is None or not choice.grid.mask.any():
                 return Container(files(choice, 0, self.progress))
-            return Container(*tuner(choice, self.splats, files, checkpoint))
+            start = choice if bold == chosen else chooser(bold, as_stage("finetune", self.progress))
+            return Container(*tuner(choice, start, self.splats, files, checkpoint))
 
         return encoder
+
+    def _bold(self, chosen: EncodeSettings) -> EncodeSettings:
+        """What training starts from: it closes holes, so more Gaussians may go."""
+        if not chosen.weigh or chosen.drop == 0:
+            return chosen
+        return chosen.model_copy(update={"drop": max(chosen.drop, self.settings.finetune.drop)})
 
     def _tuner(self) -> Tuner | None:
         if not self.settings.finetune.wanted or len(self.splats) == 0:
@@ -138,8 +147,8 @@ class Encoding:
             progress=self.progress,
         )
 
-    def _blind(self, chosen: EncodeSettings) -> Choice:
-        return choose(self.splats, chosen, threads=self.threads, progress=self.progress)
+    def _blind(self, chosen: EncodeSettings, progress: Progress) -> Choice:
+        return choose(self.splats, chosen, threads=self.threads, progress=progress)
 
     def _looking(self) -> Chooser:
         """Weighs by pictures of the scene, which are taken once."""
@@ -165,11 +174,11 @@ class Encoding:
             if captured and settings.refit:  # virtual pictures would mislead it
                 recolor = _recolor(splats, watched, importance, settings.refit, *common)
 
-        def ready(stage: str, fraction: float, note: str = "") -> None:
-            if stage != "kernels":  # that was before
-                self.progress(stage, fraction)
+        def chooser(chosen: EncodeSettings, progress: Progress) -> Choice:
+            def ready(stage: str, fraction: float, note: str = "") -> None:
+                if stage != "kernels":  # that was before
+                    progress(stage, fraction)
 
-        def chooser(chosen: EncodeSettings) -> Choice:
             return choose(
                 *(splats, chosen), importance=importance, recolor=recolor, threads=self.threads, progress=ready
             )

@@ -57,7 +57,7 @@ def test_without_a_number_it_is_that_of_the_preset() -> None:
     assert spelled_out(["--finetune", "a.ply", "-q"]) == ["--finetune", "auto", "a.ply", "-q"]
     assert spelled_out(["--finetune", "70", "a.ply"]) == ["--finetune", "70", "a.ply"]
     assert spelled_out(["--finetune", "auto"]) == ["--finetune", "auto"]
-    for preset, steps in (("fast", 200), ("balanced", 500), ("small", 2000), ("paper", 4000)):
+    for preset, steps in (("fast", 200), ("balanced", 1000), ("small", 2000), ("paper", 4000)):
         assert kissgs.Settings.from_preset(preset, finetune={"wanted": True}).finetune.steps == steps
 
 

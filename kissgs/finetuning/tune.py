@@ -98,13 +98,14 @@ class Tuner:
         return cls(original, settings, found, taught, device, threads, progress)
 
     def __call__(
-        self, choice: Choice, scene: Splats, write: Write, checkpoint: Path | None = None
+        self, choice: Choice, start: Choice, scene: Splats, write: Write, checkpoint: Path | None = None
     ) -> tuple[Encoded, FinetuneReport]:
         """Fine-tune, and keep what is better: the container as it was chosen, or the new one.
 
         Args:
             choice: of at least one Gaussian.
-            scene: for which it was made.
+            start: what is trained: the same, or one of fewer Gaussians, of at least one.
+            scene: for which they were made.
             write: makes the files, and tells of it.
             checkpoint: file to keep the state in, every half minute. If there is one of this very work, it is taken up
                 where it was left.
@@ -118,7 +119,7 @@ class Tuner:
         before = write(choice, 0, at_first)
         first = self._judge(before, at_first)
         price = choice.price or implied_price(self._rounding(before, scene, at_first), int(choice.grid.mask.sum()))
-        better, trouble = self._train(choice, scene.sh_degree, price, checkpoint)
+        better, trouble = self._train(start, scene.sh_degree, start.price or price, checkpoint)
         after = write(better, self.settings.steps, self.progress)
         second = self._judge(after, self._at_last)
         cost, new_cost = (told.error + 8 * told.bytes * price for told in (first, second))

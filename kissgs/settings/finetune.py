@@ -11,8 +11,15 @@ class FinetuneSettings(SchoolSettings):
     """How the numbers in the images are improved against pictures of what a decoder makes of them."""
 
     wanted: bool = Field(False, description="Fine-tune. Takes pictures to learn from: photographs are the best.")
-    steps: int = Field(500, ge=1, le=1_000_000, description="Of training.")
+    steps: int = Field(1000, ge=1, le=1_000_000, description="Of training.")
     batch: int = Field(1, ge=1, le=64, description="Pictures in each step.")
+    drop: float = Field(
+        100.0,
+        ge=0,
+        le=200,
+        description="Where bits are weighed: leave out Gaussians that show less than so many bits are worth before "
+        "training, which closes the holes. Without effect where it is less than that of encoding, or that is 0.",
+    )
     rate: float = Field(
         0.06, gt=0, le=10, description="Learning rate at the beginning, in steps of each attribute; SH's entries apart."
     )

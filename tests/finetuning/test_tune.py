@@ -12,7 +12,7 @@ from tuning_scenes import chosen
 
 import kissgs
 from kissgs import FinetuneSettings, OutputError, Settings, UnsupportedError, decompress
-from kissgs.finetuning.tune import Tuner
+from kissgs.finetuning.tune import Tuner, _Mark
 from kissgs.info import describe
 from kissgs.progress import silent
 from kissgs.sogxt.container import zip_bytes
@@ -45,7 +45,7 @@ def tuned(scene, *, checkpoint=None, progress=None, preset="fast", encode=COARSE
         work = replace(work, progress=progress)
     settings = Settings.from_preset(preset, **encode).encode
     choice = chosen(scene, preset, **encode)
-    return work(choice, scene, written(scene, settings), checkpoint)
+    return work(choice, choice, scene, written(scene, settings), checkpoint)
 
 
 @pytest.mark.parametrize("degree", [0, 2])
@@ -85,7 +85,8 @@ def test_threads_change_no_bit_and_the_seed_does(batch):
         torch.set_num_threads(threads)
         work = replace(tuner(scene, batch=batch, size=140, view_size=160, **GENTLE), threads=threads)
         settings = Settings.from_preset("fast", **COARSE).encode
-        found.append(work(chosen(scene, "fast", **COARSE), scene, written(scene, settings))[0].files)
+        choice = chosen(scene, "fast", **COARSE)
+        found.append(work(choice, choice, scene, written(scene, settings))[0].files)
     torch.set_num_threads(before)
     assert found[0] == found[1] == found[2]
     assert found[0] != tuned(scene, batch=batch, size=140, view_size=160, seed=1, **GENTLE)[0].files
@@ -162,6 +163,30 @@ def test_compress_does_it_and_says_so(tmp_path):
     assert [path.name for path in again.checkpoints] == ["c-finetune.npz"]
     told = describe(tmp_path / "a.zip").details["settings"]
     assert told.get("finetune_steps", 0) == (12 if report.finetuning.kept else 0)
+
+
+@pytest.mark.parametrize(
+    ("encode", "finetune", "fewer"), [(10, 80, True), (10, 10, False), (90, 80, False), (0, 80, False)]
+)
+def test_more_gaussians_go_before_training_than_without_it(monkeypatch, encode, finetune, fewer):
+    """As many as without training at that threshold; and none where all shall stay."""
+    scene = cloud(600, 1)
+    chosen = {"fidelity": -12, "views": 4, "view_size": 60}
+
+    def better_after_training(self, encoded, progress):
+        return _Mark(len(zip_bytes(encoded.files)), psnr=30.0, error=1.0 - (b"finetune" in encoded.files[YAML_NAME]))
+
+    monkeypatch.setattr(Tuner, "_judge", better_after_training)
+
+    def made(drop, tuning=None):
+        return kissgs.compress(scene, settings=Settings.from_preset("balanced", **chosen, drop=drop, finetune=tuning))
+
+    found = made(encode, SHORT | {"drop": finetune})
+    assert found.report.negligible == made(max(encode, finetune) if encode else 0).report.negligible
+    assert found.report.finetuning.bytes_before == made(encode).report.container_bytes
+    assert (found.report.negligible > made(encode).report.negligible) == fewer
+    drop = float(max(encode, finetune) if encode else 0)
+    assert f"drop: {drop}\n".encode() in found.files[YAML_NAME]
 
 
 def test_a_size_is_met_by_the_fine_tuned_container():
