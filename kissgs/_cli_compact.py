@@ -63,6 +63,7 @@ def compact(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
 ) -> None:
     """Bring scenes down to fewer Gaussians that show the same: score, prune, train, prune, train (POPSpa)."""
+    from kissgs._cli_signals import stoppable
     from kissgs._console import progress_bar
     from kissgs.io.ply import write_ply
     from kissgs.pipeline import compact as run
@@ -85,7 +86,8 @@ def compact(
 
     def work(scene: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"
-        with progress_bar(quiet or as_json) as progress:
+        seeks = settings.compact.max_psnr_drop is not None
+        with progress_bar(quiet or as_json) as bar, stoppable(bar, seeks) as progress:
             result = run(
                 source(scene),
                 None if piped else target,

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from kissgs.progress import Progress
 
 
+ENOUGH = b"\nkissgs: enough: the best so far is taken, if there is one; Ctrl-C again: nothing is\n"
+
+
 class Interrupted(BaseException):
     """Ctrl-C or a request to end: unwinds everything, so that no half-written file stays."""
 
@@ -48,19 +51,20 @@ def stoppable(progress: Progress, searches: bool) -> Iterator[Progress]:
         yield progress
         return
     told: list[int] = []
+    before = signal.getsignal(signal.SIGINT)
 
     def heard(number: int, frame: FrameType | None) -> None:
         told.append(number)
         signal.signal(signal.SIGINT, before)
+        os.write(2, ENOUGH)  # at once: it may take a while until progress is told
 
     def receive(stage: str, fraction: float, note: str = "") -> None:
         if told:
-            sys.stderr.write("kissgs: enough: the best so far is taken, if there is one; Ctrl-C again: nothing is\n")
             told.clear()
             raise Enough
         progress(stage, fraction, note)
 
-    before = signal.signal(signal.SIGINT, heard)
+    signal.signal(signal.SIGINT, heard)
     try:
         yield receive
     except Enough as error:

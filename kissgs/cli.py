@@ -140,7 +140,8 @@ def compress(
 
     def work(scene: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"
-        with _progress(quiet or as_json) as bar, stoppable(bar, settings.encode.has_goal) as progress:
+        seeks = settings.encode.has_goal or settings.compact.max_psnr_drop is not None
+        with _progress(quiet or as_json) as bar, stoppable(bar, seeks) as progress:
             if evaluate:  # announced here, because it is no stage of the evaluation
                 from kissgs.rendering.rasterizer import load_kernels
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -13,7 +14,7 @@ import numpy as np
 
 from kissgs._typing import Float32, Int
 from kissgs._version import __version__
-from kissgs.errors import UnsupportedError
+from kissgs.errors import Enough, UnsupportedError
 from kissgs.goal import Container, Encoder, GoalSearch
 from kissgs.importance import Importance
 from kissgs.io.importance_file import read_importance, write_importance
@@ -57,6 +58,7 @@ class Encoding:
         cleaned: what was mended, for the metadata.
         checkpoint: file for the state of fine-tuning; a search for a goal keeps none.
         device: where fine-tuning trains.
+        packed: whether the files become a zip; a size is then that of the zip.
         threads: 0 means one per processor.
         progress: receives the stages of all that is done; its note tells where a search stands.
     """
@@ -70,37 +72,52 @@ class Encoding:
     cleaned: Cleaned
     checkpoint: Path | None
     device: Device
+    packed: bool
     threads: int
     progress: Annotated
 
-    def run(self) -> tuple[Container, tuple[Trial, ...]]:
+    def run(self, search: GoalSearch | None = None) -> tuple[Container, tuple[Trial, ...]]:
         """The container, and what was tried on the way to it if the settings name a goal.
+
+        Args:
+            search: for that goal, if it was made before; attempts that it made are not told again.
 
         Raises:
             InvalidViewsError: a photograph cannot be read.
             OutputError: ``cache`` or ``checkpoint`` is something else, or ``cache`` cannot be written.
             UnsupportedError: the goal cannot be met; the scene is too large for one container.
         """
-        wanted = self.settings.encode
-        weighs = wanted.weigh and len(self.splats) > 0
-        chooser, tuner = self._looking() if weighs else self._blind, self._tuner()
-        if not (weighs and wanted.has_goal):
-            return self._encoder(chooser, tuner, self.checkpoint)(wanted), ()
-        search = self.search(chooser)
-        if tuner is not None and not search.stopped:
+        wanted, told = self.settings.encode, 0 if search is None else len(search.trials)
+        if not wanted.has_goal:
+            return self._encoder(self._chooser(), self._tuner(), self.checkpoint)(wanted), ()
+        chooser = None
+        if search is None:
+            chooser = self._chooser()
+            search = self.search(chooser)
+        if self.settings.finetune.wanted and len(self.splats) > 0 and not search.stopped:
             price = None if search.best is None else search.best.encoded.price
-            search.run(self._encoder(chooser, tuner, None), price, min(TUNED_ATTEMPTS, wanted.attempts))
-        return search.found()
+            try:
+                encoder = self._encoder(chooser or self._chooser(), self._tuner(), None)
+                search.run(encoder, price, min(TUNED_ATTEMPTS, wanted.attempts))
+            except Enough:  # while it looked
+                if search.best is None:
+                    raise
+        found = search.found(all_stay=not self.settings.compact.by_goal)
+        return found, tuple(search.trials[told:])
 
-    def search(self, chooser: Chooser | None = None) -> GoalSearch:
-        """For the goal of the settings, without fine-tuning; for bits that are weighed, of one Gaussian or more."""
+    def search(self, chooser: Chooser | None = None, limit: float = math.inf) -> GoalSearch:
+        """For the goal of the settings, without fine-tuning; see :class:`GoalSearch` for ``limit``."""
         search = GoalSearch(
-            *(self.original, self.settings.encode, self.views, self.threads, self.progress), count=len(self.splats)
+            *(self.original, self.settings.encode, self.views, self.threads, self.progress),
+            count=len(self.splats),
+            packed=self.packed,
+            limit=limit,
         )
-        encoder = self._encoder(chooser or self._looking(), None, None)
+        encoder = self._encoder(chooser or self._chooser(), None, None)
         search.run(encoder)
         left = search.settings.attempts - len(search.trials)
-        if search.best is None and not search.goal.by_size and search.settings.sh_ratio > 1 and left > 0:
+        coarse = search.settings.sh_ratio > 1 and self.splats.sh_degree > 0
+        if search.best is None and not search.goal.by_size and coarse and left > 0 and not search.hopeless:
             search.settings = search.settings.model_copy(update={"sh_ratio": 1.0})  # a codebook as large as it takes
             search.run(encoder, attempts=left)
         return search
@@ -123,9 +140,10 @@ class Encoding:
 
             choice = chooser(chosen, self.progress)
             if tuner is None or not choice.grid.mask.any():
-                return Container(files(choice, 0, self.progress))
+                return Container(files(choice, 0, self.progress), chosen)
             start = choice if bold == chosen else chooser(bold, as_stage("finetune", self.progress))
-            return Container(*tuner(choice, start, self.splats, files, checkpoint))
+            encoded, report = tuner(choice, start, self.splats, files, checkpoint)
+            return Container(encoded, bold if report.kept else chosen, report)
 
         return encoder
 
@@ -146,6 +164,9 @@ class Encoding:
             threads=self.threads,
             progress=self.progress,
         )
+
+    def _chooser(self) -> Chooser:
+        return self._looking() if self.settings.encode.weigh and len(self.splats) > 0 else self._blind
 
     def _blind(self, chosen: EncodeSettings, progress: Progress) -> Choice:
         return choose(self.splats, chosen, threads=self.threads, progress=progress)

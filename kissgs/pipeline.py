@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
@@ -14,12 +14,13 @@ from kissgs.clock import Clock, peak_memory
 from kissgs.compaction.result import Compacted
 from kissgs.errors import UnsupportedError
 from kissgs.importance import Importance
-from kissgs.progress import Annotated, Progress, as_stage, silent
+from kissgs.progress import Annotated, Progress, as_stage, silent, until_the_end
 from kissgs.rendering.rasterizer import Device
 from kissgs.report import Report
 from kissgs.scenes import AnyPath, check_ply, open_scene, save
-from kissgs.settings import Settings
-from kissgs.sogxt.container import check_destination, open_source, write_container, zip_bytes
+from kissgs.settings import EncodeSettings, Settings
+from kissgs.settings.encode import GOALS
+from kissgs.sogxt.container import check_destination, is_packed, stored_sizes, write_container, zip_bytes
 from kissgs.sogxt.decode import MAX_GAUSSIANS, decode
 from kissgs.splats import Splats
 from kissgs.training.checkpoint import beside, forget
@@ -27,7 +28,7 @@ from kissgs.training.checkpoint import beside, forget
 if TYPE_CHECKING:
     from kissgs.encoding import Encoding
     from kissgs.evaluation.likeness import Evaluation
-    from kissgs.goal import Container
+    from kissgs.goal import GoalSearch
     from kissgs.search import Trial
     from kissgs.views.view import Views
 
@@ -113,7 +114,7 @@ def compact(
         progress=clock,
     )
     if target is not None:
-        save(result.splats, target, overwrite=overwrite, progress=clock)
+        save(result.splats, target, overwrite=overwrite, progress=until_the_end(clock))
         forget(result.checkpoint)
     clock.stop()
     report = replace(result.report, cleaned=cleaned, cpu_seconds=clock.cpu_seconds, peak_memory=peak_memory())
@@ -187,20 +188,21 @@ def compress(
         cleaned=cleaned,
         checkpoint=kept,
         device=device,
+        packed=target is None or is_packed(target),
         threads=threads,
         progress=Annotated(clock),
     )
-    compacted, container, trials = _compacted(encoding, checkpoint)
-    if container is None:
-        chosen = encoding if compacted is None else replace(encoding, splats=compacted.splats)
-        container, more = chosen.run()
-        trials += more
-    encoded = container.encoded
-    archive_bytes, file_bytes = _sizes(encoded.files)
-    evaluation = _evaluate(original, encoded.files, views, threads, clock) if evaluate else None
+    compacted, search, trials = _compacted(encoding, checkpoint)
+    chosen = encoding if compacted is None else replace(encoding, splats=compacted.splats)
+    if not settings.encode.has_goal:
+        chosen = replace(chosen, progress=Annotated(until_the_end(clock)))
+    container, more = chosen.run(search)
+    encoded, onwards = container.encoded, until_the_end(clock)
+    container_bytes, file_bytes = stored_sizes(encoded.files, packed=encoding.packed)
+    evaluation = _evaluate(original, encoded.files, views, threads, onwards) if evaluate else None
     checkpoints = (None if compacted is None else compacted.checkpoint, kept)
     if target is not None:
-        clock("write", 0.0)
+        onwards("write", 0.0)
         write_container(encoded.files, target, overwrite=overwrite)
         forget(*checkpoints)
     clock.stop()
@@ -209,7 +211,7 @@ def compress(
         count=len(encoded.order),
         sh_degree=original.sh_degree,
         source_bytes=source_bytes,
-        container_bytes=archive_bytes,
+        container_bytes=container_bytes,
         file_bytes=file_bytes,
         cleaned=cleaned,
         compaction=None if compacted is None else compacted.report,
@@ -220,11 +222,11 @@ def compress(
         form_error=encoded.form_error,
         half_steps=encoded.errors,
         price=encoded.price,
-        trials=trials,
+        trials=trials + more,
         seconds=clock.seconds,
         cpu_seconds=clock.cpu_seconds,
         peak_memory=peak_memory(),
-        settings=settings.model_dump(mode="json"),
+        settings=_as_made(settings, container.settings),
         evaluation=evaluation,
     )
     order = encoded.order if compacted is None else compacted.index[encoded.order]
@@ -232,11 +234,10 @@ def compress(
     return Compressed(encoded.files, order, report, left)
 
 
-def _sizes(files: Mapping[str, bytes]) -> tuple[int, dict[str, int]]:
-    """Of the zip, and of each file in it."""
-    archive = zip_bytes(files)
-    with open_source(archive) as stored:
-        return len(archive), {name: stored.size(name) for name in files}
+def _as_made(asked: Settings, made: EncodeSettings) -> dict[str, Any]:
+    """What was asked for, with what a search for a goal and fine-tuning have changed of it."""
+    goals = {name: getattr(asked.encode, name) for name in (*GOALS, "price")}
+    return asked.model_copy(update={"encode": made.model_copy(update=goals)}).model_dump(mode="json")
 
 
 def decompress(
@@ -283,8 +284,8 @@ class _Common(TypedDict):
 
 def _compacted(
     encoding: Encoding, checkpoint: AnyPath | None
-) -> tuple[Compacted | None, Container | None, tuple[Trial, ...]]:
-    """What compaction leaves, if it is asked for; a container that was made on the way, and all attempts."""
+) -> tuple[Compacted | None, GoalSearch | None, tuple[Trial, ...]]:
+    """What compaction leaves, if it is asked for; the search that was made on the way, and all attempts."""
     splats, chosen, kept = encoding.splats, encoding.settings.compact, Path(checkpoint) if checkpoint else None
     if not chosen.wanted:
         return None, None, ()
@@ -304,12 +305,12 @@ def _compacted(
 
 
 def _evaluate(
-    splats: Splats, container: Mapping[str, bytes], views: Views | None, threads: int, clock: Progress
+    splats: Splats, container: Mapping[str, bytes], views: Views | None, threads: int, progress: Progress
 ) -> Evaluation:
     """One stage of compression, whatever stages of its own it has: decoding, kernels, pictures."""
     from kissgs.evaluation.pictures import evaluate
 
-    clock("evaluate", 0.0)
+    progress("evaluate", 0.0)
     decoded = decode(container, max_gaussians=max(len(splats), MAX_GAUSSIANS), threads=threads)
 
-    return evaluate(splats, decoded, views, threads=threads, progress=as_stage("evaluate", clock))
+    return evaluate(splats, decoded, views, threads=threads, progress=as_stage("evaluate", progress))

@@ -1,6 +1,9 @@
 """How long work reports itself: one callback, used alike by the command line, the service and tests."""
 
+from contextlib import suppress
 from typing import Protocol, runtime_checkable
+
+from kissgs.errors import Enough
 
 
 @runtime_checkable
@@ -28,6 +31,16 @@ def as_stage(stage: str, progress: Progress) -> Progress:
 
     def receive(inner: str, fraction: float, note: str = "") -> None:
         progress(stage, fraction if inner == stage else 0.0)
+
+    return receive
+
+
+def until_the_end(progress: Progress) -> Progress:
+    """Passes everything on to one who may have had enough: once the search is over, work is finished nevertheless."""
+
+    def receive(stage: str, fraction: float, note: str = "") -> None:
+        with suppress(Enough):
+            progress(stage, fraction, note)
 
     return receive
 

@@ -83,5 +83,6 @@ class Report:
         evaluation = None if self.evaluation is None else self.evaluation.as_dict()
         compaction = None if self.compaction is None else self.compaction.as_dict()
         finetuning = None if self.finetuning is None else self.finetuning.as_dict()
-        parts = {"compaction": compaction, "finetuning": finetuning, "evaluation": evaluation}
+        trials = [trial.as_dict() for trial in self.trials]
+        parts = {"compaction": compaction, "finetuning": finetuning, "evaluation": evaluation, "trials": trials}
         return {**asdict(self), **derived, **parts}

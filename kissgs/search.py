@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 ATTEMPTS = 10
 FINEST = 0.2
@@ -20,14 +21,14 @@ class Trial:
 
     Attributes:
         count: Gaussians of the scene that was encoded.
-        price: squared error per bit.
-        bytes: of its zip.
+        price: squared error per bit; None where nothing is seen, and bits were not weighed.
+        bytes: of its zip, or of the files in its folder.
         psnr: of its pictures to those of the scene, decibels; None where it was not asked for.
         drop: decibels that they have lost; the same.
     """
 
     count: int
-    price: float
+    price: float | None
     bytes: int
     psnr: float | None = None
     drop: float | None = None
@@ -36,6 +37,10 @@ class Trial:
         """For people."""
         pictures = "" if self.psnr is None else f" at {self.psnr:.2f} dB"
         return f"{self.bytes / 1000:,.0f} kB{pictures}" + ("" if self.drop is None else f" (-{self.drop:.2f})")
+
+    def as_dict(self) -> dict[str, Any]:
+        """For machines; what is infinite is null."""
+        return {name: None if value == math.inf else value for name, value in asdict(self).items()}
 
 
 def seek(
@@ -54,14 +59,15 @@ def seek(
     most :data:`REACH`.
 
     Args:
-        spare: at least 0 where the goal is met; only about monotone and smooth, as results of rounding are.
+        spare: at least 0 where the goal is met, infinite where it cannot be told by how much; only about monotone and
+            smooth, as results of rounding are.
         start: first attempt.
         slope: of ``spare``, about; its sign must be right.
         tolerance: at most so much above 0 is near enough.
         bounds: attempts stay between these.
         grain: attempts are whole multiples of this; 0 for any number.
         attempts: how many at most.
-        jump: an attempt that met the goal, and one that did not, so near to each other leave nothing to find between.
+        jump: an attempt that met the goal, and the next one that did not, so near to each other leave nothing to find.
 
     Returns:
         The best attempt that met the goal; None if none did, or the function does not go on rising.
@@ -70,7 +76,7 @@ def seek(
     x = _whole(start, grain)
     while len(known) < attempts and x not in known:
         known[x] = spare(x)
-        if 0 <= known[x] <= tolerance or _flat(known, tolerance) or _gap(known) < jump:
+        if 0 <= known[x] <= tolerance or _flat(known, tolerance) or _gap(known, slope) < jump:
             break
         x = min(max(_whole(_next(known, slope, tolerance / 2), grain), bounds[0]), bounds[1])
     met = [x for x, found in known.items() if found >= 0]
@@ -125,25 +131,29 @@ def _whole(x: float, grain: float) -> float:
 
 
 def _next(known: dict[float, float], slope: float, aim: float) -> float:
-    met = [x for x, found in known.items() if found >= 0]
-    unmet = [x for x, found in known.items() if found < 0]
-    if met and unmet:
-        inside = max(met, key=lambda x: -slope * x)
-        outside = min(unmet, key=lambda x: abs(x - inside))
-        share = (known[inside] - aim) / (known[inside] - known[outside])
+    inside, outside = _bracket(known, slope)
+    if inside is not None and outside is not None:
+        share = 0.5 if math.isinf(known[inside]) else (known[inside] - aim) / (known[inside] - known[outside])
         return inside + (outside - inside) * min(max(share, 0.1), 0.9)
     *before, last = known
-    if before:
+    if before and math.isfinite(known[last]) and math.isfinite(known[before[-1]]):
         measured = (known[last] - known[before[-1]]) / (last - before[-1])
         slope *= min(max(measured / slope, 0.1), 10.0)
-    return last + min(max((aim - known[last]) / slope, -REACH), REACH)
+    start = last if inside is None else inside
+    return start + min(max((aim - known[start]) / slope, -REACH), REACH)
 
 
-def _gap(known: dict[float, float]) -> float:
-    """Between the nearest two of which one met the goal and the other did not."""
-    met = [x for x, found in known.items() if found >= 0]
-    unmet = [x for x, found in known.items() if found < 0]
-    return min((abs(one - other) for one in met for other in unmet), default=math.inf)
+def _bracket(known: dict[float, float], slope: float) -> tuple[float | None, float | None]:
+    """The last place where the goal is met, and the first beyond it where it is not."""
+    inside = max((x for x, found in known.items() if found >= 0), key=lambda x: -slope * x, default=None)
+    beyond = [x for x, found in known.items() if found < 0 and (inside is None or slope * (x - inside) < 0)]
+    return inside, min(beyond, key=lambda x: -slope * x, default=None)
+
+
+def _gap(known: dict[float, float], slope: float) -> float:
+    """Between these two."""
+    inside, outside = _bracket(known, slope)
+    return math.inf if inside is None or outside is None else abs(outside - inside)
 
 
 def _flat(known: dict[float, float], tolerance: float) -> bool:
@@ -151,4 +161,4 @@ def _flat(known: dict[float, float], tolerance: float) -> bool:
     if len(known) < 2:
         return False
     (one, first), (two, second) = list(known.items())[-2:]
-    return abs(two - one) > REACH / 2 and abs(second - first) < tolerance
+    return abs(two - one) > REACH / 2 and abs(second - first) < tolerance  # of two infinite ones nothing is known

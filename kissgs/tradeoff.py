@@ -7,7 +7,8 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from kissgs.errors import Enough, UnsupportedError
-from kissgs.goal import Container, Goal
+from kissgs.evaluation.drop import drop_of
+from kissgs.goal import Goal, GoalSearch
 from kissgs.search import Trial, lowest
 from kissgs.sogxt.container import zip_bytes
 from kissgs.splats import Splats
@@ -34,12 +35,12 @@ class Offer:
     Attributes:
         cost: what is to be small: of containers of a wanted size minus the PSNR to what judges them, else the bytes;
             infinite where the goal cannot be met.
-        container: the best.
+        search: in which the best container was found.
         compacted: the scene that is in it; None for the scene with all its Gaussians.
     """
 
     cost: float
-    container: Container | None = None
+    search: GoalSearch | None = None
     compacted: Compacted | None = None
 
 
@@ -51,7 +52,7 @@ class Tradeoff:
     has left, which tells whether it is worth encoding, and of the container.
 
     Attributes:
-        encoding: of the scene with all its Gaussians; what is said there of fine-tuning is left for later.
+        encoding: of the scene with all its Gaussians; fine-tuning is left for later.
         compactor: of the same scene.
         trials: containers that were made.
     """
@@ -60,14 +61,12 @@ class Tradeoff:
     compactor: Compactor
     trials: list[Trial] = field(default_factory=list)
     _drops: dict[int, float] = field(default_factory=dict)
-    _offers: dict[float, Offer] = field(default_factory=dict)
-    _overhead: int = 0
+    _offers: dict[int, Offer] = field(default_factory=dict)
+    _whole: GoalSearch | None = None
     _stopped: bool = False
 
-    def run(self) -> tuple[Compacted, Container | None, tuple[Trial, ...]]:
-        """The scene that serves the goal best, its container, and the way to it.
-
-        The container is None where it is still to be fine-tuned.
+    def run(self) -> tuple[Compacted, GoalSearch, tuple[Trial, ...]]:
+        """The scene that serves the goal best, the search for its container, and the way to it.
 
         Raises:
             UnsupportedError: no count meets the goal.
@@ -75,71 +74,92 @@ class Tradeoff:
         from kissgs.compaction.budget import unchanged
 
         splats, most = self.compactor.splats, math.log2(len(self.compactor.splats))
-        by_size = self.goal.by_size
         try:
-            self._offers[most] = whole = self._encode(splats, None)
-            if not (self._roomy() if by_size else math.isinf(whole.cost)):
-                known = {most: whole.cost}
+            whole = self._offers[len(splats)] = self._encode(splats, None)
+            self._whole = whole.search
+            if not (self._stopped or self._settled(whole)):
+                by_size = self.goal.by_size
                 start = most + (min(self._guess(), 0.0) if by_size else FEW)
-                attempts = self.encoding.settings.compact.attempts
                 way_out = -1.0 if by_size else 1.0  # fewer Gaussians are smaller, more are better
-                lowest(self._cost, known, start, STEPS[by_size], (0.0, most), way_out, attempts)
+                attempts = self.encoding.settings.compact.attempts
+                lowest(self._cost, {most: whole.cost}, start, STEPS[by_size], (0.0, most), way_out, attempts)
         except Enough:
-            if all(offer.container is None for offer in self._offers.values()):
+            if all(math.isinf(offer.cost) for offer in self._offers.values()):
                 raise
             self._stopped = True
-        best = min(self._offers, key=lambda x: (self._offers[x].cost, x))
-        offer = self._offers[best]
-        if offer.container is None:
+        best = self._offers[min(self._offers, key=lambda count: (self._offers[count].cost, count))]
+        if best.search is None or best.search.best is None:
             raise UnsupportedError(self.goal.regret(self.trials, all_stay=False))
-        tried = "and no smaller number that was tried serves the goal better"
-        compacted = offer.compacted or unchanged(splats, tried if self._drops else "and there is room for all of them")
+        best.search.stopped |= self._stopped
+        compacted = best.compacted or unchanged(splats, self._why_all_stay())
         notes = filter(None, [compacted.report.note, self.compactor.note])
         report = replace(compacted.report, trials=tuple(self._drops.items()), note="; ".join(notes))
-        tunes = self.encoding.settings.finetune.wanted and not self._stopped
-        return replace(compacted, report=report), None if tunes else offer.container, tuple(self.trials)
+        return replace(compacted, report=report), best.search, tuple(self.trials)
 
     @property
     def goal(self) -> Goal:
         """Of the settings."""
         return Goal.of(self.encoding.settings.encode)
 
-    def _roomy(self) -> bool:
-        """Whether all Gaussians have room enough as they are stored where no size is asked for."""
+    def _settled(self, whole: Offer) -> bool:
+        """Whether fewer Gaussians need not be tried.
+
+        All of them have room enough as they are stored where no size is asked for, or not even they are good enough, or
+        what is no image takes all the room.
+        """
         wanted = self.encoding.settings.encode.target_size
-        return wanted is not None and bool(self.trials) and self.trials[0].bytes <= wanted
+        if wanted is None or self._whole is None:
+            return math.isinf(whole.cost)
+        return self.trials[0].bytes <= wanted or self._whole.overhead >= wanted
+
+    def _why_all_stay(self) -> str:
+        if self._drops:
+            return "and no smaller number that was tried serves the goal better"
+        return (
+            "and the search was ended before fewer were tried" if self._stopped else "and there is room for all of them"
+        )
 
     def _guess(self) -> float:
         """Of the share of the Gaussians; a power of 2."""
         wanted = self.encoding.settings.encode.target_size or 1
-        room, taken = wanted - self._overhead, self.trials[0].bytes - self._overhead
+        overhead = 0 if self._whole is None else self._whole.overhead
+        room, taken = wanted - overhead, self.trials[0].bytes - overhead
         return math.log2(max(room, 1) / (FINELY * taken))
 
     def _cost(self, x: float) -> float:
         splats = self.compactor.splats
         count = min(max(1, round(2**x)), len(splats) - 1)
-        if self._stopped or count in self._drops:
+        if self._stopped:
             return math.inf
+        if count in self._offers:
+            return self._offers[count].cost
         self.encoding.progress.note = f"{count:,} Gaussians"
         found = self.compactor(count)
-        drop = self._drops[count] = self.compactor.drop(found)
-        allowed = self.encoding.settings.encode.max_psnr_drop
-        hopeless = allowed is not None and drop > allowed
+        seen = self.compactor.pictures(found)
+        self._drops[count] = drop_of(seen)
+        wanted = self.encoding.settings.encode
+        hopeless = wanted.max_psnr_drop is not None and self._drops[count] > wanted.max_psnr_drop
+        hopeless |= wanted.psnr is not None and seen.mean.between.psnr < wanted.psnr
         offer = Offer(math.inf, None, found) if hopeless else self._encode(found.splats, found)
-        self._offers[x] = offer
+        self._offers[count] = offer
         return offer.cost
 
     def _encode(self, splats: Splats, compacted: Compacted | None) -> Offer:
         cache = self.encoding.cache if compacted is None else None
-        encoding = replace(self.encoding, splats=splats, cache=cache)
-        search = encoding.search()
+        search = replace(self.encoding, splats=splats, cache=cache).search(limit=self._least())
         self._stopped = search.stopped
         self.trials += search.trials
-        self._overhead = search.overhead
         if search.best is None:
-            return Offer(math.inf, None, compacted)
+            return Offer(math.inf, search, compacted)
         encoded = search.best.encoded
         if not search.goal.by_size:
-            return Offer(len(zip_bytes(encoded.files)), search.best, compacted)
-        psnr = search.pictures(encoded).mean.candidate.psnr
-        return Offer(-min(psnr, 1e3), search.best, compacted)
+            return Offer(len(zip_bytes(encoded.files)), search, compacted)
+        try:
+            psnr = search.pictures(encoded).mean.candidate.psnr
+        except Enough:  # as it began
+            self._stopped, psnr = True, search.pictures(encoded).mean.candidate.psnr
+        return Offer(-min(psnr, 1e3), search, compacted)
+
+    def _least(self) -> float:
+        """Bytes of the best offer, where these are the cost."""
+        return math.inf if self.goal.by_size else min((offer.cost for offer in self._offers.values()), default=math.inf)

@@ -13,6 +13,7 @@ from service.problems import Problem
 
 COMPACTED = "+compact"
 TUNED = "+finetune"
+SOUGHT = "+seek"
 """After the preset, in the kind of a job."""
 
 
@@ -35,9 +36,13 @@ class JobOptions(kissgs.Settings):
 
     @property
     def kind(self) -> str:
-        """What its duration depends on beside the scene: the preset, whether Gaussians go, and whether levels learn."""
-        compacted, tuned = COMPACTED if self.compact.wanted else "", TUNED if self.finetune.wanted else ""
-        return f"{self.preset}{compacted}{tuned}"
+        """What its duration depends on beside the scene: the preset, and what is done beside encoding it once."""
+        stages = {
+            COMPACTED: self.compact.wanted,
+            TUNED: self.finetune.wanted,
+            SOUGHT: self.encode.has_goal or self.compact.max_psnr_drop is not None,
+        }
+        return "".join([self.preset, *(suffix for suffix, wanted in stages.items() if wanted)])
 
     @property
     def retrains(self) -> bool:

@@ -51,6 +51,14 @@ def test_a_jump_is_not_looked_into_any_finer():
     assert seek(Counted(spare.function), 1.0, -1.0, 0.01, (-9, 9)) == pytest.approx(0.3, abs=1 / 32)
 
 
+def test_where_nothing_is_lost_the_search_goes_on():
+    """Outcomes that tell no distance from the goal are no valley's floor."""
+    spare = Counted(lambda x: math.inf if x < 6 else 10 - x)
+    found = seek(spare, -3.0, -1.0, 0.1, (-20, 20))
+    assert found == pytest.approx(9.95, abs=0.06)
+    assert all(math.isfinite(x) for x in spare.asked)
+
+
 def test_it_goes_on_where_nearer_attempts_are_no_better():
     """A function that is not quite monotone: the same place is not tried twice."""
     spare = Counted(lambda x: 0.9 - 0.3 * x if x < 0.1 else -0.1 - 0.02 * (1 - x) if x < 1 else -x)
@@ -134,7 +142,10 @@ def test_hardly_anything_can_have_a_goal(count):
         ("balanced", {"psnr": 40, "price": 1e-9}, "price and psnr cannot both be met"),
         ("balanced", {"psnr": 0}, "setting psnr: input should be greater than 0"),
         ("balanced", {"target_size": 0}, "setting target_size: input should be greater than or equal to 1"),
-        ("balanced", {"target_size": "3 XB"}, "setting target_size: could not interpret byte unit"),
+        ("balanced", {"target_size": "3 XB"}, "setting target_size: write 800kB, 2.5MB or 2,500,000, not '3 XB'"),
+        ("balanced", {"target_size": "3,5MB"}, "not '3,5MB'"),
+        ("balanced", {"target_size": "3MB more"}, "not '3MB more'"),
+        ("balanced", {"target_size": "2.5"}, "not '2.5'"),
         (
             "balanced",
             {"opacity_step": 0.02},

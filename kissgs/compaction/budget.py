@@ -25,6 +25,7 @@ from kissgs.training.school import SCORED, School, school
 from kissgs.views.view import Views
 
 if TYPE_CHECKING:
+    from kissgs.evaluation.likeness import Evaluation
     from kissgs.training.lessons import Lessons
 
 START, SLOPE, LARGEST = -2.0, 0.4, -0.1
@@ -160,10 +161,10 @@ class Compactor:
             progress=self.progress,
         )
 
-    def drop(self, found: Compacted) -> float:
-        """Decibels that pictures from held-out views have lost."""
+    def pictures(self, found: Compacted) -> Evaluation:
+        """From held-out views, beside those of the scene."""
         progress = as_stage("judge", self.progress)
-        return drop_of(evaluate(self.splats, found.splats, self.school.exam, threads=self.threads, progress=progress))
+        return evaluate(self.splats, found.splats, self.school.exam, threads=self.threads, progress=progress)
 
     @property
     def note(self) -> str:
@@ -205,7 +206,7 @@ class _Search:
         if count in self.trials:
             return self.trials[count]
         found = self.compactor(count)
-        drop = self.trials[count] = self.compactor.drop(found)
+        drop = self.trials[count] = drop_of(self.compactor.pictures(found))
         if drop <= allowed and (self.best is None or count < len(self.best.splats)):
             self.best = found
         return drop

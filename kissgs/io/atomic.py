@@ -44,6 +44,16 @@ def refuse_existing(path: Path, *, overwrite: bool) -> None:
         raise OutputError(f"{path} is a folder; name a file")
     if present and not overwrite:
         raise OutputError(f"{path} exists already; choose another name or allow overwriting (--force)")
+    try_out(path)
+
+
+def try_out(path: Path) -> None:
+    """Raise OutputError if nothing can be written beside ``path``: before the work starts, rather than after it."""
+    try:
+        with tempfile.TemporaryFile(dir=path.parent, prefix=".kissgs.", suffix=".part"):
+            pass
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {reason_of(error)}") from error
 
 
 def look(path: Path) -> tuple[bool, bool]:

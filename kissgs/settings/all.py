@@ -80,7 +80,8 @@ class Settings(BaseModel):
             if problem["type"] == "extra_forbidden":
                 known = ", ".join(dict.fromkeys([*GROUPS[group].__annotations__, *GROUPS[group].model_fields]))
                 raise UnsupportedError(f"there is no setting {name!r} of {group}; there are {known}") from error
-            raise UnsupportedError(f"setting {name}: {problem['msg'].lower()}, not {problem['input']!r}") from error
+            told = problem["msg"][:1].lower() + problem["msg"][1:]
+            raise UnsupportedError(f"setting {name}: {told}, not {problem['input']!r}") from error
 
 
 def _filled(group: Any, preset: Mapping[str, Any]) -> Any:  # noqa: ANN401

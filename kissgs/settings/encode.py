@@ -2,11 +2,28 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ByteSize, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ByteSize, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
 
 Step = Annotated[float, Field(ge=1e-4, le=10)]
+
+SIZE = re.compile(r"(\d+|\d{1,3}(?:,\d{3})+|\d*\.\d+)\s*([kmgt]i?)?b?", re.IGNORECASE)
+
+
+def _spelled(size: object) -> object:
+    """A size as pydantic reads it, which would take 3,5MB for 3 bytes, and leave out what it does not know."""
+    if not isinstance(size, str):
+        return size
+    found = SIZE.fullmatch(size.strip())
+    if found is None or ("." in found[1] and not found[2]):
+        raise PydanticCustomError("size", "Write 800kB, 2.5MB or 2,500,000")
+    return found[1].replace(",", "") + (f"{found[2]}B" if found[2] else "")
+
+
+Size = Annotated[ByteSize, BeforeValidator(_spelled)]
 
 
 class EncodeSettings(BaseModel):
@@ -35,7 +52,7 @@ class EncodeSettings(BaseModel):
         description="Where bits are weighed: search for the smallest container whose pictures have at least this PSNR, "
         "decibels, to those of the scene, from where 'evaluate' takes them. Takes a few encodings.",
     )
-    target_size: ByteSize | None = Field(
+    target_size: Size | None = Field(
         None,
         ge=1,
         description="Where bits are weighed: search for the best container of at most so many bytes, such as 800kB or "
@@ -49,7 +66,11 @@ class EncodeSettings(BaseModel):
         "at most so many decibels. Takes a few encodings. Without photographs, as if the scene were 30 dB from them.",
     )
     attempts: int = Field(
-        10, ge=1, le=100, description="On the way to a goal: containers that are made of one scene, at most."
+        10,
+        ge=1,
+        le=100,
+        description="On the way to a goal: containers that are made of one scene, at most; as many fine-tuned ones, no "
+        "more than four, come on top.",
     )
     drop: float = Field(
         10.0,

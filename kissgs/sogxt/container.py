@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import BinaryIO, Protocol, runtime_checkable
 
 from kissgs.errors import InvalidContainerError, OutputError
-from kissgs.io.atomic import atomic_file, look, reason_of, refuse_existing, umask
+from kissgs.io.atomic import atomic_file, look, reason_of, refuse_existing, try_out, umask
 from kissgs.sogxt.names import FILES
 
 MAX_ZIP_ENTRIES = 1000
@@ -160,6 +160,21 @@ def zip_bytes(files: Mapping[str, bytes]) -> bytes:
     return buffer.getvalue()
 
 
+def stored_sizes(files: Mapping[str, bytes], *, packed: bool) -> tuple[int, dict[str, int]]:
+    """Bytes of what is written, and of each file in it: of a zip, or of a folder."""
+    if not packed:
+        sizes = {name: len(data) for name, data in files.items()}
+        return sum(sizes.values()), sizes
+    archive = zip_bytes(files)
+    with open_source(archive) as stored:
+        return len(archive), {name: stored.size(name) for name in files}
+
+
+def is_packed(path: Path) -> bool:
+    """Whether a container of that name is a zip, and no folder."""
+    return path.suffix.lower() == ".zip"
+
+
 def write_container(files: Mapping[str, bytes], path: Path, *, overwrite: bool = False) -> int:
     """Write a container whole or not at all: a zip if the name ends in ``.zip``, else a folder.
 
@@ -171,7 +186,7 @@ def write_container(files: Mapping[str, bytes], path: Path, *, overwrite: bool =
             if it holds a container and nothing else.
     """
     check_destination(path, overwrite=overwrite, names=files.keys())
-    if path.suffix.lower() == ".zip":
+    if is_packed(path):
         data = zip_bytes(files)
         with atomic_file(path, overwrite=overwrite) as file:
             file.write(data)
@@ -185,7 +200,7 @@ def check_destination(path: Path, *, overwrite: bool, names: Collection[str] = F
 
     ``names`` are the files that a folder may hold and still be replaced.
     """
-    if path.suffix.lower() == ".zip":
+    if is_packed(path):
         refuse_existing(path, overwrite=overwrite)
         return
     present, folder = look(path)
@@ -193,6 +208,7 @@ def check_destination(path: Path, *, overwrite: bool, names: Collection[str] = F
         raise OutputError(f"{path} exists already; choose another name or allow overwriting (--force)")
     if present and (not folder or {entry.name for entry in path.iterdir()} - set(names)):
         raise OutputError(f"{path} holds more than a container; name an empty or a new folder, or a .zip file")
+    try_out(path)
 
 
 def _write_directory(files: Mapping[str, bytes], path: Path) -> None:

@@ -14,6 +14,7 @@ from kissgs.importance import Importance
 from kissgs.parallel import blas_workers
 from kissgs.progress import Progress, silent
 from kissgs.settings import EncodeSettings
+from kissgs.settings.encode import GOALS
 from kissgs.sogxt import metadata, names
 from kissgs.sogxt.choice import Choice
 from kissgs.sogxt.even import choose_evenly
@@ -151,7 +152,7 @@ def write(
     with blas_workers(threads) as pool:
         files = compress_images(images, settings, pool, _stage(progress, "images"))
     kept, count = len(_candidates(splats, settings)), int(choice.grid.mask.sum())
-    made = {**settings.model_dump(exclude={"psnr", "target_size"}), "price": choice.price}
+    made = {**settings.model_dump(exclude={*GOALS, "attempts"}), "price": choice.price}
     layout = metadata.Layout(
         grid_side=choice.grid.side,
         codebook_side=choice.codebook.side,

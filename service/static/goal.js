@@ -60,7 +60,11 @@ export function goalField(presets, preset) {
   refresh();
   return {
     /** @returns {Goals | null} */
-    chosen: () => (named() ? { [goal.value]: Number((Number(amount.value) * named().factor).toPrecision(12)) } : null),
+    chosen() {
+      if (!named()) return null;
+      const value = Number((Number(amount.value) * named().factor).toPrecision(12));
+      return { [goal.value]: goal.value === "target_size" ? Math.floor(value) : value };
+    },
     /** @param {Goals} goals */
     prefer(goals) {
       const name = Object.keys(GOALS).find((key) => (goals[/** @type {keyof Goals} */ (key)] ?? null) !== null) ?? "";

@@ -202,12 +202,17 @@ def test_a_size_is_met_by_the_fine_tuned_container():
 
 def test_a_size_that_is_met_without_fine_tuning_is_met_with_it(monkeypatch):
     """Even where fine-tuned containers are all too large."""
-    monkeypatch.setattr("kissgs.goal.zip_bytes", lambda files: b"x" * (900 + 900 * (b"finetune" in files[YAML_NAME])))
+
+    def sizes(files, *, packed):
+        return 900 + 900 * (b"finetune" in files[YAML_NAME]), {}
+
+    monkeypatch.setattr("kissgs.goal.stored_sizes", sizes)
     chosen = {"target_size": 1000, "views": 4, "view_size": 60}
     gentle = Settings.from_preset("balanced", finetune={**SHORT, **GENTLE}, **chosen)
     found = kissgs.compress(cloud(60), settings=gentle)
     assert b"finetune" not in found.files[YAML_NAME]
-    assert found.report.finetuning is None or not found.report.finetuning.kept
+    assert not found.report.finetuning.kept
+    assert "as it was without" in found.report.finetuning.note
 
 
 def test_a_search_leaves_other_files_alone(tmp_path):

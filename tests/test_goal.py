@@ -1,0 +1,157 @@
+"""Goals at the edge; oracle: sizes on disk, the search without interruption, and containers put in by hand."""
+
+import json
+from pathlib import Path
+
+import pytest
+import kissgs
+from kissgs import Enough, FinetuneReport, OutputError, Settings, UnsupportedError
+from kissgs.goal import Container, GoalSearch
+from kissgs.progress import Annotated, silent
+from kissgs.sogxt.encode import encode
+
+SCENE = kissgs.sample_scene(600, sh_degree=0, seed=5)
+GLANCE = {"views": 4, "view_size": 48}
+PRUNE = {"sparsify_steps": 0, "refine_steps": 0, "score_share": 0.6, "views": 24, "view_size": 48}
+TUNE = {"wanted": True, "steps": 4, "views": 16, "view_size": 48}
+TUNED = FinetuneReport(
+    steps=1,
+    taught_by="photos",
+    source="",
+    psnr_before=30.0,
+    psnr_after=31.0,
+    bytes_before=1,
+    bytes_after=1,
+    kept=True,
+    seconds=1.0,
+)
+
+
+def settings(compact=None, finetune=None, **goal):
+    return Settings.from_preset("balanced", compact=compact, finetune=finetune, **GLANCE, **goal)
+
+
+def enough_at(wanted, number=1):
+    """Raises once, when that stage begins for the ``number``-th time."""
+    seen = []
+
+    def progress(stage, fraction, note=""):
+        if stage == wanted and fraction == 0:
+            seen.append(stage)
+            if len(seen) == number:
+                raise Enough
+
+    return progress
+
+
+@pytest.mark.parametrize("stage", ["write", "evaluate"])
+def test_what_is_found_is_written_even_if_it_was_enough(tmp_path, stage):
+    """Said after the search: there is nothing left to end."""
+    goal = settings(target_size=8000)
+    expected = kissgs.compress(SCENE, settings=goal).to_zip()
+    told = kissgs.compress(SCENE, tmp_path / "a.zip", settings=goal, evaluate=True, progress=enough_at(stage))
+    assert (tmp_path / "a.zip").read_bytes() == expected
+    assert told.report.evaluation is not None
+
+
+def test_enough_while_a_count_is_judged_takes_it():
+    found = kissgs.compress(
+        SCENE, settings=settings({**PRUNE, "by_goal": True}, target_size=8000), progress=enough_at("evaluate")
+    )
+    assert len(found.to_zip()) <= 8000
+    assert found.report.compaction.trials == ()
+    assert "ended before fewer were tried" in found.report.compaction.note
+
+
+@pytest.mark.parametrize("by_goal", [False, True])
+def test_enough_before_fine_tuning_takes_what_is_there(by_goal):
+    """Said when it is looked at again to be fine-tuned, or when the first picture to learn from is drawn."""
+    compact = {**PRUNE, "by_goal": True, "attempts": 1} if by_goal else None
+    goal = settings(compact, TUNE, target_size=8000)
+    found = kissgs.compress(SCENE, settings=goal, progress=enough_at("lessons"))
+    assert len(found.to_zip()) <= 8000
+    assert found.report.finetuning is None or not found.report.finetuning.kept
+
+
+@pytest.mark.parametrize("fidelity", [8, -8])
+def test_a_loss_is_met_from_far_away(fidelity):
+    found = kissgs.compress(SCENE, settings=settings(max_psnr_drop=3, fidelity=fidelity))
+    lost = [trial.drop for trial in found.report.trials if trial.drop <= 3]
+    assert max(lost) > 2.5  # PSNR jumps, on so small a scene
+    assert len(found.to_zip()) == min(trial.bytes for trial in found.report.trials if trial.drop <= 3)
+
+
+def test_a_folder_is_as_small_as_was_asked_for(tmp_path):
+    found = kissgs.compress(SCENE, tmp_path / "a", settings=settings(target_size=12_000))
+    written = {path.name: path.stat().st_size for path in (tmp_path / "a").iterdir()}
+    assert 0.9 * 12_000 < sum(written.values()) <= 12_000
+    assert found.report.container_bytes == sum(written.values())
+    assert found.report.file_bytes == written
+
+
+@pytest.mark.parametrize(("goal", "told"), [({"target_size": 1}, "at most 1 byte,"), ({"target_size": 99}, "99 bytes")])
+def test_nothing_takes_bytes_too(goal, told):
+    with pytest.raises(UnsupportedError, match=told):
+        kissgs.compress(SCENE.select([]), settings=settings(**goal))
+    assert len(kissgs.compress(SCENE.select([]), settings=settings(target_size=9000)).to_zip()) <= 9000
+    assert len(kissgs.compress(SCENE.select([]), settings=settings(psnr=99.0)).order) == 0
+
+
+def test_the_smallest_is_best_whoever_made_it():
+    """Where pictures are the goal; and that fine-tuning was in vain is told."""
+    small, large = (
+        encode(SCENE, Settings.from_preset("fast", scale_step=step).encode, threads=1) for step in (0.2, 0.1)
+    )
+    wanted = settings(psnr=20.0).encode
+    search = GoalSearch(SCENE, wanted, None, 1, Annotated(silent))
+    search.run(lambda chosen: Container(small, chosen))
+    search.run(lambda chosen: Container(large, chosen, TUNED))
+    assert [trial.bytes for trial in search.trials] == sorted(trial.bytes for trial in search.trials)
+    found = search.found()
+    assert found.encoded is small
+    assert found.finetuning is not None
+    assert not found.finetuning.kept
+    assert "as it was without" in found.finetuning.note
+    search.run(lambda chosen: Container(small, chosen))
+    assert search.found().encoded is small
+
+
+@pytest.mark.parametrize("worse", [True, False])
+def test_the_best_pictures_are_best_where_a_size_is_the_goal(worse):
+    """A fine-tuned container that is smaller than need be may be worse than one that is not fine-tuned."""
+    small, large = (
+        encode(SCENE, Settings.from_preset("fast", scale_step=step).encode, threads=1) for step in (0.2, 0.1)
+    )
+    search = GoalSearch(SCENE, settings(target_size=10**6).encode, None, 1, Annotated(silent))
+    search.run(lambda chosen: Container(large, chosen))
+    report = FinetuneReport(**{**TUNED.as_dict(), "psnr_after": 29.0 if worse else 31.0})
+    search.run(lambda chosen: Container(small, chosen, report))
+    assert search.found().encoded is (large if worse else small)
+
+
+@pytest.mark.parametrize("goal", [{"max_psnr_drop": 0.3}, {"max_psnr_drop": 0.2, "attempts": 3}, {"psnr": 36.0}])
+def test_the_report_tells_how_to_make_it_again(goal):
+    found = kissgs.compress(SCENE, settings=settings(**goal))
+    told = found.report.settings["encode"]
+    assert {name: told[name] for name in goal} == goal
+    again = {**told, "psnr": None, "max_psnr_drop": None, "price": found.report.price}
+    assert kissgs.compress(SCENE, settings=Settings(encode=again)).to_zip() == found.to_zip()
+
+
+def test_what_is_infinite_is_null_for_machines():
+    faint = kissgs.Splats(**{**{name: getattr(SCENE, name) for name in ATTRIBUTES}, "opacities": SCENE.opacities - 99})
+    told = kissgs.compress(faint, settings=settings(psnr=40.0)).report.as_dict()
+    assert json.dumps(told["trials"], allow_nan=False)
+    assert told["trials"][0]["psnr"] is None
+
+
+ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="only Linux has a folder that nobody can write to")
+@pytest.mark.parametrize("name", ["a.zip", "a"])
+def test_a_folder_that_cannot_be_written_to_is_told_before_the_work(name):
+    begun = []
+    with pytest.raises(OutputError, match="cannot write /proc/a"):
+        kissgs.compress(SCENE, Path("/proc") / name, progress=lambda *told: begun.append(told))
+    assert begun == []
