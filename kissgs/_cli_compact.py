@@ -86,8 +86,7 @@ def compact(
 
     def work(scene: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"
-        seeks = settings.compact.max_psnr_drop is not None
-        with progress_bar(quiet or as_json) as bar, stoppable(bar, seeks) as progress:
+        with progress_bar(quiet or as_json) as bar, stoppable(bar, settings.searches) as progress:
             result = run(
                 source(scene),
                 None if piped else target,

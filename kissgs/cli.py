@@ -140,8 +140,7 @@ def compress(
 
     def work(scene: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"
-        seeks = settings.encode.has_goal or settings.compact.max_psnr_drop is not None
-        with _progress(quiet or as_json) as bar, stoppable(bar, seeks) as progress:
+        with _progress(quiet or as_json) as bar, stoppable(bar, settings.searches) as progress:
             if evaluate:  # announced here, because it is no stage of the evaluation
                 from kissgs.rendering.rasterizer import load_kernels
 

@@ -74,7 +74,8 @@ class Cancelled(KissgsError):
 class Enough(Cancelled):
     """Raised from a progress callback: a search for a goal ends with the best that it has found.
 
-    Where nothing that meets the goal has been found yet, or nothing is searched for, the work is cancelled.
+    Where nothing that meets the goal has been found yet, or nothing is searched for, the work is cancelled; where the
+    search is over already, it is finished.
     """
 
     code = "enough"

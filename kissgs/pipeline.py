@@ -114,7 +114,7 @@ def compact(
         progress=clock,
     )
     if target is not None:
-        save(result.splats, target, overwrite=overwrite, progress=until_the_end(clock))
+        save(result.splats, target, overwrite=overwrite, progress=until_the_end(clock) if settings.searches else clock)
         forget(result.checkpoint)
     clock.stop()
     report = replace(result.report, cleaned=cleaned, cpu_seconds=clock.cpu_seconds, peak_memory=peak_memory())
@@ -194,10 +194,11 @@ def compress(
     )
     compacted, search, trials = _compacted(encoding, checkpoint)
     chosen = encoding if compacted is None else replace(encoding, splats=compacted.splats)
+    onwards = until_the_end(clock) if settings.searches else clock
     if not settings.encode.has_goal:
-        chosen = replace(chosen, progress=Annotated(until_the_end(clock)))
+        chosen = replace(chosen, progress=Annotated(onwards))
     container, more = chosen.run(search)
-    encoded, onwards = container.encoded, until_the_end(clock)
+    encoded = container.encoded
     container_bytes, file_bytes = stored_sizes(encoded.files, packed=encoding.packed)
     evaluation = _evaluate(original, encoded.files, views, threads, onwards) if evaluate else None
     checkpoints = (None if compacted is None else compacted.checkpoint, kept)

@@ -40,7 +40,7 @@ class JobOptions(kissgs.Settings):
         stages = {
             COMPACTED: self.compact.wanted,
             TUNED: self.finetune.wanted,
-            SOUGHT: self.encode.has_goal or self.compact.max_psnr_drop is not None,
+            SOUGHT: self.searches,
         }
         return "".join([self.preset, *(suffix for suffix, wanted in stages.items() if wanted)])
 
@@ -58,8 +58,8 @@ class JobOptions(kissgs.Settings):
     def resumable(self) -> bool:
         """Whether its training can be taken up where it was left: searches, which train several times, cannot."""
         tunes_once = self.finetune.wanted and not self.encode.has_goal
-        searches = self.compact.max_psnr_drop is not None or self.compact.by_goal
-        return not searches and (self.retrains or tunes_once)
+        compacts_once = self.compact.max_psnr_drop is None and not self.compact.by_goal
+        return compacts_once and (self.retrains or tunes_once)
 
 
 class Wire(BaseModel):

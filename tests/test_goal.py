@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+
 import kissgs
 from kissgs import Enough, FinetuneReport, OutputError, Settings, UnsupportedError
 from kissgs.goal import Container, GoalSearch
@@ -155,3 +156,23 @@ def test_a_folder_that_cannot_be_written_to_is_told_before_the_work(name):
     with pytest.raises(OutputError, match="cannot write /proc/a"):
         kissgs.compress(SCENE, Path("/proc") / name, progress=lambda *told: begun.append(told))
     assert begun == []
+
+
+@pytest.mark.parametrize("stage", ["images", "write"])
+def test_without_a_search_enough_cancels(tmp_path, stage):
+    with pytest.raises(Enough):
+        kissgs.compress(SCENE, tmp_path / "a.zip", settings=settings(), progress=enough_at(stage))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_enough_ends_a_search_for_fewer_gaussians_and_no_more():
+    """What was found is encoded, whatever is said later."""
+    said = [enough_at("score", 3), enough_at("images")]
+
+    def progress(stage, fraction, note=""):
+        for one in said:
+            one(stage, fraction, note)
+
+    found = kissgs.compress(SCENE, settings=settings({**PRUNE, "max_psnr_drop": 1.0}), progress=progress)
+    assert 1 <= len(found.report.compaction.trials) <= 2
+    assert len(kissgs.decompress(found.files)) == found.report.compaction.count - found.report.negligible

@@ -30,6 +30,11 @@ class Settings(BaseModel):
     encode: EncodeSettings = EncodeSettings()
     finetune: FinetuneSettings = FinetuneSettings()
 
+    @property
+    def searches(self) -> bool:
+        """Whether several scenes or containers are made, to find the one that is wanted."""
+        return self.encode.has_goal or self.compact.max_psnr_drop is not None
+
     @model_validator(mode="after")
     def _a_goal_to_go_by(self) -> Self:
         if self.compact.by_goal and not self.encode.has_goal:
