@@ -95,7 +95,7 @@ class Encoding:
             chooser = self._chooser()
             search = self.search(chooser)
         if self.settings.finetune.wanted and len(self.splats) > 0 and not search.stopped:
-            price = None if search.best is None else search.best.encoded.price
+            price = search.trials[-1].price if search.best is None else search.best.encoded.price
             try:
                 encoder = self._encoder(chooser or self._chooser(), self._tuner(), None)
                 search.run(encoder, price, min(TUNED_ATTEMPTS, wanted.attempts))

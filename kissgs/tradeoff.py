@@ -115,9 +115,9 @@ class Tradeoff:
     def _why_all_stay(self) -> str:
         if self._drops:
             return "and no smaller number that was tried serves the goal better"
-        return (
-            "and the search was ended before fewer were tried" if self._stopped else "and there is room for all of them"
-        )
+        if self._stopped:
+            return "and the search was ended before fewer were tried"
+        return "and there is room for all of them"
 
     def _guess(self) -> float:
         """Of the share of the Gaussians; a power of 2."""

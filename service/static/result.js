@@ -79,6 +79,7 @@ function gain({ kept, psnr_before: before, psnr_after: after, bytes_before: whol
 function planeTable(sizes) {
   const rows = planes(sizes.files);
   const largest = Math.max(...rows.map(([, size]) => size));
+  const whole = rows.reduce((sum, [, size]) => sum + size, 0); // the zip deflates some
   const lines = rows.map(([name, size]) => {
     const bar = el("span");
     bar.style.inlineSize = `${(100 * size) / largest}%`;
@@ -88,7 +89,7 @@ function planeTable(sizes) {
       el("th", { scope: "row" }, name),
       el("td", { class: "bar", "aria-hidden": "true" }, bar),
       el("td", {}, bytes(size)),
-      el("td", { class: "muted share" }, share(size / sizes.container)),
+      el("td", { class: "muted share" }, share(size / whole)),
     );
   });
   const head = (/** @type {string} */ text, /** @type {string} */ kind) =>
