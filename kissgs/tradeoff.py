@@ -10,7 +10,7 @@ from kissgs.errors import Enough, UnsupportedError
 from kissgs.evaluation.drop import drop_of
 from kissgs.goal import Goal, GoalSearch
 from kissgs.search import Trial, lowest
-from kissgs.sogxt.container import zip_bytes
+from kissgs.sogxt.container import stored_sizes
 from kissgs.splats import Splats
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ class Tradeoff:
             return Offer(math.inf, search, compacted)
         encoded = search.best.encoded
         if not search.goal.by_size:
-            return Offer(len(zip_bytes(encoded.files)), search, compacted)
+            return Offer(stored_sizes(encoded.files, packed=self.encoding.packed)[0], search, compacted)
         try:
             psnr = search.pictures(encoded).mean.candidate.psnr
         except Enough:  # as it began

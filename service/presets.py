@@ -14,10 +14,10 @@ EVALUATION = 60.0
 """CPU seconds per million Gaussians, roughly: decoding, and two pictures from each of four cameras."""
 
 _FACTS: dict[kissgs.Preset, tuple[str, str, float, float, float]] = {
-    kissgs.Preset.FAST: ("Fast", "Seconds, for uploads that wait.", 13.18, -0.39, 26),
-    kissgs.Preset.BALANCED: ("Balanced", "The best pictures for their size. The default.", 11.57, -0.35, 266),
-    kissgs.Preset.SMALL: ("Small", "A little smaller still, and slower.", 11.36, -0.36, 363),
-    kissgs.Preset.PAPER: ("Paper", "KISS-GS as published, to compare with.", 17.19, -0.38, 342),
+    kissgs.Preset.FAST: ("Fast", "Seconds, for uploads that wait.", 13.13, -0.39, 26),
+    kissgs.Preset.BALANCED: ("Balanced", "The best pictures for their size. The default.", 11.51, -0.35, 266),
+    kissgs.Preset.SMALL: ("Small", "A little smaller still, and slower.", 11.31, -0.36, 363),
+    kissgs.Preset.PAPER: ("Paper", "KISS-GS as published, to compare with.", 17.13, -0.38, 342),
 }
 
 
