@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-import tracemalloc
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -93,20 +90,6 @@ def equivalents(quats, scales):
         new_quats += [turned, -turned]
         new_scales += [scales[:, source]] * 2
     return np.stack(new_quats), np.stack(new_scales)
-
-
-def peak_memory(call):
-    """Bytes that Python and NumPy held at most while ``call`` ran."""
-    tracemalloc.start()
-    try:
-        call()
-        return tracemalloc.get_traced_memory()[1]
-    finally:
-        # After an error, a task that had begun may still run; stopping amid it can crash Python 3.11 (gh-128679).
-        for thread in threading.enumerate():
-            if thread.name.startswith("ThreadPoolExecutor"):
-                thread.join()
-        tracemalloc.stop()
 
 
 def signed_log(x):

@@ -7,9 +7,10 @@ import zipfile
 import numpy as np
 import pytest
 import yaml
-from codec_scenes import peak_memory, random_scene
+from codec_scenes import random_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from memory import takes_less_than
 
 from kissgs import KissgsError, Settings, compress, decompress
 from kissgs.splats import ATTRIBUTES
@@ -42,7 +43,7 @@ def check(source):
         except KissgsError as error:
             outcome.append(str(error))
 
-    assert peak_memory(run) < MEMORY
+    assert takes_less_than(MEMORY, run)
     if isinstance(outcome[0], str):
         assert outcome[0]
         assert "\n" not in outcome[0]

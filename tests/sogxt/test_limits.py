@@ -4,7 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from codec_scenes import peak_memory, random_scene
+from codec_scenes import random_scene
+from memory import takes_less_than
 
 import kissgs
 from kissgs.errors import OutputError, UnsupportedError
@@ -36,7 +37,7 @@ def test_more_gaussians_than_the_limit_are_refused_before_memory_is_taken():
         with pytest.raises(UnsupportedError, match=r"262144 Gaussians; .* raise the limit"):
             kissgs.decompress(files, max_gaussians=200_000)
 
-    assert peak_memory(refused) < 30e6
+    assert takes_less_than(30e6, refused)
     assert len(kissgs.decompress(files, max_gaussians=262_144)) == 262_144
 
 
