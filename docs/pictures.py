@@ -1,6 +1,6 @@
-"""Take docs/images/preview.webp: the sample scene, compressed by a service of its own, in its preview page.
+"""Take docs/images/page.webp and preview.webp: the sample scene, compressed by a service of its own, on its pages.
 
-Needs Chromium, scripts/vendor, and playwright of the extra ``dev``. Takes half a minute: Chromium draws in software.
+Needs Chromium, scripts/vendor, and playwright of the extra ``dev``. Takes two minutes: Chromium draws in software.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from playwright.sync_api import Page, sync_playwright
 import kissgs
 
 HERE = Path(__file__).parent
-SIZE = {"width": 1280, "height": 800}
+PAGE, PREVIEW = {"width": 760, "height": 1200}, {"width": 1280, "height": 800}
 SOFTWARE = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--no-sandbox"]
 KEYS = ["+"] * 16 + ["ArrowLeft"] * 4 + ["ArrowUp"] * 2
 GAUSSIANS = 60_000
 
 
 def main() -> None:
-    """Compress, preview, and take the picture."""
+    """Compress, look, and take the pictures."""
     chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))))
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as driver:
         scene = Path(folder) / "sample.ply"
@@ -42,16 +42,24 @@ def main() -> None:
         try:
             address = next(found[0] for line in service.stdout if (found := re.search(r"http://\S+:\d+", line)))
             with kissgs.Remote(address) as remote:
-                job = remote.compress(scene, Path(folder) / "sample.zip")
+                job = remote.compress(scene, Path(folder) / "sample.zip", evaluate=True)
             browser = driver.chromium.launch(executable_path=chromium, args=SOFTWARE)
-            page = browser.new_page(viewport=SIZE, color_scheme="dark", reduced_motion="reduce")
+            page = browser.new_page(viewport=PAGE)
+            page.goto(f"{address}/#{job['id']}")
+            page.get_by_text("Where the bytes go").wait_for()
+            save(page.screenshot(), "page.webp")
+            page = browser.new_page(viewport=PREVIEW, color_scheme="dark", reduced_motion="reduce")
             page.set_default_timeout(120_000)
             page.goto(f"{address}/preview/{job['id']}")
-            shot = pose(page)
+            save(pose(page), "preview.webp")
         finally:
             service.terminate()
             service.wait()
-    Image.open(io.BytesIO(shot)).convert("RGB").save(HERE / "images" / "preview.webp", quality=90, method=6)
+
+
+def save(shot: bytes, name: str) -> None:
+    """As a small picture among those of the documentation."""
+    Image.open(io.BytesIO(shot)).convert("RGB").save(HERE / "images" / name, quality=90, method=6)
 
 
 def pose(page: Page) -> bytes:

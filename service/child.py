@@ -64,7 +64,10 @@ def _compress(order: dict[str, Any], send: Send) -> dict[str, Any]:
         _sync(made)
     report = result.report.as_dict()
     _write(folder / "report.json", json.dumps(report, indent=2).encode())
-    files = {path.name: _described(path) for path in sorted((folder / "files").iterdir())}
+    stored = result.report.file_bytes
+    files = {
+        path.name: {**_described(path), "stored": stored[path.name]} for path in sorted((folder / "files").iterdir())
+    }
     summary = {
         "container": _described(folder / "scene.zip"),
         "report": _described(folder / "report.json"),

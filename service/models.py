@@ -8,8 +8,8 @@ from typing import Any
 from sqlalchemy import JSON, BigInteger, Float, ForeignKey, Index, Integer, String, UniqueConstraint
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
-SCHEMA_VERSION = 2
-"""Of the tables below. A database of another version is refused rather than misread."""
+SCHEMA_VERSION = 3
+"""Of the tables below, and of the results in them. A database of another version is refused rather than misread."""
 
 NOTE_CHARS = 200
 """Of what a running job has to say; the rest is cut."""

@@ -104,7 +104,7 @@ class Sizes(Wire):
     """What came out, in bytes."""
 
     container: int
-    files: dict[str, int] = Field(description="Of each file of the container.")
+    files: dict[str, int] = Field(description="Of each file, as the container has it: text is deflated there.")
     ratio: float = Field(description="Upload over container.")
     bytes_per_gaussian: float = Field(description="Of the container, per Gaussian of the upload.")
 

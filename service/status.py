@@ -99,7 +99,7 @@ def _sizes(job: Job) -> Sizes | None:
     container = job.result["container"]["bytes"]
     return Sizes(
         container=container,
-        files={name: file["bytes"] for name, file in job.result["files"].items()},
+        files={name: file["stored"] for name, file in job.result["files"].items()},
         ratio=job.upload_bytes / container,
         bytes_per_gaussian=container / max(job.gaussians, 1),
     )

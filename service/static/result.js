@@ -79,7 +79,7 @@ function gain({ kept, psnr_before: before, psnr_after: after, bytes_before: whol
 function planeTable(sizes) {
   const rows = planes(sizes.files);
   const largest = Math.max(...rows.map(([, size]) => size));
-  const whole = rows.reduce((sum, [, size]) => sum + size, 0); // the zip deflates some
+  const whole = rows.reduce((sum, [, size]) => sum + size, 0); // the zip has names, too
   const lines = rows.map(([name, size]) => {
     const bar = el("span");
     bar.style.inlineSize = `${(100 * size) / largest}%`;

@@ -127,7 +127,7 @@ def test_the_status_tells_what_the_library_reports(service, job, local):
     report = local.report
     assert (job["state"], job["kept"], job["invisible"]) == ("succeeded", report.count, report.invisible)
     assert job["cleaned"] == report.as_dict()["cleaned"]
-    assert job["sizes"]["files"] == {name: len(data) for name, data in local.files.items()}
+    assert job["sizes"]["files"] == report.file_bytes
     assert job["sizes"]["container"] == report.container_bytes
     assert job["upload_bytes"] == len(SMALL)
     assert job["sizes"]["ratio"] == pytest.approx(report.ratio)
