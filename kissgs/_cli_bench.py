@@ -174,7 +174,7 @@ def _measure(study: str, asked: Asked, as_json: bool) -> None:
     outcome = measure(asked)
     if as_json:
         print_json(outcome.rows)
-    else:
+    elif outcome.rows:
         show(outcome.table)
     if asked.plot is not None and outcome.draw is not None:  # last: what it shows has taken long to find
         outcome.draw(asked.plot)

@@ -5,11 +5,16 @@ from __future__ import annotations
 import shlex
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from kissgs._cli_settings import chosen
-from kissgs._cli_study import Asked, Outcome
-from kissgs._console import progress_bar
+from kissgs._cli_study import Asked, Outcome, each_scene
 from kissgs.errors import UnsupportedError
+
+if TYPE_CHECKING:
+    from kissgs.evaluation.speed import RenderingCost
+    from kissgs.measured import Measured
+    from kissgs.progress import Progress
 
 
 def comparison(asked: Asked) -> Outcome:
@@ -17,7 +22,7 @@ def comparison(asked: Asked) -> Outcome:
     from kissgs._bench_plots import comparison_plot, growth_plot
     from kissgs._bench_tables import bench_tables
     from kissgs.comparison import Plan, compare, growth
-    from kissgs.measured import Measured, at_equal_psnr
+    from kissgs.measured import at_equal_psnr
     from kissgs.settings import Preset
 
     if asked.gaussians and (asked.peers or asked.fidelities):
@@ -43,13 +48,15 @@ def comparison(asked: Asked) -> Outcome:
         views=asked.views,
         threads=asked.threads,
     )
-    rows, failures = list[Measured](), list[str]()
-    with progress_bar(False) as progress:
-        for scene in map(Path, asked.scenes):
-            if asked.gaussians:
-                rows += growth(scene, asked.gaussians, plan, progress=progress)
-            else:
-                rows += compare(scene, plan, failed=failures.append, progress=progress)
+    refused = list[str]()
+
+    def measure(scene: Path, progress: Progress) -> list[Measured]:
+        if asked.gaussians:
+            return growth(scene, asked.gaussians, plan, progress=progress)
+        return compare(scene, plan, failed=refused.append, progress=progress)
+
+    named, failures = each_scene(asked, measure)
+    rows = [row for _, row in named]
     equals = at_equal_psnr(rows)
     told = [row.as_dict() for row in rows]
     for row, entry in zip(rows, told, strict=True):
@@ -57,7 +64,7 @@ def comparison(asked: Asked) -> Outcome:
         if row.is_peer and asked.fidelities:
             entry["at_equal_psnr"] = [equal.as_dict() for equal in of]
     draw = partial(growth_plot if asked.gaussians else comparison_plot, rows)
-    return Outcome(rows=told, table=bench_tables(rows, equals), draw=draw, failures=failures)
+    return Outcome(rows=told, table=bench_tables(rows, equals), draw=draw, failures=refused + failures)
 
 
 def ablation(asked: Asked) -> Outcome:
@@ -66,12 +73,11 @@ def ablation(asked: Asked) -> Outcome:
     from kissgs.ablation import ablate
 
     presets = [chosen(name, asked.changes) for name in asked.presets or ("paper", "balanced")]
-    rows = []
-    with progress_bar(False) as progress:
-        for scene in map(Path, asked.scenes):
-            found = ablate(scene, presets, asked.views, threads=asked.threads, progress=progress)
-            rows += [(scene.name, row) for row in found]
-    return Outcome(rows=[{"scene": scene, **row.as_dict()} for scene, row in rows], table=ablation_table(rows))
+    rows, failures = each_scene(
+        asked, lambda scene, progress: ablate(scene, presets, asked.views, threads=asked.threads, progress=progress)
+    )
+    told = [{"scene": scene, **row.as_dict()} for scene, row in rows]
+    return Outcome(rows=told, table=ablation_table(rows), failures=failures)
 
 
 def rendering(asked: Asked) -> Outcome:
@@ -81,14 +87,15 @@ def rendering(asked: Asked) -> Outcome:
     from kissgs.scenes import load
     from kissgs.views.virtual import virtual_views
 
-    rows = []
-    with progress_bar(False) as progress:
-        for scene in asked.scenes:
-            splats = load(scene, threads=asked.threads, progress=progress)
-            views = asked.views or virtual_views(splats, threads=asked.threads, progress=progress)
-            cameras = [view.camera for view in views.test or views.train]
-            for count in asked.gaussians or [len(splats)]:
-                sized = resampled(splats, count)
-                cost = rendering_cost(sized, cameras, threads=asked.threads, progress=progress)
-                rows.append((Path(scene).name, cost))
-    return Outcome(rows=[{"scene": scene, **cost.as_dict()} for scene, cost in rows], table=rendering_table(rows))
+    def measure(scene: Path, progress: Progress) -> list[RenderingCost]:
+        splats = load(scene, threads=asked.threads, progress=progress)
+        views = asked.views or virtual_views(splats, threads=asked.threads, progress=progress)
+        cameras = [view.camera for view in views.test or views.train]
+        return [
+            rendering_cost(resampled(splats, count), cameras, threads=asked.threads, progress=progress)
+            for count in asked.gaussians or [len(splats)]
+        ]
+
+    rows, failures = each_scene(asked, measure)
+    told = [{"scene": scene, **cost.as_dict()} for scene, cost in rows]
+    return Outcome(rows=told, table=rendering_table(rows), failures=failures)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from rich.console import Group
@@ -12,16 +11,18 @@ from rich.text import Text
 
 from kissgs._cli_pictures import choice
 from kissgs._cli_settings import chosen
-from kissgs._cli_study import Asked, Outcome
-from kissgs._console import progress_bar
+from kissgs._cli_study import Asked, Outcome, each_scene
 from kissgs.errors import UnsupportedError
 from kissgs.evaluation.likeness import spell
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from rich.console import RenderableType
 
     from kissgs.compaction.study import Point
     from kissgs.curves import RatePoint
+    from kissgs.progress import Progress
     from kissgs.views.view import Source
 
 
@@ -37,22 +38,23 @@ def compaction(asked: Asked) -> Outcome:
             raise UnsupportedError(f"there is no way {name!r}; there are: {'; '.join(known)}")
     source = _teacher(asked)
     settings = chosen(asked.preset, asked.changes, group="compact").compact
-    rows: list[tuple[str, Point]] = []
-    with progress_bar(False) as progress:
-        for scene in asked.scenes:
-            found = study(
-                *(load(scene, threads=asked.threads, progress=progress), settings, asked.views),
-                ratios=asked.ratios or RATIOS,
-                ways=[known[name] for name in asked.ways or known],
-                learn_from=source,
-                threads=asked.threads,
-                progress=progress,
-            )
-            rows += [(Path(scene).name, point) for point in found]
+
+    def measure(scene: Path, progress: Progress) -> list[Point]:
+        return study(
+            *(load(scene, threads=asked.threads, progress=progress), settings, asked.views),
+            ratios=asked.ratios or RATIOS,
+            ways=[known[name] for name in asked.ways or known],
+            learn_from=source,
+            threads=asked.threads,
+            progress=progress,
+        )
+
+    rows, failures = each_scene(asked, measure)
     return Outcome(
         rows=[{"scene": scene, **point.as_dict()} for scene, point in rows],
         table=curves_table(rows),
         draw=partial(compaction_plot, [point for _, point in rows]),
+        failures=failures,
     )
 
 
@@ -86,22 +88,23 @@ def finetuning(asked: Asked) -> Outcome:
 
     source = _teacher(asked)
     settings = chosen(asked.preset, asked.changes, group="finetune")
-    rows: list[tuple[str, RatePoint]] = []
-    with progress_bar(False) as progress:
-        for scene in asked.scenes:
-            found = rate_curves(
-                *(load(scene, threads=asked.threads, progress=progress), settings, asked.views),
-                fidelities=asked.fidelities or None,
-                ratios=asked.ratios,
-                learn_from=source,
-                threads=asked.threads,
-                progress=progress,
-            )
-            rows += [(Path(scene).name, point) for point in found]
+
+    def measure(scene: Path, progress: Progress) -> list[RatePoint]:
+        return rate_curves(
+            *(load(scene, threads=asked.threads, progress=progress), settings, asked.views),
+            fidelities=asked.fidelities or None,
+            ratios=asked.ratios,
+            learn_from=source,
+            threads=asked.threads,
+            progress=progress,
+        )
+
+    rows, failures = each_scene(asked, measure)
     return Outcome(
         rows=[{"scene": scene, **point.as_dict()} for scene, point in rows],
         table=finetuning_table(rows),
         draw=partial(finetuning_plot, [point for _, point in rows]),
+        failures=failures,
     )
 
 

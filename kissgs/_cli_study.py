@@ -5,12 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from kissgs.errors import KissgsError
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
+    from kissgs.progress import Progress
     from kissgs.views.view import Views
+
+Row = TypeVar("Row")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,3 +53,23 @@ class Outcome:
     table: RenderableType
     draw: Callable[[Path], None] | None = None
     failures: list[str] = field(default_factory=list)
+
+
+def each_scene(asked: Asked, measure: Callable[[Path, Progress], list[Row]]) -> tuple[list[tuple[str, Row]], list[str]]:
+    """What ``measure`` finds of every scene, beside the scene's name; and a sentence for each of several that failed.
+
+    Raises:
+        KissgsError: there is one scene, and it failed.
+    """
+    from kissgs._console import progress_bar
+
+    rows, failures = list[tuple[str, Row]](), list[str]()
+    with progress_bar(False) as progress:
+        for scene in map(Path, asked.scenes):
+            try:
+                rows += [(scene.name, row) for row in measure(scene, progress)]
+            except KissgsError as error:
+                if len(asked.scenes) == 1:
+                    raise
+                failures.append(str(error))  # what the others took an hour to find is not lost
+    return rows, failures

@@ -80,3 +80,18 @@ def test_what_does_not_go_together_is_refused(scene: Path, words: str, sentence:
 
 def test_two_scenes_are_not_one_plot(scene: Path, tmp_path: Path) -> None:
     assert "--plot draws one scene" in failure("bench", scene, scene, "--plot", tmp_path / "p.svg")
+
+
+@pytest.mark.parametrize("study", [["--ablate", "-p", "paper"], ["--rendering"], ["-p", "fast"]])
+def test_a_scene_that_fails_costs_the_others_nothing(scene: Path, study: list[str]) -> None:
+    """What the first took long to find is told all the same, and so is what is wrong with the second."""
+    done = run("bench", scene, scene.with_name("none.ply"), *study, "--json")
+    assert done.returncode == 2
+    assert b"none.ply: there is no such file" in done.stderr
+    assert {row["scene"] for row in json.loads(done.stdout)} == {"scene.ply"}
+
+
+def test_scenes_that_all_fail_make_no_table() -> None:
+    done = run("bench", "none.ply", "nothing.ply", "-p", "fast")
+    assert (done.returncode, done.stdout) == (2, b"")
+    assert done.stderr.count(b"there is no such file") == 2

@@ -11,6 +11,9 @@ from typing import BinaryIO
 
 from kissgs.errors import OutputError
 
+BLOCK = 4096
+"""Bytes, for which a file system takes at least one block of its own."""
+
 
 @contextlib.contextmanager
 def atomic_file(path: Path, *, overwrite: bool = False) -> Iterator[BinaryIO]:
@@ -50,8 +53,8 @@ def refuse_existing(path: Path, *, overwrite: bool) -> None:
 def try_out(path: Path) -> None:
     """Raise OutputError if nothing can be written beside ``path``: before the work starts, rather than after it."""
     try:
-        with tempfile.TemporaryFile(dir=path.parent, prefix=".kissgs.", suffix=".part"):
-            pass
+        with tempfile.TemporaryFile(dir=path.parent, prefix=".kissgs.", suffix=".part") as file:
+            file.write(bytes(BLOCK))  # a full disk takes names, but no bytes
     except OSError as error:
         raise OutputError(f"cannot write {path}: {reason_of(error)}") from error
 

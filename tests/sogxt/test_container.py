@@ -14,7 +14,7 @@ from memory import takes_less_than
 
 from kissgs import compress, decompress
 from kissgs.errors import InvalidContainerError, OutputError
-from kissgs.sogxt.container import MAX_ZIP_ENTRIES, open_source, write_container, zip_bytes
+from kissgs.sogxt.container import MAX_ZIP_ENTRIES, check_destination, open_source, write_container, zip_bytes
 
 FILES = {"container_meta.yaml": b"meta", "meta.json": b"{}", "a.webp": bytes(range(256)) * 4, "empty.webp": b""}
 
@@ -223,6 +223,18 @@ def test_a_folder_is_not_replaced_by_a_zip(tmp_path):
 def test_a_missing_folder_above_is_an_output_error(tmp_path, name):
     with pytest.raises(OutputError, match=f"cannot write .*{name}: there is no folder"):
         write_container(FILES, tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["a.zip", "folder"])
+def test_a_full_disk_is_told_before_the_work(tmp_path, monkeypatch, name):
+    """It still takes names, but no bytes."""
+
+    def full(**_):
+        return Path("/dev/full").open("wb")
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", full)
+    with pytest.raises(OutputError, match=r"cannot write .*: no space left on device"):
+        check_destination(tmp_path / name, overwrite=False, names=FILES)
 
 
 @pytest.mark.parametrize("existing", [False, True])
