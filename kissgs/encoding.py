@@ -113,13 +113,7 @@ class Encoding:
             packed=self.packed,
             limit=limit,
         )
-        encoder = self._encoder(chooser or self._chooser(), None, None)
-        search.run(encoder)
-        left = search.settings.attempts - len(search.trials)
-        coarse = search.settings.sh_ratio > 1 and self.splats.sh_degree > 0
-        if search.best is None and not search.goal.by_size and coarse and left > 0 and not search.hopeless:
-            search.settings = search.settings.model_copy(update={"sh_ratio": 1.0})  # a codebook as large as it takes
-            search.run(encoder, attempts=left)
+        search.exhaust(self._encoder(chooser or self._chooser(), None, None))
         return search
 
     def _encoder(self, chooser: Chooser, tuner: Tuner | None, checkpoint: Path | None) -> Encoder:

@@ -85,24 +85,26 @@ class Goal:
             return math.inf if trial.drop is not None else -math.inf
         return math.log2((self.settings.max_psnr_drop or 1.0) / trial.drop)
 
-    def regret(self, trials: Sequence[Trial], *, all_stay: bool) -> str:
-        """Why none of these will do; ``all_stay``: whether none with fewer Gaussians may be tried."""
+    def regret(self, trials: Sequence[Trial], *, fewer: bool) -> str:
+        """Why none of these will do; ``fewer``: whether fewer Gaussians have not been tried, and may serve."""
+        at = (max if self.by_size else min)((trial.price for trial in trials if trial.price), default=None)
+        trials = [trial for trial in trials if trial.price in (None, at)]  # at the bound, which is tried in any case
         if self.settings.target_size is not None:
             least, wanted = min(trial.bytes for trial in trials), int(self.settings.target_size)
             return (
                 f"no container of this scene that was found has at most {wanted:,} byte{'' if wanted == 1 else 's'}, "
                 f"the smallest has {least:,}; ask for no less than that"
-                + (", or let Gaussians go: --compact auto" if all_stay else "")
+                + (", or let Gaussians go: --compact auto" if fewer else "")
             )
         if self.settings.psnr is not None:
             most = math.floor(100 * max(trial.psnr or 0.0 for trial in trials)) / 100
             return (
-                f"no container of this scene that was found has {self.settings.psnr:g} dB, the best has {most:.2f}; "
+                f"no container of this scene that was found has {self.settings.psnr:g} dB, the finest has {most:.2f}; "
                 "ask for no more than that"
             )
         least_lost = 1.005 * min(math.inf if trial.drop is None else trial.drop for trial in trials)
         return (
-            f"no container of this scene that was found loses at most {self.settings.max_psnr_drop:g} dB, the best "
+            f"no container of this scene that was found loses at most {self.settings.max_psnr_drop:g} dB, the finest "
             f"loses {least_lost:.3g}; allow as much"
         )
 
@@ -115,6 +117,7 @@ class GoalSearch:
 
     Attributes:
         goal: of the settings.
+        settings: with which containers are made: those that were asked for, or with another codebook.
         trials: all attempts.
         best: of them; None if none met the goal.
         stopped: whether somebody said that it was enough.
@@ -155,8 +158,43 @@ class GoalSearch:
         self.stopped = self.hopeless = False
         self.overhead = 0
         self._bytes = 0
+        self._known: dict[float, _Known] = {}
+        self._jump: tuple[float, int] | None = None
         self._psnr: float | None = None
         self._tuned: FinetuneReport | None = None
+
+    def exhaust(self, encoder: Encoder) -> None:
+        """As many attempts as the settings have; with another codebook where one in balance with the rest will not do.
+
+        Its size is bounded for the sake of time, and its side is a multiple of 8: there may be nothing beyond that
+        bound, and nothing between two sides.
+        """
+        self.run(encoder)
+        if self._short and self.settings.sh_ratio > 1 and self.original.sh_degree > 0 and self._known:
+            largest = max(known.side for known in self._known.values())
+            bounded = max(x for x, known in self._known.items() if known.side == largest)
+            self._known = {x: known for x, known in self._known.items() if known.side < largest}
+            self._again(encoder, 2.0**bounded, sh_ratio=1.0)
+        if self._jump is not None:
+            price, side = self._jump
+            self._known = {x: known for x, known in self._known.items() if known.side <= side}
+            self._again(encoder, price, sh_entries=side**2)
+        self._known = {}  # nothing of what fine-tuning will find
+        if self.best is not None:
+            made = self.best.settings
+            self.settings = self.settings.model_copy(update={"sh_ratio": made.sh_ratio, "sh_entries": made.sh_entries})
+
+    def _again(self, encoder: Encoder, price: float, **changes: float) -> None:
+        left = self.settings.attempts - len(self.trials)
+        if left > 0 and not (self.stopped or self.hopeless):
+            self.settings = self.settings.model_copy(update=changes)
+            self.run(encoder, price, left)
+
+    @property
+    def _short(self) -> bool:
+        """Whether nothing was good enough, or nothing large enough."""
+        spares = [self.goal.spare(trial) for trial in self.trials]
+        return min(spares) > self.goal.near if self.goal.by_size else max(spares) < 0
 
     def run(self, encoder: Encoder, price: float | None = None, attempts: int | None = None) -> None:
         """So many attempts at most, by default as many as the settings have, the first at ``price`` if one is given."""
@@ -178,7 +216,8 @@ class GoalSearch:
             UnsupportedError: none met the goal. ``all_stay``: whether none with fewer Gaussians may be tried.
         """
         if self.best is None:
-            raise UnsupportedError(self.goal.regret(self.trials, all_stay=all_stay))
+            fewer = all_stay and self.count > 1 and self.overhead < (self.settings.target_size or 0)
+            raise UnsupportedError(self.goal.regret(self.trials, fewer=fewer))
         if self._tuned is None or self.best.finetuning is not None:
             return self.best
         return replace(self.best, finetuning=replace(self._tuned, kept=False, note=NOT_TUNED))
@@ -188,12 +227,29 @@ class GoalSearch:
         start = self._judge(first)
         if first.encoded.price is not None:
             begin = math.log2(first.encoded.price)
+
+            def spare(x: float) -> float:
+                container = first if x == begin else encoder(self._at(2.0**x))
+                found = start if x == begin else self._judge(container)
+                self._known[x] = _Known(container.encoded.codebook_side, found)
+                return found
+
             seek(
-                lambda x: start if x == begin else self._judge(encoder(self._at(2.0**x))),
+                spare,
                 *(begin, self.goal.slope, self.goal.near, PRICES),
                 attempts=attempts,
-                jump=JUMP if self.goal.by_size else 0.0,
+                settled=self._settled,
+                before={x: known.spare for x, known in self._known.items()},
             )
+
+    def _settled(self, inside: float, outside: float) -> bool:
+        """Whether what lies between these prices, as powers of 2, is a jump."""
+        one, other, gap = self._known[inside], self._known[outside], abs(inside - outside)
+        smooth = gap * abs(self.goal.slope)
+        if one.side != other.side and gap < 1 and (smooth < self.goal.near or one.spare - other.spare > 2 * smooth):
+            self._jump = 2.0 ** min(inside, outside), min(one.side, other.side)
+            return True
+        return self.goal.by_size and gap < JUMP
 
     def _at(self, price: float) -> EncodeSettings:
         without = dict.fromkeys(GOALS)
@@ -241,6 +297,14 @@ class GoalSearch:
             self.views = virtual_views(self.original, threads=self.threads)
         decoded = decode(encoded.files, max_gaussians=max(len(self.original), MAX_GAUSSIANS), threads=self.threads)
         return evaluate(self.original, decoded, self.views, threads=self.threads, progress=silent)
+
+
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """Of a container: the side of its codebook's image, and what it left to spare."""
+
+    side: int
+    spare: float
 
 
 class _Hopeless(Exception):

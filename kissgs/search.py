@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -12,7 +12,10 @@ FINEST = 0.2
 """Of :func:`lowest`: steps are halved no further."""
 
 REACH = 4.0
-"""How far from all that is known an attempt may be, octaves."""
+"""How far from all that is known an attempt may be, octaves; but for the last one, at a bound."""
+
+LAME = 0.15
+"""Of what the slope promises: where no more comes over half of :data:`REACH`, only the bound can tell more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,12 +54,13 @@ def seek(
     bounds: tuple[float, float],
     grain: float = 0.0,
     attempts: int = ATTEMPTS,
-    jump: float = 0.0,
+    settled: Callable[[float, float], bool] = lambda inside, outside: False,
+    before: Mapping[float, float] | None = None,
 ) -> float | None:
     """Where a monotone function is hardly above zero.
 
     False position between attempts that met the goal and ones that did not; before there are both, Newton's steps of at
-    most :data:`REACH`.
+    most :data:`REACH`, and the bound once these lead nowhere: no goal is given up that is met there.
 
     Args:
         spare: at least 0 where the goal is met, infinite where it cannot be told by how much; only about monotone and
@@ -67,19 +71,25 @@ def seek(
         bounds: attempts stay between these.
         grain: attempts are whole multiples of this; 0 for any number.
         attempts: how many at most.
-        jump: an attempt that met the goal, and the next one that did not, so near to each other leave nothing to find.
+        settled: whether an attempt that met the goal, and the next that did not, leave nothing to find between them.
+        before: what is known already; its attempts are not among those that count, nor among those to return.
 
     Returns:
-        The best attempt that met the goal; None if none did, or the function does not go on rising.
+        The best attempt that met the goal; None if none did.
     """
-    known: dict[float, float] = {}
+    known = dict(before or {})
+    attempts += len(known)
     x = _whole(start, grain)
     while len(known) < attempts and x not in known:
         known[x] = spare(x)
-        if 0 <= known[x] <= tolerance or _flat(known, tolerance) or _gap(known, slope) < jump:
+        inside, outside = _bracket(known, slope)
+        if 0 <= known[x] <= tolerance or (inside is not None and outside is not None and settled(inside, outside)):
             break
-        x = min(max(_whole(_next(known, slope, tolerance / 2), grain), bounds[0]), bounds[1])
-    met = [x for x, found in known.items() if found >= 0]
+        if (inside is None or outside is None) and (len(known) == attempts - 1 or _stuck(known, slope)):
+            x = bounds[(inside is None) == (slope > 0)]
+        else:
+            x = min(max(_whole(_next(known, slope, tolerance / 2), grain), bounds[0]), bounds[1])
+    met = [x for x, found in known.items() if found >= 0 and x not in (before or {})]
     return min(met, key=lambda x: known[x]) if met else None
 
 
@@ -133,7 +143,10 @@ def _whole(x: float, grain: float) -> float:
 def _next(known: dict[float, float], slope: float, aim: float) -> float:
     inside, outside = _bracket(known, slope)
     if inside is not None and outside is not None:
-        share = 0.5 if math.isinf(known[inside]) else (known[inside] - aim) / (known[inside] - known[outside])
+        latest = [found >= 0 for found in known.values()][-3:]
+        if math.isinf(known[inside]) or latest in ([True] * 3, [False] * 3):  # it creeps: one end does not move
+            return (inside + outside) / 2
+        share = (known[inside] - aim) / (known[inside] - known[outside])
         return inside + (outside - inside) * min(max(share, 0.1), 0.9)
     *before, last = known
     if before and math.isfinite(known[last]) and math.isfinite(known[before[-1]]):
@@ -143,22 +156,17 @@ def _next(known: dict[float, float], slope: float, aim: float) -> float:
     return start + min(max((aim - known[start]) / slope, -REACH), REACH)
 
 
-def _bracket(known: dict[float, float], slope: float) -> tuple[float | None, float | None]:
+def _bracket(known: Mapping[float, float], slope: float) -> tuple[float | None, float | None]:
     """The last place where the goal is met, and the first beyond it where it is not."""
     inside = max((x for x, found in known.items() if found >= 0), key=lambda x: -slope * x, default=None)
     beyond = [x for x, found in known.items() if found < 0 and (inside is None or slope * (x - inside) < 0)]
     return inside, min(beyond, key=lambda x: -slope * x, default=None)
 
 
-def _gap(known: dict[float, float], slope: float) -> float:
-    """Between these two."""
-    inside, outside = _bracket(known, slope)
-    return math.inf if inside is None or outside is None else abs(outside - inside)
-
-
-def _flat(known: dict[float, float], tolerance: float) -> bool:
-    """Whether the last step was long and for nothing."""
-    if len(known) < 2:
-        return False
-    (one, first), (two, second) = list(known.items())[-2:]
-    return abs(two - one) > REACH / 2 and abs(second - first) < tolerance  # of two infinite ones nothing is known
+def _stuck(known: Mapping[float, float], slope: float) -> bool:
+    """Whether a long way to the last attempt was for hardly anything."""
+    *before, last = known
+    return any(
+        abs(last - x) > REACH / 2 and abs(known[last] - known[x]) < LAME * abs(slope * (last - x))
+        for x in before  # of two infinite ones nothing is known
+    )

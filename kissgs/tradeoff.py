@@ -89,7 +89,7 @@ class Tradeoff:
             self._stopped = True
         best = self._offers[min(self._offers, key=lambda count: (self._offers[count].cost, count))]
         if best.search is None or best.search.best is None:
-            raise UnsupportedError(self.goal.regret(self.trials, all_stay=False))
+            raise UnsupportedError(self.goal.regret(self.trials, fewer=False))
         best.search.stopped |= self._stopped
         compacted = best.compacted or unchanged(splats, self._why_all_stay())
         notes = filter(None, [compacted.report.note, self.compactor.note])

@@ -1,6 +1,7 @@
 """Oracle: functions whose crossing is known, and the size and the pictures of what a search returns."""
 
 import math
+import re
 
 import pytest
 from hypothesis import given
@@ -23,7 +24,7 @@ class Counted:
         return self.function(x)
 
 
-@given(st.floats(-20, 20), st.floats(0.3, 3), st.sampled_from([-1, 1]), st.floats(-15, 15))
+@given(st.floats(-15, 15), st.floats(0.3, 3), st.sampled_from([-1, 1]), st.floats(-10, 10))
 def test_a_bent_line_is_met_in_few_attempts(crossing, steepness, sign, start):
     """Steeper above its crossing than below, and up to three times as steep as announced."""
     spare = Counted(lambda x: sign * steepness * (x - crossing) * (1.5 if sign * x > sign * crossing else 0.8))
@@ -44,11 +45,44 @@ def test_steps_are_lived_with():
 
 def test_a_jump_is_not_looked_into_any_finer():
     spare = Counted(lambda x: (1.0 if x < 0.3 else -1.0) - 0.1 * x)
-    found = seek(spare, 1.0, -1.0, 0.01, (-9, 9), jump=1 / 32)
+    found = seek(spare, 1.0, -1.0, 0.01, (-9, 9), settled=lambda inside, outside: outside - inside < 1 / 32)
     assert found is not None
     assert 0.3 - 1 / 32 < found < 0.3
     assert len(spare.asked) < ATTEMPTS - 1
     assert seek(Counted(spare.function), 1.0, -1.0, 0.01, (-9, 9)) == pytest.approx(0.3, abs=1 / 32)
+
+
+def test_what_is_known_need_not_be_asked_for_again():
+    spare = Counted(lambda x: 5.0 - math.exp(x))
+    found = seek(spare, 0.0, -1.0, 0.05, (-9, 9), before={1.7: spare.function(1.7), 1.5: spare.function(1.5)})
+    assert found == pytest.approx(math.log(5), abs=0.02)
+    assert len(spare.asked) <= 4
+    assert min(spare.asked[1:]) > 1.5
+    assert seek(spare, 3.0, -1.0, 0.05, (-9, 9), before={1.0: 2.0}, attempts=1) is None
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_what_is_met_at_the_bound_is_found(sign):
+    """A staircase: long ways lead nowhere, and then they do."""
+    spare = Counted(lambda x: -1.0 if sign * x < 20 else 30.0 + sign * x)
+    found = seek(spare, 0.0, sign * 1.0, 0.05, (-40, 40))
+    assert found is not None
+    assert 20 <= sign * found < 30
+    assert len(spare.asked) <= ATTEMPTS
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_what_is_met_everywhere_is_met_at_the_far_bound(sign):
+    spare = Counted(lambda x: 3.0 + 0.01 * sign * x)
+    assert seek(spare, 0.0, sign * 1.0, 0.05, (-40, 40)) == -40 * sign
+    assert len(spare.asked) <= 4
+
+
+def test_a_stale_end_does_not_make_it_creep():
+    """False position alone goes a tenth of the way at each step here."""
+    spare = Counted(lambda x: 100.0 if x < 1.3 else -0.1 - 0.01 * x)
+    seek(spare, 8.0, -1.0, 0.05, (-9, 9))
+    assert any(abs(x - 1.3) < 0.2 for x in spare.asked)
 
 
 def test_where_nothing_is_lost_the_search_goes_on():
@@ -69,9 +103,11 @@ def test_it_goes_on_where_nearer_attempts_are_no_better():
 
 @pytest.mark.parametrize("function", [lambda x: -5.0 - math.exp(-abs(x)), lambda x: min(-x, 40) - 41])
 def test_what_cannot_be_met_is_given_up(function):
+    """But not before the bound was tried."""
     spare = Counted(function)
     assert seek(spare, 3.0, -1.0, 0.05, (-50, 50)) is None
-    assert len(spare.asked) <= ATTEMPTS + 1
+    assert len(spare.asked) <= ATTEMPTS
+    assert spare.asked[-1] == -50
 
 
 def test_bounds_are_kept_and_end_the_search():
@@ -105,16 +141,57 @@ def test_a_psnr_is_met_from_above(change):
     assert (len(found.to_zip()) > len(plain.to_zip())) == (change > 0)
 
 
-def test_the_price_that_was_found_gives_the_same_container():
+def test_the_price_and_the_codebook_that_were_found_give_the_same_container():
     found = kissgs.compress(SCENE, settings=Settings.from_preset("small", target_size="40 kB", **GLANCE))
-    again = kissgs.compress(SCENE, settings=Settings.from_preset("small", price=found.report.price, **GLANCE))
+    made = found.report.settings["encode"]
+    same = {"price": found.report.price, **{name: made[name] for name in ("sh_ratio", "sh_entries")}}
+    again = kissgs.compress(SCENE, settings=Settings.from_preset("small", **same, **GLANCE))
     assert again.files == found.files
+
+
+FIXED = kissgs.sample_scene(4000, sh_degree=3, seed=4)
+
+
+def test_a_codebook_that_jumps_is_kept_small():
+    """Sides are multiples of 8: with 24 and what is in balance with it this scene takes 56 kB, with 32 already 65."""
+    found = kissgs.compress(FIXED, settings=Settings.from_preset("balanced", target_size=61_500))
+    assert 0.97 * 61_500 <= len(found.to_zip()) <= 61_500
+    assert found.report.settings["encode"]["sh_entries"] < 1024
+
+
+def test_a_codebook_grows_where_there_is_room():
+    """Seven Gaussians to an entry: so bounded, this scene takes 96 kB at the finest."""
+    found = kissgs.compress(FIXED, settings=Settings.from_preset("balanced", target_size=140_000))
+    assert 0.97 * 140_000 <= len(found.to_zip()) <= 140_000
+    assert found.report.settings["encode"]["sh_ratio"] == 1
+
+
+def test_what_is_told_to_be_the_finest_can_be_asked_for():
+    few = kissgs.sample_scene(2000, sh_degree=1, seed=2)
+
+    def sought(psnr):
+        return kissgs.compress(few, settings=Settings.from_preset("balanced", psnr=psnr, **GLANCE))
+
+    with pytest.raises(UnsupportedError) as refused:
+        sought(150)
+    told = float(re.search(r"the finest has (\d+\.\d\d);", str(refused.value))[1])
+    assert told <= sought(told).report.trials[-1].psnr
+    for less in (0.3, 1.0):
+        assert max(trial.psnr for trial in sought(told - less).report.trials) >= told - less
+
+
+def test_equal_gaussians_have_a_psnr_like_any_others():
+    """Their quality is a staircase: the goal is met far beyond where many attempts gain nothing."""
+    equal = kissgs.sample_scene(400, sh_degree=1, seed=3).select([5] * 400)
+    for psnr in (30, 40):
+        found = kissgs.compress(equal, settings=Settings.from_preset("balanced", psnr=psnr))
+        assert max(trial.psnr for trial in found.report.trials) >= psnr
 
 
 @pytest.mark.parametrize(
     ("goal", "told"),
     [
-        ({"psnr": 150}, r"no container .* has 150 dB, the best has \d+\.\d\d; ask for no more"),
+        ({"psnr": 150}, r"no container .* has 150 dB, the finest has \d+\.\d\d; ask for no more"),
         ({"target_size": 900}, r"no container .* has at most 900 bytes, the smallest has [\d,]+; ask for no less"),
     ],
 )

@@ -151,6 +151,7 @@ class EncodeSettings(BaseModel):
         description="Gaussians per codebook entry: fewer entries are fewer bytes and a rougher gloss. Where bits are "
         "weighed: at least so many, if there are more than 8,192 entries.",
     )
+    sh_entries: int = Field(65_536, ge=64, le=65_536, description="Entries of the codebook, at most.")
     sh_tolerance: float = Field(
         0.001,
         ge=0,

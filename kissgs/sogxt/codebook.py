@@ -78,7 +78,7 @@ def fit_codebook(
     clusters = kmeans.fit(
         splats.shN[chosen].reshape(len(chosen), dimensions),
         weights,
-        whole_side(size) ** 2,
+        whole_side(min(size, settings.sh_entries)) ** 2,
         pool,
         seed=settings.seed,
         rounds=settings.sh_rounds,

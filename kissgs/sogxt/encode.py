@@ -40,6 +40,7 @@ class Encoded:
         tamed: number of Gaussians whose base colour, an outlier, was pulled in (:func:`kissgs.sogxt.quantize.tame`).
         errors: largest error of quantisation, per field and channel, see :class:`kissgs.sogxt.choice.Choice`.
         price: of a bit, squared error; None where bits were not weighed.
+        codebook_side: of its image.
     """
 
     files: dict[str, bytes]
@@ -50,6 +51,7 @@ class Encoded:
     tamed: int
     errors: dict[str, list[float]]
     price: float | None
+    codebook_side: int
 
 
 def encode(
@@ -185,6 +187,7 @@ def write(
         tamed=choice.tamed,
         errors=choice.errors,
         price=choice.price,
+        codebook_side=choice.codebook.side,
     )
 
 
