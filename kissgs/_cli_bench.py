@@ -135,7 +135,7 @@ def bench(
         raise UnsupportedError(f"{study} goes with one --preset")
     capture = open_views(views, scale=scale, images=images, resolution=resolution)
     asked = Asked(
-        scenes=expand(scenes),
+        scenes=list(dict.fromkeys(map(Path, expand(scenes)))),
         presets=presets or [],
         changes=changes,
         peers=peers or [],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -56,7 +57,7 @@ def comparison(asked: Asked) -> Outcome:
         return compare(scene, plan, failed=refused.append, progress=progress)
 
     named, failures = each_scene(asked, measure)
-    rows = [row for _, row in named]
+    rows = [replace(row, scene=name) for name, row in named]
     equals = at_equal_psnr(rows)
     told = [row.as_dict() for row in rows]
     for row, entry in zip(rows, told, strict=True):

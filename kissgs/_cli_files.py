@@ -135,6 +135,7 @@ def stdout() -> Iterator[None]:
     except OSError as error:
         from kissgs.io.atomic import reason_of
 
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is still in the buffer would fail again at the end
         raise OutputError(f"cannot write to standard output: {reason_of(error)}") from error
 
 

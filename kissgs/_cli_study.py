@@ -22,7 +22,7 @@ Row = TypeVar("Row")
 class Asked:
     """The options, as the command line has them; those of other measurements are empty."""
 
-    scenes: list[str]
+    scenes: list[Path]
     presets: list[str] = field(default_factory=list)
     changes: list[str] | None = None
     peers: list[str] = field(default_factory=list)
@@ -56,7 +56,7 @@ class Outcome:
 
 
 def each_scene(asked: Asked, measure: Callable[[Path, Progress], list[Row]]) -> tuple[list[tuple[str, Row]], list[str]]:
-    """What ``measure`` finds of every scene, beside the scene's name; and a sentence for each of several that failed.
+    """What ``measure`` finds of every scene, beside its name; and a sentence for each of several that failed.
 
     Raises:
         KissgsError: there is one scene, and it failed.
@@ -65,11 +65,21 @@ def each_scene(asked: Asked, measure: Callable[[Path, Progress], list[Row]]) -> 
 
     rows, failures = list[tuple[str, Row]](), list[str]()
     with progress_bar(False) as progress:
-        for scene in map(Path, asked.scenes):
+        for scene, name in zip(asked.scenes, _names(asked.scenes), strict=True):
             try:
-                rows += [(scene.name, row) for row in measure(scene, progress)]
+                rows += [(name, row) for row in measure(scene, progress)]
             except KissgsError as error:
                 if len(asked.scenes) == 1:
                     raise
                 failures.append(str(error))  # what the others took an hour to find is not lost
     return rows, failures
+
+
+def _names(scenes: list[Path]) -> list[str]:
+    """As much of the end of each path as tells it from the others: many captures have a ``point_cloud.ply``."""
+    longest = max(len(scene.parts) for scene in scenes)
+    for depth in range(1, longest + 1):
+        names = [str(Path(*scene.parts[-depth:])) for scene in scenes]
+        if len(set(names)) == len(scenes):
+            break
+    return names

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import sys
@@ -277,6 +278,7 @@ def _progress(silent: bool) -> Any:  # noqa: ANN401
 
 def _fail(error: KissgsError) -> NoReturn:
     if "--json" in sys.argv:
-        sys.stdout.write(json.dumps({"error": {"code": error.code, "message": str(error)}}) + "\n")
+        with contextlib.suppress(KissgsError):  # it may be standard output that failed
+            write_stdout((json.dumps({"error": {"code": error.code, "message": str(error)}}) + "\n").encode())
     sys.stderr.write(f"kissgs: {error}\n")
     sys.exit(2)

@@ -76,7 +76,7 @@ class Measured:
     """One encoder on one scene.
 
     Attributes:
-        scene: its file's name.
+        scene: its file's name, or as much of the path as tells it from others.
         encoder: a preset, or a peer's format.
         fidelity: of a point of a curve; None of a preset as it is, and of a peer.
         gaussians: of the scene, before anything is left out.

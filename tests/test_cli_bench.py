@@ -91,6 +91,22 @@ def test_a_scene_that_fails_costs_the_others_nothing(scene: Path, study: list[st
     assert {row["scene"] for row in json.loads(done.stdout)} == {"scene.ply"}
 
 
+def test_scenes_of_equal_names_are_told_apart(scene: Path, tmp_path: Path) -> None:
+    """A capture's scene is often called point_cloud.ply; a peer must be compared with its own."""
+    other = tmp_path / "other" / scene.name
+    other.parent.mkdir()
+    kissgs.save(kissgs.sample_scene(50, sh_degree=0), other)
+    rows = json.loads(run("bench", scene, other, scene, "-p", "fast", "--json").stdout)
+    names = [f"{path.parent.name}/{path.name}" for path in (scene, other)]
+    assert [(row["scene"], row["gaussians"]) for row in rows] == [(names[0], 600), (names[1], 50)]
+
+
+def test_nothing_has_no_other_size(tmp_path: Path) -> None:
+    kissgs.save(kissgs.sample_scene(0), tmp_path / "none.ply")
+    rows = json.loads(run("bench", tmp_path / "none.ply", "-p", "fast", "--gaussians", 5, "--json").stdout)
+    assert [row["gaussians"] for row in rows] == [0]
+
+
 def test_scenes_that_all_fail_make_no_table() -> None:
     done = run("bench", "none.ply", "nothing.ply", "-p", "fast")
     assert (done.returncode, done.stdout) == (2, b"")

@@ -122,7 +122,9 @@ def resampled(splats: Splats, count: int, *, seed: int = 0) -> Splats:
     Surfaces stay covered. Fewer: evenly many are left out and the rest enlarged. More: Gaussians are replaced by
     several smaller ones within their own shape.
     """
-    if not len(splats) or count <= len(splats):
+    if not len(splats):
+        return splats
+    if count <= len(splats):
         keep = np.linspace(0, len(splats), count, endpoint=False).astype(np.int64)
         thinned = splats.select(keep)
         return _rescaled(thinned, thinned.means, np.log(len(splats) / max(count, 1)) / 2)
