@@ -154,7 +154,8 @@ def write(
     with blas_workers(threads) as pool:
         files = compress_images(images, settings, pool, _stage(progress, "images"))
     kept, count = len(_candidates(splats, settings)), int(choice.grid.mask.sum())
-    made = {**settings.model_dump(exclude={*GOALS, "attempts"}), "price": choice.price}
+    unsaid = {*GOALS, "attempts"} | ({"sh_entries"} if settings.sh_entries == metadata.MAX_CODEBOOK_SIDE**2 else set())
+    made = {**settings.model_dump(exclude=unsaid), "price": choice.price}
     layout = metadata.Layout(
         grid_side=choice.grid.side,
         codebook_side=choice.codebook.side,
