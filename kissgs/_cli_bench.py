@@ -172,12 +172,14 @@ def _measure(study: str, asked: Asked, as_json: bool) -> None:
         "--rendering": _cli_compare.rendering,
     }[study]
     outcome = measure(asked)
-    if as_json:
-        print_json(outcome.rows)
-    elif outcome.rows:
-        show(outcome.table)
-    if asked.plot is not None and outcome.draw is not None:  # last: what it shows has taken long to find
-        outcome.draw(asked.plot)
+    try:  # what has taken long to find is told where one can be written to, and drawn where the other can
+        if as_json:
+            print_json(outcome.rows)
+        elif outcome.rows:
+            show(outcome.table)
+    finally:
+        if asked.plot is not None and outcome.draw is not None:
+            outcome.draw(asked.plot)
     for failure in outcome.failures:
         sys.stderr.write(f"kissgs: {failure}\n")
     if outcome.failures:

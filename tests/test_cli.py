@@ -106,7 +106,7 @@ def test_goals_and_what_was_seen_from_the_command_line(scene: Path, tmp_path: Pa
     assert "importance" not in report["seconds"]
     assert report["evaluation"]["mean"]["between"]["psnr"] >= 38
     assert report["trials"][0]["bytes"] > 0
-    assert "has 150 dB, the best has" in failure("compress", copy, "-f", "-q", "--psnr", "150", *glance)
+    assert "has 150 dB, the finest has" in failure("compress", copy, "-f", "-q", "--psnr", "150", *glance)
     assert "psnr needs bits that are weighed" in failure("compress", copy, "-f", "-p", "fast", "--psnr", "40")
     piped = failure("compress", "-", "-o", tmp_path / "b.zip", "--cache", stdin=scene.read_bytes())
     assert "standard input has no place" in piped

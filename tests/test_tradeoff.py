@@ -105,7 +105,7 @@ def test_a_loss_is_that_to_photographs_where_there_are_some(tmp_path):
 
 
 def test_a_loss_that_cannot_be_that_small_is_refused():
-    with pytest.raises(UnsupportedError, match=r"loses at most 1e-09 dB, the best loses \d\.\d+; allow as much"):
+    with pytest.raises(UnsupportedError, match=r"loses at most 1e-09 dB, the finest loses \d\.\d+; allow as much"):
         kissgs.compress(SCENE, settings=Settings.from_preset("balanced", max_psnr_drop=1e-9, **GLANCE))
 
 
