@@ -79,7 +79,7 @@ def test_what_does_not_go_together_is_refused(scene: Path, words: str, sentence:
 
 
 def test_two_scenes_are_not_one_plot(scene: Path, tmp_path: Path) -> None:
-    assert "--plot draws one scene" in failure("bench", scene, scene, "--plot", tmp_path / "p.svg")
+    assert "--plot draws one scene" in failure("bench", scene, "other.ply", "--plot", tmp_path / "p.svg")
 
 
 @pytest.mark.parametrize("study", [["--ablate", "-p", "paper"], ["--rendering"], ["-p", "fast"]])
