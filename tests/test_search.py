@@ -167,7 +167,7 @@ def test_a_codebook_grows_where_there_is_room():
 
 
 def test_what_is_told_to_be_the_finest_can_be_asked_for():
-    few = kissgs.sample_scene(2000, sh_degree=1, seed=2)
+    few = kissgs.sample_scene(1000, sh_degree=1, seed=2)
 
     def sought(psnr):
         return kissgs.compress(few, settings=Settings.from_preset("balanced", psnr=psnr, **GLANCE))
@@ -176,16 +176,14 @@ def test_what_is_told_to_be_the_finest_can_be_asked_for():
         sought(150)
     told = float(re.search(r"the finest has (\d+\.\d\d);", str(refused.value))[1])
     assert told <= sought(told).report.trials[-1].psnr
-    for less in (0.3, 1.0):
-        assert max(trial.psnr for trial in sought(told - less).report.trials) >= told - less
+    assert max(trial.psnr for trial in sought(told - 0.3).report.trials) >= told - 0.3
 
 
 def test_equal_gaussians_have_a_psnr_like_any_others():
     """Their quality is a staircase: the goal is met far beyond where many attempts gain nothing."""
     equal = kissgs.sample_scene(400, sh_degree=1, seed=3).select([5] * 400)
-    for psnr in (30, 40):
-        found = kissgs.compress(equal, settings=Settings.from_preset("balanced", psnr=psnr))
-        assert max(trial.psnr for trial in found.report.trials) >= psnr
+    found = kissgs.compress(equal, settings=Settings.from_preset("balanced", psnr=30, **GLANCE))
+    assert max(trial.psnr for trial in found.report.trials) >= 30
 
 
 @pytest.mark.parametrize(
