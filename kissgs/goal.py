@@ -243,13 +243,19 @@ class GoalSearch:
             )
 
     def _settled(self, inside: float, outside: float) -> bool:
-        """Whether what lies between these prices, as powers of 2, is a jump."""
+        """Whether what lies between these prices, as powers of 2, is a jump.
+
+        Where a size is the goal, what is made finer with the codebook of ``inside`` is only better than that; pictures
+        are better served by the codebook of the finer one.
+        """
+        if not self.goal.by_size:
+            return False
         one, other, gap = self._known[inside], self._known[outside], abs(inside - outside)
         smooth = gap * abs(self.goal.slope)
         if one.side != other.side and gap < 1 and (smooth < self.goal.near or one.spare - other.spare > 2 * smooth):
             self._jump = 2.0 ** min(inside, outside), min(one.side, other.side)
             return True
-        return self.goal.by_size and gap < JUMP
+        return gap < JUMP
 
     def _at(self, price: float) -> EncodeSettings:
         without = dict.fromkeys(GOALS)
