@@ -252,7 +252,8 @@ class GoalSearch:
             return False
         one, other, gap = self._known[inside], self._known[outside], abs(inside - outside)
         smooth = gap * abs(self.goal.slope)
-        if one.side != other.side and gap < 1 and (smooth < self.goal.near or one.spare - other.spare > 2 * smooth):
+        jumps = gap < 1 and (smooth < self.goal.near or one.spare - other.spare > 2 * smooth)
+        if jumps and one.side != other.side and self._tuned is None:
             self._jump = 2.0 ** min(inside, outside), min(one.side, other.side)
             return True
         return gap < JUMP
