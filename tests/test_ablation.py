@@ -73,7 +73,7 @@ def test_the_command_tells_of_parts_and_of_choices(tmp_path, monkeypatch):
     monkeypatch.setattr(ablation, "OURS_IN_PAPER", OURS_IN_PAPER[:2])
     scene = tmp_path / "scene.ply"
     kissgs.save(kissgs.sample_scene(200, sh_degree=0), scene)
-    outcome = _cli_compare.ablation(Asked(scenes=[str(scene)], presets=["paper"]))
+    outcome = _cli_compare.ablation(Asked(scenes=[scene], presets=["paper"]))
     rows = json.loads(json.dumps(outcome.rows))
     assert {row["scene"] for row in rows} == {"scene.ply"}
     assert list(dict.fromkeys(row["table"] for row in rows)) == ["KISS-GS", "paper"]

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -86,7 +87,7 @@ def test_nobodys_cameras_cannot_be_learned_from():
         ("there is no way 'mine'; there are: random; opacity; ", {"ways": ["mine"]}),
     ):
         with pytest.raises(UnsupportedError, match=message):
-            compaction(Asked(scenes=["x.ply"], presets=["fast"], **options))
+            compaction(Asked(scenes=[Path("x.ply")], presets=["fast"], **options))
 
 
 @pytest.mark.parametrize("kind", ["png", "svg", "pdf"])
