@@ -60,7 +60,7 @@ def seek(
     """Where a monotone function is hardly above zero.
 
     False position between attempts that met the goal and ones that did not; before there are both, Newton's steps of at
-    most :data:`REACH`, and the bound once these lead nowhere: no goal is given up that is met there.
+    most :data:`REACH`, and the bound once these lead nowhere, or where the last attempt would not get there with one.
 
     Args:
         spare: at least 0 where the goal is met, infinite where it cannot be told by how much; only about monotone and
@@ -85,10 +85,13 @@ def seek(
         inside, outside = _bracket(known, slope)
         if 0 <= known[x] <= tolerance or (inside is not None and outside is not None and settled(inside, outside)):
             break
-        if (inside is None or outside is None) and (len(known) == attempts - 1 or _stuck(known, slope)):
+        following = _next(known, slope, tolerance / 2)
+        last = len(known) == attempts - 1
+        one_sided = inside is None or outside is None
+        if one_sided and (_stuck(known, slope, 0.0 if last else REACH / 2) or (last and abs(following - x) >= REACH)):
             x = bounds[(inside is None) == (slope > 0)]
         else:
-            x = min(max(_whole(_next(known, slope, tolerance / 2), grain), bounds[0]), bounds[1])
+            x = min(max(_whole(following, grain), bounds[0]), bounds[1])
     met = [x for x, found in known.items() if found >= 0 and x not in (before or {})]
     return min(met, key=lambda x: known[x]) if met else None
 
@@ -163,10 +166,10 @@ def _bracket(known: Mapping[float, float], slope: float) -> tuple[float | None, 
     return inside, min(beyond, key=lambda x: -slope * x, default=None)
 
 
-def _stuck(known: Mapping[float, float], slope: float) -> bool:
-    """Whether a long way to the last attempt was for hardly anything."""
+def _stuck(known: Mapping[float, float], slope: float, far: float) -> bool:
+    """Whether a way to the last attempt that is longer than ``far`` was for hardly anything."""
     *before, last = known
     return any(
-        abs(last - x) > REACH / 2 and abs(known[last] - known[x]) < LAME * abs(slope * (last - x))
+        abs(last - x) > far and abs(known[last] - known[x]) < LAME * abs(slope * (last - x))
         for x in before  # of two infinite ones nothing is known
     )
