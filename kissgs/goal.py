@@ -88,7 +88,7 @@ class Goal:
     def regret(self, trials: Sequence[Trial], *, fewer: bool) -> str:
         """Why none of these will do; ``fewer``: whether fewer Gaussians have not been tried, and may serve."""
         at = (max if self.by_size else min)((trial.price for trial in trials if trial.price), default=None)
-        trials = [trial for trial in trials if trial.price in (None, at)]  # where another search ends, too, and meets as much
+        trials = [trial for trial in trials if trial.price in (None, at)]  # where another ends, too
         if self.settings.target_size is not None:
             least, wanted = min(trial.bytes for trial in trials), int(self.settings.target_size)
             return (
