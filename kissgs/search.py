@@ -60,7 +60,7 @@ def seek(
     """Where a monotone function is hardly above zero.
 
     False position between attempts that met the goal and ones that did not; before there are both, Newton's steps of at
-    most :data:`REACH`, and the bound once these lead nowhere, or where the last attempt would not get there with one.
+    most :data:`REACH`, and the bound once these lead nowhere: no goal is given up that is met there.
 
     Args:
         spare: at least 0 where the goal is met, infinite where it cannot be told by how much; only about monotone and
@@ -70,7 +70,7 @@ def seek(
         tolerance: at most so much above 0 is near enough.
         bounds: attempts stay between these.
         grain: attempts are whole multiples of this; 0 for any number.
-        attempts: how many at most.
+        attempts: how many at most; and one at the bound where none of them met the goal.
         settled: whether an attempt that met the goal, and the next that did not, leave nothing to find between them.
         before: what is known already; its attempts are not among those that count, nor among those to return.
 
@@ -85,13 +85,13 @@ def seek(
         inside, outside = _bracket(known, slope)
         if 0 <= known[x] <= tolerance or (inside is not None and outside is not None and settled(inside, outside)):
             break
-        following = _next(known, slope, tolerance / 2)
-        last = len(known) == attempts - 1
-        one_sided = inside is None or outside is None
-        if one_sided and (_stuck(known, slope, 0.0 if last else REACH / 2) or (last and abs(following - x) >= REACH)):
+        if (inside is None or outside is None) and _stuck(known, slope):
             x = bounds[(inside is None) == (slope > 0)]
         else:
-            x = min(max(_whole(following, grain), bounds[0]), bounds[1])
+            x = min(max(_whole(_next(known, slope, tolerance / 2), grain), bounds[0]), bounds[1])
+    bound = bounds[slope > 0]
+    if bound not in known and all(found < 0 for found in known.values()):
+        known[bound] = spare(bound)
     met = [x for x, found in known.items() if found >= 0 and x not in (before or {})]
     return min(met, key=lambda x: known[x]) if met else None
 
@@ -166,10 +166,10 @@ def _bracket(known: Mapping[float, float], slope: float) -> tuple[float | None, 
     return inside, min(beyond, key=lambda x: -slope * x, default=None)
 
 
-def _stuck(known: Mapping[float, float], slope: float, far: float) -> bool:
-    """Whether a way to the last attempt that is longer than ``far`` was for hardly anything."""
+def _stuck(known: Mapping[float, float], slope: float) -> bool:
+    """Whether a long way to the last attempt was for hardly anything."""
     *before, last = known
     return any(
-        abs(last - x) > far and abs(known[last] - known[x]) < LAME * abs(slope * (last - x))
+        abs(last - x) > REACH / 2 and abs(known[last] - known[x]) < LAME * abs(slope * (last - x))
         for x in before  # of two infinite ones nothing is known
     )

@@ -71,6 +71,12 @@ def test_what_is_met_at_the_bound_is_found(sign):
     assert len(spare.asked) <= ATTEMPTS
 
 
+def test_the_bound_is_tried_when_attempts_are_over():
+    spare = Counted(lambda x: -1.0 - x)
+    assert seek(spare, 30.0, -1.0, 0.05, (-40, 40), attempts=2) == -40
+    assert spare.asked == [30.0, 26.0, -40]
+
+
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_what_is_met_everywhere_is_met_at_the_far_bound(sign):
     spare = Counted(lambda x: 3.0 + 0.01 * sign * x)
@@ -106,7 +112,7 @@ def test_what_cannot_be_met_is_given_up(function):
     """But not before the bound was tried."""
     spare = Counted(function)
     assert seek(spare, 3.0, -1.0, 0.05, (-50, 50)) is None
-    assert len(spare.asked) <= ATTEMPTS
+    assert len(spare.asked) <= ATTEMPTS + 1
     assert spare.asked[-1] == -50
 
 
