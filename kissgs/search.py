@@ -70,7 +70,7 @@ def seek(
         tolerance: at most so much above 0 is near enough.
         bounds: attempts stay between these.
         grain: attempts are whole multiples of this; 0 for any number.
-        attempts: how many at most; and one at the bound where none of them met the goal.
+        attempts: how many at most; where several did not meet the goal, one at the bound on top.
         settled: whether an attempt that met the goal, and the next that did not, leave nothing to find between them.
         before: what is known already; its attempts are not among those that count, nor among those to return.
 
@@ -90,7 +90,7 @@ def seek(
         else:
             x = min(max(_whole(_next(known, slope, tolerance / 2), grain), bounds[0]), bounds[1])
     bound = bounds[slope > 0]
-    if bound not in known and all(found < 0 for found in known.values()):
+    if len(known) > 1 and bound not in known and all(found < 0 for found in known.values()):
         known[bound] = spare(bound)
     met = [x for x, found in known.items() if found >= 0 and x not in (before or {})]
     return min(met, key=lambda x: known[x]) if met else None

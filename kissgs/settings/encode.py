@@ -70,7 +70,7 @@ class EncodeSettings(BaseModel):
         ge=1,
         le=100,
         description="On the way to a goal: containers that are made of one scene, at most; as many fine-tuned ones, no "
-        "more than four, come on top, and the finest or the coarsest of all where none has met it.",
+        "more than four, come on top, and the finest or coarsest of all where several have missed it.",
     )
     drop: float = Field(
         10.0,
