@@ -7,11 +7,9 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING
-
 from kissgs._version import __version__
 
+TYPE_CHECKING = False  # without typing, which takes longer to import than all of this
 if TYPE_CHECKING:
     from kissgs.compaction.result import Compacted, CompactionReport
     from kissgs.errors import (
@@ -141,6 +139,8 @@ def __getattr__(name: str) -> object:
     """Import a public name when it is first used, so that ``import kissgs`` costs nothing."""
     if name not in _HOMES:
         raise AttributeError(f"module 'kissgs' has no attribute {name!r}")
+    import importlib
+
     value = getattr(importlib.import_module(f"kissgs.{_HOMES[name]}"), name)
     globals()[name] = value
     return value

@@ -99,6 +99,7 @@ def _figures(rows: Sequence[Measured]) -> Table:
         *("rotation\n°", "log-\nscale", "SH\nRMSE"),
         *(("PSNR to\nphoto", "change\ndB", "SSIM") if photographed else ()),
         *(("PSNR to\noriginal", "SSIM") if seen else ()),
+        *(("worst\nview",) if seen and not photographed else ()),
     ]
     table = Table("encoder", *map(_right, heads), box=None, pad_edge=False, padding=(0, 1, 0, 0))
     for name, row in zip(_names(rows), rows, strict=True):
@@ -118,7 +119,10 @@ def _picture_cells(evaluation: Evaluation | None, photographed: bool) -> list[st
     mean = evaluation.mean
     change = "" if mean.change is None else spell(mean.change, 2, signed=True)
     to_photo = [spell(mean.candidate.psnr, 2), change, spell(mean.candidate.ssim, 4)]
-    return [*(to_photo if photographed else []), spell(mean.between.psnr, 2), spell(mean.between.ssim, 4)]
+    to_original = [spell(mean.between.psnr, 2), spell(mean.between.ssim, 4)]
+    if photographed:
+        return [*to_photo, *to_original]
+    return [*to_original, spell(evaluation.worst.comparison.between.psnr, 2)]
 
 
 def _columns(what: str, names: Sequence[str], parts: Sequence[Mapping[str, float]], form: str) -> Table:

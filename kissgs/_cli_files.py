@@ -28,13 +28,25 @@ def each(
     work: Callable[[str, Path], dict[str, Any]],
     *,
     writes: bool = True,
+    unreadable: type[KissgsError] = InvalidSceneError,
 ) -> None:
-    """Do ``work`` for every input. Where one of several fails, the others are done all the same; then it is exit 2."""
+    """Do ``work`` for every input. Where one of several fails, the others are done all the same; then it is exit 2.
+
+    Args:
+        names: of the inputs, as they were given.
+        output: where results go, as it was given.
+        suffix: of a result's name.
+        as_json: whether to print reports.
+        work: takes an input and the place of its result.
+        writes: whether there are results.
+        unreadable: what an input is said to be that no file system would find.
+    """
     inputs = expand(names)
     if writes and as_json and str(output) == "-":
         raise OutputError("--json and -o - would both write to standard output; choose one")
     targets = _targets(inputs, output, suffix) if writes else [Path("-")] * len(inputs)
     if len(inputs) == 1:
+        _look_at(inputs[0], unreadable)
         report = work(inputs[0], targets[0])
         if as_json:
             print_json(_entry(inputs[0], targets[0], writes, report))
@@ -42,6 +54,7 @@ def each(
     reports, failed = [], False
     for name, target in zip(inputs, targets, strict=True):
         try:
+            _look_at(name, unreadable)
             reports.append(_entry(name, target, writes, work(name, target)))
         except KissgsError as error:
             failed = True
@@ -51,6 +64,20 @@ def each(
         print_json(reports)
     if failed:
         raise typer.Exit(2)
+
+
+def _look_at(name: str, unreadable: type[KissgsError]) -> None:
+    """Say what is wrong with the name of an input before it is said of the result's, which is made from it."""
+    from kissgs.io.atomic import reason_of
+
+    try:
+        if name != "-":
+            os.stat(name)  # noqa: PTH116  the name as it is
+    except FileNotFoundError as error:
+        if not is_folder(Path(name).absolute().parent):  # else reading it says the same, and how to mend it
+            raise unreadable(f"cannot read {name}: {reason_of(error)}") from error
+    except (OSError, ValueError) as error:
+        raise unreadable(f"cannot read {name:.100}: {reason_of(error)}") from error
 
 
 def _entry(name: str, target: Path, writes: bool, report: dict[str, Any]) -> dict[str, Any]:
@@ -72,7 +99,7 @@ def _targets(inputs: list[str], output: Path | None, suffix: str) -> list[Path]:
     targets = []
     for name in inputs:
         path = Path(name).absolute()
-        stem = path.name if path.is_dir() else path.stem
+        stem = path.name if is_folder(path) else path.stem
         if not stem:
             raise OutputError(f"{name} has no name to call the result after; say where to write with -o")
         folder = output if output is not None else Path(name).parent
@@ -96,7 +123,12 @@ def beside(name: str, suffix: str) -> Path:
     if name == "-":
         raise OutputError("standard input has no place beside which anything could be kept")
     path = Path(name).absolute()
-    return path.parent / ((path.name if path.is_dir() else path.stem) + suffix)
+    return path.parent / ((path.name if is_folder(path) else path.stem) + suffix)
+
+
+def is_folder(path: Path) -> bool:
+    """Whether there is a folder; whatever is wrong with the name, opening it will tell."""
+    return os.path.isdir(path)  # noqa: PTH112  Path.is_dir raises where a name is too long
 
 
 def make_folder(folder: Path) -> None:
@@ -105,19 +137,19 @@ def make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as error:
-        raise OutputError(f"cannot make the folder {folder}: {reason_of(error)}") from error
+        raise OutputError(f"cannot make the folder {folder!s:.100}: {reason_of(error)}") from error
 
 
 def expand(names: list[str]) -> list[str]:
     """Patterns that the shell has not expanded, expanded."""
     found: list[str] = []
     for name in names:
-        if not glob.has_magic(name) or Path(name).exists():
+        if not glob.has_magic(name) or os.path.lexists(name):  # which never raises, as Path.exists may
             found.append(name)
             continue
         matches = sorted(glob.glob(name))  # noqa: PTH207  Path.glob takes no absolute patterns
         if not matches:
-            raise UnsupportedError(f"no file matches {name}")
+            raise UnsupportedError(f"no file matches {name:.100}")
         found.extend(matches)
     return found
 

@@ -1,4 +1,4 @@
-"""Commands that take pictures. ``kissgs.cli`` registers them; heavy imports wait until one of them runs."""
+"""Commands that take pictures. ``kissgs._cli`` registers them; heavy imports wait until one of them runs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ViewsOption = Annotated[
         "--views",
         metavar="DATA",
         help="Cameras, and photographs if there are any: a folder with a COLMAP model or transforms.json. "
-        "By default virtual cameras around the scene.",
+        "By default kissgs places cameras itself.",
     ),
 ]
 ScaleOption = Annotated[
@@ -46,6 +46,7 @@ def evaluate(
     images: ImagesOption = None,
     resolution: ResolutionOption = None,
     split: SplitOption = "test",
+    seed: Annotated[int, typer.Option(min=0, help="Of the cameras that are drawn: another seed draws others.")] = 0,
     lpips: Annotated[bool, typer.Option("--lpips", help="Measure LPIPS too; needs kissgs\\[lpips].")] = False,
     html: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write a page with pictures of both, and where they differ.")
@@ -75,7 +76,15 @@ def evaluate(
             for path in (reference, candidate)
         ]
         scenes = sides[0].splats, sides[1].splats
-        result = measure(*scenes, capture, split=used, lpips=lpips, device=where, threads=threads, progress=progress)
+        result = measure(
+            *(*scenes, capture),
+            split=used,
+            seed=seed,
+            lpips=lpips,
+            device=where,
+            threads=threads,
+            progress=progress,
+        )
         if html is not None:
             page = html_report(result, sides[0], sides[1], device=where, threads=threads, progress=progress)
             with atomic_file(html, overwrite=force) as file:

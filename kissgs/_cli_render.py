@@ -1,4 +1,4 @@
-"""``kissgs render``: pictures of a scene. ``kissgs.cli`` registers it; heavy imports wait until it runs."""
+"""``kissgs render``: pictures of a scene. ``kissgs._cli`` registers it; heavy imports wait until it runs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kissgs._cli_files import each, show, write_stdout
+from kissgs._cli_files import each, is_folder, show, write_stdout
 from kissgs._cli_pictures import (
     DeviceOption,
     ForceOption,
@@ -174,7 +174,7 @@ def _suffix(file: str, output: Path | None) -> str:
     """Of what will be written: .png unless .webp is asked for."""
     if file == "-":
         raise UnsupportedError("render reads a file, not standard input")
-    if output is None or output.is_dir() or str(output) == "-" or not output.suffix:
+    if output is None or is_folder(output) or str(output) == "-" or not output.suffix:
         return ".png"
     if output.suffix.lower() not in (".png", ".webp"):
         raise UnsupportedError(f"{output}: pictures are written as .png or .webp")

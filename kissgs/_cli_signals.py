@@ -7,9 +7,10 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, NoReturn
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
 
+from kissgs._interrupts import Interrupted, end, leave_when_told, reason_of_end, unwind_when_told
 from kissgs.errors import Enough
 
 if TYPE_CHECKING:
@@ -21,19 +22,20 @@ if TYPE_CHECKING:
 ENOUGH = b"\nkissgs: enough: the best so far is taken, if there is one; Ctrl-C again: nothing is\n"
 
 
-class Interrupted(BaseException):
-    """Ctrl-C or a request to end: unwinds everything, so that no half-written file stays."""
-
-
-def listen() -> None:
-    """Have requests to end unwind everything."""
-    signal.signal(signal.SIGINT, _interrupt)
-    signal.signal(signal.SIGTERM, _interrupt)
+def unwinding(work: Callable[[], None]) -> None:
+    """Do it; meanwhile, a request to end unwinds everything first. Before and after, it ends the process at once."""
     sys.unraisablehook = _again
-
-
-def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
-    raise Interrupted(number)
+    try:
+        unwind_when_told()
+        try:
+            work()
+        finally:
+            leave_when_told()
+    except BaseException as error:
+        number = reason_of_end(error)
+        if number is not None:
+            end(number)
+        raise
 
 
 def _again(lost: sys.UnraisableHookArgs) -> None:

@@ -8,7 +8,7 @@ from rich.console import Group, RenderableType
 from rich.table import Column, Table
 from rich.text import Text
 
-from kissgs._tables import size
+from kissgs._tables import elsewhere, size
 from kissgs.evaluation.html import Side
 from kissgs.evaluation.likeness import Evaluation
 from kissgs.evaluation.speed import RenderingCost
@@ -18,9 +18,16 @@ def evaluation_table(evaluation: Evaluation, reference: Side, candidate: Side, *
     """What ``kissgs evaluate`` shows; ``asked`` is the split that was asked for."""
     what = Text(f"{evaluation.views_used}, {evaluation.size}: {evaluation.source}")
     notes = [Text(evaluation.note, "yellow")] if evaluation.note else []
-    if evaluation.split != asked:
+    if evaluation.split == "train" != asked:
         notes.append(Text("no view is held out, so these are those that the scene may have learnt from", "yellow"))
-    return Group(_sizes(evaluation, reference, candidate), what, *notes, Text(), _views(evaluation))
+    found: list[RenderableType] = [_views(evaluation), Text(), Text(_sentence(evaluation.extremes))]
+    if evaluation.surroundings is not None:
+        found.append(Text(_sentence(f"elsewhere: {elsewhere(evaluation.surroundings)}")))
+    return Group(_sizes(evaluation, reference, candidate), what, *notes, Text(), *found)
+
+
+def _sentence(told: str) -> str:
+    return f"{told[0].upper()}{told[1:]}."
 
 
 def _sizes(evaluation: Evaluation, reference: Side, candidate: Side) -> Text:

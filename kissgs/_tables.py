@@ -61,7 +61,8 @@ def report_table(report: Report, target: str) -> RenderableType:
     changes = _changes(changed)
     compaction = [] if report.compaction is None else _compaction(report.compaction)
     finetuning = [] if report.finetuning is None else _finetuning(report.finetuning)
-    told = [*compaction, *searched, *finetuning, *pictures]
+    note = [Text(report.note, style="yellow")] if report.note else []
+    told = [*compaction, *searched, *finetuning, *note, *pictures]
     return Group(head, Text(body), *told, parts_table(report.file_bytes, report.count), *changes)
 
 
@@ -128,7 +129,16 @@ def _pictures(evaluation: Evaluation) -> Text:
     else:
         own = f"{spell(mean.reference.psnr, 2)} dB, {spell(mean.reference.ssim, 4)}"
         against = f"to {evaluation.views_used}; the scene itself {own}"
-    return Text.assemble(f"{told} {against}", (f"; {evaluation.note}" if evaluation.note else "", "yellow"))
+    around = evaluation.surroundings
+    rest = "" if around is None else f"\nelsewhere: {elsewhere(around)}"
+    note = f"; {evaluation.note}" if evaluation.note else ""
+    return Text.assemble(f"{told} {against}; {evaluation.extremes}", (note, "yellow"), rest)
+
+
+def elsewhere(around: Evaluation) -> str:
+    """What views beside those of a capture found."""
+    mean = f"PSNR {spell(around.mean.between.psnr, 2)} dB to the scene's own renderings"
+    return f"{mean} from {around.views_used}; {around.extremes}"
 
 
 def parts_table(parts: Mapping[str, int], count: int) -> Table:

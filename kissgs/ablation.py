@@ -15,15 +15,15 @@ from typing import Any
 from kissgs.bench import RoundTrip, isolated_roundtrip
 from kissgs.errors import InvalidSceneError, UnsupportedError
 from kissgs.evaluation import recoding
+from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.likeness import Comparison
-from kissgs.evaluation.pictures import evaluate
+from kissgs.evaluation.pictures import compare_pictures
 from kissgs.progress import Progress, silent
 from kissgs.rates import RateCurve, at_fidelity
 from kissgs.scenes import load
 from kissgs.settings import EncodeSettings, Preset, Settings
 from kissgs.splats import clean
 from kissgs.views.view import Views
-from kissgs.views.virtual import virtual_views
 
 PUBLISHED_BYTES = 3_877_944
 """Of KISS-GS' container of bicycle with all its parts."""
@@ -172,7 +172,8 @@ def ablate(
     Args:
         scene: a ``.ply``.
         presets: ``paper``, and such as weigh bits.
-        views: a capture, whose cameras weigh bits and whose held-out views are compared; by default virtual ones.
+        views: a capture, whose cameras weigh bits and whose held-out views are compared; by default drawn
+            ones are compared.
         threads: 0 means one per processor.
         progress: receives "measure", with what is left out as a note.
 
@@ -208,10 +209,10 @@ class _Study:
         splats, _ = clean(load(self.scene, threads=self.threads, progress=self.progress))
         if not len(splats):
             raise InvalidSceneError(f"{self.scene} has no usable Gaussian")
-        judges = self.views or virtual_views(splats, threads=self.threads, progress=self.progress)
+        judges = self.views or evaluation_views(splats, threads=self.threads, progress=self.progress)
 
         def row(name: str, coded: recoding.Coded, **told: float | None) -> Ablated:
-            mean = evaluate(splats, coded.decoded, judges, threads=self.threads).mean
+            mean = compare_pictures(splats, coded.decoded, judges, threads=self.threads).mean
             return _row("KISS-GS", name, coded.size(settings.encode, self.threads), mean, base, **told)
 
         self.progress("measure", 0.0, "KISS-GS")

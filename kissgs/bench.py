@@ -13,14 +13,15 @@ from typing import Any
 from kissgs.clock import peak_memory
 from kissgs.errors import UnsupportedError
 from kissgs.evaluation.attributes import AttributeErrors, attribute_errors
+from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.likeness import Evaluation
-from kissgs.evaluation.pictures import evaluate
+from kissgs.evaluation.pictures import compare_pictures
 from kissgs.pipeline import compress, decompress
 from kissgs.progress import Progress, silent
 from kissgs.report import Report
 from kissgs.scenes import load
 from kissgs.settings import Settings
-from kissgs.splats import Splats
+from kissgs.splats import Splats, clean
 from kissgs.views.view import Views
 
 
@@ -65,8 +66,9 @@ def roundtrip(
     Args:
         source: a scene, or the path of a ``.ply``.
         settings: of the compression.
-        pictures: compare pictures too (:func:`kissgs.evaluate`); no part of the times.
-        views: a capture of the scene: weighs the bits, and its held-out views are compared; by default virtual cameras.
+        pictures: compare pictures too (:func:`kissgs.evaluation.pictures.compare_pictures`); no part of the times.
+        views: a capture of the scene: weighs the bits, and its held-out views are compared; by default cameras drawn
+            over the whole scene are.
         threads: 0 means one per processor.
         progress: receives the events of both directions.
     """
@@ -83,8 +85,13 @@ def roundtrip(
         decode_cpu_seconds=cpu,
         peak_memory=peak,
         errors=attribute_errors(scene.select(result.order), decoded),
-        pictures=evaluate(scene, decoded, views, threads=threads, progress=progress) if pictures else None,
+        pictures=_compared(clean(scene)[0], decoded, views, threads, progress) if pictures else None,
     )
+
+
+def _compared(scene: Splats, decoded: Splats, views: Views | None, threads: int, progress: Progress) -> Evaluation:
+    judges = views or evaluation_views(scene, threads=threads, progress=progress)
+    return compare_pictures(scene, decoded, judges, threads=threads, progress=progress)
 
 
 def isolated_roundtrip(

@@ -8,14 +8,14 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from kissgs.errors import UnsupportedError
-from kissgs.evaluation.pictures import evaluate
+from kissgs.evaluation.cameras import evaluation_views
+from kissgs.evaluation.pictures import compare_pictures
 from kissgs.pipeline import compact, compress, decompress
 from kissgs.progress import Progress, as_stage, silent
 from kissgs.rates import RateCurve, at_fidelity
 from kissgs.settings import Settings
 from kissgs.splats import Splats
 from kissgs.views.view import Source, Views
-from kissgs.views.virtual import virtual_views
 
 FIDELITIES = (-8.0, -5.0, -2.0, 1.0)
 CHOSEN, TUNED = "as chosen", "fine-tuned"
@@ -70,7 +70,7 @@ def rate_curves(
     Args:
         splats: clean.
         settings: of all else.
-        views: a capture; by default virtual views judge, and the scene itself is the teacher.
+        views: a capture; by default cameras drawn over the whole scene judge, and the scene itself is the teacher.
         fidelities: settings of that name; by default :data:`FIDELITIES`, or that of the settings if there are ratios.
         ratios: compact the scene to these shares first, and compress each of what is left as a scene of its own.
         learn_from: how much of the capture is learned from; its held-out views judge in any case.
@@ -85,7 +85,7 @@ def rate_curves(
         raise UnsupportedError(
             "fine-tuning is measured on a scene as it is; compact it first: kissgs compact, or ratios"
         )
-    judges = views or virtual_views(splats, threads=threads, progress=progress)
+    judges = views or evaluation_views(splats, threads=threads, progress=progress)
     taught = None if views is None or learn_from == "scene" else views.to_learn(learn_from)
     points = []
     shares: list[float | None] = [*ratios] or [None]
@@ -117,7 +117,7 @@ def _point(
     result = compress(scene, settings=settings, views=taught, threads=threads, progress=progress)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     decoded = decompress(result.files, threads=threads)
-    mean = evaluate(original, decoded, judges, threads=threads, progress=as_stage("judge", progress)).mean
+    mean = compare_pictures(original, decoded, judges, threads=threads, progress=as_stage("judge", progress)).mean
     return RatePoint(
         way=way,
         count=len(scene),

@@ -37,6 +37,9 @@ if TYPE_CHECKING:
 HEDGE = {True: 0.1, False: 0.55}
 """How little pictures say of others: those from a capture's cameras, and those from virtual ones."""
 
+MEASURE = 3
+"""Version of how importance is measured: what an earlier one has kept in a file is measured anew."""
+
 TUNED_ATTEMPTS = 4
 """Containers that are fine-tuned on the way to a goal, at most: each takes a training."""
 
@@ -228,7 +231,10 @@ def _importance(
 
     if cache is None:
         return measure_importance(splats, watched, hedge=hedge, threads=threads, progress=progress)
-    key = hashlib.sha256(f"{__version__} {hedge} {splats.sh_degree} {watched.weights} {watched.spread}".encode())
+    key = hashlib.sha256(
+        f"{MEASURE} {__version__} {hedge} {splats.sh_degree} "
+        f"{watched.weights} {watched.spread} {watched.captured}".encode()
+    )
     for camera in watched.cameras:
         key.update(camera.viewmat.tobytes() + camera.K.tobytes() + f"{camera.width} {camera.height} ".encode())
     for values in (watched.background, *(getattr(splats, name) for name in ATTRIBUTES)):

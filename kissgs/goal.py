@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from kissgs.errors import Enough, UnsupportedError
 from kissgs.evaluation.drop import drop_of
 from kissgs.finetuning.result import FinetuneReport
-from kissgs.progress import Annotated, silent
+from kissgs.progress import Annotated
 from kissgs.search import Trial, seek
 from kissgs.settings import EncodeSettings
 from kissgs.settings.encode import GOALS
@@ -22,6 +22,7 @@ from kissgs.views.view import Views
 
 if TYPE_CHECKING:
     from kissgs.evaluation.likeness import Evaluation
+    from kissgs.evaluation.pictures import Picture
 
 PRICES = (-70.0, -6.0)
 """Between which prices are sought, as powers of 2."""
@@ -142,7 +143,7 @@ class GoalSearch:
         Args:
             original: whose pictures tell what is lost.
             settings: with a goal.
-            views: from where, or virtual cameras.
+            views: from where; None: cameras drawn over the whole scene.
             threads: 0 means one per processor.
             progress: whose note tells where the search stands.
             count: Gaussians of what is encoded, if it is not the original.
@@ -162,6 +163,7 @@ class GoalSearch:
         self._jump: tuple[float, int] | None = None
         self._psnr: float | None = None
         self._tuned: FinetuneReport | None = None
+        self._taken: dict[str, Picture] | None = None
 
     def exhaust(self, encoder: Encoder) -> None:
         """As many attempts as the settings have; with another codebook where one in balance with the rest will not do.
@@ -296,14 +298,14 @@ class GoalSearch:
 
     def pictures(self, encoded: Encoded) -> Evaluation:
         """Of a container beside those of the original."""
-        from kissgs.evaluation.pictures import evaluate
-        from kissgs.views.virtual import virtual_views
+        from kissgs.evaluation.cameras import evaluation_views
+        from kissgs.evaluation.pictures import compare_pictures
 
         self.progress("evaluate", 0.0)
         if self.views is None:  # those that evaluate would take
-            self.views = virtual_views(self.original, threads=self.threads)
+            self.views, self._taken = evaluation_views(self.original, threads=self.threads), {}
         decoded = decode(encoded.files, max_gaussians=max(len(self.original), MAX_GAUSSIANS), threads=self.threads)
-        return evaluate(self.original, decoded, self.views, threads=self.threads, progress=silent)
+        return compare_pictures(self.original, decoded, self.views, threads=self.threads, taken=self._taken)
 
 
 @dataclass(frozen=True, slots=True)

@@ -151,7 +151,7 @@ def compress(
         evaluate: decode the result and compare its pictures with those of the cleaned scene, and with the photographs
             of ``views`` if they have any; see :func:`kissgs.evaluate`. The report then has an ``evaluation``.
         views: a capture of the scene: its views for training are learned from and weigh the bits, those held out are
-            for evaluation; by default virtual cameras for all.
+            for evaluation; by default virtual cameras for all. Settings that take no pictures use the latter alone.
         checkpoint: of the compaction, see :func:`kissgs.compact`. Fine-tuning has one of its own beside it, with
             "-finetune" in its name; a search for a goal keeps none of that.
         overwrite: replace ``destination`` if it exists.
@@ -219,6 +219,7 @@ def compress(
         finetuning=container.finetuning,
         invisible=encoded.invisible,
         negligible=encoded.negligible,
+        note=encoded.note,
         tamed_colours=encoded.tamed,
         form_error=encoded.form_error,
         half_steps=encoded.errors,

@@ -37,6 +37,7 @@ class Report:
         cpu_seconds: processor time of all stages, over all threads.
         peak_memory: bytes, the largest this process has ever had resident.
         settings: all of them, as used.
+        note: a sentence about Gaussians that were left out, where these are more than a fifth; or empty.
         evaluation: the container's pictures beside those of the cleaned input; None unless it was asked for.
     """
 
@@ -61,6 +62,7 @@ class Report:
     peak_memory: int
     settings: dict[str, Any]
     evaluation: Evaluation | None = None
+    note: str = ""
 
     @property
     def ratio(self) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from os import PathLike
 from pathlib import Path
 
@@ -9,12 +10,11 @@ from kissgs.errors import InvalidContainerError, OutputError
 from kissgs.io.atomic import atomic_file, reason_of, refuse_existing
 from kissgs.io.ply import read_ply, write_ply
 from kissgs.progress import Progress, silent
+from kissgs.sogxt.container import is_packed, kind_of
 from kissgs.sogxt.decode import MAX_GAUSSIANS, decode
 from kissgs.splats import Cleaned, Splats, clean
 
 AnyPath = str | PathLike[str]
-
-ZIP_BEGINNINGS = (b"PK\x03\x04", b"PK\x05\x06")
 
 
 def load(path: AnyPath, *, max_gaussians: int = MAX_GAUSSIANS, threads: int = 0, progress: Progress = silent) -> Splats:
@@ -45,18 +45,21 @@ def save(splats: Splats, path: AnyPath, *, overwrite: bool = False, progress: Pr
 
 
 def is_container(source: Path | bytes) -> bool:
-    """Whether this looks like a container rather than a ``.ply``: a folder, or something that begins as a zip."""
+    """Whether this is a container rather than a ``.ply``, as far as a look at it tells; every command asks here.
+
+    A folder is one, and a zip under any name, whatever stands before it; of what cannot be opened, what is named .zip.
+    """
     if isinstance(source, bytes):
-        return source[:4] in ZIP_BEGINNINGS
+        return kind_of(io.BytesIO(source)) == "zip"
     try:
         if source.is_dir():
             return True
-        if not source.is_file():  # a pipe would keep us waiting
-            return source.suffix.lower() == ".zip"
-        with source.open("rb") as file:
-            return file.read(4) in ZIP_BEGINNINGS
+        if source.is_file():  # a pipe would keep us waiting
+            with source.open("rb") as file:
+                return kind_of(file) == "zip"
     except (OSError, ValueError):
-        return source.suffix.lower() == ".zip"
+        pass
+    return is_packed(source)
 
 
 def check_ply(path: Path, *, overwrite: bool) -> None:

@@ -120,6 +120,7 @@ class Admission:
 
     def _give_up(self, number: int, job_id: str) -> None:
         """Remove the upload of an ended job, and its decoded scene, which can be made anew."""
+        self.store.require()
         for path in self.folders.spare(job_id):
             self.folders.discard(path)
         self.store.update(number, upload_kept=False, spare_bytes=0, disk_bytes=self.folders.job_bytes(job_id))

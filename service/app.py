@@ -8,7 +8,6 @@ import logging
 from collections.abc import AsyncIterator
 from http import HTTPStatus
 
-from anyio.to_thread import run_sync
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
@@ -23,16 +22,19 @@ from service.bell import Bell
 from service.clock import Clock
 from service.context import Context
 from service.decoding import Decoder
+from service.ending import Ending
 from service.events import Follower
 from service.files import Folders
 from service.janitor import Janitor
 from service.metrics import Metrics
 from service.middleware import Envelope
 from service.openapi import describe
-from service.problems import ProblemError, answer, fields_of
+from service.pairing import open_store
+from service.problems import ProblemError, answer, fields_of, unusable_database
+from service.recovery import recover
 from service.routes import facts, jobs, page, preview, results
 from service.settings import ServiceSettings, SettingsError
-from service.store import Store
+from service.watch import reason_of
 from service.worker import Worker
 
 ROUTERS = (jobs.router, results.router, facts.router, page.router, preview.router)
@@ -41,12 +43,13 @@ log = logging.getLogger("kissgs.service")
 
 
 def create_app(settings: ServiceSettings) -> FastAPI:
-    """The service as an ASGI application. Its data folder and database are opened here and now.
+    """The service as an ASGI application. Its data folder and database are opened here and now, and what a former
+    service left in them is taken up.
 
     Raises:
         SettingsError: the data folder or the database cannot be used.
     """
-    context = build(settings)
+    context = _begin(settings)
     app = FastAPI(
         title="kissgs",
         version=facts.API_VERSION,
@@ -81,21 +84,35 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     return app
 
 
+def _begin(settings: ServiceSettings) -> Context:
+    try:
+        context = build(settings)
+        try:
+            recover(context)
+        except BaseException:
+            context.store.close()
+            context.folders.close()
+            raise
+    except OSError as error:
+        raise SettingsError(f"KISSGS_DATA_DIR: cannot use {settings.data_dir}: {str(error).lower()}") from error
+    except SQLAlchemyError as error:
+        raise SettingsError(f"KISSGS_DATABASE_URL: the job database cannot be used: {reason_of(error)}") from error
+    return context
+
+
 def build(settings: ServiceSettings) -> Context:
     """The parts of a service, ready to start."""
-    folders = Folders(settings.data_dir)
-    folders.remove_unfinished()  # first: it may make the room that the database needs
-    clock = Clock()
-    store = Store(settings.database, clock)
-    if not store.belongs_to(folders.identity()):
-        raise SettingsError(
-            "KISSGS_DATABASE_URL, KISSGS_DATA_DIR: this database is that of another data folder; "
-            "each service needs its own of both"
-        )
+    folders, clock = Folders(settings.data_dir), Clock()
+    try:
+        store = open_store(settings, folders, clock)
+    except BaseException:
+        folders.close()
+        raise
+    folders.remove_unfinished(store.ids())
     clock.start_after(store.latest_time())
     bell, metrics = Bell(), Metrics()
     metrics.queue_limit.set(settings.max_queue)
-    worker = Worker(settings, store, folders, bell, metrics, clock)
+    worker = Worker(settings, store, folders, bell, metrics, Ending(settings, store, folders, metrics, clock))
     admission = Admission(settings, store, folders)
     decoder = Decoder(settings, store, folders, admission)
     follower = Follower(store, bell, settings.workers)
@@ -105,17 +122,17 @@ def build(settings: ServiceSettings) -> Context:
 @contextlib.asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     context: Context = app.state.context
-    await run_sync(context.worker.recover)
     context.worker.start()
-    janitor = asyncio.create_task(Janitor(context, context.clock()).run())
+    janitor = Janitor(context, context.clock())
+    tasks = [asyncio.create_task(janitor.run()), asyncio.create_task(janitor.show_life())]
     try:
         yield
     finally:
         context.bell.close()
         await context.worker.drain()
-        janitor.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await janitor
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
         context.store.close()
         context.folders.close()
 
@@ -136,10 +153,10 @@ def _answer_errors(app: FastAPI) -> None:
         match error.status_code:
             case HTTPStatus.NOT_FOUND:
                 return answer(
-                    ProblemError("not-found", f"there is nothing at {request.url.path[:200]}; see /openapi.json")
+                    ProblemError("not-found", f"there is nothing at {request.scope['path'][:200]}; see /openapi.json")
                 )
             case HTTPStatus.METHOD_NOT_ALLOWED:
-                allowed = _allowed(request.url.path)
+                allowed = _allowed(request.scope["path"])
                 text = f"{request.method[:20]} is not possible here; use {allowed}"
                 return answer(ProblemError("method-not-allowed", text, headers={"Allow": allowed}))
             case _:
@@ -155,7 +172,7 @@ def _answer_errors(app: FastAPI) -> None:
         reason = str(getattr(error, "orig", "")).lower()
         if "is full" in reason or "no space left" in reason:
             return answer(ProblemError("disk-full", "the server's disk is full; try again later", retry_after=600))
-        return answer(ProblemError("internal", "the job database does not answer; try again later", retry_after=5))
+        return answer(unusable_database())
 
 
 def _allowed(path: str) -> str:

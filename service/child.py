@@ -82,7 +82,11 @@ def _compress(order: dict[str, Any], send: Send) -> dict[str, Any]:
         "peak_memory": report["peak_memory"],
     }
     if report["evaluation"] is not None:
-        summary["evaluation"] = report["evaluation"]["mean"]["between"]
+        told = report["evaluation"]
+        summary["evaluation"] = {
+            **told["mean"]["between"],
+            **{name: told[name] for name in ("worst", "fifth_percentile", "shown")},
+        }
     _write(folder / "summary.json", json.dumps(summary).encode())
     return summary
 

@@ -7,6 +7,7 @@ import hashlib
 import logging
 import re
 import secrets
+import signal
 import sys
 from pathlib import Path
 from typing import NoReturn
@@ -74,6 +75,8 @@ def _run(settings: ServiceSettings) -> None:
         app = create_app(settings)
     except SettingsError as error:
         _fail(error)
+    except KeyboardInterrupt:  # it may have been waiting for another service
+        sys.exit(128 + signal.SIGINT)
     if not settings.keys and not settings.is_private:
         logging.getLogger("kissgs.service").warning(
             "no keys are set: everyone who can reach %s may use this service (see `kissgs-serve key`)", settings.host

@@ -11,11 +11,12 @@ from typing import Any
 from anyio.to_thread import run_sync
 
 from service.admission import Admission
-from service.files import BYTES_PER_GAUSSIAN, Folders
+from service.files import Folders
 from service.models import Job, State
 from service.problems import KINDS, ProblemError
 from service.runner import Child
 from service.settings import ServiceSettings
+from service.sizes import BYTES_PER_GAUSSIAN
 from service.store import Store
 
 

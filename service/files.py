@@ -7,45 +7,41 @@
     jobs/ID/result/              the result, renamed into place once it is whole and on the disk
         scene.zip  report.json  files/NAME
     jobs/ID/decoded.ply          made when first asked for; decoded.json has its size and checksum
+    jobs/.orphaned/ID/           what no job of the database owns; nothing here is read or removed
+    lock, identity, database     who uses the folder, its own number, and that of its database
 
-What a killed service leaves half-written stands under a name that nothing reads, and is swept at the next start.
+What a killed service leaves half-written stands under a name that nothing reads, and is swept at the next start. Only
+what bears a name of this list is ever removed, and nothing behind a link in the place of a job's folder.
 """
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import fcntl
+import logging
 import os
+import re
 import secrets
 import shutil
+import time
 from pathlib import Path
 from typing import IO
 
 from service.settings import SettingsError
 
-BYTES_PER_GAUSSIAN = (68, 104, 164, 248)
-"""Of a ``.ply``, by SH degree."""
+log = logging.getLogger("kissgs.service")
 
-STEPS_BYTES = 300_000
-"""What a checkpoint tells of the steps done, if there are as many as settings allow."""
-
-TUNED_BYTES, ENTRY_BYTES, MOST_ENTRIES = 12 * 14, 12 * 45, 1 << 16
-"""What fine-tuning keeps of a Gaussian and of an entry, and how many entries there are at most, or nearly."""
+ORPHANED = ".orphaned"
 
 UNFINISHED = ("work-*", ".*.part")
 """What a process that was ended leaves in its job's folder: a folder of its own, and the file that was to become the
 next checkpoint."""
 
+OF_A_JOB = (*UNFINISHED, "scene.ply", "result", "checkpoint*.npz", "decoded.ply", "decoded.json")
+"""All that the service puts into a job's folder."""
 
-def checkpoint_bytes(gaussians: int, sh_degree: int, *, compact: bool = True, finetune: bool = False) -> int:
-    """What the checkpoints of a scene's trainings take at most.
-
-    That of compaction holds each parameter and the two moments of Adam, of no more Gaussians than the scene has; that
-    of fine-tuning, beside it, the same of levels and of the codebook's entries. While one is written anew, the former
-    one is still there.
-    """
-    first = compact * (STEPS_BYTES + 3 * BYTES_PER_GAUSSIAN[sh_degree] * gaussians)
-    second = finetune * (STEPS_BYTES + TUNED_BYTES * gaussians + ENTRY_BYTES * min(max(gaussians, 64), MOST_ENTRIES))
-    return first + second + max(first, second)
+_JOB, _UPLOAD = re.compile("[0-9a-f]{32}"), re.compile(r"[0-9a-f]{16}\.part")
 
 
 class Folders:
@@ -62,7 +58,7 @@ class Folders:
             self.root.mkdir(mode=0o700, parents=True, exist_ok=True)
             for folder in (self.incoming, self.jobs):
                 folder.mkdir(exist_ok=True)
-            self._lock: IO[str] = (self.root / "lock").open("w")
+            self._lock: IO[str] = (self.root / "lock").open("a")
         except OSError as error:
             raise SettingsError(
                 f"KISSGS_DATA_DIR: cannot use {root}: {(error.strerror or str(error)).lower()}"
@@ -72,9 +68,16 @@ class Folders:
         except OSError as error:
             self._lock.close()
             raise SettingsError(f"KISSGS_DATA_DIR: another service is using {root}; give this one its own") from error
+        # Open, so that they stay the same to every file system for as long as they are.
+        self._opened = {folder: os.open(folder, os.O_RDONLY) for folder in (self.incoming, self.jobs)}
+        if os.path.lexists(self.orphaned) and not self.orphaned.is_dir():
+            self.close()
+            raise SettingsError(f"KISSGS_DATA_DIR: {self.orphaned} is not a folder; move it away")
 
     def close(self) -> None:
         """Let another service have the folder."""
+        while self._opened:
+            os.close(self._opened.popitem()[1])
         self._lock.close()
 
     def new_upload(self) -> Path:
@@ -86,8 +89,8 @@ class Folders:
         folder = self.jobs / job_id
         folder.mkdir()
         upload.rename(folder / "scene.ply")
-        _sync(folder)
-        _sync(self.jobs)
+        sync_folder(folder)
+        sync_folder(self.jobs)
 
     def upload(self, job_id: str) -> Path:
         """The job's ``.ply``."""
@@ -121,16 +124,27 @@ class Folders:
         return folder
 
     def keep_result(self, job_id: str) -> None:
-        """Make what a job's process has written its result, all at once; nothing to do if that is done already."""
-        for work in (self.jobs / job_id).glob("work-*/result"):
-            work.rename(self.result(job_id))
-            _sync(self.jobs / job_id)
+        """Make what a job's process has written its result, all at once; nothing to do if that is done already.
+
+        A former result makes room for it, and goes with what else its process has left.
+
+        Raises:
+            OSError: that is not possible, or there is no result.
+        """
+        result = self.result(job_id)
+        for written in (self.jobs / job_id).glob("work-*/result"):
+            if os.path.lexists(result):
+                result.rename(written.with_name("former"))
+            written.rename(result)
+            sync_folder(self.jobs / job_id)
+        if not result.is_dir():
+            raise FileNotFoundError(errno.ENOENT, "its result has vanished")
 
     def keep_decoded(self, work: Path, job_id: str) -> None:
         """Make a decoded scene the job's, all at once."""
         (work / "decoded.json").rename(self.decoded(job_id).with_suffix(".json"))
         (work / "decoded.ply").rename(self.decoded(job_id))
-        _sync(self.jobs / job_id)
+        sync_folder(self.jobs / job_id)
 
     def remove_work(self, job_id: str) -> None:
         """Remove what a process of the job has left, but for its checkpoint."""
@@ -139,35 +153,134 @@ class Folders:
                 self.discard(path)
 
     def discard(self, path: Path) -> None:
-        """Remove a file or folder, if it is there."""
-        if path.is_dir():
+        """Remove a file or folder, if it is there; of a link, only the link."""
+        if path.parent.parent == self.jobs and path.parent.is_symlink():
+            return
+        if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path, ignore_errors=True)
         else:
-            path.unlink(missing_ok=True)
+            with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+                path.unlink()
 
     def remove_job(self, job_id: str) -> None:
-        """Remove all files of a job."""
-        self.discard(self.jobs / job_id)
+        """Remove all files of a job. What is no folder, or holds anything else, is set aside instead.
 
-    def remove_unfinished(self) -> None:
-        """Remove what was being written when a former service ended."""
+        What the system does not let go stays where it is, and the log says so.
+        """
+        folder = self.jobs / job_id
+        if not _JOB.fullmatch(job_id):
+            raise ValueError(f"{job_id!r} is no id of a job")
+        try:
+            if not self._remove(folder):
+                log.warning("job %s: its folder cannot be removed", job_id)
+        except OSError as error:
+            log.warning("job %s: its folder cannot be removed: %s", job_id, (error.strerror or str(error)).lower())
+
+    def _remove(self, folder: Path) -> bool:
+        """Remove the folder of a job, or set it aside; False if it is still there."""
+        for _ in range(20):  # its process may write a last file while it is being ended
+            if not os.path.lexists(folder):
+                return True
+            if folder.is_symlink() or not folder.is_dir():
+                self.set_aside(folder.name, "is no folder of ours")
+                return True
+            for pattern in OF_A_JOB:
+                for path in folder.glob(pattern):
+                    self.discard(path)
+            with contextlib.suppress(FileNotFoundError):
+                if not all(any(path.match(pattern) for pattern in OF_A_JOB) for path in folder.iterdir()):
+                    self.set_aside(folder.name, "holds files of others")
+                    return True
+                with contextlib.suppress(OSError):
+                    folder.rmdir()
+                    return True
+            time.sleep(0.05)
+        return False
+
+    def remove_unfinished(self, known: set[str]) -> None:
+        """Remove what was being written when a former service ended: uploads, and work of known jobs."""
+        self.remove_uploads()
+        for job_id in self.held() & known:
+            self.remove_work(job_id)
+
+    def remove_uploads(self) -> None:
+        """Remove what had arrived of uploads when a former service ended."""
         for path in self.incoming.iterdir():
-            self.discard(path)
-        for folder in self.jobs.iterdir():
-            self.remove_work(folder.name)
-
-    def remove_strangers(self, known: set[str]) -> None:
-        """Remove what no known job owns: only while nothing arrives."""
-        for path in self.jobs.iterdir():
-            if path.name not in known:
+            if _UPLOAD.fullmatch(path.name):
                 self.discard(path)
 
-    def identity(self) -> int:
-        """A number that this folder alone has."""
-        path = self.root / "identity"
-        if not path.exists():
-            path.write_text(str(secrets.randbits(48)), encoding="ascii")
-        return int(path.read_text(encoding="ascii"))
+    # What others own -----------------------------------------------------------------------------------------------
+
+    @property
+    def orphaned(self) -> Path:
+        """The folder of what has been set aside."""
+        return self.jobs / ORPHANED
+
+    def held(self) -> set[str]:
+        """The ids of all jobs that have a folder."""
+        return {path.name for path in self.jobs.iterdir() if _JOB.fullmatch(path.name) and path.is_dir()}
+
+    def set_aside(self, job_id: str, why: str) -> None:
+        """Move the folder of a job out of the way, with all that it holds; the log says why and where it lies now."""
+        self._move_aside(self.jobs / job_id)
+        log.warning("job %s: its folder %s and lies in %s now", job_id, why, self.orphaned)
+
+    def keep_aside(self, job_id: str, why: str) -> None:
+        """Set the folder of a job aside, if there is anything in it."""
+        with contextlib.suppress(OSError):  # not empty, no folder, or not there
+            (self.jobs / job_id).rmdir()
+        if os.path.lexists(self.jobs / job_id):
+            self.set_aside(job_id, why)
+
+    def set_aside_unknown(self, known: set[str]) -> int:
+        """Move the folders of all jobs but the known ones out of the way: only while nothing arrives.
+
+        Returns:
+            How many there were.
+        """
+        unknown = sorted(self.held() - known)
+        for job_id in unknown:
+            self._move_aside(self.jobs / job_id)
+        return len(unknown)
+
+    def count_orphaned(self) -> int:
+        """Count the folders that have been set aside and are still there."""
+        try:
+            return sum(1 for _ in self.orphaned.iterdir())
+        except OSError:
+            return 0
+
+    def _move_aside(self, folder: Path) -> None:
+        self.orphaned.mkdir(exist_ok=True)
+        place, number = self.orphaned / folder.name, 1
+        while os.path.lexists(place):
+            number += 1
+            place = self.orphaned / f"{folder.name}-{number}"
+        folder.rename(place)
+
+    # The disk ------------------------------------------------------------------------------------------------------
+
+    def trouble(self) -> str | None:
+        """Why nothing can be kept in the folder; None if it can. A matter of microseconds."""
+        for folder, opened in self._opened.items():
+            try:
+                same = os.path.samestat(folder.stat(), os.fstat(opened))
+            except OSError:
+                return f"the data folder cannot be used: its folder {folder.name} is not there; put it back"
+            if not same:
+                return f"the data folder cannot be used: its folder {folder.name} was replaced; restart the service"
+            if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
+                return f"the data folder cannot be used: its folder {folder.name} cannot be written to"
+        return None
+
+    def require(self) -> None:
+        """See that files can be kept.
+
+        Raises:
+            OSError: they cannot.
+        """
+        if trouble := self.trouble():
+            raise OSError(trouble)
 
     def free_bytes(self) -> int:
         """What the disk has left."""
@@ -178,7 +291,7 @@ class Folders:
         return sum(path.stat().st_size for path in (self.jobs / job_id).rglob("*") if path.is_file())
 
 
-def _sync(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
     """Have the names in a folder on the disk, so that a power cut cannot undo a rename."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 from dataclasses import dataclass
 
 from anyio.to_thread import run_sync
+from sqlalchemy.exc import SQLAlchemyError
 
 from service.bell import ended
 from service.context import Context
 from service.models import ENDED, State
+from service.tenancy import SIGN_SECONDS
 
 log = logging.getLogger("kissgs.service")
 
@@ -35,6 +38,13 @@ class Janitor:
                     self.context.bell.ring(ended(job_id))
             except Exception:
                 log.exception("what has expired could not be removed; trying again")
+
+    async def show_life(self) -> None:
+        """For ever: what keeps other services from using the same database."""
+        while True:
+            await asyncio.sleep(SIGN_SECONDS)
+            with contextlib.suppress(SQLAlchemyError):  # /readyz and the worker tell
+                await run_sync(self.context.store.keep_time)
 
     def sweep(self) -> list[str]:
         """Remove the files of ended jobs whose time is over; forget them altogether after as long again.

@@ -56,17 +56,18 @@ class Metrics:
             registry=r,
         )
 
-    def job_ended(self, job: Job, state: State, seconds: float) -> None:
-        """Count a job that has ended, after ``seconds`` of running."""
+    def job_ended(self, job: Job, state: State, seconds: float | None) -> None:
+        """Count a job that has ended, after ``seconds`` of running; None if nobody knows."""
         self.ended.labels(state, (job.problem or {}).get("code", "")).inc()
         if state != State.SUCCEEDED or job.result is None:
             return
-        self.ran.labels(job.preset).observe(seconds)
         for stage, spent in job.result["seconds"].items():
             self.stages.labels(stage).observe(spent)
         self.bytes_out.inc(job.result["container"]["bytes"])
         self.ratio.observe(job.upload_bytes / job.result["container"]["bytes"])
-        self.per_second.observe(job.gaussians / max(seconds, 1e-3))
+        if seconds is not None:
+            self.ran.labels(job.preset).observe(seconds)
+            self.per_second.observe(job.gaussians / max(seconds, 1e-3))
 
     def text(self, counts: dict[State, int], disk_bytes: int) -> bytes:
         """The page, with these gauges up to date."""

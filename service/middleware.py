@@ -82,9 +82,9 @@ class Envelope:
             text = f"this service does not answer as {host[:100]!r}; its operator may add the name to KISSGS_NAMES"
             return ProblemError("foreign", text)
         origin = headers.get("origin")
-        if method in ("GET", "HEAD", "OPTIONS") or origin is None or origin in self._settings.cors_origins:
+        if method in ("GET", "HEAD", "OPTIONS") or origin is None or origin.lower() in self._settings.cors_origins:
             return None
-        if "*" in self._settings.cors_origins or urlsplit(origin).netloc == host:
+        if "*" in self._settings.cors_origins or _site(origin) == host.lower():
             return None
         text = f"pages of {origin[:100]!r} may not use this service; its operator may add it to KISSGS_CORS_ORIGINS"
         return ProblemError("foreign", text)
@@ -92,6 +92,14 @@ class Envelope:
     def _is_ours(self, host: str) -> bool:
         name = host.rpartition(":")[0] if re.search(r":[0-9]*$", host) else host
         return self._settings.answers_to(name.strip("[]").lower())
+
+
+def _site(origin: str) -> str | None:
+    """The name and port of an origin, in lower case; None if it has none, or is malformed."""
+    try:
+        return urlsplit(origin).netloc.lower() or None
+    except ValueError:  # brackets that hold no address of IPv6
+        return None
 
 
 def _mark(headers: MutableHeaders, request_id: str, path: str) -> None:

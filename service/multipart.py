@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import AsyncIterable, AsyncIterator
 from dataclasses import dataclass
 
@@ -11,6 +12,9 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 from service.problems import ProblemError
 
 MAX_PART_HEADER_BYTES = 8192
+
+MAX_PREAMBLE_BYTES = 8192
+"""The most that may stand before the first boundary; RFC 2046 allows text there, which is ignored."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +99,30 @@ class _Parser:
         self.complete = True
 
 
+class _Preamble:
+    """Leaves out what stands before the first boundary, which the library does not."""
+
+    def __init__(self, boundary: bytes) -> None:
+        self._line = re.compile(rb"(?:^|\n)--" + re.escape(boundary) + rb"(?:[ \t]*(?=\r\n)|(?=--))")
+        self._boundary, self._head = b"--" + boundary, b""
+        self.over = False
+
+    def feed(self, chunk: bytes) -> bytes:
+        """Take the next bytes; return those that belong to the parts."""
+        if self.over:
+            return chunk
+        self._head += chunk
+        found = self._line.search(self._head)
+        if (found.start() if found else len(self._head)) > MAX_PREAMBLE_BYTES + len(self._boundary):
+            raise ProblemError(
+                "invalid-request", f"the form has more than {MAX_PREAMBLE_BYTES} bytes before its first boundary"
+            )
+        if not found:
+            return b""
+        self.over = True
+        return self._boundary + self._head[found.end() :]
+
+
 async def parts(content_type: str, chunks: AsyncIterable[bytes]) -> AsyncIterator[PartBegin | PartData]:
     """The parts of a form, in the order they come.
 
@@ -106,11 +134,13 @@ async def parts(content_type: str, chunks: AsyncIterable[bytes]) -> AsyncIterato
     if not 1 <= len(boundary) <= 256:
         raise ProblemError("invalid-request", "the Content-Type names no boundary; let your HTTP library write it")
     try:
-        parser = _Parser(boundary)
+        parser, preamble = _Parser(boundary), _Preamble(boundary)
         async for chunk in chunks:
-            for event in parser.feed(chunk):
+            for event in parser.feed(preamble.feed(chunk)):
                 yield event
     except FormParserError as error:
         raise ProblemError("invalid-request", f"the form cannot be read: {error}") from error
+    if not preamble.over:
+        raise ProblemError("invalid-request", "the form has no line with its boundary; let your HTTP library write it")
     if not parser.complete:
         raise ProblemError("invalid-request", "the form ends before its last boundary; send it again")

@@ -58,6 +58,7 @@ KINDS: dict[str, Kind] = {
     "too-many-uploads": Kind(429, "Too many uploads at the same time", retryable=True),
     "disk-full": Kind(507, "There is no room for it", retryable=True),
     "stopping": Kind(503, "The service is stopping", retryable=True),
+    "database": Kind(503, "The job database cannot be used", retryable=True),
 }
 """Every code there is. A code never changes its meaning."""
 
@@ -128,6 +129,11 @@ def problem(code: str, detail: str, *, errors: list[dict[str, Any]] | None = Non
         retryable=kind.retryable,
         errors=errors,
     )
+
+
+def unusable_database() -> ProblemError:
+    """The problem of a database that fails; the log and ``/readyz`` say more than clients are told."""
+    return ProblemError("database", "the job database cannot be used for now; try again later", retry_after=5)
 
 
 def answer(error: ProblemError) -> JSONResponse:

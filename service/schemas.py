@@ -140,7 +140,12 @@ class JobStatus(Wire):
     compacted: int | None = Field(None, description="Gaussians left out by compaction, whose work others do.")
     invisible: int | None = Field(None, description="Gaussians left out because no renderer would draw them.")
     cleaned: dict[str, int] | None = Field(None, description="What was wrong with the upload and was mended, counted.")
-    evaluation: dict[str, Any] | None = Field(None, description="PSNR and SSIM to the upload's own renderings.")
+    evaluation: dict[str, Any] | None = Field(
+        None,
+        description="PSNR and SSIM to the upload's own renderings from cameras drawn over the whole scene: means, the "
+        "worst view and where its camera stands, the fifth percentile of PSNR, and the share of the scene that the "
+        "views show. A PSNR of null is infinite.",
+    )
     finetuning: dict[str, Any] | None = Field(
         None, description="What fine-tuning gave: PSNR and bytes before and after, and whether it was kept."
     )

@@ -113,7 +113,7 @@ class ServiceSettings(BaseSettings):
         for origin in origins:
             if not re.fullmatch(r"\*|https?://[^/\s]+", origin):
                 raise ValueError(f"{origin!r} is not an origin such as https://example.org")
-        return origins
+        return [origin.lower() for origin in origins]  # as browsers send them
 
     @property
     def is_private(self) -> bool:

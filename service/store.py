@@ -6,15 +6,18 @@ result that arrive together cannot both win. Every change that a client may want
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import contextlib
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import sqlalchemy as sa
-from sqlalchemy.exc import IntegrityError
+from sqlalchemy.exc import IntegrityError, SQLAlchemyError
 from sqlalchemy.orm import Session, load_only
 
+from service import tenancy
 from service.database import connect
 from service.models import ACTIVE, ENDED, NOTE_CHARS, Event, Job, Meta, State
+from service.watch import IDENTITY, VanishedError, Watch
 
 _NEXT: dict[State, tuple[State, ...]] = {
     State.RUNNING: (State.QUEUED,),
@@ -36,15 +39,80 @@ class Refused(Exception):
 
 
 class Store:
-    """Jobs and events in a database. Methods block for milliseconds and are safe in any thread."""
+    """Jobs and events in a database. Methods block for milliseconds and are safe in any thread.
 
-    def __init__(self, url: str, clock: Callable[[], float]) -> None:
-        self._engine, self._writing, self._reading = connect(url)
+    Args:
+        url: of SQLAlchemy.
+        clock: tells the time.
+        may_be_new: whether tables may be made.
+
+    Raises:
+        SettingsError: as :func:`service.database.connect`.
+    """
+
+    def __init__(self, url: str, clock: Callable[[], float], *, may_be_new: bool = True) -> None:
+        self._engine, self._writing, self._reading = connect(url, may_be_new=may_be_new)
+        self._watch = Watch(self._engine)
+        self._watch.identity = self.fact(IDENTITY)
         self.clock = clock
 
     def close(self) -> None:
-        """Let go of all connections."""
+        """Let go of all connections, and let the next service have the database."""
+        if self._watch.owner is not None and self.trouble() is None:
+            with contextlib.suppress(SQLAlchemyError), self._write() as session:
+                tenancy.leave(session)
         self._engine.dispose()
+        self._watch.close()
+
+    def leave(self) -> None:
+        """Let go of a database that is not to be touched."""
+        self._watch.leave()
+        self._engine.dispose()
+
+    # The database itself -------------------------------------------------------------------------------------------
+
+    def require(self) -> None:
+        """See that the database's files are those that were opened: a matter of microseconds.
+
+        Raises:
+            VanishedError: they are not.
+        """
+        self._watch.require()
+
+    def trouble(self) -> str | None:
+        """Why the database cannot be relied on; None if it can."""
+        return self._watch.trouble()
+
+    def fact(self, name: str) -> float | None:
+        """A number that the database keeps about itself: ``identity``, ``folder`` or ``time``."""
+        with self._reading() as session:
+            found = session.get(Meta, name)
+        return found.value if found is not None else None
+
+    def belong_to(self, folder: float, identity: float) -> None:
+        """Write down which data folder the database belongs to, and which number it is known by."""
+        with self._writing.begin() as session:
+            session.merge(Meta(name="folder", value=folder))
+            session.merge(Meta(name=IDENTITY, value=identity))
+        self._watch.identity = identity
+
+    def claim_database(self) -> None:
+        """Keep other services from using the database as long as this one calls :meth:`keep_time` again and again.
+
+        Raises:
+            SettingsError: another service is using it.
+        """
+        self._watch.owner = tenancy.claim(self._writing, self._reading)
+
+    @contextlib.contextmanager
+    def _write(self) -> Iterator[Session]:
+        """A transaction that counts only if the database is still there when it has ended."""
+        self.require()
+        with self._writing.begin() as session:
+            if why := self._watch.stranger(session):
+                raise VanishedError(f"the job database is no longer this service's: {why}")
+            yield session
+        self.require()
 
     # Jobs ----------------------------------------------------------------------------------------------------------
 
@@ -56,7 +124,7 @@ class Store:
                 is taken.
         """
         try:
-            with self._writing.begin() as session:
+            with self._write() as session:
                 if self._count(session, Job.state == State.QUEUED) >= max_queue:
                     raise Refused("queue")
                 mine = Job.owner == job.owner, Job.owner != "", Job.state.in_(ACTIVE)
@@ -106,7 +174,7 @@ class Store:
 
     def claim(self) -> Job | None:
         """The job that has waited longest, now running; None if none waits."""
-        with self._writing.begin() as session:
+        with self._write() as session:
             query = sa.select(Job).where(Job.state == State.QUEUED).order_by(Job.number).limit(1)
             job = session.scalar(query.with_for_update(skip_locked=True))
             if job is None:
@@ -120,7 +188,7 @@ class Store:
 
     def progress(self, number: int, stage: str, fraction: float, note: str = "") -> None:
         """Note how far a running job is, and what it has to say of that, if anything."""
-        with self._writing.begin() as session:
+        with self._write() as session:
             job = session.get(Job, number, with_for_update=True)
             if job is not None and job.state == State.RUNNING:
                 job.stage, job.fraction, job.note = stage, fraction, note[:NOTE_CHARS] or None
@@ -132,7 +200,7 @@ class Store:
 
         A job that goes back into the queue has nothing behind it.
         """
-        with self._writing.begin() as session:
+        with self._write() as session:
             job = session.get(Job, number, with_for_update=True)
             if job is None or job.state not in _NEXT[state]:
                 return False
@@ -148,12 +216,12 @@ class Store:
 
     def update(self, number: int, **values: Any) -> None:  # noqa: ANN401
         """Set columns that nobody needs to hear of."""
-        with self._writing.begin() as session:
+        with self._write() as session:
             session.execute(sa.update(Job).where(Job.number == number).values(**values))
 
     def forget(self, number: int) -> None:
         """Remove a job and its events."""
-        with self._writing.begin() as session:
+        with self._write() as session:
             session.execute(sa.delete(Event).where(Event.job == number))
             session.execute(sa.delete(Job).where(Job.number == number))
 
@@ -194,9 +262,9 @@ class Store:
         return [spent / count for spent, count in latest if spent and count >= 10_000][:limit]
 
     def ids(self, *states: State) -> set[str]:
-        """Of all jobs in ``states``."""
+        """The ids of all jobs in ``states``; without any, of all jobs."""
         with self._reading() as session:
-            return set(session.scalars(sa.select(Job.id).where(Job.state.in_(states))))
+            return set(session.scalars(sa.select(Job.id).where(Job.state.in_(states or tuple(State)))))
 
     def due(self, states: Iterable[State], before: float, limit: int = 200) -> list[tuple[int, str]]:
         """Number and id of some jobs in ``states`` that expire before a time."""
@@ -221,25 +289,15 @@ class Store:
         with self._reading() as session:
             return self._count(session, Job.state == State.QUEUED)
 
-    def belongs_to(self, folder: int) -> bool:
-        """Whether this database is that of a data folder, which the first to ask becomes."""
-        with self._writing.begin() as session:
-            known = session.get(Meta, "folder")
-            if known is None:
-                session.add(Meta(name="folder", value=folder))
-            return known is None or known.value == folder
-
     # The clock -----------------------------------------------------------------------------------------------------
 
     def latest_time(self) -> float:
         """What :meth:`keep_time` has written last."""
-        with self._reading() as session:
-            found = session.get(Meta, "time")
-        return found.value if found is not None else 0.0
+        return self.fact("time") or 0.0
 
     def keep_time(self) -> None:
         """Write down the time, and see that the database can be written to."""
-        with self._writing.begin() as session:
+        with self._write() as session:
             session.merge(Meta(name="time", value=self.clock()))
 
     @staticmethod

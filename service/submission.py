@@ -15,12 +15,12 @@ from starlette.requests import Request
 
 from service.admission import FULL_SECONDS
 from service.context import Context
-from service.files import checkpoint_bytes
 from service.models import Job
 from service.multipart import PartBegin, PartData, parts
 from service.presets import can_train
-from service.problems import ProblemError, fields_of
+from service.problems import ProblemError, fields_of, unusable_database
 from service.schemas import JobOptions
+from service.sizes import checkpoint_bytes
 from service.store import Refused
 from service.uploads import Received, Spool, scene_name, timed
 from service.worker import QUEUE
@@ -66,6 +66,9 @@ async def submit(
     """
     if context.worker.draining:
         raise ProblemError("stopping", "the service is stopping; try again in a minute", retry_after=60)
+    if trouble := await run_sync(context.store.trouble):
+        log.error("a submission was refused: the job database cannot be used: %s", trouble)
+        raise unusable_database()
     known = await run_sync(context.store.by_idempotency_key, owner, key) if key is not None else None
     if known is None:
         await run_sync(context.admission.check, owner)
@@ -138,7 +141,7 @@ def _scene_bytes(request: Request, kind: str, limit: int) -> int | None:
     text = request.headers.get("content-length", "")
     if not (text.isascii() and text.isdigit()):
         return None
-    length = int(text)
+    length = int(text) if len(text) < 19 else 10**18
     return limit if kind == FORM_TYPE and limit < length <= limit + MAX_FORM_BYTES else length
 
 

@@ -24,6 +24,9 @@ from service.settings import ServiceSettings
 BLOCK_BYTES = 1 << 20
 """Written at a time. A thread is asked once for each, and memory holds one or two per upload."""
 
+LAST_LINE = re.compile(rb"\nend_header[ \t\r]*\n")
+"""The last line of a header: all of it, because a comment may end with the same word."""
+
 CLOSE = {"Connection": "close"}
 
 STEP_BYTES = 16 << 20
@@ -76,13 +79,16 @@ class Spool:
         Raises:
             ProblemError: they cannot be a usable scene, are too many, or do not fit on the disk.
         """
+        line = max(self._pending.rfind(b"\n"), 0)  # the last one so far, which may go on
         self._pending += data
         self._size += len(data)
         self._refuse_size(self._size)
         if self._size > self._reserved:
             coming = STEP_BYTES if self._at_most is None else min(STEP_BYTES, self._at_most - self._reserved)
             await self._reserve(max(coming, self._size - self._reserved))
-        if not self._checked and (self._size > self._settings.max_header_bytes or b"end_header" in self._pending):
+        if not self._checked and (
+            self._size > self._settings.max_header_bytes or LAST_LINE.search(self._pending, line)
+        ):
             self._check_header()
         if len(self._pending) >= BLOCK_BYTES:
             await run_sync(self._flush)
@@ -143,8 +149,6 @@ class Spool:
     def _check_header(self) -> None:
         """What the header tells, once it has arrived: long before the last byte of a file that is of no use."""
         head, limit = bytes(self._pending), self._settings.max_header_bytes
-        if self._size <= limit and not re.search(rb"end_header[ \t\r]*\n", head):
-            return
         self._checked = True
         whole = self._at_most if self._at_most is not None else self._settings.max_upload_bytes
         try:

@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import asyncio
 import errno
-import json
 import logging
 from dataclasses import dataclass, field
-from typing import Any
 
 from anyio.to_thread import run_sync
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.bell import Bell, ended, wait
-from service.clock import Clock
+from service.ending import Ending
 from service.files import Folders
 from service.metrics import Metrics
 from service.models import Job, State
-from service.problems import KINDS, problem
 from service.runner import Child, Outcome
 from service.schemas import JobOptions
 from service.settings import ServiceSettings
 from service.store import Store
+from service.watch import reason_of
 
 log = logging.getLogger("kissgs.service")
 
@@ -41,11 +39,12 @@ class Worker:
     folders: Folders
     bell: Bell
     metrics: Metrics
-    clock: Clock
+    ending: Ending
     draining: bool = False
     _children: dict[str, Child] = field(default_factory=dict)
     _loops: list[asyncio.Task[None]] = field(default_factory=list)
     _looked: dict[int, float] = field(default_factory=dict)
+    _complaints: set[str] = field(default_factory=set)
 
     def start(self) -> None:
         """Begin to take jobs."""
@@ -82,7 +81,7 @@ class Worker:
 
     async def cancel(self, job: Job) -> None:
         """End a job that has not ended yet: its process is gone, and so are its files, when this returns."""
-        if not await run_sync(lambda: self._end(job, State.CANCELLED, upload_kept=False, disk_bytes=0)):
+        if not await run_sync(lambda: self.ending.end(job, State.CANCELLED, upload_kept=False, disk_bytes=0)):
             return
         child = self._children.get(job.id)
         if child is not None:
@@ -92,24 +91,6 @@ class Worker:
         self.bell.ring(job.id)
         self.bell.ring(ended(job.id))
 
-    def recover(self) -> None:
-        """Take up what a former service left: to be called before anything is accepted or started."""
-        for job in self.store.in_state(State.RUNNING):
-            summary = self.folders.result(job.id) / "summary.json"
-            if summary.exists():
-                self._succeed(job, json.loads(summary.read_text(encoding="utf-8")))
-            elif job.starts >= self.settings.job_starts:
-                detail = (
-                    f"the service was ended {job.starts} times while the job ran; submit a scene with fewer Gaussians"
-                )
-                self._fail(job, "crashed", detail)
-            else:
-                self.store.move(job.number, State.QUEUED)
-        for job in self.store.in_state(State.QUEUED):
-            if not self.folders.upload(job.id).exists():
-                self._fail(job, "internal", "the upload is no longer on the server's disk; submit the scene again")
-        self.folders.remove_strangers(self.store.ids(State.QUEUED, State.RUNNING, State.SUCCEEDED))
-
     # Running -------------------------------------------------------------------------------------------------------
 
     async def _loop(self, number: int) -> None:
@@ -117,15 +98,22 @@ class Worker:
             self._looked[number] = asyncio.get_running_loop().time()
             ticket = self.bell.ticket(QUEUE)
             try:
-                job = await run_sync(self.store.claim)
-            except SQLAlchemyError:
-                log.exception("the queue cannot be read; trying again")
+                job = await run_sync(self._claim)
+            except (SQLAlchemyError, OSError) as error:
+                self._complain("no job is started", error)
                 await asyncio.sleep(IDLE_SECONDS)
                 continue
+            if self._complaints:
+                log.info("the job database and the data folder can be used again")
+                self._complaints.clear()
             if job is None:
                 await wait(ticket, IDLE_SECONDS)
             else:
                 await self._run(job)
+
+    def _claim(self) -> Job | None:
+        self.folders.require()  # or jobs would fail one after the other for want of their uploads
+        return self.store.claim()
 
     async def _run(self, job: Job) -> None:
         child = self._children[job.id] = Child(seconds=self.settings.job_seconds)
@@ -143,6 +131,9 @@ class Worker:
             del self._children[job.id]
             child.ended.set()
             self.metrics.busy.dec()
+        trouble = await run_sync(self.folders.trouble)
+        if trouble and outcome.kind in ("error", "crashed"):
+            outcome = Outcome("postponed")  # no fault of the job
         await self._settle(job, outcome)
 
     async def _follow(self, job: Job, child: Child) -> Outcome:
@@ -165,8 +156,8 @@ class Worker:
         async def progress(stage: str, fraction: float, note: str) -> None:
             try:
                 await run_sync(self.store.progress, job.number, stage, fraction, note)
-            except SQLAlchemyError:  # a full disk: the job itself may yet succeed
-                log.exception("job %s: progress was not recorded", job.id)
+            except SQLAlchemyError as error:  # a full disk: the job itself may yet succeed
+                self._complain(f"job {job.id}: progress was not recorded", error)
             self.bell.ring(job.id)
 
         return await child.run(order, progress)
@@ -179,8 +170,12 @@ class Worker:
             try:
                 await run_sync(self._record, job, outcome)
                 break
-            except (SQLAlchemyError, OSError):
-                log.exception("job %s: its end was not recorded; trying again", job.id)
+            except (SQLAlchemyError, OSError) as error:
+                if outcome.kind == "done" and await run_sync(self._is_final, error):
+                    log.error("job %s: its result cannot be kept: %s", job.id, reason_of(error))
+                    outcome = _unrunnable(error)
+                    continue
+                self._complain(f"job {job.id}: its end was not recorded; trying again", error)
                 if self.draining:  # the next start takes it up
                     return
                 await asyncio.sleep(IDLE_SECONDS)
@@ -195,7 +190,20 @@ class Worker:
             await asyncio.sleep(IDLE_SECONDS)
         self.bell.ring(QUEUE)
 
+    def _is_final(self, error: Exception) -> bool:
+        """Whether the same would fail for ever, while everything else can go on."""
+        return isinstance(error, OSError) and error.errno in _FINAL and self.folders.trouble() is None
+
+    def _complain(self, what: str, error: Exception) -> None:
+        """Log what fails again and again once, until the queue can be read."""
+        reason = f"{what}: {reason_of(error)}"
+        if reason not in self._complaints:
+            log.error("%s", reason)
+            self._complaints.add(reason)
+
     def _record(self, job: Job, outcome: Outcome) -> None:
+        self.store.require()  # or the files would say what nobody wrote down
+        self.folders.require()
         current = self.store.get(job.id)
         if current is None or current.state != State.RUNNING:  # cancelled or deleted meanwhile
             self.folders.remove_work(job.id)
@@ -205,9 +213,9 @@ class Worker:
         self.folders.remove_work(job.id)  # now: once the job is back in the queue, another worker may be at it
         match outcome.kind:
             case "done":
-                self._succeed(job, outcome.data)
+                self.ending.succeed(job, outcome.data)
             case "error":
-                self._fail(job, outcome.data["code"], outcome.data["detail"])
+                self.ending.fail(job, outcome.data["code"], outcome.data["detail"])
             case "stopped" | "postponed":
                 self._put_back(job)
             case "crashed" if self.draining:  # whoever stops the service may have signalled its children, too
@@ -217,42 +225,18 @@ class Worker:
                 self.metrics.restarts.inc()
                 self.store.move(job.number, State.QUEUED, crashes=1)
             case "crashed":
-                self._fail(job, "crashed", outcome.data["detail"])
+                self.ending.fail(job, "crashed", outcome.data["detail"])
 
     def _put_back(self, job: Job) -> None:
         """Into the queue, as if it had never been started."""
         self.store.move(job.number, State.QUEUED, starts=job.starts - 1)
 
-    def _succeed(self, job: Job, summary: dict[str, Any]) -> None:
-        self.folders.discard_checkpoints(job.id)
-        if not self.settings.keep_uploads:
-            self.folders.discard(self.folders.upload(job.id))
-        values = {
-            "result": summary,
-            "upload_kept": self.settings.keep_uploads,
-            "spare_bytes": job.upload_bytes if self.settings.keep_uploads else 0,
-            "disk_bytes": self.folders.job_bytes(job.id),
-        }
-        if not self._end(job, State.SUCCEEDED, **values):
-            self.folders.discard(self.folders.result(job.id))
-
-    def _fail(self, job: Job, code: str, detail: str) -> None:
-        document = problem(code if code in KINDS else "internal", detail).model_dump(exclude_none=True)
-        if self._end(job, State.FAILED, problem=document, upload_kept=False, disk_bytes=0):
-            self.folders.remove_job(job.id)
-
-    def _end(self, job: Job, state: State, **values: Any) -> bool:  # noqa: ANN401
-        moved = self.store.move(job.number, state, expires_at=self.clock() + self.settings.keep_seconds, **values)
-        current = self.store.get(job.id)
-        if moved and current is not None:
-            seconds = self.clock() - (job.started_at or self.clock())
-            self.metrics.job_ended(current, state, seconds)
-            log.info("job %s %s after %.1f s", job.id, state, seconds)
-        return moved
-
 
 _PASSING = (errno.EMFILE, errno.ENFILE, errno.EAGAIN, errno.ENOMEM, errno.ENOSPC, errno.EDQUOT)
 """What the system lacks for the moment; no fault of the job."""
+
+_FINAL = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENOTEMPTY, errno.ELOOP)
+"""What lies in a job's folder is not what it should be: no time mends that."""
 
 _FAULT = Outcome("error", {"code": "internal", "detail": "the job could not be run; please report it with the scene"})
 

@@ -184,14 +184,14 @@ def test_json_errors_have_a_code(tmp_path: Path) -> None:
 def test_an_interrupt_inside_a_finalizer_is_not_lost() -> None:
     """Python prints what is raised there and goes on; numba and torch have such callbacks wherever they import."""
     lines = (
-        "import signal, time, weakref; from kissgs import cli",
+        "import signal, time, weakref; from kissgs import _cli, cli",
         "class Thing: pass",
         "def work(words):",
         "    thing = Thing()",
         "    watch = weakref.ref(thing, lambda _: signal.raise_signal(signal.SIGINT))",
         "    del thing",
         "    time.sleep(30)",
-        "cli.app = work",
+        "_cli.app = work",
         "cli.main()",
     )
     done = subprocess.run(

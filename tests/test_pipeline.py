@@ -312,6 +312,8 @@ def test_importance_is_handed_on():
     """What costs a thousandth in one half of the scene is rounded more coarsely there."""
     cameras = [view.camera for view in kissgs.virtual_views(SCENE, width=64, height=64, count=4).all]
     measured = kissgs.measure_importance(SCENE, kissgs.Watch(cameras, [1.0] * 4, np.zeros(3, np.float32)), hedge=1)
+    everywhere = np.ones(120, np.float32)  # a capture's cameras have looked: no bound but the price
+    measured = dataclasses.replace(measured, coverage=everywhere, captured=everywhere)
     halves = np.arange(120) < 60
     errors = []
     for half in (halves, ~halves):

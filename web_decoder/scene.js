@@ -1,5 +1,7 @@
 /** Images of a container to the arrays of a scene. What is done here, the page docs/format.md of kissgs explains. */
 
+import { crc32 } from "./zip.js";
+
 /** @import { Scene } from "./types.js" */
 /** Values of the lowest and of the highest level that occur in an image. @typedef {number[]} Range */
 
@@ -9,6 +11,9 @@ const fail = (why) => {
 };
 
 export const [META, MASK] = ["meta.json", "active_mask.webp"];
+const [KISSGS, CHECKSUM] = ["kissgs", "kissgs_crc32"];
+/** Stands for the block of kissgs where another encoder has written. */
+const NOT_OURS = { version: "-", sh_degree: 0 };
 const [HIGH, LOW, QUATS] = ["means_bytes_1.webp", "means_bytes_0.webp", "quaternions.webp"];
 const [LABELS, CENTROIDS] = ["f_rest_labels.webp", "f_rest_centroids.webp"];
 /** In the order in which they make a picture. */
@@ -23,6 +28,7 @@ const PLAIN = /** @type {Record<string, ["sh0" | "opacities" | "scales" | "quats
 /** Of spherical harmonics, by degree. */
 export const COEFFICIENTS = [0, 3, 8, 15];
 const [TILE_ROWS, TILE_COLUMNS] = [3, 5];
+const KIND = JSON.stringify(["sog-xt", 3, "direct", "uv-codebook", 15, TILE_ROWS, TILE_COLUMNS]);
 const MAX_GRID_SIDE = 13376;
 const MAX_CODEBOOK_SIDE = 256;
 const MAX_SIGNED_LOG = 88.7; // e to more than this is beyond float32
@@ -30,7 +36,7 @@ const MAX_SIGNED_LOG = 88.7; // e to more than this is beyond float32
 /** @type {(json: Uint8Array) => any} */
 function parse(json) {
   try {
-    const { quats, shN, ...meta } = JSON.parse(new TextDecoder().decode(json));
+    const { quats, shN, ...meta } = JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(json));
     return { ...meta, quats: { ...quats }, shN: { ...shN } };
   } catch {
     return fail(`${META} is not readable JSON`);
@@ -39,7 +45,7 @@ function parse(json) {
 
 /** A range for each channel; one number stands for all. @type {(field: any, ends: string[], channels: number) => Range[]} */
 function rangesOf(field, ends, channels) {
-  const lists = ends.map((end) => [field?.[end]].flat(2));
+  const lists = ends.map((end) => [field?.[end]].flat());
   return Array.from({ length: channels }, (_, i) => {
     const range = lists.map((list) => list[list.length === channels ? i : 0]);
     if (!range.every((end) => Number.isFinite(end) && Number.isFinite(Math.fround(end)))) {
@@ -83,15 +89,24 @@ export class Assembly {
    */
   constructor(json, maxGaussians) {
     const meta = parse(json);
-    const { count, gridSide, means, quats, shN, format = "sog-xt", version = 3, kissgs } = meta;
-    const { layout = "uv-codebook", centroidSide: codebookSide, centroidsMins, centroidsMaxs } = shN;
-    const kind = [format, version, quats.encoding ?? "direct", layout].join(", ");
-    if (kind !== "sog-xt, 3, direct, uv-codebook") fail(`${META}: of a kind that is not read: ${kind}`);
+    const { count, gridSide, means, mask, quats, shN, format = "sog-xt", version = 3 } = meta;
+    const { layout = "uv-codebook", coeffs = 15, tileRows = TILE_ROWS, tileCols = TILE_COLUMNS } = shN;
+    const { centroidSide: codebookSide } = shN;
+    const { encoding = "direct" } = quats;
+    const kind = JSON.stringify([format, version, encoding, layout, coeffs, tileRows, tileCols]);
+    if (kind !== KIND) fail(`${META}: of a kind that is not read: ${kind}`);
+    const files = JSON.stringify(mask?.files);
+    if (!/^\["([^"]*\.)?webp"/.test(files)) fail(`${META}: mask.files are no WebP: ${files}`);
+    // What is ours other encoders leave out; where it is, it is whole.
+    const { version: made, sh_degree, crc32: checksums = {} } = (KISSGS in meta ? meta[KISSGS] : NOT_OURS) ?? {};
+    if (!/^"[\w.+-]{1,40}"$/.test(JSON.stringify(made))) fail(`${META}: ${KISSGS}.version is impossible: ${made}`);
+    const isObject = Object.getPrototypeOf(checksums ?? 0) === Object.prototype;
     for (const [name, value, least, most] of [
       ["count", count, 0, gridSide ** 2],
       ["gridSide", gridSide, 1, MAX_GRID_SIDE],
       ["shN.centroidSide", codebookSide, 1, MAX_CODEBOOK_SIDE],
-      ["kissgs.sh_degree", kissgs?.sh_degree ?? 0, 0, 3],
+      [`${KISSGS}.sh_degree`, sh_degree, 0, 3],
+      ...Object.entries(isObject ? checksums : { crc32: NaN }).map((entry) => [...entry, 0, 2 ** 32 - 1]),
     ]) {
       if (!(Number.isInteger(value) && value >= least && value <= most))
         fail(`${META}: ${name} is impossible: ${value}`);
@@ -107,13 +122,16 @@ export class Assembly {
     if (this.ranges[HIGH][0].some((end) => Math.abs(end) > MAX_SIGNED_LOG)) fail(`${META}: means beyond float32`);
     const rest = (this.ranges[CENTROIDS] = rangesOf(shN, ["centroidsMins", "centroidsMaxs"], 45));
     const used = Math.max(...rest.map((range, i) => (range.some(Boolean) ? 1 + (i % 15) : 0)));
+    const inferred = COEFFICIENTS.findIndex((coefficients) => coefficients >= used);
+    const degree = Math.max(inferred, sh_degree);
+    const sizes = [count, gridSide, codebookSide, degree];
+    const numbers = new Float64Array([...sizes, ...Object.values(this.ranges).flat(2)]);
+    if (CHECKSUM in meta && crc32(new Uint8Array(numbers.buffer)) !== meta[CHECKSUM]) {
+      fail(`${META} is damaged: its numbers do not give its ${CHECKSUM}`);
+    }
     /** @type {Scene} */
     this.scene = {
-      ...{ count, gridSide, codebookSide, meta, planes: {}, sizes: { [META]: json.length } },
-      degree: Math.max(
-        COEFFICIENTS.findIndex((coefficients) => coefficients >= used),
-        kissgs?.sh_degree ?? 0,
-      ),
+      ...{ count, degree, gridSide, codebookSide, meta, planes: {}, sizes: { [META]: json.length } },
       ...{ means: new Float32Array(), quats: new Float32Array(), scales: new Float32Array(), sh0: new Float32Array() },
       ...{ opacities: new Float32Array(), centroids: new Float32Array() },
       ...{ labels: new Uint16Array(), cells: new Uint32Array() },

@@ -13,8 +13,9 @@ import numpy as np
 from kissgs.compaction.popspa import popspa
 from kissgs.compaction.result import Compacted, CompactionReport
 from kissgs.errors import Enough, UnsupportedError
+from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.drop import MODELLED, drop_of
-from kissgs.evaluation.pictures import evaluate
+from kissgs.evaluation.pictures import Picture, compare_pictures
 from kissgs.progress import Progress, as_stage, silent
 from kissgs.rendering.gsplat_backend import need_cuda
 from kissgs.rendering.rasterizer import Device
@@ -57,7 +58,7 @@ def compact_scene(
         splats: clean.
         settings: with a budget.
         views: a capture: its views for training are learned from, those that are held out judge. By default virtual
-            ones, and the scene itself is the teacher.
+            ones teach, by pictures of the scene itself, and cameras drawn over the whole scene judge.
         judges: measure PSNR, SSIM and bytes after every step, unless several compactions are tried.
         checkpoint: see :func:`kissgs.compaction.popspa.popspa`.
         threads: 0 means one per processor; the result does not depend on it.
@@ -103,10 +104,11 @@ class Compactor:
     Attributes:
         splats: clean.
         settings: of the recipe.
-        school: views to learn from, and to judge by.
+        school: views to learn from.
         threads: see :func:`compact_scene`.
         device: see the same.
         progress: see the same.
+        judges: views to judge by; None: cameras drawn over the whole scene.
     """
 
     splats: Splats
@@ -115,6 +117,8 @@ class Compactor:
     threads: int
     device: Device
     progress: Progress
+    judges: Views | None = None
+    _taken: dict[str, Picture] | None = None
     _lessons: Lessons | None = None
 
     @classmethod
@@ -138,7 +142,7 @@ class Compactor:
             need_cuda()
         scored = SCORED if settings.trains else 1
         taught = school(splats, views, settings, scored=scored, threads=threads, progress=progress)
-        return cls(splats, settings, taught, threads, device, progress)
+        return cls(splats, settings, taught, threads, device, progress, None if views is None else taught.exam)
 
     def __call__(self, count: int, *, judges: bool = False, checkpoint: Path | None = None) -> Compacted:
         """Down to ``count``, which is less than the scene has."""
@@ -162,9 +166,14 @@ class Compactor:
         )
 
     def pictures(self, found: Compacted) -> Evaluation:
-        """From held-out views, beside those of the scene."""
+        """From views that were not learned from, beside those of the scene."""
         progress = as_stage("judge", self.progress)
-        return evaluate(self.splats, found.splats, self.school.exam, threads=self.threads, progress=progress)
+        if self.judges is None:
+            drawn = evaluation_views(self.splats, threads=self.threads, progress=progress)
+            self.judges, self._taken = drawn, {}
+        return compare_pictures(
+            *(self.splats, found.splats, self.judges), threads=self.threads, taken=self._taken, progress=progress
+        )
 
     @property
     def note(self) -> str:

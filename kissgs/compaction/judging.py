@@ -1,15 +1,24 @@
-"""How good a smaller scene is: its pictures from held-out views, and the bytes it will take."""
+"""How good a smaller scene is: its pictures from views that it has not learned from, and the bytes it will take."""
 
 from __future__ import annotations
 
+from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.likeness import Likeness
-from kissgs.evaluation.pictures import evaluate
+from kissgs.evaluation.pictures import compare_pictures
 from kissgs.progress import Progress, as_stage, silent
 from kissgs.settings import Preset, Settings
 from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.encode import encode
 from kissgs.splats import Splats
 from kissgs.training.school import School
+from kissgs.views.view import Views
+
+
+def exam(reference: Splats, school: School, threads: int = 0, progress: Progress = silent) -> Views:
+    """Views to judge by: a capture's held-out photographs, or else cameras drawn over the whole scene."""
+    if any(view.photo is not None for view in school.test):
+        return school.exam
+    return evaluation_views(reference, threads=threads, progress=progress)
 
 
 def judge(
@@ -20,6 +29,8 @@ def judge(
     The bytes are those of its container as the preset ``fast`` makes it. ``progress`` receives the stage ``"judge"``.
     """
     receive = as_stage("judge", progress)
-    compared = evaluate(reference, scene, school.exam, threads=threads, progress=receive)
+    compared = compare_pictures(
+        *(reference, scene, exam(reference, school, threads, receive)), threads=threads, progress=receive
+    )
     encoded = encode(scene, Settings(preset=Preset.FAST).encode, threads=threads, progress=receive)
     return compared.mean.candidate, len(zip_bytes(encoded.files))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kissgs._typing import Int
+from kissgs._typing import Float32, Int
 from kissgs._version import __version__
 from kissgs.compaction.judging import judge
 from kissgs.compaction.result import Compacted, CompactionReport, CompactionStep
@@ -35,10 +35,14 @@ if TYPE_CHECKING:
 
 MEANS_RATE = 1.6e-4
 RATES = {"scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 1.25e-4}
-"""Learning rates of 3DGS; that of the means is in units of the cameras' extent."""
+"""Learning rates of 3DGS; that of a mean is in units of the extent of the cameras about it."""
 
 ONE_PLACE = 1e-4
 """Extent of cameras, in radii of the scene, that tells of rounding, or of a camera that only turned."""
+
+UNSEEN = {True: 0.05, False: 0.3}
+"""Least score, in units of what a camera nearby would find: where a capture says who looks from where, and where none
+does."""
 
 State = Mapping[str, np.ndarray]
 
@@ -148,7 +152,7 @@ class _Recipe:
             self._done("prune", scene)
             return self._result(scene, "nothing")
         lessons = self.lessons or self._look()
-        begun, done, state = self._begin()
+        begun, done, state = self._begin(lessons)
         for number in range(begun, len(phases)):
             self._train(phases, number, done, state, lessons)
             done, state = 0, {}
@@ -183,21 +187,22 @@ class _Recipe:
             progress=self.progress,
         )
 
-    def _begin(self) -> tuple[int, int, State]:
+    def _begin(self, lessons: Lessons) -> tuple[int, int, State]:
         """Prune for a start, or take up what was left: number of the phase, steps of it that are done, its state."""
         from kissgs.training.trainee import Trainee
 
         state = self.checkpoint.load()
         if state is not None:
             told = json.loads(state["told"].tobytes())
-            self.index, self.trainee = state["index"], Trainee.restored(state, self.device)
+            self.index = state["index"]
+            self.trainee = Trainee.restored(state, self.device, self._reach(lessons))
             self.steps = [CompactionStep(**step) for step in told["steps"]]
             self.since -= told["seconds"]
             return told["phase"], told["done"], state
         self._done("input", self.splats)
         scene = self.splats.select(self._prune(self.splats, self._first_count(), self.progress))
         self._done("prune", scene)
-        self.trainee = Trainee(scene, self.device)
+        self.trainee = Trainee(scene, self.device, self._reach(lessons))
         self._save(0, 0, {})  # if that cannot be, it is better known before the work than after
         return 0, 0, {}
 
@@ -207,6 +212,7 @@ class _Recipe:
         chosen = show_most(
             *(scene, cameras, self.school.background, count),
             share=self.settings.score_share,
+            least=UNSEEN[self.school.captured],
             threads=self.threads,
             progress=progress,
         )
@@ -254,6 +260,10 @@ class _Recipe:
         radius = anatomy(self.splats).radius
         return lessons.extent if lessons.extent > ONE_PLACE * radius else radius
 
+    def _reach(self, lessons: Lessons) -> Float32[np.ndarray, " M"]:
+        """How far apart the cameras about each Gaussian that is left stand, by where the scene has it."""
+        return lessons.reach(self.splats.means[self.index], self._extent(lessons))
+
     def _within(self, phases: list[_Phase], number: int) -> Progress:
         """Tells of all phases of one name as of one stage, with the prunings between them."""
         name = phases[number].name
@@ -271,7 +281,7 @@ class _Recipe:
         from kissgs.training.loop import falling
 
         chosen = self.settings
-        base = {"means": MEANS_RATE * self._extent(lessons), **RATES}
+        base = {"means": MEANS_RATE, **RATES}
         if lessons.taught_by == "renderings":
             base = {name: rate * chosen.renderings_rate for name, rate in base.items()}
         begin = {name: chosen.means_rate if name == "means" else chosen.rate for name in base}

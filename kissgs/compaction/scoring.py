@@ -10,6 +10,7 @@ import numpy as np
 from kissgs._typing import Float, Float32, Int
 from kissgs.progress import Progress, silent
 from kissgs.rendering.camera import Camera
+from kissgs.rendering.coverage import Coverage
 from kissgs.rendering.rasterizer import removal_scores
 from kissgs.splats import Splats
 
@@ -27,6 +28,7 @@ def show_most(
     count: int,
     *,
     share: float = 0.0,
+    least: float = 0.0,
     threads: int = 0,
     progress: Progress = silent,
 ) -> Int[np.ndarray, " M"]:
@@ -42,6 +44,7 @@ def show_most(
         background: of all of them.
         count: at least 1.
         share: the smallest that one scoring may leave, from 0 (one scoring will do) to less than 1.
+        least: lowest score of any Gaussian, seen or not, in units of what a camera nearby would probably find.
         threads: 0 means one per processor; the choice does not depend on it.
         progress: receives the stage ``"score"``.
 
@@ -49,6 +52,7 @@ def show_most(
         Their numbers, rising.
     """
     kept = np.arange(len(splats))
+    nearby = Coverage(splats).close_up
     rounds = max(1, math.ceil(math.log(count / max(len(splats), count)) / math.log(share) - 1e-9)) if share > 0 else 1
     shrink = (count / max(len(splats), 1)) ** (1 / rounds)
     for round_ in range(rounds):
@@ -60,7 +64,16 @@ def show_most(
 
         scene = splats.select(kept)
         scores = removal_scores(scene, cameras, background=background.tolist(), threads=threads, progress=part)
+        scores = np.maximum(scores, least * _prior(scores, nearby[kept]))
         left = count if round_ == rounds - 1 else max(count, round(len(splats) * shrink ** (round_ + 1)))
         kept = kept[highest(scores, left)]
     progress("score", 1.0)
     return kept
+
+
+def _prior(scores: Float[np.ndarray, " N"], nearby: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+    """Scores that cameras near each Gaussian would find, with nothing in front of it."""
+    known = (scores > 0) & (nearby > 0)
+    if not known.any():
+        return nearby
+    return np.asarray(np.median(scores[known] / nearby[known]) * nearby)

@@ -14,9 +14,16 @@ from PIL import Image
 
 from kissgs._typing import Float32, UInt8
 from kissgs.evaluation.difference import STOPS, difference, full_scale, heat_map, worst_place
-from kissgs.evaluation.html_figures import change_of, figure_cards, in_words, summary_line, views_table
-from kissgs.evaluation.likeness import Comparison, Evaluation, spell
-from kissgs.evaluation.pictures import take_picture
+from kissgs.evaluation.html_figures import (
+    change_of,
+    extremes_lines,
+    figure_cards,
+    in_words,
+    summary_line,
+    views_table,
+)
+from kissgs.evaluation.likeness import Comparison, Evaluation, ViewComparison, spell
+from kissgs.evaluation.pictures import over, take_picture
 from kissgs.progress import Progress, silent
 from kissgs.rendering.pictures import to_bytes
 from kissgs.rendering.rasterizer import Device
@@ -24,6 +31,9 @@ from kissgs.splats import Splats
 
 MOST_VIEWS = 12
 """Shown with pictures: some 10 MB of them."""
+
+MOST_ELSEWHERE = 4
+"""Views of the surroundings that are shown with pictures."""
 
 LARGEST = 1280
 """Pixels a side of the large pictures; what is larger is reduced."""
@@ -55,7 +65,8 @@ def html_report(
 ) -> str:
     """Write an evaluation as a page that needs nothing beside itself: styles, script and pictures are in it.
 
-    Up to :data:`MOST_VIEWS` views are shown with pictures, evenly chosen, the worst always among them.
+    Up to :data:`MOST_VIEWS` views are shown with pictures, evenly chosen, the worst first. Of the ``surroundings``, the
+    worst :data:`MOST_ELSEWHERE` follow.
 
     Args:
         evaluation: of these two scenes.
@@ -69,16 +80,20 @@ def html_report(
         InvalidViewsError: a photograph cannot be read.
         UnsupportedError: a picture would take too much memory; no CUDA here.
     """
-    shown = chosen_views(evaluation)
-    full = full_scale(min((evaluation.views[i].comparison.between.psnr for i in shown), key=_badness))
-    sections = []
-    for done, i in enumerate(shown):
-        progress("html", done / len(shown))
-        view, scenes = evaluation.views[i].view, (reference.splats, candidate.splats)
-        pictures = [take_picture(scene, view.camera, evaluation.background, device, threads) for scene in scenes]
-        photo = view.load_photo() if evaluation.against == "photos" else None
-        layers = _Pictures(pictures[0], pictures[1], photo)
-        sections.append(_section(f"view-{i}", view.name, evaluation.views[i].comparison, layers, full))
+    shown, around = chosen_views(evaluation), evaluation.surroundings
+    parts = [(f"view-{i}", evaluation, evaluation.views[i]) for i in shown]
+    if around is not None:
+        elsewhere = sorted(range(len(around.views)), key=lambda i: around.views[i].badness)[:MOST_ELSEWHERE]
+        parts += [(f"elsewhere-{i}", around, around.views[i]) for i in elsewhere]
+    worst = min((compared for _, _, compared in parts), key=lambda compared: compared.badness)
+    full, sections = full_scale(worst.comparison.between.psnr), []
+    for done, (anchor, of, compared) in enumerate(parts):
+        progress("html", done / len(parts))
+        view, scenes = compared.view, (reference.splats, candidate.splats)
+        background = over(view, of.background)
+        pictures = [take_picture(scene, view.camera, background, device, threads) for scene in scenes]
+        photo = view.load_photo() if of.against == "photos" else None
+        sections.append(_section(anchor, compared, _Pictures(pictures[0], pictures[1], photo), full))
     progress("html", 1.0)
     return Template(files("kissgs.evaluation").joinpath("report.html").read_text(encoding="utf-8")).substitute(
         title=escape(f"{candidate.name} compared with {reference.name}"),
@@ -87,6 +102,7 @@ def html_report(
         summary=escape(summary_line(evaluation, len(shown)) + _sentence(evaluation.note)),
         figures="\n".join(figure_cards(evaluation, reference.bytes, candidate.bytes)),
         table=views_table(evaluation, shown),
+        extremes=escape(extremes_lines(evaluation)),
         sections="\n".join(sections),
         colours=", ".join("#" + bytes(stop).hex() for stop in STOPS),
         quality=QUALITY,
@@ -95,23 +111,16 @@ def html_report(
 
 
 def chosen_views(evaluation: Evaluation) -> list[int]:
-    """Which views to show: evenly spread, and the one where the two scenes' renderings are least alike."""
+    """Which views to show: first that where the scenes' renderings are least alike, then others, evenly spread."""
     count = len(evaluation.views)
-    if count <= MOST_VIEWS:
-        return list(range(count))
-    chosen = np.rint(np.linspace(0, count - 1, MOST_VIEWS)).astype(int).tolist()
-    worst = min(range(count), key=lambda i: _badness(evaluation.views[i].comparison.between.psnr))
-    if worst not in chosen:
-        chosen[min(range(MOST_VIEWS), key=lambda i: abs(chosen[i] - worst))] = worst
-    return chosen
+    worst = min(range(count), key=lambda i: evaluation.views[i].badness)
+    chosen = np.unique(np.rint(np.linspace(0, count - 1, min(count, MOST_VIEWS))).astype(int)).tolist()
+    chosen.remove(min(chosen, key=lambda i: abs(i - worst)))
+    return [worst, *chosen]
 
 
 def _sentence(note: str) -> str:
     return f" {note[0].upper()}{note[1:]}." if note else ""
-
-
-def _badness(psnr: float) -> float:
-    return -np.inf if np.isnan(psnr) else psnr  # NaN is the worst
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,8 +130,8 @@ class _Pictures:
     photo: UInt8[np.ndarray, "H W 3"] | None
 
 
-def _section(anchor: str, name: str, comparison: Comparison, pictures: _Pictures, full: int) -> str:
-    name = escape(name)
+def _section(anchor: str, compared: ViewComparison, pictures: _Pictures, full: int) -> str:
+    name = escape(compared.view.name)
     levels = difference(pictures.candidate, pictures.reference)
     place = worst_place(levels, max(SMALLEST_CROP, min(CROP, min(levels.shape) // 2)))
     layers = {
@@ -143,7 +152,8 @@ def _section(anchor: str, name: str, comparison: Comparison, pictures: _Pictures
     crops = [_picture(_lossless(image[place]), f"{layer}, enlarged", layer) for layer, image in layers.items()]
     shape = "tall" if levels.shape[0] > levels.shape[1] else "wide" if pictures.photo is None else "wide photographed"
     return (
-        f'<section class="card" id="{anchor}"><h2>{name}</h2><p class="numbers">{_numbers(comparison)}</p>'
+        f'<section class="card" id="{anchor}"><h2>{name}</h2><p class="numbers">{_numbers(compared.comparison)} · '
+        f"{compared.place}</p>"
         f'<div class="pictures {shape}">{"".join(figures)}</div>'
         f'<div class="crops">{"".join(crops)}</div></section>'
     )

@@ -10,7 +10,8 @@ from kissgs.evaluation.likeness import Comparison, Evaluation, Likeness, spell
 
 def summary_line(evaluation: Evaluation, shown: int) -> str:
     """What was compared, where from; ``shown`` views have pictures. Plain text, to be escaped."""
-    rest = "" if shown == len(evaluation.views) else f" Pictures of {shown} of them are below, the worst among them."
+    rest = " Their pictures are below" if shown == len(evaluation.views) else f" Pictures of {shown} of them are below"
+    rest += ", the worst first."
     return f"{evaluation.views_used}, {evaluation.size.replace('x', '×')}: {evaluation.source}.{rest}"
 
 
@@ -24,12 +25,23 @@ def figure_cards(evaluation: Evaluation, before: int | None, after: int | None) 
         yield _card("SSIM, candidate to photographs", spell(mean.candidate.ssim, 4), ssim)
     between = f"of their renderings; {in_words(mean.between)}"
     yield _card("PSNR, candidate to reference", f"{spell(mean.between.psnr, 2)} dB", between)
+    fifth = f"{spell(evaluation.fifth_percentile, 2)} dB is the 5th percentile"
+    yield _card("PSNR, worst view", f"{spell(evaluation.worst.comparison.between.psnr, 2)} dB", fifth)
     counts = f"{evaluation.candidate_count:,} of {evaluation.reference_count:,} Gaussians"
     if before and after:
         change = f"{before / after:.1f}× smaller" if before >= after else f"{after / before:.1f}× larger"
         yield _card("Size", change, f"{before / 1e6:,.2f} → {after / 1e6:,.2f} MB; {counts}")
     else:
         yield _card("Gaussians", f"{evaluation.candidate_count:,}", counts)
+
+
+def extremes_lines(evaluation: Evaluation) -> str:
+    """Where the worst views are, of the scene beside those of a capture too. Plain text, to be escaped."""
+    told, around = f"Candidate to reference: {evaluation.extremes}.", evaluation.surroundings
+    if around is None:
+        return told
+    mean = f"PSNR {spell(around.mean.between.psnr, 2)} dB, SSIM {spell(around.mean.between.ssim, 4)}"
+    return f"{told} Elsewhere, {around.views_used} ({around.source}): {mean}; {around.extremes}."
 
 
 def _card(name: str, value: str, remark: str) -> str:

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from kissgs._typing import Float32
+from kissgs._typing import Float32, Float64
 from kissgs.views.view import View
 
 Split = Literal["test", "train", "all"]
@@ -85,6 +85,35 @@ class ViewComparison:
     view: View
     comparison: Comparison
 
+    @property
+    def badness(self) -> float:
+        """PSNR of the candidate to the reference; NaN, a failed picture, is the worst there is."""
+        psnr = self.comparison.between.psnr
+        return -math.inf if math.isnan(psnr) else psnr
+
+    @property
+    def place(self) -> str:
+        """Where the camera stands and looks, in the scene's coordinates, for people."""
+        camera = self.view.camera
+        if self.view.target is not None:
+            return f"at {_point(camera.position)} looking at {_point(self.view.target)}"
+        return f"at {_point(camera.position)} looking along {_point(camera.viewmat[2, :3])}"
+
+    def where(self) -> dict[str, Any]:
+        """For JSON: the name, the PSNR of the candidate to the reference, and where the camera stands and looks.
+
+        ``position``, ``target`` (null where none is known) and the unit vector ``direction`` are in the scene's
+        coordinates.
+        """
+        camera, target = self.view.camera, self.view.target
+        return {
+            "name": self.view.name,
+            "psnr": _as_json(self.comparison.between.psnr),
+            "position": camera.position.tolist(),
+            "target": None if target is None else target.tolist(),
+            "direction": camera.viewmat[2, :3].tolist(),
+        }
+
     def as_dict(self) -> dict[str, Any]:
         """Name, size in pixels, and the likenesses."""
         camera = self.view.camera
@@ -100,11 +129,16 @@ class Evaluation:
         split: the views that were used: "test", "train" or "all". Where "test" was asked for and no view is held out,
             this is "train".
         source: of the views, for people.
-        background: ``(3,)`` red, green, blue from 0 to 1, over which everything was rendered.
+        background: ``(3,)`` red, green, blue from 0 to 1, over which views without a background of their own were
+            rendered.
         reference_count: Gaussians of the reference.
         candidate_count: Gaussians of the candidate.
         views: in their order, one or more.
         note: of the views, for people; see :class:`kissgs.views.view.Views`.
+        shown: share of the scene that the views show, from 0 to 1; see
+            :func:`kissgs.evaluation.shown.share_shown`. None where it was not computed.
+        surroundings: the same from cameras drawn over the whole scene; None where those are the ``views``, or were not
+            asked for.
     """
 
     against: Literal["photos", "renderings"]
@@ -115,6 +149,8 @@ class Evaluation:
     candidate_count: int
     views: tuple[ViewComparison, ...]
     note: str = ""
+    shown: float | None = None
+    surroundings: Evaluation | None = None
 
     @property
     def views_used(self) -> str:
@@ -140,6 +176,34 @@ class Evaluation:
             between=_mean([view.between for view in all_views]),
         )
 
+    @property
+    def worst(self) -> ViewComparison:
+        """The view from which the candidate is least like the reference; the first of several."""
+        return min(self.views, key=lambda view: view.badness)
+
+    @property
+    def fifth_percentile(self) -> float:
+        """PSNR of the candidate to the reference that one view in twenty falls short of, between views linearly.
+
+        NaN where a picture failed; between a number and infinity, the number.
+        """
+        values = sorted(view.comparison.between.psnr for view in self.views)
+        if any(math.isnan(value) for value in values):
+            return math.nan
+        place = 0.05 * (len(values) - 1)
+        lower, upper = values[math.floor(place)], values[math.ceil(place)]
+        return lower if math.isinf(upper) else lower + (place - math.floor(place)) * (upper - lower)
+
+    @property
+    def extremes(self) -> str:
+        """For people: the worst view and where it is, the fifth percentile, and how much of the scene is shown."""
+        worst = self.worst
+        told = (
+            f"worst view {spell(worst.comparison.between.psnr, 1)} dB ({worst.view.name}, {worst.place}), "
+            f"5th percentile {spell(self.fifth_percentile, 1)} dB"
+        )
+        return told if self.shown is None else f"{told}; the views show {math.floor(100 * self.shown)} % of the scene"
+
     def as_dict(self) -> dict[str, Any]:
         """For JSON; see :meth:`Likeness.as_dict` for infinity and NaN."""
         return {
@@ -150,6 +214,10 @@ class Evaluation:
             "count": {"reference": self.reference_count, "candidate": self.candidate_count},
             "views": [view.as_dict() for view in self.views],
             "mean": self.mean.as_dict(),
+            "worst": self.worst.where(),
+            "fifth_percentile": _as_json(self.fifth_percentile),
+            "shown": self.shown,
+            "surroundings": None if self.surroundings is None else self.surroundings.as_dict(),
         }
 
 
@@ -169,6 +237,10 @@ def _mean(values: Sequence[Likeness]) -> Likeness:
         ssim=sum(value.ssim for value in values) / len(values),
         lpips=sum(distances) / len(values) if distances else None,
     )
+
+
+def _point(point: Float64[np.ndarray, "3"]) -> str:
+    return f"({', '.join(f'{value:.4g}' for value in point)})"
 
 
 def _as_json(value: float) -> float | str | None:

@@ -15,9 +15,10 @@ from typing import IO, Any
 
 from kissgs.errors import InvalidSceneError, UnsupportedError
 from kissgs.evaluation.attributes import AttributeErrors, attribute_errors, sigmoid
+from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.likeness import Evaluation
 from kissgs.evaluation.pairing import pair
-from kissgs.evaluation.pictures import evaluate
+from kissgs.evaluation.pictures import compare_pictures
 from kissgs.io.atomic import reason_of
 from kissgs.io.ply import read_ply
 from kissgs.splats import Splats, clean
@@ -81,8 +82,8 @@ def measure_peer(
         format: ``"sog"`` or ``"spz"``.
         command: How to start splat-transform.
         sh_iterations: k-means iterations over the SH of ``.sog``; None leaves the tool's default.
-        pictures: compare pictures too (:func:`kissgs.evaluate`).
-        views: from where; by default virtual cameras.
+        pictures: compare pictures too (:func:`kissgs.evaluation.pictures.compare_pictures`).
+        views: from where; by default cameras drawn over the whole scene.
 
     Raises:
         InvalidSceneError: ``scene``, or what the tool made of it, cannot be read or has no usable Gaussian.
@@ -111,7 +112,7 @@ def measure_peer(
         decode_cpu_seconds=decoding.cpu,
         peak_memory=max(encoding.memory, decoding.memory),
         errors=_errors_of_visible(reference, candidate),
-        pictures=evaluate(reference, candidate, views) if pictures else None,
+        pictures=compare_pictures(reference, candidate, views or evaluation_views(reference)) if pictures else None,
     )
 
 

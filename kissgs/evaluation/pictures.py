@@ -7,13 +7,16 @@ Pictures are clamped to [0, 1], as a screen clamps them, but not rounded to 8 bi
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
 
 from kissgs._typing import Float32, Shaped
 from kissgs.errors import InvalidViewsError, UnsupportedError
+from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.likeness import Comparison, Evaluation, Likeness, Split, ViewComparison
+from kissgs.evaluation.shown import share_shown
 from kissgs.progress import Progress, silent
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.lpips import Lpips
@@ -27,12 +30,17 @@ NOTHING_SEEN = (
 )
 
 
+Picture = Float32[np.ndarray, "H W 3"]
+Measure = Callable[[np.ndarray, np.ndarray], Likeness]
+
+
 def evaluate(
     reference: Splats,
     candidate: Splats,
     views: Views | None = None,
     *,
     split: Split = "test",
+    seed: int = 0,
     lpips: bool = False,
     device: Device = "cpu",
     threads: int = 0,
@@ -40,18 +48,21 @@ def evaluate(
 ) -> Evaluation:
     """Take the same pictures of two scenes, and compare them with the photographs, if there are any, and each other.
 
+    Cameras drawn over the whole scene (:func:`kissgs.evaluation.cameras.evaluation_views`) judge where no views are
+    given. Where some are, the drawn ones judge beside them: they are the ``surroundings`` of the result.
+
     The pictures of one view are in memory at a time. They are clamped to [0, 1] and not rounded to 8 bits.
 
     Args:
         reference: the scene as it was; cleaned first, as is the candidate.
         candidate: what became of it. Gaussians need not be as many, nor in the same order.
-        views: from where; by default virtual cameras around the reference. Without photographs, the candidate is
-            compared with the reference's renderings alone.
-        split: the views to use. Where "test" has none, it is "train", which the result says.
+        views: from where. Without photographs, the candidate is compared with the reference's renderings alone.
+        split: the part of these views to use. Where "test" has none, it is "train", which the result says.
+        seed: of the drawn cameras; another one, other cameras.
         lpips: compute LPIPS too, which needs the extra ``kissgs[lpips]``.
         device: ``"cuda"`` needs the extra ``kissgs[cuda]``.
         threads: of the processor; 0 means one each. The figures do not depend on it.
-        progress: receives the stages ``"kernels"``, ``"cameras"`` (of virtual ones) and ``"evaluate"``.
+        progress: receives the stages ``"kernels"``, ``"cameras"`` (of those that are drawn) and ``"evaluate"``.
 
     Raises:
         InvalidViewsError: there is no view to use; some of them have photographs and some have not; a photograph
@@ -60,44 +71,113 @@ def evaluate(
     """
     reference, candidate = clean(reference)[0], clean(candidate)[0]
     measure = _measure(lpips, device)
-    if device == "cpu" or views is None:
-        load_kernels(progress)
-    if views is None:
-        from kissgs.views.virtual import virtual_views
-
-        views = virtual_views(reference, threads=threads, progress=progress)
-    used, chosen = _views_to_use(views, split)
-    photographed = _have_photos(chosen)
-    compared, blank = [], len(reference) > 0
-    for done, view in enumerate(chosen):
-        progress("evaluate", done / len(chosen))
-        scenes = (reference, candidate)
-        pictures = [take_picture(scene, view.camera, views.background, device, threads) for scene in scenes]
-        blank = blank and bool((pictures[0] == np.clip(views.background, 0, 1)).all())
-        photo = view.load_photo() if photographed else None
-        compared.append(ViewComparison(view=view, comparison=_compare(pictures[0], pictures[1], photo, measure)))
+    given = [] if views is None else [_chosen(views, split)]
+    load_kernels(progress)
+    drawn = evaluation_views(reference, seed=seed, threads=threads, progress=progress)
+    parts = [*given, _chosen(drawn, "all")]
+    total, done, found = sum(len(part.views) for part in parts), 0, list[Evaluation]()
+    for part in parts:
+        begin, share = done / total, len(part.views) / total
+        told = _compare_all(
+            *(reference, candidate, part, measure, device, threads),
+            progress=lambda stage, fraction, begin=begin, share=share: progress(stage, begin + share * fraction),
+        )
+        shown = share_shown(reference, [view.camera for view in part.views], threads=threads)
+        found.append(replace(told, shown=shown))
+        done += len(part.views)
     progress("evaluate", 1.0)
+    return found[0] if len(found) == 1 else replace(found[0], surroundings=found[1])
+
+
+def compare_pictures(
+    reference: Splats,
+    candidate: Splats,
+    views: Views,
+    *,
+    device: Device = "cpu",
+    threads: int = 0,
+    taken: dict[str, Picture] | None = None,
+    progress: Progress = silent,
+) -> Evaluation:
+    """As :func:`evaluate` from these views alone: held-out ones, or where none is held out, those for training.
+
+    Args:
+        reference: the scene as it was.
+        candidate: what became of it.
+        views: from where.
+        device: as for :func:`evaluate`, as are the following and the errors.
+        threads: of the processor.
+        taken: pictures of the reference by the names of the views, for those who compare many candidates with it:
+            they are taken from there, or put there.
+        progress: receives the stages ``"kernels"`` and ``"evaluate"``.
+    """
+    reference, candidate = clean(reference)[0], clean(candidate)[0]
+    part = _chosen(views, "test")
+    if device == "cpu":
+        load_kernels(progress)
+    measure = _measure(False, device)
+    found = _compare_all(reference, candidate, part, measure, device, threads, taken, progress=progress)
+    progress("evaluate", 1.0)
+    return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Part:
+    """Views to compare from: those of one split."""
+
+    of: Views
+    split: Split
+    views: tuple[View, ...]
+    photographed: bool
+
+
+def _compare_all(
+    reference: Splats,
+    candidate: Splats,
+    part: _Part,
+    measure: Measure,
+    device: Device,
+    threads: int,
+    taken: dict[str, Picture] | None = None,
+    *,
+    progress: Progress,
+) -> Evaluation:
+    """View by view; both scenes are clean."""
+    compared, blank = [], len(reference) > 0
+    for done, view in enumerate(part.views):
+        progress("evaluate", done / len(part.views))
+        background = over(view, part.of.background)
+        known = None if taken is None else taken.get(view.name)
+        picture = take_picture(reference, view.camera, background, device, threads) if known is None else known
+        if taken is not None:
+            taken[view.name] = picture
+        other = take_picture(candidate, view.camera, background, device, threads)
+        blank = blank and bool((picture == np.clip(background, 0, 1)).all())
+        photo = view.load_photo() if part.photographed else None
+        compared.append(ViewComparison(view=view, comparison=_compare(picture, other, photo, measure)))
     return Evaluation(
-        against="photos" if photographed else "renderings",
-        split=used,
-        source=views.source,
-        background=views.background,
+        against="photos" if part.photographed else "renderings",
+        split=part.split,
+        source=part.of.source,
+        background=part.of.background,
         reference_count=len(reference),
         candidate_count=len(candidate),
         views=tuple(compared),
-        note="; ".join(filter(None, [views.note, NOTHING_SEEN if blank else ""])),
+        note="; ".join(filter(None, [part.of.note, NOTHING_SEEN if blank else ""])),
     )
+
+
+def over(view: View, otherwise: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, "3"]:
+    """The background over which to render for a view: its own, or where it has none, that of all views."""
+    return otherwise if view.background is None else view.background
 
 
 def take_picture(
     splats: Splats, camera: Camera, background: Float32[np.ndarray, "3"], device: Device, threads: int
-) -> Float32[np.ndarray, "H W 3"]:
+) -> Picture:
     """What a screen would show: clamped to [0, 1]."""
     image, _ = render(splats, camera, background=background.tolist(), threads=threads, device=device)
     return np.clip(image, 0, 1)
-
-
-Measure = Callable[[np.ndarray, np.ndarray], Likeness]
 
 
 def _measure(lpips: bool, device: Device) -> Measure:
@@ -110,7 +190,7 @@ def _measure(lpips: bool, device: Device) -> Measure:
     return measure
 
 
-def _views_to_use(views: Views, split: str) -> tuple[Split, tuple[View, ...]]:
+def _chosen(views: Views, split: str) -> _Part:
     """The views of a split, and which that is: where "test" is empty, "train"."""
     parts = {
         "test": views.test,
@@ -122,7 +202,7 @@ def _views_to_use(views: Views, split: str) -> tuple[Split, tuple[View, ...]]:
         raise UnsupportedError(f"there is no split {split!r}; choose test, train or all")
     if not parts[used]:
         raise InvalidViewsError(f"there is no view to evaluate from: the split {used!r} of {views.source} is empty")
-    return cast(Split, used), parts[used]
+    return _Part(views, cast(Split, used), parts[used], _have_photos(parts[used]))
 
 
 def _compare(

@@ -66,12 +66,12 @@ def look(path: Path) -> tuple[bool, bool]:
         OutputError: there is no folder to put it in, or no file system would take the name.
     """
     try:
-        path.lstat()
-    except FileNotFoundError:
-        pass
+        present, folder, above = False, path.is_dir(), path.absolute().parent.is_dir()
+        with contextlib.suppress(FileNotFoundError):
+            path.lstat()
+            present = True  # even if it is a link that leads nowhere
     except (OSError, ValueError) as error:
         raise OutputError(f"cannot write {path!s:.100}: {reason_of(error)}") from error
-    present, folder, above = path.exists(), path.is_dir(), path.absolute().parent.is_dir()
     if not above:
         raise OutputError(f"cannot write {path}: there is no folder {path.parent}")
     return present, folder

@@ -11,18 +11,19 @@ import numpy as np
 
 from kissgs.errors import OutputError
 from kissgs.importance import Importance
-from kissgs.io.atomic import atomic_file, reason_of
+from kissgs.io.atomic import atomic_file, reason_of, refuse_existing
 
 
 def read_importance(path: Path, key: str) -> Importance | None:
     """What :func:`write_importance` kept under ``key``; None where there is no file, or one with another key.
 
     Raises:
-        OutputError: there is something else, which must not be written over.
+        OutputError: there is something else, which must not be written over, or nothing can be kept there.
     """
-    if not path.exists():
-        return None
+    refuse_existing(path, overwrite=True)  # rather now than after what is kept there has been measured
     try:
+        if not path.exists():
+            return None
         with path.open("rb") as file, np.load(file, allow_pickle=False) as kept:
             if str(kept["key"]) != key:
                 return None

@@ -162,8 +162,12 @@ def _read_header(file: io.BufferedIOBase, name: str) -> Header:
                 continue
             case [] | ["comment" | "obj_info", *_]:
                 continue
-            case ["format", ("ascii" | "binary_little_endian" | "binary_big_endian") as encoding, *_]:
-                continue
+            case ["format", ("ascii" | "binary_little_endian" | "binary_big_endian") as named, *_]:
+                if encoding not in (None, named):
+                    raise InvalidSceneError(
+                        f"{where}: the format is {named}, and before it was {encoding}; delete the line that is wrong"
+                    )
+                encoding = named
             case ["format", other, *_]:
                 raise InvalidSceneError(
                     f"{where}: unknown format {_quote(other)}; it is ascii, binary_little_endian or binary_big_endian"

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kissgs._typing import Float32, Float64
+from kissgs._typing import Float32
 from kissgs.errors import InvalidViewsError
 from kissgs.importance import LARGEST, OPACITY, ROTATION, SCALES, Importance
 from kissgs.parallel import Workers
 from kissgs.progress import Progress, silent
 from kissgs.rendering.camera import Camera
-from kissgs.rendering.semantics import NEAR
+from kissgs.rendering.coverage import Coverage
 from kissgs.splats import Splats
 
 
@@ -27,6 +27,7 @@ class Watch:
         weights: of each, positive; they need not sum to 1.
         background: ``(3,)`` red, green, blue.
         spread: standard deviation of each channel of the background: how little is known of it.
+        captured: how many of the cameras, the first ones, are a capture's.
 
     Raises:
         InvalidViewsError: no camera; not as many weights as cameras; a weight or the spread is negative or not finite.
@@ -36,6 +37,7 @@ class Watch:
     weights: Sequence[float]
     background: Float32[np.ndarray, "3"]
     spread: float = 0.25
+    captured: int = 0
 
     def __post_init__(self) -> None:
         if not self.cameras or len(self.cameras) != len(self.weights):
@@ -65,8 +67,8 @@ def measure_importance(
     Args:
         splats: finite (:func:`kissgs.clean`).
         watch: at least one camera.
-        hedge: from 0 to 1, share of a guess to add for cameras that are not among them
-            (:meth:`kissgs.Importance.hedged`).
+        hedge: from 0 to 1, how far to move towards a prior for cameras that are not among them
+            (:meth:`kissgs.Importance.with_prior`).
         threads: 0 means one per processor; the result does not depend on it.
         progress: receives the stage ``"importance"``.
 
@@ -76,18 +78,24 @@ def measure_importance(
     from kissgs.rendering.cpu.frame import add_sensitivities, draw
 
     found = Importance.none(len(splats), splats.sh_degree)
+    coverage, captured = Coverage(splats), np.zeros(len(splats))
     with Workers(threads) as pool:
         for done, (camera, weight) in enumerate(zip(watch.cameras, watch.per_pixel(), strict=True)):
             progress("importance", done / len(watch.cameras))
+            before = found.colors.copy()
             add_sensitivities(draw(splats, camera, watch.background, pool), weight, watch.spread, found, pool)
+            coverage.add(camera, np.maximum(found.colors - before, 0) / weight)
+            if done < watch.captured:
+                captured = coverage.share.copy()
     _bound(found.places, (0, 3, 5))
     _bound(found.shapes, OPACITY + SCALES + ROTATION)
     np.nan_to_num(found.colors, copy=False, nan=LARGEST, posinf=LARGEST)
     np.nan_to_num(found.directions, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
     seen = found.colors > 0
     found.directions[seen] /= found.colors[seen, None]
+    found.captured[:] = captured if hedge else 1.0  # where nothing is hedged, these cameras are all that matters
     progress("importance", 1.0)
-    return found.hedged(splats, _exposed(splats, watch), hedge)
+    return found.with_prior(splats, coverage.close_up, coverage.share, hedge)
 
 
 def _bound(forms: Float32[np.ndarray, "N n"], diagonal: tuple[int, ...]) -> None:
@@ -96,16 +104,3 @@ def _bound(forms: Float32[np.ndarray, "N n"], diagonal: tuple[int, ...]) -> None
     kept = np.nan_to_num(forms[wild][:, diagonal], nan=LARGEST)
     forms[wild] = 0
     forms[np.ix_(wild, diagonal)] = np.minimum(kept, LARGEST)
-
-
-def _exposed(splats: Splats, watch: Watch) -> Float64[np.ndarray, " N"]:
-    """Mean of (alpha)² in the pictures, if nothing were before each Gaussian and all were in the picture."""
-    size = np.exp(np.sort(splats.scales, axis=1)[:, 1:].astype(np.float64))
-    opacity = 1 / (1 + np.exp(-splats.opacities.astype(np.float64)))
-    total = np.zeros(len(splats))
-    for camera, weight in zip(watch.cameras, watch.per_pixel(), strict=True):
-        distance = np.linalg.norm(splats.means - camera.position, axis=1)
-        pixels = np.sqrt(camera.K[0, 0] * camera.K[1, 1]) / np.maximum(distance, NEAR)
-        area = np.pi * (size[:, 0] * pixels) * (size[:, 1] * pixels)  # of a squared Gaussian
-        total += weight * np.minimum(area + 1, camera.width * camera.height)
-    return opacity**2 * total

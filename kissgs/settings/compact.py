@@ -19,7 +19,8 @@ class CompactSettings(SchoolSettings):
         gt=0,
         le=20,
         description="Keep as few as are found whose pictures from held-out views lose at most so many decibels. "
-        "Takes several compactions. Without photographs, as if the scene were 30 dB from them.",
+        "Takes several compactions. Without photographs, from where 'evaluate' looks, and as if the scene were 30 dB "
+        "from them.",
     )
     by_goal: bool = Field(
         False,
@@ -84,7 +85,8 @@ class CompactSettings(SchoolSettings):
         384,
         ge=1,
         le=10_000,
-        description="Virtual views where there is no capture to learn from, an eighth of them held out; every fourth "
+        description="Virtual views where there is no capture to learn from, up to four times as many for a scene of "
+        "several objects, an eighth of them held out; every fourth "
         "of the rest scores. Without training a quarter of them, and all score. Their sides are three fifths of "
         "view_size.",
     )

@@ -37,7 +37,7 @@ class EncodeSettings(BaseModel):
         "codebook size and precision then follow from fidelity, and settings of even steps are refused.",
     )
     fidelity: Annotated[float, Field(ge=-30, le=30)] = Field(
-        0.2, description="Where bits are weighed: decibels above the paper's own settings on the same scene, about."
+        0.0, description="Where bits are weighed: decibels above the paper's own settings on the same scene, about."
     )
     price: float | None = Field(
         None,
@@ -63,7 +63,8 @@ class EncodeSettings(BaseModel):
         gt=0,
         le=20,
         description="Where bits are weighed: search for the smallest container whose pictures from held-out views lose "
-        "at most so many decibels. Takes a few encodings. Without photographs, as if the scene were 30 dB from them.",
+        "at most so many decibels. Takes a few encodings. Without photographs, from where 'evaluate' looks, and as if "
+        "the scene were 30 dB from them.",
     )
     attempts: int = Field(
         10,
@@ -73,11 +74,12 @@ class EncodeSettings(BaseModel):
         "more than four, come on top, and the finest or coarsest of all where several have missed it.",
     )
     drop: float = Field(
-        10.0,
+        18.0,
         ge=0,
         le=200,
-        description="Where bits are weighed: leave out Gaussians that show less than so many bits are worth. A "
-        "Gaussian takes some 60; beyond 30, holes that they leave together begin to show.",
+        description="Where bits are weighed: leave out Gaussians that show less than so many bits are worth, fewer "
+        "bits the larger hedge is. A Gaussian takes some 60; beyond 30, holes that they leave together begin to show. "
+        "At the default quality none is left out that no camera looked at from nearby.",
     )
     classes: int = Field(
         3,
@@ -96,14 +98,21 @@ class EncodeSettings(BaseModel):
         description="Where bits are weighed by a capture's cameras: steps of fitting base colours to its pictures, to "
         "make up for all other losses.",
     )
-    views: int = Field(48, ge=1, le=1000, description="Where bits are weighed: how many pictures to take, at most.")
+    views: int = Field(
+        48,
+        ge=1,
+        le=1000,
+        description="Where bits are weighed: how many pictures to take of the scene, or of the capture's cameras at "
+        "most; to the latter come two thirds as many from virtual cameras.",
+    )
     view_size: int = Field(480, ge=16, le=4096, description="Longer side of these pictures, pixels, at most.")
     hedge: float | None = Field(
         None,
         ge=0,
         le=1,
-        description="Where bits are weighed: how little these pictures are taken to say of others, 0 to 1; auto: 0.1 "
-        "with a capture's cameras, 0.55 without.",
+        description="Where bits are weighed: how far importance moves towards what a camera nearby would find, 0 to 1: "
+        "0 counts these pictures alone. What none of them looked at from nearby moves farther. The larger it is, up to "
+        "0.55, the smaller are the largest changes by rounding. auto: 0.1 with a capture's cameras, 0.55 without.",
     )
     order: Literal["hilbert", "plas"] = Field(
         "hilbert",

@@ -26,7 +26,7 @@ ENCODE: dict[Preset, dict[str, Any]] = {
         "webp_method": 2,
     },
     Preset.BALANCED: {},
-    Preset.SMALL: {"fidelity": 0.0, "drop": 18, "refit": 4, "sh_rounds": 8, "sh_reach": 32, "plas_decay": 0.9},
+    Preset.SMALL: {"fidelity": -0.4, "refit": 4, "sh_rounds": 8, "sh_reach": 32, "plas_decay": 0.9},
     Preset.PAPER: {
         "weigh": False,
         "order": "plas",

@@ -22,7 +22,8 @@ class SchoolSettings(BaseModel):
         384,
         ge=1,
         le=10_000,
-        description="Virtual views where there is no capture to learn from, an eighth of them held out. Their sides "
+        description="Virtual views where there is no capture to learn from, up to four times as many for a scene of "
+        "several objects, an eighth of them held out. Their sides "
         "are three fifths of view_size.",
     )
     view_size: int = Field(640, ge=16, le=8192, description="Longer side of pictures to learn from, pixels, at most.")

@@ -29,6 +29,7 @@ class Choice:
             entries).
         costs: of one unit in each attribute, ``(M,)`` each; None where bits were not weighed.
         price: of a bit, squared error; None where bits were not weighed.
+        note: a sentence for people about Gaussians that were left out, if these are many; or empty.
     """
 
     grid: Grid
@@ -40,3 +41,4 @@ class Choice:
     errors: dict[str, list[float]]
     costs: Costs | None = None
     price: float | None = None
+    note: str = ""

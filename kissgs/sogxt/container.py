@@ -10,7 +10,7 @@ import tempfile
 import zipfile
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import BinaryIO, Protocol, runtime_checkable
+from typing import BinaryIO, Literal, Protocol, runtime_checkable
 
 from kissgs.errors import InvalidContainerError, OutputError
 from kissgs.io.atomic import atomic_file, look, reason_of, refuse_existing, try_out, umask
@@ -18,6 +18,9 @@ from kissgs.sogxt.names import FILES
 
 MAX_ZIP_ENTRIES = 1000
 """A container has 12 files; people may add notes and previews, not thousands of entries."""
+
+
+ZIP_BEGINNINGS = (b"PK\x03\x04", b"PK\x05\x06")
 
 
 @runtime_checkable
@@ -85,6 +88,8 @@ class ZipSource:
     """Files in a zip, at its top or together in one folder of it. Nothing is ever extracted to disk."""
 
     def __init__(self, file: BinaryIO, label: str) -> None:
+        if kind_of(file) == "ply":
+            raise InvalidContainerError(f"{label} is a .ply, not a container; name what compress has made of it")
         try:
             self._zip = zipfile.ZipFile(file)
             entries = self._zip.infolist()
@@ -120,6 +125,16 @@ class ZipSource:
             raise InvalidContainerError(f"{name} cannot be read from the zip: it is damaged or encrypted") from error
         _check(name, True, len(data), limit)
         return data
+
+
+def kind_of(file: BinaryIO) -> Literal["ply", "zip"] | None:
+    """What a file is: a zip may have something before it, such as a program that unpacks it, and a ``.ply`` has not."""
+    file.seek(0)
+    head = file.read(4)
+    file.seek(0)
+    if head[:3] == b"ply" and head[3:].isspace():
+        return "ply"
+    return "zip" if head in ZIP_BEGINNINGS or zipfile.is_zipfile(file) else None
 
 
 @contextlib.contextmanager
@@ -206,9 +221,16 @@ def check_destination(path: Path, *, overwrite: bool, names: Collection[str] = F
     present, folder = look(path)
     if present and not overwrite:
         raise OutputError(f"{path} exists already; choose another name or allow overwriting (--force)")
-    if present and (not folder or {entry.name for entry in path.iterdir()} - set(names)):
+    if present and (not folder or _names_in(path) - set(names)):
         raise OutputError(f"{path} holds more than a container; name an empty or a new folder, or a .zip file")
     try_out(path)
+
+
+def _names_in(folder: Path) -> set[str]:
+    try:
+        return {entry.name for entry in folder.iterdir()}
+    except OSError as error:
+        raise OutputError(f"cannot look into {folder}: {reason_of(error)}") from error
 
 
 def _write_directory(files: Mapping[str, bytes], path: Path) -> None:

@@ -8,12 +8,15 @@ finest class', so that the decoder need not know of them. WebP's entropy codes, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from kissgs._typing import Bool, Float64, Int
+from kissgs._typing import Bool, Float32, Float64, Int
 from kissgs.importance import OPACITY, ROTATION, SCALES, Importance
+from kissgs.settings import EncodeSettings
+from kissgs.sogxt.quantize import means_bits, signed_log
 from kissgs.splats import Splats
 
 FLOOR = 1e-3
@@ -57,6 +60,7 @@ class Costs:
         color: of ``sh0``.
         place: of the signed logarithm of a coordinate.
         removal: of leaving it out.
+        coverage: from 0, unseen, to 1, looked at from nearby.
     """
 
     opacity: Float64[np.ndarray, " M"]
@@ -65,6 +69,7 @@ class Costs:
     color: Float64[np.ndarray, " M"]
     place: Float64[np.ndarray, " M"]
     removal: Float64[np.ndarray, " M"]
+    coverage: Float64[np.ndarray, " M"]
 
     @classmethod
     def of(cls, importance: Importance, splats: Splats) -> Costs:
@@ -77,27 +82,53 @@ class Costs:
             color=_floored(importance.base_colors()),
             place=_floored((importance.places[:, [0, 3, 5]] * reach).mean(axis=1)),
             removal=importance.removal(splats),
+            coverage=importance.coverage.astype(np.float64),
         )
 
     def take(self, chosen: Int[np.ndarray, " k"]) -> Costs:
         """Those of the Gaussians ``chosen`` alone."""
         return Costs(**{name: getattr(self, name)[chosen] for name in Costs.__slots__})
 
-    def classes(self, number: int) -> Int[np.ndarray, " M"]:
-        """Class of each, from 0, the most important; all of about the same size, and none empty."""
+    def classes(self, number: int, means: Float32[np.ndarray, "M 3"]) -> Int[np.ndarray, " M"]:
+        """Class of each, from 0, the most important; of about the same size, and none between them empty.
+
+        Gaussians in one place, by ``means``, are of one class: renderers blend them in the order in which they are
+        stored, and that is by class.
+        """
         worth = np.log(self.scale) + np.log(self.turn) + np.log(self.color)
         rank = np.empty(len(worth), np.int64)
         rank[np.argsort(-worth, kind="stable")] = np.arange(len(worth))
-        return rank * min(number, len(worth)) // max(len(worth), 1)
+        classes = rank * min(number, len(worth)) // max(len(worth), 1)
+        key = np.zeros(len(means), np.uint64)
+        for axis in (means + np.float32(0)).view(np.uint32).T:
+            key = (key ^ axis) * MIX
+        _, place = np.unique(key, return_inverse=True)
+        first = np.full(len(means), number)
+        np.minimum.at(first, place, classes)
+        return np.unique(first[place], return_inverse=True)[1]
 
-    def negligible(self, price: float, drop: float) -> Bool[np.ndarray, " M"]:
-        """Whose removal costs less than ``drop`` bits; never more than :data:`MOST_DROPPED` of all."""
-        worthless = self.removal < drop * price
+    def negligible(self, price: float, drop: float, usual: float | None = None) -> Bool[np.ndarray, " M"]:
+        """Whose removal costs less than ``drop`` bits; never more than :data:`MOST_DROPPED` of all.
+
+        Args:
+            price: squared error per bit.
+            drop: bits.
+            usual: price at which the scene keeps its default quality. Up to that, nothing goes that no camera has seen
+                from nearby, and little of it beyond; None counts the seen and the unseen alike.
+        """
+        unseen = 0.0 if usual is None else min(usual, price) * (self.coverage < SEEN)
+        worthless = self.removal < drop * (price - unseen)
         most = int(MOST_DROPPED * len(worthless))
         if int(worthless.sum()) > most:
-            worthless[np.argsort(self.removal, kind="stable")[most:]] = False
+            worthless[np.argsort(np.where(worthless, self.removal, np.inf), kind="stable")[most:]] = False
         return worthless
 
+
+MIX = np.uint64(0x9E3779B97F4A7C15)
+"""Odd, with bits at random: spreads a hash of places."""
+
+SEEN = 0.1
+"""Coverage below which a Gaussian was not seen, or from far away only."""
 
 MOST_DROPPED = 0.5
 """Share of the Gaussians. What is removed is no longer there to hide what else is: scores hold for few of them."""
@@ -140,22 +171,47 @@ class Gloss:
         return round(float(np.exp(low)))
 
 
-def paper_error(costs: Costs, splats: Splats, kept: Int[np.ndarray, " M"], gloss: Gloss) -> float:
-    """About the mean squared error at which the paper's own settings would leave the ``M`` Gaussians ``kept``.
+def default_error(costs: Costs, splats: Splats, kept: Int[np.ndarray, " M"], gloss: Gloss) -> float:
+    """Mean squared error to aim at: about that of the paper's own settings, or of ``fast`` where that is less.
 
-    100 levels for rotations, 256 for the rest and 65,536 for positions, spread from each channel's least to its largest
-    value; a codebook of an entry for 8 Gaussians.
+    The paper's 100 levels for rotations, 256 for the rest and 65,536 for positions are spread from each channel's least
+    to its largest value, so that a single outlier spoils them; the steps of ``fast`` are absolute.
+
+    Args:
+        costs: of all Gaussians of ``kept``, ``(M,)``.
+        splats: the scene.
+        kept: the ``M`` Gaussians that a renderer draws.
+        gloss: error of the view-dependent colour, by codebook size.
     """
-    means = splats.means[kept].astype(np.float64)
-    steps = (
-        (costs.opacity, np.ptp(splats.opacities[kept]), 255),
-        (costs.scale, np.ptp(splats.scales[kept], axis=0), 255),
-        (costs.turn, np.full(3, 4.0), 99),  # a quaternion's change of 1 turns by 2; its components reach from -1 to 1
-        (costs.color, np.ptp(splats.sh0[kept], axis=0), 255),
-        (costs.place, np.ptp(np.sign(means) * np.log1p(np.abs(means)), axis=0), 65535),
+    spans = [np.ptp(getattr(splats, name)[kept].astype(np.float64), axis=0) for name in ("opacities", "scales", "sh0")]
+    opacity, scale, color = (span / 255 for span in spans)
+    log_extent = np.ptp(signed_log(splats.means[kept]), axis=0)
+    turns = np.full(3, 2.0)  # a quaternion's change of 1 turns by 2
+    paper = (opacity, scale, turns * 2 / 99, color, log_extent / 65535)
+    defaults = {name: field.default for name, field in EncodeSettings.model_fields.items()}
+    levels = 2 ** means_bits(splats, kept, defaults["means_tolerance"]) - 1
+    fast = (
+        np.float64(defaults["opacity_step"]),
+        np.full(3, defaults["scale_step"]),
+        turns * defaults["quat_step"],
+        np.full(3, defaults["sh0_step"]),
+        log_extent / levels,
     )
-    total = sum(float(cost.sum()) * float(np.sum((np.float64(extent) / top) ** 2)) / 12 for cost, extent, top in steps)
-    entries = max(len(kept) / PAPER_RATIO, 1)
+    return min(_error(paper, PAPER_RATIO, costs, gloss), _error(fast, defaults["sh_ratio"], costs, gloss))
+
+
+def _error(steps: Sequence[np.ndarray | np.float64], ratio: float, costs: Costs, gloss: Gloss) -> float:
+    """About the mean squared error of rounding to such steps of opacity, scale, turn, colour and position.
+
+    Positions far from the origin may be as coarse as 16 bits let them be, whatever is spent: their error counts no more
+    than that of as many other numbers.
+    """
+    each = (costs.opacity, costs.scale, costs.turn, costs.color, costs.place)
+    squares = [float(np.sum(np.square(step, dtype=np.float64))) for step in steps]
+    terms = [float(cost.sum()) * square / 12 for cost, square in zip(each, squares, strict=True)]
+    total = sum(terms[:-1])
+    total += min(terms[-1], total * 3 / (DIMENSIONS - 3))
+    entries = max(len(costs.color) / ratio, 1)
     return total + PAPER_GLOSS * gloss.plain * (gloss.entries / entries) ** SH_SHRINK
 
 

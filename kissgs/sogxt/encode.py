@@ -41,6 +41,7 @@ class Encoded:
         errors: largest error of quantisation, per field and channel, see :class:`kissgs.sogxt.choice.Choice`.
         price: of a bit, squared error; None where bits were not weighed.
         codebook_side: of its image.
+        note: a sentence for people about Gaussians that were left out, if these are many; or empty.
     """
 
     files: dict[str, bytes]
@@ -52,6 +53,7 @@ class Encoded:
     errors: dict[str, list[float]]
     price: float | None
     codebook_side: int
+    note: str = ""
 
 
 def encode(
@@ -189,6 +191,7 @@ def write(
         errors=choice.errors,
         price=choice.price,
         codebook_side=choice.codebook.side,
+        note=choice.note,
     )
 
 

@@ -7,14 +7,16 @@ browsers read.
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
+from pydantic_core import PydanticCustomError
 
-from kissgs.sogxt.names import JSON_NAME
+from kissgs.sogxt.names import CHECKSUM, JSON_NAME
 from kissgs.sogxt.order import MAX_GRID_SIDE
 from kissgs.splats import SH_REST_COUNTS
 
@@ -25,7 +27,22 @@ MAX_CODEBOOK_SIDE = 256
 CHANNELS = {"opacities": 1, "means": 1, "scales": 3, "quaternions": 4, "f_dc": 3, "f_rest_centroids": 45}
 """Fields with a range, and how many numbers it has. One number stands as such, several as a list."""
 
-Limit = Annotated[FiniteFloat, Field(ge=-3.4028234e38, le=3.4028234e38)]
+CHECKED = ("f_dc", "opacities", "scales", "quaternions", "means", "f_rest_centroids")
+"""Order of the ranges in the checksum of the metadata."""
+
+BEYOND = 2.0**128 - 2.0**103
+"""The smallest number that rounds to no finite float32."""
+
+
+def _no_switch(value: Any) -> Any:  # noqa: ANN401
+    """Refuse true and false, which Python takes for numbers."""
+    if isinstance(value, bool):
+        raise PydanticCustomError("no_switch", "Input should be a valid number, not true or false")
+    return value
+
+
+Number = BeforeValidator(_no_switch)
+Limit = Annotated[FiniteFloat, Field(gt=-BEYOND, lt=BEYOND), Number]
 
 
 class Provenance(BaseModel):
@@ -33,8 +50,10 @@ class Provenance(BaseModel):
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
-    version: str = Field(pattern=r"^[\w.+-]{1,40}$", description="Version of kissgs that wrote the container.")
-    sh_degree: int = Field(ge=0, le=3, description="SH degree of the scene; coefficients of higher bands are zero.")
+    version: str = Field(pattern=r"^[A-Za-z0-9_.+-]{1,40}$", description="Version of kissgs that wrote the container.")
+    sh_degree: Annotated[int, Number] = Field(
+        ge=0, le=3, description="SH degree of the scene; coefficients of higher bands are zero."
+    )
     count: int = Field(ge=0, description="Number of Gaussians: active cells of the mask.")
     source_count: int = Field(ge=0, description="Number of Gaussians in the scene that was encoded.")
     changed: dict[str, int] = Field(default_factory=dict, description="Gaussians left out or mended, by reason.")
@@ -76,6 +95,7 @@ class ContainerMeta(BaseModel):
     meta: Sides
     ops: list[Op]
     kissgs: Provenance | None = None
+    kissgs_crc32: int | None = Field(None, ge=0, lt=1 << 32, description="CRC-32 of all numbers that decoding needs.")
 
 
 class Layout(BaseModel):
@@ -83,12 +103,12 @@ class Layout(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    grid_side: int = Field(ge=1, le=MAX_GRID_SIDE)
-    codebook_side: int = Field(ge=1, le=MAX_CODEBOOK_SIDE)
+    grid_side: Annotated[int, Number] = Field(ge=1, le=MAX_GRID_SIDE)
+    codebook_side: Annotated[int, Number] = Field(ge=1, le=MAX_CODEBOOK_SIDE)
     ranges: dict[str, tuple[list[Limit], list[Limit]]]
     count: int | None = Field(None, ge=0)
     provenance: Provenance | None = None
-    crc32: dict[str, int] = Field(default_factory=dict)
+    crc32: dict[str, Annotated[int, Field(ge=0, lt=1 << 32)]] = Field(default_factory=dict)
     """Of each image's pixels (:func:`kissgs.sogxt.planes.pixels_crc32`); in ``meta.json``, as the YAML has SHA-256."""
 
     def limits(self, field: str) -> tuple[np.ndarray, np.ndarray]:
@@ -105,9 +125,16 @@ class Layout(BaseModel):
         inferred = next(degree for degree, count in enumerate(SH_REST_COUNTS) if needed <= count)
         return max(inferred, self.provenance.sh_degree if self.provenance else 0)
 
+    @property
+    def checksum(self) -> int:
+        """CRC-32 of all numbers that decoding needs, as float64, little endian."""
+        sizes = [-1 if self.count is None else self.count, self.grid_side, self.codebook_side, self.sh_degree]
+        ends = [np.stack(self.limits(field), axis=1).ravel() for field in CHECKED]
+        return zlib.crc32(np.concatenate([sizes, *ends]).astype("<f8").tobytes())
+
     def to_yaml(self) -> bytes:
         """``container_meta.yaml``: ASCII, floats always with a point, so that YAML 1.1 readers see numbers."""
-        document = {
+        document: dict[str, Any] = {
             "meta": {
                 "grid_side": self.grid_side,
                 "f_rest_centroids_side": self.codebook_side,
@@ -123,6 +150,7 @@ class Layout(BaseModel):
         }
         if self.provenance:
             document["kissgs"] = self.provenance.model_dump()
+            document[CHECKSUM] = self.checksum
         dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
         return yaml.dump(document, Dumper=dumper, sort_keys=False, allow_unicode=False, width=120).encode("ascii")
 
@@ -160,6 +188,7 @@ class Layout(BaseModel):
         if self.provenance:
             made = self.provenance.model_dump(include={"version", "sh_degree"})
             document["kissgs"] = {**made, "crc32": self.crc32}
+            document[CHECKSUM] = self.checksum
         return json.dumps(document, separators=(",", ":"), allow_nan=False).encode("ascii")
 
     def _spelled(self, field: str, low: str, high: str) -> dict[str, float | list[float]]:

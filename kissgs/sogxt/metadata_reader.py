@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import yaml
@@ -12,8 +12,8 @@ from pydantic import ValidationError
 
 from kissgs.errors import InvalidContainerError, UnsupportedError
 from kissgs.sogxt.container import Source
-from kissgs.sogxt.metadata import CHANNELS, Layout
-from kissgs.sogxt.names import JSON_NAME, YAML_NAME
+from kissgs.sogxt.metadata import CHANNELS, TILE_COLUMNS, TILE_ROWS, Layout
+from kissgs.sogxt.names import CHECKSUM, JSON_NAME, YAML_NAME
 
 MAX_METADATA_BYTES = 1 << 20
 """The three metadata files have about 4 kB each."""
@@ -23,6 +23,9 @@ MAX_YAML_DEPTH = 50
 
 MAX_YAML_ALIASES = 20
 """Dumpers write one where two fields share a list; a few thousand would take hours to follow."""
+
+ABSENT = object()
+"""Stands for a checksum that nobody wrote: other encoders, and kissgs before it had one."""
 
 MAX_SIGNED_LOG = 88.7
 """e to more than this is beyond float32."""
@@ -36,19 +39,20 @@ def read_layout(source: Source) -> Layout:
         UnsupportedError: its images are not WebP.
     """
     names = source.names()
-    if YAML_NAME in names:
-        raw = _from_yaml(source.read(YAML_NAME, MAX_METADATA_BYTES))
-        name = YAML_NAME
-    elif JSON_NAME in names:
-        raw = _from_json(source.read(JSON_NAME, MAX_METADATA_BYTES))
-        name = JSON_NAME
-    else:
+    name = next((name for name in (YAML_NAME, JSON_NAME) if name in names), None)
+    if name is None:
         raise InvalidContainerError(f"this is no SOG-XT container: it has neither {YAML_NAME} nor {JSON_NAME}")
+    read = _from_yaml if name == YAML_NAME else _from_json
+    raw = read(source.read(name, MAX_METADATA_BYTES))
+    checksum = raw.pop(CHECKSUM)
     try:
-        layout = Layout.model_validate(raw)
+        # Numbers as text occur in YAML, whose dumpers write some so; in JSON they are refused, as browsers do.
+        layout = Layout.model_validate(raw, strict=name == JSON_NAME)
     except ValidationError as error:
         raise InvalidContainerError(f"{name}: {_first_problem(error)}") from error
     _check_ranges(layout, name)
+    if checksum is not ABSENT and checksum != layout.checksum:
+        raise InvalidContainerError(f"{name} is damaged: its numbers do not give its {CHECKSUM}; copy it again")
     return layout
 
 
@@ -88,6 +92,7 @@ def _from_yaml(data: bytes) -> dict[str, Any]:
         "codebook_side": sides.get("f_rest_centroids_side"),
         "ranges": ranges,
         "provenance": made,
+        CHECKSUM: document.get(CHECKSUM, ABSENT),
     }
 
 
@@ -117,9 +122,13 @@ def _ranges_of(op: Mapping[str, Any]) -> Iterator[tuple[str, tuple[list[Any], li
 
 
 def _from_json(data: bytes) -> dict[str, Any]:
-    """The fields of :class:`Layout` out of ``meta.json``."""
+    """The fields of :class:`Layout` out of ``meta.json``: what ``web_decoder/scene.js`` takes, and nothing else."""
     try:
-        document = json.loads(data)
+        # Every number becomes a float64, as in browsers; NaN and Infinity are not JSON.
+        document = json.loads(data.decode("utf-8-sig"), parse_int=float, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        raise InvalidContainerError(f"{JSON_NAME} is not readable JSON") from error
+    try:
         _check_dialect(document)
         keys = {"opacities": "opacities", "means": "means", "scales": "scales", "quats": "quaternions", "sh0": "f_dc"}
         ranges = {
@@ -128,33 +137,53 @@ def _from_json(data: bytes) -> dict[str, Any]:
         }
         rest = document["shN"]
         ranges["f_rest_centroids"] = _spread(rest["centroidsMins"], 45), _spread(rest["centroidsMaxs"], 45)
-        files = document["mask"]["files"]
-        _require_webp(str(files[0]).rsplit(".", 1)[-1])
-        count, made = document["count"], document.get("kissgs")
-        return {
+        count = _whole(document["count"])
+        if count is None:
+            raise KeyError("count")
+        raw = {
             "count": count,
-            "grid_side": document["gridSide"],
-            "codebook_side": rest["centroidSide"],
+            "grid_side": _whole(document["gridSide"]),
+            "codebook_side": _whole(rest["centroidSide"]),
             "ranges": ranges,
-            "provenance": {"source_count": count, **made, "count": count} if isinstance(made, dict) else made,
-            "crc32": made.get("crc32", {}) if isinstance(made, dict) else {},
+            CHECKSUM: document.get(CHECKSUM, ABSENT),
         }
-    except (ValueError, RecursionError) as error:
-        raise InvalidContainerError(f"{JSON_NAME} is not readable JSON") from error
+        if "kissgs" in document:
+            made = document["kissgs"]
+            degree, checksums = _whole(made["sh_degree"]), made.get("crc32", {})
+            shared = {"count": count, "source_count": count}
+            raw["provenance"] = {"version": made["version"], "sh_degree": degree, **shared}
+            raw["crc32"] = {name: _whole(value) for name, value in checksums.items()}
+        return raw
     except (KeyError, TypeError, AttributeError, IndexError) as error:
         raise InvalidContainerError(f"{JSON_NAME} lacks something that a SOG-XT container has: {error}") from error
 
 
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not JSON")
+
+
+def _whole(value: Any) -> Any:  # noqa: ANN401
+    """A whole number as int; anything else as it is, for the check of types to refuse."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
 def _check_dialect(document: Mapping[str, Any]) -> None:
     """Refuse what would decode without complaint, and wrong."""
+    quats, rest, files = document["quats"], document["shN"], document["mask"]["files"]
     for name, found, known in (
         ("format", document.get("format", "sog-xt"), "sog-xt"),
         ("version", document.get("version", 3), 3),
-        ("quats.encoding", document["quats"].get("encoding", "direct"), "direct"),
-        ("shN.layout", document["shN"].get("layout", "uv-codebook"), "uv-codebook"),
+        ("quats.encoding", quats.get("encoding", "direct"), "direct"),
+        ("shN.layout", rest.get("layout", "uv-codebook"), "uv-codebook"),
+        ("shN.coeffs", rest.get("coeffs", 15), 15),
+        ("shN.tileRows", rest.get("tileRows", TILE_ROWS), TILE_ROWS),
+        ("shN.tileCols", rest.get("tileCols", TILE_COLUMNS), TILE_COLUMNS),
     ):
         if found != known:
-            raise UnsupportedError(f"{JSON_NAME}: {name} is {found!r}; only {known!r} is read")
+            raise UnsupportedError(f"{JSON_NAME}: {name} is {repr(_whole(found))[:80]}; only {known!r} is read")
+    if not isinstance(files, list):
+        raise TypeError("mask.files is no list")
+    _require_webp(files[0].rsplit(".", 1)[-1])
 
 
 def _require_webp(codec: object) -> None:
@@ -178,9 +207,9 @@ def _flat(values: Any) -> list[Any]:  # noqa: ANN401
 
 
 def _spread(values: Any, channels: int) -> list[Any]:  # noqa: ANN401
-    """As browsers do: a range of another length stands for all channels by its first number."""
-    flat = _flat(values)
-    return flat if len(flat) == channels else [flat[0]] * channels
+    """As browsers do: a number, or the first of a list of another length, stands for all channels."""
+    numbers = values if isinstance(values, list) else [values]
+    return numbers if len(numbers) == channels else numbers[:1] * channels
 
 
 def _first_problem(error: ValidationError) -> str:

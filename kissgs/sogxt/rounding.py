@@ -11,18 +11,49 @@ from math import ceil
 
 import numpy as np
 
-from kissgs._typing import Float32, Float64, Int, UInt8
+from kissgs._typing import Float, Float32, Float64, Int, UInt8
 from kissgs.parallel import Workers
 from kissgs.sogxt.economy import Costs, step
 from kissgs.sogxt.pras import PERMUTATIONS, ROTATIONS
 from kissgs.sogxt.quantize import Quantized
 
-COARSEST = {"opacities": 2.0, "scales": 0.6, "quaternions": 0.25, "f_dc": 0.5}
-"""Largest step of each attribute, whatever the price: the first derivative says nothing about larger errors."""
+UNSEEN = {"opacities": 0.15, "scales": 0.11, "growth": 0.11, "quaternions": 0.023, "f_dc": 0.055}
+VIRTUAL = {"opacities": 0.4, "scales": 0.13, "growth": 0.12, "quaternions": 0.08, "f_dc": 0.2}
+CAPTURED = {"opacities": 2.0, "scales": 0.6, "growth": 0.3, "quaternions": 0.25, "f_dc": 0.5}
+"""Largest step of each attribute and largest change by rounding, whatever the price.
 
-REACH = np.array([[2.0] + 3 * [0.6] + 4 * [0.25], [2.0] + 3 * [0.3] + 4 * [0.25]])
-"""How far below and above its value a level may be. A Gaussian smaller than a pixel has no derivative by its size, but
-becomes a blob elsewhere: so growth is held back most."""
+The first, the steps of ``fast``, are for Gaussians that no camera has looked at; the second for those that virtual
+cameras have, to which any other may come as near as it likes; the third for those that a capture has, which says who
+looks from where. The first derivative says nothing about larger errors; and a Gaussian smaller than a pixel has no
+derivative by its size, but becomes a blob elsewhere: so growth is held back most.
+"""
+
+RELAXED = 1 / 3
+"""Power of the coarseness asked for with which these bounds grow. Measured on cameras that the encoder did not use."""
+
+
+def largest_changes(
+    coverage: Float[np.ndarray, " M"], captured: Float[np.ndarray, " M"], slack: float
+) -> dict[str, Float64[np.ndarray, " M"]]:
+    """How far each attribute of each Gaussian may be rounded.
+
+    Steps in balance with a price grow as its root. These bounds grow less: they are there for cameras from which a
+    change shows more than it was found to cost, and fewer Gaussians or coarser colours are then the smaller loss.
+
+    Args:
+        coverage: from 0 to 1, see :class:`kissgs.Importance`.
+        captured: from 0 to ``coverage``, see the same.
+        slack: from 1, how many times coarser than by default the scene is to be.
+    """
+    looked, known = coverage.astype(np.float64), captured.astype(np.float64)
+    return {
+        name: np.minimum(
+            UNSEEN[name] ** (1 - looked) * VIRTUAL[name] ** (looked - known) * CAPTURED[name] ** known * slack**RELAXED,
+            CAPTURED[name],
+        )
+        for name in CAPTURED
+    }
+
 
 UNUSED = 0.05
 """Times that a level is taken to occur which does not."""
@@ -56,7 +87,7 @@ def quantize_by_class(
     cost: Float64[np.ndarray, " M"],
     classes: Int[np.ndarray, " M"],
     price: float,
-    coarsest: float,
+    coarsest: Float64[np.ndarray, " M"],
 ) -> Quantized:
     """Round to the nearest of the levels that each class of Gaussians uses.
 
@@ -65,7 +96,7 @@ def quantize_by_class(
         cost: of one unit, per Gaussian.
         classes: of each Gaussian, from 0.
         price: of a bit.
-        coarsest: largest step.
+        coarsest: largest step, per Gaussian.
 
     Returns:
         Levels from 0 to at most 255, of one step for all channels and classes.
@@ -73,12 +104,11 @@ def quantize_by_class(
     low32 = values.min(axis=0).astype(np.float32) + np.float32(0)
     low = low32.astype(np.float64)
     widest = float((values - low).max(initial=0))
-    steps = np.array(
-        [min(step(float(cost[classes == c].mean()), price), coarsest) for c in range(int(classes.max()) + 1)]
-    )
+    balanced = np.array([step(float(cost[classes == c].mean()), price) for c in range(int(classes.max()) + 1)])
+    steps = np.minimum(balanced[classes], coarsest)
     finest = max(float(steps.min()), widest / 255, 1e-30)
     top = int(min(max(ceil(widest / finest - 1e-3), 1), 255))
-    spacing = np.clip(np.rint(steps / finest), 1, 255)[classes]
+    spacing = np.clip(np.rint(steps / finest), 1, 255)
     multiples = spacing[:, None]
     levels = np.rint((values - low) / finest / multiples) * multiples
     levels = np.where(levels > top, np.floor(top / multiples) * multiples, levels)
@@ -95,6 +125,7 @@ def round_shapes(
     costs: Costs,
     classes: Int[np.ndarray, " M"],
     price: float,
+    largest: dict[str, Float64[np.ndarray, " M"]],
     pool: Workers,
 ) -> tuple[Quantized, Quantized, Quantized]:
     """Choose the levels of opacities, scales and quaternions together.
@@ -107,6 +138,7 @@ def round_shapes(
         costs: whose floors are kept.
         classes: of each Gaussian, from 0.
         price: of a bit.
+        largest: change of each attribute, see :func:`largest_changes`.
         pool: where the work runs.
     """
     from kissgs.sogxt import rounding_kernels
@@ -118,6 +150,10 @@ def round_shapes(
     steps = (high - low) / top
     top[steps <= 0] = 0  # a constant channel
     steps[steps <= 0] = 1.0
+    changes = [
+        np.stack([largest["opacities"], *3 * [largest[scales]], *4 * [largest["quaternions"]]], axis=1)
+        for scales in ("scales", "growth")
+    ]
     floor = np.array([float(cost.min(initial=np.inf)) for cost in (costs.opacity, costs.scale, costs.turn)])
 
     for _ in range(ROUNDS):
@@ -127,7 +163,9 @@ def round_shapes(
             rows = slice(first, first + CHUNK)
             rounding_kernels.round_shapes(
                 *(values[rows], shapes[rows], forms[rows], PERMUTATIONS, MIRRORS),
-                *(classes[rows], low, steps, top, charges, REACH, floor),
+                *(classes[rows], low, steps, top, charges),
+                np.stack([change[rows] for change in changes], axis=1),
+                floor,
                 SWEEPS,
                 levels[rows],
             )

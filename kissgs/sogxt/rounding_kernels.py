@@ -43,7 +43,7 @@ def _turns(w: float, x: float, y: float, z: float, moves: np.ndarray) -> None:
 
 @compiled(
     "void(float64[:, ::1], float32[:, ::1], uint8[::1], int64[:, ::1], float64[:, ::1], int64[::1],"
-    " float64[::1], float64[::1], int64[::1], float64[:, :, ::1], float64[:, ::1], float64[::1], int64,"
+    " float64[::1], float64[::1], int64[::1], float64[:, :, ::1], float64[:, :, ::1], float64[::1], int64,"
     " int64[:, ::1])"
 )
 def round_shapes(
@@ -77,7 +77,7 @@ def round_shapes(
         step: ``(8,)``.
         top: ``(8,)`` last level.
         charges: ``(classes, 8, 256)`` of each level: its bits times their price.
-        reach: ``(2, 8)`` how far below and above the value a level may be.
+        reach: ``(N, 2, 8)`` how far below and above the value a level may be.
         floor: ``(3,)`` added to the diagonal of the form: opacity, scales, rotation.
         sweeps: how often to go through the eight.
         levels: ``(N, 8)``; changed.
@@ -110,8 +110,8 @@ def round_shapes(
                         bend += moves[j, k] * across
                 bend = max(bend, 0.0)
                 here = (values[n, j] - low[j]) / step[j]
-                first = max(int(np.ceil(here - reach[0, j] / step[j])), 0)
-                last = min(int(np.floor(here + reach[1, j] / step[j])), top[j])
+                first = max(int(np.ceil(here - reach[n, 0, j] / step[j])), 0)
+                last = min(int(np.floor(here + reach[n, 1, j] / step[j])), top[j])
                 current = levels[n, j]
                 if first > last:
                     continue

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
-from kissgs._typing import Float32, Float64, Int
+from kissgs._typing import Bool, Float, Float32, Float64, Int
 from kissgs.importance import Importance
 from kissgs.parallel import Workers
 from kissgs.progress import Progress
 from kissgs.settings import EncodeSettings
 from kissgs.sogxt import kmeans
 from kissgs.sogxt.choice import Choice
-from kissgs.sogxt.codebook import COEFFICIENTS, Codebook, bounded, fit_codebook
-from kissgs.sogxt.economy import GLOSS, Costs, Gloss, paper_error, price_for, step
+from kissgs.sogxt.codebook import COEFFICIENTS, Codebook, bounded, fit_codebook, guessed_weights
+from kissgs.sogxt.economy import GLOSS, SEEN, Costs, Gloss, default_error, price_for, step
 from kissgs.sogxt.order import place
 from kissgs.sogxt.pras import choose_forms
-from kissgs.sogxt.quantize import MEANS_TOP, Quantized, quantize_means, signed_exp, signed_log, tame
-from kissgs.sogxt.rounding import COARSEST, quantize_by_class, round_shapes
+from kissgs.sogxt.quantize import MEANS_TOP, Quantized, means_bits, quantize_means, signed_exp, signed_log, tame
+from kissgs.sogxt.rounding import largest_changes, quantize_by_class, round_shapes
 from kissgs.splats import SH_C0, Splats
 
 Recolor = Callable[[Splats, Int[np.ndarray, " M"]], Float32[np.ndarray, "M 3"]]
@@ -27,13 +28,23 @@ Recolor = Callable[[Splats, Int[np.ndarray, " M"]], Float32[np.ndarray, "M 3"]]
 TRIAL, TRIAL_ENTRIES = 1 << 15, 1024
 """Gaussians, and entries of the codebook, from which the cost of gloss is told."""
 
-SH_HEDGE = 1.5
-"""Weights of the codebook are colours' importance to the power of 1 minus this times the hedge, and bounded:"""
+DISPLAYED = 3.0
+"""Largest squared error of a colour that a display can show, summed over RGB from 0 to 1."""
+
+MADE_UP = np.float32(0.5 / SH_C0)
+"""Largest change of a base colour for the sake of lost SH coefficients: half of a colour's range."""
+
+SH_HEDGE, SIZE_HEDGE = 0.55, 0.64
+"""Weights of the codebook are colours' importance to the power of 1 minus the first times the hedge, times what large
+and opaque Gaussians show anywhere (:func:`guessed_weights`) to the second times the hedge; and bounded:"""
 
 SH_WEIGHTS = (1e-2, 1e2)
 """in units of the median."""
 
 OUTLIERS = 1e-4
+
+MANY_DROPPED = 0.2
+"""Share of the Gaussians from which on the report says why they were left out."""
 
 REFIT_GAIN = 0.25
 """Decibels by a step of refitting base colours: less than what is measured on average, for the sake of the worst."""
@@ -51,15 +62,15 @@ def weigh(
     """Choose everything for the Gaussians ``kept``, at least one of which is seen."""
     progress("price", 0.0)
     costs, gloss = Costs.of(importance, splats).take(kept), _trial(splats, kept, importance, settings, pool)
-    drop, price = settings.drop * (1 - importance.hedge), settings.price
-    if price is None:
-        error = 10 ** (-settings.psnr / 10) if settings.psnr is not None else paper_error(costs, splats, kept, gloss)
-        gain = settings.fidelity if settings.psnr is None else 0.0
-        gain -= REFIT_GAIN * settings.refit if recolor is not None else 0.0
-        price = price_for(error * 10 ** (-gain / 10), costs, gloss, drop, settings.sh_ratio, importance.hedge)
-    worth = np.flatnonzero(~costs.negligible(price, drop))
+    drop = settings.drop * (1 - importance.hedge)
+    prices = _Prices(costs, gloss, drop, settings, importance.hedge, settings.refit if recolor is not None else 0)
+    price, usual_price = prices.wanted(default_error(costs, splats, kept, gloss))
+    slack = max(1.0, float(np.sqrt(price / usual_price)))
+    negligible = costs.negligible(price, drop, usual_price)
+    note = _why_dropped(negligible, costs)
+    worth = np.flatnonzero(~negligible)
     kept, costs = kept[worth], costs.take(worth)
-    classes = costs.classes(settings.classes)
+    classes = costs.classes(settings.classes, splats.means[kept])
     progress("order", 0.0)
     grid = place(splats.means, kept, 16, settings, pool, lambda fraction: progress("order", fraction), classes)
     order = grid.cells[grid.mask]
@@ -71,25 +82,29 @@ def weigh(
         splats, grid.cells, grid.side, settings, pool, lambda fraction: progress("forms", fraction)
     )
     quats, scales, forms = quats[grid.mask], scales[grid.mask], forms[grid.mask]
-    weights, size = _sh_weights(importance, order), gloss.best_size(price, len(order), settings.sh_ratio)
+    weights, size = _sh_weights(importance, order, splats), gloss.best_size(price, len(order), settings.sh_ratio)
     codebook = fit_codebook(shown, np.arange(len(order)), weights, size, settings, pool, progress)
     progress("rounding", 0.0)
     values = np.concatenate([shown.opacities[:, None], scales, quats], axis=1).astype(np.float64)
+    captured = importance.captured[order]
+    largest = largest_changes(importance.coverage[order], captured, slack)
     parts = (
-        quantize_by_class(values[:, :1], costs.opacity, classes, price, COARSEST["opacities"]),
-        quantize_by_class(values[:, 1:4], costs.scale, classes, price, COARSEST["scales"]),
-        quantize_by_class(values[:, 4:], 3 * costs.turn, classes, price, COARSEST["quaternions"]),
+        quantize_by_class(values[:, :1], costs.opacity, classes, price, largest["opacities"]),
+        quantize_by_class(values[:, 1:4], costs.scale, classes, price, largest["scales"]),
+        quantize_by_class(values[:, 4:], 3 * costs.turn, classes, price, largest["quaternions"]),
     )
     if settings.round_by_price:
-        parts = round_shapes(values, parts, importance.shapes[order], forms, costs, classes, price, pool)
+        parts = round_shapes(values, parts, importance.shapes[order], forms, costs, classes, price, largest, pool)
     fields = dict(zip(("opacities", "scales", "quaternions"), parts, strict=True))
-    fields["means"] = _means(shown.means, costs, classes, price)
+    coarser = np.rint(captured + np.log2(slack))
+    fields["means"] = _means(shown, costs, classes, price, settings.means_tolerance, coarser)
 
     rest = _gloss_of(codebook, shown)
-    base = shown.sh0 + np.einsum("nk,nkc->nc", importance.directions[order], shown.shN - rest) / np.float32(SH_C0)
+    made_up = np.einsum("nk,nkc->nc", importance.directions[order], shown.shN - rest) / np.float32(SH_C0)
+    base = shown.sh0 + np.clip(made_up, -MADE_UP, MADE_UP)
     if recolor is not None:
         base = recolor(_decoded(fields, base.astype(np.float32), rest), order)
-    fields["f_dc"], tamed = _colors(base.astype(np.float64), costs, classes, price)
+    fields["f_dc"], tamed = _colors(base.astype(np.float64), costs, classes, price, largest["f_dc"])
     wanted = {
         "means": signed_log(shown.means),
         "opacities": values[:, :1],
@@ -112,6 +127,45 @@ def weigh(
         errors={**errors, "f_rest_centroids": half.tolist()},
         costs=costs,
         price=price,
+        note=note,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Prices:
+    """Prices at which a scene is left at a given error."""
+
+    costs: Costs
+    gloss: Gloss
+    drop: float
+    settings: EncodeSettings
+    hedge: float
+    refits: int
+
+    def wanted(self, usual: float) -> tuple[float, float]:
+        """The price that the settings ask for, and that of default quality, whose mean squared error is ``usual``."""
+        by_default = self.leaving(usual, 0.0)
+        if self.settings.price is not None:
+            return self.settings.price, by_default
+        if self.settings.psnr is not None:
+            return self.leaving(10 ** (-self.settings.psnr / 10), 0.0), by_default
+        return self.leaving(usual, self.settings.fidelity), by_default
+
+    def leaving(self, error: float, fidelity: float) -> float:
+        """The price at which the mean squared error is about ``fidelity`` decibels less than ``error``."""
+        error *= 10 ** (-(fidelity - REFIT_GAIN * self.refits) / 10)
+        return price_for(error, self.costs, self.gloss, self.drop, self.settings.sh_ratio, self.hedge)
+
+
+def _why_dropped(negligible: Bool[np.ndarray, " M"], costs: Costs) -> str:
+    """A sentence about a drop of more than a fifth of the Gaussians, or nothing."""
+    count = int(negligible.sum())
+    if count <= MANY_DROPPED * len(negligible):
+        return ""
+    seen = float((costs.coverage[negligible] >= SEEN).mean())
+    return (
+        f"{count:,} of {len(negligible):,} Gaussians were left out because each shows less than its bytes are worth; "
+        f"{seen:.0%} of them were looked at from nearby (--set drop=0 keeps all)"
     )
 
 
@@ -127,7 +181,7 @@ def _trial(
     entries = min(TRIAL_ENTRIES, len(some) // 16)
     clusters = kmeans.fit(
         vectors,
-        _sh_weights(importance, some),
+        _sh_weights(importance, some, splats),
         entries,
         pool,
         seed=settings.seed,
@@ -137,36 +191,55 @@ def _trial(
         lattice=0.0,
     )
     squared = np.square(vectors - clusters.centroids[clusters.labels], dtype=np.float64).sum(axis=1)
+    squared = np.minimum(squared, DISPLAYED / GLOSS)
     colors = importance.colors[kept].astype(np.float64).sum() * GLOSS
     share = importance.colors[some].astype(np.float64)
     weighed = float(squared @ share / max(share.sum(), 1e-300) * colors)
     return Gloss(entries, weighed, float(squared.mean() * colors))
 
 
-def _sh_weights(importance: Importance, chosen: Int[np.ndarray, " M"]) -> Float32[np.ndarray, " M"]:
+def _sh_weights(importance: Importance, chosen: Int[np.ndarray, " M"], splats: Splats) -> Float32[np.ndarray, " M"]:
     """How much the gloss of each counts."""
-    power = max(1 - SH_HEDGE * importance.hedge, 0.0)
-    return bounded(importance.colors[chosen] ** np.float32(power), *SH_WEIGHTS)
+    power = np.float32(max(1 - SH_HEDGE * importance.hedge, 0.0))
+    sizes = guessed_weights(splats, SIZE_HEDGE * importance.hedge)[chosen]
+    return bounded(importance.colors[chosen] ** power * sizes, *SH_WEIGHTS)
 
 
-def _means(means: Float32[np.ndarray, "M 3"], costs: Costs, classes: Int[np.ndarray, " M"], price: float) -> Quantized:
-    """Positions, in each class as many bits as the price asks for."""
+def _means(
+    shown: Splats,
+    costs: Costs,
+    classes: Int[np.ndarray, " M"],
+    price: float,
+    tolerance: float,
+    coarser: Float[np.ndarray, " M"],
+) -> Quantized:
+    """Positions, in each class as many bits as the price asks for.
+
+    Each has at most its number in ``coarser`` less than the same step for all would give them, at which the median
+    Gaussian moves by ``tolerance`` of its size.
+    """
+    means = shown.means
+    most = np.clip(16 - means_bits(shown, np.arange(len(shown)), tolerance) + coarser, 0, 8)
     logs = signed_log(means)
     unit = max(float(np.ptp(logs)), 1e-30) / MEANS_TOP
     coarse = [
-        np.clip(np.floor(np.log2(step(float(costs.place[classes == c].mean()), price) / unit) + 0.5), 0, 8)
+        max(np.floor(np.log2(step(float(costs.place[classes == c].mean()), price) / unit) + 0.5), 0)
         for c in range(int(classes.max()) + 1)
     ]
-    return quantize_means(means, bits=16 - np.array(coarse, np.int64)[classes])
+    return quantize_means(means, bits=16 - np.minimum(np.array(coarse)[classes], most).astype(np.int64))
 
 
 def _colors(
-    base: Float64[np.ndarray, "M 3"], costs: Costs, classes: Int[np.ndarray, " M"], price: float
+    base: Float64[np.ndarray, "M 3"],
+    costs: Costs,
+    classes: Int[np.ndarray, " M"],
+    price: float,
+    coarsest: Float64[np.ndarray, " M"],
 ) -> tuple[Quantized, int]:
     """Base colours, and how many of them are outliers that were pulled in."""
     finest = min(step(float(costs.color[classes == c].mean()), price) for c in range(int(classes.max()) + 1))
     tamed = tame(base, step=finest, share=OUTLIERS)
-    levels = quantize_by_class(tamed, costs.color, classes, price, COARSEST["f_dc"])
+    levels = quantize_by_class(tamed, costs.color, classes, price, coarsest)
     return levels, int((tamed != base).any(axis=1).sum())
 
 

@@ -16,6 +16,9 @@ from kissgs.rendering.rasterizer import Device, render
 from kissgs.splats import Splats
 from kissgs.views.view import View
 
+AROUND, REACH = 4, 4.0
+"""Distances to this nearest camera that the cameras about a place extend, about."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lessons:
@@ -61,6 +64,23 @@ class Lessons:
         """
         places = np.array([camera.position for camera in self.cameras])
         return 1.1 * float(np.linalg.norm(places - places.mean(axis=0), axis=1).max())
+
+    def reach(self, means: Float32[np.ndarray, "N 3"], longest: float) -> Float32[np.ndarray, " N"]:
+        """Extent of the cameras about each of these places, ``(N,)``, world units, above 0 and at most ``longest``.
+
+        The cameras of a scene of several objects stand about each of them, so that their extent in all says nothing
+        about the size of one. Where all stand about one object, most places are given ``longest``.
+        """
+        places = np.array([camera.position for camera in self.cameras])
+        nearest = np.full((len(means), min(AROUND, len(places))), np.inf)
+        for place in places:
+            distance = np.linalg.norm(means - place, axis=1)
+            for rank in range(nearest.shape[1]):
+                nearest[:, rank], distance = (
+                    np.minimum(nearest[:, rank], distance),
+                    np.maximum(nearest[:, rank], distance),
+                )
+        return np.clip(REACH * nearest[:, -1], 1e-6 * longest, longest).astype(np.float32)
 
 
 def lessons(

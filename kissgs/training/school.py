@@ -12,8 +12,8 @@ from kissgs._typing import Float32
 from kissgs.progress import Progress, silent
 from kissgs.settings.school import SchoolSettings
 from kissgs.splats import Splats
+from kissgs.views.everywhere import scene_views
 from kissgs.views.view import View, Views
-from kissgs.views.virtual import virtual_views
 from kissgs.views.wander import wander
 
 SCORED = 4
@@ -33,6 +33,7 @@ class School:
         test: to judge by: held out, or where no view is, some of those to learn from. All have photographs, or none.
         background: ``(3,)`` RGB over which to render.
         source: for people.
+        captured: whether the views to learn from are those of a capture.
         note: a sentence for people about what they may not have expected, without a capital and a full stop; or none.
     """
 
@@ -41,6 +42,7 @@ class School:
     test: tuple[View, ...]
     background: Float32[np.ndarray, "3"]
     source: str
+    captured: bool = False
     note: str = ""
 
     @property
@@ -79,7 +81,7 @@ def school(
         camera = views.train[0].camera.at_most(size)
         side = round(math.sqrt(camera.width * camera.height))
         count = max(1, round(len(views.train) * settings.around / (1 - settings.around)))
-        around = virtual_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
+        around = scene_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
         train, source = (*train, *around.all), f"{source}, and {around.source}"
     sized = _sized(train, size)
     unheld = "" if views.test else "no view is held out: the figures are those of views that were learned from"
@@ -89,6 +91,7 @@ def school(
         test=_held_out(views, size),
         background=views.background,
         source=source,
+        captured=True,
         note="; ".join(filter(None, [views.note, unheld])),
     )
 

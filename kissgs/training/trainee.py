@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kissgs._typing import Int
+from kissgs._typing import Float32, Int
 from kissgs.rendering.differentiable import tensors_of
 from kissgs.rendering.rasterizer import Device
 from kissgs.splats import (
@@ -36,9 +36,13 @@ BOUNDS = {
 class Trainee:
     """The stored parameters of a scene as leaves of torch, and the Adam that moves them."""
 
-    def __init__(self, splats: Splats, device: Device = "cpu") -> None:
-        """``splats`` is copied; it must be clean."""
+    def __init__(self, splats: Splats, device: Device = "cpu", reach: Float32[np.ndarray, " N"] | None = None) -> None:
+        """``splats`` is copied; it must be clean.
+
+        ``reach`` is ``(N,)``, the length in which the learning rate of each Gaussian's position is given; by default 1.
+        """
         self._leaves = Leaves(tensors_of(splats, device))
+        self._reach = torch.from_numpy(np.ones(len(splats), np.float32) if reach is None else reach)[:, None].to(device)
 
     @property
     def parameters(self) -> dict[str, Tensor]:
@@ -58,14 +62,18 @@ class Trainee:
         What a stored scene cannot hold is kept out: values stay within the bounds of :func:`kissgs.splats.clean`, and
         a gradient that is no number counts as none.
         """
-        self._leaves.step(rates)
+        before = self.parameters["means"].detach().clone()
+        longest = float(self._reach.max()) if len(self) else 1.0
+        self._leaves.step({**rates, "means": rates["means"] * longest})
         with torch.no_grad():
+            self.parameters["means"].sub_(before).mul_(self._reach / longest).add_(before)
             for name, (least, most) in BOUNDS.items():
                 self.parameters[name].clamp_(least, most)
 
     def keep(self, index: Int[np.ndarray, " M"]) -> None:
         """Leave all but the Gaussians at ``index`` out; what Adam remembers of these stays with them."""
         self._leaves.keep(index)
+        self._reach = self._reach[torch.from_numpy(index).to(self._reach.device)]
 
     def splats(self) -> Splats:
         """A clean copy of the scene as it is now."""
@@ -77,8 +85,10 @@ class Trainee:
         return self._leaves.state()
 
     @classmethod
-    def restored(cls, state: Mapping[str, np.ndarray], device: Device = "cpu") -> Trainee:
-        """One that goes on exactly as the one whose :meth:`state` this was."""
-        trainee = cls(Splats(**{name: state[name] for name in ATTRIBUTES}), device)
+    def restored(
+        cls, state: Mapping[str, np.ndarray], device: Device = "cpu", reach: Float32[np.ndarray, " N"] | None = None
+    ) -> Trainee:
+        """One that goes on exactly as the one whose :meth:`state` this was, if its ``reach`` was the same."""
+        trainee = cls(Splats(**{name: state[name] for name in ATTRIBUTES}), device, reach)
         trainee._leaves.restore(state)
         return trainee

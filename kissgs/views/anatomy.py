@@ -30,21 +30,25 @@ class Anatomy:
     up: Point
 
 
-def anatomy(splats: Splats) -> Anatomy:
+def anatomy(splats: Splats, start: tuple[Point, float] | None = None) -> Anatomy:
     """Middle, size and up of a scene; Gaussians count by their opacity, so floaters and sky hardly do.
 
     A capture's attention shows in the density of Gaussians: the middle is found by climbing it (mean shift) from the
     median, at a scale that follows what is found.
+
+    Args:
+        splats: finite.
+        start: place and radius from which to climb in place of the median's.
     """
     means = splats.means.astype(np.float64)
     weights = opacity(splats)
     if not weights.sum() > 0:
         return Anatomy(np.zeros(3), 1.0, UP_OF_FILES[0])
-    centre = np.array([weighted_median(axis, weights) for axis in means.T])
+    centre = np.array([weighted_median(axis, weights) for axis in means.T]) if start is None else start[0]
     distance = np.linalg.norm(means - centre, axis=1)
     size = float(np.exp(np.median(splats.scales.max(axis=1)).astype(np.float64)))
     smallest = max(2 * size, 1e-5 * float(np.abs(centre).max()), 1e-9)  # float32 positions are no finer
-    radius = max(weighted_median(distance, weights), smallest)
+    radius = max(weighted_median(distance, weights) if start is None else start[1], smallest)
     for _ in range(30):
         pull = weights * np.exp(-0.5 * (distance / radius) ** 2)
         moved = pull @ means / pull.sum()

@@ -98,9 +98,9 @@ def _from_colour(colour: np.ndarray) -> np.ndarray:
     return (colour - 0.5) * 60
 
 
-def sketch_of(splats: Splats) -> Splats:
-    """The scene without gloss, in fewer Gaussians."""
-    step = max(1, -(-len(splats) // SKETCH))
+def sketch_of(splats: Splats, most: int = SKETCH) -> Splats:
+    """The scene without gloss, in ``most`` Gaussians at most."""
+    step = max(1, -(-len(splats) // most))
     thinned = splats.select(slice(None, None, step))
     return Splats(
         means=np.ascontiguousarray(thinned.means),

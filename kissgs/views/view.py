@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from kissgs._typing import Float32, UInt8
+from kissgs._typing import Float32, Float64, UInt8
 from kissgs.errors import InvalidViewsError
 from kissgs.rendering.camera import Camera
 from kissgs.views.pixels import read_photo
@@ -36,15 +36,18 @@ class View:
         name: of the view.
         camera: an undistorted pinhole of the photograph's size after all reduction and cropping.
         photo: the photograph's file; None where there are only cameras.
-        background: ``(3,)`` red, green, blue from 0 to 1: what transparent pixels of the photograph show.
+        background: ``(3,)`` red, green, blue from 0 to 1: what transparent pixels of the photograph show, and over
+            which to render when scenes are compared; None: black, and that of all views.
         bend: how to undistort the photograph; None if it is a pinhole's.
+        target: ``(3,)`` the point in the middle of the picture that the camera looks at; None where none is known.
     """
 
     name: str
     camera: Camera
     photo: Path | None = None
-    background: Float32[np.ndarray, "3"] = field(default_factory=black)
+    background: Float32[np.ndarray, "3"] | None = None
     bend: Bend | None = None
+    target: Float64[np.ndarray, "3"] | None = None
 
     def at_most(self, size: int) -> View:
         """The same with at most so many pixels on the longer side; the photograph is reduced when it is loaded."""
@@ -68,10 +71,11 @@ class View:
         """
         if self.photo is None:
             raise InvalidViewsError(f"view {self.name} has no photograph, only a camera")
+        background = black() if self.background is None else self.background
         if self.bend is None:
-            return read_photo(self.photo, self.camera.width, self.camera.height, self.background)
+            return read_photo(self.photo, self.camera.width, self.camera.height, background)
         lens = self.bend.lens
-        return undistort(read_photo(self.photo, lens.width, lens.height, self.background), lens, self.bend.window)
+        return undistort(read_photo(self.photo, lens.width, lens.height, background), lens, self.bend.window)
 
 
 Source = Literal["photos", "cameras", "scene"]

@@ -65,7 +65,7 @@ def virtual_views(
         InvalidViewsError: less than one view, or pictures of less than one pixel, are asked for.
     """
     _, tried, chosen = _find(splats, (width, height), count, threads, progress)
-    return split_views(_sized([tried.cameras[n] for n in chosen], width, height))
+    return split_views(sized([tried.cameras[n] for n in chosen], width, height))
 
 
 def best_view(
@@ -82,7 +82,7 @@ def best_view(
     Good as they are, and from some distance: what shows more of the scene stands for it better than a close-up.
     """
     scene, tried, chosen = _find(splats, (width, height), count, threads, progress)
-    views = split_views(_sized([tried.cameras[n] for n in chosen], width, height))
+    views = split_views(sized([tried.cameras[n] for n in chosen], width, height))
     distances = [float(np.linalg.norm(tried.cameras[n].position - scene.centre)) for n in chosen]
     scores = tried.scores[chosen] + [of_distance(distance / scene.radius) for distance in distances]
     return views.all[int(scores.argmax())]
@@ -116,8 +116,7 @@ def _find(
     splats: Splats, size: tuple[int, int], count: int, threads: int, progress: Progress
 ) -> tuple[Anatomy, Tried, list[int]]:
     """What the scene is like, all that was tried, and the chosen ones of it."""
-    if min(*size, count) < 1:
-        raise InvalidViewsError(f"at least 1 view of 1x1 pixels can be had, not {count} of {size[0]}x{size[1]}")
+    check_wanted(count, size)
     with Workers(threads) as pool:
         scene, critic, tried = survey(splats, size, pool, progress)
         for _ in range(ROUNDS):
@@ -125,10 +124,21 @@ def _find(
                 break
             tried = tried.with_more(scene, critic)
     progress("cameras", 1.0)
-    return scene, tried, _choose(tried, scene, count)
+    return scene, tried, choose(tried, scene, count)
 
 
-def _sized(cameras: list[Camera], width: int, height: int) -> list[Camera]:
+def check_wanted(count: int, size: tuple[int, int]) -> None:
+    """Refuse to choose no view, or views without a pixel; ``size`` is (width, height).
+
+    Raises:
+        InvalidViewsError: it is refused.
+    """
+    if min(*size, count) < 1:
+        raise InvalidViewsError(f"at least 1 view of 1x1 pixels can be had, not {count} of {size[0]}x{size[1]}")
+
+
+def sized(cameras: list[Camera], width: int, height: int) -> list[Camera]:
+    """The same poses with images of another size, ``FIELD_OF_VIEW`` along the longer side."""
     K = pinhole(FIELD_OF_VIEW, width, height)
     return [Camera(camera.viewmat, K, width, height) for camera in cameras]
 
@@ -219,7 +229,7 @@ def _apart(
     return np.asarray(np.linalg.norm(places - places[one], axis=1) + np.linalg.norm(looks - looks[one], axis=1))
 
 
-def _choose(tried: Tried, scene: Anatomy, count: int) -> list[int]:
+def choose(tried: Tried, scene: Anatomy, count: int) -> list[int]:
     """Among the good ones: the best, then always the one farthest from all chosen; in the order of going round."""
     scores, good = tried.scores, tried.good()
     if len(good) < count:

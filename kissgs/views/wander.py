@@ -2,7 +2,7 @@
 
 :func:`kissgs.virtual_views` picks few cameras, each as good as can be, to judge by. What is fitted to pictures from
 such falls apart between them and beside them. These are many and of all sorts: near and far, high and low, from the
-sides as well, all that the critic lets pass.
+sides as well, of every region of the scene, all that the critic lets pass.
 """
 
 from __future__ import annotations
@@ -19,8 +19,10 @@ from kissgs.rendering.camera import Camera, look_at
 from kissgs.splats import Splats
 from kissgs.views.anatomy import Anatomy, Point
 from kissgs.views.candidates import ground
+from kissgs.views.everywhere import scene_views
+from kissgs.views.regions import Region, allot, regions
 from kissgs.views.view import Views
-from kissgs.views.virtual import Tried, split_views, survey, virtual_views
+from kissgs.views.virtual import Tried, split_views
 
 PASSABLE = 0.5
 """How much lower than the best a view may score: as photographs of real captures do."""
@@ -36,6 +38,9 @@ LOW, HIGH = -np.pi / 6, np.pi / 3
 
 AIM = 0.35
 """How far beside the middle a camera aims, radii of the scene along each axis: root mean square."""
+
+MOST = 4.0
+"""Times as many views as are asked for, at most, where a scene has several regions."""
 
 PATIENCE = 8
 """Tries for each camera, at most."""
@@ -54,7 +59,8 @@ def wander(
     Args:
         splats: finite (:func:`kissgs.clean`).
         side: of the pictures, pixels.
-        count: how many views. Where a scene hardly shows from anywhere, they are fewer.
+        count: how many views of a scene with one region; one with several gets more, as many as give the region that
+            shows most its ``count``, up to :data:`MOST` times that. Where a scene hardly shows, they are fewer.
         seed: another one, other views.
         threads: 0 means one per processor.
         progress: receives the stage ``"cameras"``.
@@ -67,21 +73,32 @@ def wander(
     rng = np.random.default_rng(seed)
     found: list[Camera] = []
     with Workers(threads) as pool:
-        scene, critic, tried = survey(splats, (side, side), pool, progress)
-        propose, small = _proposer(scene, tried, rng), tried.cameras[0].width
-        least = float(tried.scores.max()) - PASSABLE
-        for _ in range(PATIENCE):
-            poses = [propose() for _ in range(count)]
-            fields = rng.uniform(FIELDS_OF_VIEW[0], FIELDS_OF_VIEW[1], count)
-            thumbnails = [_take(pose, scene, fov, small) for pose, fov in zip(poses, fields, strict=True)]
-            passes = tried.scores_for(thumbnails, critic) >= least
-            found += [_take(poses[n], scene, fields[n], side) for n in np.flatnonzero(passes)]
-            if len(found) >= count:
-                break
+        parts = regions(splats, (side, side), pool, progress, wanted=0)
+        largest = max(region.share for region in parts) or 1.0
+        most = round(count * min(1 / largest, MOST))
+        for region, share in zip(parts, allot(parts, most), strict=True):
+            found += _around(region, share, side, rng)
     if len(found) < min(2, count):
-        return virtual_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
+        return scene_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
     progress("cameras", 1.0)
-    return split_views(found[:count])
+    return split_views(found[:most])
+
+
+def _around(region: Region, count: int, side: int, rng: np.random.Generator) -> list[Camera]:
+    """Random views of one region that are no worse than photographs would be."""
+    scene, tried = region.scene, region.tried
+    propose, small = _proposer(scene, tried, rng), tried.cameras[0].width
+    least = float(tried.scores.max()) - PASSABLE
+    found: list[Camera] = []
+    for _ in range(PATIENCE):
+        poses = [propose() for _ in range(count)]
+        fields = rng.uniform(FIELDS_OF_VIEW[0], FIELDS_OF_VIEW[1], count)
+        thumbnails = [_take(pose, scene, fov, small) for pose, fov in zip(poses, fields, strict=True)]
+        passes = tried.scores_for(thumbnails, region.critic) >= least
+        found += [_take(poses[n], scene, fields[n], side) for n in np.flatnonzero(passes)]
+        if len(found) >= count:
+            break
+    return found[:count]
 
 
 def _take(pose: Pose, scene: Anatomy, fov: float, side: int) -> Camera:

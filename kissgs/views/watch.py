@@ -8,8 +8,8 @@ from kissgs.progress import Progress, silent
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.importance import Watch
 from kissgs.splats import Splats
+from kissgs.views.everywhere import scene_views
 from kissgs.views.view import Views
-from kissgs.views.virtual import virtual_views
 
 AROUND = 0.3
 """Weight of all virtual cameras together, in units of that of the photographs': what was never photographed must not
@@ -38,18 +38,18 @@ def watch(
     """
     if views is None or not views.train:
         side = size * 4 // 5
-        found = virtual_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
+        found = scene_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
         cameras = [_wider(view.camera) if n % 2 else view.camera for n, view in enumerate(found.all)]
         return Watch(cameras, [1.0] * len(found.all), found.background)
     given = [view.camera for view in views.train]
     chosen = [given[n].at_most(size) for n in np.unique(np.linspace(0, len(given) - 1, count).astype(int))]
     side = round(float(np.sqrt(chosen[0].width * chosen[0].height)))
-    around = virtual_views(
+    around = scene_views(
         splats, width=side, height=side, count=max(1, count * 2 // 3), threads=threads, progress=progress
     )
     weight = AROUND * len(chosen) / len(around.all)
     cameras = [*chosen, *(view.camera for view in around.all)]
-    return Watch(cameras, [1.0] * len(chosen) + [weight] * len(around.all), views.background)
+    return Watch(cameras, [1.0] * len(chosen) + [weight] * len(around.all), views.background, captured=len(chosen))
 
 
 WIDER = 0.6

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from typing import Annotated, Any
 
 from anyio.to_thread import run_sync
@@ -24,7 +25,7 @@ NO_STORE = {"Cache-Control": "no-store"}
 def problems(*codes: str) -> dict[int | str, dict[str, Any]]:
     """The answers of a route that are problem documents, for OpenAPI."""
     answers: dict[int | str, dict[str, Any]] = {}
-    for code in ("unauthorized", "invalid-request", "internal", *codes):
+    for code in ("unauthorized", "invalid-request", "internal", "database", *codes):
         answer = answers.setdefault(
             KINDS[code].status,
             {
@@ -43,7 +44,7 @@ async def _find(
     owner: Owner,
     id: Annotated[str, Path(description="Of a job: 32 hexadecimal digits.", max_length=100)],
 ) -> Job:
-    job = await run_sync(context.store.get, id, owner)
+    job = await run_sync(context.store.get, id, owner) if re.fullmatch("[0-9a-f]{32}", id) else None
     if job is None:
         raise ProblemError("not-found", f"there is no job {id!r}; it may have been deleted")
     return job

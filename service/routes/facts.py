@@ -10,11 +10,13 @@ from sqlalchemy.exc import SQLAlchemyError
 
 import kissgs
 from service.context import Context, Service
+from service.files import ORPHANED
 from service.metrics import CONTENT_TYPE
 from service.presets import can_train, presets
 from service.problems import KINDS, ProblemError
 from service.routes.common import MAX_WAIT_SECONDS, NO_STORE, problems
 from service.schemas import Health, Limits, Presets, ProblemKind, Version
+from service.watch import reason_of
 
 router = APIRouter()
 
@@ -101,9 +103,12 @@ async def get_readyz(context: Service, response: Response) -> Health:
         "disk": await run_sync(_disk_trouble, context),
     }
     ready = not any(trouble.values())
+    checks = {part: text or "ok" for part, text in trouble.items()}
+    if orphaned := await run_sync(context.folders.count_orphaned):
+        checks["orphaned"] = f"folders that no job owns lie in jobs/{ORPHANED} of the data folder: {orphaned}"
     response.status_code = 200 if ready else 503
     response.headers.update(NO_STORE)
-    return Health(ready=ready, checks={part: text or "ok" for part, text in trouble.items()})
+    return Health(ready=ready, checks=checks)
 
 
 @router.get(
@@ -127,13 +132,21 @@ def _kind(code: str) -> ProblemKind:
 
 
 def _database_trouble(context: Context) -> str | None:
-    try:
-        context.store.keep_time()
-    except SQLAlchemyError as error:
-        return f"the job database cannot be written to: {str(getattr(error, 'orig', error)).splitlines()[0]}"
-    return None
+    trouble = context.store.trouble()
+    if trouble is None:
+        try:
+            context.store.keep_time()
+        except SQLAlchemyError as error:
+            trouble = reason_of(error)
+    return None if trouble is None else f"the job database cannot be used: {trouble}"
 
 
 def _disk_trouble(context: Context) -> str | None:
-    free, needed = context.folders.free_bytes(), context.settings.min_free_bytes
+    needed = context.settings.min_free_bytes
+    if trouble := context.folders.trouble():
+        return trouble
+    try:
+        free = context.folders.free_bytes()
+    except OSError as error:
+        return f"the data folder cannot be used: {(error.strerror or str(error)).lower()}"
     return None if free >= needed else f"{free:,} bytes are free, {needed:,} are to stay free"

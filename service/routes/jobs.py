@@ -270,8 +270,10 @@ async def delete_job(context: Service, job: Found) -> Response:
     """Cancel it if need be, and remove everything there is of it."""
     await context.worker.cancel(job)
     context.decoder.stop(job.id)
+    gone = {"upload_kept": False, "disk_bytes": 0, "spare_bytes": 0}
+    await run_sync(lambda: context.store.move(job.number, State.EXPIRED, **gone))
+    await run_sync(context.folders.remove_job, job.id)  # now: a folder that no job owns would be kept
     await run_sync(context.store.forget, job.number)
-    await run_sync(context.folders.remove_job, job.id)
     context.bell.ring(job.id)
     context.bell.ring(ended(job.id))
     log.info("job %s deleted", job.id)

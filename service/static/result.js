@@ -57,15 +57,23 @@ function figures(status) {
   ];
   if (finetuning) pairs.push(["Fine-tuning", gain(finetuning), "on views that were held out"]);
   if (evaluation) {
-    const { psnr, ssim } = evaluation; // no PSNR: there is no noise at all
+    const { psnr, ssim, worst } = evaluation; // no PSNR: there is no noise at all
     pairs.push([
       "PSNR",
       typeof psnr === "number" ? `${psnr.toFixed(2)} dB` : "identical",
       "to the upload's renderings",
     ]);
     pairs.push(["SSIM", ssim.toFixed(4), "1 is identical"]);
+    if (typeof worst?.psnr === "number") {
+      pairs.push(["Worst view", `${worst.psnr.toFixed(2)} dB`, `from ${point(worst.position)}`]);
+    }
   }
   return facts(pairs);
+}
+
+/** @param {number[]} position */
+function point(position) {
+  return `(${position.map((value) => Number(value.toPrecision(4))).join(", ")})`;
 }
 
 /** @param {NonNullable<Status["finetuning"]>} finetuning */

@@ -1,5 +1,7 @@
 """Oracle: counting, and for a pile of copies, knowing that one of them is enough. Scores: tests/rendering."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -8,6 +10,7 @@ from training_scenes import around, cloud
 
 import kissgs
 from kissgs.compaction.scoring import highest, show_most
+from kissgs.rendering.coverage import Coverage
 from kissgs.rendering.rasterizer import removal_scores
 from kissgs.splats import ATTRIBUTES
 from kissgs.views.view import black
@@ -26,6 +29,22 @@ def test_in_one_round_those_with_the_highest_scores_stay():
     scene = cloud(80)
     scores = removal_scores(scene, CAMERAS)
     assert show_most(scene, CAMERAS, black(), 20).tolist() == sorted(np.argsort(-scores)[:20].tolist())
+
+
+@pytest.mark.parametrize("least", [0.05, 0.3, 10.0])
+def test_no_score_is_less_than_a_share_of_what_a_camera_nearby_would_find(least):
+    """The unit: scores of the seen, in the median, by squared alpha over an image that the surroundings fill."""
+    scene = cloud(80)
+    hidden = np.arange(80) % 4 == 0
+    scene = replace(scene, means=np.where(hidden[:, None], scene.means + np.float32(500), scene.means))
+    scores, nearby = removal_scores(scene, CAMERAS), Coverage(scene).close_up
+    assert (scores[hidden] == 0).all()
+    unit = np.median((scores / nearby)[scores > 0])
+    wanted = np.maximum(scores, least * unit * nearby)
+    kept = show_most(scene, CAMERAS, black(), 20, least=least)
+    assert kept.tolist() == sorted(np.argsort(-wanted)[:20].tolist())
+    assert not hidden[show_most(scene, CAMERAS, black(), 20)].any()
+    assert hidden[kept].any()
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.8, 0.99])

@@ -13,8 +13,8 @@ from PIL import Image
 
 from kissgs.errors import Cancelled
 from kissgs.evaluation.difference import SCALES, STOPS, WINDOW, difference, full_scale, heat_map, worst_place
-from kissgs.evaluation.html import MOST_VIEWS, Side, chosen_views, html_report
-from kissgs.evaluation.pictures import evaluate
+from kissgs.evaluation.html import MOST_ELSEWHERE, MOST_VIEWS, Side, chosen_views, html_report
+from kissgs.evaluation.pictures import compare_pictures, evaluate
 from kissgs.splats import ATTRIBUTES, Splats
 from kissgs.views.load import load_views
 from kissgs.views.view import View, Views
@@ -58,8 +58,8 @@ class Page(HTMLParser):
         return [attributes for name, attributes in self.elements if name == tag]
 
 
-def report(views, *, candidate=WORSE, names=("a.ply", "b.zip"), sizes=(20_000, 4_000), **options):
-    found = evaluate(SCENE, candidate, views, **options)
+def report(views, *, candidate=WORSE, names=("a.ply", "b.zip"), sizes=(20_000, 4_000), found=None):
+    found = found or compare_pictures(SCENE, candidate, views)
     sides = [
         Side(name=name, splats=scene, bytes=size)
         for name, scene, size in zip(names, (SCENE, candidate), sizes, strict=True)
@@ -83,11 +83,13 @@ def test_the_page_needs_nothing_beside_itself():
 def test_pictures_of_every_view_without_photographs():
     text, found = report(cameras(test=3))
     page = Page(text)
-    assert [section["id"] for section in page.of("section") if "id" in section] == ["view-0", "view-1", "view-2"]
+    worst = min(range(3), key=lambda i: found.views[i].comparison.between.psnr)
+    ids = [section["id"] for section in page.of("section") if "id" in section]
+    assert ids == [f"view-{worst}", *(f"view-{i}" for i in range(3) if i != worst)]
     assert len(page.images) == 3 * (3 + 3)
     first = page.images[:6]
     assert all(image.shape == (40, 60, 3) for image in first)
-    view, wanted = found.views[0].view, {}
+    view, wanted = found.views[worst].view, {}
     for at, scene in (("candidate", WORSE), ("reference", SCENE)):
         wanted[at] = np.rint(255 * picture(scene, view)).astype(np.uint8)
     assert np.abs(first[0].astype(int) - wanted["candidate"]).mean() < 6  # lossy
@@ -97,10 +99,14 @@ def test_pictures_of_every_view_without_photographs():
 
 def test_photographs_are_shown_where_there_are_any(tmp_path):
     views = load_views(write_capture(tmp_path / "capture"))
-    text, found = report(views, split="all")
+    text, found = report(views, found=evaluate(SCENE, WORSE, views, split="all"))
     page = Page(text)
-    assert len(page.images) == 3 * (4 + 4)
-    np.testing.assert_array_equal(page.images[6], views.test[0].load_photo())
+    assert len(page.images) == 3 * (4 + 4) + MOST_ELSEWHERE * (3 + 3)
+    np.testing.assert_array_equal(page.images[6], found.worst.view.load_photo())
+    for told in (found, found.surroundings):
+        assert told.worst.view.name in page.text
+        assert told.worst.place in page.text
+        assert told.extremes in page.text
     for compared in found.views:
         for cell in compared.comparison.spelled():
             assert cell.replace("-", "−") in page.text
@@ -137,13 +143,13 @@ def test_large_pictures_are_reduced_and_crops_are_not():
 def test_twelve_of_many_views_and_the_worst_among_them():
     one = SCENE.select(slice(0, 300))
     views = cameras(test=30, train=0, size=(8, 6))
-    found = evaluate(one, damaged(one), views)
+    found = compare_pictures(one, damaged(one), views)
     shown = chosen_views(found)
     worst = int(np.argmin([each.comparison.between.psnr for each in found.views]))
     assert len(shown) == len(set(shown)) == MOST_VIEWS
-    assert shown == sorted(shown)
-    assert worst in shown
-    assert np.diff(shown).max() <= 6
+    assert shown[0] == worst
+    assert shown[1:] == sorted(shown[1:])
+    assert np.diff(sorted(shown)).max() <= 6
     text = html_report(found, Side(name="a", splats=one), Side(name="b", splats=damaged(one)))
     page = Page(text)
     assert [section["id"] for section in page.of("section") if "id" in section] == [f"view-{i}" for i in shown]
@@ -151,7 +157,7 @@ def test_twelve_of_many_views_and_the_worst_among_them():
 
 
 def test_cancelling():
-    found = evaluate(SCENE, SCENE, cameras())
+    found = compare_pictures(SCENE, SCENE, cameras())
     events = []
 
     def stop(stage, fraction):

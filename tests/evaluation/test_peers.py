@@ -113,7 +113,7 @@ def test_impossible_requests_are_refused(scene, tmp_path):
     with pytest.raises(UnsupportedError, match="'ksplat'; there are sog, spz"):
         measure_peer(scene, "ksplat")
     with pytest.raises(InvalidSceneError):
-        measure_peer(tmp_path / "absent.ply", "spz")
+        measure_peer(tmp_path / "absent.ply", "spz", command=[sys.executable])
 
 
 @pytest.mark.skipif(shutil.which("splat-transform") is None, reason="splat-transform is not on the PATH")

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,10 +14,13 @@ from PIL import Image
 import kissgs
 from kissgs.errors import Cancelled, InvalidViewsError, UnsupportedError
 from kissgs.evaluation import pictures
+from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.likeness import Comparison, Evaluation, Likeness, ViewComparison, spell
-from kissgs.evaluation.pictures import evaluate
+from kissgs.evaluation.pictures import compare_pictures, evaluate
+from kissgs.evaluation.shown import share_shown
 from kissgs.rendering.camera import look_at
 from kissgs.rendering.metrics import ssim
+from kissgs.rendering.rasterizer import render
 from kissgs.splats import ATTRIBUTES, Splats
 from kissgs.views.load import load_views
 from kissgs.views.view import View, Views
@@ -119,11 +123,52 @@ def test_threads_do_not_change_the_figures():
     assert results[0] == results[1]
 
 
-def test_virtual_cameras_are_the_default():
-    found = evaluate(SCENE, WORSE)
-    assert found.against == "renderings"
-    assert "virtual" in found.source
-    assert found.as_dict() == evaluate(SCENE, WORSE, kissgs.virtual_views(SCENE)).as_dict()
+def test_drawn_cameras_are_the_default():
+    found, views = evaluate(SCENE, WORSE, seed=3), evaluation_views(SCENE, seed=3)
+    assert (found.against, found.split, found.source) == ("renderings", "all", "drawn over the whole scene, seed 3")
+    assert found.surroundings is None
+    compared = compare_pictures(SCENE, WORSE, views)
+    assert [each.comparison for each in found.views] == [each.comparison for each in compared.views]
+    assert found.shown == share_shown(SCENE, [view.camera for view in views.test])
+
+
+def test_drawn_cameras_judge_beside_those_of_a_capture(capture):
+    found, alone = evaluate(SCENE, WORSE, capture), evaluate(SCENE, WORSE)
+    assert found.against == "photos"
+    assert found.surroundings.as_dict() == alone.as_dict()
+    assert [each.comparison for each in found.views] == [
+        each.comparison for each in compare_pictures(SCENE, WORSE, capture).views
+    ]
+
+
+def test_each_view_has_a_background_of_its_own_or_that_of_all():
+    views = cameras(test=2, background=(1, 0, 0))
+    white = replace(views.test[1], background=np.ones(3, np.float32))
+    found = compare_pictures(SCENE, WORSE, replace(views, test=(views.test[0], white)))
+    for each, background in zip(found.views, ((1, 0, 0), (1, 1, 1)), strict=True):
+        pair = [picture(scene, each.view, background) for scene in (WORSE, SCENE)]
+        assert_likeness(each.comparison.between, *pair)
+
+
+def test_pictures_of_the_reference_are_taken_once(monkeypatch):
+    taken, drawn = {}, []
+    first = compare_pictures(SCENE, WORSE, cameras(), taken=taken)
+    monkeypatch.setattr(pictures, "render", lambda *args, **options: drawn.append(args[0]) or render(*args, **options))
+    again = compare_pictures(SCENE, WORSE, cameras(), taken=taken)
+    assert first.as_dict() == again.as_dict()
+    assert len(drawn) == len(taken) == 3
+    assert all((scene.sh0 == WORSE.sh0).all() for scene in drawn)
+
+
+def test_a_removed_object_is_found():
+    """The judge of an encoder that looks at the first object alone: the second is a thousand units away."""
+    away = Splats(**{name: getattr(SCENE, name) + np.float32(1000 * (name == "means")) for name in ATTRIBUTES})
+    both = Splats(**{name: np.concatenate([getattr(SCENE, name), getattr(away, name)]) for name in ATTRIBUTES})
+    found = evaluate(both, SCENE)
+    assert found.worst.comparison.between.psnr < 20
+    assert np.linalg.norm(found.worst.view.target - 1000) < 100
+    assert found.fifth_percentile < 25
+    assert found.shown > 0.7
 
 
 def test_fox_is_as_good_as_its_readme_says(shared_data):
@@ -160,7 +205,7 @@ def test_empty_splits_are_refused():
         with pytest.raises(InvalidViewsError, match="there is no view to evaluate from"):
             evaluate(SCENE, SCENE, cameras(test=0, train=0), split=split)
     with pytest.raises(UnsupportedError, match="there is no split 'val'; choose test, train or all"):
-        pictures._views_to_use(cameras(), "val")
+        pictures._chosen(cameras(), "val")
 
 
 def test_photographs_of_some_views_are_refused(capture):
@@ -182,12 +227,17 @@ def test_missing_photographs_are_an_error(tmp_path):
 
 def test_progress_and_cancelling():
     events = []
-    evaluate(SCENE, SCENE, cameras(test=4), progress=lambda stage, fraction: events.append((stage, fraction)))
+    compare_pictures(SCENE, SCENE, cameras(test=4), progress=lambda stage, fraction: events.append((stage, fraction)))
     assert [fraction for stage, fraction in events if stage == "evaluate"] == [0, 0.25, 0.5, 0.75, 1]
     assert {stage for stage, _ in events} == {"kernels", "evaluate"}
+    events.clear()
+    evaluate(SCENE, SCENE, cameras(test=4), progress=lambda stage, fraction: events.append((stage, fraction)))
+    told = [fraction for stage, fraction in events if stage == "evaluate"]
+    np.testing.assert_allclose(told, np.arange(29) / 28)
+    assert list(dict.fromkeys(stage for stage, _ in events)) == ["kernels", "cameras", "evaluate"]
 
     def stop(stage, fraction):
-        if (stage, fraction) == ("evaluate", 0.5):
+        if stage == "evaluate" and fraction >= 0.5:
             raise Cancelled("enough")
 
     with pytest.raises(Cancelled, match="enough"):
@@ -258,6 +308,40 @@ def test_any_figures_survive_means_and_json(figures):
     assert all(len(each.comparison.spelled()) == 7 for each in compared)
     same = [a == b for a, b, _ in figures]
     assert all(each.comparison.change == 0 for each, equal in zip(compared, same, strict=True) if equal)
+
+
+@given(st.lists(FIGURES, min_size=1, max_size=45))
+def test_the_worst_view_and_the_fifth_percentile(figures):
+    """Oracle: sorting, and NumPy's percentile where all is finite."""
+    place = cameras(test=1).test[0].camera
+    compared = [
+        ViewComparison(
+            view=View(f"{number}", place), comparison=Comparison(reference=None, candidate=told, between=told)
+        )
+        for number, told in enumerate(Likeness(psnr=value, ssim=0.5) for value in figures)
+    ]
+    found = Evaluation(
+        against="renderings",
+        split="all",
+        source="",
+        background=np.zeros(3, np.float32),
+        reference_count=1,
+        candidate_count=1,
+        views=tuple(compared),
+    )
+    failed = [number for number, value in enumerate(figures) if math.isnan(value)]
+    assert int(found.worst.view.name) == (failed[0] if failed else figures.index(min(figures)))
+    told = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    assert told["worst"]["name"] == found.worst.view.name
+    assert told["worst"]["position"] == place.position.tolist()
+    assert told["worst"]["target"] is None
+    if failed:
+        assert math.isnan(found.fifth_percentile)
+    elif all(map(math.isfinite, figures)):
+        assert found.fifth_percentile == pytest.approx(np.percentile(figures, 5))
+    else:
+        assert min(figures) <= found.fifth_percentile
+    assert "worst view" in found.extremes
 
 
 @pytest.mark.parametrize(

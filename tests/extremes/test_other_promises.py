@@ -41,15 +41,15 @@ def test_what_no_picture_shows_has_the_steps_of_the_settings():
     assert unseen.files == encode(scene, settings).files
 
 
-def test_details_of_a_tiny_scene_are_kept_by_fast_alone():
-    """All of 300 Gaussians, and shapes as in a scene of common size; pictures taken from 0.01 away show fewer."""
+def test_details_of_a_tiny_scene_are_kept():
+    """All of 300 Gaussians, and shapes as in a scene of common size, though no image is taken from nearer than 0.01."""
     scene = cloud(300)
     tiny = replaced(scene, means=scene.means * 1e-4, scales=scene.scales + np.log(1e-4))
-    for preset, worse in (("fast", False), ("balanced", True)):
+    for preset in ("fast", "balanced"):
         common, small = compressed(scene, preset).report, compressed(tiny, preset).report
         assert max(small.half_steps["means"]) < 1e-2 * 1e-4
-        assert (max(small.half_steps["scales"]) > 1.2 * max(common.half_steps["scales"])) == worse
-        assert (small.count < common.count - 5) == worse
+        assert max(small.half_steps["scales"]) <= 1.2 * max(common.half_steps["scales"])
+        assert small.count >= common.count - 5
 
 
 def test_costs_are_cut_off():

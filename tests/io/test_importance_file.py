@@ -70,7 +70,7 @@ def test_other_arrays_are_not_written_over(tmp_path):
 def test_it_survives(tmp_path):
     rng = np.random.default_rng(0)
     kept = Importance.none(5, 2)
-    for values in (kept.places, kept.shapes, kept.colors, kept.directions, kept.guessed):
+    for values in (kept.places, kept.shapes, kept.colors, kept.directions, kept.guessed, kept.coverage):
         values[:] = rng.random(values.shape)
     write_importance(tmp_path / "a.npz", kept, "key")
     found = read_importance(tmp_path / "a.npz", "key")

@@ -42,6 +42,13 @@ NOT_A_PLY = {
     b"ply\nformat binary 1.0\n": (
         ", header line 2: unknown format 'binary'; it is ascii, binary_little_endian or binary_big_endian"
     ),
+    b"ply\nformat ascii 1.0\ncomment\nformat binary_little_endian 1.0\n": (
+        ", header line 4: the format is binary_little_endian, and before it was ascii; delete the line that is wrong"
+    ),
+    b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nformat binary_big_endian 1.0\n": (
+        ", header line 4: the format is binary_big_endian, and before it was binary_little_endian; "
+        "delete the line that is wrong"
+    ),
     b"ply\nformat\n": ", header line 2: 'format' is not a line of a PLY header",
     b"ply\n\x00\xff\n": ", header line 2: '\\x00�' is not a line of a PLY header",
     b"ply\n" + b"verbose" * 10 + b"\n": (
@@ -243,3 +250,9 @@ def test_failing_disk(tmp_path, monkeypatch):
     with pytest.raises(InvalidSceneError) as error:
         read_ply(path, progress=fail)
     assert str(error.value) == f"cannot read {path}: input/output error"
+
+
+def test_the_same_format_line_twice_contradicts_nothing(tmp_path):
+    path = tmp_path / "a.ply"
+    path.write_bytes(header_bytes([*VERTEX[:1], "format ascii 1.0", *VERTEX[1:]], "ascii") + ROW + b"\n")
+    assert len(read_ply(path)) == 1

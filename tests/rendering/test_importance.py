@@ -186,13 +186,96 @@ def test_what_no_camera_sees_costs_nothing_until_hedged():
     assert hedged.hedge == 0.5
 
 
+def panes(*depths, side=10):
+    """Opaque panes, one behind the other, of so many Gaussians in either direction."""
+    x, y = np.meshgrid(np.linspace(-1, 1, side), np.linspace(-1, 1, side))
+    flat = np.log([2.0 / side, 2.0 / side, 0.01])
+    return together(
+        *(one(mean=(a, b, z), scale=flat, opacity=8.0) for z in depths for a, b in zip(x.flat, y.flat, strict=True))
+    )
+
+
 def test_a_full_hedge_forgets_what_was_before_a_gaussian():
-    """Two alike, one behind an opaque pile: then they count alike but for their distance."""
-    pile = together(*(one(mean=(0, 0, 0.05 * i), scale=(0, 0, -4), opacity=5.0) for i in range(4)))
-    splats = together(one(mean=(0.2, 0, -0.3)), one(mean=(0.2, 0, 0.6)), pile)
-    plain, hedged = (measure_importance(splats, looked_at(camera()), hedge=hedge) for hedge in (0.0, 1.0))
-    assert plain.colors[1] < 0.01 * plain.colors[0]
-    assert 0.3 < hedged.colors[1] / hedged.colors[0] < 1
+    """Two panes alike, one hidden by the other: to a camera near each they are worth the same."""
+    splats, inner = panes(0.0, 2.0), np.zeros((2, 10, 10), bool)
+    inner[:, 3:7, 3:7] = True
+    front, behind = np.arange(200)[inner.flat].reshape(2, -1)
+    plain, hedged = (measure_importance(splats, looked_at(camera(120, 120)), hedge=hedge) for hedge in (0.0, 1.0))
+    assert plain.colors[behind].max() < 0.01 * plain.colors[front].min()
+    assert 0.6 < np.median(hedged.colors[behind]) / np.median(hedged.colors[front]) < 1.6
+    assert (hedged.guessed[behind] > 0.98 * hedged.colors[behind]).all()
+
+
+def test_an_image_is_what_is_measured_whatever_is_near_as_long_as_nothing_is_hedged():
+    """Coverage is told, and nothing else: no prior, no floor."""
+    splats = panes(0.0, 2.0)
+    found = measure_importance(splats, looked_at(camera(120, 120)))
+    none = found.with_prior(splats, np.ones(len(splats)), np.full(len(splats), 0.25), 0.0)
+    for name in ("places", "shapes", "colors", "directions", "guessed"):
+        np.testing.assert_array_equal(getattr(none, name), getattr(found, name))
+    np.testing.assert_array_equal(none.coverage, np.float32(0.25))
+    assert none.hedge == found.hedge == 0
+    assert found.coverage[:100].min() > 0.5
+    assert found.coverage[100:].reshape(10, 10)[3:7, 3:7].max() < 0.05
+
+
+def measured(colors, splats):
+    """Importance of such colours, in which opacity, scales and rotation cost what colours do."""
+    nothing = Importance.none(len(splats), splats.sh_degree)
+    shapes = np.eye(7)[np.triu_indices(7)] * np.asarray(colors)[:, None]
+    places = np.array([1, 0, 0, 1, 0, 1]) * np.asarray(colors)[:, None]
+    return replace(
+        nothing,
+        colors=np.array(colors, np.float32),
+        shapes=shapes.astype(np.float32),
+        places=places.astype(np.float32),
+    )
+
+
+@pytest.mark.parametrize("hedge", [0.1, 0.55, 1.0])
+def test_what_no_camera_saw_takes_the_prior_whole(hedge):
+    """The prior: 2e-6 per unit of what a camera nearby finds, the median of the seen ones."""
+    splats = together(*[one()] * 6)
+    close_up = np.array([0.1, 0.2, 0.4, 0.3, 0.05, 0.2])
+    colors = np.array([2e-7, 4e-7, 8e-7, 0.0, 0.0, 0.0])
+    coverage = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 1.0])  # the last: looked at, and nothing of it seen
+    found = measured(colors, splats).with_prior(splats, close_up, coverage, hedge)
+    np.testing.assert_allclose(found.colors[:3], colors[:3], rtol=1e-5)  # they are what the prior says
+    np.testing.assert_allclose(found.colors[3:5], 2e-6 * close_up[3:5], rtol=1e-5)
+    np.testing.assert_allclose(found.guessed[3:5], found.colors[3:5])
+    # Shapes and positions of the unseen cost in proportion, as those of the seen do.
+    for of in (SCALES, ROTATION):
+        np.testing.assert_allclose(found.diagonal(of)[3:5] / found.colors[3:5, None], 1, rtol=1e-4)
+    np.testing.assert_allclose(found.places[3] / found.colors[3], found.places[0] / found.colors[0], rtol=1e-4)
+    assert 0 < found.colors[5] <= found.colors[3]
+    found.check(splats)
+
+
+@pytest.mark.parametrize("hedge", [0.1, 0.55, 0.9])
+def test_logarithms_move_towards_the_prior_by_the_hedge_and_none_falls_far_below(hedge):
+    splats = together(*[one()] * 5)
+    close_up, prior = np.ones(5), 1e-6
+    colors = np.array([1e-6, 1e-6, 1e-6, 1e-4, 1e-12])  # their median is the prior
+    found = measured(colors, splats).with_prior(splats, close_up, np.ones(5), hedge)
+    np.testing.assert_allclose(np.log10(found.colors[3]), -4 * (1 - hedge) - 6 * hedge, rtol=1e-5)
+    least = max(10 ** (-9 * (1 - hedge) - 6 * hedge), 0.55 * hedge * prior)  # a thousandth of the prior at least
+    np.testing.assert_allclose(found.colors[4], least, rtol=1e-4)
+    half = measured(colors, splats).with_prior(splats, close_up, np.array([1, 1, 1, 0.5, 0.5]), hedge)
+    share = 1 - 0.5 * (1 - hedge)
+    np.testing.assert_allclose(np.log10(half.colors[3]), -4 * (1 - share) - 6 * share, rtol=1e-5)
+    # A whole form is raised as its colour is.
+    np.testing.assert_allclose(
+        found.shapes[3], measured(colors, splats).shapes[3] * (found.colors[3] / 1e-4), rtol=1e-4
+    )
+
+
+@pytest.mark.parametrize("brightest", [2.0, 1e5])
+def test_a_display_shows_no_more_than_white(brightest):
+    """What is far brighter costs what something twice as bright as white does."""
+    bright = [one(opacity=3.0, sh0=[(b - 0.5) / SH_C0] * 3) for b in (2.0, brightest)]
+    usual, found = (measure_importance(together(b, one(mean=(0.1, 0, 1))), looked_at(camera())) for b in bright)
+    np.testing.assert_allclose(found.shapes, usual.shapes, rtol=1e-3, atol=1e-6 * usual.shapes.max())
+    np.testing.assert_allclose(found.places, usual.places, rtol=1e-3, atol=1e-6 * usual.places.max())
 
 
 def test_refitting_is_least_squares():

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
+from data_folders import jobs_folder, no_variables, sample_folder  # noqa: F401
 from preview_browser import preview, software_browser  # noqa: F401
 from serving import Service
 

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import os
 import random
+import shutil
 import signal
 import threading
 import time
@@ -134,11 +135,17 @@ def test_an_upload_that_has_vanished_fails_its_job(tmp_path):
         service.kill(signal.SIGKILL)
         rewind(service, job, "queued")
         (service.folder / "jobs" / job["id"] / "scene.ply").unlink()
+        shutil.rmtree(service.folder / "jobs" / job["id"] / "result")
         (service.folder / "jobs" / ("0" * 32)).mkdir()  # of no job
         service.restart()
         status = service.status(job)
         assert (status["state"], status["problem"]["code"]) == ("failed", "internal")
-        assert [path.name for path in (service.folder / "jobs").iterdir()] == []
+        assert [path.name for path in (service.folder / "jobs").iterdir()] == [".orphaned"]
+        assert [path.name for path in (service.folder / "jobs" / ".orphaned").iterdir()] == ["0" * 32]
+        ready = service.http.get("/readyz")
+        assert (ready.status_code, ready.json()["ready"]) == (200, True)
+        assert ready.json()["checks"]["orphaned"].endswith("lie in jobs/.orphaned of the data folder: 1")
+        assert f"were set aside in {service.folder}/jobs/.orphaned: 1\n" in service.log.read_text()
 
 
 def test_the_server_is_killed_while_the_result_is_written(start):
@@ -366,7 +373,10 @@ def test_expiry(start):
         assert time.monotonic() < end
         time.sleep(0.1)
     problem(service.http.get(f"/v1/jobs/{job['id']}/result"), 410, "gone")
-    assert not (service.folder / "jobs" / job["id"]).exists()
+    while (service.folder / "jobs" / job["id"]).exists():  # removed once that is written down
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    assert list((service.folder / "jobs").iterdir()) == []
     while service.http.get(f"/v1/jobs/{job['id']}").status_code != 404:  # and forgotten, after as long again
         assert time.monotonic() < end
         time.sleep(0.1)

@@ -287,7 +287,7 @@ def test_events_arrive_as_they_happen(start):
     job = service.submit(scene_bytes(20_000, 3), SLOW)
     with service.http.stream("GET", job["links"]["events"]) as answer:
         for line in answer.iter_lines():
-            if "order" in line:
+            if line.startswith("data: ") and json.loads(line[6:]).get("stage") == "order":
                 break
         assert service.status(job)["state"] == "running"
     service.http.post(job["links"]["cancel"])
@@ -404,6 +404,9 @@ def test_evaluating(service):
     evaluation = service.ended(job, seconds=120)["evaluation"]
     expected = kissgs.compress(SMALL, settings=kissgs.Settings(preset="fast"), evaluate=True).report.evaluation
     assert evaluation["psnr"] == pytest.approx(expected.mean.between.psnr, abs=1e-6)
+    assert evaluation["worst"] == json.loads(json.dumps(expected.worst.where()))
+    assert evaluation["fifth_percentile"] == pytest.approx(expected.fifth_percentile, abs=1e-6)
+    assert evaluation["shown"] == pytest.approx(expected.shown)
 
 
 def test_an_idempotency_key_makes_one_job(service):

@@ -96,7 +96,10 @@ def test_pages_of_other_sites_cannot_use_it(service, start):
     for method, path in (("POST", "/v1/jobs/" + "0" * 32 + "/cancel"), ("DELETE", "/v1/jobs/" + "0" * 32)):
         problem(service.http.request(method, path, headers={"Origin": "https://evil.example"}), 403, "foreign")
     assert service.http.post("/v1/jobs", files=form, headers={"Origin": service.url}).status_code == 202
-    allowed = start(KISSGS_CORS_ORIGINS="https://good.example")
+    for origin, host in (("LOCALHOST", "localhost"), ("localhost", "LocalHost")):  # names have no case
+        headers = {"Origin": f"http://{origin}:{service.port}", "Host": f"{host}:{service.port}"}
+        assert service.http.post("/v1/jobs", files=form, headers=headers).status_code == 202
+    allowed = start(KISSGS_CORS_ORIGINS="https://Good.example")
     assert allowed.http.post("/v1/jobs", files=form, headers={"Origin": "https://good.example"}).status_code == 202
 
 

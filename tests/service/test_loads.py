@@ -246,7 +246,7 @@ def test_a_fault_has_an_id(start):
     (service.folder / "jobs.sqlite").write_bytes(b"no database")
     answer = service.http.get("/v1/jobs", headers={"X-Request-ID": "find-me"})
     if answer.status_code != 200:  # its connections may still have the old file
-        problem(answer, 500, "internal")
+        problem(answer, 503, "database")
     assert answer.headers["x-request-id"] == "find-me"
     time.sleep(0.3)  # the log is written after the answer
     assert "find-me" in service.log.read_text()

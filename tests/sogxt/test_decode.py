@@ -11,6 +11,7 @@ from codec_scenes import PLANES, random_scene
 from PIL import Image
 
 from kissgs import Cancelled, InvalidContainerError, Settings, compress, decompress
+from kissgs.sogxt.names import CHECKSUM
 from kissgs.splats import ATTRIBUTES
 
 FILES = compress(random_scene(100, 3, seed=1), settings=Settings.from_preset("paper")).files
@@ -24,9 +25,9 @@ def webp(image):
 
 
 def foreign(files=FILES, **images):
-    """The container as another encoder might have left it: without our key, some images exchanged."""
+    """The container as another encoder might have left it: without our keys, some images exchanged."""
     document = yaml.safe_load(files["container_meta.yaml"])
-    document.pop("kissgs", None)
+    document = {key: value for key, value in document.items() if not key.startswith("kissgs")}
     changed = {f"{name}.webp": webp(image) for name, image in images.items()}
     return {**files, **changed, "container_meta.yaml": yaml.safe_dump(document).encode()}
 
@@ -165,6 +166,7 @@ def test_labels_outside_the_codebook(active):
 def test_a_mask_that_disagrees_with_the_metadata():
     document = yaml.safe_load(FILES["container_meta.yaml"])
     document["kissgs"]["count"] = 99
+    del document[CHECKSUM]
     files = {**FILES, "container_meta.yaml": yaml.safe_dump(document).encode()}
     assert refusal(files) == "active_mask.webp marks 100 Gaussians; the metadata declares 99"
 
@@ -176,7 +178,9 @@ def test_images_far_larger_than_their_pixels_need():
 
 def test_meta_json_alone_is_checked_likewise():
     files = {name: data for name, data in FILES.items() if name != "container_meta.yaml"}
-    files["meta.json"] = json.dumps(json.loads(files["meta.json"]) | {"gridSide": 24}).encode()
+    meta = json.loads(files["meta.json"]) | {"gridSide": 24}
+    del meta[CHECKSUM]
+    files["meta.json"] = json.dumps(meta).encode()
     assert refusal(files).endswith("is 16 x 16 pixels; the metadata asks for 24 x 24")
 
 

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from memory import takes_less_than
 
 from kissgs import KissgsError, Settings, compress, decompress
+from kissgs.sogxt.names import CHECKSUM
 from kissgs.splats import ATTRIBUTES
 
 MEMORY = 30_000_000
@@ -24,8 +25,11 @@ COMPRESSED = compress(random_scene(30, 1, seed=2), settings=Settings.from_preset
 def without_checksums(files):
     """Damage must then be found by what decodes, not by its hash."""
     document = yaml.safe_load(files["container_meta.yaml"])
-    del document["kissgs"]["sha256"]
-    return {**files, "container_meta.yaml": yaml.safe_dump(document).encode()}
+    del document["kissgs"]["sha256"], document[CHECKSUM]
+    meta = json.loads(files["meta.json"])
+    del meta["kissgs"]["crc32"], meta[CHECKSUM]
+    texts = {"container_meta.yaml": yaml.safe_dump(document), "meta.json": json.dumps(meta, separators=(",", ":"))}
+    return {**files, **{name: text.encode() for name, text in texts.items()}}
 
 
 FILES = without_checksums(COMPRESSED.files)

@@ -49,7 +49,7 @@ def test_every_float32_survives_both_spellings(numbers, mean):
     first = np.cumsum([0, *CHANNELS.values()])
     exact = {field: np.float32(numbers[i : i + n]) for i, (field, n) in zip(first, CHANNELS.items(), strict=False)}
     spelled = {field: [float(str(number)) for number in values] for field, values in exact.items()}
-    layout = Layout(grid_side=8, codebook_side=8, ranges={field: (low, low) for field, low in spelled.items()})
+    layout = Layout(count=0, grid_side=8, codebook_side=8, ranges={field: (low, low) for field, low in spelled.items()})
     document = yaml.safe_load(layout.to_yaml())
     for field, (low, _) in oracle.ranges_of(document).items():
         found = np.ravel(low).tolist()
@@ -205,7 +205,7 @@ def test_aliases_as_dumpers_write_them():
 def test_the_degree_of_foreign_containers_is_that_of_their_highest_band(degree):
     files = dict(compress(random_scene(30, degree)).files)
     changed = yaml.safe_load(files["container_meta.yaml"])
-    del changed["kissgs"]
+    del changed["kissgs"], changed["kissgs_crc32"]
     files["container_meta.yaml"] = yaml.safe_dump(changed).encode()
     assert decompress(files).sh_degree == degree
 

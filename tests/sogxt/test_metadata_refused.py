@@ -23,7 +23,7 @@ JSON_ERRORS = [
     (lambda meta: meta.pop("means"), "meta.json lacks something that a SOG-XT container has: 'means'"),
     (lambda meta: meta.pop("shN"), "meta.json lacks something that a SOG-XT container has: 'shN'"),
     (lambda meta: meta.pop("gridSide"), "meta.json lacks something that a SOG-XT container has: 'gridSide'"),
-    (lambda meta: meta["sh0"].update(mins=[]), "meta.json lacks something that a SOG-XT container has"),
+    (lambda meta: meta["sh0"].update(mins=[]), "meta.json: the range of f_dc has 0 numbers, not 3"),
     (lambda meta: meta["sh0"].update(mins="low"), "meta.json: ranges.f_dc.0.0: input should be a valid number"),
     (lambda meta: meta.update(gridSide=0), "meta.json: grid_side: input should be greater than or equal to 1"),
     (lambda meta: meta.update(gridSide=13377), "meta.json: grid_side: input should be less than or equal to 13376"),
@@ -49,12 +49,12 @@ def test_impossible_meta_json_is_refused(change, sentence):
     assert refusal(with_json(change)).startswith(sentence)
 
 
-@pytest.mark.parametrize("data", [b"", b"{", b"\xff\xfe\xfd", b'{"a": ' * 5000, b"1" * 5000, b"[" * 100_000])
+@pytest.mark.parametrize("data", [b"", b"{", b"\xff\xfe\xfd", b'{"a": ' * 5000, b"NaN", b"[" * 100_000])
 def test_what_is_no_json_is_refused(data):
     assert refusal({"meta.json": data}) == "meta.json is not readable JSON"
 
 
-@pytest.mark.parametrize("data", [b"[]", b"null", b"3", b'"text"'])
+@pytest.mark.parametrize("data", [b"[]", b"null", b"3", b'"text"', b"1" * 5000])
 def test_json_that_is_no_object_is_refused(data):
     assert refusal({"meta.json": data}).startswith("meta.json lacks something that a SOG-XT container has")
 
@@ -133,11 +133,19 @@ YAML_ERRORS = [
     ),
     (
         lambda d: quantize_of(d, "opacities").update(max_values=1e39),
-        "container_meta.yaml: ranges.opacities.1.0: input should be less than or equal to",
+        "container_meta.yaml: ranges.opacities.1.0: input should be less than",
     ),
     (
         lambda d: quantize_of(d, "opacities").update(max_values="high"),
         "container_meta.yaml: ranges.opacities.1.0: input should be a valid number",
+    ),
+    (
+        lambda d: quantize_of(d, "means").update(min_values=True),
+        "container_meta.yaml: ranges.means.0.0: input should be a valid number, not true or false",
+    ),
+    (
+        lambda d: d["meta"].update(f_rest_centroids_side=True),
+        "container_meta.yaml: codebook_side: input should be a valid number, not true or false",
     ),
     (
         lambda d: d["meta"].update(grid_side=0),

@@ -15,7 +15,7 @@ from kissgs.sogxt.economy import NEARLY, Costs, Gloss, error_at, price_for, step
 from kissgs.sogxt.encode import encode
 from kissgs.sogxt.pras import ROTATIONS, apply_forms
 from kissgs.sogxt.quantize import quantize
-from kissgs.sogxt.rounding import MIRRORS, quantize_by_class, round_shapes
+from kissgs.sogxt.rounding import CAPTURED, MIRRORS, quantize_by_class, round_shapes
 from kissgs.splats import clean
 
 WEIGHED = ["balanced", "small"]
@@ -35,7 +35,14 @@ def made_up(splats, seed=0, spread=2.0):
         colors=size.astype(np.float32),
         directions=rng.normal(0, 0.2, (count, splats.shN.shape[1])).astype(np.float32),
         guessed=np.zeros(count, np.float32),
+        coverage=np.ones(count, np.float32),
+        captured=np.zeros(count, np.float32),
     )
+
+
+def anything(count):
+    """Changes as large as any may be."""
+    return {name: np.full(count, change) for name, change in CAPTURED.items()}
 
 
 def weighed(splats, importance, **changes):
@@ -73,13 +80,27 @@ def test_prices_are_found_for_the_error_asked_for():
 def test_classes_are_of_like_importance_and_size():
     splats = random_scene(1000, 0)
     costs = Costs.of(made_up(splats), splats).take(np.arange(0, 1000, 2))
-    classes = costs.classes(5)
+    places = splats.means[::2]
+    classes = costs.classes(5, places)
     assert np.bincount(classes).tolist() == [100] * 5
     worth = costs.scale * costs.turn * costs.color
     assert all(worth[classes == c].min() >= worth[classes == c + 1].max() for c in range(4))
-    assert (costs.classes(1) == 0).all()
+    assert (costs.classes(1, places) == 0).all()
     for few in range(1, 10):
-        assert (np.bincount(costs.take(np.arange(few)).classes(32)) == 1).all()
+        assert (np.bincount(costs.take(np.arange(few)).classes(32, places[:few])) == 1).all()
+
+
+def test_gaussians_in_one_place_keep_their_order():
+    """Which of them is in front is decided by the order in which they are stored."""
+    splats = random_scene(600, 0)
+    splats = replace(splats, means=np.repeat(splats.means[:20] * np.float32([0, 1, 1]), 30, axis=0))
+    costs = Costs.of(made_up(splats), splats)
+    classes = costs.classes(5, splats.means).reshape(20, 30)
+    assert (classes == classes[:, :1]).all()
+    assert len(np.unique(classes)) == classes.max() + 1
+    order = weighed(splats, made_up(splats), drop=0).order
+    for place in range(20):
+        assert (np.diff(order[order // 30 == place]) > 0).all()
 
 
 def test_what_is_dropped_is_worth_least_and_never_more_than_half():
@@ -95,7 +116,7 @@ def test_levels_of_a_class_are_multiples_of_its_step():
     rng = np.random.default_rng(0)
     values, classes = rng.normal(size=(3000, 3)), np.repeat([0, 1, 2], 1000)
     cost = np.repeat([1.0, 0.1, 0.004], 1000)
-    found = quantize_by_class(values, cost, classes, 1e-4, 2.0)
+    found = quantize_by_class(values, cost, classes, 1e-4, np.full(3000, 2.0))
     each = (found.high.astype(float) - found.low) / found.top
     errors = np.abs(found.low + found.levels * each - values)
     for c, wanted in enumerate((1, 3, 16)):
@@ -146,7 +167,7 @@ def test_rounding_for_nothing_is_rounding_to_the_nearest_along_each_axis():
     with Workers(1) as pool:
         found = round_shapes(
             *(values, parts, np.tile(packed(np.diag([1.0] * 4 + [0] * 3)), (count, 1)), np.zeros(count, np.uint8)),
-            *(costs, np.zeros(count, np.int64), 1e-30, pool),
+            *(costs, np.zeros(count, np.int64), 1e-30, anything(count), pool),
         )
     for part, chosen, (a, b) in list(zip(parts, found, ((0, 1), (1, 4), (4, 8)), strict=True))[:2]:
         each = (part.high.astype(float) - part.low) / part.top
@@ -173,7 +194,7 @@ def test_rounding_by_price_never_costs_more_than_the_nearest():
     with Workers(1) as pool:
         found = round_shapes(
             *(values, parts, np.tile(packed(form), (count, 1)), np.zeros(count, np.uint8), costs),
-            *(np.zeros(count, np.int64), price, pool),
+            *(np.zeros(count, np.int64), price, anything(count), pool),
         )
 
     def decoded(chosen):

@@ -18,8 +18,8 @@ def cameras(count=12):
 
 
 @functools.cache
-def compressed(preset):
-    return kissgs.compress(SCENE, settings=kissgs.Settings.from_preset(preset))
+def compressed(preset, **changes):
+    return kissgs.compress(SCENE, settings=kissgs.Settings.from_preset(preset, **changes))
 
 
 def likeness(scene, found, views, background=(0, 0, 0)):
@@ -32,9 +32,21 @@ def likeness(scene, found, views, background=(0, 0, 0)):
 
 @pytest.mark.parametrize("background", [(0, 0, 0), (1, 1, 1), (0.2, 0.9, 0.5)])
 @pytest.mark.parametrize("preset", ["balanced", "small"])
-def test_fewer_bytes_than_the_papers_and_no_worse_before_any_background(preset, background):
+def test_fewer_bytes_than_the_papers_and_better_before_any_background(preset, background):
+    """By default a scene whose range the paper's levels do not fit is to be better than with them: as good as by the
+    steps of ``fast``. Here that is more than 2 dB, and takes some of the bytes that are saved."""
     paper, ours = compressed("paper"), compressed(preset)
-    assert len(ours.to_zip()) < 0.8 * len(paper.to_zip())
+    assert len(ours.to_zip()) < 0.85 * len(paper.to_zip())
+    wanted, found = (likeness(SCENE, kissgs.decompress(c.files), cameras(), background) for c in (paper, ours))
+    assert found.mean() > wanted.mean() + 2
+    assert found.min() > wanted.min() + 1
+
+
+@pytest.mark.parametrize("background", [(0, 0, 0), (1, 1, 1), (0.2, 0.9, 0.5)])
+def test_two_thirds_of_the_papers_bytes_are_as_good_before_any_background(background):
+    """Where that is all that is asked for."""
+    paper, ours = compressed("paper"), compressed("balanced", fidelity=-2.5)
+    assert len(ours.to_zip()) < 0.7 * len(paper.to_zip())
     wanted, found = (likeness(SCENE, kissgs.decompress(c.files), cameras(), background) for c in (paper, ours))
     assert found.mean() > wanted.mean()
     assert found.min() > wanted.min() - 1

@@ -1,6 +1,7 @@
 """Oracle: the photographs and renderings themselves; for the order, counting."""
 
 from collections import Counter
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -57,3 +58,31 @@ def test_every_view_comes_once_in_every_round():
 def test_the_extent_is_that_of_the_cameras():
     """A circle of radius 3: in INRIA's code, 1.1 times the largest distance from the mean."""
     assert taught(cloud()).extent == pytest.approx(3.3)
+
+
+def test_the_reach_of_each_object_is_that_of_the_cameras_about_it():
+    """Two objects, one at a hundredth of the size, far from each other."""
+
+    def smaller(view):
+        pose = view.camera.viewmat.copy()
+        pose[:3, 3] = -pose[:3, :3] @ (0.01 * view.camera.position + (50, 0, 0))
+        return View(view.name, replace(view.camera, viewmat=pose))
+
+    small = [smaller(view) for view in around(12)]
+    found = lessons(cloud(), [*around(12), *small], black())
+    alone = lessons(cloud(), around(12), black())
+    means = cloud(30).means
+    reach = found.reach(np.concatenate([means, means * np.float32(0.01) + np.float32([50, 0, 0])]), found.extent)
+    assert found.extent > 20
+    np.testing.assert_allclose(reach[:30], alone.reach(means, found.extent), rtol=1e-6)
+    np.testing.assert_allclose(reach[30:], 0.01 * reach[:30], rtol=1e-3)
+    assert (reach[:30] > 0.5 * alone.extent).all()
+
+
+def test_the_reach_is_never_nothing_and_never_more_than_it_may_be():
+    found = lessons(cloud(), around(3), black())
+    places = np.concatenate([[camera.position for camera in found.cameras], [[1e6, 0, 0]]]).astype(np.float32)
+    reach = found.reach(places, 2.0)
+    assert (reach > 0).all()
+    assert reach[-1] == 2.0
+    assert found.reach(places[:0], 2.0).shape == (0,)

@@ -67,6 +67,20 @@ def test_a_restored_one_goes_on_exactly_as_the_first_would(steps):
     assert same(one.splats(), other.splats())
 
 
+def test_positions_move_in_units_of_their_reach():
+    scene, rng = cloud(50, 2), np.random.default_rng(1)
+    reach = np.exp(rng.normal(0, 4, 50)).astype(np.float32)
+    trainee, oracle = Trainee(scene, reach=reach), NaiveAdam(scene.means)
+    for step in range(9):
+        oracle.step(push(trainee, rng)["means"], RATES["means"] * reach[:, None])
+        if step in (3, 6):
+            index = np.sort(rng.permutation(len(trainee))[:20])
+            trainee.keep(index)
+            oracle.keep(index)
+            reach = reach[index]
+    np.testing.assert_allclose(trainee.parameters["means"].detach().numpy(), oracle.value, rtol=2e-5, atol=2e-5)
+
+
 def test_the_scene_it_came_from_is_not_changed():
     scene = cloud(12)
     before = scene.means.copy()

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from hollow_scenes import box, surface
+from whole_scenes import five
 
 from kissgs.errors import Cancelled, InvalidViewsError
 from kissgs.io.ply import read_ply
@@ -23,7 +24,8 @@ def places_of(views):
 
 def test_views_are_split_named_square_and_of_many_angles(thing):
     views = wander(thing, side=48, count=17)
-    assert sorted(view.name for view in views.all) == [f"virtual_{n:02}" for n in range(17)]
+    assert 17 <= len(views.all) <= 4 * 17
+    assert sorted(view.name for view in views.all) == [f"virtual_{n:02}" for n in range(len(views.all))]
     assert [view.name for view in views.test] == ["virtual_00", "virtual_08", "virtual_16"]
     assert {(view.camera.width, view.camera.height) for view in views.all} == {(48, 48)}
     angles = np.array([2 * np.arctan(24 / view.camera.K[0, 0]) for view in views.all])
@@ -31,11 +33,16 @@ def test_views_are_split_named_square_and_of_many_angles(thing):
     assert np.ptp(angles) > 0.2
 
 
+def test_a_scene_of_several_objects_gets_more_views():
+    views = wander(five(), side=16, count=24)
+    assert 48 <= len(views.all) <= 4 * 24
+
+
 def test_the_same_seed_gives_the_same_views_for_any_number_of_threads(thing):
     one, same = (wander(thing, side=32, count=9, seed=3, threads=threads) for threads in (1, 3))
     assert np.array_equal(places_of(one), places_of(same))
     other = wander(thing, side=32, count=9, seed=4)
-    assert not (places_of(one) == places_of(other)).any()
+    assert not set(map(tuple, places_of(one))) & set(map(tuple, places_of(other)))
 
 
 def test_an_object_is_seen_from_all_around_and_from_outside(thing):
@@ -52,12 +59,13 @@ def test_a_room_is_seen_from_inside_in_all_directions():
     half = np.array([4.0, 1.4, 3.0])
     room = box(half, 10_000, 0.12)
     views = wander(room, side=48, count=40)
-    assert (np.abs(places_of(views)) < half).all()
+    within = (np.abs(places_of(views)) < half).all(axis=1)
+    assert within.mean() > 0.8  # what is hidden from within, if anything, is looked at from outside
     looks = np.array([view.camera.viewmat[2, :3] for view in views.all])
     assert np.diff(np.sort(np.arctan2(*looks[:, [0, 2]].T))).max() < np.pi / 3
-    for view in views.all:
+    for view, inside in zip(views.all, within, strict=True):
         _, alpha = render(room, view.camera)
-        assert alpha.mean() > 0.8
+        assert alpha.mean() > (0.8 if inside else 0.01)
 
 
 def test_photographers_places_are_among_them(shared_data):

@@ -13,6 +13,7 @@ from web_tools import pillow, run_node
 
 import kissgs
 from kissgs.sogxt.decode import decode as decode_in_python
+from kissgs.sogxt.names import CHECKSUM
 
 IMAGES = (
     *("active_mask.webp", "means_bytes_1.webp", "f_dc.webp", "opacities.webp", "scales.webp", "quaternions.webp"),
@@ -55,8 +56,9 @@ def zipped(files, method=zipfile.ZIP_STORED, folder="", comment=b""):
 
 
 def with_meta(files, change):
-    """The container after a change of what ``meta.json`` says."""
+    """The container after a change of what ``meta.json`` says, which then has no checksum."""
     meta = json.loads(files["meta.json"])
+    meta.pop(CHECKSUM, None)
     change(meta)
     return {**files, "meta.json": json.dumps(meta).encode()}
 

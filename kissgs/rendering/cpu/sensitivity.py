@@ -63,6 +63,7 @@ def moments(
     """
     alpha_min, alpha_max = limits[0], limits[1]
     zero, one = np.float32(0), np.float32(1)
+    brightest = np.float32(2)  # a display shows no more than 1, and hardly less with a factor of two of it in front
     height, width = transmittance.shape
     variance = np.float32(3 * spread * spread)
     # Per pixel: x, y, stop, T; R, G, B of what is behind, and how much of the background shines through that.
@@ -82,6 +83,7 @@ def moments(
             sums[slots[i], :] = zero
         for i in range(begin + furthest - 1, begin - 1, -1):
             (mx, my, l0, l1, l2), (opacity, red, green, blue) = _footprint(splats, members[i], x0, y0)
+            red, green, blue = min(red, brightest), min(green, brightest), min(blue, brightest)
             top, bottom = np.uint64(spans[i] >> 5), np.uint64(spans[i] & 31)
             place = np.float32(i - begin)
             m0, mu, mv, muu, muv, mvv = zero, zero, zero, zero, zero, zero

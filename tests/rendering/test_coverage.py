@@ -1,0 +1,134 @@
+"""Coverage and local scale; the oracles are brute-force neighbours and hand-placed cameras."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from whole_scenes import joined, moved
+
+from kissgs import Splats, sample_scene
+from kissgs.parallel import Workers
+from kissgs.rendering.camera import Camera, look_at
+from kissgs.rendering.coverage import Coverage
+from kissgs.rendering.local_scale import local_scale
+
+UP = np.array([0.0, -1.0, 0.0])
+
+
+def neighbour(splats: Splats, rank: int) -> np.ndarray:
+    means = splats.means.astype(np.float64)
+    return np.array([np.partition(np.linalg.norm(means - mean, axis=1), rank)[rank] for mean in means])
+
+
+def test_local_scale_is_the_distance_of_some_hundredth_neighbour():
+    scene = sample_scene(3000)
+    found = local_scale(scene)
+    sizes = np.exp(np.sort(scene.scales, axis=1)[:, 1])
+    by_neighbours = found > 1.01 * sizes
+    share = found[by_neighbours]
+    assert (share >= 0.99 * neighbour(scene, 20)[by_neighbours]).mean() > 0.97  # the rest: at the end of something
+    assert np.median(share / neighbour(scene, 128)[by_neighbours]) < 1.6
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_local_scale_follows_the_scale_of_the_scene(scale: float):
+    scene = sample_scene(2000)
+    assert local_scale(moved(scene, scale=scale)) == pytest.approx(scale * local_scale(scene), rel=2e-2)
+
+
+def test_a_far_object_does_not_change_local_scales():
+    """As far as float32 can hold its shape: at ten times the distance it could not."""
+    scene = sample_scene(2000)
+    both = joined(scene, moved(sample_scene(2000, seed=1), by=(1e4, 0, 0), scale=0.01))
+    there = both.means[:, 0] > 5e3
+    found = local_scale(both)
+    assert np.median(found[there]) == pytest.approx(0.01 * np.median(local_scale(sample_scene(2000, seed=1))), rel=0.5)
+    assert np.median(found[~there]) == pytest.approx(np.median(local_scale(scene)), rel=0.5)
+
+
+@pytest.mark.parametrize("count", [60, 100])
+def test_the_scale_of_an_object_of_few_gaussians_is_its_own(count: int):
+    """The next objects are three hundred times as far."""
+    one = replace(sample_scene(count, seed=2), scales=np.full((count, 3), -9, np.float32))
+    extent = np.ptp(one.means, axis=0).max()
+    many = joined(*(moved(one, by=(n % 5 * 6000.0, n // 5 * 6000.0, 0)) for n in range(20)))
+    assert np.quantile(local_scale(many), 0.95) < 3 * extent
+
+
+@pytest.mark.parametrize("far", [1e8, 1e12, 1e18])
+def test_one_gaussian_however_far_out_does_not_change_local_scales(far: float):
+    """Distances in its leaf keep their digits."""
+    scene = sample_scene(2000)
+    means = scene.means.copy()
+    means[0, 0] = far
+    ratios = local_scale(replace(scene, means=means))[1:] / local_scale(scene)[1:]
+    assert ratios.min() > 0.5
+    assert ratios.max() < 2
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 7, 8, 9, 513])
+def test_small_and_coincident_scenes_have_positive_scales(count: int):
+    scene = sample_scene(count)
+    together = moved(scene, scale=1e-6)
+    for splats in (scene, together):
+        found = local_scale(splats)
+        assert found.shape == (count,)
+        assert (found > 0).all()
+        assert np.isfinite(found).all()
+
+
+def looked_at(splats: Splats, *cameras: Camera) -> np.ndarray:
+    from kissgs.importance import Importance
+    from kissgs.rendering.cpu.frame import add_sensitivities, draw
+
+    coverage = Coverage(splats)
+    with Workers(1) as pool:
+        for camera in cameras:
+            shown = Importance.none(len(splats), splats.sh_degree)
+            add_sensitivities(draw(splats, camera, np.zeros(3, np.float32), pool), 1.0, 0.0, shown, pool)
+            coverage.add(camera, shown.colors)
+    return coverage.share
+
+
+def plate(z: float, opacity: float = 10.0, n: int = 900) -> Splats:
+    side = int(np.sqrt(n))
+    x, y = np.meshgrid(np.linspace(-1, 1, side), np.linspace(-1, 1, side))
+    means = np.stack([x.ravel(), y.ravel(), np.full(side**2, z)], axis=1).astype(np.float32)
+    return Splats(
+        means=means,
+        quats=np.tile(np.float32([1, 0, 0, 0]), (side**2, 1)),
+        scales=np.tile(np.float32(np.log([2 / side, 2 / side, 0.01])), (side**2, 1)),
+        opacities=np.full(side**2, opacity, np.float32),
+        sh0=np.zeros((side**2, 3), np.float32),
+        shN=np.zeros((side**2, 0, 3), np.float32),
+    )
+
+
+def camera(place: tuple[float, float, float], target: tuple[float, float, float]) -> Camera:
+    return look_at(np.array(place), np.array(target), UP, fov=np.radians(60), width=128, height=128)
+
+
+def test_what_is_behind_an_opaque_plate_is_not_covered_and_what_is_in_front_is():
+    front, behind = plate(0.0), plate(1.0)
+    both = Splats(**{name: np.concatenate([getattr(front, name), getattr(behind, name)]) for name in front.__slots__})
+    share = looked_at(both, camera((0, 0, -2.2), (0, 0, 0)))
+    inner = (np.abs(both.means[:, :2]) < 0.7).all(axis=1)
+    assert (share[inner & (both.means[:, 2] == 0)] > 0.5).all()
+    assert (share[inner & (both.means[:, 2] == 1)] < 0.05).all()
+    from_both = looked_at(both, camera((0, 0, -2.2), (0, 0, 0)), camera((0, 0, 3.2), (0, 0, 0)))
+    assert (from_both[inner] > 0.5).all()
+
+
+def test_what_is_seen_from_afar_only_is_hardly_covered():
+    scene = plate(0.0)
+    near, far = (looked_at(scene, camera((0, 0, -z), (0, 0, 0))) for z in (2.2, 220.0))
+    inner = (np.abs(scene.means[:, :2]) < 0.7).all(axis=1)
+    assert (near[inner] > 0.5).all()
+    assert (far < 0.05).all()
+
+
+def test_close_up_depends_on_no_camera_and_on_no_scale():
+    scene = sample_scene(1500)
+    assert Coverage(moved(scene, scale=100)).close_up == pytest.approx(Coverage(scene).close_up, rel=0.05, abs=1e-6)

@@ -1,0 +1,204 @@
+"""Starts with a database or a data folder that is older, damaged or not there; oracle: what lay there before."""
+
+import hashlib
+import json
+import shutil
+import signal
+
+import pytest
+from data_folders import add_a_job, command, listing, opened, service
+from serving import SLOW, Service, scene_bytes
+
+from service.models import State
+from service.settings import SettingsError
+
+pytestmark = pytest.mark.usefixtures("no_variables")
+
+
+def write_result(context, job_id, folder=None):
+    """What a job's process leaves when it is done."""
+    folder = folder or context.folders.result(job_id)
+    (folder / "files").mkdir(parents=True)
+    contents = {"scene.zip": b"PK", "report.json": b"{}", "files/meta.json": b"{} "}
+    for name, content in contents.items():
+        (folder / name).write_bytes(content)
+    entries = {name: {"bytes": len(c), "sha256": hashlib.sha256(c).hexdigest()} for name, c in contents.items()}
+    summary = {
+        "container": entries["scene.zip"], "report": entries["report.json"],
+        "files": {"meta.json": {**entries["files/meta.json"], "stored": 3}},
+        "count": 3, "seconds": {"total": 1.0}, "cpu_seconds": 1.0,
+    }  # fmt: skip
+    (folder / "summary.json").write_text(json.dumps(summary))
+    return summary
+
+
+def state_of(context, job_id):
+    return context.store.get(job_id).state
+
+
+@pytest.fixture
+def two_jobs(tmp_path):
+    """A data folder with one job that waits and one that runs, in this order."""
+    with service(tmp_path / "data") as context:
+        first, second = add_a_job(context), add_a_job(context)
+        context.store.claim()
+    return tmp_path / "data", second, first
+
+
+# A database that is older than the folder ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("upload", ["kept", "gone"])
+def test_a_result_of_a_job_that_waits_is_taken_up(two_jobs, upload, caplog):
+    """The database was restored: since that copy was made, the job has been done."""
+    folder, waiting, running = two_jobs
+    with service(folder) as context:
+        summary = write_result(context, waiting)
+        if upload == "gone":
+            context.folders.upload(waiting).unlink()
+    before = listing(folder / "jobs" / waiting)
+    with service(folder) as context:
+        job = context.store.get(waiting)
+        assert (job.state, job.result, job.upload_kept) == (State.SUCCEEDED, summary, upload == "kept")
+        assert state_of(context, running) == State.QUEUED
+        events = [event.data["state"] for event in context.store.events(job.number)]
+        assert events == ["queued", "running", "succeeded"]
+    assert listing(folder / "jobs" / waiting) == before
+    assert "after -" not in caplog.text
+
+
+def test_a_restored_database_with_a_running_service(tmp_path):
+    """One job was done and has lost its upload, one has kept it: the copy says that both wait."""
+    with Service(tmp_path / "data", KISSGS_KEEP_UPLOADS="false") as it:
+        long = it.submit(scene_bytes(20_000, 3), SLOW)
+        it.running(long)
+        jobs = [it.submit(), it.submit()]
+        it.kill(signal.SIGKILL)
+        shutil.copytree(it.folder, tmp_path / "copy")
+        it.restart()
+        it.http.delete(f"/v1/jobs/{long['id']}")
+        zips = [it.http.get(it.ended(job)["links"]["result"]).content for job in jobs]
+        it.kill(signal.SIGTERM)
+        for path in it.folder.glob("jobs.sqlite*"):
+            path.unlink()
+        for path in (tmp_path / "copy").glob("jobs.sqlite*"):
+            shutil.copy(path, it.folder / path.name)
+        shutil.copy(tmp_path / "copy" / "jobs" / jobs[1]["id"] / "scene.ply", it.folder / "jobs" / jobs[1]["id"])
+        it.restart()
+        assert [it.http.get(it.ended(job)["links"]["result"]).content for job in jobs] == zips
+        assert it.http.get("/readyz").status_code == 200
+        assert it.status(long)["problem"]["detail"].startswith("the upload is no longer")
+
+
+# Folders that are not there ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("way", ["emptied", "moved away", "of other jobs"])
+def test_no_folder_of_the_jobs_that_wait_or_run(two_jobs, way):
+    folder, waiting, running = two_jobs
+    (folder / "jobs").rename(folder / "away")
+    if way != "moved away":
+        (folder / "jobs").mkdir()
+    if way == "of other jobs":
+        (folder / "jobs" / ("0" * 32)).mkdir()
+    for _ in range(2):
+        with pytest.raises(
+            SettingsError, match=r"holds none of the jobs that wait or run, of which there are 2"
+        ) as told:
+            opened(folder)
+        assert "\n" not in str(told.value)
+    ended = command(folder)
+    assert (ended.returncode, len(ended.stderr.splitlines())) == (2, 1)
+    if way == "moved away":
+        (folder / "jobs").rmdir()
+    else:
+        shutil.rmtree(folder / "jobs")
+    (folder / "away").rename(folder / "jobs")
+    with service(folder) as context:
+        assert state_of(context, waiting) == state_of(context, running) == State.QUEUED
+
+
+def test_going_on_without_them(two_jobs):
+    """As that sentence says."""
+    folder, *jobs = two_jobs
+    shutil.rmtree(folder / "jobs")
+    with pytest.raises(SettingsError) as told:
+        opened(folder)
+    named = str(told.value).split("make the empty folder ")[1].split(" ")[0]
+    assert named == str(folder / "jobs" / min(jobs))
+    (folder / "jobs" / min(jobs)).mkdir()
+    with service(folder) as context:
+        assert [state_of(context, job) for job in jobs] == [State.FAILED] * 2
+        assert list((folder / "jobs").iterdir()) == []
+
+
+def test_a_job_without_its_upload_keeps_its_folder(two_jobs, caplog):
+    caplog.set_level("INFO")
+    folder, waiting, running = two_jobs
+    for job in (waiting, running):
+        (folder / "jobs" / job / "scene.ply").unlink()
+        (folder / "jobs" / job / "result").mkdir()
+        (folder / "jobs" / job / "result" / "scene.zip").write_bytes(b"PK")
+    before = listing(folder / "jobs")
+    for _ in range(2):
+        with service(folder) as context:
+            for job in (waiting, running):
+                assert state_of(context, job) == State.FAILED
+                assert "no longer on the server's disk" in context.store.get(job).problem["detail"]
+        assert listing(folder / "jobs" / ".orphaned") == before
+    assert caplog.text.count("has lost its upload and lies in") == 2
+    assert f"job {waiting} failed before it was started" in caplog.text
+
+
+def test_a_result_of_a_job_that_failed_is_kept(two_jobs):
+    folder, waiting, running = two_jobs
+    with service(folder) as context:
+        write_result(context, running)
+        context.store.move(context.store.get(running).number, State.FAILED)
+        context.store.move(context.store.get(waiting).number, State.FAILED)
+    before = listing(folder / "jobs" / running)
+    with service(folder):
+        assert listing(folder / "jobs" / ".orphaned" / running) == before
+        assert not (folder / "jobs" / waiting).exists()  # an upload is of no more use
+
+
+# What is damaged -----------------------------------------------------------------------------------------------------
+
+DAMAGES = {
+    "cut off": lambda result: (result / "summary.json").write_text('{"container": {"by'),
+    "a list": lambda result: (result / "summary.json").write_text("[]"),
+    "no object in it": lambda result: (result / "summary.json").write_text('{"container": 3, "files": []}'),
+    "no text": lambda result: (result / "summary.json").write_bytes(b"\xff\xfe\0"),
+    "nested": lambda result: (result / "summary.json").write_text("[" * 100_000),
+    "a folder": lambda result: ((result / "summary.json").unlink(), (result / "summary.json").mkdir()),
+    "not there": lambda result: (result / "summary.json").unlink(),
+    "a container cut off": lambda result: (result / "scene.zip").write_bytes(b"P"),
+    "a file gone": lambda result: (result / "files" / "meta.json").unlink(),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("state", ["waiting", "running"])
+def test_a_damaged_result(two_jobs, damage, state, caplog):
+    """The job is done once more, and its new result takes the place of that one."""
+    folder, waiting, running = two_jobs
+    job = waiting if state == "waiting" else running
+    with service(folder) as context:
+        write_result(context, job)
+        context.store.claim()
+    DAMAGES[damage](folder / "jobs" / job / "result")
+    with service(folder) as context:
+        assert state_of(context, job) == State.QUEUED
+        assert f"job {job}: its result is damaged" in caplog.text
+        summary = write_result(context, job, context.folders.new_work(job) / "result")
+        context.folders.keep_result(job)
+        context.folders.keep_result(job)  # once more, because its end could not be recorded
+        context.folders.remove_work(job)
+        assert sorted(path.name for path in (folder / "jobs" / job).iterdir()) == ["result", "scene.ply"]
+        assert json.loads((context.folders.result(job) / "summary.json").read_text()) == summary
+
+
+def test_a_result_that_has_vanished_is_none(two_jobs):
+    folder, waiting, _ = two_jobs
+    with service(folder) as context, pytest.raises(FileNotFoundError, match="vanished"):
+        context.folders.keep_result(waiting)

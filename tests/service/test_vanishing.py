@@ -1,0 +1,347 @@
+"""A job database that goes away, changes or breaks under a running service; oracle: what was answered and what lies on
+the disk."""
+
+import contextlib
+import os
+import shutil
+import signal
+import sqlite3
+import threading
+import time
+from functools import partial
+
+import pytest
+import sqlalchemy as sa
+from serving import SLOW, SMALL, Service, problem, said, scene_bytes
+
+from service import watch
+from service.models import State
+from service.store import Store
+from service.watch import VanishedError
+
+HEAD = b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n"
+
+
+def execute(folder, *statements):
+    with contextlib.closing(sqlite3.connect(folder / "jobs.sqlite", timeout=20)) as database, database:
+        for statement in statements:
+            database.execute(statement)
+
+
+def files(folder):
+    return sorted(folder.glob("jobs.sqlite*"))
+
+
+def remove(folder, pattern="jobs.sqlite*"):
+    for path in folder.glob(pattern):
+        path.unlink()
+
+
+def replace(folder):
+    copy = folder / "copy"
+    shutil.copy(folder / "jobs.sqlite", copy)
+    copy.replace(folder / "jobs.sqlite")
+
+
+def become_another(folder):
+    execute(folder, "UPDATE meta SET value = 7 WHERE name = 'identity'")
+
+
+def overwrite(folder):
+    with (folder / "jobs.sqlite").open("r+b") as file:
+        size = file.seek(0, os.SEEK_END)
+        for place in range(100, size, 4096):
+            file.seek(place)
+            file.write(b"\xff" * 400)
+
+
+def truncate(folder, size=0):
+    os.truncate(folder / "jobs.sqlite", size)
+
+
+WAYS = {
+    "removed": (remove, "jobs.sqlite was removed"),
+    "the file alone removed": (partial(remove, pattern="jobs.sqlite"), "jobs.sqlite was removed"),
+    "the journal removed": (partial(remove, pattern="*-wal"), "jobs.sqlite-wal was removed"),
+    "the index removed": (partial(remove, pattern="*-shm"), "jobs.sqlite-shm was removed"),
+    "replaced by a copy": (replace, "jobs.sqlite was replaced"),
+    "another's": (become_another, "replaced by another"),
+    "jobs dropped": (lambda folder: execute(folder, "DROP TABLE jobs"), "no such table: jobs"),
+    "events dropped": (lambda folder: execute(folder, "DROP TABLE events"), "no such table: events"),
+    "meta dropped": (lambda folder: execute(folder, "DROP TABLE meta"), "no such table: meta"),
+    "a column dropped": (
+        lambda folder: execute(folder, "ALTER TABLE jobs DROP COLUMN note"),
+        "no such column: jobs.note",
+    ),
+    "emptied": (truncate, "empty"),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_it_is_noticed_before_an_upload_is_taken(start, way):
+    service = start()
+    job = service.ended(service.submit())
+    change, reason = WAYS[way]
+    execute(service.folder, "PRAGMA wal_checkpoint(TRUNCATE)")
+    change(service.folder)
+    ready = service.http.get("/readyz")
+    assert (ready.status_code, ready.json()["ready"]) == (503, False)
+    assert reason in ready.json()["checks"]["database"]
+    with service.raw(HEAD % 500_000) as connection:  # not a byte of the scene
+        answer = said(connection)
+    assert answer.startswith(b"HTTP/1.1 503")
+    assert b'"code":"database"' in answer
+    assert b"retry-after: " in answer.lower()
+    refused = service.http.post("/v1/compress", content=SMALL)
+    assert problem(refused, 503, "database")["retryable"]
+    assert service.http.get("/livez").status_code == 200
+    assert service.strays() == []
+    assert (service.folder / "jobs" / job["id"] / "result" / "scene.zip").exists()
+
+
+@pytest.mark.parametrize(
+    "damage", [overwrite, partial(truncate, size=5 * 4096 + 100)], ids=["overwritten", "truncated"]
+)
+def test_damage_in_any_page_is_noticed(tmp_path, damage):
+    """Pages that no request reads: of the rows in the middle."""
+    store = Store(f"sqlite:///{tmp_path / 'jobs.sqlite'}", time.time)
+    execute(tmp_path, *[f"INSERT INTO meta VALUES ('{number:032}', 1.0)" for number in range(3000)])
+    execute(tmp_path, "PRAGMA wal_checkpoint(TRUNCATE)")
+    assert store.trouble() is None
+    damage(tmp_path)
+    end = time.monotonic() + 10
+    while store.trouble() is None:
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    assert "damaged" in store.trouble() or "malformed" in store.trouble()
+
+
+def test_a_data_folder_that_is_gone(start):
+    service = start()
+    shutil.rmtree(service.folder)
+    ready = service.http.get("/readyz")
+    assert ready.status_code == 503
+    assert "jobs.sqlite was removed" in ready.json()["checks"]["database"]
+    assert "the data folder cannot be used" in ready.json()["checks"]["disk"]
+    problem(service.http.post("/v1/jobs", content=SMALL), 503, "database")
+    assert not service.folder.exists()
+
+
+def test_an_upload_that_arrives_meanwhile_is_not_accepted(start):
+    service = start()
+    with service.raw(HEAD % len(SMALL) + SMALL[:-10]) as connection:
+        time.sleep(0.5)
+        remove(service.folder)
+        connection.sendall(SMALL[-10:])
+        answer = said(connection)
+    assert answer.startswith(b"HTTP/1.1 503"), answer
+    assert b'"code":"database"' in answer
+    assert service.strays() == []
+    assert list((service.folder / "jobs").iterdir()) == []
+
+
+def test_no_job_that_was_accepted_is_lost(start):
+    """Many submit while the database is removed: whatever was answered with 202 still has its scene after a restart,
+    which says what is missing."""
+    service = start(KISSGS_MAX_QUEUE=1000)
+    service.running(service.submit(scene_bytes(20_000, 3), SLOW))
+    accepted, refused = [], []
+
+    def submit():
+        while not refused:
+            answer = service.http.post("/v1/jobs", content=SMALL)
+            (accepted if answer.status_code == 202 else refused).append(answer)
+
+    threads = [threading.Thread(target=submit) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    time.sleep(1.5)
+    kept = [path.with_name(f"kept-{path.name}") for path in files(service.folder)]
+    for path, link in zip(files(service.folder), kept, strict=True):
+        os.link(path, link)
+    remove(service.folder)
+    for thread in threads:
+        thread.join(30)
+    for answer in refused:
+        problem(answer, 503, "database")
+    assert len(accepted) > 4
+    held = {path.name for path in (service.folder / "jobs").iterdir()}
+    assert held >= {answer.json()["id"] for answer in accepted}
+    time.sleep(1.5)
+    running = service.http.get("/v1/jobs", params={"state": "running"}).json()["jobs"]
+    assert len(running) == 1  # none was started since
+    assert "no job is started: jobs.sqlite was removed" in service.log.read_text() or service.children()
+    service.kill(signal.SIGKILL)
+    with pytest.raises(AssertionError, match="the job database is new and knows none of them; restore"):
+        service.restart()
+    assert {path.name for path in (service.folder / "jobs").iterdir()} == held
+    for link in kept:
+        link.rename(link.with_name(link.name.removeprefix("kept-")))
+    service.restart()
+    known = {job["id"] for job in every(service)}
+    assert known == held
+
+
+def every(service):
+    cursor = {}
+    while True:
+        page = service.http.get("/v1/jobs", params={"limit": 100, **cursor}).json()
+        yield from page["jobs"]
+        if "next" not in page:
+            return
+        cursor = {"cursor": page["next"]}
+
+
+def test_a_database_that_is_put_back(start):
+    """Moved away and back again: the job that ran meanwhile is recorded, the one that waited is done."""
+    service = start()
+    running, waiting = service.submit(scene_bytes(6_000, 2)), service.submit()
+    service.running(running)
+    away = service.folder / "away"
+    away.mkdir()
+    for path in files(service.folder):
+        path.rename(away / path.name)
+    assert service.http.get("/readyz").status_code == 503
+    end = time.monotonic() + 60
+    while service.children():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    time.sleep(1.5)
+    assert service.status(running)["state"] == "running"
+    assert service.status(waiting)["state"] == "queued"
+    assert service.log.read_text().count("was removed while the service runs") < 5
+    problem(service.http.post(f"/v1/jobs/{waiting['id']}/cancel"), 503, "database")
+    problem(service.http.delete(f"/v1/jobs/{waiting['id']}"), 503, "database")
+    assert (service.folder / "jobs" / waiting["id"] / "scene.ply").exists()
+    for path in away.iterdir():
+        path.rename(service.folder / path.name)
+    assert service.ended(running)["state"] == service.ended(waiting)["state"] == "succeeded"
+    assert service.http.get("/readyz").status_code == 200
+    assert service.strays() == []
+
+
+def test_what_stands_in_its_place_is_left_alone(tmp_path):
+    """A restored database with a journal of its own, while the former one is still open."""
+    with Service(tmp_path / "data") as service:
+        service.ended(service.submit())
+        backup = tmp_path / "backup"
+        backup.mkdir()
+        for path in files(service.folder):
+            shutil.copy(path, backup / path.name)
+        remove(service.folder)
+        for path in files(backup):
+            if not path.name.endswith("-shm"):
+                shutil.copy(path, service.folder / path.name)
+        before = {path.name: path.read_bytes() for path in files(service.folder)}
+        assert "replaced" in service.http.get("/readyz").json()["checks"]["database"]
+        service.kill(signal.SIGTERM)
+        assert {path.name: path.read_bytes() for path in files(service.folder)} == before
+        service.restart()
+        assert [job["state"] for job in every(service)] == ["succeeded"]
+
+
+def test_a_database_that_is_locked(start):
+    service = start()
+    with contextlib.closing(sqlite3.connect(service.folder / "jobs.sqlite", isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        begun = time.monotonic()
+        ready = service.http.get("/readyz")
+        assert "locked" in ready.json()["checks"]["database"]
+        problem(service.http.post("/v1/jobs", content=SMALL), 503, "database")
+        assert time.monotonic() - begun < 6
+        begun = time.monotonic()
+        assert service.http.get("/livez").status_code == 200  # nobody waits for it who does not need it
+        assert time.monotonic() - begun < 1
+        other.execute("ROLLBACK")
+    assert service.ended(service.submit())["state"] == "succeeded"
+    assert service.http.get("/readyz").status_code == 200
+
+
+def test_a_database_that_is_read_only(tmp_path, monkeypatch):
+    def read_only(file):
+        return sqlite3.connect(f"file:{file}?mode=ro", uri=True, isolation_level=None, check_same_thread=False)
+
+    monkeypatch.setattr(watch, "_open", read_only)
+    store = Store(f"sqlite:///{tmp_path / 'jobs.sqlite'}", time.time)
+    assert "readonly" in store.trouble()
+    store.close()
+
+
+def test_nothing_is_started_or_written_without_a_database(tmp_path):
+    from test_store import add
+
+    store = Store(f"sqlite:///{tmp_path / 'jobs.sqlite'}", time.time)
+    waiting, running = add(store), add(store)
+    remove(tmp_path)
+    for change in (
+        store.claim,
+        store.keep_time,
+        partial(add, store),
+        partial(store.forget, waiting.number),
+        partial(store.update, waiting.number, spare_bytes=1),
+        partial(store.progress, running.number, "order", 0.5),
+        partial(store.move, running.number, State.RUNNING),
+    ):
+        with pytest.raises(VanishedError, match=r"jobs\.sqlite was removed while the service runs; put it back"):
+            change()
+    assert files(tmp_path) == []  # nor was another made
+    assert store.counts()[State.QUEUED] == 2
+    store.close()
+    assert files(tmp_path) == []
+
+
+def test_what_is_written_while_it_vanishes_does_not_count(tmp_path, monkeypatch):
+    from test_store import add
+
+    store = Store(f"sqlite:///{tmp_path / 'jobs.sqlite'}", time.time)
+    monkeypatch.setattr("service.store._note", lambda *arguments: remove(tmp_path))
+    with pytest.raises(VanishedError):
+        add(store)
+    store.close()
+
+
+def test_looking_takes_little(tmp_path):
+    """Oracle: a clock. It happens before every submission."""
+    store = Store(f"sqlite:///{tmp_path / 'jobs.sqlite'}", time.time)
+    spent = []
+    for _ in range(100):
+        begun = time.perf_counter()
+        assert store.trouble() is None
+        spent.append(time.perf_counter() - begun)
+    assert sorted(spent)[50] < 0.02
+    store.close()
+
+
+def test_a_database_server(postgresql):
+    store = Store(postgresql, time.time)
+    assert store.trouble() is None
+    engine = sa.create_engine(postgresql)
+
+    def change(statement):
+        with engine.begin() as connection:
+            connection.execute(sa.text(statement))
+
+    with engine.connect() as other:
+        other.execute(sa.text("LOCK TABLE meta"))
+        begun = time.monotonic()
+        assert "lock timeout" in store.trouble()
+        assert time.monotonic() - begun < 5
+    assert store.trouble() is None
+    change("ALTER DATABASE postgres SET default_transaction_read_only = on")
+    store._engine.dispose()
+    try:
+        assert "read-only transaction" in store.trouble()
+    finally:
+        change("BEGIN; SET TRANSACTION READ WRITE; ALTER DATABASE postgres RESET default_transaction_read_only")
+        engine.dispose()
+        store._engine.dispose()
+    assert store.trouble() is None
+    change("UPDATE meta SET value = 7 WHERE name = 'identity'")
+    assert store.trouble() == "it was replaced by another"
+    with pytest.raises(VanishedError):
+        store.keep_time()
+    change("ALTER TABLE jobs DROP COLUMN note")
+    change("DROP TABLE events")
+    assert store.trouble() is not None
+    store.close()
+    engine.dispose()

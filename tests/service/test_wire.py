@@ -1,0 +1,158 @@
+"""What clients may write, however it is cut into packets; oracles: RFC 2046, RFC 6454 and the grammar of PLY."""
+
+import asyncio
+
+import pytest
+from serving import FAST, SMALL, problem, said
+
+from service.multipart import MAX_PREAMBLE_BYTES, PartBegin, PartData, parts
+from service.problems import ProblemError
+from service.settings import ServiceSettings
+from service.uploads import Spool
+
+HEAD = SMALL.index(b"end_header\n") + 11
+BOUNDARY = "multipart/form-data; boundary=b"
+FORM = (
+    b'--b\r\nContent-Disposition: form-data; name="options"\r\n\r\n{}\r\n'
+    b'--b\r\nContent-Disposition: form-data; name="file"; filename="x.ply"\r\n\r\nply\n\r\n--b--\r\n'
+)
+
+
+@pytest.mark.parametrize(
+    "origin", ["http://[x", "http://[::1", "http://]", "http://[v1.x]y", "null", "", "//", "http:/x"]
+)
+def test_origins_that_are_none_are_foreign(service, origin):
+    answer = service.http.post("/v1/jobs", content=b"", headers={"Origin": origin})
+    problem(answer, 403, "foreign")
+
+
+@pytest.mark.parametrize("host", ["[x", "[::1", "]", "[x]:80:80"])
+def test_hosts_that_are_none(start, host):
+    service = start(KISSGS_KEYS=f"a:{'0' * 64}")  # with keys it answers to every name
+    for path in ("nothing", "livez", "readyz", "preview/x"):
+        with service.raw(f"PATCH /{path} HTTP/1.1\r\nHost: {host}\r\n\r\n".encode()) as connection:
+            assert said(connection)[:10] == b"HTTP/1.1 4"
+
+
+def test_a_length_beyond_all_numbers(service):
+    for digits in (19, 5000):
+        with service.raw(
+            b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: %s\r\n\r\n" % (b"9" * digits)
+        ) as c:
+            assert said(c)[:10] == b"HTTP/1.1 4"
+
+
+def test_an_id_with_a_zero_byte(service):
+    problem(service.http.get("/v1/jobs/%00"), 404, "not-found")
+
+
+class Room:
+    """A disk that takes everything."""
+
+    def require(self, size):
+        pass
+
+    reserve = wrote = require
+
+    def release(self, size, written):
+        pass
+
+
+async def received(folder, *packets, whole=True):
+    async with Spool(ServiceSettings(), Room(), folder / "x.part") as spool:
+        for packet in packets:
+            await spool.write(packet)
+        if whole:
+            found = await spool.finish()
+            assert (found.size, found.info.count) == (sum(map(len, packets)), 300)
+            found.path.unlink()
+
+
+@pytest.mark.parametrize("end", [b"\n", b"\r\n"])
+def test_a_comment_that_ends_like_a_header(tmp_path, end):
+    """Cut anywhere: a packet once ended just there, and the scene was refused."""
+    comments = b"comment see end_header\ncomment end_header \ncomment x, end_header\n"
+    head = SMALL[:HEAD].replace(b"element", comments + b"element", 1).replace(b"\n", end)
+
+    async def receive():
+        for cut in range(len(head) + 3):
+            await received(tmp_path, head[:cut], head[cut:] + SMALL[HEAD:], whole=cut % 50 == 0)
+        await received(tmp_path, *(head[i : i + 1] for i in range(len(head))), SMALL[HEAD:])
+
+    asyncio.run(receive())
+
+
+def test_a_header_is_still_checked_before_the_body(tmp_path):
+    head = SMALL[:HEAD].replace(b"vertex 300\n", b"vertex 5000001\n")
+
+    asyncio.run(received(tmp_path, head[:-1], whole=False))
+    with pytest.raises(ProblemError, match="5,000,001 Gaussians"):
+        asyncio.run(received(tmp_path, head[:-1], head[-1:], whole=False))
+
+
+def parsed(*packets, content_type=BOUNDARY):
+    async def chunks():
+        for packet in packets:
+            yield packet
+
+    async def collect():
+        fields, name = {}, None
+        async for event in parts(content_type, chunks()):
+            match event:
+                case PartBegin(name, _):
+                    fields[name] = b""
+                case PartData(data):
+                    fields[name] += data
+        return fields
+
+    return asyncio.run(collect())
+
+
+FIELDS = {"options": b"{}", "file": b"ply\n"}
+
+WRAPPED = {
+    "preamble": b"This is a message with several parts.\r\n--bb\r\n --b\r\nx--b\r\n" + FORM,
+    "empty lines": b"\r\n\r\n" + FORM,
+    "epilogue": FORM + b"This is the epilogue.\r\n--b\r\nIt is also to be ignored.",
+    "both": b"preamble\r\n" + FORM + b"epilogue",
+    "padding": b"--b \t \r\n" + FORM[5:],
+    "neither": FORM,
+}
+
+
+@pytest.mark.parametrize("kind", WRAPPED)
+def test_what_stands_around_a_form_is_ignored(kind):
+    body = WRAPPED[kind]
+    for cut in range(len(body) + 1):
+        assert parsed(body[:cut], body[cut:]) == FIELDS, cut
+    assert parsed(*(body[i : i + 1] for i in range(len(body)))) == FIELDS
+
+
+def test_a_preamble_has_an_end():
+    assert parsed(b"x" * (MAX_PREAMBLE_BYTES - 2) + b"\r\n" + FORM) == FIELDS
+    for packets in ([b"x" * 100] * 1000, [b"x" * 100_000], [b"x" * 50_000 + b"\r\n" + FORM]):
+        with pytest.raises(ProblemError, match="before its first boundary"):
+            parsed(*packets)
+    with pytest.raises(ProblemError, match="no line with its boundary"):
+        parsed(b"nothing of the kind")
+
+
+def test_a_form_as_mail_programs_write_it(service):
+    body = (
+        b"This is a multi-part message in MIME format.\r\n"
+        b'--b\r\nContent-Disposition: form-data; name="options"\r\n\r\n%s\r\n'
+        b'--b\r\nContent-Disposition: form-data; name="file"; filename="x.ply"\r\n\r\n%s\r\n--b--\r\nGood bye.\r\n'
+    ) % (FAST.encode(), SMALL)
+    answer = service.http.post("/v1/jobs", content=body, headers={"Content-Type": BOUNDARY})
+    assert answer.status_code == 202, answer.text
+    assert service.ended(answer.json())["state"] == "succeeded"
+
+
+@pytest.mark.parametrize("where", ["before", "after"])
+def test_what_stands_around_a_form_is_limited(service, where):
+    form = b'--b\r\nContent-Disposition: form-data; name="file"\r\n\r\n' + SMALL + b"\r\n--b--\r\n"
+    packets = [b"x" * 10_000 + b"\r\n"] * 100
+    packets = [*packets, form] if where == "before" else [form, *packets]
+    answer = service.http.post("/v1/jobs", content=iter(packets), headers={"Content-Type": BOUNDARY})
+    problem(answer, 422, "invalid-request")
+    assert list((service.folder / "incoming").iterdir()) == []

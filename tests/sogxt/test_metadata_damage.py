@@ -1,0 +1,120 @@
+"""Damaged metadata: refused in a sentence, or decoded to exactly the same scene; oracle: the undamaged file."""
+
+import json
+import struct
+import zlib
+
+import numpy as np
+import pytest
+import yaml
+from codec_scenes import random_scene, replaced
+from metadata_files import FILES, assert_same, document
+
+from kissgs import InvalidContainerError, KissgsError, Settings, UnsupportedError, compress, decompress
+from kissgs.sogxt.container import MemorySource
+from kissgs.sogxt.metadata import CHANNELS
+from kissgs.sogxt.metadata_reader import read_layout
+from kissgs.sogxt.names import CHECKSUM, JSON_NAME, YAML_NAME
+
+STEP = 11
+REFUSED = (InvalidContainerError, UnsupportedError)
+WAYS = {
+    **{f"bit {bit}": lambda byte, at, bit=bit: byte ^ 1 << bit for bit in range(8)},
+    "all bits": lambda byte, at: byte ^ 255,
+    "zero": lambda byte, at: 0,
+    "blank": lambda byte, at: ord(" "),
+    "digit": lambda byte, at: ord("0") + at % 10,
+}
+
+
+def meaning(name, text):
+    """All that decoding takes from the metadata; None if it refuses them."""
+    try:
+        layout = read_layout(MemorySource({name: text}))
+    except REFUSED:
+        return None
+    ranges = [end.tobytes() for field in CHANNELS for end in layout.limits(field)]
+    return layout.count, layout.grid_side, layout.codebook_side, layout.sh_degree, *ranges
+
+
+def changed_everywhere(text, change, step=1, first=0):
+    """Every text in which one byte is another."""
+    for at in range(first, len(text), step):
+        byte = change(text[at], at) & 255
+        if byte != text[at]:
+            yield text[:at] + bytes([byte]) + text[at + 1 :]
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize(("name", "step"), [(YAML_NAME, STEP), (JSON_NAME, 1)])
+def test_no_changed_byte_makes_another_scene(name, step, way):
+    """Every byte, in every way; of the YAML, which takes longer to read, one in eleven, and others in each way."""
+    text = FILES[name]
+    right = meaning(name, text)
+    texts = list(changed_everywhere(text, WAYS[way], step, [*WAYS].index(way) % step))
+    found = [meaning(name, some) for some in texts]
+    assert {None, right} >= set(found), texts[next(i for i, some in enumerate(found) if some not in (None, right))]
+    assert found.count(None) > len(found) / 4
+
+
+@pytest.mark.parametrize("name", [YAML_NAME, JSON_NAME])
+def test_whole_decoding_of_damaged_metadata(name):
+    """What :func:`meaning` looks at is all that counts: checksums of images that are lost, or that are wrong."""
+    files = dict(FILES) if name == YAML_NAME else {key: data for key, data in FILES.items() if key != YAML_NAME}
+    refused = 0
+    for at in np.random.default_rng(3).integers(0, 8 * len(FILES[name]), 150):
+        text = bytearray(FILES[name])
+        text[at // 8] ^= 1 << at % 8
+        try:
+            assert_same(decompress({**files, name: bytes(text)}))
+        except KissgsError:
+            refused += 1
+    assert refused > 50
+
+
+def test_the_checksum_is_the_one_that_the_format_describes():
+    meta = json.loads(FILES[JSON_NAME])
+    numbers = [meta["count"], meta["gridSide"], meta["shN"]["centroidSide"], meta["kissgs"]["sh_degree"]]
+    for key, *ends in (
+        *((key, "mins", "maxs") for key in ("sh0", "opacities", "scales", "quats", "means")),
+        ("shN", "centroidsMins", "centroidsMaxs"),
+    ):
+        low, high = (np.ravel(meta[key][end]).astype(np.float32) for end in ends)
+        numbers += [end for channel in zip(low, high, strict=True) for end in channel]
+    assert len(numbers) == 4 + 2 * sum(CHANNELS.values())
+    wanted = zlib.crc32(struct.pack(f"<{len(numbers)}d", *numbers))
+    assert meta[CHECKSUM] == document()[CHECKSUM] == wanted
+
+
+def test_a_lost_block_of_ours_is_noticed():
+    """It says the degree of the spherical harmonics, which nothing else says where the last band is zero."""
+    splats = random_scene(20, 3)
+    files = compress(replaced(splats, shN=splats.shN * 0), settings=Settings.from_preset("fast")).files
+    for name in (YAML_NAME, JSON_NAME):
+        damaged = files[name].replace(b"kissgs:", b"kisses:").replace(b'"kissgs":', b'"kisses":')
+        assert damaged != files[name]
+        with pytest.raises(InvalidContainerError, match=f"{name} is damaged: its numbers do not give its"):
+            decompress({name: damaged, **{key: data for key, data in files.items() if key.endswith(".webp")}})
+
+
+@pytest.mark.parametrize("checksum", [0, None, "x", -1, 1.5, [], {}])
+@pytest.mark.parametrize("name", [YAML_NAME, JSON_NAME])
+def test_another_checksum_is_refused(name, checksum):
+    changed = yaml.safe_load(FILES[name]) | {CHECKSUM: checksum}
+    assert meaning(name, json.dumps(changed).encode()) is None
+
+
+@pytest.mark.parametrize("name", [YAML_NAME, JSON_NAME])
+def test_containers_without_the_checksum_are_read(name):
+    """As kissgs once wrote them, and as other encoders do."""
+    changed = yaml.safe_load(FILES[name])
+    del changed[CHECKSUM]
+    assert meaning(name, json.dumps(changed).encode()) == meaning(name, FILES[name])
+    del changed["kissgs"]
+    assert meaning(name, json.dumps(changed).encode())[1:] == meaning(name, FILES[name])[1:]
+
+
+@pytest.mark.parametrize("name", [YAML_NAME, JSON_NAME])
+def test_another_spelling_of_the_same_numbers_has_the_same_checksum(name):
+    changed = dict(reversed(list(yaml.safe_load(FILES[name]).items())))
+    assert meaning(name, json.dumps(changed, indent=3).encode()) == meaning(name, FILES[name])
