@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from kissgs.errors import Enough, UnsupportedError
 from kissgs.evaluation.drop import drop_of
+from kissgs.evaluation.likeness import MOST
 from kissgs.finetuning.result import FinetuneReport
 from kissgs.progress import Annotated
 from kissgs.search import Trial, seek
@@ -102,6 +103,7 @@ class Goal:
             return (
                 f"no container of this scene that was found has {self.settings.psnr:g} dB, the finest has {most:.2f}; "
                 "ask for no more than that"
+                + (f"; views count for at most {MOST:g} dB each" if self.settings.psnr > MOST else "")
             )
         least_lost = 1.005 * min(math.inf if trial.drop is None else trial.drop for trial in trials)
         return (

@@ -14,13 +14,18 @@ from kissgs.views.view import View
 
 Split = Literal["test", "train", "all"]
 
+MOST = 60.0
+"""Decibels that a view counts for at most in a mean: beyond about 59 no display of 8 bits shows a difference, and one
+view of an unchanged part, at 120 dB or infinite, would make up for others that are spoilt."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Likeness:
     """How alike two pictures are, or many pairs of them on average.
 
     Attributes:
-        psnr: decibels; infinite for equal pictures, and so for an average over views that has such a pair.
+        psnr: decibels; infinite for equal pictures. On average, views count for at most :data:`MOST`, and it is
+            infinite only where all pictures are equal.
         ssim: -1 to 1; 1 for equal pictures.
         lpips: from 0 for equal pictures up to about 1; None where it was not asked for.
 
@@ -167,7 +172,7 @@ class Evaluation:
 
     @property
     def mean(self) -> Comparison:
-        """Mean over views of each figure; of the PSNR, as is the field's custom, a mean of decibels."""
+        """Mean over views of each figure; of the PSNR a mean of decibels, of at most :data:`MOST` for each view."""
         all_views = [view.comparison for view in self.views]
         references = [view.reference for view in all_views if view.reference is not None]
         return Comparison(
@@ -233,10 +238,16 @@ def spell(value: float, digits: int, *, signed: bool = False) -> str:
 def _mean(values: Sequence[Likeness]) -> Likeness:
     distances = [value.lpips for value in values if value.lpips is not None]
     return Likeness(
-        psnr=sum(value.psnr for value in values) / len(values),
+        psnr=_mean_decibels([value.psnr for value in values]),
         ssim=sum(value.ssim for value in values) / len(values),
         lpips=sum(distances) / len(values) if distances else None,
     )
+
+
+def _mean_decibels(values: Sequence[float]) -> float:
+    if all(value == math.inf for value in values):
+        return math.inf
+    return sum(value if math.isnan(value) else min(value, MOST) for value in values) / len(values)
 
 
 def _point(point: Float64[np.ndarray, "3"]) -> str:

@@ -50,7 +50,8 @@ class EncodeSettings(BaseModel):
         gt=0,
         le=200,
         description="Where bits are weighed: search for the smallest container whose pictures have at least this PSNR, "
-        "decibels, to those of the scene, from where 'evaluate' takes them. Takes a few encodings.",
+        "decibels, to those of the scene, from where 'evaluate' takes them. A view counts for at most 60: only equal "
+        "pictures have more. Takes a few encodings.",
     )
     target_size: Size | None = Field(
         None,

@@ -301,18 +301,15 @@ def test_any_figures_survive_means_and_json(figures):
     told = json.loads(json.dumps(found.as_dict(), allow_nan=False))
     for i, side in enumerate(("reference", "candidate", "between")):
         column = [row[i] for row in figures]
-        wanted = (
-            "NaN" if any(map(math.isnan, column)) else None if math.inf in column else pytest.approx(np.mean(column))
-        )
-        assert told["mean"][side]["psnr"] == wanted
+        mean = None if set(column) == {math.inf} else pytest.approx(np.mean(np.minimum(column, 60)))
+        assert told["mean"][side]["psnr"] == ("NaN" if any(map(math.isnan, column)) else mean)
     assert all(len(each.comparison.spelled()) == 7 for each in compared)
     same = [a == b for a, b, _ in figures]
     assert all(each.comparison.change == 0 for each, equal in zip(compared, same, strict=True) if equal)
 
 
-@given(st.lists(FIGURES, min_size=1, max_size=45))
-def test_the_worst_view_and_the_fifth_percentile(figures):
-    """Oracle: sorting, and NumPy's percentile where all is finite."""
+def evaluation_of(figures):
+    """Views from one place that have these PSNRs, named by their numbers."""
     place = cameras(test=1).test[0].camera
     compared = [
         ViewComparison(
@@ -320,7 +317,7 @@ def test_the_worst_view_and_the_fifth_percentile(figures):
         )
         for number, told in enumerate(Likeness(psnr=value, ssim=0.5) for value in figures)
     ]
-    found = Evaluation(
+    return Evaluation(
         against="renderings",
         split="all",
         source="",
@@ -329,6 +326,25 @@ def test_the_worst_view_and_the_fifth_percentile(figures):
         candidate_count=1,
         views=tuple(compared),
     )
+
+
+@pytest.mark.parametrize(
+    ("figures", "mean"),
+    [((10, math.inf), 35), ((10, 120), 35), ((70, 120), 60), ((20, 40), 30), ((math.inf,) * 2, math.inf)],
+)
+def test_a_view_that_has_lost_nothing_does_not_hide_the_others(figures, mean):
+    """One of 120 dB beside one of 10 once told of 65 on average, and an infinite one of infinitely many."""
+    found = evaluation_of(figures)
+    assert found.mean.between.psnr == mean
+    assert found.worst.comparison.between.psnr == min(figures)
+    assert [each.comparison.between.psnr for each in found.views] == list(figures)
+
+
+@given(st.lists(FIGURES, min_size=1, max_size=45))
+def test_the_worst_view_and_the_fifth_percentile(figures):
+    """Oracle: sorting, and NumPy's percentile where all is finite."""
+    found = evaluation_of(figures)
+    place = found.views[0].view.camera
     failed = [number for number, value in enumerate(figures) if math.isnan(value)]
     assert int(found.worst.view.name) == (failed[0] if failed else figures.index(min(figures)))
     told = json.loads(json.dumps(found.as_dict(), allow_nan=False))
