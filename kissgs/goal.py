@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from kissgs.errors import Enough, UnsupportedError
-from kissgs.evaluation.drop import drop_of
+from kissgs.evaluation.drop import SEARCH_SEED
 from kissgs.evaluation.likeness import MOST
 from kissgs.finetuning.result import FinetuneReport
 from kissgs.progress import Annotated
@@ -272,8 +272,7 @@ class GoalSearch:
         size, sizes = stored_sizes(encoded.files, packed=self.packed)
         trial = Trial(self.count, encoded.price, size)
         if not self.goal.by_size:
-            seen = self.pictures(encoded)
-            trial = replace(trial, psnr=seen.mean.between.psnr, drop=drop_of(seen))
+            trial = trial.with_pictures(self.pictures(encoded))
         self.trials.append(trial)
         self.overhead = size - sum(taken for name, taken in sizes.items() if name.endswith(".webp"))
         self.progress.note = f"try {len(self.trials) + 1}, after {trial.spelled()}"
@@ -304,8 +303,9 @@ class GoalSearch:
         from kissgs.evaluation.pictures import compare_pictures
 
         self.progress("evaluate", 0.0)
-        if self.views is None:  # those that evaluate would take
-            self.views, self._taken = evaluation_views(self.original, threads=self.threads), {}
+        if self.views is None:
+            self.views = evaluation_views(self.original, seed=SEARCH_SEED, threads=self.threads)
+            self._taken = {}
         decoded = decode(encoded.files, max_gaussians=max(len(self.original), MAX_GAUSSIANS), threads=self.threads)
         return compare_pictures(self.original, decoded, self.views, threads=self.threads, taken=self._taken)
 

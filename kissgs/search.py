@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from kissgs.evaluation.drop import drop_of, psnr_of
+
+if TYPE_CHECKING:
+    from kissgs.evaluation.likeness import Evaluation
 
 ATTEMPTS = 10
 FINEST = 0.2
@@ -26,8 +31,11 @@ class Trial:
         count: Gaussians of the scene that was encoded.
         price: squared error per bit; None where nothing is seen, and bits were not weighed.
         bytes: of its zip, or of the files in its folder.
-        psnr: of its pictures to those of the scene, decibels; None where it was not asked for.
-        drop: decibels that they have lost; the same.
+        psnr: of its pictures to those of the scene, as goals count it (:func:`kissgs.evaluation.drop.psnr_of`),
+            decibels; None where it was not asked for.
+        drop: decibels that they have lost (:func:`kissgs.evaluation.drop.drop_of`); the same.
+        worst: PSNR of the worst view; the same.
+        fifth_percentile: of the views' PSNR; the same.
     """
 
     count: int
@@ -35,11 +43,20 @@ class Trial:
     bytes: int
     psnr: float | None = None
     drop: float | None = None
+    worst: float | None = None
+    fifth_percentile: float | None = None
+
+    def with_pictures(self, seen: Evaluation) -> Trial:
+        """The same, with what the pictures say of it."""
+        worst, fifth = seen.worst.comparison.between.psnr, seen.fifth_percentile
+        return replace(self, psnr=psnr_of(seen), drop=drop_of(seen), worst=worst, fifth_percentile=fifth)
 
     def spelled(self) -> str:
         """For people."""
         pictures = "" if self.psnr is None else f" at {self.psnr:.2f} dB"
-        return f"{self.bytes / 1000:,.0f} kB{pictures}" + ("" if self.drop is None else f" (-{self.drop:.2f})")
+        lost = "" if self.drop is None else f" (-{self.drop:.2f})"
+        worst = "" if self.worst is None else f", worst view {self.worst:.1f} dB"
+        return f"{self.bytes / 1000:,.0f} kB{pictures}{lost}{worst}"
 
     def as_dict(self) -> dict[str, Any]:
         """For machines; what is infinite is null."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from kissgs.errors import Enough, UnsupportedError
-from kissgs.evaluation.drop import drop_of
+from kissgs.evaluation.drop import drop_of, psnr_of
 from kissgs.goal import Goal, GoalSearch
 from kissgs.search import Trial, lowest
 from kissgs.sogxt.container import stored_sizes
@@ -139,7 +139,7 @@ class Tradeoff:
         self._drops[count] = drop_of(seen)
         wanted = self.encoding.settings.encode
         hopeless = wanted.max_psnr_drop is not None and self._drops[count] > wanted.max_psnr_drop
-        hopeless |= wanted.psnr is not None and seen.mean.between.psnr < wanted.psnr
+        hopeless |= wanted.psnr is not None and psnr_of(seen) < wanted.psnr
         offer = Offer(math.inf, None, found) if hopeless else self._encode(found.splats, found)
         self._offers[count] = offer
         return offer.cost

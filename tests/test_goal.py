@@ -3,14 +3,17 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import kissgs
-from kissgs import Enough, FinetuneReport, OutputError, Settings, UnsupportedError
+from kissgs import Enough, FinetuneReport, OutputError, Settings, Splats, UnsupportedError
+from kissgs.evaluation.cameras import evaluation_views
 from kissgs.goal import Container, GoalSearch
 from kissgs.progress import Annotated, silent
 from kissgs.sogxt.encode import encode
 
+ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 SCENE = kissgs.sample_scene(600, sh_degree=0, seed=5)
 GLANCE = {"views": 4, "view_size": 48}
 PRUNE = {"sparsify_steps": 0, "refine_steps": 0, "score_share": 0.6, "views": 24, "view_size": 48}
@@ -117,6 +120,31 @@ def test_the_smallest_is_best_whoever_made_it():
     assert search.found().encoded is small
 
 
+def test_the_verdict_is_by_cameras_that_the_search_has_not_used():
+    """The same ones found a container good that was chosen because they did."""
+    search = GoalSearch(SCENE, settings(psnr=20.0).encode, None, 1, Annotated(silent))
+    search.run(lambda chosen: Container(encode(SCENE, chosen, threads=1), chosen))
+    places = [
+        {view.camera.viewmat.tobytes() for view in views.test} for views in (search.views, evaluation_views(SCENE))
+    ]
+    assert not places[0] & places[1]
+
+
+@pytest.mark.parametrize("goal", [{"psnr": 30.0}, {"max_psnr_drop": 2.0}])
+def test_no_goal_is_met_with_an_object_lost(goal):
+    """Of two, one as it was: views of that one alone have lost nothing, and made up for the others."""
+    away = Splats(**{name: getattr(SCENE, name) + np.float32(1000 * (name == "means")) for name in ATTRIBUTES})
+    both = Splats(**{name: np.concatenate([getattr(SCENE, name), getattr(away, name)]) for name in ATTRIBUTES})
+    one = encode(SCENE, Settings.from_preset("fast", fidelity=12).encode, threads=1)
+    search = GoalSearch(both, settings(**goal).encode, None, 1, Annotated(silent))
+    search.run(lambda chosen: Container(one, chosen))
+    trial = search.trials[0]
+    assert search.best is None
+    assert trial.worst < 20
+    assert f"worst view {trial.worst:.1f} dB" in trial.spelled()
+    assert {"worst", "fifth_percentile"} <= set(trial.as_dict())
+
+
 @pytest.mark.parametrize("worse", [True, False])
 def test_the_best_pictures_are_best_where_a_size_is_the_goal(worse):
     """A fine-tuned container that is smaller than need be may be worse than one that is not fine-tuned."""
@@ -144,9 +172,6 @@ def test_what_is_infinite_is_null_for_machines():
     told = kissgs.compress(faint, settings=settings(psnr=40.0)).report.as_dict()
     assert json.dumps(told["trials"], allow_nan=False)
     assert told["trials"][0]["psnr"] is None
-
-
-ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="only Linux has a folder that nobody can write to")

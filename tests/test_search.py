@@ -137,13 +137,16 @@ def test_a_size_is_met_from_below(share):
 
 @pytest.mark.parametrize("change", [-2.5, 2.0])
 def test_a_psnr_is_met_from_above(change):
-    """As evaluate measures it, from the cameras that it takes by itself, or from those of a capture."""
+    """From cameras that the search has drawn; those of evaluate are others, and need not find the very same."""
     plain = kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **GLANCE), evaluate=True)
     wanted = plain.report.evaluation.mean.between.psnr + change
     settings = Settings.from_preset("balanced", psnr=wanted, **GLANCE)
     found = kissgs.compress(SCENE, settings=settings, evaluate=True)
-    assert wanted <= found.report.evaluation.mean.between.psnr <= wanted + 1.5
-    assert found.report.evaluation.mean.between.psnr in [trial.psnr for trial in found.report.trials]
+    (made,) = {trial for trial in found.report.trials if trial.bytes == len(found.to_zip())}
+    assert wanted <= made.psnr <= wanted + 1.5
+    assert made.worst <= made.fifth_percentile <= made.psnr
+    assert abs(found.report.evaluation.mean.between.psnr - wanted) < 2.5
+    assert found.report.evaluation.mean.between.psnr not in [trial.psnr for trial in found.report.trials]
     assert (len(found.to_zip()) > len(plain.to_zip())) == (change > 0)
 
 

@@ -79,10 +79,10 @@ def test_notes_of_a_search_come_before_those_of_its_work():
 def test_a_loss_is_met_from_below(allowed):
     chosen = Settings.from_preset("balanced", max_psnr_drop=allowed, **GLANCE)
     found = kissgs.compress(SCENE, settings=chosen, evaluate=True)
-    drop = drop_of(found.report.evaluation)
+    assert drop_of(found.report.evaluation) < 2 * allowed  # from other cameras
+    (drop,) = {trial.drop for trial in found.report.trials if trial.bytes == len(found.to_zip())}
     assert drop <= allowed
     tried = [(trial.drop, trial.bytes) for trial in found.report.trials]
-    assert (pytest.approx(drop), len(found.to_zip())) in tried
     assert all(size >= len(found.to_zip()) for lost, size in tried if lost <= allowed)
     nearest = max(lost for lost, _ in tried if lost <= allowed)  # the smallest may lose a little less
     assert nearest > allowed - 0.02 or len(tried) == chosen.encode.attempts
@@ -152,8 +152,10 @@ def test_fewer_gaussians_for_a_quality(goal):
     found = kissgs.compress(SCENE, settings=settings(**goal), evaluate=True)
     whole = kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **goal, **GLANCE))
     assert len(found.to_zip()) <= len(whole.to_zip())
-    evaluation = found.report.evaluation
-    assert drop_of(evaluation) <= 0.4 if "psnr" not in goal else evaluation.mean.between.psnr >= 35.0
+    made = [trial for trial in found.report.trials if trial.bytes == len(found.to_zip())]
+    assert any(trial.drop <= 0.4 if "psnr" not in goal else trial.psnr >= 35.0 for trial in made)
+    evaluation = found.report.evaluation  # from other cameras
+    assert drop_of(evaluation) <= 0.8 if "psnr" not in goal else evaluation.mean.between.psnr >= 33.0
 
 
 def test_the_same_again():

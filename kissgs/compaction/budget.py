@@ -14,7 +14,7 @@ from kissgs.compaction.popspa import popspa
 from kissgs.compaction.result import Compacted, CompactionReport
 from kissgs.errors import Enough, UnsupportedError
 from kissgs.evaluation.cameras import evaluation_views
-from kissgs.evaluation.drop import MODELLED, drop_of
+from kissgs.evaluation.drop import MODELLED, SEARCH_SEED, drop_of
 from kissgs.evaluation.pictures import Picture, compare_pictures
 from kissgs.progress import Progress, as_stage, silent
 from kissgs.rendering.gsplat_backend import need_cuda
@@ -169,7 +169,7 @@ class Compactor:
         """From views that were not learned from, beside those of the scene."""
         progress = as_stage("judge", self.progress)
         if self.judges is None:
-            drawn = evaluation_views(self.splats, threads=self.threads, progress=progress)
+            drawn = evaluation_views(self.splats, seed=SEARCH_SEED, threads=self.threads, progress=progress)
             self.judges, self._taken = drawn, {}
         return compare_pictures(
             *(self.splats, found.splats, self.judges), threads=self.threads, taken=self._taken, progress=progress

@@ -19,8 +19,8 @@ class CompactSettings(SchoolSettings):
         gt=0,
         le=20,
         description="Keep as few as are found whose pictures from held-out views lose at most so many decibels. "
-        "Takes several compactions. Without photographs, from where 'evaluate' looks, and as if the scene were 30 dB "
-        "from them.",
+        "Takes several compactions. Without photographs, from cameras drawn as for 'evaluate', but others, and as if "
+        "the scene were 30 dB from them.",
     )
     by_goal: bool = Field(
         False,

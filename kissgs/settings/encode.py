@@ -50,8 +50,8 @@ class EncodeSettings(BaseModel):
         gt=0,
         le=200,
         description="Where bits are weighed: search for the smallest container whose pictures have at least this PSNR, "
-        "decibels, to those of the scene, from where 'evaluate' takes them. A view counts for at most 60: only equal "
-        "pictures have more. Takes a few encodings.",
+        "decibels, to those of the scene: from held-out views, or from cameras drawn as for 'evaluate', but others. A "
+        "view counts for at most 60: only equal pictures have more. Takes a few encodings.",
     )
     target_size: Size | None = Field(
         None,
@@ -64,8 +64,8 @@ class EncodeSettings(BaseModel):
         gt=0,
         le=20,
         description="Where bits are weighed: search for the smallest container whose pictures from held-out views lose "
-        "at most so many decibels. Takes a few encodings. Without photographs, from where 'evaluate' looks, and as if "
-        "the scene were 30 dB from them.",
+        "at most so many decibels. Takes a few encodings. Without photographs, from cameras drawn as for 'evaluate', "
+        "but others, and as if the scene were 30 dB from them.",
     )
     attempts: int = Field(
         10,
