@@ -73,7 +73,8 @@ class Importance:
         """See that this is the importance of such a scene.
 
         Raises:
-            InvalidSceneError: it has another number of Gaussians or another SH degree, or values that no costs have.
+            InvalidSceneError: it has another number of Gaussians or another SH degree, or values that no costs have, or
+                coverage that is not from 0 to 1.
         """
         wanted = Importance.none(len(splats), splats.sh_degree)
         for name in ("places", "shapes", "colors", "directions", "guessed", "coverage", "captured"):
@@ -83,8 +84,15 @@ class Importance:
                     f"this importance is not that of the scene: {name} must be {shape} float32, and is {found.shape} "
                     f"{found.dtype}; measure it for the scene as it is compressed"
                 )
-            if not np.isfinite(found).all() or (name in ("colors", "guessed", "coverage") and (found < 0).any()):
+            if not np.isfinite(found).all() or (name in ("colors", "guessed") and (found < 0).any()):
                 raise InvalidSceneError(f"this importance is damaged: {name} has a value that is no cost; measure it")
+        for name in ("coverage", "captured"):
+            found = getattr(self, name)
+            outside = found[(found < 0) | (found > 1)]
+            if len(outside):
+                raise InvalidSceneError(
+                    f"this importance is damaged: {name} must be from 0 to 1, and has {outside[0]:g}"
+                )
         if not 0 <= self.hedge <= 1:
             raise InvalidSceneError(f"this importance is damaged: its hedge is {self.hedge}, not from 0 to 1")
 

@@ -337,6 +337,9 @@ def test_the_importance_of_another_scene_is_refused():
     for name, value, told in (
         ("colors", -right.colors - 1, "colors has a value that is no cost"),
         ("guessed", right.guessed + np.float32(np.nan), "guessed has a value that is no cost"),
+        ("coverage", right.coverage + np.float32(1.5), "coverage must be from 0 to 1, and has [12]"),
+        ("coverage", right.coverage - np.float32(1.5), "coverage must be from 0 to 1, and has -"),
+        ("captured", right.captured + np.float32(1.5), "captured must be from 0 to 1, and has [12]"),
         ("hedge", 5.0, "its hedge is 5.0"),
         ("hedge", float("nan"), "its hedge is nan"),
     ):
