@@ -14,13 +14,14 @@ import numpy as np
 
 from kissgs._typing import Float32, Float64
 from kissgs.errors import InvalidViewsError
+from kissgs.evaluation.aim import BACKGROUNDS, FIELDS_OF_VIEW, PATIENCE, THUMBNAIL, Point, aim, direction
+from kissgs.evaluation.overlooked import MOST_ADDED, Parts
 from kissgs.evaluation.prominence import GaussianSampler, distances, opacity, prominence
 from kissgs.evaluation.shown import weights_of, without_gloss
 from kissgs.parallel import Workers
 from kissgs.progress import Progress, silent
-from kissgs.rendering.camera import Camera, look_at
+from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu.frame import draw
-from kissgs.rendering.semantics import NEAR
 from kissgs.splats import Splats
 from kissgs.views.view import View, Views
 
@@ -31,29 +32,14 @@ Kind = Literal["far", "around", "close-up", "across"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 """From outside of all there is; around a part of any size; close to a surface; from one place to another."""
 
-BACKGROUNDS = (0.0, 0.5, 1.0)
-"""Black, grey and white, in turn: what is lost of a dark scene does not show on black."""
-
 EXTENTS = (1.0, 0.98, 0.9, 0.5)
 """Shares of the Gaussians, along each axis, that views from far have in their picture: a few may be far away."""
-
-FIELDS_OF_VIEW = np.radians((50.0, 90.0))
-"""Angles along the longer side."""
 
 CLOSE = (100, 1000)
 """How many Gaussians are nearer than a close-up's camera to what it looks at."""
 
 BESIDE = 5.0
 """Standard deviations: no camera is nearer than that to the Gaussian that it looks at."""
-
-NEAREST = 5 * NEAR
-"""World units: cameras do not go nearer, for what is nearer than NEAR is not drawn; they take a longer lens instead."""
-
-PATIENCE = 12
-"""Cameras that are drawn for a view, at most."""
-
-THUMBNAIL = 64
-"""Pixels of the longer side of the pictures that tell whether there is anything to see."""
 
 EMPTY = 0.02
 """A picture with less than this mean alpha shows nothing."""
@@ -63,10 +49,6 @@ WITHIN = 3.0
 
 INSIDE, ALONE = 0.5, 0.3
 """Shares of a picture that may show Gaussians inside of which the camera stands, and a single Gaussian."""
-
-UP = np.array([0.0, -1.0, 0.0])
-
-Point = Float64[np.ndarray, "3"]
 
 
 def evaluation_views(
@@ -82,11 +64,13 @@ def evaluation_views(
     """Cameras all over a scene, none of which the encoder uses; all are for testing.
 
     Four kinds take turns, see :data:`KINDS`. A camera is drawn anew only if it shows nothing at all, or little but the
-    inside of Gaussians or a single one. The same scene and seed give the same cameras, whatever the number of threads.
+    inside of Gaussians or a single one. For parts of the scene that stand apart, and whose loss would hardly change any
+    of these pictures, cameras are added (:mod:`kissgs.evaluation.overlooked`). The same scene and seed give the same
+    cameras, whatever the number of threads.
 
     Args:
         splats: finite (:func:`kissgs.clean`).
-        count: how many views.
+        count: how many views, but for those that are added.
         width: of the pictures, pixels.
         height: of the pictures, pixels.
         seed: another one, other cameras.
@@ -100,32 +84,37 @@ def evaluation_views(
         raise InvalidViewsError(f"at least 1 view of 1x1 pixels can be had, not {count} of {width}x{height}")
     if seed < 0:
         raise InvalidViewsError(f"a seed is a whole number from 0, not {seed}")
-    rng = np.random.Generator(np.random.PCG64(seed))
-    sampler = _PoseSampler.of(splats, (width, height))
+    rng, counts = np.random.Generator(np.random.PCG64(seed)), prominence(splats)
+    sampler = _PoseSampler.of(splats, counts, (width, height))
     subjects = _subjects(count, rng)
     poses: list[_Pose] = [sampler.pose(n, 0, float(subjects[n]), rng) for n in range(count)]
-    bare = without_gloss(splats)
+    parts = Parts.of(without_gloss(splats), counts)
+    shares = np.zeros((count, len(parts.parts)))
     again = list(range(count)) if sampler.seen else []
     with Workers(threads) as pool:
         for attempt in range(1, PATIENCE):
             progress("cameras", (count - len(again)) / count)
-            cameras = [poses[n].camera.at_most(THUMBNAIL) for n in again]
-            shows = pool.map(lambda camera: _shows(bare, camera), cameras)
-            again = [n for n, good in zip(again, shows, strict=True) if not good]
+            if not again:
+                break
+            shown = pool.map(lambda n: _shows(parts, poses[n].camera.at_most(THUMBNAIL)), again)
+            shares[again] = [taken if good else 0 * taken for good, taken in shown]
+            again = [n for n, (good, _) in zip(again, shown, strict=True) if not good]
             for n in again:
                 poses[n] = sampler.pose(n, attempt, float(subjects[n]), rng)
+        drawn = [(pose.camera, BACKGROUNDS[n % len(BACKGROUNDS)]) for n, pose in enumerate(poses)]
+        few = parts.overlooked(shares, drawn, pool)[:MOST_ADDED]
+        added = parts.cameras_for(few, (width, height), rng, pool)
     progress("cameras", 1.0)
-    digits = len(str(count - 1))
-    views = tuple(
-        View(
-            f"{n:0{digits}} {pose.kind}",
-            pose.camera,
-            background=_grey(BACKGROUNDS[n % len(BACKGROUNDS)]),
-            target=pose.target,
-        )
-        for n, pose in enumerate(poses)
-    )
-    return Views((), views, _grey(0.5), f"drawn over the whole scene, seed {seed}")
+    digits = len(str(count + len(added) - 1))
+    views = [
+        View(f"{n:0{digits}} {pose.kind}", camera, background=_grey(level), target=pose.target)
+        for n, (pose, (camera, level)) in enumerate(zip(poses, drawn, strict=True))
+    ]
+    views += [
+        View(f"{n:0{digits}} part", one.camera, background=_grey(one.background), target=one.target, added=True)
+        for n, one in enumerate(added, count)
+    ]
+    return Views((), tuple(views), _grey(0.5), f"drawn over the whole scene, seed {seed}")
 
 
 def _subjects(count: int, rng: np.random.Generator) -> Float64[np.ndarray, " count"]:
@@ -168,14 +157,14 @@ class _PoseSampler:
     size: tuple[int, int]
 
     @classmethod
-    def of(cls, splats: Splats, size: tuple[int, int]) -> _PoseSampler:
+    def of(cls, splats: Splats, counts: Float64[np.ndarray, " N"], size: tuple[int, int]) -> _PoseSampler:
         visible = np.flatnonzero(opacity(splats) > 0)
         if not len(visible):
             alone = GaussianSampler(np.zeros(1, np.int64), np.ones(1))
             return cls(False, np.zeros((3, 1), np.float32), np.ones(1), alone, size)
         means = splats.means[visible].astype(np.float64)
         sizes = np.exp(np.median(splats.scales[visible].astype(np.float64), axis=1))
-        gaussians = GaussianSampler.of(means, prominence(splats)[visible])
+        gaussians = GaussianSampler.of(means, counts[visible])
         return cls(True, np.ascontiguousarray(splats.means[visible].T), sizes, gaussians, size)
 
     def pose(self, number: int, attempt: int, subject: float, rng: np.random.Generator) -> _Pose:
@@ -183,7 +172,7 @@ class _PoseSampler:
         kind = KINDS[number % len(KINDS)] if 2 * attempt < PATIENCE else "around"  # there is always something near
         chosen = self.gaussians.at(subject if 2 * attempt < PATIENCE else rng.random())
         other = self.gaussians.at(rng.random())
-        fov, towards = float(rng.uniform(*FIELDS_OF_VIEW)), _direction(rng)
+        fov, towards = float(rng.uniform(*FIELDS_OF_VIEW)), direction(rng)
         nearer = 2 * attempt * (attempt % 2)  # every other one, in case that a lone cluster has fewer Gaussians
         few, many = (max(1, min(limit, self.columns.shape[1]) >> nearer) for limit in CLOSE)
         close = _between(few, many, rng)
@@ -199,13 +188,7 @@ class _PoseSampler:
         return self._take(kind, target + towards * self._reach(chosen, around), target, fov)
 
     def _take(self, kind: Kind, place: Point, target: Point, fov: float) -> _Pose:
-        distance = float(np.linalg.norm(place - target))
-        if distance < NEAREST:
-            away = (place - target) / distance if distance > 0 else -UP
-            place = target + NEAREST * away
-            fov = max(2 * float(np.arctan(np.tan(fov / 2) * distance / NEAREST)), 1e-9)
-        camera = look_at(place, target, UP, fov=fov, width=self.size[0], height=self.size[1])
-        return _Pose(kind, camera, target)
+        return _Pose(kind, aim(place, target, fov, self.size), target)
 
     def _at(self, index: int) -> Point:
         return self.columns[:, index].astype(np.float64)
@@ -226,25 +209,20 @@ class _PoseSampler:
         return 0.5 * (low + high), max(radius, BESIDE * float(np.median(self.sizes)))
 
 
-def _direction(rng: np.random.Generator) -> Point:
-    """A direction, any as likely as any other."""
-    vector = rng.standard_normal(3)
-    return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-9))
-
-
 def _between(low: int, high: int, rng: np.random.Generator) -> int:
     """A whole number of any order of magnitude."""
     return int(np.clip(np.rint(np.exp(rng.uniform(np.log(low), np.log(high)))), low, high))
 
 
-def _shows(splats: Splats, camera: Camera) -> bool:
-    """Whether there is something to see, and more than the inside of Gaussians, or one of them."""
+def _shows(parts: Parts, camera: Camera) -> tuple[bool, Float64[np.ndarray, " P"]]:
+    """Whether there is something to see, and more than the inside of Gaussians, or one of them; the parts' shares."""
     with Workers(1) as alone:
-        frame = draw(splats, camera, _grey(0.0), alone)
+        frame = draw(parts.splats, camera, _grey(0.0), alone)
         if 1 - float(frame.transmittance.mean(dtype=np.float64)) < EMPTY:
-            return False
+            return False, np.zeros(len(parts.parts))
         weights = weights_of(frame, alone)
     pixels = frame.transmittance.size
     around = np.flatnonzero(weights > 0)
-    inside = distances(splats.select(around), camera.position) < WITHIN
-    return bool(weights.max() < ALONE * pixels and weights[around[inside]].sum() < INSIDE * pixels)
+    inside = distances(parts.splats.select(around), camera.position) < WITHIN
+    good = weights.max() < ALONE * pixels and weights[around[inside]].sum() < INSIDE * pixels
+    return bool(good), parts.shares(weights, pixels)

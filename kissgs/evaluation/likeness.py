@@ -171,8 +171,16 @@ class Evaluation:
         return sizes.pop() if len(sizes) == 1 else f"{len(sizes)} sizes"
 
     @property
+    def added(self) -> int:
+        """How many of the views were put beside the drawn ones for parts of the scene that those overlook."""
+        return sum(view.view.added for view in self.views)
+
+    @property
     def mean(self) -> Comparison:
-        """Mean over views of each figure; of the PSNR a mean of decibels, of at most :data:`MOST` for each view."""
+        """Mean over views of each figure; of the PSNR a mean of decibels, of at most :data:`MOST` for each view.
+
+        Added views count as all others do: without them, the mean would say nothing of the parts they were added for.
+        """
         all_views = [view.comparison for view in self.views]
         references = [view.reference for view in all_views if view.reference is not None]
         return Comparison(
@@ -207,7 +215,10 @@ class Evaluation:
             f"worst view {spell(worst.comparison.between.psnr, 1)} dB ({worst.view.name}, {worst.place}), "
             f"5th percentile {spell(self.fifth_percentile, 1)} dB"
         )
-        return told if self.shown is None else f"{told}; the views show {math.floor(100 * self.shown)} % of the scene"
+        if self.shown is not None:
+            told += f"; the views show {math.floor(100 * self.shown)} % of the scene"
+        added = f"{self.added} of the views {'was' if self.added == 1 else 'were'} added"
+        return told if not self.added else f"{told}; {added} for parts that the others overlook"
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON; see :meth:`Likeness.as_dict` for infinity and NaN."""
@@ -218,6 +229,7 @@ class Evaluation:
             "note": self.note,
             "count": {"reference": self.reference_count, "candidate": self.candidate_count},
             "views": [view.as_dict() for view in self.views],
+            "added": self.added,
             "mean": self.mean.as_dict(),
             "worst": self.worst.where(),
             "fifth_percentile": _as_json(self.fifth_percentile),

@@ -36,7 +36,7 @@ def prominence(splats: Splats) -> Float64[np.ndarray, " N"]:
     opacities = opacity(splats)
     visible = np.flatnonzero(opacities > 0)
     if len(visible):
-        visible = visible[np.argsort(_codes(splats.means[visible].astype(np.float64)), kind="stable")]
+        visible = visible[np.argsort(morton_codes(splats.means[visible].astype(np.float64)), kind="stable")]
         axes = np.sort(splats.scales[visible].astype(np.float64), axis=1)
         areas = np.exp(axes[:, 1] + axes[:, 2])
         blocks = np.pad(areas, (0, -len(areas) % NEIGHBOURS), mode="edge").reshape(-1, NEIGHBOURS)
@@ -77,7 +77,7 @@ class GaussianSampler:
             means: positions.
             weights: not negative, not all 0.
         """
-        codes = _codes(means)
+        codes = morton_codes(means)
         order = np.argsort(codes, kind="stable")
         sorted_weights = weights[order] / weights.sum()
         fair = _fair_chances(codes[order], sorted_weights)
@@ -107,7 +107,7 @@ def _fair_chances(codes: Int[np.ndarray, " N"], weights: Float64[np.ndarray, " N
     return np.asarray(chances[leaf] * weights / np.maximum(levels[0], 1e-300)[leaf])
 
 
-def _codes(means: Float64[np.ndarray, "N 3"]) -> Int[np.ndarray, " N"]:
+def morton_codes(means: Float64[np.ndarray, "N 3"]) -> Int[np.ndarray, " N"]:
     """Places along a space-filling curve: the bits of the coordinates, interleaved (Morton)."""
     low = means.min(axis=0)
     extent = max(float((means.max(axis=0) - low).max()), 1e-300)

@@ -40,6 +40,7 @@ class View:
             which to render when scenes are compared; None: black, and that of all views.
         bend: how to undistort the photograph; None if it is a pinhole's.
         target: ``(3,)`` the point in the middle of the picture that the camera looks at; None where none is known.
+        added: whether it was put beside drawn ones for a part of the scene that those overlook.
     """
 
     name: str
@@ -48,6 +49,7 @@ class View:
     background: Float32[np.ndarray, "3"] | None = None
     bend: Bend | None = None
     target: Float64[np.ndarray, "3"] | None = None
+    added: bool = False
 
     def at_most(self, size: int) -> View:
         """The same with at most so many pixels on the longer side; the photograph is reduced when it is loaded."""

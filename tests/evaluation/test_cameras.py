@@ -10,7 +10,8 @@ import pytest
 
 import kissgs
 from kissgs.errors import InvalidViewsError
-from kissgs.evaluation.cameras import BACKGROUNDS, EMPTY, HEIGHT, KINDS, NEAREST, WIDTH, evaluation_views
+from kissgs.evaluation.aim import BACKGROUNDS, NEAREST
+from kissgs.evaluation.cameras import EMPTY, HEIGHT, KINDS, WIDTH, evaluation_views
 from kissgs.rendering.rasterizer import render
 from kissgs.splats import ATTRIBUTES, Splats
 
