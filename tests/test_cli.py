@@ -104,8 +104,8 @@ def test_goals_and_what_was_seen_from_the_command_line(scene: Path, tmp_path: Pa
     assert sorted(file.name for file in tmp_path.iterdir()) == ["scene.importance.npz", "scene.ply", "scene.zip"]
     report = json.loads(run("compress", copy, "-f", "--psnr", "38", "--cache", "--evaluate", "--json", *glance).stdout)
     assert "importance" not in report["seconds"]
-    assert report["evaluation"]["mean"]["between"]["psnr"] >= 38
-    assert report["trials"][0]["bytes"] > 0
+    assert any(trial["bytes"] == report["container_bytes"] and trial["psnr"] >= 38 for trial in report["trials"])
+    assert report["evaluation"]["mean"]["between"]["psnr"] > 37  # from cameras that the search did not use
     assert "has 150 dB, the finest has" in failure("compress", copy, "-f", "-q", "--psnr", "150", *glance)
     assert "psnr needs bits that are weighed" in failure("compress", copy, "-f", "-p", "fast", "--psnr", "40")
     piped = failure("compress", "-", "-o", tmp_path / "b.zip", "--cache", stdin=scene.read_bytes())

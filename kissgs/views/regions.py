@@ -32,11 +32,8 @@ MOST = 16
 LEAST = 0.01
 """Share of what a scene shows that a further region must add."""
 
-POSES = 24
-"""Cameras that are tried around each further region, at least; half as many as are wanted in all, if that is more."""
-
-DETAIL = SKETCH // 4
-"""Gaussians in a thumbnail of a further region, and as many of all else."""
+POSES = 40
+"""Cameras that are tried around each further region."""
 
 PROBES = 6
 """Cameras by which it is told what a region's views show."""
@@ -101,7 +98,7 @@ def regions(splats: Splats, size: tuple[int, int], pool: Workers, progress: Prog
         start = sketch.means[densest].astype(np.float64), 4 * float(spacing[densest])
         part = anatomy(sketch.select(left), start)
         part = Anatomy(part.centre, part.radius, scene.up)
-        region = _region(splats, part, max(POSES, wanted // 2), tried.cameras[0], pool, progress)
+        region = _region(splats, part, tried.cameras[0], pool, progress)
         before = float(unseen.sum())
         unseen = worth * (1 - _look(sketch, region, coverage, pool))
         gain = before - float(unseen.sum())
@@ -145,23 +142,23 @@ def _look(sketch: Splats, region: Region, coverage: Coverage, pool: Workers) -> 
     return coverage.share
 
 
-def _region(splats: Splats, part: Anatomy, poses: int, like: Camera, pool: Workers, progress: Progress) -> Region:
-    """Score so many views all around a further part of the scene, of the scene in front of and behind it too."""
+def _region(splats: Splats, part: Anatomy, like: Camera, pool: Workers, progress: Progress) -> Region:
+    """Score views all around a further part of the scene, of the scene in front of and behind it too."""
     distance = np.linalg.norm(splats.means - part.centre, axis=1)
     near = distance <= 6 * part.radius
     sketch = _joined(
-        sketch_of(splats.select(np.flatnonzero(near)), DETAIL),
-        sketch_of(splats.select(np.flatnonzero(~near)), DETAIL),
+        sketch_of(splats.select(np.flatnonzero(near)), SKETCH // 2),
+        sketch_of(splats.select(np.flatnonzero(~near)), SKETCH // 2),
     )
     critic = Critic(sketch, part, pool, progress)
-    cameras = list(_poses(part, poses, like))
+    cameras = list(_poses(part, like))
     return Region(part, critic, Tried(cameras, critic.judge(cameras), False, False, np.zeros(len(cameras))), 0.0)
 
 
-def _poses(part: Anatomy, count: int, like: Camera) -> Iterator[Camera]:
+def _poses(part: Anatomy, like: Camera) -> Iterator[Camera]:
     """From all directions, evenly, at distances at which the part fills the image or leaves some air around."""
-    for n in range(count):
-        height, turn = 1 - (2 * n + 1) / count, n * np.pi * (3 - np.sqrt(5))
+    for n in range(POSES):
+        height, turn = 1 - (2 * n + 1) / POSES, n * np.pi * (3 - np.sqrt(5))
         flat = np.sqrt(1 - height**2)
         direction = np.array([flat * np.cos(turn), height, flat * np.sin(turn)])
         place = part.centre + part.radius * (1.3, 2.0, 3.0)[n % 3] * direction

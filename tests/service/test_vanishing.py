@@ -182,7 +182,7 @@ def test_no_job_that_was_accepted_is_lost(start):
     assert known.keys() >= held
     written = [job for job_id, job in known.items() if job_id not in held]  # just before the removal was noticed
     assert len(written) <= len(refused)
-    assert all(job["state"] == "failed" and "upload is no longer" in job["error"]["detail"] for job in written)
+    assert all(job["state"] == "failed" and "upload is no longer" in job["problem"]["detail"] for job in written)
 
 
 def every(service):
