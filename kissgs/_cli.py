@@ -131,7 +131,8 @@ def compress(
 
     budget = None if compact is None else budget_of(compact)
     settings = chosen(
-        *(preset, changes),
+        preset,
+        changes,
         budget=budget,
         finetune=finetune,
         seed=seed,

@@ -77,7 +77,8 @@ def evaluate(
         ]
         scenes = sides[0].splats, sides[1].splats
         result = measure(
-            *(*scenes, capture),
+            *scenes,
+            capture,
             split=used,
             seed=seed,
             lpips=lpips,

@@ -63,7 +63,8 @@ def compress(
     if "-" in scenes or str(output) == "-":
         raise UnsupportedError("remote compression reads and writes files; name them")
     settings = chosen(
-        *(preset, changes),
+        preset,
+        changes,
         budget=None if compact is None else budget_of(compact),
         finetune=finetune,
         psnr=psnr,

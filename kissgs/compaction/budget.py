@@ -172,7 +172,7 @@ class Compactor:
             drawn = evaluation_views(self.splats, seed=SEARCH_SEED, threads=self.threads, progress=progress)
             self.judges, self._taken = drawn, {}
         return compare_pictures(
-            *(self.splats, found.splats, self.judges), threads=self.threads, taken=self._taken, progress=progress
+            self.splats, found.splats, self.judges, threads=self.threads, taken=self._taken, progress=progress
         )
 
     @property

@@ -29,8 +29,7 @@ def judge(
     The bytes are those of its container as the preset ``fast`` makes it. ``progress`` receives the stage ``"judge"``.
     """
     receive = as_stage("judge", progress)
-    compared = compare_pictures(
-        *(reference, scene, exam(reference, school, threads, receive)), threads=threads, progress=receive
-    )
+    views = exam(reference, school, threads, receive)
+    compared = compare_pictures(reference, scene, views, threads=threads, progress=receive)
     encoded = encode(scene, Settings(preset=Preset.FAST).encode, threads=threads, progress=receive)
     return compared.mean.candidate, len(zip_bytes(encoded.files))

@@ -79,7 +79,12 @@ def evaluate(
     for part in parts:
         begin, share = done / total, len(part.views) / total
         told = _compare_all(
-            *(reference, candidate, part, measure, device, threads),
+            reference,
+            candidate,
+            part,
+            measure,
+            device,
+            threads,
             progress=lambda stage, fraction, begin=begin, share=share: progress(stage, begin + share * fraction),
         )
         shown = share_shown(reference, [view.camera for view in part.views], threads=threads)
