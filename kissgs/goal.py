@@ -83,8 +83,12 @@ class Goal:
             return math.log2(self.settings.target_size / trial.bytes)
         if self.settings.psnr is not None:
             return (trial.psnr or 0.0) - self.settings.psnr
-        if trial.drop is None or trial.drop <= 0:  # photographs may even find a container better
-            return math.inf if trial.drop is not None else -math.inf
+        if (
+            trial.drop is None or trial.drop == math.inf
+        ):  # infinite where photographs were equal to the scene's pictures
+            return -math.inf
+        if trial.drop <= 0:  # photographs may even find a container better
+            return math.inf
         return math.log2((self.settings.max_psnr_drop or 1.0) / trial.drop)
 
     def regret(self, trials: Sequence[Trial], *, fewer: bool) -> str:

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from kissgs.evaluation.drop import drop_of, psnr_of
+from kissgs.evaluation.likeness import as_json
 
 if TYPE_CHECKING:
     from kissgs.evaluation.likeness import Evaluation
@@ -59,8 +60,8 @@ class Trial:
         return f"{self.bytes / 1000:,.0f} kB{pictures}{lost}{worst}"
 
     def as_dict(self) -> dict[str, Any]:
-        """For machines; what is infinite is null."""
-        return {name: None if value == math.inf else value for name, value in asdict(self).items()}
+        """For machines; what is infinite is null, and NaN, of a picture that failed, the string ``"NaN"``."""
+        return {name: as_json(value) if isinstance(value, float) else value for name, value in asdict(self).items()}
 
 
 def seek(

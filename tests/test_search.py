@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 import kissgs
 from kissgs import Settings, UnsupportedError
-from kissgs.search import ATTEMPTS, REACH, seek
+from kissgs.goal import Goal
+from kissgs.search import ATTEMPTS, REACH, Trial, seek
 
 SCENE = kissgs.sample_scene(1500, sh_degree=1, seed=5)
 GLANCE = {"views": 4, "view_size": 48}
@@ -257,3 +258,13 @@ def test_a_search_can_be_stopped(tmp_path):
     with pytest.raises(kissgs.Cancelled):
         kissgs.compress(SCENE, tmp_path / "a.zip", settings=settings, progress=stop)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_has_no_number_in_json_is_spelled():
+    told = Trial(1, 1e-9, 10, psnr=math.inf, drop=-math.inf, worst=math.nan).as_dict()
+    assert (told["psnr"], told["drop"], told["worst"], told["bytes"]) == (None, None, "NaN", 10)
+
+
+def test_a_loss_without_bound_meets_no_goal():
+    goal = Goal.of(Settings.from_preset("balanced", max_psnr_drop=1.0).encode)
+    assert goal.spare(Trial(1, 1e-9, 10, drop=math.inf)) == -math.inf

@@ -69,7 +69,7 @@ def evaluation_views(
     cameras, whatever the number of threads.
 
     Args:
-        splats: finite (:func:`kissgs.clean`).
+        splats: cleaned (:func:`kissgs.clean`).
         count: how many views, but for those that are added.
         width: of the pictures, pixels.
         height: of the pictures, pixels.

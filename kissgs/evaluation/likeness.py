@@ -38,8 +38,8 @@ class Likeness:
 
     def as_dict(self) -> dict[str, float | str | None]:
         """For JSON, which has no infinity and no NaN: an infinite value is None (null), NaN the string ``"NaN"``."""
-        values = {"psnr": _as_json(self.psnr), "ssim": _as_json(self.ssim)}
-        return values if self.lpips is None else {**values, "lpips": _as_json(self.lpips)}
+        values = {"psnr": as_json(self.psnr), "ssim": as_json(self.ssim)}
+        return values if self.lpips is None else {**values, "lpips": as_json(self.lpips)}
 
     def spelled(self) -> list[str]:
         """For people."""
@@ -113,7 +113,7 @@ class ViewComparison:
         camera, target = self.view.camera, self.view.target
         return {
             "name": self.view.name,
-            "psnr": _as_json(self.comparison.between.psnr),
+            "psnr": as_json(self.comparison.between.psnr),
             "position": camera.position.tolist(),
             "target": None if target is None else target.tolist(),
             "direction": camera.viewmat[2, :3].tolist(),
@@ -232,7 +232,7 @@ class Evaluation:
             "added": self.added,
             "mean": self.mean.as_dict(),
             "worst": self.worst.where(),
-            "fifth_percentile": _as_json(self.fifth_percentile),
+            "fifth_percentile": as_json(self.fifth_percentile),
             "shown": self.shown,
             "surroundings": None if self.surroundings is None else self.surroundings.as_dict(),
         }
@@ -266,7 +266,8 @@ def _point(point: Float64[np.ndarray, "3"]) -> str:
     return f"({', '.join(f'{value:.4g}' for value in point)})"
 
 
-def _as_json(value: float) -> float | str | None:
+def as_json(value: float) -> float | str | None:
+    """For JSON, which has no infinity and no NaN: None and ``"NaN"``."""
     if math.isinf(value):
         return None
     return "NaN" if math.isnan(value) else value

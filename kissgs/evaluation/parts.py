@@ -43,8 +43,8 @@ def find_parts(splats: Splats, counts: Float64[np.ndarray, " N"]) -> tuple[list[
     """The smallest parts that stand apart, and for each Gaussian the number of its part, -1 for none.
 
     A sample of the Gaussians is joined, nearest pairs first (single linkage, as in HDBSCAN, where no two Gaussians are
-    nearer than their own size). What has grown to :data:`LEAST` of the scene before it meets something as large, and
-    has meanwhile crossed no gap a third as wide as that between them, is a part.
+    nearer than their own size). What has grown to :data:`LEAST` of the scene before it meets something as large is a
+    part, if it crossed no gap while it grew to that that is a third as wide as the one between them.
 
     Args:
         splats: finite.
