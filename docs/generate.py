@@ -11,9 +11,9 @@ from pydantic import ByteSize
 from kissgs.settings import PRESETS, CompactSettings, EncodeSettings, FinetuneSettings, Preset
 from kissgs.settings.compact import BUDGETS
 from kissgs.sogxt.metadata import ContainerMeta
-from service.app import create_app
-from service.problems import KINDS
-from service.settings import ServiceSettings
+from service.core.problems import PROBLEM_TYPES
+from service.core.settings import ServiceSettings
+from service.http.app import create_app
 
 HERE = Path(__file__).parent
 
@@ -39,7 +39,7 @@ GROUPS = {
         FinetuneSettings,
         "How levels become better once all else is chosen ([finetuning.md](finetuning.md)). "
         "`kissgs compress --finetune --set finetune.NAME=VALUE`, or "
-        '`Settings.from_preset("balanced", finetune={"wanted": True, "NAME": VALUE})` in Python, changes one.',
+        '`Settings.from_preset("balanced", finetune={"enabled": True, "NAME": VALUE})` in Python, changes one.',
     ),
 }
 
@@ -66,7 +66,8 @@ def container_schema() -> str:
 
 SERVICE_INTRODUCTION = """# The service: settings and problems
 
-Made by `make docs` from `service/settings.py` and `service/problems.py`; how to use it is in [service.md](service.md).
+Made by `make docs` from `service/core/settings.py` and `service/core/problems.py`; for its use see
+[service.md](service.md).
 
 ## Settings
 
@@ -86,7 +87,7 @@ def service_page() -> str:
         page += f"| `KISSGS_{name.upper()}` | {default} | {field.description} |\n"
     page += "\n## Problems\n\nThe `code` of a problem document. Codes never change their meaning.\n\n"
     page += "| code | status | what | try again |\n|---|---|---|---|\n"
-    for code, kind in KINDS.items():
+    for code, kind in PROBLEM_TYPES.items():
         page += f"| `{code}` | {kind.status} | {kind.title} | {'yes' if kind.retryable else ''} |\n"
     return page
 
@@ -102,7 +103,7 @@ def openapi_document() -> str:
     with tempfile.TemporaryDirectory() as folder:
         app = create_app(ServiceSettings(data_dir=Path(folder)))
         app.state.context.store.close()
-        app.state.context.folders.close()
+        app.state.context.storage.close()
     return json.dumps(app.openapi(), indent=1) + "\n"
 
 

@@ -11,81 +11,81 @@ from kissgs._version import __version__
 
 TYPE_CHECKING = False  # without typing, which takes longer to import than all of this
 if TYPE_CHECKING:
+    from kissgs.cameras.captures.load import load_views
+    from kissgs.cameras.views import View, Views
+    from kissgs.cameras.virtual.select import virtual_views
+    from kissgs.client.remote import Remote
     from kissgs.compaction.result import Compacted, CompactionReport
-    from kissgs.errors import (
+    from kissgs.core.errors import (
         Cancelled,
-        Enough,
         InvalidContainerError,
         InvalidSceneError,
         InvalidViewsError,
         KissgsError,
         OutputError,
         RemoteError,
+        StopSearch,
         UnsupportedError,
     )
-    from kissgs.evaluation.likeness import Evaluation
-    from kissgs.evaluation.pictures import evaluate
+    from kissgs.core.progress import Progress
+    from kissgs.core.sensitivity import Sensitivity
+    from kissgs.core.splats import Splats, clean
+    from kissgs.evaluation.evaluate import evaluate
+    from kissgs.evaluation.results import Evaluation
     from kissgs.finetuning.result import FinetuneReport
-    from kissgs.importance import Importance
     from kissgs.io.ply import PlyInfo, read_ply_info
-    from kissgs.pipeline import Compressed, compact, compress, decompress
-    from kissgs.progress import Progress
-    from kissgs.remote import Remote
+    from kissgs.pipeline.pipeline import Compressed, compact, compress, decompress
+    from kissgs.pipeline.report import Report
+    from kissgs.pipeline.scene_files import load, save
     from kissgs.rendering.camera import Camera
-    from kissgs.rendering.importance import Watch, measure_importance
     from kissgs.rendering.rasterizer import render
-    from kissgs.report import Report
-    from kissgs.sample import sample_scene
-    from kissgs.scenes import load, save
+    from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
     from kissgs.settings import CompactSettings, EncodeSettings, FinetuneSettings, Preset, Settings
-    from kissgs.splats import Splats, clean
-    from kissgs.views.load import load_views
-    from kissgs.views.view import View, Views
-    from kissgs.views.virtual import virtual_views
+    from kissgs.synthetic.scene import sample_scene
 
 _HOMES = {
     "Camera": "rendering.camera",
-    "Cancelled": "errors",
+    "Cancelled": "core.errors",
     "CompactSettings": "settings",
     "Compacted": "compaction.result",
     "CompactionReport": "compaction.result",
-    "Compressed": "pipeline",
+    "Compressed": "pipeline.pipeline",
     "EncodeSettings": "settings",
-    "Enough": "errors",
-    "Evaluation": "evaluation.likeness",
+    "StopSearch": "core.errors",
+    "Evaluation": "evaluation.results",
     "FinetuneReport": "finetuning.result",
     "FinetuneSettings": "settings",
-    "Importance": "importance",
-    "InvalidContainerError": "errors",
-    "InvalidSceneError": "errors",
-    "InvalidViewsError": "errors",
-    "KissgsError": "errors",
-    "OutputError": "errors",
+    "Sensitivity": "core.sensitivity",
+    "InvalidContainerError": "core.errors",
+    "InvalidSceneError": "core.errors",
+    "InvalidViewsError": "core.errors",
+    "KissgsError": "core.errors",
+    "OutputError": "core.errors",
     "PlyInfo": "io.ply",
     "Preset": "settings",
-    "Progress": "progress",
-    "Remote": "remote",
-    "RemoteError": "errors",
-    "Report": "report",
+    "Progress": "core.progress",
+    "Remote": "client.remote",
+    "RemoteError": "core.errors",
+    "Report": "pipeline.report",
     "Settings": "settings",
-    "Splats": "splats",
-    "UnsupportedError": "errors",
-    "View": "views.view",
-    "Views": "views.view",
-    "Watch": "rendering.importance",
-    "clean": "splats",
-    "compact": "pipeline",
-    "compress": "pipeline",
-    "decompress": "pipeline",
-    "evaluate": "evaluation.pictures",
-    "load": "scenes",
-    "load_views": "views.load",
-    "measure_importance": "rendering.importance",
+    "Splats": "core.splats",
+    "UnsupportedError": "core.errors",
+    "View": "cameras.views",
+    "Views": "cameras.views",
+    "WeightedCameras": "rendering.sensitivity",
+    "clean": "core.splats",
+    "compact": "pipeline.pipeline",
+    "compress": "pipeline.pipeline",
+    "decompress": "pipeline.pipeline",
+    "evaluate": "evaluation.evaluate",
+    "load": "pipeline.scene_files",
+    "load_views": "cameras.captures.load",
+    "measure_sensitivity": "rendering.sensitivity",
     "read_ply_info": "io.ply",
     "render": "rendering.rasterizer",
-    "sample_scene": "sample",
-    "save": "scenes",
-    "virtual_views": "views.virtual",
+    "sample_scene": "synthetic.scene",
+    "save": "pipeline.scene_files",
+    "virtual_views": "cameras.virtual.select",
 }
 
 __all__ = [
@@ -96,11 +96,9 @@ __all__ = [
     "CompactionReport",
     "Compressed",
     "EncodeSettings",
-    "Enough",
     "Evaluation",
     "FinetuneReport",
     "FinetuneSettings",
-    "Importance",
     "InvalidContainerError",
     "InvalidSceneError",
     "InvalidViewsError",
@@ -112,12 +110,14 @@ __all__ = [
     "Remote",
     "RemoteError",
     "Report",
+    "Sensitivity",
     "Settings",
     "Splats",
+    "StopSearch",
     "UnsupportedError",
     "View",
     "Views",
-    "Watch",
+    "WeightedCameras",
     "__version__",
     "clean",
     "compact",
@@ -126,7 +126,7 @@ __all__ = [
     "evaluate",
     "load",
     "load_views",
-    "measure_importance",
+    "measure_sensitivity",
     "read_ply_info",
     "render",
     "sample_scene",

@@ -2,28 +2,48 @@
 
 from pathlib import Path
 
+import helpers.shape_checks  # noqa: F401  # the hook names it
 import pytest
 from jaxtyping import install_import_hook
 
 # The shapes and dtypes in signatures are executed. Not those of Splats, Camera and encode, which have their own
 # sentences for what users hand them, nor of compiled kernels.
-install_import_hook(
-    [
-        "kissgs.evaluation",
-        "kissgs.io",
-        "kissgs.sample",
-        "kissgs.spherical_harmonics",
-        *(f"kissgs.rendering.{name}" for name in ("cpu.frame", "differentiable", "losses", "lpips", "metrics")),
-        "kissgs.importance",
-        "kissgs.rendering.importance",
-        "kissgs.rendering.rasterizer",
-        "kissgs.rendering.refit",
-        "kissgs.views",
-        *(f"kissgs.sogxt.{name}" for name in ("codebook", "decode", "economy", "even", "kmeans")),
-        *(f"kissgs.sogxt.{name}" for name in ("order", "planes", "plas", "pras", "quantize", "rounding", "weighed")),
-    ],
-    "checking.typechecker",
-)
+ROOT = Path(__file__).parents[1]
+CHECKED = [
+    "cameras",
+    "core/sensitivity",
+    "core/signed_log",
+    "core/spherical_harmonics",
+    "evaluation",
+    "io",
+    "planning/kmeans",
+    "planning/layout",
+    "planning/plas",
+    "planning/quantize",
+    "planning/rate_distortion",
+    "planning/rd_model",
+    "planning/rdo_quantize",
+    "planning/rotation_forms",
+    "planning/sh_codebook",
+    "planning/uniform",
+    "rendering/color_refit",
+    "rendering/coverage",
+    "rendering/cpu/frame",
+    "rendering/differentiable",
+    "rendering/local_scale",
+    "rendering/losses",
+    "rendering/lpips",
+    "rendering/metrics",
+    "rendering/rasterizer",
+    "rendering/sensitivity",
+    "sogxt/decode",
+    "sogxt/planes",
+    "synthetic/scene",
+]
+
+for name in CHECKED:  # a module that has moved is not to go unchecked
+    assert (ROOT / "kissgs" / name).is_dir() or (ROOT / "kissgs" / f"{name}.py").is_file(), name
+install_import_hook([f"kissgs.{name.replace('/', '.')}" for name in CHECKED], "helpers.shape_checks.typechecker")
 
 
 @pytest.fixture(scope="session")

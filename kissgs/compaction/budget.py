@@ -10,24 +10,24 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from kissgs.cameras.views import Views
 from kissgs.compaction.popspa import popspa
 from kissgs.compaction.result import Compacted, CompactionReport
-from kissgs.errors import Enough, UnsupportedError
+from kissgs.core.errors import StopSearch, UnsupportedError
+from kissgs.core.progress import Progress, as_stage, silent
+from kissgs.core.root_finding import find_root
+from kissgs.core.splats import Splats
 from kissgs.evaluation.cameras import evaluation_views
-from kissgs.evaluation.drop import MODELLED, SEARCH_SEED, drop_of
-from kissgs.evaluation.pictures import Picture, compare_pictures
-from kissgs.progress import Progress, as_stage, silent
+from kissgs.evaluation.evaluate import Picture, compare_pictures
+from kissgs.evaluation.psnr_loss import MODELLED, SEARCH_SEED, drop_of
 from kissgs.rendering.gsplat_backend import need_cuda
 from kissgs.rendering.rasterizer import Device
-from kissgs.search import seek
 from kissgs.settings import CompactSettings
-from kissgs.splats import Splats
-from kissgs.training.school import SCORED, School, school
-from kissgs.views.view import Views
+from kissgs.training.supervision import SCORED, SupervisionViews, supervision_views
 
 if TYPE_CHECKING:
-    from kissgs.evaluation.likeness import Evaluation
-    from kissgs.training.lessons import Lessons
+    from kissgs.evaluation.results import Evaluation
+    from kissgs.training.targets import TrainingTargets
 
 START, SLOPE, LARGEST = -2.0, 0.4, -0.1
 """First share that is tried, decibels that doubling it is about worth, and the largest share; powers of 2."""
@@ -70,9 +70,9 @@ def compact_scene(
         OutputError: ``checkpoint`` is of other work, or cannot be written.
         UnsupportedError: no budget is given; no torch or no GPU to train with; too little memory.
     """
-    if not settings.wanted:
+    if not settings.enabled:
         raise UnsupportedError("how many Gaussians to keep is not said; give count, ratio or max_psnr_drop")
-    if settings.by_goal:
+    if settings.auto_count:
         raise UnsupportedError(
             "a goal is that of a container: kissgs compress; here give count, ratio or max_psnr_drop"
         )
@@ -92,7 +92,7 @@ def unchanged(splats: Splats, why: str) -> Compacted:
     count = f"{len(splats):,} Gaussian{'' if len(splats) == 1 else 's'}"
     note = f"the scene has {count}, {why}: it stays as it is"
     report = CompactionReport(
-        source_count=len(splats), count=len(splats), taught_by="nothing", source="", steps=(), note=note
+        source_count=len(splats), count=len(splats), target_source="nothing", source="", steps=(), note=note
     )
     return Compacted(splats, np.arange(len(splats)), report)
 
@@ -104,7 +104,7 @@ class Compactor:
     Attributes:
         splats: clean.
         settings: of the recipe.
-        school: views to learn from.
+        supervision: views to learn from.
         threads: see :func:`compact_scene`.
         device: see the same.
         progress: see the same.
@@ -113,13 +113,13 @@ class Compactor:
 
     splats: Splats
     settings: CompactSettings
-    school: School
+    supervision: SupervisionViews
     threads: int
     device: Device
     progress: Progress
     judges: Views | None = None
     _taken: dict[str, Picture] | None = None
-    _lessons: Lessons | None = None
+    _targets: TrainingTargets | None = None
 
     @classmethod
     def of(
@@ -141,23 +141,23 @@ class Compactor:
         if settings.trains and device == "cuda":
             need_cuda()
         scored = SCORED if settings.trains else 1
-        taught = school(splats, views, settings, scored=scored, threads=threads, progress=progress)
-        return cls(splats, settings, taught, threads, device, progress, None if views is None else taught.exam)
+        taught = supervision_views(splats, views, settings, scored=scored, threads=threads, progress=progress)
+        return cls(splats, settings, taught, threads, device, progress, None if views is None else taught.eval_views)
 
     def __call__(self, count: int, *, judges: bool = False, checkpoint: Path | None = None) -> Compacted:
         """Down to ``count``, which is less than the scene has."""
-        if self._lessons is None and self.settings.trains:
-            from kissgs.training.lessons import lessons
+        if self._targets is None and self.settings.trains:
+            from kissgs.training.targets import training_targets
 
-            self._lessons = lessons(
-                *(self.splats, self.school.train, self.school.background),
+            self._targets = training_targets(
+                *(self.splats, self.supervision.train, self.supervision.background),
                 threads=self.threads,
                 device=self.device,
                 progress=self.progress,
             )
         return popspa(
-            *(self.splats, count, self.settings, self.school),
-            lessons=self._lessons,
+            *(self.splats, count, self.settings, self.supervision),
+            targets=self._targets,
             judges=judges,
             checkpoint=checkpoint,
             threads=self.threads,
@@ -178,7 +178,7 @@ class Compactor:
     @property
     def note(self) -> str:
         """How a drop is told, where that needs to be said."""
-        return "" if any(view.photo for view in self.school.test) else MODELLED
+        return "" if any(view.photo for view in self.supervision.test) else MODELLED
 
 
 class _Search:
@@ -194,7 +194,7 @@ class _Search:
         splats = self.compactor.splats
         least = -math.log2(len(splats))
         try:
-            seek(
+            find_root(
                 lambda share: allowed - self._drop(share, allowed),
                 max(START, least),
                 SLOPE,
@@ -202,7 +202,7 @@ class _Search:
                 (least, LARGEST),
                 GRAIN,
             )
-        except Enough:
+        except StopSearch:
             if self.best is None:
                 raise
         best = self.best or unchanged(splats, f"and every smaller one that was tried loses more than {allowed:g} dB")

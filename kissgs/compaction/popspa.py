@@ -13,25 +13,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kissgs._typing import Float32, Int
 from kissgs._version import __version__
-from kissgs.compaction.judging import judge
+from kissgs.cameras.captures.files import open_file
+from kissgs.cameras.virtual.scene_bounds import scene_bounds
+from kissgs.compaction.evaluate import evaluate_scene
 from kissgs.compaction.result import Compacted, CompactionReport, CompactionStep
 from kissgs.compaction.scoring import show_most
-from kissgs.errors import OutputError
-from kissgs.progress import Progress, silent
+from kissgs.core.array_types import Float32, Int
+from kissgs.core.errors import OutputError
+from kissgs.core.progress import Progress, silent
+from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.rendering.rasterizer import Device, load_kernels
 from kissgs.settings import CompactSettings
-from kissgs.splats import ATTRIBUTES, Splats
 from kissgs.training.checkpoint import Checkpoint
-from kissgs.training.school import School
-from kissgs.views._files import open_file
-from kissgs.views.anatomy import anatomy
+from kissgs.training.supervision import SupervisionViews
 
 if TYPE_CHECKING:
-    from kissgs.training.lessons import Lessons
     from kissgs.training.loop import Rates
-    from kissgs.training.trainee import Trainee
+    from kissgs.training.model import GaussianModel
+    from kissgs.training.targets import TrainingTargets
 
 MEANS_RATE = 1.6e-4
 RATES = {"scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 1.25e-4}
@@ -51,10 +51,10 @@ def popspa(
     splats: Splats,
     count: int,
     settings: CompactSettings,
-    school: School,
+    supervision: SupervisionViews,
     *,
-    teacher: Splats | None = None,
-    lessons: Lessons | None = None,
+    reference: Splats | None = None,
+    targets: TrainingTargets | None = None,
     judges: bool = False,
     checkpoint: Path | None = None,
     threads: int = 0,
@@ -67,9 +67,9 @@ def popspa(
         splats: the scene.
         count: at least 1, and no more than it has.
         settings: of the recipe; their budget is not looked at.
-        school: views to score by, to learn from and to judge by.
-        teacher: what the pictures should show where there are no photographs; by default the scene itself.
-        lessons: pictures from the school's views for training, if they are at hand.
+        supervision: views to score by, to learn from and to judge by.
+        reference: what the pictures should show where there are no photographs; by default the scene itself.
+        targets: pictures from the school's views for training, if they are at hand.
         judges: measure PSNR, SSIM and bytes after every step.
         checkpoint: file to keep the state in, every half minute of training. If there is one of this very work, it is
             taken up where it was left, and ends (on the processor) as if it had never been interrupted. It stays when
@@ -77,27 +77,34 @@ def popspa(
         threads: 0 means one per processor; the result does not depend on it.
         device: where it is trained; ``"cuda"`` needs the extra ``kissgs[cuda]``, and adds up in an order of chance: no
             two results are quite the same. Scores are always the processor's.
-        progress: receives "kernels", "score", "lessons", "sparsify", "refine" and "judge".
+        progress: receives "kernels", "score", "targets", "sparsify", "refine" and "judge".
 
     Raises:
         InvalidViewsError: a photograph cannot be read.
         OutputError: ``checkpoint`` is of other work, or cannot be written.
         UnsupportedError: there is no torch to train with; a picture would take too much memory.
     """
-    teacher = teacher or splats
-    key = "" if checkpoint is None else _key((splats, teacher), count, settings, school, judges, device)
+    reference = reference or splats
+    key = "" if checkpoint is None else _key((splats, reference), count, settings, supervision, judges, device)
     kept = Checkpoint(checkpoint, key)
-    found = _Recipe(splats, count, settings, school, teacher, lessons, judges, kept, threads, device, progress).run()
+    found = _Recipe(
+        splats, count, settings, supervision, reference, targets, judges, kept, threads, device, progress
+    ).run()
     return replace(found, checkpoint=checkpoint) if settings.trains else found
 
 
 def _key(
-    scenes: Sequence[Splats], count: int, settings: CompactSettings, school: School, judges: bool, device: Device
+    scenes: Sequence[Splats],
+    count: int,
+    settings: CompactSettings,
+    supervision: SupervisionViews,
+    judges: bool,
+    device: Device,
 ) -> str:
     """Of the work: equal only where the result is equal."""
-    told = f"{__version__} {count} {judges} {device} {settings.model_dump_json()} {school.background}"
+    told = f"{__version__} {count} {judges} {device} {settings.model_dump_json()} {supervision.background}"
     key = hashlib.sha256(told.encode())
-    for view in (*school.train, *school.test):
+    for view in (*supervision.train, *supervision.score, *supervision.test):
         camera = view.camera
         key.update(camera.viewmat.tobytes() + camera.K.tobytes() + f"{camera.width} {camera.height}".encode())
         key.update(f"{view.background} {view.bend}".encode())
@@ -120,21 +127,21 @@ class _Phase:
 
 @dataclass(slots=True, eq=False)
 class _Recipe:
-    """One compaction: where it stands is in ``trainee``, ``index`` and ``steps``."""
+    """One compaction: where it stands is in ``model``, ``index`` and ``steps``."""
 
     splats: Splats
     count: int
     settings: CompactSettings
-    school: School
-    teacher: Splats
-    lessons: Lessons | None
+    supervision: SupervisionViews
+    reference: Splats
+    targets: TrainingTargets | None
     judges: bool
     checkpoint: Checkpoint
     threads: int
     device: Device
     progress: Progress
     index: Int[np.ndarray, " M"] = field(init=False)
-    trainee: Trainee = field(init=False)
+    model: GaussianModel = field(init=False)
     steps: list[CompactionStep] = field(init=False, default_factory=list)
     since: float = field(init=False, default_factory=time.perf_counter)
     note: str = field(init=False, default="")
@@ -151,18 +158,18 @@ class _Recipe:
             scene = self.splats.select(self._prune(self.splats, self.count, self.progress))
             self._done("prune", scene)
             return self._result(scene, "nothing")
-        lessons = self.lessons or self._look()
-        begun, done, state = self._begin(lessons)
+        targets = self.targets or self._look()
+        begun, done, state = self._begin(targets)
         for number in range(begun, len(phases)):
-            self._train(phases, number, done, state, lessons)
+            self._train(phases, number, done, state, targets)
             done, state = 0, {}
         self._save(len(phases), 0, {})
-        return self._result(self.trainee.splats(), lessons.taught_by)
+        return self._result(self.model.splats(), targets.target_source)
 
     def _phases(self) -> Iterator[_Phase]:
         chosen = self.settings
         if chosen.sparsify_steps:
-            rounds = min(chosen.rounds, chosen.sparsify_steps)
+            rounds = min(chosen.prune_rounds, chosen.sparsify_steps)
             first, shares = self._first_count(), np.arange(1, rounds + 1) / rounds
             counts = np.rint(first * (self.count / first) ** shares).astype(int)
             edges = np.rint(chosen.sparsify_steps * np.concatenate([[0], shares])).astype(int)
@@ -173,53 +180,55 @@ class _Recipe:
 
     def _first_count(self) -> int:
         """How many the first pruning leaves."""
-        share = self.settings.first_share if self.settings.sparsify_steps else 1.0
+        share = self.settings.initial_prune_fraction if self.settings.sparsify_steps else 1.0
         return round(len(self.splats) * (self.count / len(self.splats)) ** share)
 
-    def _look(self) -> Lessons:
-        from kissgs.training.lessons import lessons
+    def _look(self) -> TrainingTargets:
+        from kissgs.training.targets import training_targets
 
-        school = self.school
-        return lessons(
-            *(self.teacher, school.train, school.background),
+        supervision = self.supervision
+        return training_targets(
+            *(self.reference, supervision.train, supervision.background),
             threads=self.threads,
             device=self.device,
             progress=self.progress,
         )
 
-    def _begin(self, lessons: Lessons) -> tuple[int, int, State]:
+    def _begin(self, targets: TrainingTargets) -> tuple[int, int, State]:
         """Prune for a start, or take up what was left: number of the phase, steps of it that are done, its state."""
-        from kissgs.training.trainee import Trainee
+        from kissgs.training.model import GaussianModel
 
         state = self.checkpoint.load()
         if state is not None:
             told = json.loads(state["told"].tobytes())
             self.index = state["index"]
-            self.trainee = Trainee.restored(state, self.device, self._reach(lessons))
+            self.model = GaussianModel.restored(state, self.device, self._reach(targets))
             self.steps = [CompactionStep(**step) for step in told["steps"]]
             self.since -= told["seconds"]
             return told["phase"], told["done"], state
         self._done("input", self.splats)
         scene = self.splats.select(self._prune(self.splats, self._first_count(), self.progress))
         self._done("prune", scene)
-        self.trainee = Trainee(scene, self.device, self._reach(lessons))
+        self.model = GaussianModel(scene, self.device, self._reach(targets))
         self._save(0, 0, {})  # if that cannot be, it is better known before the work than after
         return 0, 0, {}
 
     def _prune(self, scene: Splats, count: int, progress: Progress) -> Int[np.ndarray, " M"]:
         """Which to keep."""
-        cameras = [view.camera for view in self.school.score]
         chosen = show_most(
-            *(scene, cameras, self.school.background, count),
-            share=self.settings.score_share,
-            least=UNSEEN[self.school.captured],
+            scene,
+            self.supervision.score,
+            self.supervision.background,
+            count,
+            share=self.settings.min_keep_per_scoring,
+            least=UNSEEN[self.supervision.captured],
             threads=self.threads,
             progress=progress,
         )
         self.index = self.index[chosen]
         return chosen
 
-    def _train(self, phases: list[_Phase], number: int, done: int, state: State, lessons: Lessons) -> None:
+    def _train(self, phases: list[_Phase], number: int, done: int, state: State, targets: TrainingTargets) -> None:
         """One phase from a step of it on, and the pruning after it."""
         from kissgs.compaction.regularizers import Shape
         from kissgs.compaction.sparsify import Sparsity
@@ -227,11 +236,11 @@ class _Recipe:
 
         phase, chosen, wishes = phases[number], self.settings, list[Regularizer]()
         progress = self._within(phases, number)
-        if chosen.needle_weight or chosen.flat_weight:
-            wishes.append(Shape(chosen.needle_weight, chosen.flat_weight, self._extent(lessons)))
+        if chosen.erank_weight or chosen.min_scale_weight:
+            wishes.append(Shape(chosen.erank_weight, chosen.min_scale_weight, self._extent(targets)))
         sparsity = None
-        if phase.name == "sparsify" and chosen.rho:
-            sparsity = Sparsity(self.trainee.parameters["opacities"], phase.count, chosen.rho, chosen.interval)
+        if phase.name == "sparsify" and chosen.admm_rho:
+            sparsity = Sparsity(self.model.parameters["opacities"], phase.count, chosen.admm_rho, chosen.admm_interval)
             wishes.append(sparsity)
             if "z" in state:  # not where the phase had not begun
                 sparsity.restore(state)
@@ -243,26 +252,26 @@ class _Recipe:
         plan = Plan(
             stage=phase.name,
             steps=phase.steps,
-            rates=self._rates(phase, lessons),
+            rates=self._rates(phase, targets),
             ssim_weight=chosen.ssim_weight,
             seed=(chosen.seed, number),
             regularizers=tuple(wishes),
         )
-        train(self.trainee, lessons, plan, first=done, after=after, threads=self.threads, progress=progress)
-        scene = self.trainee.splats()
+        train(self.model, targets, plan, first=done, after=after, threads=self.threads, progress=progress)
+        scene = self.model.splats()
         self._done(phase.name, scene)
         if len(scene) > phase.count:
-            self.trainee.keep(self._prune(scene, phase.count, progress))
-            self._done("prune", self.trainee.splats())
+            self.model.keep(self._prune(scene, phase.count, progress))
+            self._done("prune", self.model.splats())
 
-    def _extent(self, lessons: Lessons) -> float:
+    def _extent(self, targets: TrainingTargets) -> float:
         """By which lengths are measured: the cameras', or the scene's where all cameras stand in one place, about."""
-        radius = anatomy(self.splats).radius
-        return lessons.extent if lessons.extent > ONE_PLACE * radius else radius
+        radius = scene_bounds(self.splats).radius
+        return targets.extent if targets.extent > ONE_PLACE * radius else radius
 
-    def _reach(self, lessons: Lessons) -> Float32[np.ndarray, " M"]:
+    def _reach(self, targets: TrainingTargets) -> Float32[np.ndarray, " M"]:
         """How far apart the cameras about each Gaussian that is left stand, by where the scene has it."""
-        return lessons.reach(self.splats.means[self.index], self._extent(lessons))
+        return targets.reach(self.splats.means[self.index], self._extent(targets))
 
     def _within(self, phases: list[_Phase], number: int) -> Progress:
         """Tells of all phases of one name as of one stage, with the prunings between them."""
@@ -276,17 +285,17 @@ class _Recipe:
 
         return receive
 
-    def _rates(self, phase: _Phase, lessons: Lessons) -> Rates:
+    def _rates(self, phase: _Phase, targets: TrainingTargets) -> Rates:
         """Rates stay while Gaussians go, and fall exponentially, as 3DGS has it for the means, in the refinement."""
-        from kissgs.training.loop import falling
+        from kissgs.training.loop import exponential_lr
 
         chosen = self.settings
         base = {"means": MEANS_RATE, **RATES}
-        if lessons.taught_by == "renderings":
-            base = {name: rate * chosen.renderings_rate for name, rate in base.items()}
-        begin = {name: chosen.means_rate if name == "means" else chosen.rate for name in base}
-        end = {name: chosen.means_rate_end if name == "means" else chosen.rate_end for name in base}
-        return falling(base, begin, end if phase.name == "refine" else begin)
+        if targets.target_source == "renderings":
+            base = {name: rate * chosen.synthetic_lr_scale for name, rate in base.items()}
+        begin = {name: chosen.means_lr_scale if name == "means" else chosen.lr_scale for name in base}
+        end = {name: chosen.final_means_lr_scale if name == "means" else chosen.final_lr_scale for name in base}
+        return exponential_lr(base, begin, end if phase.name == "refine" else begin)
 
     def _save(self, number: int, done: int, extra: State) -> None:
         told = {
@@ -296,7 +305,7 @@ class _Recipe:
             "steps": [asdict(step) for step in self.steps],
         }
         words = np.frombuffer(json.dumps(told).encode(), np.uint8)
-        state = {**self.trainee.state(), **extra, "index": self.index, "told": words}
+        state = {**self.model.state(), **extra, "index": self.index, "told": words}
         try:
             self.checkpoint.save(state)
         except OutputError as error:
@@ -309,7 +318,7 @@ class _Recipe:
         seconds = time.perf_counter() - self.since
         likeness, size = None, None
         if self.judges:
-            likeness, size = judge(scene, self.teacher, self.school, self.threads, self.progress)
+            likeness, size = evaluate_scene(scene, self.reference, self.supervision, self.threads, self.progress)
         self.steps.append(
             CompactionStep(
                 name=name,
@@ -322,13 +331,13 @@ class _Recipe:
         )
         self.since = time.perf_counter()
 
-    def _result(self, scene: Splats, taught_by: str) -> Compacted:
+    def _result(self, scene: Splats, target_source: str) -> Compacted:
         report = CompactionReport(
             source_count=len(self.splats),
             count=len(scene),
-            taught_by=taught_by,
-            source=self.school.source,
+            target_source=target_source,
+            source=self.supervision.source,
             steps=tuple(self.steps),
-            note="; ".join(filter(None, [self.school.note, self.note])),
+            note="; ".join(filter(None, [self.supervision.note, self.note])),
         )
         return Compacted(scene, self.index, report)

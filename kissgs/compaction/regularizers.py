@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kissgs._typing import Float
-from kissgs.training.loop import Learner, Parameters
+from kissgs.core.array_types import Float
+from kissgs.training.loop import Parameters, TrainableScene
 
 EPSILON = 1e-7
 """Added to effective rank - 1: the loss of a perfect needle is 16.1."""
@@ -36,8 +36,8 @@ class Shape:
     The second flattens what is round. It is measured in units of ``extent``, so that a scene's size does not matter.
     """
 
-    def __init__(self, needle_weight: float, flat_weight: float, extent: float) -> None:
-        self._needle_weight, self._flat_weight = needle_weight, flat_weight / extent
+    def __init__(self, erank_weight: float, min_scale_weight: float, extent: float) -> None:
+        self._needle_weight, self._flat_weight = erank_weight, min_scale_weight / extent
 
     def penalty(self, step: int, parameters: Parameters) -> Tensor | None:
         """Of all Gaussians, seen or not."""
@@ -47,5 +47,5 @@ class Shape:
         loss = self._needle_weight * needle_loss(scales).mean()
         return loss + self._flat_weight * scales.amin(dim=1).exp().mean()
 
-    def update(self, step: int, learner: Learner) -> None:
+    def update(self, step: int, learner: TrainableScene) -> None:
         """Nothing is remembered."""

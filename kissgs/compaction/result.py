@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from kissgs._typing import Int
-from kissgs.splats import NOTHING_CLEANED, Cleaned, Splats
+from kissgs.core.array_types import Int
+from kissgs.core.splats import NOTHING_CLEANED, Cleaned, Splats
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,7 +41,7 @@ class CompactionReport:
     Attributes:
         source_count: Gaussians before.
         count: Gaussians after.
-        taught_by: what it was fitted to: "photos" or "renderings" of the input; "nothing" where it was only pruned.
+        target_source: what it was fitted to: "photos" or "renderings" of the input; "nothing" where it was only pruned.
         source: of the views, for people.
         steps: in their order, the input first.
         trials: where a drop of PSNR was given instead of a count: counts that were tried, and the drop of each, dB.
@@ -53,7 +53,7 @@ class CompactionReport:
 
     source_count: int
     count: int
-    taught_by: str
+    target_source: str
     source: str
     steps: tuple[CompactionStep, ...]
     trials: tuple[tuple[int, float], ...] = ()

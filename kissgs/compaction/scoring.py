@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Sequence
 
 import numpy as np
 
-from kissgs._typing import Float, Float32, Int
-from kissgs.progress import Progress, silent
+from kissgs.cameras.views import View
+from kissgs.core.array_types import Float, Float32, Float64, Int
+from kissgs.core.progress import Progress, silent
+from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.coverage import Coverage
 from kissgs.rendering.rasterizer import removal_scores
-from kissgs.splats import Splats
 
 
 def highest(scores: Float[np.ndarray, " N"], count: int) -> Int[np.ndarray, " M"]:
@@ -23,7 +25,7 @@ def highest(scores: Float[np.ndarray, " N"], count: int) -> Int[np.ndarray, " M"
 
 def show_most(
     splats: Splats,
-    cameras: Sequence[Camera],
+    views: Sequence[View],
     background: Float32[np.ndarray, "3"],
     count: int,
     *,
@@ -34,14 +36,14 @@ def show_most(
 ) -> Int[np.ndarray, " M"]:
     """Which ``count`` Gaussians to keep: those whose removal would change the pictures most.
 
-    GaussianPOP, section 3, in as many rounds as ``share`` asks for. A score is the error of one removal alone: of two
-    Gaussians, one behind the other, each may be superfluous only as long as the other is there. So a part is removed,
-    by the same factor in each round, and the rest is scored anew.
+    GaussianPOP, section 3, every picture counting the same whatever its size, in as many rounds as ``share`` asks for.
+    A score is the error of one removal alone: of two Gaussians, one behind the other, each may be superfluous only as
+    long as the other is there. So a part is removed, by the same factor in each round, and the rest is scored anew.
 
     Args:
         splats: finite.
-        cameras: pictures to take.
-        background: of all of them.
+        views: pictures to take.
+        background: of those that have none of their own.
         count: at least 1.
         share: the smallest that one scoring may leave, from 0 (one scoring will do) to less than 1.
         least: lowest score of any Gaussian, seen or not, in units of what a camera nearby would probably find.
@@ -63,12 +65,31 @@ def show_most(
             progress(stage, (done + fraction) / rounds, note)
 
         scene = splats.select(kept)
-        scores = removal_scores(scene, cameras, background=background.tolist(), threads=threads, progress=part)
+        scores = _scores(scene, views, background, threads, part)
         scores = np.maximum(scores, least * _prior(scores, nearby[kept]))
         left = count if round_ == rounds - 1 else max(count, round(len(splats) * shrink ** (round_ + 1)))
         kept = kept[highest(scores, left)]
     progress("score", 1.0)
     return kept
+
+
+def _scores(
+    scene: Splats, views: Sequence[View], background: Float32[np.ndarray, "3"], threads: int, progress: Progress
+) -> Float64[np.ndarray, " N"]:
+    """Sum of mean squared errors over all views, each before its own background."""
+    groups = defaultdict[tuple[int, tuple[float, ...]], list[Camera]](list)
+    for view in views:
+        behind = background if view.background is None else view.background
+        groups[view.camera.width * view.camera.height, tuple(behind.tolist())].append(view.camera)
+    scores, done = np.zeros(len(scene)), 0
+    for (pixels, colour), cameras in groups.items():
+
+        def part(stage: str, fraction: float, note: str = "", done: int = done, count: int = len(cameras)) -> None:
+            progress(stage, (done + fraction * count) / len(views), note)
+
+        scores += removal_scores(scene, cameras, background=colour, threads=threads, progress=part) / (3 * pixels)
+        done += len(cameras)
+    return scores
 
 
 def _prior(scores: Float[np.ndarray, " N"], nearby: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:

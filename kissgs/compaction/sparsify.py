@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kissgs._typing import Float
-from kissgs.training.loop import Learner, Parameters
+from kissgs.core.array_types import Float
+from kissgs.training.loop import Parameters, TrainableScene
 
 
 class Sparsity:
@@ -35,7 +35,7 @@ class Sparsity:
             return None
         return 0.5 * self._rho * (_sigmoid(parameters["opacities"]) - self.z + self.u).square().sum()
 
-    def update(self, step: int, learner: Learner) -> None:
+    def update(self, step: int, learner: TrainableScene) -> None:
         """Sparsify, and move the dual."""
         if (step + 1) % self._interval:
             return

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from kissgs._typing import Float, Float32, Float64
-from kissgs.errors import InvalidSceneError
-from kissgs.splats import SH_C0, SH_REST_COUNTS, Splats
+from kissgs.core.array_types import Float, Float32, Float64
+from kissgs.core.errors import InvalidSceneError
+from kissgs.core.splats import SH_C0, SH_REST_COUNTS, Splats
 
 CHUNK = 65_536
 """Rows at a time: float64 temporaries of some tens of MB, whatever the size of the scene."""

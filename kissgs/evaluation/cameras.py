@@ -1,8 +1,8 @@
-"""Cameras to judge by: drawn at random over a whole scene, at all scales, from a seed.
+"""Evaluation cameras: drawn at random over a whole scene, at all scales, from a seed.
 
-The encoder looks at a scene from cameras of its own (:mod:`kissgs.views.virtual`), and what these do not see it stores
-coarsely. Who asks the same cameras what was lost is told that nothing was. So nothing here is shared with them: cameras
-are drawn, not chosen, and every Gaussian that can show something has its chance to be looked at.
+The encoder has cameras of its own (:mod:`kissgs.cameras.virtual`) and stores coarsely what these do not see. The same
+cameras would not notice what was lost. So nothing here is shared with them: cameras are drawn, not chosen, and every
+Gaussian that can be visible may be looked at.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from kissgs._typing import Float32, Float64
-from kissgs.errors import InvalidViewsError
-from kissgs.evaluation.aim import BACKGROUNDS, FIELDS_OF_VIEW, PATIENCE, THUMBNAIL, Point, aim, direction
+from kissgs.cameras.views import View, Views
+from kissgs.core.array_types import Float32, Float64
+from kissgs.core.errors import InvalidViewsError
+from kissgs.core.progress import Progress, silent
+from kissgs.core.splats import Splats
+from kissgs.core.threads import Workers
+from kissgs.evaluation.camera_sampling import BACKGROUNDS, FIELDS_OF_VIEW, PATIENCE, THUMBNAIL, Point, aim, direction
 from kissgs.evaluation.overlooked import MOST_ADDED, Parts
 from kissgs.evaluation.prominence import GaussianSampler, distances, opacity, prominence
-from kissgs.evaluation.shown import weights_of, without_gloss
-from kissgs.parallel import Workers
-from kissgs.progress import Progress, silent
+from kissgs.evaluation.visibility import weights_of, without_gloss
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu.frame import draw
-from kissgs.splats import Splats
-from kissgs.views.view import View, Views
 
 COUNT = 24
 WIDTH, HEIGHT = 320, 240

@@ -12,9 +12,12 @@ from string import Template
 import numpy as np
 from PIL import Image
 
-from kissgs._typing import Float32, UInt8
-from kissgs.evaluation.difference import STOPS, difference, full_scale, heat_map, worst_place
-from kissgs.evaluation.html_figures import (
+from kissgs.core.array_types import Float32, UInt8
+from kissgs.core.progress import Progress, silent
+from kissgs.core.splats import Splats
+from kissgs.evaluation.error_maps import STOPS, difference, full_scale, heat_map, worst_place
+from kissgs.evaluation.evaluate import over, take_picture
+from kissgs.evaluation.html_tables import (
     change_of,
     extremes_lines,
     figure_cards,
@@ -22,12 +25,9 @@ from kissgs.evaluation.html_figures import (
     summary_line,
     views_table,
 )
-from kissgs.evaluation.likeness import Comparison, Evaluation, ViewComparison, spell
-from kissgs.evaluation.pictures import over, take_picture
-from kissgs.progress import Progress, silent
-from kissgs.rendering.pictures import to_bytes
+from kissgs.evaluation.results import Comparison, Evaluation, ViewComparison, spell
+from kissgs.rendering.images import to_bytes
 from kissgs.rendering.rasterizer import Device
-from kissgs.splats import Splats
 
 MOST_VIEWS = 12
 """Shown with pictures: some 10 MB of them."""
@@ -86,7 +86,7 @@ def html_report(
         elsewhere = sorted(range(len(around.views)), key=lambda i: around.views[i].badness)[:MOST_ELSEWHERE]
         parts += [(f"elsewhere-{i}", around, around.views[i]) for i in elsewhere]
     worst = min((compared for _, _, compared in parts), key=lambda compared: compared.badness)
-    full, sections = full_scale(worst.comparison.between.psnr), []
+    full, sections = full_scale(worst.comparison.candidate_vs_reference.psnr), []
     for done, (anchor, of, compared) in enumerate(parts):
         progress("html", done / len(parts))
         view, scenes = compared.view, (reference.splats, candidate.splats)
@@ -160,7 +160,8 @@ def _section(anchor: str, compared: ViewComparison, pictures: _Pictures, full: i
 
 
 def _numbers(comparison: Comparison) -> str:
-    between = f"candidate to reference {spell(comparison.between.psnr, 2)} dB, {in_words(comparison.between)}"
+    found = comparison.candidate_vs_reference
+    between = f"candidate to reference {spell(found.psnr, 2)} dB, {in_words(found)}"
     if comparison.reference is None:
         return between
     candidate = f"candidate to photograph {spell(comparison.candidate.psnr, 2)} dB ({change_of(comparison)})"

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kissgs._typing import Float32, Float64, Int
-from kissgs.evaluation.aim import BACKGROUNDS, FIELDS_OF_VIEW, PATIENCE, THUMBNAIL, Point, aim, direction
+from kissgs.core.array_types import Float32, Float64, Int
+from kissgs.core.splats import Splats
+from kissgs.core.threads import Workers
+from kissgs.evaluation.camera_sampling import BACKGROUNDS, FIELDS_OF_VIEW, PATIENCE, THUMBNAIL, Point, aim, direction
 from kissgs.evaluation.parts import Part, find_parts
-from kissgs.parallel import Workers
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu.frame import draw
-from kissgs.splats import Splats
 
 MOST_ADDED = 72
 """Cameras that are added, at most."""

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from kissgs._typing import Float64, Int
+from kissgs.core.array_types import Float64, Int
+from kissgs.core.splats import Splats
 from kissgs.evaluation.prominence import morton_codes
-from kissgs.splats import Splats
 
 SAMPLE = 2048
 """Gaussians that stand for all, at most."""

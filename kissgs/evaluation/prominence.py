@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kissgs._typing import Float64, Int
-from kissgs.rendering.semantics import ALPHA_MIN
-from kissgs.splats import Splats
+from kissgs.core.array_types import Float64, Int
+from kissgs.core.splats import Splats
+from kissgs.rendering.constants import ALPHA_MIN
 
 LEVELS = 21
 """Halvings of the scene's extent along each axis: as many as 64 bits hold."""

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kissgs._typing import Float32, Float64, Int
-from kissgs.finetuning.roundtrip import Plane, RoundTrip
-from kissgs.sogxt.order import Grid
-from kissgs.sogxt.rounding import UNUSED
-from kissgs.training.loop import Learner, Parameters
+from kissgs.core.array_types import Float32, Float64, Int
+from kissgs.finetuning.quantized_scene import Plane, QuantizedScene
+from kissgs.planning.layout import Grid
+from kissgs.planning.rdo_quantize import UNUSED
+from kissgs.training.loop import Parameters, TrainableScene
 
 COUNTED = ("opacities", "scales", "quaternions", "f_dc")
 """Fields whose bits are told from how many have a level. Positions have nearly as many levels as Gaussians."""
@@ -24,11 +24,11 @@ RECOUNT = 25
 class CodeLength:
     """Bits of all levels, if an ideal entropy code knew how many of each class of Gaussians have which.
 
-    That is what WebP's entropy image comes near to, and by which levels were chosen (:mod:`kissgs.sogxt.rounding`). In
-    between two levels, bits are interpolated: latents are drawn to the cheaper one of their neighbours.
+    WebP's entropy image comes near to it, and levels were chosen by it (:mod:`kissgs.planning.rdo_quantize`). Between
+    two levels, bits are interpolated: latents are drawn to the cheaper one of their neighbours.
     """
 
-    def __init__(self, roundtrip: RoundTrip, weight: float) -> None:
+    def __init__(self, roundtrip: QuantizedScene, weight: float) -> None:
         """``weight``: of one bit in the loss."""
         self._roundtrip, self._weight = roundtrip, weight
         self._coders = {name: _Coder(roundtrip.planes[name], roundtrip.classes) for name in COUNTED}
@@ -45,7 +45,7 @@ class CodeLength:
             (coder.bits(latents[name]) for name, coder in self._coders.items()), torch.tensor(0.0)
         )
 
-    def update(self, step: int, learner: Learner) -> None:
+    def update(self, step: int, learner: TrainableScene) -> None:
         """Nothing."""
 
     def state(self) -> dict[str, np.ndarray]:
@@ -72,7 +72,7 @@ class Smoothness:
     over channels, of the distance of their levels. Not published is in which unit; here it is levels.
     """
 
-    def __init__(self, roundtrip: RoundTrip, weight: float, steps: int) -> None:
+    def __init__(self, roundtrip: QuantizedScene, weight: float, steps: int) -> None:
         """``weight``: in units of the paper's."""
         self._roundtrip, self._weight, self._steps = roundtrip, weight, steps
         device = roundtrip.latents["means"].device
@@ -91,7 +91,7 @@ class Smoothness:
                 total = total + share * (image[self._one] - image[self._other]).abs().mean()
         return weight * total
 
-    def update(self, step: int, learner: Learner) -> None:
+    def update(self, step: int, learner: TrainableScene) -> None:
         """Nothing is remembered."""
 
 
@@ -122,13 +122,13 @@ class _Coder:
     table: Float32[np.ndarray, "classes C symbols"]
 
     def __init__(self, plane: Plane, classes: Int[np.ndarray, " M"]) -> None:
-        whole = plane.symbols.cpu().numpy()
-        self._first = int(np.floor(whole + plane.least.cpu().numpy()).min(initial=0))
-        self._symbols = int(np.ceil(whole + plane.most.cpu().numpy()).max(initial=0)) - self._first + 1
+        whole = plane.base_multiples.cpu().numpy()
+        self._first = int(np.floor(whole + plane.min_latent.cpu().numpy()).min(initial=0))
+        self._symbols = int(np.ceil(whole + plane.max_latent.cpu().numpy()).max(initial=0)) - self._first + 1
         self._kinds, self._channels = int(classes.max(initial=0)) + 1, whole.shape[1]
         rows = (classes[:, None] * self._channels + np.arange(self._channels)) * (self._symbols + 1)
-        self._rows = torch.from_numpy(rows).to(plane.symbols.device)
-        self._begun: Float64[Tensor, "M C"] = plane.symbols - self._first
+        self._rows = torch.from_numpy(rows).to(plane.base_multiples.device)
+        self._begun: Float64[Tensor, "M C"] = plane.base_multiples - self._first
         self.table = np.zeros((self._kinds, self._channels, self._symbols + 1), np.float32)
 
     def count(self, latents: Float32[Tensor, "M C"]) -> None:

@@ -12,7 +12,7 @@ class FinetuneReport:
 
     Attributes:
         steps: of training.
-        taught_by: what the levels were fitted to: "photos", or "renderings" of the scene as it was.
+        target_source: what the levels were fitted to: "photos", or "renderings" of the scene as it was.
         source: of the views, for people.
         psnr_before: decibels, mean over held-out views (over those that were learned from, if none are), to their
             photographs or, where there are none, to renderings: of the container as it was chosen.
@@ -26,7 +26,7 @@ class FinetuneReport:
     """
 
     steps: int
-    taught_by: str
+    target_source: str
     source: str
     psnr_before: float
     psnr_after: float

@@ -13,44 +13,44 @@ import numpy as np
 import torch
 
 from kissgs._version import __version__
-from kissgs.errors import OutputError
-from kissgs.evaluation.pictures import evaluate
+from kissgs.cameras.views import Views
+from kissgs.core.errors import OutputError
+from kissgs.core.progress import Progress, as_stage, silent
+from kissgs.core.splats import ATTRIBUTES, Splats, clean
+from kissgs.evaluation.evaluate import evaluate
 from kissgs.finetuning.losses import CodeLength, Smoothness
+from kissgs.finetuning.quantized_scene import FIELDS, QuantizedScene
 from kissgs.finetuning.result import FinetuneReport
-from kissgs.finetuning.roundtrip import FIELDS, RoundTrip
-from kissgs.progress import Progress, as_stage, silent
+from kissgs.planning.encoding_plan import EncodingPlan
+from kissgs.planning.rd_model import Costs, implied_lambda
 from kissgs.rendering.differentiable import rasterize
-from kissgs.rendering.importance import Watch, measure_importance
 from kissgs.rendering.losses import photometric_loss
 from kissgs.rendering.rasterizer import Device
+from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
 from kissgs.settings import FinetuneSettings
-from kissgs.sogxt.choice import Choice
 from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.decode import MAX_GAUSSIANS, decode
-from kissgs.sogxt.economy import Costs, implied_price
 from kissgs.sogxt.encode import Encoded
-from kissgs.splats import ATTRIBUTES, Splats, clean
 from kissgs.training.checkpoint import Checkpoint
-from kissgs.training.lessons import Lessons, lessons
-from kissgs.training.loop import Plan, Rates, falling, threads_of_torch, train
-from kissgs.training.school import School, school
-from kissgs.views.view import Views
+from kissgs.training.loop import Plan, Rates, exponential_lr, threads_of_torch, train
+from kissgs.training.supervision import SupervisionViews, supervision_views
+from kissgs.training.targets import TrainingTargets, training_targets
 
 WATCHED = 64
-"""Lessons from which costs of errors are told, about."""
+"""TrainingTargets from which costs of errors are told, about."""
 
 HEDGE = 0.1
-"""How little they say of other places, see :class:`kissgs.Importance`."""
+"""How little they say of other places, see :class:`kissgs.Sensitivity`."""
 
 LOOKS = 16
-"""Lessons from which the loss at the beginning is told."""
+"""TrainingTargets from which the loss at the beginning is told."""
 
 SETTLE = 0.5
 """Share of the steps after which levels begin to settle."""
 
 NO_HELP = "fine-tuning did not help; the container is as it was without it"
 
-Write = Callable[[Choice, int, Progress], Encoded]
+Write = Callable[[EncodingPlan, int, Progress], Encoded]
 """The files that show a choice, which became better in so many steps; and who is told of it."""
 
 
@@ -61,8 +61,8 @@ class Tuner:
     Attributes:
         original: the scene as it was, clean: the teacher where there are no photographs.
         settings: how.
-        school: views to learn from, and to judge by.
-        lessons: what they should show.
+        supervision: views to learn from, and to judge by.
+        targets: what they should show.
         device: where it is trained.
         threads: 0 means one per processor; the result does not depend on it.
         progress: receives "finetune", and then what writing tells.
@@ -70,8 +70,8 @@ class Tuner:
 
     original: Splats
     settings: FinetuneSettings
-    school: School
-    lessons: Lessons
+    supervision: SupervisionViews
+    targets: TrainingTargets
     device: Device
     threads: int
     progress: Progress
@@ -93,12 +93,14 @@ class Tuner:
             InvalidViewsError: a photograph cannot be read.
             UnsupportedError: a picture would take too much memory.
         """
-        found = school(original, views, settings, threads=threads, progress=progress)
-        taught = lessons(*(original, found.train, found.background), threads=threads, device=device, progress=progress)
+        found = supervision_views(original, views, settings, scored=0, threads=threads, progress=progress)
+        taught = training_targets(
+            *(original, found.train, found.background), threads=threads, device=device, progress=progress
+        )
         return cls(original, settings, found, taught, device, threads, progress)
 
     def __call__(
-        self, choice: Choice, start: Choice, scene: Splats, write: Write, checkpoint: Path | None = None
+        self, choice: EncodingPlan, start: EncodingPlan, scene: Splats, write: Write, checkpoint: Path | None = None
     ) -> tuple[Encoded, FinetuneReport]:
         """Fine-tune, and keep what is better: the container as it was chosen, or the new one.
 
@@ -118,23 +120,25 @@ class Tuner:
         at_first = as_stage("finetune", self.progress)
         before = write(choice, 0, at_first)
         first = self._judge(before, at_first)
-        price = choice.price or implied_price(self._rounding(before, scene, at_first), int(choice.grid.mask.sum()))
-        better, trouble = self._train(start, scene.sh_degree, start.price or price, checkpoint)
+        rd_lambda = choice.rd_lambda or implied_lambda(
+            self._rounding(before, scene, at_first), int(choice.grid.mask.sum())
+        )
+        better, trouble = self._train(start, scene.sh_degree, start.rd_lambda or rd_lambda, checkpoint)
         after = write(better, self.settings.steps, self.progress)
         second = self._judge(after, self._at_last)
-        cost, new_cost = (told.error + 8 * told.bytes * price for told in (first, second))
+        cost, new_cost = (told.error + 8 * told.bytes * rd_lambda for told in (first, second))
         kept = new_cost < cost
         report = FinetuneReport(
             steps=self.settings.steps,
-            taught_by=self.lessons.taught_by,
-            source=self.school.source,
+            target_source=self.targets.target_source,
+            source=self.supervision.source,
             psnr_before=first.psnr,
             psnr_after=second.psnr,
             bytes_before=first.bytes,
             bytes_after=second.bytes,
             kept=kept,
             seconds=time.perf_counter() - begun,
-            note="; ".join(filter(None, [self.school.note, "" if kept else NO_HELP, trouble])),
+            note="; ".join(filter(None, [self.supervision.note, "" if kept else NO_HELP, trouble])),
         )
         return (after if kept else before), report
 
@@ -144,7 +148,10 @@ class Tuner:
     def _judge(self, encoded: Encoded, progress: Progress) -> _Mark:
         decoded = decode(encoded.files, max_gaussians=max(len(self.original), MAX_GAUSSIANS), threads=self.threads)
         compared = evaluate(
-            *(self.original, decoded, self.school.exam), device=self.device, threads=self.threads, progress=progress
+            *(self.original, decoded, self.supervision.eval_views),
+            device=self.device,
+            threads=self.threads,
+            progress=progress,
         )
         return _Mark(
             bytes=len(zip_bytes(encoded.files)),
@@ -156,17 +163,19 @@ class Tuner:
         """Squared error by which pictures of a container differ from those of the scene that it was made of."""
         decoded = decode(encoded.files, max_gaussians=max(len(scene), MAX_GAUSSIANS), threads=self.threads)
         compared = evaluate(
-            *(scene, decoded, self.school.exam), device=self.device, threads=self.threads, progress=progress
+            *(scene, decoded, self.supervision.eval_views), device=self.device, threads=self.threads, progress=progress
         )
-        return float(np.mean([_squared(view.comparison.between.psnr) for view in compared.views]))
+        return float(np.mean([_squared(view.comparison.candidate_vs_reference.psnr) for view in compared.views]))
 
-    def _train(self, choice: Choice, sh_degree: int, price: float, path: Path | None) -> tuple[Choice, str]:
+    def _train(
+        self, choice: EncodingPlan, sh_degree: int, rd_lambda: float, path: Path | None
+    ) -> tuple[EncodingPlan, str]:
         """A better choice, and what went wrong with the checkpoint on the way to it."""
-        chosen, work = self.settings, RoundTrip(choice, sh_degree, self.device)
+        chosen, work = self.settings, QuantizedScene(choice, sh_degree, self.device)
         kept, done, trouble = Checkpoint(path, "" if path is None else self._key(choice, sh_degree)), 0, ""
         steepness = self._steepness(work)
         work.hang(choice.costs or self._costs(work), steepness)
-        lengths = CodeLength(work, chosen.code_length * price * steepness)
+        lengths = CodeLength(work, chosen.rate_weight * rd_lambda * steepness)
         state = kept.load()
         if state is not None:
             done = int(state["done"])
@@ -184,16 +193,16 @@ class Tuner:
         plan = Plan(
             stage="finetune",
             steps=chosen.steps,
-            rates=_rates(chosen, self.lessons),
+            rates=_rates(chosen, self.targets),
             ssim_weight=chosen.ssim_weight,
             seed=(chosen.seed,),
-            regularizers=(lengths, Smoothness(work, chosen.smoothness, chosen.steps)),
+            regularizers=(lengths, Smoothness(work, chosen.tv_weight, chosen.steps)),
             batch=chosen.batch,
         )
-        train(work, self.lessons, plan, first=done, after=after, threads=self.threads, progress=self.progress)
+        train(work, self.targets, plan, first=done, after=after, threads=self.threads, progress=self.progress)
         return work.choice(), trouble
 
-    def _steepness(self, work: RoundTrip) -> float:
+    def _steepness(self, work: QuantizedScene) -> float:
         """How much the loss grows with the mean squared error of pictures.
 
         As if it were proportional to its root, which holds for errors that come on top of those of photographs.
@@ -201,17 +210,17 @@ class Tuner:
         losses, errors = [], []
         with torch.no_grad(), threads_of_torch(1):  # its sums depend on them
             shown = work.gaussians()
-            for n in islice(self.lessons.order((self.settings.seed,)), min(LOOKS, len(self.lessons))):
+            for n in islice(self.targets.order((self.settings.seed,)), min(LOOKS, len(self.targets))):
                 self.progress("finetune", 0.0)
-                camera = self.lessons.cameras[n]
-                target = torch.from_numpy(self.lessons.picture(n))[None].to(shown["means"].device)
+                camera = self.targets.cameras[n]
+                target = torch.from_numpy(self.targets.picture(n))[None].to(shown["means"].device)
                 image, _ = rasterize(
                     **shown,
                     viewmats=torch.from_numpy(camera.viewmat)[None],
                     Ks=torch.from_numpy(camera.K)[None],
                     width=camera.width,
                     height=camera.height,
-                    backgrounds=torch.from_numpy(self.lessons.background)[None],
+                    backgrounds=torch.from_numpy(self.targets.background)[None],
                     threads=self.threads,
                 )
                 loss = photometric_loss(image, target, ssim_weight=self.settings.ssim_weight, threads=self.threads)
@@ -219,23 +228,25 @@ class Tuner:
                 errors.append(float((image - target).square().mean()))
         return float(np.mean(losses)) / (2 * max(float(np.mean(errors)), 1e-10))
 
-    def _costs(self, work: RoundTrip) -> Costs:
+    def _costs(self, work: QuantizedScene) -> Costs:
         """What errors of the Gaussians cost in the pictures that are learned from, where nobody has looked before."""
         with torch.no_grad():
             scene = clean(Splats(**{name: value.cpu().numpy() for name, value in work.gaussians().items()}))[0]
-        cameras = self.lessons.cameras[:: max(1, len(self.lessons) // WATCHED)]
-        watch = Watch(cameras, [1.0] * len(cameras), self.lessons.background)
+        cameras = self.targets.cameras[:: max(1, len(self.targets) // WATCHED)]
+        watch = WeightedCameras(cameras, [1.0] * len(cameras), self.targets.background)
         progress = as_stage("finetune", self.progress)
-        return Costs.of(measure_importance(scene, watch, hedge=HEDGE, threads=self.threads, progress=progress), scene)
+        return Costs.of(
+            measure_sensitivity(scene, watch, view_uncertainty=HEDGE, threads=self.threads, progress=progress), scene
+        )
 
-    def _key(self, choice: Choice, sh_degree: int) -> str:
+    def _key(self, choice: EncodingPlan, sh_degree: int) -> str:
         """Of the work: equal only where the result is equal."""
-        taught = self.lessons
-        told = f"{__version__} {self.device} {sh_degree} {self.settings.model_dump_json()} {choice.price} "
+        taught = self.targets
+        told = f"{__version__} {self.device} {sh_degree} {self.settings.model_dump_json()} {choice.rd_lambda} "
         key = hashlib.sha256(f"{told}{taught.background}".encode())
         for name, field in choice.fields.items():
-            key.update(f"{name} {field.top} {field.first} {field.levels.shape}".encode())
-            for array in (field.levels, field.low, field.high, np.asarray(field.spacing)):
+            key.update(f"{name} {field.top} {field.level_offset} {field.levels.shape}".encode())
+            for array in (field.levels, field.low, field.high, np.asarray(field.level_stride)):
                 key.update(array.tobytes())
         for array in (choice.codebook.labels, choice.classes, choice.grid.mask):
             key.update(array.tobytes())
@@ -249,11 +260,11 @@ class Tuner:
         return key.hexdigest()
 
 
-def _rates(chosen: FinetuneSettings, lessons: Lessons) -> Rates:
+def _rates(chosen: FinetuneSettings, targets: TrainingTargets) -> Rates:
     """Learning rates that fall exponentially, and springs that grow from nothing once most is learned."""
-    share = 1.0 if lessons.taught_by == "photos" else chosen.renderings_rate
-    base = {name: share * (chosen.entry_rate if name == "f_rest_centroids" else chosen.rate) for name in FIELDS}
-    learning = falling(base, dict.fromkeys(FIELDS, 1.0), dict.fromkeys(FIELDS, chosen.rate_end))
+    share = 1.0 if targets.target_source == "photos" else chosen.synthetic_lr_scale
+    base = {name: share * (chosen.codebook_lr if name == "f_rest_centroids" else chosen.lr) for name in FIELDS}
+    learning = exponential_lr(base, dict.fromkeys(FIELDS, 1.0), dict.fromkeys(FIELDS, chosen.final_lr_scale))
 
     def rates(done: float) -> dict[str, float]:
         return {**learning(done), "spring": max(done - SETTLE, 0.0) / (1 - SETTLE)}
@@ -261,7 +272,7 @@ def _rates(chosen: FinetuneSettings, lessons: Lessons) -> Rates:
     return rates
 
 
-def _state(work: RoundTrip, lengths: CodeLength, done: int) -> dict[str, np.ndarray]:
+def _state(work: QuantizedScene, lengths: CodeLength, done: int) -> dict[str, np.ndarray]:
     return {**work.state(), **lengths.state(), "done": np.asarray(done)}
 
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from kissgs.errors import OutputError
+from kissgs.core.errors import OutputError
 
 BLOCK = 4096
 """Bytes, for which a file system takes at least one block of its own."""

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from kissgs._typing import Float32, Float64, Shaped, UInt32
-from kissgs.errors import InvalidSceneError, UnsupportedError
+from kissgs.core.array_types import Float32, Float64, Shaped, UInt32
+from kissgs.core.errors import InvalidSceneError, UnsupportedError
+from kissgs.core.progress import Progress
+from kissgs.core.splats import SH_C0, SH_REST_COUNTS, Splats
 from kissgs.io.ply_body import BLOCK_ALIGNMENT, check_complete, rows
 from kissgs.io.ply_header import Element, Header, PlyFile, sh_degree
-from kissgs.progress import Progress
-from kissgs.splats import SH_C0, SH_REST_COUNTS, Splats
 
 _CHUNK = BLOCK_ALIGNMENT
 """Gaussians per row of element ``chunk``; the format's number, which blocks of rows are multiples of."""

@@ -8,13 +8,13 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from kissgs._typing import Float32
-from kissgs.errors import InvalidSceneError, UnsupportedError
+from kissgs.core.array_types import Float32
+from kissgs.core.errors import InvalidSceneError, UnsupportedError
+from kissgs.core.progress import Progress, silent
+from kissgs.core.splats import SH_C0, SH_REST_COUNTS, Splats
 from kissgs.io.compressed_ply import check_compressed, is_compressed, read_compressed
 from kissgs.io.ply_body import check_complete, rows
 from kissgs.io.ply_header import Element, Encoding, PlyFile, open_ply, sh_degree
-from kissgs.progress import Progress, silent
-from kissgs.splats import SH_C0, SH_REST_COUNTS, Splats
 
 _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")

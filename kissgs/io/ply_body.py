@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from kissgs.errors import InvalidSceneError, UnsupportedError
+from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.io.ply_header import Element, PlyFile
 
 BLOCK_BYTES = 1 << 20

@@ -13,8 +13,8 @@ from typing import Literal
 
 import numpy as np
 
-from kissgs.errors import InvalidSceneError, UnsupportedError
-from kissgs.splats import SH_REST_COUNTS
+from kissgs.core.errors import InvalidSceneError, UnsupportedError
+from kissgs.core.splats import SH_REST_COUNTS
 
 Encoding = Literal["ascii", "binary_little_endian", "binary_big_endian"]
 

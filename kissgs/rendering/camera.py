@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kissgs._typing import Float64
-from kissgs.errors import InvalidViewsError
+from kissgs.core.array_types import Float64
+from kissgs.core.errors import InvalidViewsError
 
 MAX_SIDE = 1 << 16
 """Of a picture, pixels; already such a square has 50 GB."""

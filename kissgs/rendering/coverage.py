@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from kissgs._typing import Float, Float64
+from kissgs.core.array_types import Float, Float64
+from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera
+from kissgs.rendering.constants import NEAR
 from kissgs.rendering.local_scale import local_scale
-from kissgs.rendering.semantics import NEAR
-from kissgs.splats import Splats
 
 VISIBLE = 0.003
 """A Gaussian has been looked at once so much of its squared alpha came through to an image: with less than a twentieth

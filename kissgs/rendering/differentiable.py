@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from kissgs.errors import InvalidViewsError, UnsupportedError
-from kissgs.parallel import Workers
+from kissgs.core.errors import InvalidViewsError, UnsupportedError
+from kissgs.core.splats import ATTRIBUTES, Splats
+from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu.frame import Frame, differentiate, draw
-from kissgs.splats import ATTRIBUTES, Splats
 
 try:
     import torch
@@ -38,7 +38,7 @@ def rasterize(
     """Take pictures of a scene; gradients flow to all of its parameters.
 
     On the processor by kissgs' own kernels, on CUDA by gsplat (extra ``kissgs[cuda]``); both draw what
-    :mod:`kissgs.rendering.semantics` says. The parameters are those stored in a scene, float32 and finite:
+    :mod:`kissgs.rendering.constants` says. The parameters are those stored in a scene, float32 and finite:
 
     Args:
         means: ``(N, 3)`` world units.
@@ -90,11 +90,6 @@ def _check_views(viewmats: Tensor, Ks: Tensor, backgrounds: Tensor) -> None:
             raise InvalidViewsError(f"{name} must be of shape {(count, *shape)}, not {tuple(tensor.shape)}")
         if tensor.requires_grad:
             raise UnsupportedError("gradients flow to the Gaussians only, not to cameras and backgrounds: detach them")
-
-
-def tensors_of(splats: Splats, device: str = "cpu") -> dict[str, Tensor]:
-    """The scene's parameters by name, as :func:`rasterize` takes them; on the processor they share its memory."""
-    return {name: torch.from_numpy(getattr(splats, name)).to(device) for name in ATTRIBUTES}
 
 
 class _Rasterize(torch.autograd.Function):

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kissgs._typing import Float32
-from kissgs.errors import UnsupportedError
-from kissgs.rendering import semantics
+from kissgs.core.array_types import Float32
+from kissgs.core.errors import UnsupportedError
+from kissgs.core.splats import SH_REST_COUNTS, Splats
+from kissgs.rendering import constants as semantics
 from kissgs.rendering.camera import Camera
-from kissgs.splats import SH_REST_COUNTS, Splats
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 Picture = tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]
 """Colours and alphas."""
 
-CameraMan = Callable[[Camera, Sequence[float]], Picture]
+ImageRenderer = Callable[[Camera, Sequence[float]], Picture]
 """Takes a picture over a background."""
 
 MISSING = "rendering on CUDA is gsplat's work, which is missing: pip install 'kissgs[cuda]'"
@@ -105,7 +105,7 @@ def need_cuda() -> None:
         raise UnsupportedError(MISSING)
 
 
-def camera_man(splats: Splats) -> CameraMan:
+def image_renderer(splats: Splats) -> ImageRenderer:
     """Takes pictures of a scene that goes to the GPU once.
 
     Raises:
@@ -114,7 +114,7 @@ def camera_man(splats: Splats) -> CameraMan:
     need_cuda()
     import torch
 
-    from kissgs.rendering.differentiable import tensors_of
+    from kissgs.rendering.tensors import tensors_of
 
     parameters = tensors_of(splats, "cuda")
 

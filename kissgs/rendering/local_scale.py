@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from kissgs._typing import Float64, Int
-from kissgs.splats import Splats
+from kissgs.core.array_types import Bool, Float64, Int
+from kissgs.core.splats import Splats
 
 LEAF = 512
 """Gaussians among which neighbours are sought, at most."""
@@ -56,5 +56,14 @@ def _leaves(means: Float64[np.ndarray, "N 3"]) -> Iterator[Int[np.ndarray, " n"]
             yield part
             continue
         axis = int(np.ptp(means[part], axis=0).argmax())
-        order = np.argpartition(means[part, axis], len(part) // 2)
-        parts += [part[order[: len(part) // 2]], part[order[len(part) // 2 :]]]
+        lower = _lower_half(means[part, axis])
+        parts += [part[lower], part[~lower]]
+
+
+def _lower_half(values: Float64[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    """Which values are the lower half, of equal ones the first: argpartition's choice depends on the processor."""
+    count = len(values) // 2
+    middle = np.partition(values, count)[count]
+    lower = values < middle
+    lower[np.flatnonzero(values == middle)[: count - int(lower.sum())]] = True
+    return lower

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from kissgs._typing import Float
-from kissgs.errors import InvalidViewsError, UnsupportedError
-from kissgs.parallel import Workers
+from kissgs.core.array_types import Float
+from kissgs.core.errors import InvalidViewsError, UnsupportedError
+from kissgs.core.threads import Workers
 from kissgs.rendering.metrics import difference_and_ssim
 
 try:

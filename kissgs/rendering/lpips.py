@@ -8,8 +8,8 @@ import warnings
 
 import numpy as np
 
-from kissgs._typing import Shaped
-from kissgs.errors import UnsupportedError
+from kissgs.core.array_types import Shaped
+from kissgs.core.errors import UnsupportedError
 from kissgs.rendering.metrics import image_pair
 
 SMALLEST = 16  # pixels: the network halves its input four times

@@ -11,9 +11,9 @@ import math
 
 import numpy as np
 
-from kissgs._typing import Float32, Float64, Shaped
-from kissgs.errors import InvalidViewsError
-from kissgs.parallel import Workers
+from kissgs.core.array_types import Float32, Float64, Shaped
+from kissgs.core.errors import InvalidViewsError
+from kissgs.core.threads import Workers
 
 TILE_PIXELS = 160  # across: the most that fits the kernel's rings
 TILE_ROWS = 128  # the rows around a tile are blurred once more for it: 20 per tile

@@ -1,6 +1,6 @@
 """The rasteriser: Gaussians and a camera -> a picture. On the processor by kissgs' own kernels, on CUDA by gsplat.
 
-What a picture is stands in :mod:`kissgs.rendering.semantics`. This module is for NumPy and does without torch unless
+What a picture is stands in :mod:`kissgs.rendering.constants`. This module is for NumPy and does without torch unless
 ``device`` asks for CUDA; with gradients it is :func:`kissgs.rendering.differentiable.rasterize`.
 """
 
@@ -11,11 +11,11 @@ from typing import Literal
 
 import numpy as np
 
-from kissgs._typing import Float32, Float64
-from kissgs.parallel import Workers
-from kissgs.progress import Progress, silent
+from kissgs.core.array_types import Float32, Float64
+from kissgs.core.progress import Progress, silent
+from kissgs.core.splats import Splats
+from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera
-from kissgs.splats import Splats
 
 Device = Literal["cpu", "cuda"]
 Colour = Sequence[float]
@@ -45,9 +45,9 @@ def render(
         UnsupportedError: the picture would take too much memory; no CUDA here.
     """
     if device == "cuda":
-        from kissgs.rendering.gsplat_backend import camera_man
+        from kissgs.rendering.gsplat_backend import image_renderer
 
-        return camera_man(splats)(camera, background)
+        return image_renderer(splats)(camera, background)
     from kissgs.rendering.cpu.frame import draw
 
     with Workers(threads) as pool:

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kissgs.compiled import compiled
+from kissgs.core.numba_kernels import compiled
 
 _FAST = {"contract", "nsz", "reassoc"}  # and NaN stays NaN
 

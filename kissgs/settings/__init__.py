@@ -1,9 +1,9 @@
 """What the user may choose: one model per stage, and the presets. Every setting says what it trades."""
 
-from kissgs.settings.all import Settings
 from kissgs.settings.compact import CompactSettings
 from kissgs.settings.encode import EncodeSettings
 from kissgs.settings.finetune import FinetuneSettings
+from kissgs.settings.groups import Settings
 from kissgs.settings.presets import PRESETS, Preset
 
 __all__ = ["PRESETS", "CompactSettings", "EncodeSettings", "FinetuneSettings", "Preset", "Settings"]

@@ -31,19 +31,20 @@ class EncodeSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    weigh: bool = Field(
+    rate_distortion: bool = Field(
         True,
         description="Take pictures of the scene, and weigh every bit against the error it saves in them. Steps, "
-        "codebook size and precision then follow from fidelity, and settings of even steps are refused.",
+        "codebook size and precision then follow from quality_offset_db, and settings of even steps are refused.",
     )
-    fidelity: Annotated[float, Field(ge=-30, le=30)] = Field(
+    quality_offset_db: Annotated[float, Field(ge=-30, le=30)] = Field(
         0.0, description="Where bits are weighed: decibels above the paper's own settings on the same scene, about."
     )
-    price: float | None = Field(
+    rd_lambda: float | None = Field(
         None,
         gt=0,
         lt=1,
-        description="Where bits are weighed: squared error per bit, in place of fidelity; auto: found for the scene.",
+        description="Where bits are weighed: squared error per bit, in place of quality_offset_db; auto: found for the "
+        "scene.",
     )
     psnr: float | None = Field(
         None,
@@ -67,53 +68,55 @@ class EncodeSettings(BaseModel):
         "at most so many decibels. Takes a few encodings. Without photographs, from cameras drawn as for 'evaluate', "
         "but others, and as if the scene were 30 dB from them.",
     )
-    attempts: int = Field(
+    max_encodes: int = Field(
         10,
         ge=1,
         le=100,
         description="On the way to a goal: containers that are made of one scene, at most; as many fine-tuned ones, no "
         "more than four, come on top, and the finest or coarsest of all where several have missed it.",
     )
-    drop: float = Field(
+    prune_threshold_bits: float = Field(
         18.0,
         ge=0,
         le=200,
         description="Where bits are weighed: leave out Gaussians that show less than so many bits are worth, fewer "
-        "bits the larger hedge is. A Gaussian takes some 60; beyond 30, holes that they leave together begin to show. "
-        "At the default quality none is left out that no camera looked at from nearby.",
+        "bits the larger view_uncertainty is. A Gaussian takes some 60; beyond 30, holes that they leave together "
+        "begin to show. At the default quality none is left out that no camera looked at from nearby.",
     )
-    classes: int = Field(
+    step_classes: int = Field(
         3,
         ge=1,
         le=32,
-        description="Where bits are weighed: kinds of Gaussians by importance, each with its own steps. More make "
+        description="Where bits are weighed: kinds of Gaussians by sensitivity, each with its own steps. More make "
         "steps fit better, and positions cost more.",
     )
-    round_by_price: bool = Field(
+    rdo_quantization: bool = Field(
         True, description="Where bits are weighed: prefer levels that many have. False: the nearest level."
     )
-    refit: int = Field(
+    color_refit_iterations: int = Field(
         2,
         ge=0,
         le=20,
         description="Where bits are weighed by a capture's cameras: steps of fitting base colours to its pictures, to "
         "make up for all other losses.",
     )
-    views: int = Field(
+    sensitivity_views: int = Field(
         48,
         ge=1,
         le=1000,
         description="Where bits are weighed: how many pictures to take of the scene, or of the capture's cameras at "
         "most; to the latter come two thirds as many from virtual cameras.",
     )
-    view_size: int = Field(480, ge=16, le=4096, description="Longer side of these pictures, pixels, at most.")
-    hedge: float | None = Field(
+    sensitivity_view_size: int = Field(
+        480, ge=16, le=4096, description="Longer side of these pictures, pixels, at most."
+    )
+    view_uncertainty: float | None = Field(
         None,
         ge=0,
         le=1,
-        description="Where bits are weighed: how far importance moves towards what a camera nearby would find, 0 to 1: "
-        "0 counts these pictures alone. What none of them looked at from nearby moves farther. The larger it is, up to "
-        "0.55, the smaller are the largest changes by rounding. auto: 0.1 with a capture's cameras, 0.55 without.",
+        description="Where bits are weighed: how far sensitivity moves towards what a camera nearby would find, 0 to "
+        "1: 0 counts these pictures alone. What none of them looked at from nearby moves farther. The larger it is, up "
+        "to 0.55, the smaller are the largest changes by rounding. auto: 0.1 with a capture's cameras, 0.55 without.",
     )
     order: Literal["hilbert", "plas"] = Field(
         "hilbert",
@@ -125,12 +128,12 @@ class EncodeSettings(BaseModel):
         description="Where order is plas: start from the Hilbert curve and sort only within this radius; auto: from "
         "a random order, as the paper.",
     )
-    forms: Literal["upright", "smooth"] = Field(
-        "upright",
+    rotation_form: Literal["canonical", "pras"] = Field(
+        "canonical",
         description="Which of 48 equivalent rotations is stored: the one nearest to none (fast, smallest), or the one "
         "most like its neighbours (the paper's PRAS). The shape is the same in all.",
     )
-    shared_steps: bool = Field(
+    shared_step_size: bool = Field(
         True,
         description="One step for all channels of an attribute, of the size given below. If false, each spreads "
         "the full number of levels over its own range (the paper): the steps below are then ignored.",
@@ -154,14 +157,14 @@ class EncodeSettings(BaseModel):
         0.023, description="Step of quaternion components: 0.02 turns a Gaussian by 1 degree on average."
     )
     sh0_step: Step = Field(0.055, description="Step of base colours: 0.055 is an error of up to 2 levels of 255.")
-    sh_ratio: float = Field(
+    gaussians_per_codebook_entry: float = Field(
         7.0,
         ge=1,
         le=4096,
         description="Gaussians per codebook entry: fewer entries are fewer bytes and a rougher gloss. Where bits are "
         "weighed: at least so many, if there are more than 8,192 entries.",
     )
-    sh_entries: int = Field(65_536, ge=64, le=65_536, description="Entries of the codebook, at most.")
+    sh_codebook_size: int = Field(65_536, ge=64, le=65_536, description="Entries of the codebook, at most.")
     sh_tolerance: float = Field(
         0.001,
         ge=0,
@@ -178,26 +181,29 @@ class EncodeSettings(BaseModel):
         description="How much the codebook favours what is seen: weights are (opacity x projected area) to this power. "
         "0 treats all alike; 1 gives up on small and faint Gaussians.",
     )
-    sh_rounds: int = Field(
+    sh_kmeans_iterations: int = Field(
         6, ge=1, le=50, description="Rounds of codebook refinement: more are slower and a little better."
     )
-    sh_reach: int = Field(
+    sh_nprobe: int = Field(
         24, ge=1, le=512, description="How far a Gaussian may look for its codebook entry; slower, better."
     )
-    plas_decay: float = Field(
+    plas_radius_decay: float = Field(
         0.8, ge=0.5, le=0.99, description="How slowly PLAS and PRAS narrow their filters: 0.95 is slow and smoothest."
     )
-    drop_invisible: bool = Field(
+    prune_invisible: bool = Field(
         True,
         description="Leave out Gaussians of opacity 1/255 and less: no renderer draws them. The count is reported.",
     )
     webp_quality: int = Field(75, ge=0, le=100, description="Effort of libwebp; always lossless.")
     webp_method: int = Field(4, ge=0, le=6, description="Methods of libwebp; always lossless.")
-    codebook_effort: bool = Field(
+    codebook_max_effort: bool = Field(
         True, description="Spend libwebp's highest effort on the codebook image: some seconds for 8 % of it."
     )
     seed: int = Field(
-        0, ge=0, lt=2**31, description="Of all random choices. Same input, settings and seed: same bytes."
+        0,
+        ge=0,
+        lt=2**31,
+        description="Seed of all random choices. Same input, settings, seed and kind of processor: same bytes.",
     )
 
     @property
@@ -207,30 +213,33 @@ class EncodeSettings(BaseModel):
 
     @model_validator(mode="after")
     def _only_what_counts(self) -> Self:
-        unused = [name for name in UNWEIGHED if self.weigh and getattr(self, name) != _default(name)]
+        unused = [name for name in UNWEIGHED if self.rate_distortion and getattr(self, name) != _default(name)]
         if unused:
             raise ValueError(
-                f"{unused[0]} has no effect where bits are weighed: set fidelity or price, or weigh=false with it"
+                f"{unused[0]} has no effect where bits are weighed: set quality_offset_db or rd_lambda, or "
+                "rate_distortion=false with it"
             )
         return self
 
     @model_validator(mode="after")
     def _one_goal(self) -> Self:
-        goals = [name for name in ("price", *GOALS) if getattr(self, name) is not None]
+        goals = [name for name in ("rd_lambda", *GOALS) if getattr(self, name) is not None]
         if len(goals) > 1:
             raise ValueError(f"{goals[0]} and {goals[1]} cannot both be met; give one")
-        if goals and not self.weigh:
-            raise ValueError(f"{goals[0]} needs bits that are weighed: choose balanced or small, or set weigh=true")
+        if goals and not self.rate_distortion:
+            raise ValueError(
+                f"{goals[0]} needs bits that are weighed: choose balanced or small, or set rate_distortion=true"
+            )
         return self
 
 
 GOALS = ("psnr", "target_size", "max_psnr_drop")
 
 UNWEIGHED = (
-    *("shared_steps", "means_bits", "means_tolerance", "opacity_step", "scale_step", "quat_step", "sh0_step"),
+    *("shared_step_size", "means_bits", "means_tolerance", "opacity_step", "scale_step", "quat_step", "sh0_step"),
     "sh_weight_power",
 )
-"""Settings that price and importance decide about where bits are weighed."""
+"""Settings that price and sensitivity decide about where bits are weighed."""
 
 
 def _default(name: str) -> object:

@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO, Literal, Protocol, runtime_checkable
 
-from kissgs.errors import InvalidContainerError, OutputError
+from kissgs.core.errors import InvalidContainerError, OutputError
 from kissgs.io.atomic import atomic_file, look, reason_of, refuse_existing, try_out, umask
 from kissgs.sogxt.names import FILES
 

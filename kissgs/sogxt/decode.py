@@ -12,16 +12,16 @@ from pathlib import Path
 
 import numpy as np
 
-from kissgs._typing import Float32, Float64, Int, UInt8, UInt16
-from kissgs.errors import InvalidContainerError, UnsupportedError
-from kissgs.parallel import Workers
-from kissgs.progress import Progress, silent
+from kissgs.core.array_types import Float32, Float64, Int, UInt8, UInt16
+from kissgs.core.errors import InvalidContainerError, UnsupportedError
+from kissgs.core.progress import Progress, silent
+from kissgs.core.signed_log import signed_exp
+from kissgs.core.splats import SH_REST_COUNTS, Splats
+from kissgs.core.threads import Workers
 from kissgs.sogxt.container import Source, open_source
 from kissgs.sogxt.metadata import TILE_COLUMNS, TILE_ROWS, Layout
 from kissgs.sogxt.metadata_reader import read_layout
 from kissgs.sogxt.planes import decode_plane
-from kissgs.sogxt.quantize import signed_exp
-from kissgs.splats import SH_REST_COUNTS, Splats
 
 CHUNK = 1 << 14
 """Gaussians per task of lookups."""

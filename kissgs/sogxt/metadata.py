@@ -16,13 +16,11 @@ import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
 from pydantic_core import PydanticCustomError
 
+from kissgs.core.limits import MAX_CODEBOOK_SIDE, MAX_GRID_SIDE
+from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.sogxt.names import CHECKSUM, JSON_NAME
-from kissgs.sogxt.order import MAX_GRID_SIDE
-from kissgs.splats import SH_REST_COUNTS
 
 TILE_ROWS, TILE_COLUMNS = 3, 5
-MAX_CODEBOOK_SIDE = 256
-"""Labels have two 8-bit coordinates."""
 
 CHANNELS = {"opacities": 1, "means": 1, "scales": 3, "quaternions": 4, "f_dc": 3, "f_rest_centroids": 45}
 """Fields with a range, and how many numbers it has. One number stands as such, several as a list."""

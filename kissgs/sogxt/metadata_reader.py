@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 from pydantic import ValidationError
 
-from kissgs.errors import InvalidContainerError, UnsupportedError
+from kissgs.core.errors import InvalidContainerError, UnsupportedError
 from kissgs.sogxt.container import Source
 from kissgs.sogxt.metadata import CHANNELS, TILE_COLUMNS, TILE_ROWS, Layout
 from kissgs.sogxt.names import CHECKSUM, JSON_NAME, YAML_NAME

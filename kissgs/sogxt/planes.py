@@ -10,9 +10,9 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from PIL import Image, WebPImagePlugin
 
-from kissgs._typing import UInt8
-from kissgs.errors import InvalidContainerError
-from kissgs.parallel import Workers
+from kissgs.core.array_types import UInt8
+from kissgs.core.errors import InvalidContainerError
+from kissgs.core.threads import Workers
 from kissgs.settings import EncodeSettings
 
 HIGHEST_EFFORT = (100, 6)
@@ -27,7 +27,7 @@ def compress_images(
     """Compress all images of a container in parallel, the slowest first."""
 
     def work(name: str) -> bytes:
-        slow = settings.codebook_effort and name.startswith("f_rest_centroids")
+        slow = settings.codebook_max_effort and name.startswith("f_rest_centroids")
         quality, method = HIGHEST_EFFORT if slow else (settings.webp_quality, settings.webp_method)
         return encode_plane(images[name], quality=quality, method=method)
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from kissgs.errors import OutputError
+from kissgs.core.errors import OutputError
 from kissgs.io.atomic import atomic_file, reason_of, refuse_existing
 
 SECONDS = 30.0

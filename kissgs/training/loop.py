@@ -11,11 +11,11 @@ from typing import Protocol
 
 import numpy as np
 
-from kissgs.errors import UnsupportedError
-from kissgs.progress import Progress, silent
+from kissgs.core.errors import UnsupportedError
+from kissgs.core.progress import Progress, silent
 from kissgs.rendering.differentiable import rasterize
 from kissgs.rendering.losses import photometric_loss
-from kissgs.training.lessons import Lessons
+from kissgs.training.targets import TrainingTargets
 
 try:
     import torch
@@ -31,11 +31,11 @@ Rates = Callable[[float], Mapping[str, float]]
 """Learning rates by parameter, given the share of the steps that are done."""
 
 
-class Learner(Protocol):
+class TrainableScene(Protocol):
     """What is fitted to pictures."""
 
     def gaussians(self) -> dict[str, Tensor]:
-        """The scene as it is now, by the names in :class:`kissgs.splats.Splats`: gradients flow back from there."""
+        """Current parameters, by the names in :class:`kissgs.core.splats.Splats`; gradients flow back from there."""
 
     def step(self, rates: Mapping[str, float]) -> None:
         """Move against the gradients that have come, at these learning rates, and forget them."""
@@ -50,7 +50,7 @@ class Regularizer(Protocol):
     def penalty(self, step: int, parameters: Parameters) -> Tensor | None:
         """To be added to the loss of ``step``; None for nothing."""
 
-    def update(self, step: int, learner: Learner) -> None:
+    def update(self, step: int, learner: TrainableScene) -> None:
         """What is to be done after ``step``."""
 
 
@@ -78,8 +78,8 @@ class Plan:
 
 
 def train(
-    learner: Learner,
-    lessons: Lessons,
+    learner: TrainableScene,
+    targets: TrainingTargets,
     plan: Plan,
     *,
     first: int = 0,
@@ -94,7 +94,7 @@ def train(
 
     Args:
         learner: changed in place.
-        lessons: pictures.
+        targets: pictures.
         plan: what to do.
         first: steps that were done before.
         after: told the number of steps done, after each.
@@ -102,16 +102,16 @@ def train(
         progress: receives the plan's stage, with loss, PSNR to the lessons and count; what it raises leaves the
             learner as it was after a whole number of steps.
     """
-    cameras = [_as_tensors(camera.viewmat, camera.K, lessons.background) for camera in lessons.cameras]
-    order, told = lessons.order(plan.seed, first * plan.batch), Told()
+    cameras = [_as_tensors(camera.viewmat, camera.K, targets.background) for camera in targets.cameras]
+    order, told = targets.order(plan.seed, first * plan.batch), Told()
     with threads_of_torch(threads):
         for step in range(first, plan.steps):
             progress(plan.stage, step / plan.steps, told.in_words(len(learner)))
             shown = learner.gaussians()
             losses, errors = [], []
             for n in islice(order, plan.batch):
-                camera, (viewmat, K, background) = lessons.cameras[n], cameras[n]
-                target = torch.from_numpy(lessons.picture(n))[None].to(shown["means"].device)
+                camera, (viewmat, K, background) = targets.cameras[n], cameras[n]
+                target = torch.from_numpy(targets.picture(n))[None].to(shown["means"].device)
                 image, _ = rasterize(
                     **shown,
                     viewmats=viewmat,
@@ -174,7 +174,7 @@ def threads_of_torch(threads: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def falling(base: Mapping[str, float], begin: Mapping[str, float], end: Mapping[str, float]) -> Rates:
+def exponential_lr(base: Mapping[str, float], begin: Mapping[str, float], end: Mapping[str, float]) -> Rates:
     """Rates that go from one share of ``base`` to another, exponentially, as those of the means do in 3DGS.
 
     Args:

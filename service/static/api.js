@@ -7,10 +7,10 @@
  *   bytes_per_gaussian: number}} Sizes
  * @typedef {{created_at: string, queue_seconds?: number, run_seconds?: number}} Timings
  * @typedef {{id: string, name: string, state: string, position?: number, progress?: Progress,
- *   estimate?: {seconds_left: number}, options: {preset: string, encode: {weigh: boolean} & import("./goal.js").Goals,
+ *   estimate?: {seconds_left: number}, options: {preset: string, encode: {rate_distortion: boolean} & import("./goal.js").Goals,
  *     evaluate: boolean,
- *     compact: {count: number | null, ratio: number | null, max_psnr_drop: number | null, by_goal: boolean,
- *     sparsify_steps: number, refine_steps: number}, finetune: {wanted: boolean}},
+ *     compact: {count: number | null, ratio: number | null, max_psnr_drop: number | null, auto_count: boolean,
+ *     sparsify_steps: number, refine_steps: number}, finetune: {enabled: boolean}},
  *   finetuning?: {kept: boolean, psnr_before: number | null, psnr_after: number | null, bytes_before: number,
  *     bytes_after: number},
  *   upload_bytes: number, gaussians: number, sh_degree: number, kept?: number, compacted?: number, invisible?: number, cleaned?: Record<string, number>,
@@ -20,7 +20,7 @@
  * @typedef {{max_upload_bytes: number, max_header_bytes: number, max_gaussians: number,
  *   keys_required: boolean, training: boolean}} Limits
  * @typedef {{name: string, title: string, description: string, bytes_per_gaussian: number, psnr_change: number,
- *   cpu_seconds_per_million: number, settings: {encode: {weigh: boolean}}}} Preset
+ *   cpu_seconds_per_million: number, settings: {encode: {rate_distortion: boolean}}}} Preset
  * @typedef {{default: string, measured_on: string, presets: Preset[]}} Presets
  */
 

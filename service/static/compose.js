@@ -8,7 +8,7 @@ import { presetList } from "./presets.js";
 
 /**
  * @typedef {{preset: string, evaluate: boolean, encode?: import("./goal.js").Goals,
- *   compact?: {ratio?: number | null, by_goal?: boolean}, finetune?: {wanted?: boolean}}} Options
+ *   compact?: {ratio?: number | null, auto_count?: boolean}, finetune?: {enabled?: boolean}}} Options
  * @typedef {{file: File, options: Options}} Order
  */
 
@@ -65,7 +65,7 @@ export function composer(limits, presets, submit) {
   form.addEventListener("submit", (/** @type {SubmitEvent} */ event) => {
     event.preventDefault();
     const [preset, evaluate, encode] = [list.chosen(), byId("evaluate").checked, goal.chosen()];
-    const [compact, finetune] = [budget(byId("keep").value), byId("finetune").checked && { wanted: true }];
+    const [compact, finetune] = [budget(byId("keep").value), byId("finetune").checked && { enabled: true }];
     const asked = { ...(encode && { encode }), ...(compact && { compact }), ...(finetune && { finetune }) };
     if (chosen) return submit({ file: chosen, options: { preset, evaluate, ...asked } });
     say("Choose a .ply first.");
@@ -83,11 +83,11 @@ export function composer(limits, presets, submit) {
       list.choose(options.preset);
       goal.prefer(options.encode ?? {});
       byId("evaluate").checked = options.evaluate;
-      byId("finetune").checked = limits.training && (options.finetune?.wanted ?? false);
+      byId("finetune").checked = limits.training && (options.finetune?.enabled ?? false);
       const [keep, ratio] = [/** @type {HTMLSelectElement} */ (byId("keep")), options.compact?.ratio ?? null];
       if (ratio !== null && ![...keep.options].some(({ value }) => Number(value) === ratio))
         keep.add(new Option(`Keep ${Math.round(100 * ratio)} %`, String(ratio)));
-      const known = options.compact?.by_goal
+      const known = options.compact?.auto_count
         ? "auto"
         : [...keep.options].find(({ value }) => Number(value) === ratio)?.value;
       keep.value = known ?? "";
@@ -96,7 +96,7 @@ export function composer(limits, presets, submit) {
 }
 
 /** @param {string} kept how many Gaussians: a share, "auto", or nothing for all */
-const budget = (kept) => (kept === "auto" ? { by_goal: true } : kept ? { ratio: Number(kept) } : null);
+const budget = (kept) => (kept === "auto" ? { auto_count: true } : kept ? { ratio: Number(kept) } : null);
 
 /** @param {string} text */
 function say(text) {

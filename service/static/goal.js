@@ -31,7 +31,7 @@ const GOALS = {
  */
 export function goalField(presets, preset) {
   const [goal, amount] = [/** @type {HTMLSelectElement} */ (byId("goal")), byId("amount")];
-  const weighs = () => presets.presets.find(({ name }) => name === preset())?.settings.encode.weigh ?? false;
+  const weighs = () => presets.presets.find(({ name }) => name === preset())?.settings.encode.rate_distortion ?? false;
   const named = () => GOALS[goal.value];
 
   function refresh() {

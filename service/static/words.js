@@ -21,11 +21,11 @@ const STAGES = {
   cameras: "Placing cameras",
   score: "Scoring Gaussians",
   judge: "Judging what it has come to",
-  lessons: "Taking pictures to learn from",
+  targets: "Taking pictures to learn from",
   sparsify: "Training while Gaussians go",
   refine: "Training those that stay",
-  importance: "Seeing what matters",
-  price: "Pricing bits",
+  sensitivity: "Seeing what matters",
+  rate_distortion: "Weighing bits against errors",
   order: "Putting Gaussians in order",
   forms: "Choosing forms",
   codebook: "Building the codebook",
@@ -39,7 +39,7 @@ const STAGES = {
 };
 
 const ALWAYS = ["read", "kernels", "order", "forms", "images"];
-const WEIGHED = ["cameras", "importance", "price", "rounding"];
+const WEIGHED = ["cameras", "sensitivity", "rate_distortion", "rounding"];
 const COMPACTED = ["cameras", "score"];
 const WITH_COLOURS_BY_ANGLE = ["codebook", "sort codebook"];
 
@@ -81,15 +81,22 @@ export const stageWord = (stage) => STAGES[stage] ?? stage;
  */
 export function plannedStages(status) {
   const planned = new Set(ALWAYS);
-  if (status.options.encode.weigh) WEIGHED.forEach((stage) => planned.add(stage));
-  const { count: wanted, ratio, max_psnr_drop: drop, by_goal, sparsify_steps, refine_steps } = status.options.compact;
-  if (wanted !== null || ratio !== null || drop !== null || by_goal) {
+  if (status.options.encode.rate_distortion) WEIGHED.forEach((stage) => planned.add(stage));
+  const {
+    count: wanted,
+    ratio,
+    max_psnr_drop: drop,
+    auto_count,
+    sparsify_steps,
+    refine_steps,
+  } = status.options.compact;
+  if (wanted !== null || ratio !== null || drop !== null || auto_count) {
     COMPACTED.forEach((stage) => planned.add(stage));
-    if (sparsify_steps + refine_steps > 0) planned.add("lessons");
+    if (sparsify_steps + refine_steps > 0) planned.add("targets");
     if (sparsify_steps > 0) planned.add("sparsify");
     if (refine_steps > 0) planned.add("refine");
   }
-  if (status.options.finetune.wanted) ["cameras", "lessons", "finetune"].forEach((stage) => planned.add(stage));
+  if (status.options.finetune.enabled) ["cameras", "targets", "finetune"].forEach((stage) => planned.add(stage));
   if (status.sh_degree > 0) WITH_COLOURS_BY_ANGLE.forEach((stage) => planned.add(stage));
   if (status.options.evaluate) planned.add("evaluate");
   return Object.keys(STAGES).filter((stage) => planned.has(stage));

@@ -4,18 +4,18 @@ import math
 
 import numpy as np
 import pytest
+from helpers.training_scenes import around, cloud, same
 from PIL import Image
-from training_scenes import around, cloud, same
 
 import kissgs
 from kissgs import CompactSettings, UnsupportedError
+from kissgs.cameras.views import View, Views, black
 from kissgs.compaction.budget import compact_scene
-from kissgs.evaluation.drop import USUAL, drop_of
-from kissgs.evaluation.pictures import evaluate
+from kissgs.evaluation.evaluate import evaluate
+from kissgs.evaluation.psnr_loss import USUAL, drop_of
 from kissgs.rendering.rasterizer import render
-from kissgs.views.view import View, Views, black
 
-ONLY_PRUNE = {"sparsify_steps": 0, "refine_steps": 0, "score_share": 0.6}
+ONLY_PRUNE = {"sparsify_steps": 0, "refine_steps": 0, "min_keep_per_scoring": 0.6}
 
 
 def views():
@@ -120,10 +120,12 @@ def test_without_photographs_errors_add_up_to_those_of_a_usual_capture():
 
 def evaluation_of(psnr):
     judged = evaluate(cloud(5), cloud(5), Views((), around(1), black(), ""))
-    likeness = kissgs.evaluation.likeness.Likeness(psnr=psnr, ssim=1.0)
-    comparison = kissgs.evaluation.likeness.Comparison(reference=None, candidate=likeness, between=likeness)
+    likeness = kissgs.evaluation.results.ImageMetrics(psnr=psnr, ssim=1.0)
+    comparison = kissgs.evaluation.results.Comparison(
+        reference=None, candidate=likeness, candidate_vs_reference=likeness
+    )
     (view,) = judged.views
-    changed = kissgs.evaluation.likeness.ViewComparison(view=view.view, comparison=comparison)
-    return kissgs.evaluation.likeness.Evaluation(
+    changed = kissgs.evaluation.results.ViewComparison(view=view.view, comparison=comparison)
+    return kissgs.evaluation.results.Evaluation(
         **{name: getattr(judged, name) for name in judged.__slots__ if name != "views"}, views=(changed,)
     )

@@ -6,28 +6,28 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from helpers.training_scenes import around, cloud, same
 from PIL import Image
-from training_scenes import around, cloud, same
 
 import kissgs
 from kissgs import CompactSettings, OutputError, UnsupportedError
+from kissgs.cameras.views import View, Views, black
 from kissgs.compaction.budget import compact_scene
 from kissgs.compaction.popspa import popspa
 from kissgs.compaction.scoring import highest, show_most
+from kissgs.core.splats import ATTRIBUTES
 from kissgs.rendering.camera import look_at
 from kissgs.rendering.coverage import Coverage
 from kissgs.rendering.rasterizer import render
-from kissgs.splats import ATTRIBUTES
 from kissgs.training.checkpoint import Checkpoint
-from kissgs.training.lessons import lessons
-from kissgs.training.school import School, school
-from kissgs.views.view import View, Views, black
+from kissgs.training.supervision import SupervisionViews, supervision_views
+from kissgs.training.targets import training_targets
 
-SHORT = {"sparsify_steps": 8, "refine_steps": 6, "rounds": 2, "score_share": 0.6, "interval": 3}
+SHORT = {"sparsify_steps": 8, "refine_steps": 6, "prune_rounds": 2, "min_keep_per_scoring": 0.6, "admm_interval": 3}
 
 
 def taught():
-    return School(around(5), around(5), around(3), black(), "five views")
+    return SupervisionViews(around(5), around(5), around(3), black(), "five views")
 
 
 def settings(**changes):
@@ -43,16 +43,16 @@ def error(scene, original, views):
     "changes",
     [
         {},
-        {"rounds": 1},
-        {"rounds": 8},
-        {"rounds": 1000},
+        {"prune_rounds": 1},
+        {"prune_rounds": 8},
+        {"prune_rounds": 1000},
         {"sparsify_steps": 0},
         {"refine_steps": 0},
         {"sparsify_steps": 0, "refine_steps": 0},
-        {"first_share": 0.0},
-        {"first_share": 1.0},
-        {"rho": 0.0},
-        {"needle_weight": 0.1, "flat_weight": 0.1},
+        {"initial_prune_fraction": 0.0},
+        {"initial_prune_fraction": 1.0},
+        {"admm_rho": 0.0},
+        {"erank_weight": 0.1, "min_scale_weight": 0.1},
     ],
 )
 @pytest.mark.parametrize("count", [1, 13, 59])
@@ -73,23 +73,23 @@ def test_exactly_so_many_are_left_and_it_says_which(count, changes):
 @pytest.mark.parametrize(("captured", "least"), [(True, 0.05), (False, 0.3)])
 def test_without_training_it_is_pruning_alone(captured, least):
     """What no camera shows counts little where people said from where they look, and more where nobody did."""
-    scene, taught_by = cloud(60), replace(taught(), captured=captured)
-    result = popspa(scene, 20, settings(sparsify_steps=0, refine_steps=0), taught_by)
-    kept = show_most(scene, [view.camera for view in taught_by.train], black(), 20, share=0.6, least=least)
+    scene, target_source = cloud(60), replace(taught(), captured=captured)
+    result = popspa(scene, 20, settings(sparsify_steps=0, refine_steps=0), target_source)
+    kept = show_most(scene, target_source.train, black(), 20, share=0.6, least=least)
     assert (result.index == kept).all()
     assert same(result.splats, scene.select(kept))
-    assert result.report.taught_by == "nothing"
+    assert result.report.target_source == "nothing"
 
 
 def test_training_makes_up_for_what_went():
-    scene, taught_by = cloud(200), taught()
-    pruned = popspa(scene, 60, settings(sparsify_steps=0, refine_steps=0), taught_by)
-    fitted = popspa(scene, 60, settings(sparsify_steps=60, refine_steps=120), taught_by)
-    assert error(fitted.splats, scene, taught_by.train) < 0.5 * error(pruned.splats, scene, taught_by.train)
+    scene, target_source = cloud(200), taught()
+    pruned = popspa(scene, 60, settings(sparsify_steps=0, refine_steps=0), target_source)
+    fitted = popspa(scene, 60, settings(sparsify_steps=60, refine_steps=120), target_source)
+    assert error(fitted.splats, scene, target_source.train) < 0.5 * error(pruned.splats, scene, target_source.train)
 
 
 def test_the_steps_are_told():
-    result = popspa(cloud(100), 20, settings(first_share=0.5), taught(), judges=True)
+    result = popspa(cloud(100), 20, settings(initial_prune_fraction=0.5), taught(), judges=True)
     names = [step.name for step in result.report.steps]
     assert names == ["input", "prune", "sparsify", "prune", "sparsify", "prune", "refine"]
     assert [step.count for step in result.report.steps] == [100, 45, 45, 30, 30, 20, 20]
@@ -125,9 +125,9 @@ def stopping_after(steps):
 def test_opacities_that_are_made_sparse_are_taken_up_too(tmp_path, monkeypatch, steps):
     """Before the first step there is a checkpoint, and no z and u in it."""
     monkeypatch.setattr(Checkpoint, "due", True)
-    chosen, path = settings(rho=0.01, interval=1), tmp_path / "c.npz"
+    chosen, path = settings(admm_rho=0.01, admm_interval=1), tmp_path / "c.npz"
     whole = popspa(cloud(80), 20, chosen, taught())
-    assert not same(whole.splats, popspa(cloud(80), 20, settings(rho=0.0), taught()).splats)
+    assert not same(whole.splats, popspa(cloud(80), 20, settings(admm_rho=0.0), taught()).splats)
     with pytest.raises(Interrupted):
         popspa(cloud(80), 20, chosen, taught(), checkpoint=path, progress=stopping_after(steps))
     assert same(whole.splats, popspa(cloud(80), 20, chosen, taught(), checkpoint=path).splats)
@@ -161,7 +161,7 @@ def test_what_was_interrupted_ends_as_if_it_had_not_been(tmp_path, monkeypatch, 
         progress=lambda stage, fraction, note="": begun.append(stage),
     )
     assert same(whole.splats, third.splats), "what was finished is not done again"
-    assert set(begun) == {"kernels", "lessons"}
+    assert set(begun) == {"kernels", "targets"}
 
 
 def test_what_was_begun_without_figures_is_not_taken_up_for_figures(tmp_path, monkeypatch):
@@ -215,25 +215,28 @@ def test_all_cameras_in_one_place(turn):
     targets = [np.array([turn * n, 0.0, 0.0]) for n in range(5)]
     cameras = [look_at(place, target, up, fov=0.9, width=40, height=32) for target in targets]
     turned = tuple(View(f"{n}", camera) for n, camera in enumerate(cameras))
-    extent = lessons(cloud(5), turned, black()).extent
+    extent = training_targets(cloud(5), turned, black()).extent
     assert extent < 1e-10
     assert (extent > 0) == (turn > 0)
     scene = cloud(60)
     result = popspa(
-        scene, 30, settings(flat_weight=1.0, needle_weight=0.1), School(turned, turned, turned, black(), "")
+        scene,
+        30,
+        settings(min_scale_weight=1.0, erank_weight=0.1),
+        SupervisionViews(turned, turned, turned, black(), ""),
     )
     assert np.abs(result.splats.means - scene.means[result.index]).max() > 1e-4
     assert np.abs(result.splats.scales - scene.scales[result.index]).max() < 0.15, "and flatness has not run away"
 
 
 def test_the_scene_as_it_was_teaches_the_smaller_one():
-    """``teacher`` is for those that are pruned already."""
-    scene, taught_by = cloud(200), taught()
+    """``reference`` is for those that are pruned already."""
+    scene, target_source = cloud(200), taught()
     pruned = scene.select(np.arange(0, 200, 3))
     steps = settings(sparsify_steps=0, refine_steps=80)
     apart = [
-        error(popspa(pruned, len(pruned), steps, taught_by, teacher=teacher).splats, scene, taught_by.train)
-        for teacher in (scene, pruned)
+        error(popspa(pruned, len(pruned), steps, target_source, reference=reference).splats, scene, target_source.train)
+        for reference in (scene, pruned)
     ]
     assert apart[0] < 0.7 * apart[1]
 
@@ -247,8 +250,8 @@ def test_the_checkpoint_of_other_work_is_refused(tmp_path, monkeypatch, other):
     work = {
         "scene": (cloud(80, seed=5), 20, settings(), taught()),
         "count": (cloud(80), 21, settings(), taught()),
-        "settings": (cloud(80), 20, settings(rho=1e-3), taught()),
-        "views": (cloud(80), 20, settings(), School(around(4), around(4), around(3), black(), "four views")),
+        "settings": (cloud(80), 20, settings(admm_rho=1e-3), taught()),
+        "views": (cloud(80), 20, settings(), SupervisionViews(around(4), around(4), around(3), black(), "four views")),
     }
     with pytest.raises(OutputError, match="checkpoint of other work"):
         popspa(*work[other], checkpoint=path)
@@ -263,23 +266,30 @@ def test_a_full_disk_is_told(tmp_path, monkeypatch):
 
 def test_virtual_views_teach_where_there_is_no_capture():
     scene = kissgs.sample_scene(400, sh_degree=0)
-    found = school(scene, None, settings(views=64, view_size=50))
+    found = supervision_views(scene, None, settings(views=64, view_size=50))
     assert 56 <= len(found.train) <= 4 * 56  # several regions
-    assert len(found.score) == len(range(0, len(found.train), 4))
+    scored = len(range(0, len(found.train), 4))
+    assert [view.camera.width for view in found.score] == [30] * scored + [7] * 4 * scored
+    for part in (found.score[:scored], found.score[scored:]):
+        assert [view.background[0] for view in part[:4]] == [0.0, 0.5, 1.0, 0.0]
+    other = supervision_views(scene, None, settings(views=64, view_size=50, seed=9)).score[-1].camera.position
+    assert not np.array_equal(found.score[-1].camera.position, other)
+    assert [view.background for view in found.train] == [None] * len(found.train)
     assert len(found.test) == min(-(-len(found.train) // 7), 16)
     assert all(max(view.camera.width, view.camera.height) <= 50 for view in found.train)
-    pruned = school(scene, None, settings(views=64, view_size=50), scored=1)
+    pruned = supervision_views(scene, None, settings(views=64, view_size=50), scored=1)
     assert len(pruned.score) == len(found.score)
+    assert supervision_views(scene, None, settings(views=64, view_size=50), scored=0).score == ()
     result = popspa(scene, 100, settings(), found)
-    assert result.report.taught_by == "renderings"
-    assert result.report.source == f"{len(found.train)} virtual cameras"
+    assert result.report.target_source == "renderings"
+    assert result.report.source.startswith(f"{len(found.train)} virtual cameras, and ")
 
 
 @pytest.mark.parametrize(("around_it", "virtual"), [(0.0, 0), (0.1, 1), (0.5, 5)])
 def test_a_capture_has_virtual_views_around_it(around_it, virtual):
     """Its own views come first, and those held out are never learned from."""
     capture = Views(around(5), around(3), black(), "a capture")
-    found = school(kissgs.sample_scene(400, sh_degree=0), capture, settings(around=around_it))
+    found = supervision_views(kissgs.sample_scene(400, sh_degree=0), capture, settings(synthetic_view_share=around_it))
     assert len(found.train) == 5 + virtual
     assert [view.name for view in found.train[:5]] == [view.name for view in capture.train]
     assert [view.name for view in found.test] == [view.name for view in capture.test]
@@ -295,11 +305,13 @@ def test_a_capture_that_holds_no_view_out(tmp_path, photos):
         Image.new("RGB", (40, 32), (50, 90, 20)).save(tmp_path / f"{n}.png")
         train[n] = View(train[n].name, train[n].camera, tmp_path / f"{n}.png")
     scene = cloud(60)
-    found = school(scene, Views(tuple(train), (), black(), "a capture", "a note"), settings(around=0.5))
+    found = supervision_views(
+        scene, Views(tuple(train), (), black(), "a capture", "a note"), settings(synthetic_view_share=0.5)
+    )
     assert len(found.test) == (photos or 4)
     result = popspa(scene, 20, settings(), found, judges=True)
     assert result.report.note.startswith("a note; no view is held out")
-    assert result.report.taught_by == ("photos" if photos else "renderings")
+    assert result.report.target_source == ("photos" if photos else "renderings")
 
 
 def test_nothing_is_seen():
@@ -308,14 +320,14 @@ def test_nothing_is_seen():
     far = replace(scene, means=scene.means + np.float32(500))
     pruned = popspa(far, 10, settings(sparsify_steps=0, refine_steps=0), taught())
     assert pruned.index.tolist() == highest(Coverage(far).close_up, 10).tolist()
-    result = popspa(far, 10, settings(rho=0), taught())
+    result = popspa(far, 10, settings(admm_rho=0), taught())
     large = np.exp(np.sort(far.scales, axis=1)[:, 1:].sum(axis=1)) / (1 + np.exp(-far.opacities)) ** 2
     assert np.median(large[result.index]) > 2 * np.median(np.delete(large, result.index))
     assert same(result.splats, far.select(result.index))
 
 
 def test_prunings_are_by_the_same_factor():
-    chosen = settings(sparsify_steps=10, rounds=3, first_share=0.0)
+    chosen = settings(sparsify_steps=10, prune_rounds=3, initial_prune_fraction=0.0)
     steps = popspa(cloud(100), 10, chosen, taught()).report.steps
     assert [step.count for step in steps if step.name == "prune"] == [100, 46, 22, 10]
     assert [step.name for step in steps] == ["input", "prune", *["sparsify", "prune"] * 3, "refine"]

@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from kissgs.errors import InvalidSceneError
+from kissgs.core.errors import InvalidSceneError
+from kissgs.core.splats import SH_C0
 from kissgs.evaluation import attributes
 from kissgs.evaluation.attributes import attribute_errors
-from kissgs.sample import sample_scene
-from kissgs.splats import SH_C0
+from kissgs.synthetic.scene import sample_scene
 
 OCTAHEDRAL = Rotation.create_group("O")
 seeds = st.integers(0, 2**32)

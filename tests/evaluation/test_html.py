@@ -6,18 +6,18 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from helpers.captured_scene import SCENE, camera, cameras, damaged, picture, write_capture
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from picture_scenes import SCENE, camera, cameras, damaged, picture, write_capture
 from PIL import Image
 
-from kissgs.errors import Cancelled
-from kissgs.evaluation.difference import SCALES, STOPS, WINDOW, difference, full_scale, heat_map, worst_place
+from kissgs.cameras.captures.load import load_views
+from kissgs.cameras.views import View, Views
+from kissgs.core.errors import Cancelled
+from kissgs.core.splats import ATTRIBUTES, Splats
+from kissgs.evaluation.error_maps import SCALES, STOPS, WINDOW, difference, full_scale, heat_map, worst_place
+from kissgs.evaluation.evaluate import compare_pictures, evaluate
 from kissgs.evaluation.html import MOST_ELSEWHERE, MOST_VIEWS, Side, chosen_views, html_report
-from kissgs.evaluation.pictures import compare_pictures, evaluate
-from kissgs.splats import ATTRIBUTES, Splats
-from kissgs.views.load import load_views
-from kissgs.views.view import View, Views
 
 WORSE = damaged()
 VOID = {"meta", "link", "img", "input", "br"}
@@ -83,7 +83,7 @@ def test_the_page_needs_nothing_beside_itself():
 def test_pictures_of_every_view_without_photographs():
     text, found = report(cameras(test=3))
     page = Page(text)
-    worst = min(range(3), key=lambda i: found.views[i].comparison.between.psnr)
+    worst = min(range(3), key=lambda i: found.views[i].comparison.candidate_vs_reference.psnr)
     ids = [section["id"] for section in page.of("section") if "id" in section]
     assert ids == [f"view-{worst}", *(f"view-{i}" for i in range(3) if i != worst)]
     assert len(page.images) == 3 * (3 + 3)
@@ -145,7 +145,7 @@ def test_twelve_of_many_views_and_the_worst_among_them():
     views = cameras(test=30, train=0, size=(8, 6))
     found = compare_pictures(one, damaged(one), views)
     shown = chosen_views(found)
-    worst = int(np.argmin([each.comparison.between.psnr for each in found.views]))
+    worst = int(np.argmin([each.comparison.candidate_vs_reference.psnr for each in found.views]))
     assert len(shown) == len(set(shown)) == MOST_VIEWS
     assert shown[0] == worst
     assert shown[1:] == sorted(shown[1:])

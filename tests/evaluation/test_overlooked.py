@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 import kissgs
+from kissgs.core.splats import ATTRIBUTES, Splats
+from kissgs.core.threads import Workers
 from kissgs.evaluation.cameras import COUNT, evaluation_views
+from kissgs.evaluation.evaluate import compare_pictures
 from kissgs.evaluation.overlooked import MOST_ADDED, NOTICED, Parts
 from kissgs.evaluation.parts import find_parts
-from kissgs.evaluation.pictures import compare_pictures
 from kissgs.evaluation.prominence import prominence
-from kissgs.parallel import Workers
-from kissgs.splats import ATTRIBUTES, Splats
 
 
 def objects(count, gaussians=100, apart=200.0, seed=0):
@@ -99,8 +99,10 @@ def test_no_object_can_be_lost_unseen():
     taken, unseen = {}, []
     for gone in range(0, 50, 5):
         found = compare_pictures(FIFTY, FIFTY.select(np.flatnonzero(gone != OBJECT_OF)), views, taken=taken)
-        assert found.worst.comparison.between.psnr < 20
-        unseen.append(min(view.comparison.between.psnr for view in found.views if not view.view.added) > 20)
+        assert found.worst.comparison.candidate_vs_reference.psnr < 20
+        unseen.append(
+            min(view.comparison.candidate_vs_reference.psnr for view in found.views if not view.view.added) > 20
+        )
     assert sum(unseen) > 3
     assert found.added == found.as_dict()["added"] == len(found.views) - COUNT
     assert f"{found.added} of the views were added for parts that the others overlook" in found.extremes

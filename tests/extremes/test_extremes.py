@@ -1,15 +1,15 @@
-"""Oracle: the steps that the report states, and the naive decoders of tests/sogxt; for numbers at the edge."""
+"""Oracle: the steps that the report states, and reference_decoder; for numbers at the edge."""
 
 import numpy as np
-import oracle
 import pytest
-from codec_scenes import GLANCE, assert_round_trip, assert_within, constant_scene, random_scene, replaced
+from helpers import reference_decoder
+from helpers.codec_scenes import GLANCE, assert_round_trip, assert_within, constant_scene, random_scene, replaced
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as stnp
 
 from kissgs import Settings, Splats, clean, compress, decompress
-from kissgs.splats import ATTRIBUTES, OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN, SH_REST_COUNTS, Cleaned
+from kissgs.core.splats import ATTRIBUTES, OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN, SH_REST_COUNTS, Cleaned
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
@@ -19,8 +19,8 @@ def check(splats, preset="fast", **changes):
     result = compress(splats, settings=Settings.from_preset(preset, **{"sh_tolerance": 0, **GLANCE, **changes}))
     found = decompress(result.files)
     assert all(np.isfinite(getattr(found, name)).all() for name in ATTRIBUTES)
-    oracle.assert_equal_scenes(found, oracle.decode(result.files), result.files)
-    oracle.check_browser(result.files)
+    reference_decoder.assert_equal_scenes(found, reference_decoder.decode(result.files), result.files)
+    reference_decoder.check_browser(result.files)
     assert_round_trip(clean(splats)[0], result)
     assert result.report.form_error < 1e-6
     return found, result
@@ -116,7 +116,7 @@ def test_whole_attributes_at_the_edge(attribute, low, high, preset):
     splats = random_scene(50, 2, seed=5)
     shape = getattr(splats, attribute).shape
     values = np.random.default_rng(0).uniform(low, high, shape).clip(low, high)
-    found, result = check(replaced(splats, **{attribute: values}), preset, drop_invisible=False)
+    found, result = check(replaced(splats, **{attribute: values}), preset, prune_invisible=False)
     assert len(found) == 50
     assert result.report.cleaned.removed == 0
     if attribute == "shN":
@@ -143,7 +143,7 @@ def test_one_outlier_among_thousands(attribute, preset):
 @pytest.mark.parametrize("count", [1, 65, 500])
 def test_gaussians_that_are_all_the_same(count, preset):
     splats = constant_scene(count, 3)
-    found, result = check(splats, preset, drop=0)
+    found, result = check(splats, preset, prune_threshold_bits=0)
     assert sorted(result.order) == list(range(count))
     np.testing.assert_allclose(found.shN, splats.shN, rtol=1e-6)
     assert max(result.report.half_steps["scales"]) == 0
@@ -154,7 +154,7 @@ def test_gaussians_that_are_all_the_same(count, preset):
 def test_constant_attributes(attribute, value):
     splats = random_scene(40, 1, seed=9)
     constant = np.full(getattr(splats, attribute).shape, value)
-    found, _ = check(replaced(splats, **{attribute: constant}), drop_invisible=False)
+    found, _ = check(replaced(splats, **{attribute: constant}), prune_invisible=False)
     if attribute not in ("quats", "means"):
         assert (getattr(found, attribute) == np.float32(value)).all()
 
@@ -195,8 +195,8 @@ def any_scene(draw):
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(any_scene(), st.booleans())
-def test_any_numbers_at_all(splats, drop_invisible):
-    found, result = check(splats, drop_invisible=drop_invisible)
+def test_any_numbers_at_all(splats, prune_invisible):
+    found, result = check(splats, prune_invisible=prune_invisible)
     assert found.sh_degree == splats.sh_degree
     assert len(found) + result.report.invisible + result.report.cleaned.removed == len(splats)
     assert_sh_within(found, clean(splats)[0], result)
@@ -220,5 +220,5 @@ STRANGE = {
 def test_strange_scenes_can_be_weighed(kind, count, preset):
     splats = random_scene(count, 1, seed=count)
     splats = replaced(splats, **STRANGE[kind](splats, np.random.default_rng(count)))
-    found, result = check(splats, preset, views=4, view_size=48)
+    found, result = check(splats, preset, sensitivity_views=4, sensitivity_view_size=48)
     assert len(found) == result.report.count

@@ -1,23 +1,21 @@
-"""Oracle: float64 once more (exact.py, the naive rasteriser, decoder and training): every stage at every extreme."""
+"""Every stage at every extreme. Oracle: reference implementations in float64 (tests/helpers/reference_*.py)."""
 
 import re
 import runpy
 from pathlib import Path
 
-import exact
-import naive_rasterizer
 import numpy as np
 import pytest
-import stages
 import torch
-from extreme_containers import BACKGROUND, BY_NAME, given, scene
-from extremes import BOUNDS, EXTREMES
-from naive_training import adam
-from render_scenes import in_float64
-from stages import STAGES, measured
+from helpers import extreme_stages, reference_float64, reference_rasterizer
+from helpers.extreme_containers import BACKGROUND, BY_NAME, given, scene
+from helpers.extreme_stages import STAGES, measured
+from helpers.extremes import BOUNDS, EXTREMES
+from helpers.reference_training import adam
+from helpers.render_scenes import in_float64
 
 from kissgs.compaction import regularizers
-from kissgs.splats import ATTRIBUTES
+from kissgs.core.splats import ATTRIBUTES
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "numerics.md"
@@ -49,8 +47,8 @@ UNSEEN = {"transparent", "count-0", "beside"}
 def test_the_oracles_agree_and_there_is_something_to_see(name):
     """The picture that torch differentiates is that of the naive rasteriser, and shows what the row is about."""
     splats, view = scene(name)[0], BY_NAME[name].camera()
-    found = exact.draw(exact.tensors(splats), view, BACKGROUND)
-    naive = naive_rasterizer.draw(in_float64(splats), view, np.array(BACKGROUND))
+    found = reference_float64.draw(reference_float64.tensors(splats), view, BACKGROUND)
+    naive = reference_rasterizer.draw(in_float64(splats), view, np.array(BACKGROUND))
     bright = max([1.0, *(layer[3].max() for layer in naive.layers)])
     sure = found.sure & ~naive.doubtful
     np.testing.assert_allclose(found.image.numpy()[sure] / bright, naive.image[sure] / bright, atol=1e-9)
@@ -60,11 +58,13 @@ def test_the_oracles_agree_and_there_is_something_to_see(name):
 
 def test_the_oracles_gradient_is_that_of_differences():
     splats, view = scene("degree-2")[0], BY_NAME["degree-2"].camera()
-    leaves, rng = exact.tensors(splats, leaf=True), np.random.default_rng(0)
+    leaves, rng = reference_float64.tensors(splats, leaf=True), np.random.default_rng(0)
     v_image, v_alpha = rng.normal(size=(32, 48, 3)), rng.normal(size=(32, 48))
-    found = exact.draw(leaves, view, BACKGROUND)
+    found = reference_float64.draw(leaves, view, BACKGROUND)
     ((found.image * torch.from_numpy(v_image)).sum() + (found.alpha * torch.from_numpy(v_alpha)).sum()).backward()
-    wanted = naive_rasterizer.gradient_by_differences(in_float64(splats), view, np.array(BACKGROUND), v_image, v_alpha)
+    wanted = reference_rasterizer.gradient_by_differences(
+        in_float64(splats), view, np.array(BACKGROUND), v_image, v_alpha
+    )
     for name in ATTRIBUTES:
         np.testing.assert_allclose(
             leaves[name].grad.numpy(), wanted[name], rtol=1e-5, atol=1e-6 * np.abs(wanted[name]).max()
@@ -74,10 +74,12 @@ def test_the_oracles_gradient_is_that_of_differences():
 def test_the_oracles_removal_is_a_picture_without():
     splats, view, background = scene("ordinary")[0], BY_NAME["ordinary"].camera(), np.array(BACKGROUND)
     params = in_float64(splats)
-    whole = naive_rasterizer.draw(params, view, background).image
-    others = [naive_rasterizer.draw(params, view, background, removed=n).image for n in range(len(splats))]
+    whole = reference_rasterizer.draw(params, view, background).image
+    others = [reference_rasterizer.draw(params, view, background, removed=n).image for n in range(len(splats))]
     wanted = [np.square(image - whole).sum() for image in others]
-    found = exact.removed(exact.draw(exact.tensors(splats), view, background), len(splats), background)
+    found = reference_float64.removed(
+        reference_float64.draw(reference_float64.tensors(splats), view, background), len(splats), background
+    )
     np.testing.assert_allclose(found, wanted, rtol=1e-9)
 
 
@@ -113,7 +115,7 @@ def broken(stage):
 
 @pytest.mark.usefixtures("anew")
 def test_a_lost_limit_of_positions_is_noticed(monkeypatch):
-    monkeypatch.setattr("kissgs.splats.MEAN_LIMIT", 3e38)
+    monkeypatch.setattr("kissgs.core.splats.MEAN_LIMIT", 3e38)
     assert broken("clean") == {"beyond-1e15"}
 
 
@@ -125,7 +127,7 @@ def test_rotations_normalised_in_float32_are_noticed(monkeypatch):
             unit = np.where(norm[:, None] > 0, quats / np.where(norm > 0, norm, 1)[:, None], np.float32([1, 0, 0, 0]))
         return unit, int((norm == 0).sum()), int(((norm > 0) & (np.abs(norm - 1) > 1e-3)).sum())
 
-    monkeypatch.setattr("kissgs.splats._unit_quats", hasty)
+    monkeypatch.setattr("kissgs.core.splats._unit_quats", hasty)
     assert broken("clean") == {"short-quaternions", "long-quaternions", "denormal"}
 
 
@@ -138,7 +140,7 @@ def test_effective_rank_by_the_book_is_noticed(monkeypatch):
         entropy = -(share * share.log()).sum(dim=1)
         return (-torch.log(entropy.exp() - 1 + regularizers.EPSILON)).clamp_min(0)
 
-    monkeypatch.setattr(stages, "needle_loss", by_the_book)
+    monkeypatch.setattr(extreme_stages, "needle_loss", by_the_book)
     assert broken("rank") >= {"needles", "cauchy"}
 
 

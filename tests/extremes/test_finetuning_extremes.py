@@ -2,19 +2,19 @@
 
 import numpy as np
 import pytest
-from test_training_extremes import SCENES, changed
-from training_scenes import around, cloud
+from helpers.degenerate_scenes import SCENES, changed
+from helpers.training_scenes import around, cloud
 
 import kissgs
 from kissgs import Settings
-from kissgs.splats import ATTRIBUTES
-from kissgs.views.view import Views, black
+from kissgs.cameras.views import Views, black
+from kissgs.core.splats import ATTRIBUTES
 
-QUICK = {"wanted": True, "steps": 25, "rate": 0.1, "view_size": 48}
+QUICK = {"enabled": True, "steps": 25, "lr": 0.1, "view_size": 48}
 
 
 def check(scene, preset="balanced", **changes):
-    settings = Settings.from_preset(preset, finetune={**QUICK, **changes}, view_size=48)
+    settings = Settings.from_preset(preset, finetune={**QUICK, **changes}, sensitivity_view_size=48)
     views = Views(around(5), around(3), black(), "circle")
     result = kissgs.compress(scene, settings=settings, views=views)
     found = kissgs.decompress(result.to_zip())

@@ -3,23 +3,23 @@
 import numpy as np
 import pytest
 import torch
-from codec_scenes import GLANCE, random_scene, replaced
-from render_scenes import blobs, camera, one, together
-from test_rasterizer import pictures
-from training_scenes import cloud
+from helpers.codec_scenes import GLANCE, random_scene, replaced
+from helpers.rasterized import pictures
+from helpers.render_scenes import blobs, camera, one, together
+from helpers.training_scenes import cloud
 
 import kissgs
 from kissgs import Settings
-from kissgs.importance import LARGEST, OPACITY, ROTATION, SCALES, Importance
-from kissgs.parallel import Workers
+from kissgs.cameras.views import black
+from kissgs.core.sensitivity import LARGEST, OPACITY, ROTATION, SCALES, Sensitivity
+from kissgs.core.splats import ATTRIBUTES
+from kissgs.core.threads import Workers
 from kissgs.rendering.camera import look_at
 from kissgs.rendering.cpu.frame import draw
-from kissgs.rendering.importance import Watch, _bound, measure_importance
+from kissgs.rendering.sensitivity import WeightedCameras, _bound, measure_sensitivity
 from kissgs.sogxt.encode import encode
-from kissgs.splats import ATTRIBUTES
-from kissgs.training.leaves import Leaves
-from kissgs.training.trainee import BOUNDS, Trainee
-from kissgs.views.view import black
+from kissgs.training.model import BOUNDS, GaussianModel
+from kissgs.training.optimizer import PrunableAdam
 
 
 def compressed(splats, preset="fast"):
@@ -36,8 +36,8 @@ def test_steps_of_a_world_1e6_across():
 
 def test_what_no_picture_shows_has_the_steps_of_the_settings():
     scene, settings = kissgs.clean(random_scene(200, 1))[0], Settings.from_preset("balanced").encode
-    unseen = encode(scene, settings, importance=Importance.none(200, 1))
-    assert unseen.price is None
+    unseen = encode(scene, settings, sensitivity=Sensitivity.none(200, 1))
+    assert unseen.rd_lambda is None
     assert unseen.files == encode(scene, settings).files
 
 
@@ -63,14 +63,15 @@ def test_costs_are_cut_off():
     assert (forms[2] == np.eye(28)[SCALES[0]] * 7).all()
     for size in (-30, 30):
         giants = replaced(cloud(20), scales=np.full((20, 3), size))
-        found = measure_importance(giants, Watch([camera()], [1.0], black()), hedge=0.3)
+        found = measure_sensitivity(giants, WeightedCameras([camera()], [1.0], black()), view_uncertainty=0.3)
         assert all(
-            0 <= np.abs(values).max() <= np.float32(LARGEST) for values in (found.places, found.shapes, found.colors)
+            0 <= np.abs(values).max() <= np.float32(LARGEST)
+            for values in (found.position_hessian, found.shape_hessian, found.color_weight)
         )
 
 
 def test_gradients_above_1e15_count_as_that():
-    leaves = Leaves({"a": torch.zeros(4, 1)})
+    leaves = PrunableAdam({"a": torch.zeros(4, 1)})
     leaves.by_name["a"].grad = torch.tensor([[1e30], [1e15], [-np.inf], [-3e38]])
     leaves.step({"a": 1.0})
     assert leaves.state()["a.exp_avg"].ravel() / 1e14 == pytest.approx([1, 1, 0, -1])
@@ -78,14 +79,14 @@ def test_gradients_above_1e15_count_as_that():
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_values_stay_within_what_a_scene_can_hold(sign):
-    trainee = Trainee(cloud(5))
+    model = GaussianModel(cloud(5))
     for _ in range(3):
-        for leaf in trainee.parameters.values():
+        for leaf in model.parameters.values():
             leaf.grad = torch.full_like(leaf, -sign)
-        trainee.step(dict.fromkeys(ATTRIBUTES, 1e16))
+        model.step(dict.fromkeys(ATTRIBUTES, 1e16))
     for name, (least, most) in BOUNDS.items():
-        assert (trainee.parameters[name].detach().numpy() == np.float32(most if sign > 0 else least)).all(), name
-    assert len(trainee.splats()) == 5
+        assert (model.parameters[name].detach().numpy() == np.float32(most if sign > 0 else least)).all(), name
+    assert len(model.splats()) == 5
 
 
 @pytest.mark.parametrize("length", [1e-38, 0.9e-12, 1.1e-12, 1e-6, 1e6, 1e18])

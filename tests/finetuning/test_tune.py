@@ -7,34 +7,34 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from training_scenes import around, cloud
-from tuning_scenes import chosen
+from helpers.training_scenes import around, cloud
+from helpers.tuning_scenes import chosen
 
 import kissgs
 from kissgs import FinetuneSettings, OutputError, Settings, UnsupportedError, decompress
+from kissgs.cameras.views import Views, black
+from kissgs.core.progress import silent
 from kissgs.finetuning.tune import Tuner, _Mark
-from kissgs.info import describe
-from kissgs.progress import silent
+from kissgs.pipeline.inspect import describe
 from kissgs.sogxt.container import zip_bytes
-from kissgs.sogxt.encode import write
+from kissgs.sogxt.encode import write_files
 from kissgs.sogxt.names import YAML_NAME
 from kissgs.training.checkpoint import Checkpoint
-from kissgs.views.view import Views, black
 
-SHORT = {"wanted": True, "steps": 12, "rate": 0.2, "entry_rate": 0.3, "renderings_rate": 1.0}
+SHORT = {"enabled": True, "steps": 12, "lr": 0.2, "codebook_lr": 0.3, "synthetic_lr_scale": 1.0}
 SHORT |= {"views": 16, "view_size": 60}
-GENTLE = {"steps": 60, "rate": 0.05, "entry_rate": 0.05}
+GENTLE = {"steps": 60, "lr": 0.05, "codebook_lr": 0.05}
 COARSE = {"scale_step": 0.4, "opacity_step": 1.0, "sh0_step": 0.3, "quat_step": 0.1}
 
 
 def tuner(scene, size=40, **changes):
     capture = Views(around(12, size), around(7, size)[1:3], black(), "circle")
-    return Tuner.of(scene, FinetuneSettings(**{**SHORT, "around": 0.0, **changes}), capture, threads=1)
+    return Tuner.of(scene, FinetuneSettings(**{**SHORT, "synthetic_view_share": 0.0, **changes}), capture, threads=1)
 
 
 def written(scene, settings):
     def files(choice, steps, progress):
-        return write(choice, scene, settings, finetune_steps=steps, threads=1)
+        return write_files(choice, scene, settings, finetune_steps=steps, threads=1)
 
     return files
 
@@ -54,21 +54,21 @@ def test_pictures_come_nearer_to_those_of_the_scene_as_it_was(degree):
     encoded, report = tuned(scene, steps=150)
     assert report.kept
     assert report.psnr_after > report.psnr_before + 0.8
-    assert report.taught_by == "renderings"
+    assert report.target_source == "renderings"
     assert report.bytes_after == len(zip_bytes(encoded.files))
     assert len(decompress(encoded.files)) == 150
 
 
 def test_bytes_become_fewer_where_they_weigh_more():
     scene = cloud(400, 1)
-    found = [tuned(scene, code_length=weight, steps=60)[1] for weight in (0.0, 3.0, 30.0)]
+    found = [tuned(scene, rate_weight=weight, steps=60)[1] for weight in (0.0, 3.0, 30.0)]
     assert found[2].bytes_after < found[1].bytes_after < found[0].bytes_after
     assert found[2].psnr_after < found[0].psnr_after
 
 
 def test_what_does_not_help_is_not_kept():
     scene = cloud(80)
-    encoded, report = tuned(scene, rate=5.0, entry_rate=5.0, rate_end=1.0)
+    encoded, report = tuned(scene, lr=5.0, codebook_lr=5.0, final_lr_scale=1.0)
     assert not report.kept
     assert "did not help" in report.note
     assert report.psnr_after < report.psnr_before
@@ -126,7 +126,7 @@ def test_a_checkpoint_of_other_work_is_not_taken_up(tmp_path, monkeypatch):
     with pytest.raises(Interrupted):
         tuned(cloud(60), checkpoint=path, progress=stopping_after(3))
     for other in (
-        partial(tuned, cloud(60), rate=0.03),
+        partial(tuned, cloud(60), lr=0.03),
         partial(tuned, cloud(61)),
         partial(tuned, cloud(60), preset="paper", encode={}),
     ):
@@ -155,7 +155,7 @@ def test_compress_does_it_and_says_so(tmp_path):
     result = kissgs.compress(cloud(200), tmp_path / "a.zip", settings=settings, checkpoint=tmp_path / "c.npz")
     report = result.report
     assert report.finetuning.steps == 12
-    assert report.as_dict()["finetuning"]["taught_by"] == "renderings"
+    assert report.as_dict()["finetuning"]["target_source"] == "renderings"
     assert report.finetuning.source.endswith("virtual cameras")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.zip"]
     again = kissgs.compress(cloud(200), settings=settings, checkpoint=tmp_path / "c.npz")
@@ -171,7 +171,7 @@ def test_compress_does_it_and_says_so(tmp_path):
 def test_more_gaussians_go_before_training_than_without_it(monkeypatch, encode, finetune, fewer):
     """As many as without training at that threshold; and none where all shall stay."""
     scene = cloud(600, 1)
-    chosen = {"fidelity": -12, "views": 4, "view_size": 60}
+    chosen = {"quality_offset_db": -12, "sensitivity_views": 4, "sensitivity_view_size": 60}
 
     def better_after_training(self, encoded, progress):
         return _Mark(len(zip_bytes(encoded.files)), psnr=30.0, error=1.0 - (b"finetune" in encoded.files[YAML_NAME]))
@@ -179,21 +179,25 @@ def test_more_gaussians_go_before_training_than_without_it(monkeypatch, encode, 
     monkeypatch.setattr(Tuner, "_judge", better_after_training)
 
     def made(drop, tuning=None):
-        return kissgs.compress(scene, settings=Settings.from_preset("balanced", **chosen, drop=drop, finetune=tuning))
+        return kissgs.compress(
+            scene, settings=Settings.from_preset("balanced", **chosen, prune_threshold_bits=drop, finetune=tuning)
+        )
 
-    found = made(encode, SHORT | {"drop": finetune})
-    assert found.report.negligible == made(max(encode, finetune) if encode else 0).report.negligible
+    found = made(encode, SHORT | {"prune_threshold_bits": finetune})
+    assert found.report.pruned_by_rd == made(max(encode, finetune) if encode else 0).report.pruned_by_rd
     assert found.report.finetuning.bytes_before == made(encode).report.container_bytes
-    assert (found.report.negligible > made(encode).report.negligible) == fewer
+    assert (found.report.pruned_by_rd > made(encode).report.pruned_by_rd) == fewer
     drop = float(max(encode, finetune) if encode else 0)
-    assert f"drop: {drop}\n".encode() in found.files[YAML_NAME]
+    assert f"prune_threshold_bits: {drop}\n".encode() in found.files[YAML_NAME]
 
 
 def test_a_size_is_met_by_the_fine_tuned_container():
     scene = cloud(600, 1)
-    plain = kissgs.compress(scene, settings=Settings(encode={"views": 4, "view_size": 60}))
+    plain = kissgs.compress(scene, settings=Settings(encode={"sensitivity_views": 4, "sensitivity_view_size": 60}))
     size = int(0.8 * plain.report.container_bytes)
-    settings = Settings.from_preset("balanced", finetune={**SHORT, **GENTLE}, target_size=size, views=4, view_size=60)
+    settings = Settings.from_preset(
+        "balanced", finetune={**SHORT, **GENTLE}, target_size=size, sensitivity_views=4, sensitivity_view_size=60
+    )
     found = kissgs.compress(scene, settings=settings)
     assert found.report.container_bytes <= size
     assert found.report.finetuning is not None
@@ -206,8 +210,8 @@ def test_a_size_that_is_met_without_fine_tuning_is_met_with_it(monkeypatch):
     def sizes(files, *, packed):
         return 900 + 900 * (b"finetune" in files[YAML_NAME]), {}
 
-    monkeypatch.setattr("kissgs.goal.stored_sizes", sizes)
-    chosen = {"target_size": 1000, "views": 4, "view_size": 60}
+    monkeypatch.setattr("kissgs.pipeline.rate_control.stored_sizes", sizes)
+    chosen = {"target_size": 1000, "sensitivity_views": 4, "sensitivity_view_size": 60}
     gentle = Settings.from_preset("balanced", finetune={**SHORT, **GENTLE}, **chosen)
     found = kissgs.compress(cloud(60), settings=gentle)
     assert b"finetune" not in found.files[YAML_NAME]
@@ -217,7 +221,9 @@ def test_a_size_that_is_met_without_fine_tuning_is_met_with_it(monkeypatch):
 
 def test_a_search_leaves_other_files_alone(tmp_path):
     (tmp_path / "c-finetune.npz").write_bytes(b"mine")
-    settings = Settings.from_preset("balanced", finetune=SHORT, target_size=50_000, views=4, view_size=60)
+    settings = Settings.from_preset(
+        "balanced", finetune=SHORT, target_size=50_000, sensitivity_views=4, sensitivity_view_size=60
+    )
     found = kissgs.compress(cloud(60), tmp_path / "a.zip", settings=settings, checkpoint=tmp_path / "c.npz")
     assert (tmp_path / "c-finetune.npz").read_bytes() == b"mine"
     assert found.checkpoints == ()
@@ -240,7 +246,9 @@ def test_a_psnr_to_the_scene_is_not_sought_where_photographs_teach(tmp_path):
     for view in around(3):
         Image.new("RGB", (view.camera.width, view.camera.height)).save(tmp_path / f"{view.name}.png")
         views.append(replace(view, photo=tmp_path / f"{view.name}.png"))
-    settings = Settings.from_preset("balanced", finetune=SHORT, psnr=30.0, views=4, view_size=60)
+    settings = Settings.from_preset(
+        "balanced", finetune=SHORT, psnr=30.0, sensitivity_views=4, sensitivity_view_size=60
+    )
     with pytest.raises(UnsupportedError, match="ask for a size"):
         kissgs.compress(cloud(60), settings=settings, views=Views(tuple(views), (), black(), "photos"))
 

@@ -6,10 +6,10 @@ import struct
 
 import numpy as np
 import pytest
-from naive_compressed_ply import SH_C0, compressed_bytes, header_bytes
-from naive_ply import assert_identical
+from helpers.reference_compressed_ply import SH_C0, compressed_bytes, header_bytes
+from helpers.reference_ply import assert_identical
 
-from kissgs.errors import InvalidSceneError, UnsupportedError
+from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.io import ply_body
 from kissgs.io.ply import PlyInfo, read_ply, read_ply_info
 

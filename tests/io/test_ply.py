@@ -10,7 +10,7 @@ import sys
 
 import numpy as np
 import pytest
-from naive_ply import (
+from helpers.reference_ply import (
     ENCODINGS,
     STRUCT_CODES,
     assert_identical,
@@ -23,10 +23,10 @@ from naive_ply import (
     random_columns,
 )
 
-from kissgs.errors import Cancelled, InvalidSceneError
+from kissgs.core.errors import Cancelled, InvalidSceneError
+from kissgs.core.splats import Splats
 from kissgs.io import ply_body
 from kissgs.io.ply import PlyInfo, read_ply, read_ply_info, write_ply
-from kissgs.splats import Splats
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)

@@ -4,10 +4,10 @@ import os
 from pathlib import Path
 
 import pytest
-from memory import takes_less_than
-from naive_ply import declaration, header_bytes, names, ply_bytes, random_columns
+from helpers.memory import takes_less_than
+from helpers.reference_ply import declaration, header_bytes, names, ply_bytes, random_columns
 
-from kissgs.errors import InvalidSceneError, UnsupportedError
+from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.io import ply_body
 from kissgs.io.ply import read_ply, read_ply_info
 

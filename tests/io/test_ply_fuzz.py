@@ -3,15 +3,15 @@
 import io
 
 import pytest
+from helpers.memory import takes_less_than
+from helpers.reference_compressed_ply import header_bytes as compressed_header
+from helpers.reference_ply import ENCODINGS, STRUCT_CODES, assert_identical, ply_bytes, random_columns
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from memory import takes_less_than
-from naive_compressed_ply import header_bytes as compressed_header
-from naive_ply import ENCODINGS, STRUCT_CODES, assert_identical, ply_bytes, random_columns
 
-from kissgs.errors import KissgsError
+from kissgs.core.errors import KissgsError
+from kissgs.core.splats import clean
 from kissgs.io.ply import read_ply, read_ply_info, write_ply
-from kissgs.splats import clean
 
 MEMORY = 20_000_000
 """Bytes; the files here are below 20 kB, so anything near this came from trusting a count."""

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from whole_scenes import joined, moved
+from helpers.whole_scenes import joined, moved
 
 from kissgs import Splats, sample_scene
-from kissgs.parallel import Workers
+from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera, look_at
 from kissgs.rendering.coverage import Coverage
 from kissgs.rendering.local_scale import local_scale
@@ -80,15 +80,15 @@ def test_small_and_coincident_scenes_have_positive_scales(count: int):
 
 
 def looked_at(splats: Splats, *cameras: Camera) -> np.ndarray:
-    from kissgs.importance import Importance
+    from kissgs.core.sensitivity import Sensitivity
     from kissgs.rendering.cpu.frame import add_sensitivities, draw
 
     coverage = Coverage(splats)
     with Workers(1) as pool:
         for camera in cameras:
-            shown = Importance.none(len(splats), splats.sh_degree)
+            shown = Sensitivity.none(len(splats), splats.sh_degree)
             add_sensitivities(draw(splats, camera, np.zeros(3, np.float32), pool), 1.0, 0.0, shown, pool)
-            coverage.add(camera, shown.colors)
+            coverage.add(camera, shown.color_weight)
     return coverage.share
 
 

@@ -9,11 +9,12 @@ import types
 import numpy as np
 import pytest
 import torch
-from render_scenes import blobs, camera
+from helpers.render_scenes import blobs, camera
 
-from kissgs.errors import UnsupportedError
-from kissgs.rendering.differentiable import rasterize, tensors_of
+from kissgs.core.errors import UnsupportedError
+from kissgs.rendering.differentiable import rasterize
 from kissgs.rendering.gsplat_backend import rasterize_on_cuda
+from kissgs.rendering.tensors import tensors_of
 
 CLASSIC = {"near_plane": 0.01, "far_plane": 1e10, "eps2d": 0.3, "tile_size": 16, "rasterize_mode": "classic"}
 

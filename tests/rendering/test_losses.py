@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.ndimage import correlate1d
 
-from kissgs.errors import InvalidViewsError
+from kissgs.core.errors import InvalidViewsError
 from kissgs.rendering.losses import photometric_loss, plain_photometric_loss
 from kissgs.rendering.metrics import ssim
 

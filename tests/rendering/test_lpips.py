@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from kissgs.errors import InvalidViewsError, UnsupportedError
+from kissgs.core.errors import InvalidViewsError, UnsupportedError
 from kissgs.rendering.lpips import Lpips
 
 

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from kissgs.errors import InvalidViewsError
-from kissgs.parallel import Workers
+from kissgs.core.errors import InvalidViewsError
+from kissgs.core.threads import Workers
 from kissgs.rendering.metrics import difference_and_ssim, psnr, ssim
 
 C1, C2 = 0.01**2, 0.03**2

@@ -1,19 +1,21 @@
-"""Oracle: naive_rasterizer, a float64 renderer that shares nothing with the one under test. On all devices."""
+"""Oracle: reference_rasterizer, a float64 renderer that shares nothing with the one under test. On all devices."""
 
-import naive_rasterizer
 import numpy as np
 import pytest
 import torch
+from helpers import reference_rasterizer
+from helpers.rasterized import pictures
+from helpers.render_scenes import blobs, camera, in_float64, one, together
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from render_scenes import blobs, camera, in_float64, one, together
 
-from kissgs.errors import InvalidSceneError, InvalidViewsError, KissgsError, UnsupportedError
+from kissgs.core.errors import InvalidSceneError, InvalidViewsError, KissgsError, UnsupportedError
+from kissgs.core.splats import ATTRIBUTES
 from kissgs.rendering.camera import Camera
-from kissgs.rendering.differentiable import rasterize, tensors_of
+from kissgs.rendering.differentiable import rasterize
 from kissgs.rendering.gsplat_backend import alpha_max
 from kissgs.rendering.rasterizer import BLACK, load_kernels, render
-from kissgs.splats import ATTRIBUTES
+from kissgs.rendering.tensors import tensors_of
 
 
 def _cuda_is_missing():
@@ -30,30 +32,13 @@ CUDA = pytest.param("cuda", marks=pytest.mark.skipif(_cuda_is_missing() is not N
 devices = pytest.mark.parametrize("device", ["cpu", CUDA])
 
 
-def pictures(splats, cameras, device="cpu", backgrounds=None, **parameters):
-    """Images and alphas as tensors, and the parameters they came from."""
-    tensors = {name: tensor.clone().requires_grad_() for name, tensor in tensors_of(splats, device).items()}
-    images, alphas = rasterize(
-        **tensors,
-        viewmats=torch.from_numpy(np.stack([c.viewmat for c in cameras])),
-        Ks=torch.from_numpy(np.stack([c.K for c in cameras])),
-        width=cameras[0].width,
-        height=cameras[0].height,
-        backgrounds=None
-        if backgrounds is None
-        else torch.tensor(np.array(backgrounds), dtype=torch.float32, device=device),
-        **parameters,
-    )
-    return images, alphas, tensors
-
-
 def clamp_of(device):
     return alpha_max() if device == "cuda" else 0.99
 
 
 def agree(splats, view, background, device="cpu", tolerance=1e-4):
     images, alphas, _ = pictures(splats, [view], device, [background])
-    expected = naive_rasterizer.draw(in_float64(splats), view, np.array(background), alpha_max=clamp_of(device))
+    expected = reference_rasterizer.draw(in_float64(splats), view, np.array(background), alpha_max=clamp_of(device))
     sure = ~expected.doubtful
     np.testing.assert_allclose(images[0].detach().cpu().numpy()[sure], expected.image[sure], atol=tolerance, rtol=0)
     np.testing.assert_allclose(alphas[0].detach().cpu().numpy()[sure], expected.alpha[sure], atol=tolerance, rtol=0)
@@ -143,10 +128,10 @@ def compare_gradients(splats, view, device, seed, tolerance=1e-3):
     background = rng.random(3)
     params = in_float64(splats)
     clamp = clamp_of(device)
-    sure = ~naive_rasterizer.draw(params, view, background, alpha_max=clamp).doubtful
+    sure = ~reference_rasterizer.draw(params, view, background, alpha_max=clamp).doubtful
     v_image = rng.normal(0, 1, (view.height, view.width, 3)) * sure[:, :, None]
     v_alpha = rng.normal(0, 1, (view.height, view.width)) * sure
-    expected = naive_rasterizer.gradient_by_differences(params, view, background, v_image, v_alpha, alpha_max=clamp)
+    expected = reference_rasterizer.gradient_by_differences(params, view, background, v_image, v_alpha, alpha_max=clamp)
     images, alphas, tensors = pictures(splats, [view], device, [background])
     loss = (images[0].cpu() * torch.from_numpy(v_image)).sum() + (alphas[0].cpu() * torch.from_numpy(v_alpha)).sum()
     loss.backward()

@@ -8,15 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.rasterized import all_is_finite, pictures
+from helpers.render_scenes import blobs, camera, one, together
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from render_scenes import blobs, camera, one, together
-from test_rasterizer import pictures
 
-from kissgs.parallel import Workers
-from kissgs.rendering.cpu.frame import draw
-from kissgs.rendering.cpu.frame import removal_scores as scores_of
-from kissgs.splats import Splats
+from kissgs.core.splats import Splats
 
 finite32 = {"allow_nan": False, "allow_infinity": False, "width": 32}
 anywhere = st.one_of(
@@ -34,20 +31,6 @@ gaussian = st.builds(
     shN=st.lists(st.floats(-100, 100, **finite32), min_size=9, max_size=9),
 )
 sizes = st.sampled_from([(1, 1), (1, 4096), (4096, 1), (16, 16), (17, 15)])
-
-
-def all_is_finite(splats, view):
-    images, alphas, tensors = pictures(splats, [view], backgrounds=[[1.0, 0.5, 0.0]])
-    assert torch.isfinite(images).all()
-    assert torch.isfinite(alphas).all()
-    assert ((alphas >= 0) & (alphas <= 1)).all()
-    (images.sum() + alphas.sum()).backward()
-    for name, tensor in tensors.items():
-        assert torch.isfinite(tensor.grad).all(), name
-    with Workers(1) as pool:
-        scores = scores_of(draw(splats, view, np.zeros(3, np.float32), pool), pool)
-    assert np.isfinite(scores).all()
-    assert (scores >= 0).all()
 
 
 @settings(max_examples=150, deadline=None)
@@ -91,8 +74,8 @@ BOUNDS = """
 import sys
 sys.path.insert(0, sys.argv[1])
 import numpy as np, torch
-from render_scenes import blobs, camera, one, together
-from test_render_extremes import all_is_finite
+from helpers.render_scenes import blobs, camera, one, together
+from helpers.rasterized import all_is_finite
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.losses import photometric_loss
 for degree, size in enumerate(((1, 1), (33, 50), (1, 4096), (300, 7))):
@@ -111,6 +94,6 @@ for degree, size in enumerate(((1, 1), (33, 50), (1, 4096), (300, 7))):
 def test_kernels_stay_within_their_arrays(tmp_path):
     """With numba's bounds checks on, in a process and with a cache of its own."""
     environment = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path)}
-    command = [sys.executable, "-c", BOUNDS, str(Path(__file__).parent)]
+    command = [sys.executable, "-c", BOUNDS, str(Path(__file__).parents[1])]
     done = subprocess.run(command, check=False, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]

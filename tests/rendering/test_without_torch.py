@@ -7,15 +7,15 @@ CODE = """
 import sys
 sys.modules["torch"] = None
 import kissgs, pytest
-from kissgs.errors import UnsupportedError
+from kissgs.core.errors import UnsupportedError
 scene = kissgs.sample_scene(300, sh_degree=1)
 views = kissgs.virtual_views(scene, width=32, height=24, count=2)
 result = kissgs.evaluate(scene, kissgs.decompress(kissgs.compress(scene).files), views)
-assert result.mean.between.psnr > 15
+assert result.mean.candidate_vs_reference.psnr > 15
 for module in ("differentiable", "losses"):
     with pytest.raises(UnsupportedError, match="train"):
         __import__(f"kissgs.rendering.{module}")
-from kissgs.evaluation.speed import rendering_cost
+from kissgs.benchmark.render_speed import rendering_cost
 with pytest.raises(UnsupportedError, match="train"):
     rendering_cost(scene, [views.train[0].camera])
 with pytest.raises(UnsupportedError, match="cuda"):

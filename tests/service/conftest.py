@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
-from data_folders import jobs_folder, no_variables, sample_folder  # noqa: F401
-from preview_browser import preview, software_browser  # noqa: F401
-from serving import Service
+from helpers.data_folders import jobs_folder, no_variables, sample_folder  # noqa: F401
+from helpers.preview_browser import preview, software_browser  # noqa: F401
+from helpers.service import Service
 
-from service.models import Base
+from service.core.models import Base
 
 
 @pytest.fixture(scope="package")

@@ -12,10 +12,10 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from serving import FAST, SLOW, SMALL, Service, problem, scene_bytes
+from helpers.service import FAST, SLOW, SMALL, Service, problem, scene_bytes
 
 import kissgs
-from service.runner import Child
+from service.jobs.runner import JobProcess
 
 BIG = scene_bytes(20_000, 3)
 MEDIUM = scene_bytes(6_000, 2)
@@ -229,9 +229,9 @@ def test_a_job_that_needs_too_much_memory(start):
 def test_libraries_that_meet_the_memory_limit_in_their_own_words(tmp_path, last_words):
     trace = tmp_path / "stderr.txt"
     trace.write_text(last_words)
-    assert Child(seconds=1)._explain(-signal.SIGABRT, trace).data["code"] == "memory-limit"
+    assert JobProcess(seconds=1)._explain(-signal.SIGABRT, trace).data["code"] == "memory-limit"
     trace.write_text("Segmentation fault")
-    assert Child(seconds=1)._explain(-signal.SIGSEGV, trace).kind == "crashed"
+    assert JobProcess(seconds=1)._explain(-signal.SIGSEGV, trace).kind == "crashed"
 
 
 def test_a_job_that_takes_too_long(start):
@@ -398,36 +398,36 @@ def test_two_services_cannot_share_a_folder(start, tmp_path):
 
 def test_the_clock_jumps(tmp_path, monkeypatch):
     """A year forward, and back: nothing expires before its time, nothing takes less than no time."""
-    from service.app import build
-    from service.janitor import Janitor
-    from service.models import State
-    from service.settings import ServiceSettings
+    from service.core.models import State
+    from service.core.settings import ServiceSettings
+    from service.http.app import build
+    from service.jobs.expiry import ExpiryTask
 
     monkeypatch.setenv("KISSGS_DATA_DIR", str(tmp_path / "data"))
     context = build(ServiceSettings.from_environment())
-    upload = context.folders.new_upload()
+    upload = context.storage.new_upload()
     upload.write_bytes(SMALL)
     job = make_job(upload, context)
     real = time.time
     for jump in (365 * 86400, -365 * 86400):
         monkeypatch.setattr(time, "time", lambda jump=jump: real() + jump)
         asyncio.run(run_one(context))
-        Janitor(context, 0.0).sweep()
+        ExpiryTask(context, 0.0).sweep()
         found = context.store.get(job.id)
         assert found.state == State.SUCCEEDED
         assert 0 <= found.finished_at - found.started_at < 60
         assert 0 <= found.started_at - found.created_at < 60
     context.store.close()
-    context.folders.close()
+    context.storage.close()
     restarted = build(ServiceSettings.from_environment())  # a year back: time goes on from where it was
     assert 0 <= restarted.clock() - found.finished_at < 60
-    restarted.folders.close()
+    restarted.storage.close()
 
 
 def make_job(upload, context):
     import uuid
 
-    from service.models import Job
+    from service.core.models import Job
 
     job = Job(
         id=uuid.uuid4().hex,
@@ -443,7 +443,7 @@ def make_job(upload, context):
         fingerprint="0",
         disk_bytes=0,
     )
-    context.folders.adopt(upload, job.id)
+    context.storage.adopt(upload, job.id)
     return context.admission.add(job)
 
 

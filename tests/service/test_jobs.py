@@ -8,11 +8,11 @@ import time
 import zipfile
 
 import pytest
-from serving import FAST, SLOW, SMALL, events, problem, scene_bytes
+from helpers.service import FAST, SLOW, SMALL, events, problem, scene_bytes
 
 import kissgs
-from service.problems import ProblemError
-from service.submission import parse_options
+from service.core.problems import ProblemError
+from service.http.submission import parse_options
 
 
 @pytest.fixture(scope="module")
@@ -65,12 +65,12 @@ def test_training_in_a_job(service):
     changes = {"count": 100, "sparsify_steps": 4, "refine_steps": 4, "views": 24, "view_size": 48}
     status = service.ended(service.submit(options=json.dumps({"preset": "fast", "compact": changes})))
     assert (status["state"], status["compacted"]) == ("succeeded", 200)
-    assert status["timings"]["stages"].keys() >= {"score", "lessons", "sparsify", "refine"}
+    assert status["timings"]["stages"].keys() >= {"score", "targets", "sparsify", "refine"}
 
 
 @pytest.mark.parametrize(
     "compact",
-    [{"ratio": 2}, {"count": 0}, {"count": 5, "ratio": 0.1}, {"max_psnr_drop": -1}, {"speed": 1}, {"by_goal": True}],
+    [{"ratio": 2}, {"count": 0}, {"count": 5, "ratio": 0.1}, {"max_psnr_drop": -1}, {"speed": 1}, {"auto_count": True}],
 )
 def test_impossible_budgets_are_refused(service, compact):
     answer = service.http.post("/v1/jobs", content=SMALL, params={"options": json.dumps({"compact": compact})})
@@ -78,7 +78,7 @@ def test_impossible_budgets_are_refused(service, compact):
 
 
 def test_a_service_without_torch_does_not_accept_what_it_cannot_do(monkeypatch):
-    monkeypatch.setattr("service.submission.can_train", lambda: False)
+    monkeypatch.setattr("service.http.submission.can_train", lambda: False)
     with pytest.raises(ProblemError, match="no torch to train with"):
         parse_options('{"compact": {"ratio": 0.2}}')
     assert parse_options('{"preset": "fast", "compact": {"ratio": 0.2}}').kind == "fast+compact"
@@ -96,15 +96,22 @@ def test_which_training_can_be_taken_up(compact, resumable):
 
 
 def test_a_goal_and_as_many_gaussians_as_it_needs(service):
-    prune = {"by_goal": True, "attempts": 1, "sparsify_steps": 0, "refine_steps": 0, "views": 24, "view_size": 48}
-    options = {"encode": {"target_size": "6kB", "views": 4, "view_size": 48}, "compact": prune}
+    prune = {
+        "auto_count": True,
+        "max_compactions": 1,
+        "sparsify_steps": 0,
+        "refine_steps": 0,
+        "views": 24,
+        "view_size": 48,
+    }
+    options = {"encode": {"target_size": "6kB", "sensitivity_views": 4, "sensitivity_view_size": 48}, "compact": prune}
     assert not parse_options(json.dumps(options)).resumable
     status = service.ended(service.submit(options=json.dumps(options)))
     assert status["state"] == "succeeded", status
     assert status["sizes"]["container"] <= 6000
     report = service.http.get(status["links"]["report"]).json()
     assert len({trial["count"] for trial in report["trials"]}) > 1
-    lost = service.ended(service.submit(options=json.dumps({"encode": {"max_psnr_drop": 0.5, "views": 4}})))
+    lost = service.ended(service.submit(options=json.dumps({"encode": {"max_psnr_drop": 0.5, "sensitivity_views": 4}})))
     assert lost["state"] == "succeeded", lost
 
 
@@ -403,7 +410,7 @@ def test_evaluating(service):
     job = service.submit(options='{"preset": "fast", "evaluate": true}')
     evaluation = service.ended(job, seconds=120)["evaluation"]
     expected = kissgs.compress(SMALL, settings=kissgs.Settings(preset="fast"), evaluate=True).report.evaluation
-    assert evaluation["psnr"] == pytest.approx(expected.mean.between.psnr, abs=1e-6)
+    assert evaluation["psnr"] == pytest.approx(expected.mean.candidate_vs_reference.psnr, abs=1e-6)
     assert evaluation["worst"] == json.loads(json.dumps(expected.worst.where()))
     assert evaluation["fifth_percentile"] == pytest.approx(expected.fifth_percentile, abs=1e-6)
     assert evaluation["shown"] == pytest.approx(expected.shown)

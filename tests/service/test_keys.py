@@ -3,7 +3,7 @@
 import hashlib
 
 import pytest
-from serving import FAST, SLOW, SMALL, problem, scene_bytes
+from helpers.service import FAST, SLOW, SMALL, problem, scene_bytes
 
 KEYS = {"alice": ["kissgs_a1", "kissgs_a2"], "bob": ["kissgs_b"]}
 

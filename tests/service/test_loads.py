@@ -12,7 +12,7 @@ import time
 import uuid
 
 import pytest
-from serving import SLOW, SMALL, events, problem, said, scene_bytes
+from helpers.service import SLOW, SMALL, events, problem, said, scene_bytes
 
 BIG = scene_bytes(20_000, 3)
 
@@ -173,13 +173,13 @@ def test_a_fault_of_ours_is_said_to_be_one(tmp_path):
     """It looked like a crash from outside: the interpreter could not end while a thread waited for standard input."""
     import asyncio
 
-    from service.runner import Child
+    from service.jobs.runner import JobProcess
 
     async def ignore(stage, fraction, note):
         pass
 
     order = {"task": "no such task", "work": str(tmp_path), "source": "", "memory": 1 << 30}
-    outcome = asyncio.run(Child(seconds=30).run(order, ignore))
+    outcome = asyncio.run(JobProcess(seconds=30).run(order, ignore))
     assert (outcome.kind, outcome.data["code"]) == ("error", "internal")
 
 
@@ -255,16 +255,16 @@ def test_a_fault_has_an_id(start):
 def test_what_nobody_foresaw_is_a_problem_document():
     import asyncio
 
-    from service.metrics import Metrics
-    from service.middleware import Envelope
-    from service.settings import ServiceSettings
+    from service.core.metrics import Metrics
+    from service.core.settings import ServiceSettings
+    from service.http.middleware import RequestMiddleware
 
     async def application(scope, receive, send):
         raise RuntimeError("nobody's business")
 
     async def ask():
         scope = {"type": "http", "method": "GET", "path": "/x", "headers": [(b"host", b"localhost")]}
-        await Envelope(application, Metrics(), ServiceSettings())(scope, None, send)
+        await RequestMiddleware(application, Metrics(), ServiceSettings())(scope, None, send)
 
     sent = []
 
@@ -291,7 +291,7 @@ def test_refused_methods_are_told_the_others(service):
 
 
 def test_another_data_folder_is_refused(tmp_path):
-    from serving import Service
+    from helpers.service import Service
 
     database = f"sqlite:///{tmp_path}/shared.sqlite"
     with Service(tmp_path / "a", KISSGS_DATABASE_URL=database) as service:
@@ -321,7 +321,7 @@ def test_events_go_on_over_a_restart(start):
 
 
 def test_the_measuring_command(monkeypatch, capsys, tmp_path):
-    from service import bench
+    from service.cli import bench
 
     for name, value in (("UPLOAD_BYTES", 5_000_000), ("POLLS", 5), ("REPEATS", 1)):
         monkeypatch.setattr(bench, name, value)

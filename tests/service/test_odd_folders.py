@@ -9,13 +9,13 @@ import time
 from pathlib import Path
 
 import pytest
-from data_folders import add_a_job, finish_a_job, listing, names, service
-from serving import SLOW, SMALL, problem, scene_bytes
+from helpers.data_folders import add_a_job, finish_a_job, listing, names, service
+from helpers.service import SLOW, SMALL, problem, scene_bytes
 
-from service.janitor import Janitor
-from service.models import State
-from service.runner import Outcome
-from service.worker import Worker
+from service.core.models import State
+from service.jobs.expiry import ExpiryTask
+from service.jobs.runner import Outcome
+from service.jobs.worker import Worker
 
 
 def a_file(folder, elsewhere):
@@ -64,16 +64,16 @@ def test_expiring(tmp_path, way):
     """The others expire all the same."""
     with service(tmp_path / "data") as context:
         jobs = [finish_a_job(context) for _ in range(3)]
-        folder = context.folders.jobs / jobs[0]
+        folder = context.storage.jobs / jobs[0]
         before = listing(folder)
         way(folder, tmp_path / "elsewhere")
         context.clock._offset += 10**5
-        assert sorted(Janitor(context, 0.0).sweep()) == sorted(jobs)
+        assert sorted(ExpiryTask(context, 0.0).sweep()) == sorted(jobs)
         context.clock._offset += 10**5
-        Janitor(context, 0.0).sweep()
+        ExpiryTask(context, 0.0).sweep()
         assert context.store.ids() == set()
         lies_aside(folder, way, tmp_path / "elsewhere", before)
-        assert names(context.folders.jobs) == {".orphaned"}
+        assert names(context.storage.jobs) == {".orphaned"}
 
 
 @pytest.mark.usefixtures("no_variables")
@@ -89,9 +89,9 @@ def test_what_cannot_be_removed_stays(tmp_path, monkeypatch, caplog):
 
         monkeypatch.setattr(Path, "iterdir", refuse)
         context.clock._offset += 10**5
-        assert sorted(Janitor(context, 0.0).sweep()) == sorted(jobs)
+        assert sorted(ExpiryTask(context, 0.0).sweep()) == sorted(jobs)
         monkeypatch.undo()
-        assert names(context.folders.jobs) == {jobs[0]}
+        assert names(context.storage.jobs) == {jobs[0]}
         assert f"job {jobs[0]}: its folder cannot be removed: operation not permitted" in caplog.text
 
 
@@ -101,12 +101,12 @@ def test_links_within_a_folder_are_removed_alone(tmp_path):
     (tmp_path / "mine" / "scene.zip").write_text("mine")
     with service(tmp_path / "data") as context:
         job = finish_a_job(context)
-        folder = context.folders.jobs / job
+        folder = context.storage.jobs / job
         shutil.rmtree(folder / "result")
         for name in ("result", "work-0123456789abcdef", "decoded.ply"):
             (folder / name).symlink_to(tmp_path / "mine")
-        context.folders.remove_job(job)
-        assert names(context.folders.jobs) == set()
+        context.storage.remove_job(job)
+        assert names(context.storage.jobs) == set()
     assert listing(tmp_path / "mine") == {(tmp_path / "mine" / "scene.zip").relative_to(tmp_path / "mine"): b"mine"}
 
 
@@ -115,16 +115,16 @@ def test_a_start_follows_no_links(tmp_path):
     with service(tmp_path / "data") as context:
         jobs = [finish_a_job(context, State.EXPIRED), finish_a_job(context), add_a_job(context)]
         for job in jobs:
-            (context.folders.jobs / job / "work-0123456789abcdef").mkdir()
-            (context.folders.jobs / job).rename(tmp_path / job)
-            (context.folders.jobs / job).symlink_to(tmp_path / job)
+            (context.storage.jobs / job / "work-0123456789abcdef").mkdir()
+            (context.storage.jobs / job).rename(tmp_path / job)
+            (context.storage.jobs / job).symlink_to(tmp_path / job)
             (tmp_path / job / "work-0123456789abcdef" / "mine").write_text("mine")
     before = [listing(tmp_path / job) for job in jobs]
     with service(tmp_path / "data") as context:
         assert context.store.get(jobs[2]).state == State.QUEUED
-        context.folders.discard_checkpoints(jobs[1])
-        for path in context.folders.spare(jobs[1]):
-            context.folders.discard(path)
+        context.storage.discard_checkpoints(jobs[1])
+        for path in context.storage.spare(jobs[1]):
+            context.storage.discard(path)
     assert [listing(tmp_path / job) for job in jobs] == before
 
 
@@ -141,7 +141,7 @@ def test_a_result_that_can_never_be_kept_ends_its_job(tmp_path, monkeypatch):
     with service(tmp_path / "data") as context:
         job = context.store.get(add_a_job(context))
         context.store.claim()
-        monkeypatch.setattr(context.folders, "keep_result", refuse)
+        monkeypatch.setattr(context.storage, "keep_result", refuse)
         asyncio.run(asyncio.wait_for(context.worker._settle(job, Outcome("done", {})), 10))
         found = context.store.get(job.id)
         assert (found.state, found.problem["code"]) == (State.FAILED, "output")
@@ -155,12 +155,12 @@ def test_which_errors_are_final(tmp_path, monkeypatch, error):
         worker: Worker = context.worker
         assert worker._is_final(OSError(error, os.strerror(error)))
         assert not worker._is_final(OSError(errno.ENOSPC, "no space left on device"))
-        context.folders.jobs.rename(tmp_path / "away")
+        context.storage.jobs.rename(tmp_path / "away")
         assert not worker._is_final(OSError(error, os.strerror(error)))
-        (tmp_path / "away").rename(context.folders.jobs)
+        (tmp_path / "away").rename(context.storage.jobs)
 
 
-# Folders of the service that go away ---------------------------------------------------------------------------------
+# Folders of the service that go away ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["jobs", "incoming"])

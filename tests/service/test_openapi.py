@@ -7,9 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from serving import ROOT, Service
-
-HERE = Path(__file__).parent
+from helpers.service import ROOT, Service
 
 
 def test_the_document_is_the_one_in_the_docs(service):
@@ -51,7 +49,7 @@ def test_schemathesis_finds_nothing(tmp_path, seed):
                 *("--suppress-health-check", "all", "--generation-database", "none"),
             ],
             cwd=tmp_path,
-            env={**os.environ, "PYTHONPATH": f"{HERE}:{ROOT}", "SCHEMATHESIS_HOOKS": "schema_hooks"},
+            env={**os.environ, "PYTHONPATH": f"{ROOT / 'tests'}:{ROOT}", "SCHEMATHESIS_HOOKS": "helpers.schema_hooks"},
             capture_output=True,
             text=True,
             timeout=300,

@@ -9,10 +9,10 @@ import sys
 import time
 
 import pytest
+from helpers.service import SLOW, SMALL, Service, scene_bytes
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
-from serving import SLOW, SMALL, Service, scene_bytes
 
-from service.settings import ServiceSettings, SettingsError
+from service.core.settings import ServiceSettings, SettingsError
 
 COMMAND = [sys.executable, "-P", "-m", "service"]
 
@@ -132,20 +132,20 @@ def test_health(service):
 def test_a_dead_worker_is_not_ready(tmp_path, environment):
     import asyncio
 
-    from service.app import build
+    from service.http.app import build
 
     async def scenario():
         context.worker.start()
         await asyncio.sleep(0.1)
-        assert context.worker.trouble() is None
+        assert context.worker.health_problem() is None
         context.worker._loops[0].cancel()
         await asyncio.sleep(0.1)
-        return context.worker.trouble()
+        return context.worker.health_problem()
 
     environment.setenv("KISSGS_DATA_DIR", str(tmp_path / "data"))
     context = build(ServiceSettings.from_environment())
     assert asyncio.run(scenario()) == "worker 0 has ended"
-    context.folders.close()
+    context.storage.close()
 
 
 def test_metrics(start):

@@ -5,7 +5,7 @@ import json
 import shutil
 
 import pytest
-from serving import SLOW, SMALL, scene_bytes
+from helpers.service import SLOW, SMALL, scene_bytes
 
 import kissgs
 

@@ -11,11 +11,11 @@ from urllib.parse import urljoin
 
 import httpx
 import pytest
-from serving import ROOT, problem, said
+from helpers.service import ROOT, problem, said
 
-from service.app import create_app
-from service.routes import preview
-from service.settings import ServiceSettings
+from service.core.settings import ServiceSettings
+from service.http.app import create_app
+from service.http.routes import preview
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 VENDOR = ROOT / "web_decoder" / "vendor"
@@ -63,7 +63,7 @@ def ask(folder, tmp_path):
 
     yield asking
     app.state.context.store.close()
-    app.state.context.folders.close()
+    app.state.context.storage.close()
 
 
 def fixed(answer):

@@ -7,9 +7,9 @@ import zipfile
 
 import numpy as np
 import pytest
+from helpers.preview_browser import colours, looks_like
+from helpers.service import scene_bytes
 from PIL import Image
-from preview_browser import colours, looks_like
-from serving import scene_bytes
 
 import kissgs
 
@@ -74,13 +74,13 @@ def test_files_that_are_no_use(preview, service, name, data, words):
     """Neither at first, nor while a scene is shown, which stays."""
     tab = preview().open(service)
     tab.drop((name, data))
-    tab.trouble(*words)
+    tab.health_problem(*words)
     assert tab.page.locator("#empty").is_visible()
     tab.drop(("b.zip", OTHER))
     before = tab.shown(OTHERS)
     assert not tab.page.locator("#trouble").is_visible()
     tab.drop((name, data))
-    tab.trouble(*words)
+    tab.health_problem(*words)
     tab.page.get_by_role("button", name="Dismiss").click()
     assert looks_like(tab.shown(OTHERS), before) > 60
 
@@ -116,7 +116,7 @@ def test_everybody_can_use_it(preview, service, scheme):
     page.get_by_role("slider").wait_for()
     tab.shown(COUNT)
     tab.drop(("letter.txt", b"Dear reader"))
-    tab.trouble("zip")
+    tab.health_problem("zip")
     found = controls(tab)
     assert {"button", "slider", "link"} <= {role for role, _ in found}
     assert [node for node in found if not node[1]] == []
@@ -237,7 +237,7 @@ def test_an_address_and_a_file_have_the_same_statistics(preview, service):
 @pytest.mark.parametrize("address", ["%25E0%25A4%25A.zip", "http://[bad"])
 def test_what_is_no_address(preview, service, address):
     tab = preview().open(service, f"?src={address}")
-    tab.trouble("not an address")
+    tab.health_problem("not an address")
     assert tab.page.locator("#empty").is_visible()
 
 
@@ -258,7 +258,7 @@ def test_a_small_file_cannot_claim_a_large_scene(preview, service):
             other.writestr(name, json.dumps(meta) if name == "meta.json" else original.read(name))
     tab = preview().open(service)
     tab.drop(("large.zip", file.getvalue()))
-    assert "10000000" in re.sub("[ ,]", "", tab.trouble("arger than", "Gaussians"))
+    assert "10000000" in re.sub("[ ,]", "", tab.health_problem("arger than", "Gaussians"))
 
 
 PROGRESS = """async (states) => {
@@ -296,10 +296,10 @@ def test_a_lost_picture_is_told(preview, service):
     tab.page.evaluate(
         "document.querySelector('#picture').getContext('webgl2').getExtension('WEBGL_lose_context').loseContext()"
     )
-    tab.trouble("graphics driver has reset", "reload the page")
+    tab.health_problem("graphics driver has reset", "reload the page")
     tab.drop(("b.zip", OTHER))
     tab.fact("Gaussians", f"{OTHERS:,}")
-    tab.trouble("graphics driver has reset")
+    tab.health_problem("graphics driver has reset")
 
 
 def levels_of(file):
@@ -389,7 +389,7 @@ def test_no_scene_is_shown_under_the_name_of_another(preview, service):
         for name in whole.namelist():
             archive.writestr(name, whole.read(name)[: 30 if name == "means_bytes_1.webp" else None])
     tab.choose(("second.zip", damaged.getvalue()))
-    tab.trouble("means_bytes_1.webp")
+    tab.health_problem("means_bytes_1.webp")
     tab.page.locator("#empty").wait_for()
     assert not tab.page.locator("#picture").is_visible()
     tab.choose(("third.zip", ZIP))

@@ -6,12 +6,12 @@ import zipfile
 
 import numpy as np
 import pytest
+from helpers.preview_browser import colours, looks_like
+from helpers.service import SLOW, scene_bytes
 from PIL import Image
-from preview_browser import colours, looks_like
-from serving import SLOW, scene_bytes
 
 import kissgs
-from kissgs.splats import SH_C0
+from kissgs.core.splats import SH_C0
 
 GAUSSIANS = 1500
 KEYS = ":".join(("alice", hashlib.sha256(b"secret").hexdigest()))
@@ -277,7 +277,7 @@ def test_a_damaged_file_is_named(preview, service, job, file, damage):
 
     tab.page.route(f"**/files/{file}", meddle)
     tab.open(service, job["id"])
-    tab.trouble(file, *(() if damage else ("404",)))
+    tab.health_problem(file, *(() if damage else ("404",)))
     tab.page.locator("#loading").wait_for(state="hidden")
     assert tab.page.locator("#picture:visible, #empty:visible").count() == 1
     if damage is None:
@@ -295,7 +295,7 @@ def test_the_picture_is_drawn_without_what_is_damaged(preview, service, job, dec
             tab.page.route(f"**/files/{damaged}.webp", lambda route: route.fulfill(body=flipped(route.fetch().body())))
         tab.open(service, job["id"])
         if damaged:
-            tab.trouble(f"{damaged}.webp")
+            tab.health_problem(f"{damaged}.webp")
             tab.fact("Loaded in", "cut short")
             assert tab.page.locator("#planes .thumb").count() == 8
             tab.page.get_by_role("button", name="Dismiss").click()
@@ -330,7 +330,7 @@ def test_without_places_there_is_no_picture(preview, service, job, file):
     tab = preview()
     tab.page.route(f"**/files/{file}", lambda route: route.fulfill(body=flipped(route.fetch().body())))
     tab.open(service, job["id"])
-    tab.trouble(file)
+    tab.health_problem(file)
     tab.page.locator("#empty").wait_for()
     tab.page.wait_for_timeout(300)
     assert not tab.page.locator("#picture").is_visible()
@@ -339,7 +339,7 @@ def test_without_places_there_is_no_picture(preview, service, job, file):
 
 def test_no_such_job(preview, service):
     tab = preview().open(service, "0" * 32)
-    tab.trouble("does not have this")
+    tab.health_problem("does not have this")
     assert tab.page.locator("#empty").is_visible()
     tab.forgive("^404 ", "Failed to load resource.*404")
 
@@ -349,11 +349,11 @@ def test_jobs_without_a_result(start, preview):
     job = service.submit(scene_bytes(20_000, 3), SLOW)
     service.running(job)
     tab = preview().open(service, job["id"])
-    assert "running" in tab.trouble("no container")
+    assert "running" in tab.health_problem("no container")
     service.http.post(job["links"]["cancel"])
     service.ended(job)
     tab.open(service, job["id"])
-    assert "cancelled" in tab.trouble("no container")
+    assert "cancelled" in tab.health_problem("no container")
 
 
 def test_with_keys(start, preview):
@@ -361,7 +361,7 @@ def test_with_keys(start, preview):
     service.http.headers["Authorization"] = "Bearer secret"
     job = service.ended(service.submit())
     tab = preview().open(service, job["id"])
-    tab.trouble("key", "enter it on its page")
+    tab.health_problem("key", "enter it on its page")
     tab.forgive("^401 ", "Failed to load resource.*401")
     page = tab.page
     for key, works in (("other", False), ("secret", True)):
@@ -373,7 +373,7 @@ def test_with_keys(start, preview):
             page.get_by_role("slider").wait_for()
             page.locator("#loading").wait_for(state="hidden")
         else:
-            tab.trouble("does not have this")
+            tab.health_problem("does not have this")
             tab.forgive("^404 ", "Failed to load resource.*404")
     assert not any("secret" in url for _, url in tab.requests)
 
@@ -402,7 +402,7 @@ def test_without_the_viewer(preview, service, job, decoded):
     tab = preview()
     tab.page.route("**/vendor/**", lambda route: route.fulfill(status=404, body="none"))
     tab.open(service, job["id"])
-    tab.trouble("not installed", "scripts/vendor")
+    tab.health_problem("not installed", "scripts/vendor")
     tab.fact("Gaussians", f"{len(decoded):,}")
     tab.page.get_by_role("button", name="Opacity").click()
     tab.page.locator(".plane canvas").hover(position={"x": 3, "y": 3})

@@ -6,18 +6,18 @@ import shutil
 import signal
 
 import pytest
-from data_folders import add_a_job, command, listing, opened, service
-from serving import SLOW, Service, scene_bytes
+from helpers.data_folders import add_a_job, command, listing, opened, service
+from helpers.service import SLOW, Service, scene_bytes
 
-from service.models import State
-from service.settings import SettingsError
+from service.core.models import State
+from service.core.settings import SettingsError
 
 pytestmark = pytest.mark.usefixtures("no_variables")
 
 
 def write_result(context, job_id, folder=None):
     """What a job's process leaves when it is done."""
-    folder = folder or context.folders.result(job_id)
+    folder = folder or context.storage.result(job_id)
     (folder / "files").mkdir(parents=True)
     contents = {"scene.zip": b"PK", "report.json": b"{}", "files/meta.json": b"{} "}
     for name, content in contents.items():
@@ -55,7 +55,7 @@ def test_a_result_of_a_job_that_waits_is_taken_up(two_jobs, upload, caplog):
     with service(folder) as context:
         summary = write_result(context, waiting)
         if upload == "gone":
-            context.folders.upload(waiting).unlink()
+            context.storage.upload(waiting).unlink()
     before = listing(folder / "jobs" / waiting)
     with service(folder) as context:
         job = context.store.get(waiting)
@@ -90,7 +90,7 @@ def test_a_restored_database_with_a_running_service(tmp_path):
         assert it.status(long)["problem"]["detail"].startswith("the upload is no longer")
 
 
-# Folders that are not there ------------------------------------------------------------------------------------------
+# Folders that are not there -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("way", ["emptied", "moved away", "of other jobs"])
@@ -190,15 +190,15 @@ def test_a_damaged_result(two_jobs, damage, state, caplog):
     with service(folder) as context:
         assert state_of(context, job) == State.QUEUED
         assert f"job {job}: its result is damaged" in caplog.text
-        summary = write_result(context, job, context.folders.new_work(job) / "result")
-        context.folders.keep_result(job)
-        context.folders.keep_result(job)  # once more, because its end could not be recorded
-        context.folders.remove_work(job)
+        summary = write_result(context, job, context.storage.new_work(job) / "result")
+        context.storage.keep_result(job)
+        context.storage.keep_result(job)  # once more, because its end could not be recorded
+        context.storage.remove_work(job)
         assert sorted(path.name for path in (folder / "jobs" / job).iterdir()) == ["result", "scene.ply"]
-        assert json.loads((context.folders.result(job) / "summary.json").read_text()) == summary
+        assert json.loads((context.storage.result(job) / "summary.json").read_text()) == summary
 
 
 def test_a_result_that_has_vanished_is_none(two_jobs):
     folder, waiting, _ = two_jobs
     with service(folder) as context, pytest.raises(FileNotFoundError, match="vanished"):
-        context.folders.keep_result(waiting)
+        context.storage.keep_result(waiting)

@@ -10,9 +10,9 @@ import zipfile
 
 import httpx
 import pytest
-from serving import FAST, SLOW, SMALL, problem, said, scene_bytes
+from helpers.service import FAST, SLOW, SMALL, problem, said, scene_bytes
 
-from service.problems import KINDS
+from service.core.problems import PROBLEM_TYPES
 
 
 def submit(service, data=SMALL, **arguments):
@@ -127,7 +127,10 @@ def test_too_large_is_said_before_the_body_comes(service):
 
 UNUSABLE = [
     *("", "{", "[]", "null", "7", "{" * 5000, '{"x": 1}', '{"preset": "tiny"}', '{"evaluate": "perhaps"}'),
-    *(f'{{"encode": {wrong}}}' for wrong in ('{"sh_ratio": -1}', '{"nothing": 1}', '{"seed": 1e400}', "null")),
+    *(
+        f'{{"encode": {wrong}}}'
+        for wrong in ('{"gaussians_per_codebook_entry": -1}', '{"nothing": 1}', '{"seed": 1e400}', "null")
+    ),
 ]
 
 
@@ -226,7 +229,7 @@ def test_a_wait_that_is_too_long(service):
 
 def test_every_code_is_explained(service):
     listed = service.http.get("/v1/problems").json()
-    assert [kind["code"] for kind in listed] == list(KINDS)
+    assert [kind["code"] for kind in listed] == list(PROBLEM_TYPES)
     for kind in listed:
         assert service.http.get(f"/v1/problems/{kind['code']}").json() == kind
 

@@ -11,7 +11,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from serving import SMALL, Service, scene_bytes
+from helpers.service import SMALL, Service, scene_bytes
 
 import kissgs
 
@@ -91,7 +91,7 @@ def test_what_goes_wrong_here_is_told(service, scene, tmp_path):
 
 
 def test_a_service_that_is_not_there(scene, tmp_path, monkeypatch):
-    from kissgs import remote
+    from kissgs.client import remote
 
     monkeypatch.setattr(remote, "PATIENCE_SECONDS", 1.0)
     with socket.socket() as nobody:
@@ -187,7 +187,7 @@ def test_a_container_that_is_damaged_on_its_way(service, scene, tmp_path, monkey
 def kissgs_command(*arguments, **settings):
     environment = {name: value for name, value in os.environ.items() if not name.startswith("KISSGS_")}
     return subprocess.run(
-        [sys.executable, "-P", "-c", "from kissgs.cli import main; main()", "remote", *map(str, arguments)],
+        [sys.executable, "-P", "-c", "from kissgs.cli.main import main; main()", "remote", *map(str, arguments)],
         env={**environment, **settings}, capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
 
@@ -205,7 +205,7 @@ def test_the_command(service, scene, tmp_path):
 
 
 def test_the_command_with_a_goal(service, scene, tmp_path):
-    words = ("--server", service.url, "--target-size", "14.5kB", "--set", "views=4", "-f", "-q")
+    words = ("--server", service.url, "--target-size", "14.5kB", "--set", "sensitivity_views=4", "-f", "-q")
     done = kissgs_command("compress", scene, *words)
     assert (done.returncode, done.stderr) == (0, "")
     assert (tmp_path / "Schloß 1.zip").stat().st_size <= 14_500
@@ -230,7 +230,7 @@ def test_interrupting_the_command_cancels_the_job(start, tmp_path):
     service = start()
     scene = tmp_path / "scene.ply"
     scene.write_bytes(scene_bytes(20_000, 3))
-    program = "from kissgs.cli import main; main()"
+    program = "from kissgs.cli.main import main; main()"
     running = subprocess.Popen(
         [sys.executable, "-P", "-c", program, "remote", "compress", scene, "-p", "paper", "--server", service.url],
         stderr=subprocess.PIPE,

@@ -9,7 +9,7 @@ import time
 import pytest
 import uvicorn
 
-from service import server
+from service.http import server
 
 PATIENCE = 0.6
 

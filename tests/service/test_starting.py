@@ -4,12 +4,12 @@ import shutil
 
 import pytest
 import sqlalchemy as sa
-from data_folders import database, finish_a_job, listing, names, opened, service
+from helpers.data_folders import database, finish_a_job, listing, names, opened, service
 
-from service import pairing
-from service.models import SCHEMA_VERSION, State
-from service.settings import SettingsError
-from service.store import Store
+from service.core.models import SCHEMA_VERSION, State
+from service.core.settings import SettingsError
+from service.storage import folder_binding as pairing
+from service.storage.job_store import Store
 
 pytestmark = pytest.mark.usefixtures("no_variables")
 
@@ -21,8 +21,8 @@ def test_starts_one_after_the_other(tmp_path):
     for _ in range(2):
         with service(tmp_path / "data") as context:
             assert context.store.get(job).state == State.SUCCEEDED
-            assert context.folders.result(job).exists()
-            assert context.folders.count_orphaned() == 0
+            assert context.storage.result(job).exists()
+            assert context.storage.count_orphaned() == 0
     assert ((tmp_path / "data" / "identity").read_text(), (tmp_path / "data" / "database").read_text()) == marks
 
 
@@ -35,8 +35,8 @@ def test_a_folder_of_a_development_version(jobs_folder, lost, numbered):
     if not numbered:
         database(jobs_folder, "DELETE FROM meta WHERE name = 'identity'")
     with service(jobs_folder) as context:
-        assert context.folders.held() == context.store.ids()
-        assert context.store.trouble() is None
+        assert context.storage.held() == context.store.ids()
+        assert context.store.health_problem() is None
         assert finish_a_job(context) in context.store.ids()
     with service(jobs_folder) as context:
         assert len(context.store.ids()) == 121
@@ -73,7 +73,7 @@ def test_no_jobs_and_a_new_database(tmp_path):
         pass
     (tmp_path / "data" / "jobs.sqlite").unlink()
     with service(tmp_path / "data") as context:
-        assert context.store.trouble() is None
+        assert context.store.health_problem() is None
 
 
 def test_a_database_in_memory_is_refused(tmp_path):
@@ -97,14 +97,14 @@ def test_folders_of_unknown_jobs_are_set_aside(jobs_folder, caplog):
     (jobs_folder / "jobs" / job / "work-0123456789abcdef").mkdir()
     before = listing(jobs_folder / "jobs" / job)
     with service(jobs_folder) as context:
-        assert context.folders.held() == known
-        assert context.folders.count_orphaned() == 2
+        assert context.storage.held() == known
+        assert context.storage.count_orphaned() == 2
     assert listing(jobs_folder / "jobs" / ".orphaned" / f"{job}-2") == before
     assert (jobs_folder / "jobs" / ".orphaned" / job / "scene.ply").read_bytes() == b"an earlier one"
     assert f"that the database does not know were set aside in {jobs_folder}/jobs/.orphaned: 1" in caplog.text
     caplog.clear()
     with service(jobs_folder) as context:
-        assert context.folders.count_orphaned() == 2
+        assert context.storage.count_orphaned() == 2
     assert caplog.text == ""
 
 
@@ -123,11 +123,11 @@ def test_nothing_of_others_is_removed(jobs_folder):
         assert not (jobs_folder / "incoming" / "0123456789abcdef.part").exists()
         assert not (jobs_folder / "jobs" / job / "work-0123456789abcdef").exists()
         assert {name: (jobs_folder / name).read_text() for name in strays} == dict.fromkeys(strays, "mine")
-        from service.janitor import Janitor
+        from service.jobs.expiry import ExpiryTask
 
         context.clock._offset += 10**6
-        Janitor(context, 0.0).sweep()
-        assert context.folders.held() == set()
+        ExpiryTask(context, 0.0).sweep()
+        assert context.storage.held() == set()
     strays[-1] = f"jobs/.orphaned/{job}/notes.txt"
     assert {name: (jobs_folder / name).read_text() for name in strays} == dict.fromkeys(strays, "mine")
     assert names(jobs_folder / "jobs" / ".orphaned" / job) == {"notes.txt"}
@@ -136,15 +136,15 @@ def test_nothing_of_others_is_removed(jobs_folder):
 def test_a_removal_that_was_interrupted_is_finished(tmp_path):
     with service(tmp_path / "data") as context:
         job = finish_a_job(context, State.EXPIRED)
-        assert context.folders.held() == {job}
+        assert context.storage.held() == {job}
     with service(tmp_path / "data") as context:
-        assert (context.folders.held(), context.folders.count_orphaned()) == (set(), 0)
+        assert (context.storage.held(), context.storage.count_orphaned()) == (set(), 0)
 
 
 @pytest.mark.parametrize("name", ["", "..", ".", "../jobs", ".orphaned", "a/b", "0" * 31])
 def test_only_jobs_are_removed(jobs_folder, name):
     with service(jobs_folder) as context, pytest.raises(ValueError, match="no id"):
-        context.folders.remove_job(name)
+        context.storage.remove_job(name)
 
 
 # PostgreSQL ----------------------------------------------------------------------------------------------------------
@@ -153,9 +153,9 @@ def test_only_jobs_are_removed(jobs_folder, name):
 def test_all_of_that_with_postgresql(postgresql, tmp_path):
     with service(tmp_path / "data", postgresql) as context:
         job = finish_a_job(context)
-        assert context.store.trouble() is None
+        assert context.store.health_problem() is None
     with service(tmp_path / "data", postgresql) as context:
-        assert context.folders.held() == {job}
+        assert context.storage.held() == {job}
     before = listing(tmp_path / "data")
     with pytest.raises(SettingsError, match="another data folder"):
         opened(tmp_path / "other", postgresql)

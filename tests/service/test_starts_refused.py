@@ -8,11 +8,11 @@ import time
 from pathlib import Path
 
 import pytest
-from data_folders import command, database, finish_a_job, listing, opened, service
+from helpers.data_folders import command, database, finish_a_job, listing, opened, service
 
-from service.models import SCHEMA_VERSION
-from service.settings import SettingsError
-from service.store import Store
+from service.core.models import SCHEMA_VERSION
+from service.core.settings import SettingsError
+from service.storage.job_store import Store
 
 pytestmark = pytest.mark.usefixtures("no_variables")
 

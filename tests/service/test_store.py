@@ -2,13 +2,13 @@
 
 import contextlib
 import itertools
-import uuid
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+from helpers.job_rows import add
 
-from service.models import ENDED, Job, State
-from service.store import Refused, Store
+from service.core.models import ENDED, State
+from service.storage.job_store import LimitExceeded, Store
 
 ALLOWED = {
     *itertools.product([State.QUEUED], [State.RUNNING, State.FAILED, State.CANCELLED]),
@@ -31,26 +31,6 @@ def store(url):
     opened = Store(url, lambda: float(next(ticks)))
     yield opened
     opened.close()
-
-
-def job(owner="", **values):
-    fixed = {
-        "name": "scene",
-        "options": {"preset": "fast"},
-        "preset": "fast",
-        "evaluate": False,
-        "gaussians": 20_000,
-        "sh_degree": 1,
-        "upload_bytes": 5_000_000_000,
-        "upload_sha256": "0" * 64,
-        "fingerprint": "f",
-        "disk_bytes": 3_000_000_000,
-    }
-    return Job(id=uuid.uuid4().hex, owner=owner, **{**fixed, **values})
-
-
-def add(store, owner="", **values):
-    return store.add(job(owner, **values), max_queue=10, max_owner=3)
 
 
 def bring(store, number, state):
@@ -134,18 +114,18 @@ def test_what_a_job_may_write_counts_from_its_start_to_its_end(store):
 def test_limits(store):
     for _ in range(3):
         add(store, "alice")
-    with pytest.raises(Refused, match="owner"):
+    with pytest.raises(LimitExceeded, match="owner"):
         add(store, "alice")
     for _ in range(7):
         add(store)
-    with pytest.raises(Refused, match="queue"):
+    with pytest.raises(LimitExceeded, match="queue"):
         add(store)
 
 
 def test_idempotency_keys_are_an_owners(store):
     first = add(store, "alice", idempotency_key="k")
     add(store, "bob", idempotency_key="k")
-    with pytest.raises(Refused, match="key"):
+    with pytest.raises(LimitExceeded, match="key"):
         add(store, "alice", idempotency_key="k")
     add(store, "alice")
     assert store.by_idempotency_key("alice", "k").id == first.id
@@ -191,5 +171,5 @@ def test_numbers_are_never_given_twice(store):
     """They are cursors of lists that clients hold on to."""
     first = add(store).number
     store.forget(first)
-    with contextlib.suppress(Refused):
+    with contextlib.suppress(LimitExceeded):
         assert add(store).number > first

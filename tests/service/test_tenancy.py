@@ -9,14 +9,14 @@ import threading
 import time
 
 import pytest
-from data_folders import add_a_job, command, names, opened, service
-from serving import ROOT, SLOW, SMALL, Service, problem, scene_bytes
+from helpers.data_folders import add_a_job, command, names, opened, service
+from helpers.service import ROOT, SLOW, SMALL, Service, problem, scene_bytes
 
-from service import tenancy
-from service.models import State
-from service.settings import SettingsError
-from service.store import Store
-from service.watch import VanishedError
+from service.core.models import State
+from service.core.settings import SettingsError
+from service.storage import tenancy
+from service.storage.database_health import VanishedError
+from service.storage.job_store import Store
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
@@ -82,7 +82,7 @@ def test_one_that_crashed_elsewhere_is_waited_for(tmp_path, url, elsewhere, monk
     elsewhere(1)
     first = opened(tmp_path / "data", url)
     add_a_job(first)
-    first.folders.close()
+    first.storage.close()
     elsewhere(2)
     begun = time.monotonic()
     with service(tmp_path / "data", url) as context:
@@ -92,10 +92,10 @@ def test_one_that_crashed_elsewhere_is_waited_for(tmp_path, url, elsewhere, monk
         assert "there was none" in caplog.text
         with pytest.raises(VanishedError, match="another service has taken it over"):  # it did not crash after all
             first.store.claim()
-        assert "another service has taken it over" in first.store.trouble()
+        assert "another service has taken it over" in first.store.health_problem()
         first.store.close()
         context.store.keep_time()
-        assert context.store.trouble() is None
+        assert context.store.health_problem() is None
     assert facts(url)["owner"] is None
 
 
@@ -115,15 +115,15 @@ def test_one_that_lives_elsewhere(tmp_path, url, elsewhere, ends):
         with pytest.raises(SettingsError, match="on another machine or in another container") as told:
             opened(tmp_path / "copy", url)
         assert "\n" not in str(told.value)
-        assert first.store.trouble() is None
+        assert first.store.health_problem() is None
         assert first.store.claim().id == job
         first.store.close()
     else:
         with service(tmp_path / "copy", url) as second:
-            assert second.store.trouble() is None
+            assert second.store.health_problem() is None
     assert time.monotonic() - begun < 5
     timer.join()
-    first.folders.close()
+    first.storage.close()
     assert names(tmp_path / "copy" / "jobs") == {job}
 
 
@@ -145,7 +145,7 @@ def test_one_whose_place_was_taken_says_so(tmp_path, url):
 
 CLAIMING = """
 import sys, time
-from service.store import Store
+from service.storage.job_store import Store
 store = Store(sys.argv[1], time.time)
 print("ready", flush=True)
 sys.stdin.readline()

@@ -9,14 +9,14 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
-from serving import ROOT, SMALL, events, problem
+from helpers.service import ROOT, SMALL, events, problem
 
 import kissgs
 from kissgs import CompactSettings
 from kissgs.compaction.result import CompactionStep
-from kissgs.errors import OutputError
-from service import child
-from service.sizes import STEPS_BYTES, checkpoint_bytes
+from kissgs.core.errors import OutputError
+from service.core.disk_estimates import STEPS_BYTES, checkpoint_bytes
+from service.jobs import job_process as child
 
 pytest.importorskip("torch")
 
@@ -171,7 +171,7 @@ def test_room_for_a_checkpoint_is_set_aside_until_the_job_has_ended(start_saving
 def test_the_longest_story_of_a_training_has_room():
     """A pruning and a training for each of as many rounds as there may be."""
     step = asdict(CompactionStep(name="sparsify", count=20_000_000, seconds=123.456789012345))
-    (most,) = [limit.le for limit in CompactSettings.model_fields["rounds"].metadata if hasattr(limit, "le")]
+    (most,) = [limit.le for limit in CompactSettings.model_fields["prune_rounds"].metadata if hasattr(limit, "le")]
     assert len(json.dumps([step] * (2 * most + 3))) < STEPS_BYTES
 
 
@@ -186,7 +186,7 @@ def test_training_tells_what_it_has_come_to(service):
     assert any(data.get("note") == note for data in heard)
 
 
-TUNED = {"preset": "fast", "finetune": {"wanted": True, "steps": 300, "views": 24, "view_size": 48}}
+TUNED = {"preset": "fast", "finetune": {"enabled": True, "steps": 300, "views": 24, "view_size": 48}}
 
 
 def test_fine_tuning_is_taken_up_where_it_was_left_and_its_gain_is_told(start_saving):

@@ -12,12 +12,12 @@ from functools import partial
 
 import pytest
 import sqlalchemy as sa
-from serving import SLOW, SMALL, Service, problem, said, scene_bytes
+from helpers.service import SLOW, SMALL, Service, problem, said, scene_bytes
 
-from service import watch
-from service.models import State
-from service.store import Store
-from service.watch import VanishedError
+from service.core.models import State
+from service.storage import database_health as watch
+from service.storage.database_health import VanishedError
+from service.storage.job_store import Store
 
 HEAD = b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n"
 
@@ -107,13 +107,13 @@ def test_damage_in_any_page_is_noticed(tmp_path, damage):
     store = Store(f"sqlite:///{tmp_path / 'jobs.sqlite'}", time.time)
     execute(tmp_path, *[f"INSERT INTO meta VALUES ('{number:032}', 1.0)" for number in range(3000)])
     execute(tmp_path, "PRAGMA wal_checkpoint(TRUNCATE)")
-    assert store.trouble() is None
+    assert store.health_problem() is None
     damage(tmp_path)
     end = time.monotonic() + 10
-    while store.trouble() is None:
+    while store.health_problem() is None:
         assert time.monotonic() < end
         time.sleep(0.05)
-    assert "damaged" in store.trouble() or "malformed" in store.trouble()
+    assert "damaged" in store.health_problem() or "malformed" in store.health_problem()
 
 
 def test_a_data_folder_that_is_gone(start):
@@ -266,12 +266,12 @@ def test_a_database_that_is_read_only(tmp_path, monkeypatch):
 
     monkeypatch.setattr(watch, "_open", read_only)
     store = Store(f"sqlite:///{tmp_path / 'jobs.sqlite'}", time.time)
-    assert "readonly" in store.trouble()
+    assert "readonly" in store.health_problem()
     store.close()
 
 
 def test_nothing_is_started_or_written_without_a_database(tmp_path):
-    from test_store import add
+    from helpers.job_rows import add
 
     store = Store(f"sqlite:///{tmp_path / 'jobs.sqlite'}", time.time)
     waiting, running = add(store), add(store)
@@ -294,10 +294,10 @@ def test_nothing_is_started_or_written_without_a_database(tmp_path):
 
 
 def test_what_is_written_while_it_vanishes_does_not_count(tmp_path, monkeypatch):
-    from test_store import add
+    from helpers.job_rows import add
 
     store = Store(f"sqlite:///{tmp_path / 'jobs.sqlite'}", time.time)
-    monkeypatch.setattr("service.store._note", lambda *arguments: remove(tmp_path))
+    monkeypatch.setattr("service.storage.job_store._note", lambda *arguments: remove(tmp_path))
     with pytest.raises(VanishedError):
         add(store)
     store.close()
@@ -309,7 +309,7 @@ def test_looking_takes_little(tmp_path):
     spent = []
     for _ in range(100):
         begun = time.perf_counter()
-        assert store.trouble() is None
+        assert store.health_problem() is None
         spent.append(time.perf_counter() - begun)
     assert sorted(spent)[50] < 0.02
     store.close()
@@ -317,7 +317,7 @@ def test_looking_takes_little(tmp_path):
 
 def test_a_database_server(postgresql):
     store = Store(postgresql, time.time)
-    assert store.trouble() is None
+    assert store.health_problem() is None
     engine = sa.create_engine(postgresql)
 
     def change(statement):
@@ -327,24 +327,24 @@ def test_a_database_server(postgresql):
     with engine.connect() as other:
         other.execute(sa.text("LOCK TABLE meta"))
         begun = time.monotonic()
-        assert "lock timeout" in store.trouble()
+        assert "lock timeout" in store.health_problem()
         assert time.monotonic() - begun < 5
-    assert store.trouble() is None
+    assert store.health_problem() is None
     change("ALTER DATABASE postgres SET default_transaction_read_only = on")
     store._engine.dispose()
     try:
-        assert "read-only transaction" in store.trouble()
+        assert "read-only transaction" in store.health_problem()
     finally:
         change("BEGIN; SET TRANSACTION READ WRITE; ALTER DATABASE postgres RESET default_transaction_read_only")
         engine.dispose()
         store._engine.dispose()
-    assert store.trouble() is None
+    assert store.health_problem() is None
     change("UPDATE meta SET value = 7 WHERE name = 'identity'")
-    assert store.trouble() == "it was replaced by another"
+    assert store.health_problem() == "it was replaced by another"
     with pytest.raises(VanishedError):
         store.keep_time()
     change("ALTER TABLE jobs DROP COLUMN note")
     change("DROP TABLE events")
-    assert store.trouble() is not None
+    assert store.health_problem() is not None
     store.close()
     engine.dispose()

@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 import pytest
-from serving import ROOT
+from helpers.service import ROOT
 
 PACKAGES = {
     "three": ("LICENSE", "build/three.module.min.js", "build/three.core.min.js", "build/three.cjs",

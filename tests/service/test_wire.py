@@ -3,12 +3,12 @@
 import asyncio
 
 import pytest
-from serving import FAST, SMALL, problem, said
+from helpers.service import FAST, SMALL, problem, said
 
-from service.multipart import MAX_PREAMBLE_BYTES, PartBegin, PartData, parts
-from service.problems import ProblemError
-from service.settings import ServiceSettings
-from service.uploads import Spool
+from service.core.problems import ProblemError
+from service.core.settings import ServiceSettings
+from service.http.multipart import MAX_PREAMBLE_BYTES, PartBegin, PartData, parts
+from service.http.uploads import Spool
 
 HEAD = SMALL.index(b"end_header\n") + 11
 BOUNDARY = "multipart/form-data; boundary=b"

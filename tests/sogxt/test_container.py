@@ -9,11 +9,11 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from codec_scenes import random_scene
-from memory import takes_less_than
+from helpers.codec_scenes import random_scene
+from helpers.memory import takes_less_than
 
 from kissgs import compress, decompress
-from kissgs.errors import InvalidContainerError, OutputError
+from kissgs.core.errors import InvalidContainerError, OutputError
 from kissgs.sogxt.container import MAX_ZIP_ENTRIES, check_destination, open_source, write_container, zip_bytes
 
 FILES = {"container_meta.yaml": b"meta", "meta.json": b"{}", "a.webp": bytes(range(256)) * 4, "empty.webp": b""}

@@ -1,18 +1,18 @@
-"""Oracle: containers put together by hand with Pillow, as other encoders might, and the naive decoder of oracle.py."""
+"""Oracle: containers put together by hand with Pillow, as other encoders might, and reference_decoder.py."""
 
 import io
 import json
 
 import numpy as np
-import oracle
 import pytest
 import yaml
-from codec_scenes import PLANES, random_scene
+from helpers import reference_decoder
+from helpers.codec_scenes import PLANES, random_scene
 from PIL import Image
 
 from kissgs import Cancelled, InvalidContainerError, Settings, compress, decompress
+from kissgs.core.splats import ATTRIBUTES
 from kissgs.sogxt.names import CHECKSUM
-from kissgs.splats import ATTRIBUTES
 
 FILES = compress(random_scene(100, 3, seed=1), settings=Settings.from_preset("paper")).files
 
@@ -33,7 +33,7 @@ def foreign(files=FILES, **images):
 
 
 def image_of(name, files=FILES):
-    return oracle.pixels(files, f"{name}.webp")
+    return reference_decoder.pixels(files, f"{name}.webp")
 
 
 def made_by_hand(count, grid, side, seed=0):
@@ -76,7 +76,7 @@ def test_containers_of_any_size_and_any_levels(count, grid, side):
     found = decompress(files)
     assert len(found) == count
     assert found.sh_degree == 3
-    oracle.assert_equal_scenes(found, oracle.decode(files), files)
+    reference_decoder.assert_equal_scenes(found, reference_decoder.decode(files), files)
 
 
 def test_levels_need_not_span_their_bytes():
@@ -84,7 +84,7 @@ def test_levels_need_not_span_their_bytes():
     levels = np.zeros((16, 16, 3)) + 50
     levels[:, :, 1] = np.random.default_rng(0).integers(40, 74, (16, 16))
     files = foreign(scales=levels)
-    oracle.assert_equal_scenes(decompress(files), oracle.decode(files), files)
+    reference_decoder.assert_equal_scenes(decompress(files), reference_decoder.decode(files), files)
 
 
 def test_levels_that_do_not_occur_have_no_value():
@@ -118,7 +118,7 @@ def test_labels_between_the_codebook_side_and_its_end_reach_into_the_next_row():
     labels = image_of("f_rest_labels", files)
     labels[0, 0, :2] = 5, 1
     files["f_rest_labels.webp"] = webp(labels)
-    oracle.assert_equal_scenes(decompress(files), oracle.decode(files), files)
+    reference_decoder.assert_equal_scenes(decompress(files), reference_decoder.decode(files), files)
 
 
 # --- What is refused ------------------------------------------------------------------------------

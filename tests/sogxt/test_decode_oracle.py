@@ -1,14 +1,14 @@
-"""Oracle: two naive decoders written from the description of the format (oracle.py), on made and on real scenes."""
+"""Oracle: two decoders written from the format's description (reference_decoder.py), on made and real scenes."""
 
 import functools
 
 import numpy as np
-import oracle
 import pytest
-from codec_scenes import GLANCE, PRESETS, constant_scene, random_scene
+from helpers import reference_decoder
+from helpers.codec_scenes import GLANCE, PRESETS, constant_scene, random_scene
 
 from kissgs import Settings, compress, decompress, load, sample_scene
-from kissgs.splats import ATTRIBUTES
+from kissgs.core.splats import ATTRIBUTES
 
 COUNTS = (0, 1, 7, 8, 9, 63, 64, 65, 1000)
 
@@ -20,8 +20,8 @@ def encoded(splats, preset, **settings):
 def check(files):
     """Ours, the paper's and the browsers' decoders agree on ``files``."""
     ours = decompress(files)
-    oracle.assert_equal_scenes(ours, oracle.decode(files), files)
-    shown = oracle.decode_browser(files)
+    reference_decoder.assert_equal_scenes(ours, reference_decoder.decode(files), files)
+    shown = reference_decoder.decode_browser(files)
     assert shown["means"].shape == ours.means.shape
     lengths = np.linalg.norm(ours.quats.astype(np.float64), axis=1, keepdims=True)
     rest = np.zeros((len(ours), 15, 3))
@@ -30,7 +30,9 @@ def check(files):
     for name, wanted in shown.items():
         np.testing.assert_allclose(mine[name], wanted, rtol=1e-5, atol=1e-5, err_msg=name)
     # Some readers divide positions by 65535 and not by the largest level that they see.
-    np.testing.assert_allclose(oracle.decode_browser(files, means_top=65535)["means"], shown["means"], rtol=1e-9)
+    np.testing.assert_allclose(
+        reference_decoder.decode_browser(files, means_top=65535)["means"], shown["means"], rtol=1e-9
+    )
     return ours
 
 
@@ -45,7 +47,12 @@ def test_every_degree_and_preset(degree, preset):
 @pytest.mark.parametrize("preset", ["balanced", "paper"])
 @pytest.mark.parametrize("count", COUNTS)
 def test_every_count(count, preset):
-    files = encoded(random_scene(count, 3 if count in (8, 64) else 0, seed=count), preset, drop_invisible=False, drop=0)
+    files = encoded(
+        random_scene(count, 3 if count in (8, 64) else 0, seed=count),
+        preset,
+        prune_invisible=False,
+        prune_threshold_bits=0,
+    )
     assert len(check(files)) == count
 
 
@@ -107,7 +114,7 @@ def test_containers_in_all_their_forms_decode_alike(tmp_path):
     for source in (compressed.to_zip(), tmp_path / "folder", str(tmp_path / "file.zip")):
         found = decompress(source)
         assert all((getattr(found, name) == getattr(wanted, name)).all() for name in ATTRIBUTES)
-    assert oracle.as_files(compressed.to_zip()) == files
+    assert reference_decoder.as_files(compressed.to_zip()) == files
 
 
 def test_threads_do_not_change_what_is_decoded():
@@ -119,7 +126,7 @@ def test_threads_do_not_change_what_is_decoded():
 def test_padding_amid_the_grid_is_skipped():
     """Only the mask says which cells count; encoders other than ours (PLAS) leave padding anywhere."""
     files = encoded(random_scene(100, 1, seed=8), "paper")
-    mask = oracle.pixels(files, "active_mask.webp")[:, :, 0].reshape(-1) > 0
+    mask = reference_decoder.pixels(files, "active_mask.webp")[:, :, 0].reshape(-1) > 0
     assert mask.sum() == 100
     assert not mask[:100].all(), "the padding should lie amid the rest"
     check(files)

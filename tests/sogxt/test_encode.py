@@ -5,10 +5,10 @@ import io
 import json
 
 import numpy as np
-import oracle
 import pytest
 import yaml
-from codec_scenes import (
+from helpers import reference_decoder
+from helpers.codec_scenes import (
     GLANCE,
     PLANES,
     PRESETS,
@@ -18,7 +18,6 @@ from codec_scenes import (
     covariances,
     random_scene,
     replaced,
-    signed_log,
     unit,
 )
 from hypothesis import given, settings
@@ -26,8 +25,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from kissgs import Settings, compress, decompress
+from kissgs.core.signed_log import signed_log
+from kissgs.core.splats import clean
 from kissgs.sogxt.encode import encode
-from kissgs.splats import clean
 
 IMAGES = [f"{name}.webp" for name in PLANES]
 
@@ -40,7 +40,7 @@ def encoded(splats, preset="fast", **changes):
 @pytest.mark.parametrize("count", [1, 9, 300])
 def test_round_trip_is_within_the_half_steps_that_are_reported(count, preset):
     splats = random_scene(count, 1, seed=count)
-    result = encoded(splats, preset, drop=0)
+    result = encoded(splats, preset, prune_threshold_bits=0)
     assert_round_trip(splats, result)
     assert sorted(result.order) == list(range(count))
 
@@ -58,13 +58,13 @@ def test_round_trip_is_within_the_half_steps_that_are_reported(count, preset):
 def test_round_trip_for_any_steps(count, seed, coarse, fine, quat_step, bits, shared):
     splats = random_scene(count, 0, seed=seed)
     steps = {"opacity_step": coarse, "scale_step": fine, "sh0_step": coarse, "quat_step": quat_step}
-    assert_round_trip(splats, encoded(splats, "fast", means_bits=bits, shared_steps=shared, **steps))
+    assert_round_trip(splats, encoded(splats, "fast", means_bits=bits, shared_step_size=shared, **steps))
 
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_sh_of_scenes_below_the_codebook_size_is_within_its_half_steps(preset):
     splats = random_scene(50, 3, seed=2)
-    result = encoded(splats, preset, sh_ratio=1, weigh=False)
+    result = encoded(splats, preset, gaussians_per_codebook_entry=1, rate_distortion=False)
     half = max(result.report.half_steps["f_rest_centroids"])
     assert_within(decompress(result.files).shN, splats.select(result.order).shN, half)
 
@@ -92,7 +92,7 @@ def test_the_chosen_form_is_the_same_ellipsoid(preset):
     assert error.max() < (0.05 if preset == "fast" else 0.2)
 
 
-def test_upright_forms_leave_no_rotation_of_more_than_63_degrees():
+def test_canonical_forms_leave_no_rotation_of_more_than_63_degrees():
     """The claim of the module: the cube's rotations cover all with balls of 62.8 degrees around them."""
     found = decompress(encoded(random_scene(2000, 0), quat_step=1e-3).files)
     assert found.quats[:, 0].min() > np.cos(np.deg2rad(62.8) / 2) - 1e-3
@@ -106,7 +106,7 @@ def test_invisible_gaussians_are_left_out_and_counted():
     result = encoded(splats)
     assert (result.report.count, result.report.invisible, result.report.source_count) == (34, 66, 100)
     assert sorted(result.order) == list(range(0, 100, 3))
-    everything = encoded(splats, drop_invisible=False)
+    everything = encoded(splats, prune_invisible=False)
     assert (everything.report.count, everything.report.invisible) == (100, 0)
 
 
@@ -126,7 +126,7 @@ def test_ranges_are_those_of_the_data_to_the_last_bit(preset):
     for the maximum, within half a step."""
     splats = random_scene(333, 0, seed=7)
     result = encoded(splats, preset)
-    ranges = oracle.ranges_of(yaml.safe_load(result.files["container_meta.yaml"]))
+    ranges = reference_decoder.ranges_of(yaml.safe_load(result.files["container_meta.yaml"]))
     for field, data in (("opacities", splats.opacities[:, None]), ("f_dc", splats.sh0)):
         low, high = (np.ravel(limit).astype(np.float32) for limit in ranges[field])
         half = np.array(result.report.half_steps[field])
@@ -146,14 +146,16 @@ def test_ranges_are_those_of_the_data_to_the_last_bit(preset):
 def test_every_image_spans_its_levels(count, preset):
     """A decoder takes the levels that it sees for the ends of the ranges: no range may end where no level lies."""
     files = encoded(random_scene(count, 1, seed=3), preset).files
-    ranges = oracle.ranges_of(yaml.safe_load(files["container_meta.yaml"]))
+    ranges = reference_decoder.ranges_of(yaml.safe_load(files["container_meta.yaml"]))
     tops = {"quaternions": 99, "f_rest_centroids": 99} if preset == "paper" else {}
     for field, (low, high) in ranges.items():
         if field == "means":
-            levels = oracle.levels(files, "means_bytes_0", 3) + 256 * oracle.levels(files, "means_bytes_1", 3)
+            levels = reference_decoder.levels(files, "means_bytes_0", 3) + 256 * reference_decoder.levels(
+                files, "means_bytes_1", 3
+            )
             assert (levels.min(), levels.max()) == (0, 65535), "some readers divide by 65535"
             continue
-        levels = oracle.pixels(files, f"{field}.webp")
+        levels = reference_decoder.pixels(files, f"{field}.webp")
         if np.max(np.subtract(high, low)) > 0:
             assert levels.min() == 0
             if preset == "paper":
@@ -166,11 +168,11 @@ def test_every_image_spans_its_levels(count, preset):
 @pytest.mark.parametrize("count", [1, 9, 100])
 def test_padding_repeats_cells_that_are_active(count, preset):
     """In the paper's order padding may take another form of its Gaussian, to suit its neighbours."""
-    files = encoded(random_scene(count, 2), preset, drop=0).files
+    files = encoded(random_scene(count, 2), preset, prune_threshold_bits=0).files
     free = ("scales", "quaternions") if preset == "paper" else ()
-    cells = [oracle.pixels(files, f"{name}.webp") for name in PLANES[1:8] if name not in free]
+    cells = [reference_decoder.pixels(files, f"{name}.webp") for name in PLANES[1:8] if name not in free]
     cells = np.concatenate([image.reshape(len(image) ** 2, -1) for image in cells], axis=1)
-    active = oracle.pixels(files, "active_mask.webp")[:, :, 0].reshape(-1) > 0
+    active = reference_decoder.pixels(files, "active_mask.webp")[:, :, 0].reshape(-1) > 0
     assert active.sum() == count
     known = {tuple(cell) for cell in cells[active]}
     assert {tuple(cell) for cell in cells[~active]} <= known
@@ -183,18 +185,18 @@ def test_images_have_the_modes_that_decoders_expect(count):
         with Image.open(io.BytesIO(files[name])) as image:
             assert image.format == "WEBP"
             assert image.mode == ("RGBA" if name == "quaternions.webp" else "RGB"), name
-    labels = oracle.pixels(files, "f_rest_labels.webp")
+    labels = reference_decoder.pixels(files, "f_rest_labels.webp")
     side = yaml.safe_load(files["container_meta.yaml"])["meta"]["f_rest_centroids_side"]
     assert labels[:, :, :2].max() < side
     assert (labels[:, :, 2] == 0).all()
-    assert set(np.unique(oracle.pixels(files, "active_mask.webp"))) <= {0, 1}
+    assert set(np.unique(reference_decoder.pixels(files, "active_mask.webp"))) <= {0, 1}
 
 
 def test_quaternion_images_never_lose_their_fourth_channel():
     """Where every alpha is 255, libwebp drops the channel and the paper's decoder fails: z is constant here."""
     splats = replaced(random_scene(40, 0), quats=np.tile(unit([[0.9, 0.3, 0.1, 0.2]]), (40, 1)))
     for preset in PRESETS:
-        assert oracle.levels(encoded(splats, preset).files, "quaternions", 4).shape[1] == 4
+        assert reference_decoder.levels(encoded(splats, preset).files, "quaternions", 4).shape[1] == 4
 
 
 def numbers(value):
@@ -209,7 +211,7 @@ def test_files_and_metadata_are_complete():
     text = files["container_meta.yaml"].decode("ascii")
     document = yaml.safe_load(text)
     assert document["meta"] == {"grid_side": 16, "f_rest_centroids_side": 8, "image_codec": "webp"}
-    ranges = oracle.ranges_of(document)
+    ranges = reference_decoder.ranges_of(document)
     lengths = {"opacities": 0, "means": 0, "scales": 3, "quaternions": 4, "f_dc": 3, "f_rest_centroids": 45}
     assert ranges.keys() == lengths.keys()
     for field, limits in ranges.items():
@@ -229,7 +231,7 @@ def test_files_and_metadata_are_complete():
 
 def test_both_spellings_of_the_metadata_agree():
     files = encoded(random_scene(90, 3)).files
-    ranges = oracle.ranges_of(yaml.safe_load(files["container_meta.yaml"]))
+    ranges = reference_decoder.ranges_of(yaml.safe_load(files["container_meta.yaml"]))
     meta = json.loads(files["meta.json"])
     for key, field in (("quats", "quaternions"), ("sh0", "f_dc"), ("means",) * 2, ("scales",) * 2, ("opacities",) * 2):
         assert (meta[key]["mins"], meta[key]["maxs"]) == ranges[field]
@@ -248,7 +250,7 @@ def test_bands_that_are_zero_are_constant_in_the_image():
     half_zero = random_scene(1000, 3)
     half_zero.shN[:, 3:] = 0
     files = encoded(half_zero).files
-    entries = oracle.untiled(oracle.pixels(files, "f_rest_centroids.webp"), 8).reshape(64, 3, 15)
+    entries = reference_decoder.untiled(reference_decoder.pixels(files, "f_rest_centroids.webp"), 8).reshape(64, 3, 15)
     assert (entries[:, :, 3:] == entries[0, 0, 14]).all()
 
 

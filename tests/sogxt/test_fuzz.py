@@ -7,14 +7,14 @@ import zipfile
 import numpy as np
 import pytest
 import yaml
-from codec_scenes import random_scene
+from helpers.codec_scenes import random_scene
+from helpers.memory import takes_less_than
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from memory import takes_less_than
 
 from kissgs import KissgsError, Settings, compress, decompress
+from kissgs.core.splats import ATTRIBUTES
 from kissgs.sogxt.names import CHECKSUM
-from kissgs.splats import ATTRIBUTES
 
 MEMORY = 30_000_000
 """Bytes; the containers here hold a few dozen Gaussians, so anything near this came from trusting a number."""

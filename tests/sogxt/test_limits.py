@@ -4,11 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from codec_scenes import random_scene
-from memory import takes_less_than
+from helpers.codec_scenes import random_scene
+from helpers.memory import takes_less_than
 
 import kissgs
-from kissgs.errors import OutputError, UnsupportedError
+from kissgs.core.errors import OutputError, UnsupportedError
 from kissgs.settings import EncodeSettings
 from kissgs.sogxt import container
 from kissgs.sogxt.encode import encode
@@ -19,7 +19,7 @@ from kissgs.sogxt.planes import encode_plane
 def bomb(side):
     """A small container of a large scene: all planes constant."""
     scene = random_scene(1, 3)
-    files = dict(encode(scene, EncodeSettings(drop_invisible=False)).files)
+    files = dict(encode(scene, EncodeSettings(prune_invisible=False)).files)
     for name in PLANES:
         if "centroids" not in name:
             channels = {"quaternions.webp": 4, "active_mask.webp": 1, "opacities.webp": 1}.get(name, 3)
@@ -84,4 +84,4 @@ def test_one_outlier_does_not_spoil_the_colours_of_all_others(field, value):
         found = getattr(kissgs.decompress(result.files), field)[others]
         errors.append(np.sqrt(np.mean((found - getattr(scene, field)[result.order[others]]) ** 2)))
     assert errors[1] < 1.05 * errors[0]
-    assert dirty.report.tamed_colours == (1 if field == "sh0" else 0)
+    assert dirty.report.clipped_colors == (1 if field == "sh0" else 0)

@@ -4,13 +4,13 @@ import json
 
 import jsonschema
 import numpy as np
-import oracle
 import pytest
 import yaml
-from codec_scenes import GLANCE, PRESETS, random_scene, replaced
+from helpers import reference_decoder
+from helpers.codec_scenes import GLANCE, PRESETS, random_scene, replaced
+from helpers.metadata_files import FILES, assert_same, document, quantize_of, with_document, with_json, with_yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from metadata_files import FILES, assert_same, document, quantize_of, with_document, with_json, with_yaml
 
 from kissgs import Settings, compress, decompress
 from kissgs.sogxt.container import MemorySource
@@ -51,7 +51,7 @@ def test_every_float32_survives_both_spellings(numbers, mean):
     spelled = {field: [float(str(number)) for number in values] for field, values in exact.items()}
     layout = Layout(count=0, grid_side=8, codebook_side=8, ranges={field: (low, low) for field, low in spelled.items()})
     document = yaml.safe_load(layout.to_yaml())
-    for field, (low, _) in oracle.ranges_of(document).items():
+    for field, (low, _) in reference_decoder.ranges_of(document).items():
         found = np.ravel(low).tolist()
         assert all(type(number) is float for number in found)
         assert (np.float32(found) == exact[field]).all()
@@ -64,7 +64,7 @@ def test_every_float32_survives_both_spellings(numbers, mean):
 def test_tiny_numbers_are_spelled_so_that_yaml_sees_numbers():
     splats = random_scene(50, 0)
     files = compress(replaced(splats, sh0=splats.sh0 * 1e-7, means=splats.means * 1e-6)).files
-    low, high = oracle.ranges_of(yaml.safe_load(files["container_meta.yaml"]))["f_dc"]
+    low, high = reference_decoder.ranges_of(yaml.safe_load(files["container_meta.yaml"]))["f_dc"]
     assert {type(number) for number in low + high} == {float}
     assert b"e-0" in files["container_meta.yaml"]
 
@@ -168,7 +168,7 @@ def test_odd_but_valid_yaml(change):
     found = decompress(files)
     assert_same(found)
     if change is not lists_of_one_number:  # the paper's decoder wants a scalar; older encoders write lists
-        oracle.assert_equal_scenes(found, oracle.decode(files), FILES)
+        reference_decoder.assert_equal_scenes(found, reference_decoder.decode(files), FILES)
 
 
 def spellings():

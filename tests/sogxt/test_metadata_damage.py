@@ -7,8 +7,8 @@ import zlib
 import numpy as np
 import pytest
 import yaml
-from codec_scenes import random_scene, replaced
-from metadata_files import FILES, assert_same, document
+from helpers.codec_scenes import random_scene, replaced
+from helpers.metadata_files import FILES, assert_same, document
 
 from kissgs import InvalidContainerError, KissgsError, Settings, UnsupportedError, compress, decompress
 from kissgs.sogxt.container import MemorySource

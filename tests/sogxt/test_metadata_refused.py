@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from helpers.metadata_files import FILES, document, quantize_of, refusal, with_document, with_json, with_yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from metadata_files import FILES, document, quantize_of, refusal, with_document, with_json, with_yaml
 
 import kissgs
 from kissgs import KissgsError, UnsupportedError, decompress
+from kissgs.core.splats import ATTRIBUTES
 from kissgs.sogxt.container import MemorySource
 from kissgs.sogxt.metadata import CHANNELS
 from kissgs.sogxt.metadata_reader import MAX_METADATA_BYTES, read_layout
-from kissgs.splats import ATTRIBUTES
 
 JSON_ERRORS = [
     (lambda meta: meta.pop("means"), "meta.json lacks something that a SOG-XT container has: 'means'"),

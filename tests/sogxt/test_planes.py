@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from kissgs.errors import InvalidContainerError
-from kissgs.parallel import blas_workers
+from kissgs.core.errors import InvalidContainerError
+from kissgs.core.threads import blas_workers
 from kissgs.settings import EncodeSettings
 from kissgs.sogxt.planes import compress_images, decode_plane, encode_plane, probe_webp
 

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 import torch
-from training_scenes import around, cloud, same, taught
+from helpers.training_scenes import around, cloud, same, taught
 
 import kissgs
 from kissgs.rendering.losses import plain_photometric_loss
 from kissgs.rendering.rasterizer import render
-from kissgs.training.loop import Plan, falling, train
-from kissgs.training.trainee import Trainee
+from kissgs.training.loop import Plan, exponential_lr, train
+from kissgs.training.model import GaussianModel
 
 RATES = {"means": 2e-3, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 1e-2, "shN": 1e-3}
 
@@ -20,9 +20,9 @@ def plan(steps=30, **changes):
     )
 
 
-def error(scene, lessons):
-    pictures = [render(scene, camera)[0] for camera in lessons.cameras]
-    return np.mean([(image - lessons.picture(n)) ** 2 for n, image in enumerate(pictures)])
+def error(scene, targets):
+    pictures = [render(scene, camera)[0] for camera in targets.cameras]
+    return np.mean([(image - targets.picture(n)) ** 2 for n, image in enumerate(pictures)])
 
 
 def dimmed(scene):
@@ -34,57 +34,57 @@ def dimmed(scene):
 
 def test_it_finds_the_way_back_to_the_pictures():
     scene = cloud(40)
-    lessons, begun = taught(scene), dimmed(scene)
-    trainee = Trainee(begun)
-    train(trainee, lessons, plan(200))
-    assert error(trainee.splats(), lessons) < 0.03 * error(begun, lessons)
+    targets, begun = taught(scene), dimmed(scene)
+    model = GaussianModel(begun)
+    train(model, targets, plan(200))
+    assert error(model.splats(), targets) < 0.03 * error(begun, targets)
 
 
 def test_nothing_moves_where_nothing_is_to_be_learned():
     """The scene's own pictures, but for their rounding to float16."""
     scene = cloud(40)
-    lessons, trainee = taught(scene), Trainee(scene)
-    train(trainee, lessons, plan(4, rates=lambda done: dict.fromkeys(RATES, 1e-9)))
-    np.testing.assert_allclose(trainee.splats().means, scene.means, atol=1e-7)
+    targets, model = taught(scene), GaussianModel(scene)
+    train(model, targets, plan(4, rates=lambda done: dict.fromkeys(RATES, 1e-9)))
+    np.testing.assert_allclose(model.splats().means, scene.means, atol=1e-7)
 
 
 def test_it_stops_and_goes_on_as_if_nothing_had_been():
     scene = cloud(40)
-    lessons, whole = taught(scene), Trainee(dimmed(scene))
-    train(whole, lessons, plan(23))
+    targets, whole = taught(scene), GaussianModel(dimmed(scene))
+    train(whole, targets, plan(23))
     kept = []
 
     def stop(stage, fraction, note=""):
         if fraction >= 9 / 23:
             raise kissgs.Cancelled("enough")
 
-    first = Trainee(dimmed(scene))
+    first = GaussianModel(dimmed(scene))
     with pytest.raises(kissgs.Cancelled):
-        train(first, lessons, plan(23), after=kept.append, progress=stop)
+        train(first, targets, plan(23), after=kept.append, progress=stop)
     assert kept == list(range(1, 10))
-    second = Trainee.restored(first.state())
-    train(second, lessons, plan(23), first=9)
+    second = GaussianModel.restored(first.state())
+    train(second, targets, plan(23), first=9)
     assert same(whole.splats(), second.splats())
 
 
 @pytest.mark.parametrize("threads", [2, 3])
 def test_no_bit_depends_on_threads(threads):
     scene = cloud(300, 3)
-    lessons, found = taught(scene), []
+    targets, found = taught(scene), []
     for number in (1, threads):
-        trainee, before = Trainee(dimmed(scene)), torch.get_num_threads()
-        train(trainee, lessons, plan(8), threads=number)
+        model, before = GaussianModel(dimmed(scene)), torch.get_num_threads()
+        train(model, targets, plan(8), threads=number)
         assert torch.get_num_threads() == before
-        found.append(trainee.splats())
+        found.append(model.splats())
     assert same(*found)
 
 
 def test_another_seed_is_another_order():
     scene, found = cloud(40), []
     for seed in (0, 1):
-        trainee = Trainee(dimmed(scene))
-        train(trainee, taught(scene), plan(7, seed=(seed,)))
-        found.append(trainee.splats())
+        model = GaussianModel(dimmed(scene))
+        train(model, taught(scene), plan(7, seed=(seed,)))
+        found.append(model.splats())
     assert not same(*found)
 
 
@@ -104,24 +104,24 @@ class Pull:
 
 def test_regularizers_have_their_say():
     scene, pull = cloud(40), Pull()
-    trainee = Trainee(scene)
-    train(trainee, taught(scene), plan(40, regularizers=(pull,)), first=3)
+    model = GaussianModel(scene)
+    train(model, taught(scene), plan(40, regularizers=(pull,)), first=3)
     assert pull.asked == [step for step, _ in pull.updated] == list(range(3, 40))
     assert pull.updated[-1][1] < 0.9 * float((scene.means**2).sum())
 
 
 def test_what_is_told_is_the_loss():
     scene, notes = cloud(40), []
-    lessons = taught(scene)
+    targets = taught(scene)
     begun = dimmed(scene)
     frozen = plan(3, rates=lambda done: dict.fromkeys(RATES, 0.0))
-    train(Trainee(begun), lessons, frozen, progress=lambda stage, fraction, note="": notes.append(note))
-    order = [n for n, _ in zip(lessons.order((0,)), range(3), strict=False)]
+    train(GaussianModel(begun), targets, frozen, progress=lambda stage, fraction, note="": notes.append(note))
+    order = [n for n, _ in zip(targets.order((0,)), range(3), strict=False)]
     losses, errors = [], []
     for n in order:
-        image = torch.from_numpy(render(begun, lessons.cameras[n])[0])
-        losses.append(float(plain_photometric_loss(image, torch.from_numpy(lessons.picture(n)), 0.2)))
-        errors.append(float((image - torch.from_numpy(lessons.picture(n))).square().mean()))
+        image = torch.from_numpy(render(begun, targets.cameras[n])[0])
+        losses.append(float(plain_photometric_loss(image, torch.from_numpy(targets.picture(n)), 0.2)))
+        errors.append(float((image - torch.from_numpy(targets.picture(n))).square().mean()))
     assert notes[0] == "40 Gaussians"
     assert notes[1] == f"40 Gaussians, loss {losses[0]:.4f}, PSNR {-10 * np.log10(errors[0]):.2f}"
     smooth = 0.98 * (0.98 * losses[0] + 0.02 * losses[1]) + 0.02 * losses[2]
@@ -130,7 +130,7 @@ def test_what_is_told_is_the_loss():
 
 def test_rates_fall_as_in_3dgs():
     """Exponentially: half-way, the geometric mean."""
-    rates = falling({"means": 2.0, "sh0": 3.0}, {"means": 1.0, "sh0": 1.0}, {"means": 0.01, "sh0": 1.0})
+    rates = exponential_lr({"means": 2.0, "sh0": 3.0}, {"means": 1.0, "sh0": 1.0}, {"means": 0.01, "sh0": 1.0})
     assert rates(0.0) == {"means": 2.0, "sh0": 3.0}
     assert rates(0.5) == pytest.approx({"means": 0.2, "sh0": 3.0})
     assert rates(1.0) == pytest.approx({"means": 0.02, "sh0": 3.0})
@@ -138,6 +138,6 @@ def test_rates_fall_as_in_3dgs():
 
 def test_pictures_of_several_sizes_and_one_gaussian():
     scene = cloud(1, 0)
-    trainee = Trainee(scene)
-    train(trainee, taught(scene, (*around(2, 40), *around(3, 24))), plan(6))
-    assert len(trainee) == 1
+    model = GaussianModel(scene)
+    train(model, taught(scene, (*around(2, 40), *around(3, 24))), plan(6))
+    assert len(model) == 1

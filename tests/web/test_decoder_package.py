@@ -7,7 +7,7 @@ import shutil
 import subprocess
 
 import pytest
-from web_tools import DECODER, node, run_node
+from helpers.web_tools import DECODER, node, run_node
 
 import kissgs
 

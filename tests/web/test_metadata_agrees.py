@@ -4,9 +4,9 @@ import copy
 import json
 
 import pytest
-from odd_metadata import ODD, SPELLINGS
-from web_scenes import assert_scene, container, in_node, job
-from web_tools import run_node
+from helpers.odd_metadata import ODD, SPELLINGS
+from helpers.web_scenes import assert_scene, container, in_node, job
+from helpers.web_tools import run_node
 
 from kissgs import KissgsError, decompress
 from kissgs.sogxt.names import CHECKSUM

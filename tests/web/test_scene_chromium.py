@@ -4,7 +4,7 @@ import json
 import shutil
 
 import pytest
-from web_scenes import (
+from helpers.web_scenes import (
     IMAGES,
     assert_scene,
     assert_told,
@@ -14,7 +14,7 @@ from web_scenes import (
     without_checksums,
     zipped,
 )
-from web_tools import Site
+from helpers.web_tools import Site
 
 import kissgs
 

@@ -5,7 +5,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from web_scenes import (
+from helpers.web_scenes import (
     IMAGES,
     array_of,
     assert_scene,
@@ -19,7 +19,7 @@ from web_scenes import (
     without_checksums,
     zipped,
 )
-from web_tools import Site, pillow
+from helpers.web_tools import Site, pillow
 
 import kissgs
 

@@ -7,9 +7,9 @@ import zipfile
 
 import numpy as np
 import pytest
+from helpers.web_scenes import assert_scene, container, in_node, job, with_meta, without_checksums, zipped
+from helpers.web_tools import Site, pillow, webp
 from PIL import Image
-from web_scenes import assert_scene, container, in_node, job, with_meta, without_checksums, zipped
-from web_tools import Site, pillow, webp
 
 FILES = container("fast", 3, 65)
 

@@ -12,13 +12,13 @@ from math import factorial
 
 import numpy as np
 import pytest
+from helpers.web_tools import DECODER, Site
 from scipy.special import lpmv
-from web_tools import DECODER, Site
 
 import kissgs
+from kissgs.core.splats import ATTRIBUTES, SH_C0, SH_REST_COUNTS, Splats
 from kissgs.io.ply import write_ply
 from kissgs.rendering.camera import Camera, look_at
-from kissgs.splats import ATTRIBUTES, SH_C0, SH_REST_COUNTS, Splats
 
 playwright = pytest.importorskip("playwright.sync_api")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)

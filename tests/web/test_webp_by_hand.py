@@ -5,7 +5,7 @@ import hashlib
 
 import numpy as np
 import pytest
-from naive_vp8l import (
+from helpers.reference_vp8l import (
     CROSS_COLOUR,
     INDEXING,
     NEAR,
@@ -16,7 +16,7 @@ from naive_vp8l import (
     codes_of,
     tiles,
 )
-from web_tools import decode_all, pillow
+from helpers.web_tools import decode_all, pillow
 
 RNG = np.random.default_rng(0)
 

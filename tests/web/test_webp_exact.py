@@ -7,9 +7,9 @@ import subprocess
 
 import numpy as np
 import pytest
-from naive_vp8l import CROSS_COLOUR, INDEXING, PREDICTOR, SUBTRACT_GREEN, Reader, chunk, riff, stream_of
+from helpers.reference_vp8l import CROSS_COLOUR, INDEXING, PREDICTOR, SUBTRACT_GREEN, Reader, chunk, riff, stream_of
+from helpers.web_tools import as_rgba, decode_all, pillow, webp
 from PIL import Image
-from web_tools import as_rgba, decode_all, pillow, webp
 
 SIZES = [
     *((1, 1), (1, 2), (2, 1), (2, 2), (3, 3), (1, 37), (37, 1), (7, 13), (13, 7), (31, 61), (97, 5)),

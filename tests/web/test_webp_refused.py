@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from naive_vp8l import Writer, chunk, riff, stream_of, wrapped
+from helpers.reference_vp8l import Writer, chunk, riff, stream_of, wrapped
+from helpers.web_tools import decode_all, pillow, sha_of, webp
 from PIL import Image
-from web_tools import decode_all, pillow, sha_of, webp
 
 import kissgs
 

@@ -7,7 +7,7 @@ import zipfile
 import zlib
 
 import numpy as np
-from web_tools import run_node, sha_of, webp
+from helpers.web_tools import run_node, sha_of, webp
 
 PROGRAM = "read_zips.mjs"
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from kissgs.compiled import compiled
+from kissgs.core.numba_kernels import compiled
 
 # Sums may be reordered, so that they can be vectorised: always in the same way.
 _FAST = {"contract", "reassoc", "nsz"}

@@ -10,11 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kissgs._typing import Float32, Float64, Int32, Shaped
-from kissgs.errors import InvalidViewsError, UnsupportedError
-from kissgs.importance import Importance
-from kissgs.parallel import Workers
-from kissgs.rendering import semantics
+from kissgs.core.array_types import Float32, Float64, Int32, Shaped
+from kissgs.core.errors import InvalidViewsError, UnsupportedError
+from kissgs.core.sensitivity import Sensitivity
+from kissgs.core.splats import ATTRIBUTES, Splats
+from kissgs.core.threads import Workers
+from kissgs.rendering import constants as semantics
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu import blending, projection, sensitivity, shading
 from kissgs.rendering.cpu.lists import (
@@ -27,7 +28,6 @@ from kissgs.rendering.cpu.lists import (
     find_footprints,
     sort_into_tiles,
 )
-from kissgs.splats import ATTRIBUTES, Splats
 
 LIMITS = np.array([semantics.ALPHA_MIN, semantics.ALPHA_MAX, semantics.TRANSMITTANCE_MIN], np.float32)
 
@@ -72,7 +72,7 @@ class Gradients:
 
 
 def draw(splats: Splats, camera: Camera, background: Shaped[np.ndarray, "..."], pool: Workers) -> Frame:
-    """Take a picture of finite Gaussians (:func:`kissgs.clean`), as :mod:`kissgs.rendering.semantics` says.
+    """Take a picture of finite Gaussians (:func:`kissgs.clean`), as :mod:`kissgs.rendering.constants` says.
 
     Raises:
         InvalidViewsError: the background is not three finite numbers.
@@ -166,7 +166,7 @@ def removal_scores(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
     return scores
 
 
-def add_sensitivities(frame: Frame, weight: float, spread: float, into: Importance, pool: Workers) -> None:
+def add_sensitivities(frame: Frame, weight: float, spread: float, into: Sensitivity, pool: Workers) -> None:
     """Add to ``into`` what small changes of each Gaussian cost in this picture, times ``weight``.
 
     ``spread`` is the standard deviation of each channel of the background. In ``directions``, sums of (alpha T)² times
@@ -195,7 +195,7 @@ def add_sensitivities(frame: Frame, weight: float, spread: float, into: Importan
             camera.height,
             RULES,
             weight,
-            *(into.places, into.shapes, into.colors, into.directions),
+            *(into.position_hessian, into.shape_hessian, into.color_weight, into.mean_sh_basis),
         )
 
     each_part(project, even(len(visible), pool), pool)

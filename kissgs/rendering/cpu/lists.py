@@ -12,13 +12,13 @@ from typing import TypeVar
 
 import numpy as np
 
-from kissgs._typing import Float32, Int32, Int64, UInt16
-from kissgs.errors import UnsupportedError
-from kissgs.parallel import Workers
-from kissgs.rendering import semantics
+from kissgs.core.array_types import Float32, Int32, Int64, UInt16
+from kissgs.core.errors import UnsupportedError
+from kissgs.core.splats import Splats
+from kissgs.core.threads import Workers
+from kissgs.rendering import constants as semantics
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu import projection, shading, tiles
-from kissgs.splats import Splats
 
 RULES = np.array(
     [semantics.NEAR, semantics.FAR, semantics.DILATION, semantics.FRUSTUM_MARGIN, semantics.ALPHA_MIN], np.float64

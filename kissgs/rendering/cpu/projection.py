@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from kissgs.compiled import compiled
+from kissgs.core.numba_kernels import compiled
 
 Vector = tuple[float, float, float]
 Quat = tuple[float, float, float, float]

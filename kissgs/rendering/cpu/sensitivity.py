@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from kissgs.compiled import compiled
+from kissgs.core.numba_kernels import compiled
 from kissgs.rendering.cpu.blending import _FAST, _exp_minus, _footprint, _pixel_centres
 from kissgs.rendering.cpu.projection import (
     _cholesky,

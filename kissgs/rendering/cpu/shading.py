@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from kissgs.compiled import compiled
+from kissgs.core.numba_kernels import compiled
 
 
 @njit(nogil=True, error_model="numpy")

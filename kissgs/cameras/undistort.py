@@ -1,0 +1,212 @@
+"""Photographs of a distorting lens made into those of a pinhole.
+
+The model is Brown's in OpenCV's spelling, which COLMAP's SIMPLE_RADIAL, RADIAL, OPENCV and FULL_OPENCV and nerfstudio
+share. Fisheye lenses follow others and are refused where cameras are read.
+"""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from kissgs.core.array_types import Bool, Float32, Float64, UInt8
+from kissgs.core.errors import InvalidViewsError
+
+MIN_AREA = 0.1
+"""Share of the photograph that must remain. Real lenses leave more than half; less means wrong coefficients."""
+
+_BLOCK_PIXELS = 1 << 14
+"""Undistorted at a time: the temporaries, some 2 MB, stay in the processor's cache."""
+
+_GRID = 33
+"""Points per side at which the inside of a window is checked; its border is checked at every pixel."""
+
+
+@dataclass(frozen=True, slots=True)
+class Distortion:
+    """Coefficients of a lens: radial k1 to k6 (k4 to k6 in the denominator) and tangential p1, p2."""
+
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    k5: float = 0.0
+    k6: float = 0.0
+
+    def __bool__(self) -> bool:
+        """Whether the lens distorts at all."""
+        return any(astuple(self))
+
+    def apply(
+        self, x: Float64[np.ndarray, "*shape"], y: Float64[np.ndarray, "*shape"]
+    ) -> tuple[Float64[np.ndarray, "*shape"], Float64[np.ndarray, "*shape"]]:
+        """Where the lens images the ray (x, y, 1): the same plane, in units of the focal length."""
+        r2 = x * x + y * y
+        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        if self.k4 or self.k5 or self.k6:
+            radial = radial / (1 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6)))
+        if not (self.p1 or self.p2):
+            return x * radial, y * radial
+        return (
+            x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x),
+            y * radial + 2 * self.p2 * x * y + self.p1 * (r2 + 2 * y * y),
+        )
+
+
+NO_DISTORTION = Distortion()
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """Intrinsics of a photograph of ``width`` x ``height`` pixels, all lengths in these pixels."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    distortion: Distortion = NO_DISTORTION
+
+    @property
+    def K(self) -> Float64[np.ndarray, "3 3"]:
+        """Of the pinhole in it."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def resized(self, width: int, height: int) -> Lens:
+        """Of the same photograph on another grid of pixels; distortion is in units of the focal length."""
+        x, y = width / self.width, height / self.height
+        return Lens(self.fx * x, self.fy * y, self.cx * x, self.cy * y, width, height, self.distortion)
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """The part of the pinhole's picture that is kept: on the photograph's grid of pixels, from ``left``, ``top`` on."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+    def K(self, lens: Lens) -> Float64[np.ndarray, "3 3"]:
+        """Intrinsics of the pinhole whose picture it is: only the principal point moves."""
+        return lens.K - [[0, 0, self.left], [0, 0, self.top], [0, 0, 0]]
+
+
+@lru_cache(maxsize=256)  # most captures have one lens and hundreds of photographs
+def full_window(lens: Lens) -> Window:
+    """The largest window whose every pixel the photograph shows, so that no border is black.
+
+    It is the photograph's own rectangle shrunk towards the principal point, so a lens that bends outwards (barrel)
+    loses nothing, and the shape stays.
+
+    Raises:
+        InvalidViewsError: the principal point is not in the photograph, or less than a tenth of its area would remain.
+    """
+    if not (0 < lens.cx < lens.width and 0 < lens.cy < lens.height):
+        raise InvalidViewsError(
+            f"the principal point ({lens.cx:.6g}, {lens.cy:.6g}) of a distorting lens is outside its "
+            f"{lens.width}x{lens.height} photograph; calibrate again"
+        )
+    low, high = 0.0, 1.0
+    if _is_shown(lens, _shrunk(lens, 1.0)):
+        return _shrunk(lens, 1.0)
+    while high - low > 1e-5:  # windows are nested, so what holds for one holds for all smaller ones
+        middle = (low + high) / 2
+        low, high = (middle, high) if _is_shown(lens, _shrunk(lens, middle)) else (low, middle)
+    window = _shrunk(lens, low)
+    if window.width * window.height < MIN_AREA * lens.width * lens.height:
+        raise InvalidViewsError(
+            "the lens distortion leaves less than a tenth of the photograph; calibrate again, or undistort with "
+            "'colmap image_undistorter'"
+        )
+    return window
+
+
+def undistort(photo: UInt8[np.ndarray, "H W 3"], lens: Lens, window: Window) -> UInt8[np.ndarray, "h w 3"]:
+    """What a pinhole with the lens' focal lengths and principal point would have shown within ``window``.
+
+    Every pixel's ray is sent through the lens, and the photograph sampled there, bicubically (Catmull-Rom).
+    """
+    planes = np.ascontiguousarray(photo.transpose(2, 0, 1))
+    result = np.empty((window.height, window.width, 3), dtype=np.uint8)
+    x = (window.left + np.arange(window.width) + 0.5 - lens.cx) / lens.fx
+    y = (window.top + np.arange(window.height) + 0.5 - lens.cy) / lens.fy
+    step = max(1, _BLOCK_PIXELS // window.width)
+    for start in range(0, window.height, step):
+        u, v = _project(lens, *np.meshgrid(x, y[start : start + step]))
+        result[start : start + step] = _sample(planes, u - 0.5, v - 0.5)
+    return result
+
+
+def _shrunk(lens: Lens, share: float) -> Window:
+    left, right = np.ceil(lens.cx - share * lens.cx), np.floor(lens.cx + share * (lens.width - lens.cx))
+    top, bottom = np.ceil(lens.cy - share * lens.cy), np.floor(lens.cy + share * (lens.height - lens.cy))
+    return Window(int(left), int(top), max(0, int(right - left)), max(0, int(bottom - top)))
+
+
+def _is_shown(lens: Lens, window: Window) -> bool:
+    """Whether every pixel's ray meets the photograph, without the lens folding the picture over itself."""
+    if window.width == 0 or window.height == 0:
+        return True
+    first_x, first_y = window.left + 0.5, window.top + 0.5
+    last_x, last_y = first_x + window.width - 1, first_y + window.height - 1
+    xs, ys = np.arange(first_x, last_x + 1), np.arange(first_y, last_y + 1)
+    inside = np.meshgrid(np.linspace(first_x, last_x, _GRID), np.linspace(first_y, last_y, _GRID))
+    u = np.concatenate([xs, xs, np.full_like(ys, first_x), np.full_like(ys, last_x), inside[0].ravel()])
+    v = np.concatenate([np.full_like(xs, first_y), np.full_like(xs, last_y), ys, ys, inside[1].ravel()])
+    return bool(_is_seen(lens, (u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy).all())
+
+
+def _is_seen(lens: Lens, x: Float64[np.ndarray, " n"], y: Float64[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    h = 1e-5
+    with np.errstate(all="ignore"):  # coefficients may be anything; what overflows is not seen
+        u, v = _project(lens, x, y)
+        (ux1, vx1), (ux0, vx0) = lens.distortion.apply(x + h, y), lens.distortion.apply(x - h, y)
+        (uy1, vy1), (uy0, vy0) = lens.distortion.apply(x, y + h), lens.distortion.apply(x, y - h)
+        unfolded = (ux1 - ux0) * (vy1 - vy0) - (uy1 - uy0) * (vx1 - vx0) > 0  # the mapping's Jacobian determinant
+        return np.asarray(unfolded & (u >= 0) & (u <= lens.width) & (v >= 0) & (v <= lens.height))
+
+
+def _project(
+    lens: Lens, x: Float64[np.ndarray, "*shape"], y: Float64[np.ndarray, "*shape"]
+) -> tuple[Float64[np.ndarray, "*shape"], Float64[np.ndarray, "*shape"]]:
+    u, v = lens.distortion.apply(x, y)
+    return lens.fx * u + lens.cx, lens.fy * v + lens.cy
+
+
+def _sample(
+    planes: UInt8[np.ndarray, "3 H W"], u: Float64[np.ndarray, "h w"], v: Float64[np.ndarray, "h w"]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """A photograph between its pixels; (0, 0) is the centre of the first. Beyond the last, the last goes on.
+
+    One plane per colour, because numpy gathers single bytes several times faster than triples.
+    """
+    height, width = planes.shape[1:]
+    flat = planes.reshape(3, height * width)
+    column, row = np.floor(u).astype(np.int32), np.floor(v).astype(np.int32)
+    across, down = _weights((u - column).astype(np.float32)), _weights((v - row).astype(np.float32))
+    columns = [np.clip(column + i, 0, width - 1) for i in range(-1, 3)]
+    total = np.zeros((3, *u.shape), dtype=np.float32)
+    for j in range(4):
+        start = np.clip(row + j - 1, 0, height - 1) * width
+        for i in range(4):
+            place, weight = start + columns[i], down[j] * across[i]
+            for colour in range(3):
+                total[colour] += flat[colour].take(place) * weight
+    return np.clip(np.rint(total), 0, 255).astype(np.uint8).transpose(1, 2, 0)
+
+
+def _weights(t: Float32[np.ndarray, "h w"]) -> list[Float32[np.ndarray, "h w"]]:
+    """Of the four pixels around a place that is ``t`` after the second."""
+    half = np.float32(0.5)
+    return [
+        ((-half * t + 1) * t - half) * t,
+        (3 * half * t - 5 * half) * t * t + 1,
+        ((-3 * half * t + 2) * t + half) * t,
+        (half * t - half) * t * t,
+    ]

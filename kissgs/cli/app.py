@@ -1,0 +1,73 @@
+"""The command line: thin, prints what the library returns. Heavy imports wait until a command needs them."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sys
+from typing import Annotated, NoReturn
+
+import typer
+
+from kissgs._version import __version__
+from kissgs.cli.bench import bench
+from kissgs.cli.compact import compact
+from kissgs.cli.compress import compress
+from kissgs.cli.decompress import decompress
+from kissgs.cli.evaluate import evaluate
+from kissgs.cli.files import write_stdout
+from kissgs.cli.info import info
+from kissgs.cli.options import spelled_out
+from kissgs.cli.remote import app as remote
+from kissgs.cli.render import render
+from kissgs.cli.sample import sample
+from kissgs.cli.signals import unwinding
+from kissgs.cli.warmup import warmup
+from kissgs.core.errors import KissgsError, UnsupportedError
+
+app = typer.Typer(
+    name="kissgs",
+    help="Compress 3D Gaussian Splatting scenes (.ply) into SOG-XT containers that any browser can open.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+
+
+def run() -> None:
+    """Do what the command line says."""
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # torch's idle threads would take the processor from ours
+    unwinding(_run)
+
+
+def _run() -> None:
+    try:
+        app(spelled_out(sys.argv[1:]))
+    except KissgsError as error:
+        _fail(error)
+    except OSError as error:
+        if error.filename is None:  # of no file that the user could have named: a bug
+            raise
+        _fail(UnsupportedError(f"cannot use {error.filename!s:.100}: {(error.strerror or str(error)).lower()}"))
+
+
+for command in (compress, decompress, compact, render, evaluate, info, sample, bench, warmup):
+    app.command()(command)
+app.add_typer(remote)
+
+
+@app.callback(invoke_without_command=True)
+def _version(version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False) -> None:
+    if version:
+        typer.echo(f"kissgs {__version__}")
+        raise typer.Exit
+
+
+def _fail(error: KissgsError) -> NoReturn:
+    if "--json" in sys.argv:
+        with contextlib.suppress(KissgsError):  # it may be standard output that failed
+            write_stdout((json.dumps({"error": {"code": error.code, "message": str(error)}}) + "\n").encode())
+    sys.stderr.write(f"kissgs: {error}\n")
+    sys.exit(2)

@@ -1,0 +1,59 @@
+"""``kissgs decompress``: containers back into ``.ply`` files."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from kissgs.cli.arguments import (
+    ForceOption,
+    JsonOption,
+    QuietOption,
+    ScenesArgument,
+    ThreadsOption,
+)
+from kissgs.cli.console import progress_bar
+from kissgs.cli.files import each, show, source, stdout
+from kissgs.core.errors import InvalidContainerError
+
+
+def decompress(
+    containers: ScenesArgument,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="NAME.ply, a folder for them, or '-'; by default beside the container."),
+    ] = None,
+    max_gaussians: Annotated[int | None, typer.Option(min=0, help="Refuse more; by default 20 million.")] = None,
+    threads: ThreadsOption = 0,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Turn containers back into .ply files."""
+    from kissgs.io.ply import write_ply
+    from kissgs.pipeline.pipeline import decompress as run
+    from kissgs.sogxt.decode import MAX_GAUSSIANS
+
+    def work(container: str, target: Path) -> dict[str, Any]:
+        piped = str(target) == "-"
+        with progress_bar(quiet or as_json) as progress:
+            splats = run(
+                source(container),
+                None if piped else target,
+                max_gaussians=MAX_GAUSSIANS if max_gaussians is None else max_gaussians,
+                overwrite=force,
+                threads=threads,
+                progress=progress,
+            )
+        if piped:
+            with stdout():
+                write_ply(sys.stdout.buffer, splats)
+            return {}
+        if not (quiet or as_json):
+            show(f"{target}  {len(splats):,} Gaussians, SH degree {splats.sh_degree}")
+        return {"count": len(splats), "sh_degree": splats.sh_degree, "bytes": target.stat().st_size}
+
+    each(containers, output, ".ply", as_json, work, unreadable=InvalidContainerError)

@@ -1,0 +1,85 @@
+"""``kissgs evaluate``: a scene compared with its original, and with photographs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, cast
+
+import typer
+
+from kissgs.cli.arguments import (
+    ForceOption,
+    ImagesOption,
+    QuietOption,
+    RenderDeviceOption,
+    RenderThreadsOption,
+    ResolutionOption,
+    ScaleOption,
+    SplitOption,
+    ViewsOption,
+)
+from kissgs.cli.files import print_json, show
+from kissgs.cli.options import choice, device_of, open_views
+
+
+def evaluate(
+    reference: Annotated[Path, typer.Argument(metavar="REFERENCE", help="The scene as it was: .ply or container.")],
+    candidate: Annotated[Path, typer.Argument(metavar="CANDIDATE", help="What became of it: .ply or container.")],
+    views: ViewsOption = None,
+    scale: ScaleOption = None,
+    images: ImagesOption = None,
+    resolution: ResolutionOption = None,
+    split: SplitOption = "test",
+    seed: Annotated[int, typer.Option(min=0, help="Of the cameras that are drawn: another seed draws others.")] = 0,
+    lpips: Annotated[bool, typer.Option("--lpips", help="Measure LPIPS too; needs kissgs\\[lpips].")] = False,
+    html: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write a page with pictures of both, and where they differ.")
+    ] = None,
+    device: RenderDeviceOption = "cpu",
+    threads: RenderThreadsOption = 0,
+    force: ForceOption = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Compare a scene's pictures with those of its original, and with photographs: PSNR and SSIM."""
+    from kissgs.cli.console import progress_bar
+    from kissgs.evaluation.evaluate import evaluate as measure
+    from kissgs.evaluation.html import Side, html_report
+    from kissgs.evaluation.results import Split
+    from kissgs.io.atomic import atomic_file, refuse_existing
+    from kissgs.pipeline.scene_files import load, stored_bytes
+
+    used = cast(Split, choice("--split", split, Split))
+    where = device_of(device)
+    if html is not None:
+        refuse_existing(html, overwrite=force)
+    capture = open_views(views, scale=scale, images=images, resolution=resolution)
+    with progress_bar(quiet or as_json) as progress:
+        sides = [
+            Side(name=path.name, splats=load(path, threads=threads, progress=progress), bytes=stored_bytes(path))
+            for path in (reference, candidate)
+        ]
+        scenes = sides[0].splats, sides[1].splats
+        result = measure(
+            *scenes,
+            capture,
+            split=used,
+            seed=seed,
+            lpips=lpips,
+            device=where,
+            threads=threads,
+            progress=progress,
+        )
+        if html is not None:
+            page = html_report(result, sides[0], sides[1], device=where, threads=threads, progress=progress)
+            with atomic_file(html, overwrite=force) as file:
+                file.write(page.encode(errors="replace"))  # file names may be no text
+    sizes = {"reference": sides[0].bytes, "candidate": sides[1].bytes}
+    if as_json:
+        print_json({**result.as_dict(), "bytes": sizes})
+    elif not quiet:
+        from kissgs.cli.evaluation_tables import evaluation_table
+
+        show(evaluation_table(result, sides[0], sides[1], asked=split))
+        if html is not None:
+            show(f"\npictures  {html}")

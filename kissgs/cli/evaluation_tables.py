@@ -1,0 +1,76 @@
+"""What the command line prints about pictures. Nothing here computes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from rich.console import Group, RenderableType
+from rich.table import Column, Table
+from rich.text import Text
+
+from kissgs.benchmark.render_speed import RenderingCost
+from kissgs.cli.tables import elsewhere, size
+from kissgs.evaluation.html import Side
+from kissgs.evaluation.results import Evaluation
+
+
+def evaluation_table(evaluation: Evaluation, reference: Side, candidate: Side, *, asked: str) -> RenderableType:
+    """What ``kissgs evaluate`` shows; ``asked`` is the split that was asked for."""
+    what = Text(f"{evaluation.views_used}, {evaluation.size}: {evaluation.source}")
+    notes = [Text(evaluation.note, "yellow")] if evaluation.note else []
+    if evaluation.split == "train" != asked:
+        notes.append(Text("no view is held out, so these are those that the scene may have learnt from", "yellow"))
+    found: list[RenderableType] = [_views(evaluation), Text(), Text(_sentence(evaluation.extremes))]
+    if evaluation.surroundings is not None:
+        found.append(Text(_sentence(f"elsewhere: {elsewhere(evaluation.surroundings)}")))
+    return Group(_sizes(evaluation, reference, candidate), what, *notes, Text(), *found)
+
+
+def _sentence(told: str) -> str:
+    return f"{told[0].upper()}{told[1:]}."
+
+
+def _sizes(evaluation: Evaluation, reference: Side, candidate: Side) -> Text:
+    head = Text.assemble((candidate.name, "bold"), " compared with ", (reference.name, "bold"))
+    if reference.bytes is not None and candidate.bytes:
+        ratio = reference.bytes / candidate.bytes
+        change = f"{ratio:.1f}x smaller" if ratio >= 1 else f"{1 / ratio:.1f}x larger"
+        head.append(f"  {size(reference.bytes)} -> {size(candidate.bytes)}, ").append(change, "bold green")
+    return head.append(f"; {evaluation.candidate_count:,} of {evaluation.reference_count:,} Gaussians")
+
+
+def _views(evaluation: Evaluation) -> Table:
+    mean = evaluation.mean
+    parts = ["PSNR", "SSIM"] + (["LPIPS"] if mean.candidate_vs_reference.lpips is not None else [])
+    groups = ["reference\nto photo", "candidate\nto photo"] if mean.reference is not None else []
+    columns = [_group(group, parts) for group in groups]
+    changes = [Column("change\n\ndB", justify="right")] if groups else []
+    columns += [changes, _group("candidate\nto reference", parts)]
+    table = Table(
+        Column("view", vertical="bottom", overflow="fold"),
+        *(column for group in columns for column in group),
+        box=None,
+        pad_edge=False,
+    )
+    for compared in evaluation.views:
+        table.add_row(Text(compared.view.name), *compared.comparison.spelled())
+    table.add_row("mean", *mean.spelled(), style="bold")
+    return table
+
+
+def _group(title: str, parts: list[str]) -> list[Column]:
+    """Columns with one title: it stands over the first."""
+    first = Column(f"{title}\n{parts[0]}", justify="right")
+    return [first, *(Column(f"\n\n{part}", justify="right") for part in parts[1:])]
+
+
+def rendering_table(rows: Iterable[tuple[str, RenderingCost]]) -> Table:
+    """What ``kissgs bench --rendering`` shows: milliseconds of processor time per picture."""
+    works = ("draw", "draw + backward", "L1 + SSIM", "Adam", "draw + scores")
+    head = ("Gaussians", "visible", "picture", *(f"{work} ms" for work in works))
+    table = Table("scene", *(Column(name, justify="right") for name in head), box=None, pad_edge=False)
+    for scene, cost in rows:
+        taken = (cost.draw, cost.draw_and_backward, cost.loss, cost.adam, cost.score)
+        what = f"{cost.gaussians:,}", f"{cost.visible:,}", f"{cost.width}x{cost.height}"
+        table.add_row(scene, *what, *(f"{milliseconds:.1f}" for milliseconds in taken))
+    return table

@@ -1,0 +1,1 @@
+"""A kissgs service elsewhere, used from Python."""

@@ -1,0 +1,190 @@
+"""``Splats``: one Gaussian scene in canonical form, and how dirty input is brought into it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from kissgs.core.array_types import Bool, Float32, Int
+from kissgs.core.errors import InvalidSceneError
+
+SH_REST_COUNTS = (0, 3, 8, 15)
+"""Number of SH coefficients per colour channel beyond the constant one, for degree 0, 1, 2, 3."""
+
+SH_C0 = 0.28209479177387814
+"""Value of the constant real spherical harmonic: colour = 0.5 + SH_C0 * sh0."""
+
+OPACITY_LOGIT_MIN = float(np.float32(-13.815509796142578))
+OPACITY_LOGIT_MAX = float(np.float32(13.80231761932373))
+"""float32 logits of the opacities 1e-6 and 1 - 1e-6: further out no 8-bit picture changes and float32 sigmoids fail."""
+
+LOG_SCALE_LIMIT = 30.0
+MEAN_LIMIT = 1e15
+SH_LIMIT = 1e6
+"""Bounds of what is kept as it is; further out, renderers' float32 squares overflow."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Splats:
+    """One scene of N Gaussians: stored (pre-activation) parameters, as in the field's ``.ply``.
+
+    Attributes:
+        means: ``(N, 3)`` float32, positions in world units.
+        quats: ``(N, 4)`` float32, rotations as w, x, y, z; unit norm once cleaned.
+        scales: ``(N, 3)`` float32, natural logarithm of the standard deviations in world units.
+        opacities: ``(N,)`` float32, logits.
+        sh0: ``(N, 3)`` float32, constant SH coefficient of R, G, B.
+        shN: ``(N, K, 3)`` float32, the other SH coefficients, first band first; K is 0, 3, 8 or 15.
+
+    Raises:
+        InvalidSceneError: an array has another dtype or shape.
+    """
+
+    means: Float32[np.ndarray, "N 3"]
+    quats: Float32[np.ndarray, "N 4"]
+    scales: Float32[np.ndarray, "N 3"]
+    opacities: Float32[np.ndarray, " N"]
+    sh0: Float32[np.ndarray, "N 3"]
+    shN: Float32[np.ndarray, "N K 3"]
+
+    def __post_init__(self) -> None:
+        n = len(self.means) if self.means.ndim else -1
+        k = self.shN.shape[1] if self.shN.ndim == 3 else -1
+        if k not in SH_REST_COUNTS:
+            raise InvalidSceneError(
+                f"shN has shape {self.shN.shape}; it must be (N, K, 3) with K one of {SH_REST_COUNTS}"
+            )
+        expected = {
+            "means": (n, 3),
+            "quats": (n, 4),
+            "scales": (n, 3),
+            "opacities": (n,),
+            "sh0": (n, 3),
+            "shN": (n, k, 3),
+        }
+        for name, shape in expected.items():
+            array = getattr(self, name)
+            if array.shape != shape or array.dtype != np.float32:
+                raise InvalidSceneError(
+                    f"{name} is {array.dtype} of shape {array.shape}; it must be float32 of shape {shape}"
+                )
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def sh_degree(self) -> int:
+        """SH degree of the scene, 0 to 3."""
+        return SH_REST_COUNTS.index(self.shN.shape[1])
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all arrays."""
+        return sum(getattr(self, name).nbytes for name in ATTRIBUTES)
+
+    def select(self, index: Int[np.ndarray, " M"] | Bool[np.ndarray, " N"] | slice) -> Splats:
+        """The Gaussians at ``index`` (numbers, a boolean mask or a slice), in that order."""
+        return Splats(**{name: getattr(self, name)[index] for name in ATTRIBUTES})
+
+
+ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cleaned:
+    """What :func:`clean` changed, as numbers of Gaussians. The first two were removed, the others mended."""
+
+    non_finite: int = 0
+    """removed: NaN anywhere, or an infinite position, rotation or colour."""
+    far_away: int = 0
+    """removed: a position beyond ±1e15."""
+    infinite_opacities: int = 0
+    """opacity logit ±inf, set to that of opacity 1e-6 or 1 - 1e-6."""
+    saturated_opacities: int = 0
+    """finite opacity logit beyond those two, set to them: no 8-bit picture changes."""
+    zero_quats: int = 0
+    """rotation of zero length, replaced by the identity."""
+    unnormalised_quats: int = 0
+    """rotation whose length was off 1 by more than 1e-3, normalised."""
+    clamped_scales: int = 0
+    """log-scale beyond ±30 (also ±inf, the logarithm of 0), clamped."""
+    clamped_sh: int = 0
+    """SH coefficient beyond ±1e6, clamped."""
+
+    @property
+    def removed(self) -> int:
+        """Number of Gaussians that were removed."""
+        return self.non_finite + self.far_away
+
+    def as_dict(self) -> dict[str, int]:
+        """All counts by name."""
+        return asdict(self)
+
+
+NOTHING_CLEANED = Cleaned()
+
+
+def clean(splats: Splats) -> tuple[Splats, Cleaned]:
+    """Bring a scene into canonical form: finite, bounded, rotations of unit length.
+
+    Cleaning a clean scene changes nothing. The input is not modified; arrays that need no change are shared.
+
+    Returns:
+        The scene, its Gaussians in their order, and what was changed.
+    """
+    finite = _finite_rows(splats)
+    near = (np.abs(np.where(np.isfinite(splats.means), splats.means, 0)) <= MEAN_LIMIT).all(axis=1)
+    keep = finite & near
+    if not keep.all():
+        splats = splats.select(keep)
+
+    quats, zero, unnormalised = _unit_quats(splats.quats)
+    opacities = np.clip(splats.opacities, np.float32(OPACITY_LOGIT_MIN), np.float32(OPACITY_LOGIT_MAX))
+    infinite = np.isinf(splats.opacities)
+    scales, clamped_scales = _clamp(splats.scales, LOG_SCALE_LIMIT)
+    sh0, clamped_sh0 = _clamp(splats.sh0, SH_LIMIT)
+    shN, clamped_shN = _clamp(splats.shN, SH_LIMIT)
+    report = Cleaned(
+        non_finite=int((~finite).sum()),
+        far_away=int((finite & ~near).sum()),
+        infinite_opacities=int(infinite.sum()),
+        saturated_opacities=int(((opacities != splats.opacities) & ~infinite).sum()),
+        zero_quats=zero,
+        unnormalised_quats=unnormalised,
+        clamped_scales=int(clamped_scales.sum()),
+        clamped_sh=int((clamped_sh0 | clamped_shN).sum()),
+    )
+    cleaned = Splats(means=splats.means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN)
+    return cleaned, report
+
+
+def _finite_rows(splats: Splats) -> Bool[np.ndarray, " N"]:
+    n = len(splats)
+    rows = np.isfinite(splats.means).all(axis=1) & np.isfinite(splats.quats).all(axis=1)
+    rows &= ~np.isnan(splats.scales).any(axis=1) & ~np.isnan(splats.opacities)
+    # A sum is finite exactly when no term is NaN or infinite (float64 cannot overflow here): no (N, K, 3) temporary.
+    with np.errstate(invalid="ignore"):  # inf - inf
+        for sh in (splats.sh0, splats.shN.reshape(n, splats.shN.shape[1] * 3)):
+            rows &= np.isfinite(sh.sum(axis=1, dtype=np.float64))
+    return rows
+
+
+def _unit_quats(quats: Float32[np.ndarray, "N 4"]) -> tuple[Float32[np.ndarray, "N 4"], int, int]:
+    wide = quats.astype(np.float64)  # float32 squares underflow at 1e-23 and overflow at 1e19
+    norm = np.sqrt(np.einsum("nc,nc->n", wide, wide))
+    zero = norm == 0
+    unnormalised = ~zero & (np.abs(norm - 1) > 1e-3)
+    if not (zero.any() or (np.abs(norm - 1) > 1e-6).any()):
+        return quats, 0, 0
+    wide /= np.where(zero, 1, norm)[:, None]
+    wide[zero] = (1, 0, 0, 0)
+    return wide.astype(np.float32), int(zero.sum()), int(unnormalised.sum())
+
+
+def _clamp(values: np.ndarray, limit: float) -> tuple[np.ndarray, Bool[np.ndarray, " N"]]:
+    """``values`` within ±limit (the same array if it already is), and which rows were changed."""
+    if values.size == 0 or (values.max() <= limit and values.min() >= -limit):
+        return values, np.zeros(len(values), dtype=bool)
+    rows = (np.abs(values) > limit).reshape(len(values), -1).any(axis=1)
+    return np.clip(values, np.float32(-limit), np.float32(limit)), rows

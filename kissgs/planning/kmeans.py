@@ -1,0 +1,288 @@
+"""Vector quantisation: a weighted k-means in two levels, refined across their borders.
+
+Full k-means compares every vector with every centroid. Here vectors are first split among about sqrt(K) coarse
+clusters; each gets centroids in proportion to sqrt(its error × its count) and is clustered on its own; then vectors
+may move to any centroid of the coarse clusters around theirs, and centroids follow, for some rounds. On real scenes
+that is within 2 % of full k-means' error at a fraction of its time.
+
+Distances are matrix products on one BLAS thread per task, sums run in a fixed order in float64, and all chance comes
+from one seed: the result does not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from kissgs.core.array_types import Float32, Float64, Int, Int32
+from kissgs.core.threads import Workers
+from kissgs.planning.quantize import clip_outliers
+
+BLOCK = 1024
+"""Vectors per matrix product: its result, against a few thousand centroids, stays in the processor's cache."""
+
+COARSE_ROUNDS = 6
+SPLIT_ROUNDS = 4
+SAMPLES_PER_COARSE = 64
+MAX_COARSE = 512
+
+OUTLIERS = 1e-3
+"""Share of entries, at either end of a dimension, that may be pulled in to keep the others' step."""
+
+
+@dataclass(frozen=True, slots=True)
+class Clusters:
+    """K centroids, which of them each vector is replaced by, and the lattice that the centroids lie on (0: none)."""
+
+    centroids: Float32[np.ndarray, "K D"]
+    labels: Int32[np.ndarray, " N"]
+    step: float
+
+
+def fit(
+    vectors: Float32[np.ndarray, "N D"],
+    weights: Float32[np.ndarray, " N"],
+    size: int,
+    pool: Workers,
+    *,
+    seed: int,
+    rounds: int,
+    reach: int,
+    tolerance: float,
+    lattice: float,
+    report: Callable[[float], None] = lambda fraction: None,
+) -> Clusters:
+    """Find at most ``size`` centroids of small weighted squared error.
+
+    Args:
+        vectors: finite, N at least 1.
+        weights: positive; how much each vector's error counts.
+        size: K, largest number of centroids.
+        pool: where the work runs.
+        seed: of all random choices.
+        rounds: of refinement across the borders of coarse clusters.
+        reach: coarse clusters that a vector may move among in refinement.
+        tolerance: root mean square error per dimension below which a cluster is not split further.
+        lattice: step of the values that centroids are rounded to, in units of the root mean square error that the
+            codebook leaves; vectors then choose among the rounded ones. 0 leaves them as they are.
+        report: told the fraction done.
+
+    Returns:
+        The clusters; they are fewer than ``size`` where the vectors are few, alike or repeated.
+    """
+    rng = np.random.Generator(np.random.PCG64(seed))
+    mean = np.average(vectors, axis=0, weights=weights).astype(np.float32)
+    if _rms(vectors, mean) <= tolerance:
+        return Clusters(mean[None], np.zeros(len(vectors), dtype=np.int32), 0.0)
+    if len(vectors) <= size:
+        unique, labels = np.unique(vectors, axis=0, return_inverse=True)
+        step = _round_to_lattice(unique, 0.0, tolerance) if lattice else 0.0
+        return Clusters(unique, labels.reshape(-1).astype(np.int32), step)
+
+    coarse, owners, errors = _coarse(vectors, weights, size, rng, pool)
+    report(0.2)
+    order = np.argsort(owners, kind="stable")
+    counts = np.bincount(owners, minlength=len(coarse))
+    vectors, weights = vectors[order], weights[order]
+    shares = _allocate(errors, counts, size, len(vectors[0]) * tolerance**2)
+    tree = _Tree(coarse, _edges(counts), _edges(shares))
+    centroids, labels = _split(vectors, weights, tree, rng, pool)
+    report(0.4)
+    near = tree.neighbours(reach)
+    for step in range(rounds):
+        _update(centroids, vectors, weights, labels)
+        distances = _reassign(vectors, centroids, labels, tree, near, pool)
+        _revive(centroids, vectors, weights * distances, labels)
+        report(0.4 + 0.6 * (step + 1) / rounds)
+    _update(centroids, vectors, weights, labels)
+    step = 0.0
+    if lattice:
+        error = np.average(distances, weights=weights) / vectors.shape[1]
+        step = _round_to_lattice(centroids, lattice * float(error) ** 0.5, tolerance)
+        _reassign(vectors, centroids, labels, tree, near, pool)
+
+    used, compact = np.unique(labels, return_inverse=True)
+    unsorted = np.empty(len(labels), dtype=np.int32)
+    unsorted[order] = compact.reshape(-1)
+    return Clusters(centroids[used], unsorted, step)
+
+
+def assign(
+    vectors: Float32[np.ndarray, "N D"], centroids: Float32[np.ndarray, "K D"]
+) -> tuple[Int[np.ndarray, " N"], Float32[np.ndarray, " N"]]:
+    """Nearest centroid of every vector, by brute force, and the squared distance to it."""
+    labels = np.empty(len(vectors), dtype=np.int64)
+    distances = np.empty(len(vectors), dtype=np.float32)
+    norms = np.einsum("kd,kd->k", centroids, centroids)
+    minus_two = np.ascontiguousarray(centroids.T) * np.float32(-2)
+    for first in range(0, len(vectors), BLOCK):
+        block = vectors[first : first + BLOCK]
+        partial = block @ minus_two
+        partial += norms
+        best = partial.argmin(axis=1)
+        labels[first : first + BLOCK] = best
+        distances[first : first + BLOCK] = partial[np.arange(len(block)), best]
+    distances += np.einsum("nd,nd->n", vectors, vectors)
+    return labels, np.maximum(distances, 0, out=distances)
+
+
+@dataclass(frozen=True, slots=True)
+class _Tree:
+    """Coarse clusters, and the ranges of (sorted) vectors and of centroids that belong to each."""
+
+    coarse: Float32[np.ndarray, "J D"]
+    vector_edges: Int[np.ndarray, " edges"]
+    centroid_edges: Int[np.ndarray, " edges"]
+
+    def vectors_of(self, j: int) -> slice:
+        return slice(int(self.vector_edges[j]), int(self.vector_edges[j + 1]))
+
+    def centroids_of(self, j: int) -> slice:
+        return slice(int(self.centroid_edges[j]), int(self.centroid_edges[j + 1]))
+
+    def neighbours(self, reach: int) -> list[Int[np.ndarray, " _"]]:
+        """For every coarse cluster, the centroids of the ``reach`` coarse clusters nearest to it, itself first."""
+        norms = np.einsum("jd,jd->j", self.coarse, self.coarse)
+        distances = norms - 2 * (self.coarse @ self.coarse.T)
+        nearest = np.argsort(distances, axis=1, kind="stable")[:, :reach]
+        every = np.arange(self.centroid_edges[-1])
+        return [np.concatenate([every[self.centroids_of(int(j))] for j in row]) for row in nearest]
+
+
+def _coarse(
+    vectors: np.ndarray, weights: np.ndarray, size: int, rng: np.random.Generator, pool: Workers
+) -> tuple[Float32[np.ndarray, "J D"], Int[np.ndarray, " N"], Float64[np.ndarray, " J"]]:
+    """About sqrt(K) clusters from a sample; the owner of every vector and the weighted squared error of each."""
+    number = min(round(1.2 * size**0.5), MAX_COARSE)
+    sample = rng.choice(len(vectors), min(len(vectors), SAMPLES_PER_COARSE * number), replace=False)
+    some, some_weights = vectors[sample], weights[sample]
+    chances = some_weights.astype(np.float64) / some_weights.sum(dtype=np.float64)
+    coarse = some[rng.choice(len(some), number, replace=False, p=chances)]
+    for _ in range(COARSE_ROUNDS):
+        labels, _ = assign(some, coarse)
+        _update(coarse, some, some_weights, labels.astype(np.int32))
+    step = 16 * BLOCK
+    parts = pool.map(lambda first: assign(vectors[first : first + step], coarse), range(0, len(vectors), step))
+    owners = np.concatenate([labels for labels, _ in parts])
+    distances = np.concatenate([distances for _, distances in parts])
+    return coarse, owners, np.bincount(owners, weights=distances * weights, minlength=number)
+
+
+def _allocate(
+    errors: Float64[np.ndarray, " J"], counts: Int[np.ndarray, " J"], size: int, tolerance: float
+) -> Int[np.ndarray, " J"]:
+    """How many centroids each coarse cluster gets: by sqrt(error × count), at least 1, at most its vectors.
+
+    Clusters whose mean squared error is within ``tolerance`` get one. The sum is at most ``size``.
+    """
+    limit = np.where(errors > tolerance * counts, counts, np.minimum(counts, 1))
+    wish = np.sqrt(errors * counts)
+    shares = np.minimum(counts, 1)
+    left = size - int(shares.sum())
+    # Clusters that reach their limit leave the rest to the others; each pass gives out at least half of what is left.
+    while left > 0 and (open_ := (shares < limit) & (wish > 0)).any():
+        portion = np.where(open_, wish, 0)
+        extra = np.floor(portion / portion.sum() * left).astype(np.int64)
+        if not extra.any():
+            extra[np.argsort(-portion, kind="stable")[:left]] = 1
+        extra = np.minimum(np.where(open_, extra, 0), limit - shares)
+        shares += extra
+        left -= int(extra.sum())
+    return shares
+
+
+def _split(
+    vectors: np.ndarray, weights: np.ndarray, tree: _Tree, rng: np.random.Generator, pool: Workers
+) -> tuple[Float32[np.ndarray, "K D"], Int32[np.ndarray, " N"]]:
+    """Cluster the vectors of every coarse cluster on their own."""
+    centroids = np.empty((int(tree.centroid_edges[-1]), vectors.shape[1]), dtype=np.float32)
+    labels = np.empty(len(vectors), dtype=np.int32)
+    seeds = rng.integers(0, 2**63, len(tree.coarse))
+
+    def work(j: int) -> None:
+        rows, own = tree.vectors_of(j), tree.centroids_of(j)
+        some, some_weights, number = vectors[rows], weights[rows], own.stop - own.start
+        if number == 0:
+            return
+        chances = some_weights.astype(np.float64) / some_weights.sum(dtype=np.float64)
+        start = np.random.Generator(np.random.PCG64(int(seeds[j]))).choice(len(some), number, replace=False, p=chances)
+        local = some[start]
+        for _ in range(SPLIT_ROUNDS):
+            _update(local, some, some_weights, assign(some, local)[0].astype(np.int32))
+        centroids[own] = local
+        labels[rows] = assign(some, local)[0] + own.start
+
+    pool.map(work, range(len(tree.coarse)))
+    return centroids, labels
+
+
+def _reassign(
+    vectors: np.ndarray,
+    centroids: np.ndarray,
+    labels: np.ndarray,
+    tree: _Tree,
+    near: list[Int[np.ndarray, " _"]],
+    pool: Workers,
+) -> Float32[np.ndarray, " N"]:
+    """Move every vector to the best centroid near its coarse cluster. Changes ``labels``; returns distances."""
+    distances = np.zeros(len(vectors), dtype=np.float32)
+
+    def work(j: int) -> None:
+        rows = tree.vectors_of(j)
+        if rows.start < rows.stop:
+            best, distances[rows] = assign(vectors[rows], centroids[near[j]])
+            labels[rows] = near[j][best]
+
+    pool.map(work, range(len(tree.coarse)))
+    return distances
+
+
+def _update(centroids: np.ndarray, vectors: np.ndarray, weights: np.ndarray, labels: np.ndarray) -> None:
+    """Move every centroid to the weighted mean of its vectors; one that has none stays."""
+    from kissgs.planning import kernels
+
+    sums = np.zeros(centroids.shape)
+    totals = np.zeros(len(centroids))
+    kernels.weighted_sums(vectors, weights, labels, sums, totals)
+    filled = totals > 0
+    centroids[filled] = sums[filled] / totals[filled, None]
+
+
+def _revive(centroids: np.ndarray, vectors: np.ndarray, errors: np.ndarray, labels: np.ndarray) -> None:
+    """Give centroids that lost all their vectors a new start: the vectors that are represented worst."""
+    empty = np.flatnonzero(np.bincount(labels, minlength=len(centroids)) == 0)
+    worst = np.argsort(-errors, kind="stable")[: len(empty)]
+    centroids[empty] = vectors[worst]
+    labels[worst] = empty
+
+
+def _round_to_lattice(centroids: np.ndarray, step: float, tolerance: float) -> float:
+    """Round in place to whole steps from each dimension's smallest value, which a constant one keeps.
+
+    Returns:
+        The step: the one asked for, or what 256 levels and the tolerance ask for, if that is larger.
+    """
+    step = max(step, 2 * tolerance)
+    # Few vectors have no outliers, and an exact codebook has no error that would tell the step.
+    wide = (clip_outliers(centroids, step=step, share=OUTLIERS) if step > 2 * tolerance else centroids).astype(
+        np.float64
+    )
+    low = wide.min(axis=0)
+    step = max(step, float((wide - low).max()) / 254)
+    if step > 0:
+        centroids[:] = low + np.rint((wide - low) / step) * step
+    return step
+
+
+def _edges(counts: Int[np.ndarray, " J"]) -> Int[np.ndarray, " edges"]:
+    return np.concatenate([[0], np.cumsum(counts)])
+
+
+def _rms(vectors: np.ndarray, mean: np.ndarray) -> float:
+    total = sum(
+        float(np.square(vectors[first : first + BLOCK] - mean, dtype=np.float64).sum())
+        for first in range(0, len(vectors), BLOCK)
+    )
+    return float(np.sqrt(total / vectors.size))

@@ -1,0 +1,134 @@
+"""Which Gaussian sits in which cell of the grid: row-major along a 3D Hilbert curve.
+
+WebP predicts a pixel from its left and upper neighbours and repeats earlier runs; a long one-dimensional chain through
+space serves it better than any two-dimensional arrangement that was measured (docs/format.md has the grid itself).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import isqrt
+
+import numpy as np
+
+from kissgs.core.array_types import Bool, Float32, Int, UInt16
+from kissgs.core.errors import UnsupportedError
+from kissgs.core.limits import MAX_GRID_SIDE
+from kissgs.core.threads import Workers
+from kissgs.planning.plas import plas
+from kissgs.planning.quantize import quantize_means
+from kissgs.settings import EncodeSettings
+
+PLAS_HIGH, PLAS_LOW = 1.0, 0.2
+"""Weights of the high and the low position bytes where Gaussians are sorted by PLAS (the public encoder's)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Which Gaussian sits in which cell, row-major.
+
+    Attributes:
+        side: G, cells per axis.
+        cells: ``(G*G,)`` index of a Gaussian of the scene; padding repeats one that lies near.
+        mask: ``(G*G,)`` whether the cell is more than padding.
+        cell_to_gaussian: ``(G*G,)`` for each cell, the number, among the cells that are no padding, of the cell that
+            holds the same Gaussian.
+    """
+
+    side: int
+    cells: Int[np.ndarray, " cells"]
+    mask: Bool[np.ndarray, " cells"]
+    cell_to_gaussian: Int[np.ndarray, " cells"]
+
+
+def layout_grid(
+    means: Float32[np.ndarray, "N 3"],
+    kept: Int[np.ndarray, " M"],
+    bits: int,
+    settings: EncodeSettings,
+    pool: Workers,
+    report: Callable[[float], None],
+    classes: Int[np.ndarray, " M"] | None = None,
+) -> Grid:
+    """Give every Gaussian of ``kept`` a cell.
+
+    Along the Hilbert curve, those of class 0 may come first, then those of class 1, and so on: a curve for each.
+
+    Raises:
+        UnsupportedError: there are more than one image can hold.
+    """
+    side = grid_side(len(kept))
+    if len(kept) == 0:
+        nothing = np.zeros(side * side, dtype=np.int64)
+        return Grid(side, nothing, nothing.astype(bool), nothing)
+    levels = quantize_means(means[kept], bits=bits).levels
+    if settings.order == "hilbert":
+        order = hilbert_order(levels)
+        if classes is not None:
+            order = order[np.argsort(classes[order], kind="stable")]
+        order = np.concatenate([order, np.repeat(order[-1:], side * side - len(order))])
+        mask = np.arange(side * side) < len(kept)
+    else:
+        order, mask = _plas_order(levels, side, settings, pool, report)
+    rank = np.empty(len(kept), dtype=np.int64)
+    rank[order[mask]] = np.arange(len(kept))
+    return Grid(side, kept[order], mask, rank[order])
+
+
+def _plas_order(
+    levels: UInt16[np.ndarray, "M 3"],
+    side: int,
+    settings: EncodeSettings,
+    pool: Workers,
+    report: Callable[[float], None],
+) -> tuple[Int[np.ndarray, " cells"], Bool[np.ndarray, " cells"]]:
+    """Cells sorted by PLAS on both position bytes; padding is sorted along with the rest."""
+    count = len(levels)
+    rng = np.random.Generator(np.random.PCG64(settings.seed))
+    padding = rng.integers(0, count, side * side - count)
+    index = np.concatenate([np.arange(count), padding])
+    radius = settings.plas_start_radius
+    start = rng.permutation(side * side) if radius is None else hilbert_order(levels[index])
+    index = index[start]
+    high, low = (_standardized(part) for part in (levels[index] >> 8, levels[index] & 255))
+    items = np.concatenate([PLAS_HIGH * high, PLAS_LOW * low], axis=1).astype(np.float32)
+    placed = plas(items, pool, seed=settings.seed, decay=settings.plas_radius_decay, start_radius=radius, report=report)
+    return index[placed], start[placed] < count
+
+
+def _standardized(values: np.ndarray) -> np.ndarray:
+    """Zero mean and unit deviation, both over all channels together."""
+    deviation = values.std()
+    return (values - values.mean()) / (deviation if deviation > 0 else 1)
+
+
+def grid_side(count: int) -> int:
+    """Side of the square grid for ``count`` Gaussians: the smallest multiple of 8 that holds them, at least 8.
+
+    Raises:
+        UnsupportedError: there are more Gaussians than one image can hold.
+    """
+    side = isqrt(max(count, 1) - 1) + 1
+    side = -(-side // 8) * 8
+    if side > MAX_GRID_SIDE:
+        raise UnsupportedError(
+            f"{count} Gaussians do not fit into one container; at most {MAX_GRID_SIDE**2} do: split the scene"
+        )
+    return side
+
+
+def hilbert_order(levels: UInt16[np.ndarray, "N 3"]) -> Int[np.ndarray, " N"]:
+    """The order in which a 3D Hilbert curve visits the positions.
+
+    Args:
+        levels: 16-bit positions.
+
+    Returns:
+        Indices of the Gaussians along the curve; those in one cell keep their order.
+    """
+    from kissgs.planning import kernels
+
+    keys = np.empty(len(levels), dtype=np.uint64)
+    kernels.hilbert_keys(np.ascontiguousarray(levels), keys)
+    return np.argsort(keys, kind="stable")

@@ -1,0 +1,68 @@
+"""The plan of a container: weighed by what changes cost in pictures where that is known, else with even steps."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kissgs.core.array_types import Int
+from kissgs.core.progress import Progress, silent
+from kissgs.core.sensitivity import Sensitivity
+from kissgs.core.splats import Splats
+from kissgs.core.threads import blas_workers
+from kissgs.planning.encoding_plan import EncodingPlan
+from kissgs.planning.rate_distortion import ColorRefit, plan_rate_distortion
+from kissgs.planning.uniform import plan_uniform
+from kissgs.settings import EncodeSettings
+
+INVISIBLE_LOGIT = -5.5373
+"""Logit of opacity 1/255, rounded up: no renderer draws what is this faint or fainter."""
+
+
+def plan_encoding(
+    splats: Splats,
+    settings: EncodeSettings,
+    *,
+    sensitivity: Sensitivity | None = None,
+    recolor: ColorRefit | None = None,
+    threads: int = 0,
+    progress: Progress = silent,
+) -> EncodingPlan:
+    """Choose order, forms, codebook and levels for a clean scene.
+
+    Args:
+        splats: the scene.
+        settings: see :class:`EncodeSettings`.
+        sensitivity: what changes of the scene cost in pictures. With it all choices are weighed under one price of a
+            bit; without it, or where nothing was seen, steps are those of the settings.
+        recolor: where choices are weighed: given the Gaussians as a decoder will find them, and their indices in the
+            scene, returns better ``sh0``.
+        threads: to use; 0 means one per processor.
+        progress: receives "kernels", "rate_distortion", "order", "forms", "codebook", "sort codebook" and "rounding".
+
+    Raises:
+        InvalidSceneError: ``sensitivity`` does not fit the scene.
+        UnsupportedError: the scene is too large for one container.
+    """
+    if sensitivity is not None:
+        sensitivity.check(splats)
+    load_kernels(progress)
+    kept = visible_gaussians(splats, settings)
+    with blas_workers(threads) as pool:
+        if sensitivity is not None and (sensitivity.color_weight[kept] > 0).any():
+            return plan_rate_distortion(splats, kept, sensitivity, recolor, settings, pool, progress)
+        return plan_uniform(splats, kept, settings, pool, progress)
+
+
+def visible_gaussians(splats: Splats, settings: EncodeSettings) -> Int[np.ndarray, " K"]:
+    """Those that any renderer draws."""
+    if not settings.prune_invisible:
+        return np.arange(len(splats))
+    return np.flatnonzero(splats.opacities > np.float32(INVISIBLE_LOGIT))
+
+
+def load_kernels(progress: Progress = silent) -> None:
+    """Compile the encoder's kernels, or load them from numba's cache of earlier times."""
+    progress("kernels", 0.0)
+    from kissgs.planning import kernels  # noqa: F401
+
+    progress("kernels", 1.0)

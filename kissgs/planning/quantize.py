@@ -1,0 +1,175 @@
+"""Level <-> value: uniform quantisers with exact bookkeeping of the ranges that decoders use.
+
+A SOG-XT decoder knows no level counts. It maps the smallest level observed in an image to each channel's ``low`` and
+the largest to its ``high``, linearly (docs/format.md). So the ranges written must belong to the levels that are really
+in the image; :func:`observed_range` makes them so, whatever happened to the levels in between.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import ceil
+
+import numpy as np
+
+from kissgs.core.array_types import Bool, Float, Float32, Float64, Int, UInt8, UInt16
+from kissgs.core.signed_log import signed_log
+from kissgs.core.splats import Splats
+
+MEANS_TOP = 65_535
+"""Top level of positions. Some readers of meta.json divide by it instead of by what they observe, so it must occur."""
+
+
+@dataclass(frozen=True, slots=True)
+class Quantized:
+    """Levels of one plane and what they stand for: ``value = low + level / top * (high - low)``, per channel.
+
+    Attributes:
+        levels: ``(N, C)`` from 0 to ``top``.
+        low: ``(C,)`` value of level 0.
+        high: ``(C,)`` value of level ``top``.
+        top: the level that ``high`` belongs to, whether it occurs or not.
+        level_stride: distance of the levels that a row uses: multiples of it, once ``level_offset`` is added. One for
+            all, or ``(N,)``. Single levels may be others.
+        level_offset: how far multiples are shifted.
+    """
+
+    levels: UInt8[np.ndarray, "N C"] | UInt16[np.ndarray, "N C"]
+    low: Float32[np.ndarray, " C"]
+    high: Float32[np.ndarray, " C"]
+    top: int
+    level_stride: int | Int[np.ndarray, " N"] = 1
+    level_offset: int = 0
+
+    def values(self) -> Float64[np.ndarray, "N C"]:
+        """What the levels stand for."""
+        low, high = self.low.astype(np.float64), self.high.astype(np.float64)
+        return np.asarray(low + self.levels * ((high - low) / self.top))
+
+    def take(self, rows: Int[np.ndarray, " M"] | Bool[np.ndarray, " N"]) -> Quantized:
+        """Those of the rows ``rows`` alone, in that order."""
+        spacing = self.level_stride if isinstance(self.level_stride, int) else self.level_stride[rows]
+        return replace(self, levels=self.levels[rows], level_stride=spacing)
+
+
+def quantize(values: Float[np.ndarray, "N C"], *, step: float, shared: bool = True, max_top: int = 255) -> Quantized:
+    """Round to equal steps, chosen by the distance that is allowed between neighbouring levels.
+
+    Args:
+        values: finite values.
+        step: largest allowed step, in the unit of the values. It is exceeded only if ``max_top`` levels do not
+            span the widest channel.
+        shared: one step for all channels (least error for a given entropy). If false every channel spreads
+            ``max_top`` levels over its own range, and ``step`` does not matter.
+        max_top: largest level.
+
+    Returns:
+        Levels whose values are at most half a step away; a constant channel is exact.
+    """
+    wide = values.astype(np.float64)
+    low, high = _range(wide)
+    extent = high.astype(np.float64) - low
+    widest = float(extent.max(initial=0.0))
+    top = max_top
+    if shared and widest > 0:
+        top = int(min(max(ceil(widest / step - 1e-3), 1), max_top))  # a whole number of steps stays one
+        high = np.where(extent > 0, (low + widest).astype(np.float32), low)
+    return Quantized(_levels(wide, low, high, top).astype(np.uint8), low, high, top)
+
+
+def clip_outliers(values: Float[np.ndarray, "N C"], *, step: float, share: float) -> Float[np.ndarray, "N C"]:
+    """Pull in outliers that 256 levels of ``step`` cannot span, so that they do not make the step coarse for all.
+
+    Nothing happens where the levels suffice. Else each channel keeps the span of all but the outermost ``share`` of its
+    values at either end, or as much as the levels span if that is more, and values beyond it move to its ends.
+    """
+    low, high = values.min(axis=0, initial=np.inf), values.max(axis=0, initial=-np.inf)
+    if len(values) == 0 or float((high.astype(np.float64) - low).max(initial=0)) <= 255 * step:
+        return values
+    inner_low = np.quantile(values, share, axis=0, method="lower").astype(np.float64)
+    inner_high = np.quantile(values, 1 - share, axis=0, method="higher").astype(np.float64)
+    span = max(float((inner_high - inner_low).max()), 255 * step)
+    middle = (inner_low + inner_high) / 2
+    # As much of the room beside the inner values as is needed, on the side where it is needed.
+    first = np.clip(low, middle - span / 2, None)
+    last = np.clip(high, None, middle + span / 2)
+    return np.clip(values, first.astype(values.dtype), last.astype(values.dtype))
+
+
+def quantize_means(means: Float32[np.ndarray, "N 3"], *, bits: int | Int[np.ndarray, " N"]) -> Quantized:
+    """Positions as 16-bit levels of their signed logarithm, with one range for all three axes.
+
+    Args:
+        means: finite positions.
+        bits: precision, 8 to 16, of all or of each. Below 16 the levels are multiples of a power of two (the low
+            bytes then compress); the outermost level stays 65535.
+
+    Returns:
+        Levels (uint16) with ``low`` and ``high`` in the signed-log domain, alike in all channels.
+    """
+    wide = signed_log(means)
+    low32, high32 = _range(wide.reshape(-1, 1))
+    low, high = np.repeat(low32, 3), np.repeat(high32, 3)
+    spacing = np.exp2(16 - np.asarray(bits))
+    levels = _levels(wide, low, high, MEANS_TOP, spacing.reshape(-1, 1))
+    if high[0] > low[0]:
+        levels[wide == wide.max()] = MEANS_TOP  # rounding, to even or of the range, could stop just short of it
+    meant = int(spacing) if spacing.ndim == 0 else spacing.astype(np.int64)
+    return Quantized(levels.astype(np.uint16), low, high, MEANS_TOP, meant)
+
+
+def means_bits(splats: Splats, kept: Int[np.ndarray, " M"], tolerance: float) -> int:
+    """Bits of position that the scene needs: the median Gaussian moves by at most ``tolerance`` of its size.
+
+    The step of a signed logarithm grows as 1 + |x|; size is the geometric mean of the two longest axes.
+    """
+    if len(kept) == 0:
+        return 16
+    reach = 1 + np.abs(splats.means[kept]).max(axis=1).astype(np.float64)
+    longest = np.sort(splats.scales[kept], axis=1)[:, 1:].mean(axis=1, dtype=np.float64)
+    allowed = tolerance * np.exp(np.median(longest - np.log(reach)))
+    extent = float(np.ptp(signed_log(splats.means[kept])))
+    levels = extent / (2 * allowed)  # half a step is the largest error
+    return int(np.clip(np.ceil(np.log2(max(levels, 1))), 8, 16))
+
+
+def observed_range(quantized: Quantized) -> tuple[Float32[np.ndarray, " C"], Float32[np.ndarray, " C"]]:
+    """The ranges to write: values of the smallest and the largest level that occur in the image, over all channels.
+
+    An image of one level throughout decodes to ``low`` everywhere, so both ends are then that level's value.
+    """
+    if quantized.levels.size == 0:
+        return quantized.low, quantized.low
+    first, last = int(quantized.levels.min()), int(quantized.levels.max())
+    if (first, last) == (0, quantized.top):
+        return quantized.low, quantized.high
+    low, high = quantized.low.astype(np.float64), quantized.high.astype(np.float64)
+    per_level = (high - low) / quantized.top
+    return (low + first * per_level).astype(np.float32), (low + last * per_level).astype(np.float32)
+
+
+def _range(wide: Float64[np.ndarray, "N C"]) -> tuple[Float32[np.ndarray, " C"], Float32[np.ndarray, " C"]]:
+    """Per-channel minimum and maximum as the float32 numbers that will be written (zeros without rows)."""
+    if len(wide) == 0:
+        zeros = np.zeros(wide.shape[1], dtype=np.float32)
+        return zeros, zeros
+    # + 0.0 turns -0.0 into 0.0, so that equal scenes give equal bytes.
+    return wide.min(axis=0).astype(np.float32) + np.float32(0), wide.max(axis=0).astype(np.float32) + np.float32(0)
+
+
+def _levels(
+    wide: Float64[np.ndarray, "N C"],
+    low: Float32[np.ndarray, " C"],
+    high: Float32[np.ndarray, " C"],
+    top: int,
+    spacing: float | Float64[np.ndarray, "M 1"] = 1,
+) -> Float64[np.ndarray, "N C"]:
+    """Nearest multiples of ``spacing`` in the rounded ranges, at most ``top``."""
+    low64 = low.astype(np.float64)
+    extent = high.astype(np.float64) - low64
+    levels = wide - low64
+    levels *= top / np.where(extent > 0, extent, np.inf)
+    levels /= spacing
+    np.rint(levels, out=levels)
+    levels *= spacing
+    return np.clip(levels, 0, top, out=levels)

@@ -1,0 +1,199 @@
+"""Levels by rate and distortion: each the cheapest sum of squared image error and bits, under one price for both.
+
+Rounding to the nearest level treats a Gaussian that fills the picture and one behind a wall alike. Here every class of
+Gaussians has its own step, a whole multiple of the image's; and within a class levels that many others have are
+preferred where the error does not matter, so that the entropy code needs fewer bits.
+"""
+
+from __future__ import annotations
+
+from math import ceil
+
+import numpy as np
+
+from kissgs.core.array_types import Float, Float32, Float64, Int, UInt8
+from kissgs.core.threads import Workers
+from kissgs.planning.quantize import Quantized
+from kissgs.planning.rd_model import Costs, step
+from kissgs.planning.rotation_forms import PERMUTATIONS, ROTATIONS
+
+UNSEEN = {"opacities": 0.15, "scales": 0.11, "growth": 0.11, "quaternions": 0.023, "f_dc": 0.055}
+VIRTUAL = {"opacities": 0.4, "scales": 0.13, "growth": 0.12, "quaternions": 0.08, "f_dc": 0.2}
+CAPTURED = {"opacities": 2.0, "scales": 0.6, "growth": 0.3, "quaternions": 0.25, "f_dc": 0.5}
+"""Largest step of each attribute and largest change by rounding, whatever the price.
+
+The first, the steps of ``fast``, are for Gaussians that no camera has looked at; the second for those that virtual
+cameras have, to which any other may come as near as it likes; the third for those that a capture has, which says who
+looks from where. The first derivative says nothing about larger errors; and a Gaussian smaller than a pixel has no
+derivative by its size, but becomes a blob elsewhere: so growth is held back most.
+"""
+
+RELAXED = 1 / 3
+"""Power of the coarseness asked for with which these bounds grow. Measured on cameras that the encoder did not use."""
+
+
+def largest_changes(
+    coverage: Float[np.ndarray, " M"], captured: Float[np.ndarray, " M"], slack: float
+) -> dict[str, Float64[np.ndarray, " M"]]:
+    """How far each attribute of each Gaussian may be rounded.
+
+    Steps in balance with a price grow as its root. These bounds grow less: they are there for cameras from which a
+    change shows more than it was found to cost, and fewer Gaussians or coarser colours are then the smaller loss.
+
+    Args:
+        coverage: from 0 to 1, see :class:`kissgs.Sensitivity`.
+        captured: from 0 to ``coverage``, see the same.
+        slack: from 1, how many times coarser than by default the scene is to be.
+    """
+    looked, known = coverage.astype(np.float64), captured.astype(np.float64)
+    return {
+        name: np.minimum(
+            UNSEEN[name] ** (1 - looked) * VIRTUAL[name] ** (looked - known) * CAPTURED[name] ** known * slack**RELAXED,
+            CAPTURED[name],
+        )
+        for name in CAPTURED
+    }
+
+
+UNUSED = 0.05
+"""Times that a level is taken to occur which does not."""
+
+ROUNDS, SWEEPS = 3, 1
+"""Of counting levels and choosing by the counts; and of choosing in each."""
+
+CHUNK = 1 << 14
+
+
+def _mirrors() -> Float64[np.ndarray, "24 3"]:
+    """1, or -1 where the new axis is an old one turned round: entries of the cube's rotation matrices."""
+    w, x, y, z = ROTATIONS.T
+    matrices = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    axes = np.arange(3)
+    return np.stack([np.rint(matrices[PERMUTATIONS[row], axes, row]) for row in range(24)])
+
+
+MIRRORS = _mirrors()
+"""For each of the 24 rotations of the cube and each new axis: 1, or -1 where it is an old one turned round."""
+
+
+def quantize_by_class(
+    values: Float64[np.ndarray, "M C"],
+    cost: Float64[np.ndarray, " M"],
+    classes: Int[np.ndarray, " M"],
+    rd_lambda: float,
+    coarsest: Float64[np.ndarray, " M"],
+) -> Quantized:
+    """Round to the nearest of the levels that each class of Gaussians uses.
+
+    Args:
+        values: finite.
+        cost: of one unit, per Gaussian.
+        classes: of each Gaussian, from 0.
+        rd_lambda: of a bit.
+        coarsest: largest step, per Gaussian.
+
+    Returns:
+        Levels from 0 to at most 255, of one step for all channels and classes.
+    """
+    low32 = values.min(axis=0).astype(np.float32) + np.float32(0)
+    low = low32.astype(np.float64)
+    widest = float((values - low).max(initial=0))
+    balanced = np.array([step(float(cost[classes == c].mean()), rd_lambda) for c in range(int(classes.max()) + 1)])
+    steps = np.minimum(balanced[classes], coarsest)
+    finest = max(float(steps.min()), widest / 255, 1e-30)
+    top = int(min(max(ceil(widest / finest - 1e-3), 1), 255))
+    spacing = np.clip(np.rint(steps / finest), 1, 255)
+    multiples = spacing[:, None]
+    levels = np.rint((values - low) / finest / multiples) * multiples
+    levels = np.where(levels > top, np.floor(top / multiples) * multiples, levels)
+    extent = values.max(axis=0) - low
+    high = np.where(extent > 0, low + top * finest, low).astype(np.float32)
+    return Quantized(np.clip(levels, 0, top).astype(np.uint8), low32, high, top, spacing.astype(np.int64))
+
+
+def rdo_quantize_shapes(
+    values: Float64[np.ndarray, "M 8"],
+    parts: tuple[Quantized, Quantized, Quantized],
+    shapes: Float32[np.ndarray, "M 28"],
+    forms: UInt8[np.ndarray, " M"],
+    costs: Costs,
+    classes: Int[np.ndarray, " M"],
+    rd_lambda: float,
+    largest: dict[str, Float64[np.ndarray, " M"]],
+    pool: Workers,
+) -> tuple[Quantized, Quantized, Quantized]:
+    """Choose the levels of opacities, scales and quaternions together.
+
+    Args:
+        values: opacity logit, log-scales and unit quaternion, in the form in which each Gaussian is stored.
+        parts: them, rounded: opacities, scales, quaternions.
+        shapes: of :class:`kissgs.Sensitivity`.
+        forms: of each Gaussian, see :mod:`kissgs.planning.rotation_forms`.
+        costs: whose floors are kept.
+        classes: of each Gaussian, from 0.
+        rd_lambda: of a bit.
+        largest: change of each attribute, see :func:`largest_changes`.
+        pool: where the work runs.
+    """
+    from kissgs.planning import rdo_kernels as rounding_kernels
+
+    levels = np.concatenate([part.levels for part in parts], axis=1).astype(np.int64)
+    low = np.concatenate([part.low for part in parts]).astype(np.float64)
+    high = np.concatenate([part.high for part in parts]).astype(np.float64)
+    top = np.concatenate([np.full(part.levels.shape[1], part.top) for part in parts])
+    steps = (high - low) / top
+    top[steps <= 0] = 0  # a constant channel
+    steps[steps <= 0] = 1.0
+    changes = [
+        np.stack([largest["opacities"], *3 * [largest[scales]], *4 * [largest["quaternions"]]], axis=1)
+        for scales in ("scales", "growth")
+    ]
+    floor = np.array([float(cost.min(initial=np.inf)) for cost in (costs.opacity, costs.scale, costs.rotation)])
+
+    for _ in range(ROUNDS):
+        charges = rd_lambda * _bits(levels, classes)
+
+        def choose(first: int, charges: Float64[np.ndarray, "classes 8 256"] = charges) -> None:
+            rows = slice(first, first + CHUNK)
+            rounding_kernels.round_shapes(
+                *(values[rows], shapes[rows], forms[rows], PERMUTATIONS, MIRRORS),
+                *(classes[rows], low, steps, top, charges),
+                np.stack([change[rows] for change in changes], axis=1),
+                floor,
+                SWEEPS,
+                levels[rows],
+            )
+
+        pool.map(choose, range(0, len(levels), CHUNK))
+    ends = np.cumsum([0] + [part.levels.shape[1] for part in parts])
+    chosen = [_from_zero(levels[:, a:b], part) for part, a, b in zip(parts, ends, ends[1:], strict=False)]
+    return chosen[0], chosen[1], chosen[2]
+
+
+def _from_zero(levels: Int[np.ndarray, "M C"], part: Quantized) -> Quantized:
+    """These levels, moved so that the lowest is 0."""
+    first = int(levels.min(initial=255))
+    last = max(int(levels.max(initial=0)), first + 1)
+    low, high = part.low.astype(np.float64), part.high.astype(np.float64)
+    each = (high - low) / part.top
+    start, end = ((low + level * each).astype(np.float32) for level in (first, last))
+    return Quantized(
+        (levels - first).astype(np.uint8), start, end, last - first, part.level_stride, part.level_offset + first
+    )
+
+
+def _bits(levels: Int[np.ndarray, "M 8"], classes: Int[np.ndarray, " M"]) -> Float64[np.ndarray, "classes 8 256"]:
+    """Of every level of every channel in every class, if they are chosen as they were."""
+    number = int(classes.max()) + 1
+    counts = np.stack(
+        [np.bincount(classes * 256 + column, minlength=number * 256).reshape(number, 256) for column in levels.T],
+        axis=1,
+    )
+    likely = counts + UNUSED
+    return np.asarray(np.log2(likely.sum(axis=2, keepdims=True)) - np.log2(likely))

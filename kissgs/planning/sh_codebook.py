@@ -1,0 +1,132 @@
+"""The SH codebook: how many entries a scene needs, what they are, and where they lie in their image."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from kissgs.core.array_types import Float32, Int
+from kissgs.core.limits import MAX_CODEBOOK_SIDE
+from kissgs.core.progress import Progress
+from kissgs.core.splats import SH_REST_COUNTS, Splats
+from kissgs.core.threads import Workers
+from kissgs.planning import kmeans
+from kissgs.planning.plas import plas
+from kissgs.planning.quantize import Quantized, quantize
+from kissgs.settings import EncodeSettings
+
+COEFFICIENTS = SH_REST_COUNTS[-1]
+MIN_SIDE = 8
+
+WEIGHT_FLOOR, WEIGHT_CEILING = 0.1, 20.0
+"""Bounds of weights, in units of the median: no Gaussian is given up, none rules alone."""
+
+PAPER_TOP = 99
+"""The paper's codebook has 100 levels in every channel."""
+
+
+@dataclass(frozen=True, slots=True)
+class Codebook:
+    """S × S entries, and the one that stands for each Gaussian.
+
+    Attributes:
+        side: S.
+        centroids: ``(S*S, 45)`` levels, channel-major (15 of red, 15 of green, 15 of blue), entries row-major.
+        labels: ``(M,)`` entry of each Gaussian; one, for the padding, if there is none.
+    """
+
+    side: int
+    centroids: Quantized
+    labels: Int[np.ndarray, " M"]
+
+
+def fit_codebook(
+    splats: Splats,
+    chosen: Int[np.ndarray, " M"],
+    weights: Float32[np.ndarray, " M"],
+    size: float,
+    settings: EncodeSettings,
+    pool: Workers,
+    progress: Progress,
+) -> Codebook:
+    """Build the codebook for the Gaussians ``chosen``.
+
+    A scene without SH, or with bands that are zero throughout, pays nothing for them: their tiles are constant.
+
+    Args:
+        splats: the scene.
+        chosen: which of its Gaussians.
+        weights: how much the gloss of each counts.
+        size: largest number of entries; the image's side is a multiple of 8, and what is left of it is filled too.
+        settings: see :class:`EncodeSettings`.
+        pool: where the work runs.
+        progress: receives "codebook" and "sort codebook" events.
+    """
+    dimensions = splats.shN.shape[1] * 3
+    if dimensions == 0 or len(chosen) == 0:
+        nothing = quantize(np.zeros((MIN_SIDE**2, 3 * COEFFICIENTS)), step=1)
+        return Codebook(MIN_SIDE, nothing, np.zeros(max(len(chosen), 1), dtype=np.int32))
+    progress("codebook", 0.0)
+    clusters = kmeans.fit(
+        splats.shN[chosen].reshape(len(chosen), dimensions),
+        weights,
+        codebook_side(min(size, settings.sh_codebook_size)) ** 2,
+        pool,
+        seed=settings.seed,
+        rounds=settings.sh_kmeans_iterations,
+        reach=settings.sh_nprobe,
+        tolerance=settings.sh_tolerance,
+        lattice=settings.sh_step if settings.shared_step_size else 0.0,
+        report=lambda fraction: progress("codebook", fraction),
+    )
+    # The smallest image that holds the entries found; what is left of it repeats some of them.
+    side = next(s for s in range(MIN_SIDE, MAX_CODEBOOK_SIDE + 1, 8) if s * s >= len(clusters.centroids))
+    entries = clusters.centroids[np.arange(side * side) % len(clusters.centroids)]
+    progress("sort codebook", 0.0)
+    placed = _sort(entries, settings, pool, lambda fraction: progress("sort codebook", fraction))
+    position = np.empty(side * side, dtype=np.int32)
+    position[placed] = np.arange(side * side, dtype=np.int32)
+    full = np.zeros((side * side, 3, COEFFICIENTS), dtype=np.float32)
+    full[:, :, : dimensions // 3] = entries[placed].reshape(side * side, -1, 3).transpose(0, 2, 1)
+    rows = full.reshape(side * side, 3 * COEFFICIENTS)
+    if settings.shared_step_size:
+        levels = quantize(rows, step=max(clusters.step, 1e-30))
+    else:
+        levels = quantize(rows, step=1, shared=False, max_top=PAPER_TOP)
+    return Codebook(side, levels, position[clusters.labels])
+
+
+def codebook_side(size: float) -> int:
+    """S for so many entries: a multiple of 8 from 8 to 256, rounded down."""
+    side = int(size**0.5) // 8 * 8
+    return min(max(side, MIN_SIDE), MAX_CODEBOOK_SIDE)
+
+
+def _sort(
+    entries: Float32[np.ndarray, "cells D"],
+    settings: EncodeSettings,
+    pool: Workers,
+    report: Callable[[float], None],
+) -> Int[np.ndarray, " cells"]:
+    """Entry for each place of the image: neighbours alike, so that the image compresses."""
+    if (entries == entries[0]).all():
+        return np.arange(len(entries), dtype=np.int32)
+    return plas(
+        np.ascontiguousarray(entries), pool, seed=settings.seed, decay=settings.plas_radius_decay, report=report
+    )
+
+
+def guessed_weights(splats: Splats, power: float) -> Float32[np.ndarray, " N"]:
+    """How much each Gaussian's gloss counts if nobody has looked: (opacity × largest cross-section) to ``power``."""
+    area = np.sort(splats.scales, axis=1)[:, 1:].sum(axis=1, dtype=np.float64)
+    logs = area - np.logaddexp(0, -splats.opacities.astype(np.float64))
+    logs = power * (logs - np.median(logs))
+    return np.exp(np.clip(logs, np.log(WEIGHT_FLOOR), np.log(WEIGHT_CEILING))).astype(np.float32)
+
+
+def bounded_weights(weights: Float32[np.ndarray, " N"], low: float, high: float) -> Float32[np.ndarray, " N"]:
+    """In units of their median, those that are not 0, and within bounds."""
+    seen = weights[weights > 0].astype(np.float64)
+    return np.clip(weights / (np.median(seen) if len(seen) else 1.0), low, high).astype(np.float32)

@@ -1,0 +1,96 @@
+"""``Settings``: one group per stage, filled from a preset."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from kissgs.core.errors import UnsupportedError
+from kissgs.settings.compact import CompactSettings
+from kissgs.settings.encode import EncodeSettings
+from kissgs.settings.finetune import FinetuneSettings
+from kissgs.settings.presets import PRESETS, Preset
+
+GROUPS: dict[str, type[BaseModel]] = {
+    "compact": CompactSettings,
+    "encode": EncodeSettings,
+    "finetune": FinetuneSettings,
+}
+
+
+class Settings(BaseModel):
+    """All settings of a compression: one group per stage."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    preset: Preset = Field(Preset.BALANCED, description="Where settings that are not given come from.")
+    compact: CompactSettings = CompactSettings()
+    encode: EncodeSettings = EncodeSettings()
+    finetune: FinetuneSettings = FinetuneSettings()
+
+    @property
+    def searches(self) -> bool:
+        """Whether several scenes or containers are made, to find the one that is wanted."""
+        return self.encode.has_goal or self.compact.max_psnr_drop is not None
+
+    @model_validator(mode="after")
+    def _a_goal_to_go_by(self) -> Self:
+        if self.compact.auto_count and not self.encode.has_goal:
+            raise ValueError(
+                "compaction by a goal needs one: give target_size, max_psnr_drop or psnr, or say how many Gaussians to "
+                "keep"
+            )
+        return self
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_from_preset(cls, given: Any) -> Any:  # noqa: ANN401
+        if not isinstance(given, dict) or given.get("preset", Preset.BALANCED) not in list(Preset):
+            return given  # not ours to judge: validation says what is wrong with it
+        chosen = PRESETS[Preset(given.get("preset", Preset.BALANCED))]
+        return {**given, **{name: _filled(given.get(name, {}), chosen[name]) for name in GROUPS}}
+
+    @classmethod
+    def from_preset(
+        cls,
+        preset: Preset | str = Preset.BALANCED,
+        *,
+        compact: Mapping[str, Any] | CompactSettings | None = None,
+        finetune: Mapping[str, Any] | FinetuneSettings | None = None,
+        **encode: Any,  # noqa: ANN401
+    ) -> Settings:
+        """Settings of a preset, with single ones of the encoder replaced, and of ``compact`` and ``finetune``.
+
+        Raises:
+            UnsupportedError: no such preset or setting, or a value that is not possible.
+        """
+        if preset not in list(Preset):
+            raise UnsupportedError(f"there is no preset {preset!r}; choose one of {', '.join(Preset)}")
+        try:
+            return cls.model_validate(
+                {
+                    "preset": preset,
+                    "compact": compact if isinstance(compact, CompactSettings) else dict(compact or {}),
+                    "encode": encode,
+                    "finetune": finetune if isinstance(finetune, FinetuneSettings) else dict(finetune or {}),
+                }
+            )
+        except ValidationError as error:
+            problem = error.errors()[0]
+            if problem["type"] == "value_error":
+                raise UnsupportedError(str(problem["ctx"]["error"])) from error
+            group, name = str(problem["loc"][0]), str(problem["loc"][-1])
+            if problem["type"] == "extra_forbidden":
+                known = ", ".join(dict.fromkeys([*GROUPS[group].__annotations__, *GROUPS[group].model_fields]))
+                raise UnsupportedError(f"there is no setting {name!r} of {group}; there are {known}") from error
+            told = problem["msg"][:1].lower() + problem["msg"][1:]
+            raise UnsupportedError(f"setting {name}: {told}, not {problem['input']!r}") from error
+
+
+def _filled(group: Any, preset: Mapping[str, Any]) -> Any:  # noqa: ANN401
+    """What is given of a group, and the rest from the preset."""
+    if isinstance(group, BaseModel):
+        group = group.model_dump(include=group.model_fields_set)
+    return {**preset, **group} if isinstance(group, dict) else group

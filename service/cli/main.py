@@ -1,0 +1,15 @@
+"""``kissgs-serve``, where its packages are installed."""
+
+from __future__ import annotations
+
+import sys
+
+
+def main() -> None:
+    """Entry point."""
+    try:
+        from service.cli.commands import run
+    except ModuleNotFoundError as error:
+        sys.stderr.write(f"kissgs-serve: the package {error.name} is missing; install kissgs[service]\n")
+        sys.exit(2)
+    run()

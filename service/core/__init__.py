@@ -1,0 +1,1 @@
+"""Settings, problems, schemas and tables of the service: what every other part uses."""

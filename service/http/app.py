@@ -1,0 +1,184 @@
+"""The application: parts put together, errors turned into problem documents, start and stop."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import AsyncIterator
+from http import HTTPStatus
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from fastapi.routing import APIRoute
+from sqlalchemy.exc import SQLAlchemyError
+from starlette.exceptions import HTTPException
+from starlette.middleware.cors import CORSMiddleware
+
+import kissgs
+from service.core.clock import Clock
+from service.core.metrics import Metrics
+from service.core.notifier import JobNotifier
+from service.core.problems import ProblemError, answer, fields_of, unusable_database
+from service.core.settings import ServiceSettings, SettingsError
+from service.http.middleware import RequestMiddleware
+from service.http.openapi import describe
+from service.http.routes import facts, jobs, page, preview, results
+from service.jobs.admission import Admission
+from service.jobs.completion import JobCompletion
+from service.jobs.container import ServiceContainer
+from service.jobs.decoding import Decoder
+from service.jobs.event_stream import EventStream
+from service.jobs.expiry import ExpiryTask
+from service.jobs.recovery import recover
+from service.jobs.worker import Worker
+from service.storage.database_health import reason_of
+from service.storage.folder_binding import open_store
+from service.storage.job_storage import JobStorage
+
+ROUTERS = (jobs.router, results.router, facts.router, page.router, preview.router)
+
+log = logging.getLogger("kissgs.service")
+
+
+def create_app(settings: ServiceSettings) -> FastAPI:
+    """The service as an ASGI application. Its data folder and database are opened here and now, and what a former
+    service left in them is taken up.
+
+    Raises:
+        SettingsError: the data folder or the database cannot be used.
+    """
+    context = _begin(settings)
+    app = FastAPI(
+        title="kissgs",
+        version=facts.API_VERSION,
+        lifespan=_lifespan,
+        redoc_url=None,
+        openapi_url="/openapi.json",
+        redirect_slashes=False,
+        separate_input_output_schemas=False,
+    )
+    app.state.context = context
+    for router in ROUTERS:
+        app.include_router(router)
+    app.mount("/static", page.Fresh(directory=page.STATIC), name="static")
+    describe(app, keys_required=bool(settings.keys))
+    app.openapi()  # made now, not while a request waits
+    _answer_errors(app)
+    if settings.cors_origins:
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=settings.cors_origins,
+            allow_methods=["GET", "HEAD", "POST", "DELETE"],
+            allow_headers=[
+                *("Authorization", "Content-Type", "Idempotency-Key", "Last-Event-ID", "X-Request-ID"),
+                *("If-None-Match", "If-Range", "Range"),
+            ],
+            expose_headers=[
+                *("Location", "Link", "Retry-After", "X-Request-ID", "Content-Location", "Content-Disposition"),
+                *("ETag", "Content-Digest", "Repr-Digest", "Content-Range"),
+            ],
+        )
+    app.add_middleware(RequestMiddleware, metrics=context.metrics, settings=settings)
+    return app
+
+
+def _begin(settings: ServiceSettings) -> ServiceContainer:
+    try:
+        context = build(settings)
+        try:
+            recover(context)
+        except BaseException:
+            context.store.close()
+            context.storage.close()
+            raise
+    except OSError as error:
+        raise SettingsError(f"KISSGS_DATA_DIR: cannot use {settings.data_dir}: {str(error).lower()}") from error
+    except SQLAlchemyError as error:
+        raise SettingsError(f"KISSGS_DATABASE_URL: the job database cannot be used: {reason_of(error)}") from error
+    return context
+
+
+def build(settings: ServiceSettings) -> ServiceContainer:
+    """The parts of a service, ready to start."""
+    storage, clock = JobStorage(settings.data_dir), Clock()
+    try:
+        store = open_store(settings, storage, clock)
+    except BaseException:
+        storage.close()
+        raise
+    storage.remove_unfinished(store.ids())
+    clock.start_after(store.latest_time())
+    notifier, metrics = JobNotifier(), Metrics()
+    metrics.queue_limit.set(settings.max_queue)
+    worker = Worker(
+        settings, store, storage, notifier, metrics, JobCompletion(settings, store, storage, metrics, clock)
+    )
+    admission = Admission(settings, store, storage)
+    decoder = Decoder(settings, store, storage, admission)
+    follower = EventStream(store, notifier, settings.workers)
+    return ServiceContainer(settings, store, storage, notifier, metrics, clock, worker, admission, decoder, follower)
+
+
+@contextlib.asynccontextmanager
+async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
+    context: ServiceContainer = app.state.context
+    context.worker.start()
+    janitor = ExpiryTask(context, context.clock())
+    tasks = [asyncio.create_task(janitor.run()), asyncio.create_task(janitor.show_life())]
+    try:
+        yield
+    finally:
+        context.notifier.close()
+        await context.worker.drain()
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        context.store.close()
+        context.storage.close()
+
+
+def _answer_errors(app: FastAPI) -> None:
+    @app.exception_handler(ProblemError)
+    async def expected(request: Request, error: ProblemError) -> JSONResponse:
+        return answer(error)
+
+    @app.exception_handler(RequestValidationError)
+    async def invalid(request: Request, error: RequestValidationError) -> JSONResponse:
+        text, found = fields_of(error.errors())
+        return answer(ProblemError("invalid-request", f"{text}; see /openapi.json", errors=found))
+
+    @app.exception_handler(HTTPException)
+    async def plain(request: Request, error: HTTPException) -> JSONResponse:
+        headers = dict(error.headers or {})
+        match error.status_code:
+            case HTTPStatus.NOT_FOUND:
+                return answer(
+                    ProblemError("not-found", f"there is nothing at {request.scope['path'][:200]}; see /openapi.json")
+                )
+            case HTTPStatus.METHOD_NOT_ALLOWED:
+                allowed = _allowed(request.scope["path"])
+                text = f"{request.method[:20]} is not possible here; use {allowed}"
+                return answer(ProblemError("method-not-allowed", text, headers={"Allow": allowed}))
+            case _:
+                return answer(ProblemError("invalid-request", f"{error.detail}; see /openapi.json", headers=headers))
+
+    @app.exception_handler(kissgs.KissgsError)
+    async def library(request: Request, error: kissgs.KissgsError) -> JSONResponse:
+        return answer(ProblemError(error.code, str(error)))
+
+    @app.exception_handler(SQLAlchemyError)
+    async def database(request: Request, error: SQLAlchemyError) -> JSONResponse:
+        log.error("the job database failed: %s", error)
+        reason = str(getattr(error, "orig", "")).lower()
+        if "is full" in reason or "no space left" in reason:
+            return answer(ProblemError("disk-full", "the server's disk is full; try again later", retry_after=600))
+        return answer(unusable_database())
+
+
+def _allowed(path: str) -> str:
+    """The methods of all routes with this path; FastAPI names those of the first, or none."""
+    routes = [route for router in ROUTERS for route in router.routes if isinstance(route, APIRoute)]
+    fitting = [route.methods or set() for route in routes if route.path_regex.match(path)]
+    return ", ".join(sorted(set().union(*fitting))) or "GET, HEAD"

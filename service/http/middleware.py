@@ -1,0 +1,115 @@
+"""Around every request: who may ask at all, an id that goes through the logs, headers that browsers obey, counting."""
+
+from __future__ import annotations
+
+import logging
+import re
+import time
+import uuid
+from urllib.parse import urlsplit
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.core.metrics import Metrics
+from service.core.problems import ProblemError, answer
+from service.core.settings import ServiceSettings
+
+log = logging.getLogger("kissgs.access")
+
+PAGE_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
+    "form-action 'none'; base-uri 'none'; frame-ancestors 'none'"
+)
+"""Of the page: it loads nothing from elsewhere, and nobody frames it."""
+
+METHODS = ("GET", "HEAD", "POST", "DELETE", "OPTIONS", "PUT", "PATCH")
+
+
+class RequestMiddleware:
+    """Wraps the application; see above.
+
+    Args:
+        app: the application.
+        metrics: where requests are counted, by the route's template and never by what a client has put in it.
+        settings: which names and origins are ours.
+    """
+
+    def __init__(self, app: ASGIApp, metrics: Metrics, settings: ServiceSettings) -> None:
+        self._app, self._metrics, self._settings = app, metrics, settings
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        given = headers.get("x-request-id", "")
+        request_id = given if re.fullmatch(r"[A-Za-z0-9._-]{1,64}", given) else uuid.uuid4().hex[:16]
+        scope.setdefault("state", {})["request_id"] = request_id
+        begun, status = time.perf_counter(), 0
+
+        async def sending(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                self._metrics.latency.labels(_route(scope)).observe(time.perf_counter() - begun)
+                _mark(MutableHeaders(scope=message), request_id, scope["path"])
+            await send(message)
+
+        try:
+            refusal = self._refusal(scope["method"], headers)
+            await (self._app if refusal is None else answer(refusal))(scope, receive, sending)
+        except Exception:
+            log.exception("request %s failed", request_id)
+            if status == 0:
+                text = f"the service failed in a way that it should not; please report it with the id {request_id}"
+                await answer(ProblemError("internal", text))(scope, receive, sending)
+        finally:
+            method = scope["method"] if scope["method"] in METHODS else "other"
+            self._metrics.requests.labels(method, _route(scope), status).inc()
+            target = scope.get("raw_path", b"").decode("ascii", "replace")
+            spent = 1e3 * (time.perf_counter() - begun)
+            log.info("%s %s %d %.0f ms %s", method, target[:500], status, spent, request_id)
+
+    def _refusal(self, method: str, headers: Headers) -> ProblemError | None:
+        """What another site's page makes a browser send is not what its user wants.
+
+        A browser says where a page comes from, and a name that leads here may be another's (DNS rebinding).
+        """
+        host = headers.get("host", "")
+        if not self._is_ours(host):
+            text = f"this service does not answer as {host[:100]!r}; its operator may add the name to KISSGS_NAMES"
+            return ProblemError("foreign", text)
+        origin = headers.get("origin")
+        if method in ("GET", "HEAD", "OPTIONS") or origin is None or origin.lower() in self._settings.cors_origins:
+            return None
+        if "*" in self._settings.cors_origins or _site(origin) == host.lower():
+            return None
+        text = f"pages of {origin[:100]!r} may not use this service; its operator may add it to KISSGS_CORS_ORIGINS"
+        return ProblemError("foreign", text)
+
+    def _is_ours(self, host: str) -> bool:
+        name = host.rpartition(":")[0] if re.search(r":[0-9]*$", host) else host
+        return self._settings.answers_to(name.strip("[]").lower())
+
+
+def _site(origin: str) -> str | None:
+    """The name and port of an origin, in lower case; None if it has none, or is malformed."""
+    try:
+        return urlsplit(origin).netloc.lower() or None
+    except ValueError:  # brackets that hold no address of IPv6
+        return None
+
+
+def _mark(headers: MutableHeaders, request_id: str, path: str) -> None:
+    headers["X-Request-ID"] = request_id
+    headers["X-Content-Type-Options"] = "nosniff"
+    headers["Referrer-Policy"] = "no-referrer"
+    if not path.startswith("/docs"):
+        headers.setdefault("Content-Security-Policy", PAGE_POLICY)  # the preview page has its own
+
+
+def _route(scope: Scope) -> str:
+    route = scope.get("route")
+    return str(getattr(route, "path", "none"))

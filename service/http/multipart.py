@@ -1,0 +1,146 @@
+"""``multipart/form-data`` as it arrives, part by part and chunk by chunk: nothing is spooled on the way."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import AsyncIterable, AsyncIterator
+from dataclasses import dataclass
+
+from python_multipart.exceptions import FormParserError
+from python_multipart.multipart import MultipartParser, parse_options_header
+
+from service.core.problems import ProblemError
+
+MAX_PART_HEADER_BYTES = 8192
+
+MAX_PREAMBLE_BYTES = 8192
+"""The most that may stand before the first boundary; RFC 2046 allows text there, which is ignored."""
+
+
+@dataclass(frozen=True, slots=True)
+class PartBegin:
+    """A part begins: its field's name, and the file's name if it is one."""
+
+    name: str
+    filename: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class PartData:
+    """Bytes of the part that began last."""
+
+    data: bytes
+
+
+class _Parser:
+    """Collects what the library's callbacks say."""
+
+    def __init__(self, boundary: bytes) -> None:
+        self.found: list[PartBegin | PartData] = []
+        self.complete = False
+        self._name, self._value, self._size = b"", b"", 0
+        self._headers: dict[bytes, bytes] = {}
+        self._parser = MultipartParser(
+            boundary,
+            {
+                "on_part_begin": self._begin,
+                "on_header_field": self._field,
+                "on_header_value": self._text,
+                "on_header_end": self._end_header,
+                "on_headers_finished": self._headers_finished,
+                "on_part_data": self._data,
+                "on_end": self._end,
+            },
+        )
+
+    def feed(self, chunk: bytes) -> list[PartBegin | PartData]:
+        self.found = []
+        self._parser.write(chunk)
+        return self.found
+
+    def _begin(self) -> None:
+        self._headers, self._size = {}, 0
+
+    def _field(self, data: bytes, start: int, end: int) -> None:
+        self._name += self._counted(data[start:end])
+
+    def _text(self, data: bytes, start: int, end: int) -> None:
+        self._value += self._counted(data[start:end])
+
+    def _counted(self, data: bytes) -> bytes:
+        self._size += len(data)
+        if self._size > MAX_PART_HEADER_BYTES:
+            raise ProblemError("invalid-request", f"the headers of a part take more than {MAX_PART_HEADER_BYTES} bytes")
+        return data
+
+    def _end_header(self) -> None:
+        self._headers[self._name.lower()] = self._value
+        self._name, self._value = b"", b""
+
+    def _headers_finished(self) -> None:
+        _, options = parse_options_header(self._headers.get(b"content-disposition", b""))
+        if b"name" not in options:
+            raise ProblemError(
+                "invalid-request", "a part of the form has no name; send the fields 'file' and 'options'"
+            )
+        filename = options.get(b"filename")
+        self.found.append(
+            PartBegin(
+                options[b"name"].decode("utf-8", "replace"),
+                None if filename is None else filename.decode("utf-8", "replace"),
+            )
+        )
+
+    def _data(self, data: bytes, start: int, end: int) -> None:
+        if end > start:
+            self.found.append(PartData(bytes(data[start:end])))
+
+    def _end(self) -> None:
+        self.complete = True
+
+
+class _Preamble:
+    """Leaves out what stands before the first boundary, which the library does not."""
+
+    def __init__(self, boundary: bytes) -> None:
+        self._line = re.compile(rb"(?:^|\n)--" + re.escape(boundary) + rb"(?:[ \t]*(?=\r\n)|(?=--))")
+        self._boundary, self._head = b"--" + boundary, b""
+        self.over = False
+
+    def feed(self, chunk: bytes) -> bytes:
+        """Take the next bytes; return those that belong to the parts."""
+        if self.over:
+            return chunk
+        self._head += chunk
+        found = self._line.search(self._head)
+        if (found.start() if found else len(self._head)) > MAX_PREAMBLE_BYTES + len(self._boundary):
+            raise ProblemError(
+                "invalid-request", f"the form has more than {MAX_PREAMBLE_BYTES} bytes before its first boundary"
+            )
+        if not found:
+            return b""
+        self.over = True
+        return self._boundary + self._head[found.end() :]
+
+
+async def parts(content_type: str, chunks: AsyncIterable[bytes]) -> AsyncIterator[PartBegin | PartData]:
+    """The parts of a form, in the order they come.
+
+    Raises:
+        ProblemError: it is no valid form, or it ends too soon.
+    """
+    _, options = parse_options_header(content_type)
+    boundary = options.get(b"boundary", b"")
+    if not 1 <= len(boundary) <= 256:
+        raise ProblemError("invalid-request", "the Content-Type names no boundary; let your HTTP library write it")
+    try:
+        parser, preamble = _Parser(boundary), _Preamble(boundary)
+        async for chunk in chunks:
+            for event in parser.feed(preamble.feed(chunk)):
+                yield event
+    except FormParserError as error:
+        raise ProblemError("invalid-request", f"the form cannot be read: {error}") from error
+    if not preamble.over:
+        raise ProblemError("invalid-request", "the form has no line with its boundary; let your HTTP library write it")
+    if not parser.complete:
+        raise ProblemError("invalid-request", "the form ends before its last boundary; send it again")

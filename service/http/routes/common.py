@@ -1,0 +1,98 @@
+"""What routes share: how errors are documented, and finding a job."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from typing import Annotated, Any
+
+from anyio.to_thread import run_sync
+from fastapi import Depends, Path, Request
+
+from service.core.models import ACTIVE, Job
+from service.core.notifier import ended
+from service.core.problems import MEDIA_TYPE, PROBLEM_TYPES, ProblemError
+from service.core.schemas import JobStatus
+from service.jobs.container import Owner, Service, ServiceContainer
+from service.jobs.status import QueueEstimator, status_of
+
+MAX_WAIT_SECONDS = 30.0
+"""Of a long poll: shorter than proxies keep a silent connection."""
+
+NO_STORE = {"Cache-Control": "no-store"}
+
+
+def problems(*codes: str) -> dict[int | str, dict[str, Any]]:
+    """The answers of a route that are problem documents, for OpenAPI."""
+    answers: dict[int | str, dict[str, Any]] = {}
+    for code in ("unauthorized", "invalid-request", "internal", "database", *codes):
+        answer = answers.setdefault(
+            PROBLEM_TYPES[code].status,
+            {
+                "description": "",
+                "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
+            },
+        )
+        answer["description"] = ". ".join(
+            filter(None, (answer["description"], f"{PROBLEM_TYPES[code].title} (`{code}`)"))
+        )
+        if code == "unauthorized":
+            answer["headers"] = {"WWW-Authenticate": {"schema": {"type": "string"}, "description": "Bearer"}}
+    return dict(sorted(answers.items(), key=lambda item: int(item[0])))
+
+
+async def _find(
+    context: Service,
+    owner: Owner,
+    id: Annotated[str, Path(description="Of a job: 32 hexadecimal digits.", max_length=100)],
+) -> Job:
+    job = await run_sync(context.store.get, id, owner) if re.fullmatch("[0-9a-f]{32}", id) else None
+    if job is None:
+        raise ProblemError("not-found", f"there is no job {id!r}; it may have been deleted")
+    return job
+
+
+Found = Annotated[Job, Depends(_find)]
+
+
+async def show(context: ServiceContainer, *jobs: Job) -> list[JobStatus]:
+    """What a client sees of jobs."""
+
+    def look() -> list[JobStatus]:
+        queue = QueueEstimator(context.store, context.settings.workers)
+        return [status_of(job, queue) for job in jobs]
+
+    return await run_sync(look)
+
+
+async def fresh(context: ServiceContainer, job: Job) -> Job:
+    """The job as it is now."""
+    current = await run_sync(context.store.get, job.id)
+    if current is None:
+        raise ProblemError("not-found", f"there is no job {job.id}; it has just been deleted")
+    return current
+
+
+async def finished(context: ServiceContainer, job: Job, seconds: float, request: Request) -> Job:
+    """The job once it has ended, or as it is when the time is over, the client has gone, or the service stops."""
+    clock = asyncio.get_running_loop().time
+    end = clock() + seconds
+    gone = asyncio.create_task(_gone(request))
+    try:
+        while True:
+            subscribe = context.notifier.subscribe(ended(job.id))
+            job = await fresh(context, job)
+            left = end - clock()
+            if job.state not in ACTIVE or left <= 0 or context.notifier.closing or gone.done():
+                return job
+            rung = asyncio.create_task(subscribe.wait())
+            await asyncio.wait((rung, gone), timeout=left, return_when=asyncio.FIRST_COMPLETED)
+            rung.cancel()
+    finally:
+        gone.cancel()
+
+
+async def _gone(request: Request) -> None:
+    """Until the client has closed the connection."""
+    while (await request.receive())["type"] != "http.disconnect":
+        pass

@@ -1,0 +1,142 @@
+"""What a job has made: the container, its files, the decoded scene, the report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Response
+
+from service.core.models import Job, State
+from service.core.problems import ProblemError
+from service.http.file_response import StoredFile, described
+from service.http.routes.common import Found, problems
+from service.jobs.container import Service, ServiceContainer
+
+router = APIRouter(prefix="/v1/jobs/{id}", tags=["results"])
+
+_MEDIA_TYPES = {".webp": "image/webp", ".json": "application/json", ".yaml": "application/yaml"}
+
+_PRIVATE = {"Cache-Control": "private, no-cache"}
+_FOREVER = {"Cache-Control": "private, max-age=31536000, immutable"}
+"""A job's files never change; a new upload is a new job."""
+
+_UNREADY = ("not-found", "not-finished", "not-succeeded", "gone", "range")
+
+
+def _file_answers(media_types: str, *codes: str) -> dict[int | str, dict[str, Any]]:
+    headers = {
+        "ETag": {"schema": {"type": "string"}, "description": "SHA-256 of the file."},
+        "Repr-Digest": {"schema": {"type": "string"}, "description": "RFC 9530, of the whole file."},
+        "Accept-Ranges": {"schema": {"type": "string"}, "description": "bytes"},
+    }
+    whole = {**headers, "Content-Digest": {"schema": {"type": "string"}, "description": "RFC 9530, of this answer."}}
+    binary, json = {"type": "string", "format": "binary"}, {"type": "object"}
+    content = {name: {"schema": json if name == "application/json" else binary} for name in media_types.split()}
+    return {
+        200: {"description": "The file.", "content": content, "headers": whole},
+        206: {
+            "description": "The range that was asked for.",
+            "content": {name: {"schema": binary} for name in content},
+            "headers": headers,
+        },
+        304: {"description": "It is the one that `If-None-Match` names."},
+        **problems(*_UNREADY, *codes),
+    }
+
+
+async def get_result(context: Service, job: Found) -> Response:
+    """The container as one zip: any SOG-XT reader opens it. As often as wanted, until the job expires."""
+    return container(context, job)
+
+
+async def get_file(
+    context: Service, job: Found, name: Annotated[str, Path(description="One of `sizes.files` of the job.")]
+) -> Response:
+    """One file of the container, for readers that fetch only what they need. It may be cached for ever."""
+    _ready(job)
+    entry = described(job.result or {}, ("files", name))
+    path = context.storage.result(job.id) / "files" / name
+    media_type = _MEDIA_TYPES.get(path.suffix, "application/octet-stream")
+    return StoredFile(path, sha256=entry["sha256"], media_type=media_type, headers=_FOREVER)
+
+
+async def get_decoded(context: Service, job: Found) -> Response:
+    """The container turned back into a `.ply`, made when it is first asked for."""
+    _ready(job)
+    path, entry = await context.decoder.scene(job)
+    media_type = "application/octet-stream"
+    download = f"{job.name}.decoded.ply"
+    return StoredFile(path, sha256=entry["sha256"], media_type=media_type, download=download, headers=_PRIVATE)
+
+
+async def get_source(context: Service, job: Found) -> Response:
+    """The `.ply` as it was uploaded, as long as the server has room for it: for comparisons."""
+    _ready(job)
+    path = context.storage.upload(job.id)
+    if not job.upload_kept:
+        raise ProblemError("gone", "the upload was removed to make room; the result is still there")
+    media_type, download = "application/octet-stream", f"{job.name}.ply"
+    return StoredFile(path, sha256=job.upload_sha256, media_type=media_type, download=download, headers=_PRIVATE)
+
+
+async def get_report(context: Service, job: Found) -> Response:
+    """What the compression took and gave, as the library reports it."""
+    _ready(job)
+    entry = described(job.result or {}, ("report",))
+    path = context.storage.result(job.id) / "report.json"
+    return StoredFile(path, sha256=entry["sha256"], media_type="application/json", headers=_PRIVATE)
+
+
+def container(context: ServiceContainer, job: Job) -> StoredFile:
+    """The zip of a job that has succeeded.
+
+    Raises:
+        ProblemError: it has not.
+    """
+    _ready(job)
+    entry = described(job.result or {}, ("container",))
+    path = context.storage.result(job.id) / "scene.zip"
+    download = f"{job.name}.zip"
+    return StoredFile(path, sha256=entry["sha256"], media_type="application/zip", download=download, headers=_PRIVATE)
+
+
+def _ready(job: Job) -> None:
+    match job.state:
+        case State.SUCCEEDED:
+            return
+        case State.QUEUED | State.RUNNING:
+            text = f"the job is {job.state}; follow it at /v1/jobs/{job.id}/events or ask again"
+            raise ProblemError("not-finished", text, retry_after=2)
+        case State.EXPIRED:
+            raise ProblemError("gone", "the job has expired and its files were removed; submit the scene again")
+        case State.FAILED:
+            reason = (job.problem or {}).get("detail", "")
+            raise ProblemError("not-succeeded", f"the job failed: {reason}")
+        case _:
+            raise ProblemError("not-succeeded", "the job was cancelled; submit the scene again")
+
+
+def _add(endpoint: Callable[..., Any], path: str, summary: str, media_types: str, *codes: str) -> None:
+    """Serve a file by GET and by HEAD, each documented."""
+    name = endpoint.__name__.removeprefix("get_")
+    for method, operation in (("GET", name), ("HEAD", f"{name}_head")):
+        router.add_api_route(
+            path,
+            endpoint,
+            methods=[method],
+            operation_id=operation,
+            summary=summary if method == "GET" else f"{summary}: headers only",
+            response_class=Response,
+            responses=_file_answers(media_types, *codes),
+        )
+
+
+_add(get_result, "/result", "Fetch the container", "application/zip")
+_add(get_file, "/files/{name}", "Fetch one file of the container", " ".join(_MEDIA_TYPES.values()))
+_add(
+    *(get_decoded, "/decoded", "Fetch the decoded scene", "application/octet-stream"),
+    *("disk-full", "memory-limit", "crashed", "time-limit"),
+)
+_add(get_source, "/source", "Fetch the upload", "application/octet-stream")
+_add(get_report, "/report", "Fetch the report", "application/json")

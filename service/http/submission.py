@@ -1,0 +1,258 @@
+"""From a request with a scene to a job in the queue."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import uuid
+from collections.abc import AsyncIterator
+from dataclasses import dataclass
+
+from anyio.to_thread import run_sync
+from pydantic import ValidationError
+from starlette.requests import Request
+
+from service.core.disk_estimates import checkpoint_bytes
+from service.core.models import Job
+from service.core.presets import can_train
+from service.core.problems import ProblemError, fields_of, unusable_database
+from service.core.schemas import JobOptions
+from service.http.multipart import PartBegin, PartData, parts
+from service.http.uploads import Received, Spool, scene_name, timed
+from service.jobs.admission import FULL_SECONDS
+from service.jobs.container import ServiceContainer
+from service.jobs.worker import QUEUE
+from service.storage.job_store import LimitExceeded
+
+RAW_TYPES = ("", "application/octet-stream", "application/ply", "application/x-ply", "model/ply")
+FORM_TYPE = "multipart/form-data"
+log = logging.getLogger("kissgs.service")
+
+STOPPING = "stopping"
+"""What nobody rings for: the bell's closing is heard all the same."""
+
+MAX_OPTIONS_BYTES = 64 << 10
+MAX_FORM_BYTES = MAX_OPTIONS_BYTES + (32 << 10)
+"""What a form holds beside the scene."""
+
+
+@dataclass(frozen=True, slots=True)
+class Submission:
+    """What a request has brought, apart from its owner."""
+
+    received: Received
+    options: JobOptions
+    name: str
+    key: str | None
+
+    @property
+    def fingerprint(self) -> str:
+        """Equal for requests that ask for the same."""
+        asked = json.dumps([self.received.sha256, self.options.model_dump(mode="json")], sort_keys=True)
+        return hashlib.sha256(asked.encode()).hexdigest()
+
+
+async def submit(
+    context: ServiceContainer, request: Request, owner: str, *, options: str | None, name: str | None, key: str | None
+) -> tuple[Job, bool]:
+    """Receive a scene and queue a job for it.
+
+    Returns:
+        The job, and whether it is new: not if its idempotency key has been seen with the same scene and options.
+
+    Raises:
+        ProblemError: whatever is wrong with the request, or with the moment.
+    """
+    if context.worker.draining:
+        raise ProblemError("stopping", "the service is stopping; try again in a minute", retry_after=60)
+    if health_problem := await run_sync(context.store.health_problem):
+        log.error("a submission was refused: the job database cannot be used: %s", health_problem)
+        raise unusable_database()
+    known = await run_sync(context.store.by_idempotency_key, owner, key) if key is not None else None
+    if known is None:
+        await run_sync(context.admission.check, owner)
+    parsed = parse_options(options) if options is not None else None
+    with context.admission.slot():
+        path = context.storage.new_upload()
+        kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+        _check_headers(request, kind)
+        spool = Spool(
+            context.settings,
+            context.admission,
+            path,
+            at_most=_scene_bytes(request, kind, context.settings.max_upload_bytes),
+        )
+        async with spool:
+            if kind == FORM_TYPE:
+                submission = await _receive_form(context, request, spool, parsed, name, key)
+            else:
+                received = await _receive_raw(context, request, spool)
+                submission = Submission(received, parsed or JobOptions(), scene_name(name), key)
+            try:
+                job, new = await run_sync(_queue, context, submission, owner)
+            finally:
+                await run_sync(context.storage.discard, path)  # a job has taken it, or nobody wants it
+    if new:
+        context.metrics.submitted.labels(job.preset).inc()
+        context.metrics.bytes_in.inc(job.upload_bytes)
+        context.notifier.notify(QUEUE)
+        asked = request.state.request_id
+        log.info("job %s submitted by %s: %d bytes (request %s)", job.id, owner or "anyone", job.upload_bytes, asked)
+    return job, new
+
+
+def parse_options(text: str | bytes) -> JobOptions:
+    """Options as JSON.
+
+    Raises:
+        ProblemError: they are none; every field that is wrong is named.
+    """
+    try:
+        options = JobOptions.model_validate_json(text)
+    except ValidationError as error:
+        named, found = fields_of(error.errors())
+        raise ProblemError(
+            "invalid-request", f"the options cannot be used: {named}; GET /v1/presets shows all settings", errors=found
+        ) from error
+    if options.trains and not can_train():
+        raise ProblemError(
+            "invalid-request",
+            "this service has no torch to train with, so it fine-tunes nothing and compacts with the preset fast only; "
+            "whoever runs it can install kissgs[train]",
+        )
+    return options
+
+
+def _check_headers(request: Request, kind: str) -> None:
+    encoding = request.headers.get("content-encoding", "identity").strip().lower()
+    if encoding != "identity":
+        raise ProblemError("media-type", f"the body is encoded with {encoding[:40]!r}; send the .ply as it is")
+    if kind != FORM_TYPE and kind not in RAW_TYPES:
+        raise ProblemError(
+            "media-type",
+            f"the body is said to be {kind[:80]!r}; send a form with the field 'file' (curl -F file=@scene.ply), "
+            "or the .ply itself as application/octet-stream",
+        )
+
+
+def _scene_bytes(request: Request, kind: str, limit: int) -> int | None:
+    """How large the scene can be, judged by the length of the body."""
+    text = request.headers.get("content-length", "")
+    if not (text.isascii() and text.isdigit()):
+        return None
+    length = int(text) if len(text) < 19 else 10**18
+    return limit if kind == FORM_TYPE and limit < length <= limit + MAX_FORM_BYTES else length
+
+
+async def _receive_raw(context: ServiceContainer, request: Request, spool: Spool) -> Received:
+    async for chunk in timed(request, context.settings, context.notifier.subscribe(STOPPING)):
+        await spool.write(chunk)
+    return await spool.finish()
+
+
+async def _form_bytes(context: ServiceContainer, request: Request, spool: Spool) -> AsyncIterator[bytes]:
+    """The body of a form, as long as there is little in it beside the scene."""
+    received = 0
+    async for chunk in timed(request, context.settings, context.notifier.subscribe(STOPPING)):
+        yield chunk
+        received += len(chunk)
+        if received - spool.size > MAX_FORM_BYTES + len(chunk):
+            raise ProblemError("invalid-request", f"the form has more than {MAX_FORM_BYTES} bytes beside the scene")
+
+
+async def _receive_form(
+    context: ServiceContainer,
+    request: Request,
+    spool: Spool,
+    options: JobOptions | None,
+    name: str | None,
+    key: str | None,
+) -> Submission:
+    """The fields ``file`` and, before or after it, ``options``."""
+    seen: list[str] = []
+    text = bytearray()
+    async for event in parts(request.headers["content-type"], _form_bytes(context, request, spool)):
+        match event:
+            case PartBegin(field, filename):
+                if field not in ("file", "options"):
+                    raise ProblemError(
+                        "invalid-request", f"there is no field {field[:40]!r}; send 'file' and 'options'"
+                    )
+                if field in seen:
+                    raise ProblemError("invalid-request", f"the field {field!r} comes twice; send one scene at a time")
+                seen.append(field)
+                name = name or filename if field == "file" else name
+            case PartData(data) if seen[-1] == "file":
+                await spool.write(data)
+            case PartData(data):
+                text += data
+                if len(text) > MAX_OPTIONS_BYTES:
+                    raise ProblemError("invalid-request", f"the options take more than {MAX_OPTIONS_BYTES} bytes")
+    if "file" not in seen:
+        raise ProblemError("invalid-request", "the form has no field 'file'; send the scene in it")
+    if "options" in seen and options is not None:
+        raise ProblemError("invalid-request", "options stand both in the form and in the URL; send them once")
+    if "options" in seen:
+        options = parse_options(bytes(text))
+    return Submission(await spool.finish(), options or JobOptions(), scene_name(name), key)
+
+
+def _queue(context: ServiceContainer, submission: Submission, owner: str) -> tuple[Job, bool]:
+    known = _known(context, submission, owner)
+    if known is not None:
+        return known, False
+    received, options = submission.received, submission.options
+    job = Job(
+        id=uuid.uuid4().hex,
+        owner=owner,
+        name=submission.name,
+        options=options.model_dump(mode="json"),
+        preset=options.kind,
+        evaluate=options.evaluate,
+        gaussians=received.info.count,
+        sh_degree=received.info.sh_degree,
+        upload_bytes=received.size,
+        disk_bytes=received.size,
+        work_bytes=(
+            checkpoint_bytes(
+                *(received.info.count, received.info.sh_degree),
+                compact=options.retrains,
+                finetune=options.finetune.enabled,
+            )
+            if options.resumable
+            else 0
+        ),
+        upload_sha256=received.sha256,
+        fingerprint=submission.fingerprint,
+        idempotency_key=submission.key,
+    )
+    try:
+        context.storage.adopt(received.path, job.id)
+        return context.admission.add(job), True
+    except LimitExceeded:  # another request with the same key was faster
+        context.storage.remove_job(job.id)
+        known = _known(context, submission, owner)
+        if known is None:
+            raise
+        return known, False
+    except OSError as error:
+        context.storage.remove_job(job.id)
+        reason = (error.strerror or str(error)).lower()
+        text = f"the upload cannot be kept: {reason}; try again later"
+        raise ProblemError("disk-full", text, retry_after=FULL_SECONDS) from error
+    except BaseException:
+        context.storage.remove_job(job.id)
+        raise
+
+
+def _known(context: ServiceContainer, submission: Submission, owner: str) -> Job | None:
+    if submission.key is None:
+        return None
+    job = context.store.by_idempotency_key(owner, submission.key)
+    if job is not None and job.fingerprint != submission.fingerprint:
+        raise ProblemError(
+            "key-reused",
+            "this Idempotency-Key came with another scene or other options before; use a new key for a new job",
+        )
+    return job

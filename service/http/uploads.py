@@ -1,0 +1,232 @@
+"""An upload on its way to the disk: checked as it arrives, hashed, limited, and gone if it does not end well."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import os
+import re
+import unicodedata
+from collections.abc import AsyncIterator, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, Self
+
+from anyio.to_thread import run_sync
+from starlette.requests import ClientDisconnect, Request
+
+import kissgs
+from service.core.problems import ProblemError
+from service.core.settings import ServiceSettings
+from service.jobs.admission import FULL_SECONDS, Admission
+
+BLOCK_BYTES = 1 << 20
+"""Written at a time. A thread is asked once for each, and memory holds one or two per upload."""
+
+LAST_LINE = re.compile(rb"\nend_header[ \t\r]*\n")
+"""The last line of a header: all of it, because a comment may end with the same word."""
+
+CLOSE = {"Connection": "close"}
+
+STEP_BYTES = 16 << 20
+"""Set aside at a time, as the bytes arrive: what is only announced takes no room from anybody."""
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """A whole upload: where it lies, its size and SHA-256, and what its header says."""
+
+    path: Path
+    size: int
+    sha256: str
+    info: kissgs.PlyInfo
+
+
+class Spool:
+    """Takes the bytes of one ``.ply``. As a context manager it removes them unless :meth:`finish` has been reached.
+
+    Args:
+        at_most: bytes that may come, where the client has said so.
+    """
+
+    def __init__(self, settings: ServiceSettings, admission: Admission, path: Path, at_most: int | None = None) -> None:
+        self._settings, self._admission, self._path = settings, admission, path
+        self._at_most = at_most
+        self._pending = bytearray()
+        self._size, self._reserved, self._written = 0, 0, 0
+        self._hash = hashlib.sha256()
+        self._file: BinaryIO | None = None
+        self._checked = self._kept = False
+
+    async def __aenter__(self) -> Self:
+        if self._at_most is not None:
+            self._refuse_size(self._at_most)
+            await run_sync(self._admission.require, self._at_most)
+        return self
+
+    async def __aexit__(self, *error: object) -> None:
+        await asyncio.shield(asyncio.ensure_future(run_sync(self._leave)))
+
+    @property
+    def size(self) -> int:
+        """Bytes so far."""
+        return self._size
+
+    async def write(self, data: bytes) -> None:
+        """Take the next bytes.
+
+        Raises:
+            ProblemError: they cannot be a usable scene, are too many, or do not fit on the disk.
+        """
+        line = max(self._pending.rfind(b"\n"), 0)  # the last one so far, which may go on
+        self._pending += data
+        self._size += len(data)
+        self._refuse_size(self._size)
+        if self._size > self._reserved:
+            coming = STEP_BYTES if self._at_most is None else min(STEP_BYTES, self._at_most - self._reserved)
+            await self._reserve(max(coming, self._size - self._reserved))
+        if not self._checked and (
+            self._size > self._settings.max_header_bytes or LAST_LINE.search(self._pending, line)
+        ):
+            self._check_header()
+        if len(self._pending) >= BLOCK_BYTES:
+            await run_sync(self._flush)
+
+    async def finish(self) -> Received:
+        """See that the upload is whole and on the disk.
+
+        Raises:
+            ProblemError: as :meth:`write`.
+        """
+        return await run_sync(self._finish)
+
+    def _finish(self) -> Received:
+        self._flush()
+        with self._writing() as file:
+            file.flush()
+            os.fsync(file.fileno())
+            file.close()
+        try:
+            info = kissgs.read_ply_info(self._path)
+        except kissgs.KissgsError as error:
+            raise self._named(error) from error
+        self._refuse_count(info)
+        self._kept = True
+        return Received(self._path, self._size, self._hash.hexdigest(), info)
+
+    def _leave(self) -> None:
+        if self._file is not None:
+            with contextlib.suppress(OSError):  # what it could not write is thrown away
+                self._file.close()
+        if not self._kept:
+            self._path.unlink(missing_ok=True)
+        self._admission.release(self._reserved, self._written)
+
+    async def _reserve(self, size: int) -> None:
+        await run_sync(self._admission.reserve, size)
+        self._reserved += size
+
+    def _flush(self) -> None:
+        with self._writing() as file:
+            file.write(self._pending)
+        self._hash.update(self._pending)
+        self._written += len(self._pending)
+        self._admission.wrote(len(self._pending))
+        self._pending.clear()
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[BinaryIO]:
+        try:
+            if self._file is None:
+                self._file = self._path.open("xb")
+            yield self._file
+        except OSError as error:
+            reason = (error.strerror or str(error)).lower()
+            text = f"the upload cannot be written: {reason}; try again later"
+            raise ProblemError("disk-full", text, retry_after=FULL_SECONDS) from error
+
+    def _check_header(self) -> None:
+        """What the header tells, once it has arrived: long before the last byte of a file that is of no use."""
+        head, limit = bytes(self._pending), self._settings.max_header_bytes
+        self._checked = True
+        whole = self._at_most if self._at_most is not None else self._settings.max_upload_bytes
+        try:
+            info = kissgs.read_ply_info(head[:limit], size=max(whole, self._size))
+        except kissgs.KissgsError as error:
+            raise self._named(error) from error
+        self._refuse_count(info)
+
+    def _refuse_size(self, size: int) -> None:
+        if size > self._settings.max_upload_bytes:
+            raise ProblemError(
+                "too-large",
+                f"the upload is larger than {self._settings.max_upload_bytes:,} bytes, which is the limit; "
+                "remove what the scene does not need, or compress it with the command line",
+            )
+
+    def _refuse_count(self, info: kissgs.PlyInfo) -> None:
+        if info.count > self._settings.max_gaussians:
+            raise ProblemError(
+                "unsupported",
+                f"the scene has {info.count:,} Gaussians; this service takes {self._settings.max_gaussians:,} at most: "
+                "prune it first, or compress it with the command line",
+            )
+
+    def _named(self, error: kissgs.KissgsError) -> ProblemError:
+        """The library's sentence, about the upload rather than a file of ours."""
+        text = str(error).replace(str(self._path), self._path.name).replace(self._path.name, "the upload")
+        return ProblemError(error.code, text.replace("the data", "the upload"))
+
+
+async def timed(request: Request, settings: ServiceSettings, stopping: asyncio.Event) -> AsyncIterator[bytes]:
+    """The body of a request, as long as it comes fast enough, and the service is not ``stopping``.
+
+    Raises:
+        ProblemError: it stalls, drips, or breaks off; or the service stops.
+    """
+    clock = asyncio.get_running_loop().time
+    idle, begun, received = settings.upload_idle_seconds, clock(), 0
+    chunks = aiter(request.stream())
+    stopped = asyncio.ensure_future(stopping.wait())
+    try:
+        while (chunk := await _next(chunks, stopped, idle)) is not None:
+            received += len(chunk)
+            spent = clock() - begun
+            if spent > idle:  # each stretch of so many seconds is judged by itself
+                if received < settings.upload_min_rate * spent:
+                    least = f"{settings.upload_min_rate:,} bytes per second"
+                    text = f"the upload is slower than {least}; use a faster connection"
+                    raise ProblemError("upload-timeout", text, headers=CLOSE)
+                begun, received = clock(), 0
+            yield chunk
+    finally:
+        stopped.cancel()
+
+
+async def _next(chunks: AsyncIterator[bytes], stopped: asyncio.Future[Any], idle: float) -> bytes | None:
+    """The next bytes; None after the last."""
+    coming = asyncio.ensure_future(anext(chunks, None))
+    try:
+        await asyncio.wait((coming, stopped), timeout=idle, return_when=asyncio.FIRST_COMPLETED)
+        if stopped.done():
+            text = "the service is stopping; send the upload again in a minute"
+            raise ProblemError("stopping", text, retry_after=60, headers=CLOSE)
+        if not coming.done():
+            text = f"nothing came for {idle:g} s; send the upload again"
+            raise ProblemError("upload-timeout", text, headers=CLOSE)
+        return coming.result()
+    except ClientDisconnect as error:
+        raise ProblemError("upload-aborted", "the connection closed before the upload was complete") from error
+    finally:
+        coming.cancel()
+
+
+def scene_name(given: str | None) -> str:
+    """What a scene may be called in listings and downloads: no path, no control characters, never empty."""
+    name = re.split(r"[/\\]", unicodedata.normalize("NFC", given or ""))[-1]
+    name = "".join(c for c in name if unicodedata.category(c)[0] != "C" and c not in '"<>|:*?')
+    if name.lower().endswith(".ply"):
+        name = name[:-4]
+    name = name.strip(" .")
+    return name[:100] or "scene"

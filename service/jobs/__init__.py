@@ -1,0 +1,1 @@
+"""Jobs at work: admission, the worker, its processes, events, expiry and recovery."""

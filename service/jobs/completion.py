@@ -1,0 +1,69 @@
+"""How jobs end: their files, their row, what is counted and logged of it."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import Any
+
+from service.core.clock import Clock
+from service.core.metrics import Metrics
+from service.core.models import Job, State
+from service.core.problems import PROBLEM_TYPES, problem
+from service.core.settings import ServiceSettings
+from service.storage.job_storage import JobStorage
+from service.storage.job_store import Store
+
+log = logging.getLogger("kissgs.service")
+
+
+@dataclass(frozen=True, slots=True)
+class JobCompletion:
+    """Brings jobs to an end. Its methods block on the disk and the database."""
+
+    settings: ServiceSettings
+    store: Store
+    storage: JobStorage
+    metrics: Metrics
+    clock: Clock
+
+    def succeed(self, job: Job, summary: dict[str, Any]) -> None:
+        """The job's result is in its place."""
+        upload = self.storage.upload(job.id)
+        self.storage.discard_checkpoints(job.id)
+        if not self.settings.keep_uploads:
+            self.storage.discard(upload)
+        kept = self.settings.keep_uploads and upload.is_file()
+        values = {
+            "result": summary,
+            "upload_kept": kept,
+            "spare_bytes": job.upload_bytes if kept else 0,
+            "disk_bytes": self.storage.job_bytes(job.id),
+        }
+        if not self.end(job, State.SUCCEEDED, **values):
+            self.storage.discard(self.storage.result(job.id))
+
+    def fail(self, job: Job, code: str, detail: str) -> None:
+        """The job has no result, and its files are of no more use."""
+        if self._failed(job, code, detail):
+            self.storage.remove_job(job.id)
+
+    def lose(self, job: Job) -> None:
+        """The job's upload has vanished. What there is of its files stays."""
+        if self._failed(job, "internal", "the upload is no longer on the server's disk; submit the scene again"):
+            self.storage.keep_aside(job.id, "has lost its upload")
+
+    def end(self, job: Job, state: State, **values: Any) -> bool:  # noqa: ANN401
+        """Set a job's last state, and ``values`` with it; False if it has ended before."""
+        moved = self.store.move(job.number, state, expires_at=self.clock() + self.settings.keep_seconds, **values)
+        current = self.store.get(job.id)
+        if moved and current is not None:
+            seconds = None if job.started_at is None else self.clock() - job.started_at
+            self.metrics.job_ended(current, state, seconds)
+            when = "before it was started" if seconds is None else f"after {seconds:.1f} s"
+            log.info("job %s %s %s", job.id, state, when)
+        return moved
+
+    def _failed(self, job: Job, code: str, detail: str) -> bool:
+        document = problem(code if code in PROBLEM_TYPES else "internal", detail).model_dump(exclude_none=True)
+        return self.end(job, State.FAILED, problem=document, upload_kept=False, disk_bytes=0)

@@ -1,0 +1,73 @@
+"""The parts of one running service, and how a request gets at them."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+from dataclasses import dataclass
+from typing import Annotated
+
+from fastapi import Depends, Request
+from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+
+from service.core.clock import Clock
+from service.core.metrics import Metrics
+from service.core.notifier import JobNotifier
+from service.core.problems import ProblemError
+from service.core.settings import ServiceSettings
+from service.jobs.admission import Admission
+from service.jobs.decoding import Decoder
+from service.jobs.event_stream import EventStream
+from service.jobs.worker import Worker
+from service.storage.job_storage import JobStorage
+from service.storage.job_store import Store
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceContainer:
+    """What a service is made of."""
+
+    settings: ServiceSettings
+    store: Store
+    storage: JobStorage
+    notifier: JobNotifier
+    metrics: Metrics
+    clock: Clock
+    worker: Worker
+    admission: Admission
+    decoder: Decoder
+    follower: EventStream
+
+
+def _context(request: Request) -> ServiceContainer:
+    context: ServiceContainer = request.app.state.context
+    return context
+
+
+Service = Annotated[ServiceContainer, Depends(_context)]
+
+_bearer = HTTPBearer(auto_error=False, description="A key, where the service asks for one (see /v1/limits).")
+
+
+def _owner(context: Service, given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]) -> str:
+    """Whose request this is; everybody's where no keys are configured."""
+    keys = context.settings.keys
+    if not keys:
+        return ""
+    digest = hashlib.sha256((given.credentials if given else "").encode()).hexdigest()
+    found = ""
+    for key in keys:  # all of them, whichever fits: the time tells nothing
+        if hmac.compare_digest(key.sha256, digest):
+            found = key.owner
+    if not found:
+        raise ProblemError(
+            "unauthorized",
+            "this key is not known here; check it, or ask for a new one"
+            if given
+            else "this service needs a key; send it as 'Authorization: Bearer KEY'",
+            headers={"WWW-Authenticate": 'Bearer realm="kissgs"'},
+        )
+    return found
+
+
+Owner = Annotated[str, Depends(_owner)]

@@ -1,0 +1,74 @@
+"""Housekeeping: what has expired is removed, and the time is written down."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from dataclasses import dataclass
+
+from anyio.to_thread import run_sync
+from sqlalchemy.exc import SQLAlchemyError
+
+from service.core.models import ENDED, State
+from service.core.notifier import ended
+from service.jobs.container import ServiceContainer
+from service.storage.tenancy import SIGN_SECONDS
+
+log = logging.getLogger("kissgs.service")
+
+
+GRACE_SECONDS = 3600.0
+
+
+@dataclass(frozen=True, slots=True)
+class ExpiryTask:
+    """Sweeps every ``settings.sweep_seconds``."""
+
+    context: ServiceContainer
+    began: float
+
+    async def run(self) -> None:
+        """For ever; a failed sweep is logged and tried again."""
+        while True:
+            await asyncio.sleep(self.context.settings.sweep_seconds)
+            try:
+                for job_id in await run_sync(self.sweep):
+                    self.context.notifier.notify(job_id)
+                    self.context.notifier.notify(ended(job_id))
+            except Exception:
+                log.exception("what has expired could not be removed; trying again")
+
+    async def show_life(self) -> None:
+        """For ever: what keeps other services from using the same database."""
+        while True:
+            await asyncio.sleep(SIGN_SECONDS)
+            with contextlib.suppress(SQLAlchemyError):  # /readyz and the worker tell
+                await run_sync(self.context.store.keep_time)
+
+    def sweep(self) -> list[str]:
+        """Remove the files of ended jobs whose time is over; forget them altogether after as long again.
+
+        Nothing expires in the first hour of a service, should its machine have started with a wrong clock.
+
+        Returns:
+            Ids of the jobs that have expired.
+        """
+        store, storage, now = self.context.store, self.context.storage, self.context.clock()
+        keep, expired = self.context.settings.keep_seconds, []
+        store.keep_time()
+        if now - self.began < min(GRACE_SECONDS, keep):
+            return []
+        while due := store.due(ENDED, now):
+            for number, job_id in due:
+                gone = {"upload_kept": False, "disk_bytes": 0, "spare_bytes": 0}
+                if store.move(number, State.EXPIRED, expires_at=now + keep, **gone):
+                    storage.remove_job(job_id)
+                    expired.append(job_id)
+        while due := store.due([State.EXPIRED], now):
+            for number, job_id in due:
+                store.forget(number)
+                storage.remove_job(job_id)
+        if expired:
+            log.info("%d jobs expired", len(expired))
+        return expired

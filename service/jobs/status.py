@@ -1,0 +1,134 @@
+"""From a row of the table to what a client sees of a job."""
+
+from __future__ import annotations
+
+import statistics
+
+from service.core.clock import as_datetime
+from service.core.models import ACTIVE, Job, State
+from service.core.presets import usual_seconds
+from service.core.schemas import Estimate, JobOptions, JobStatus, Links, Progress, Sizes, Timings
+from service.storage.job_store import Store
+
+
+class QueueEstimator:
+    """What is to be done, and how long that will take. Reads the queue once, when it is first asked.
+
+    Args:
+        store: of the jobs.
+        workers: jobs that run at the same time.
+    """
+
+    def __init__(self, store: Store, workers: int) -> None:
+        self.now = store.clock()
+        self._store, self._workers = store, workers
+        self._active: list[Job] | None = None
+        self._rates: dict[tuple[str, bool], float | None] = {}
+
+    def position(self, job: Job) -> int:
+        """Of a waiting job; 1 is next."""
+        return 1 + sum(other.state == State.QUEUED for other in self._ahead(job))
+
+    def seconds_left(self, job: Job) -> float:
+        """Until a job that waits or runs will be done: a guess."""
+        ahead = self._ahead(job) if job.state == State.QUEUED else []
+        return self._work(job) + sum(map(self._work, ahead)) / self._workers
+
+    def seconds_to_room(self) -> float:
+        """When a place in the queue will be free: a guess, from 1 to 300."""
+        running = [self._work(job) for job in self._jobs() if job.state == State.RUNNING]
+        return min(300.0, max(1.0, min(running, default=1.0) / self._workers))
+
+    def _jobs(self) -> list[Job]:
+        if self._active is None:
+            self._active = self._store.active()
+        return self._active
+
+    def _ahead(self, job: Job) -> list[Job]:
+        return [other for other in self._jobs() if other.state == State.RUNNING or other.number < job.number]
+
+    def _work(self, job: Job) -> float:
+        """What a job itself still needs, judged by the latest of its kind on this machine."""
+        kind = job.preset, job.evaluate
+        if kind not in self._rates:
+            rates = self._store.rates(*kind)
+            self._rates[kind] = statistics.median(rates) if rates else None
+        rate = self._rates[kind]
+        whole = usual_seconds(*kind, job.gaussians) if rate is None else rate * job.gaussians
+        spent = self.now - job.started_at if job.state == State.RUNNING and job.started_at is not None else 0.0
+        return max(whole - spent, 0.1 * whole, 0.5)  # it runs: it is not done, however wrong the guess was
+
+
+def status_of(job: Job, queue: QueueEstimator) -> JobStatus:
+    """Everything there is to know of a job, now."""
+    waits, runs, result = job.state == State.QUEUED, job.state == State.RUNNING, job.result or {}
+    return JobStatus(
+        id=job.id,
+        name=job.name,
+        state=State(job.state),
+        position=queue.position(job) if waits else None,
+        progress=Progress(stage=job.stage, fraction=job.fraction, note=job.note) if runs and job.stage else None,
+        estimate=_estimate(job, queue) if waits or runs else None,
+        options=JobOptions.model_validate(job.options),
+        upload_bytes=job.upload_bytes,
+        gaussians=job.gaussians,
+        sh_degree=job.sh_degree,
+        kept=result.get("count"),
+        compacted=result.get("compacted"),
+        finetuning=result.get("finetuning"),
+        invisible=result.get("invisible"),
+        cleaned=result.get("cleaned"),
+        evaluation=result.get("evaluation"),
+        sizes=_sizes(job),
+        timings=_timings(job, queue.now),
+        starts=job.starts,
+        problem=job.problem,
+        links=_links(job),
+        expires_at=as_datetime(job.expires_at) if job.expires_at is not None else None,
+    )
+
+
+def _estimate(job: Job, queue: QueueEstimator) -> Estimate:
+    seconds = queue.seconds_left(job)
+    return Estimate(seconds_left=round(seconds, 1), ready_at=as_datetime(queue.now + seconds))
+
+
+def _sizes(job: Job) -> Sizes | None:
+    if job.result is None:
+        return None
+    container = job.result["container"]["bytes"]
+    return Sizes(
+        container=container,
+        files={name: file["stored"] for name, file in job.result["files"].items()},
+        ratio=job.upload_bytes / container,
+        bytes_per_gaussian=container / max(job.gaussians, 1),
+    )
+
+
+def _timings(job: Job, now: float) -> Timings:
+    started, finished = job.started_at, job.finished_at
+    until = finished if finished is not None else now
+    return Timings(
+        created_at=as_datetime(job.created_at),
+        started_at=as_datetime(started) if started is not None else None,
+        finished_at=as_datetime(finished) if finished is not None else None,
+        queue_seconds=max(0.0, started - job.created_at) if started is not None else None,
+        run_seconds=max(0.0, until - started) if started is not None and job.state != State.QUEUED else None,
+        stages=job.result["seconds"] if job.result else None,
+        cpu_seconds=job.result["cpu_seconds"] if job.result else None,
+    )
+
+
+def _links(job: Job) -> Links:
+    here, done = f"/v1/jobs/{job.id}", job.state == State.SUCCEEDED
+    return Links(
+        self=here,
+        events=f"{here}/events",
+        cancel=f"{here}/cancel" if job.state in ACTIVE else None,
+        result=f"{here}/result" if done else None,
+        files=f"{here}/files/{{name}}" if done else None,
+        decoded=f"{here}/decoded" if done else None,
+        source=f"{here}/source" if done and job.upload_kept else None,
+        report=f"{here}/report" if done else None,
+        preview=f"/preview/{job.id}" if done else None,
+    )

@@ -1,0 +1,1 @@
+"""Jobs at rest: the database, the data folder, and that both belong together."""

@@ -1,0 +1,253 @@
+"""Oracle: small captures made by hand, fox's README, and INRIA's and COLMAP's rules written out again."""
+
+import struct
+
+import numpy as np
+import pytest
+from helpers.reference_cameras import (
+    PINHOLE,
+    assert_camera,
+    frames,
+    poses,
+    write_binary,
+    write_json,
+    write_photo,
+    write_text,
+)
+from PIL import Image
+
+from kissgs.cameras.captures.load import load_views
+from kissgs.cameras.views import View
+from kissgs.core.errors import InvalidViewsError
+
+NAMES = [f"{letter}.jpg" for letter in "jihgfedcba"]
+HELD_OUT = ["0001.jpg", "0012.jpg", "0027.jpg", "0042.jpg", "0073.jpg", "0089.jpg", "0110.jpg"]
+
+
+def capture(folder, camera=PINHOLE, names=NAMES, photos="images", size=None):
+    """A model, and photographs of ``size`` for it."""
+    images = poses(names)
+    write_text(folder / "sparse" / "0", {1: camera}, images)
+    for name in names if size else []:
+        write_photo(folder / photos / name, *size)
+    return images
+
+
+def test_fox(shared_data):
+    views = load_views(shared_data / "fox", scale=2)
+    assert [view.name for view in views.test] == HELD_OUT
+    assert len(views.train) == 43
+    assert {(view.camera.width, view.camera.height) for view in views.train} == {(540, 960)}
+    np.testing.assert_allclose(views.train[0].camera.K, [[714.1977, 0, 270], [0, 714.1977, 480], [0, 0, 1]], atol=1e-4)
+    assert views.background.tolist() == [0, 0, 0]
+    quarter = load_views(shared_data / "fox").test[0]  # the scale that nobody has to name
+    with Image.open(shared_data / "fox" / "images_4" / "0001.jpg") as image:
+        np.testing.assert_array_equal(quarter.load_photo(), np.asarray(image))
+
+
+def test_garden_has_cameras_only(shared_data, tmp_path):
+    """Its archive has no photographs; written as a model, the cameras come back."""
+    with np.load(shared_data / "garden" / "test_garden.npz") as archive:
+        viewmats, Ks = archive["viewmats"].astype(float), archive["Ks"].astype(float)
+    data = struct.pack("<Q", 3)
+    for i, K in enumerate(Ks):
+        data += struct.pack("<IiQQ4d", i, 1, 648, 420, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    images = poses(["view_0.png", "view_1.png", "view_2.png"])
+    for i, pose in enumerate(images):
+        pose.camera, pose.rotation = i, type(pose.rotation).from_matrix(viewmats[i, :3, :3])
+        pose.translation = viewmats[i, :3, 3]
+    write_binary(tmp_path, {}, images)
+    (tmp_path / "cameras.bin").write_bytes(data)
+    views = load_views(tmp_path, hold_out=0)
+    for view, viewmat, K in zip(views.train, viewmats, Ks, strict=True):
+        np.testing.assert_allclose(view.camera.viewmat, viewmat, atol=1e-5)
+        np.testing.assert_allclose(view.camera.K, K)
+        assert view.photo is None
+    assert views.source == f"COLMAP model {tmp_path}, no photographs"
+    looked = f"looked in {tmp_path} for 'images', 'input'"
+    assert views.note == f"no photographs were found ({looked}); name their folder with --images"
+
+
+@pytest.mark.parametrize("photos", ["images", "images_4", "input"])
+def test_photographs_that_are_found_need_no_note(tmp_path, photos):
+    """The folder is told, whichever camera of a rig was first."""
+    names = ["left/1.jpg", "left/2.jpg", "right/1.jpg"]
+    factor = 4 if photos == "images_4" else 1
+    capture(tmp_path, names=names, photos=photos, size=(120 // factor, 80 // factor))
+    views = load_views(tmp_path)
+    assert [view.photo for view in views.train] == [tmp_path / photos / name for name in names[1:]]
+    assert (views.train[0].camera.width, views.train[0].camera.height) == (120 // factor, 80 // factor)
+    assert views.source == f"COLMAP model {tmp_path}/sparse/0, photographs of {photos}"
+    assert views.note == ""
+
+
+def test_photographs_in_an_unusual_folder_are_missed_aloud(tmp_path):
+    capture(tmp_path, photos="rgb", size=(120, 80))
+    assert "no photographs were found" in load_views(tmp_path).note
+    views = load_views(tmp_path, images=tmp_path / "rgb")
+    assert (views.note, views.source.split(", ")[-1]) == ("", "photographs of rgb")
+
+
+def test_all_folders_are_told(tmp_path, monkeypatch):
+    parts = ["train", "test", "val"]
+    documents = [{"w": 12, "h": 8, "fl_x": 10, "frames": frames(poses(["a.png"]), f"{part}/")} for part in parts]
+    for part, document in zip(parts, documents, strict=True):
+        write_photo(tmp_path / part / "a.png", 12, 8)
+        write_json(tmp_path / f"transforms_{part}.json", document)
+    assert load_views(tmp_path).source.endswith("photographs of train and test")
+    document = documents[0] | {"frames": [frame for document in documents for frame in document["frames"]]}
+    path = write_json(tmp_path / "transforms.json", document)
+    assert load_views(path).source.endswith("photographs of 3 folders")
+    write_photo(tmp_path / "a.png", 12, 8)
+    write_json(path, document | {"frames": frames(poses(["a.png"]), "")})
+    monkeypatch.chdir(tmp_path)
+    assert load_views(type(tmp_path)("transforms.json")).source.endswith(f"photographs of {tmp_path.name}")
+
+
+@pytest.mark.parametrize(("hold_out", "test"), [(8, "ai"), (3, "adgj"), (2, "acegi"), (0, ""), (100, "a")])
+def test_hold_out_counts_sorted_names(tmp_path, hold_out, test):
+    capture(tmp_path)
+    views = load_views(tmp_path, hold_out=hold_out)
+    assert [view.name[0] for view in views.test] == list(test)
+    assert [view.name[0] for view in views.train] == sorted(set("abcdefghij") - set(test))
+
+
+def test_a_single_view_is_for_learning(tmp_path):
+    capture(tmp_path, names=["a.jpg"])
+    views = load_views(tmp_path)
+    assert (len(views.train), len(views.test)) == (1, 0)
+
+
+@pytest.mark.parametrize(
+    ("size", "resolution", "expected"),
+    [
+        ((120, 80), None, (120, 80)),
+        ((60, 40), None, (60, 40)),
+        ((61, 40), None, (61, 40)),
+        ((2400, 1600), None, (1600, 1066)),
+        ((240, 160), 50, (50, 33)),
+        ((240, 160), 240, (240, 160)),
+        ((240, 160), 1, (1, 1)),
+    ],
+)
+def test_cameras_take_the_size_of_their_photographs(tmp_path, size, resolution, expected):
+    pose = capture(tmp_path, names=["a.jpg"], size=size)[0]
+    view = load_views(tmp_path, resolution=resolution).train[0]
+    across, down = expected[0] / 120, expected[1] / 80
+    K = [[110 * across, 0, 61 * across], [0, 115 * down, 39.5 * down], [0, 0, 1]]
+    assert_camera(view.camera, pose, K, *expected)
+    assert view.load_photo().shape == (*expected[::-1], 3)
+
+
+def test_the_longer_side_of_portrait_pictures_counts(tmp_path):
+    """Where INRIA's code would look at the width alone, and reduce nothing."""
+    capture(tmp_path, ("PINHOLE", 1200, 3200, (900.0, 900.0, 600.0, 1600.0)))
+    camera = load_views(tmp_path).train[0].camera
+    assert (camera.width, camera.height) == (600, 1600)
+
+
+@pytest.mark.parametrize("width", [1601, 1610, 1999, 5187])
+def test_reduction_is_inrias(tmp_path, width):
+    """``int(w / (w / 1600))`` is 1599 for some widths; published figures are of these sizes."""
+    capture(tmp_path, ("PINHOLE", width, 1000, (900.0, 900.0, width / 2, 500.0)))
+    scale = width / 1600
+    camera = load_views(tmp_path).train[0].camera
+    assert (camera.width, camera.height) == (int(width / scale), int(1000 / scale))
+
+
+def test_scale_without_photographs_reduces_the_cameras(tmp_path):
+    capture(tmp_path)
+    camera = load_views(tmp_path, scale=4).train[0].camera
+    assert (camera.width, camera.height) == (30, 20)
+
+
+def test_a_distorting_lens_is_undistorted(tmp_path):
+    """Straight lines of the scene, bent by the lens, are straight again, and where the camera says."""
+    size, focal, k1 = (240, 160), 200.0, 0.3
+    capture(tmp_path, ("SIMPLE_RADIAL", *size, (focal, 120.0, 80.0, k1)), names=["a.png"])
+    v, u = np.mgrid[:160, :240] + 0.5
+    x, y = (u - 120) / focal, (v - 80) / focal
+    undone = np.stack([x, y])
+    for _ in range(100):
+        undone = np.stack([x, y]) / (1 + k1 * (undone**2).sum(axis=0))
+    grey = 128 + 100 * np.sin(12 * undone[0])  # vertical stripes
+    photo = np.repeat(grey[:, :, None], 3, axis=2).round().astype(np.uint8)
+    (tmp_path / "images").mkdir()
+    Image.fromarray(photo).save(tmp_path / "images" / "a.png")
+    view = load_views(tmp_path).train[0]
+    picture, camera = view.load_photo(), view.camera
+    assert picture.shape == (camera.height, camera.width, 3)
+    assert 200 < camera.width < 240
+    columns = (np.arange(camera.width) + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
+    assert camera.K[0, 0] == focal
+    assert np.abs(picture[2:-2, 2:-2, 0] - (128 + 100 * np.sin(12 * columns))[2:-2]).max() < 1.6
+    half = load_views(tmp_path, resolution=120).train[0]
+    assert half.load_photo().shape == (half.camera.height, half.camera.width, 3)
+    assert half.camera.width == pytest.approx(camera.width / 2, abs=1.5)
+
+
+def test_colmap_counts_before_transforms(tmp_path):
+    capture(tmp_path, names=["colmap.jpg"])
+    document = {"w": 120, "h": 80, "fl_x": 100, "frames": frames(poses(["json.jpg"]), "")}
+    for name in ("transforms.json", "transforms_train.json"):
+        path = write_json(tmp_path / name, document)
+        assert [view.name for view in load_views(path).train] == ["json.jpg"]
+    assert [view.name for view in load_views(tmp_path).train] == ["colmap.jpg"]
+    assert [view.name for view in load_views(tmp_path / "sparse" / "0" / "images.txt").train] == ["colmap.jpg"]
+
+
+def test_loading_opens_no_pixels(tmp_path):
+    capture(tmp_path, names=["a.jpg"], size=(120, 80))
+    photo = tmp_path / "images" / "a.jpg"
+    photo.write_bytes(photo.read_bytes()[:-100])
+    view = load_views(tmp_path).train[0]
+    with pytest.raises(InvalidViewsError, match=r"a.jpg is damaged, cut short"):
+        view.load_photo()
+
+
+def message(path, **options):
+    with pytest.raises(InvalidViewsError) as caught:
+        load_views(path, **options)
+    return str(caught.value)
+
+
+def test_photographs_of_another_shape(tmp_path):
+    capture(tmp_path, names=["a.jpg"], size=(120, 86))
+    assert message(tmp_path) == (
+        f"{tmp_path}/images/a.jpg is 120x86 pixels, but its camera ({tmp_path}/sparse/0/images.txt, image 'a.jpg') is "
+        "for 120x80, another shape; name the folder of the photographs that the cameras belong to (--images)"
+    )
+
+
+def test_no_capture(tmp_path):
+    places = "there or in sparse/0, sparse, colmap/sparse/0"
+    assert message(tmp_path) == f"{tmp_path} has no cameras: neither a COLMAP model ({places}) nor a transforms.json"
+    assert message(tmp_path / "x") == f"there is no folder {tmp_path}/x; name the folder of a capture"
+    (tmp_path / "scene.ply").touch()
+    assert message(tmp_path / "scene.ply") == (
+        f"{tmp_path}/scene.ply is no file of cameras; name the capture's folder or a transforms.json"
+    )
+    (tmp_path / "images.bin").touch()
+    assert message(tmp_path) == f"{tmp_path} has images.bin but no cameras.bin; a COLMAP model needs both"
+    assert message(tmp_path / ("x" * 300)).endswith(": file name too long")
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"scale": 0}, "scale must be 1 or more, not 0"),
+        ({"resolution": 0}, "resolution must be 1 or more, not 0"),
+        ({"hold_out": -1}, "hold_out must be 0 or more, not -1"),
+        ({"hold_out": 1}, "hold_out 1 would leave no view to learn from; give 0 for none, or 2 or more"),
+    ],
+)
+def test_impossible_arguments(tmp_path, options, sentence):
+    assert message(tmp_path, **options) == sentence
+
+
+def test_views_without_photograph_say_so(tmp_path):
+    capture(tmp_path)
+    view = load_views(tmp_path).train[0]
+    assert isinstance(view, View)
+    with pytest.raises(InvalidViewsError, match=r"^view b.jpg has no photograph, only a camera$"):
+        view.load_photo()

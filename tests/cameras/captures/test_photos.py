@@ -1,0 +1,200 @@
+"""Oracle: folders made by hand, and which of their files a person would say is meant."""
+
+import os
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from kissgs.cameras.captures.photos import FoundPhoto, find_photos, where_looked
+from kissgs.core.errors import InvalidViewsError
+
+
+def touch(root, *names):
+    for name in names:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).touch()
+
+
+def found(root, *names, **options):
+    photos = find_photos(names, root, **options)
+    return None if photos is None else [str(photo.path.relative_to(root)) for photo in photos]
+
+
+@pytest.mark.parametrize(
+    ("folders", "scale", "expected"),
+    [
+        (["images", "images_2", "images_4"], None, ("images", 1)),
+        (["images_4", "images_2", "images_16"], None, ("images_4", 4)),
+        (["images_8", "images_2", "images_16"], None, ("images_2", 2)),
+        (["images", "images_2", "images_4"], 4, ("images_4", 4)),
+        (["images", "images_4"], 1, ("images", 1)),
+        (["images_2024", "images_old", "images_8"], None, ("images_8", 8)),
+        (["input", "images_8"], None, ("images_8", 8)),
+        (["input", "images"], None, ("images", 1)),
+        (["input", "images_old"], None, ("input", 1)),
+        (["input", "input_4"], 1, ("input", 1)),
+    ],
+)
+def test_folders_by_scale(tmp_path, folders, scale, expected):
+    for folder in folders:
+        touch(tmp_path, f"{folder}/a.jpg")
+    folder, factor = expected
+    photo = FoundPhoto(tmp_path / folder / "a.jpg", factor, tmp_path / folder)
+    assert find_photos(["images/a.jpg"], tmp_path, scale=scale) == (photo,)
+
+
+@pytest.mark.parametrize(
+    ("there", "wanted", "expected"),
+    [
+        (["a.jpg", "a.png", "A.jpg"], "a.jpg", "a.jpg"),
+        (["a.png"], "a.jpg", "a.png"),
+        (["a.JPG"], "a.jpg", "a.JPG"),
+        (["A.JPEG", "a.txt"], "a.jpg", "A.JPEG"),
+        (["a.jpg", "A.png"], "A", "A.png"),
+        (["frame.01.png", "frame.02.png"], "frame.02", "frame.02.png"),
+        (["frame.01.png", "frame.02.png"], "frame.02.jpg", "frame.02.png"),
+        (["a.webp", "a.png"], "a.jpg", "a.png"),
+        (["sub dir/a b.png"], "sub dir/a b.jpg", "sub dir/a b.png"),
+        (["a.heic"], "a.heic", "a.heic"),
+    ],
+)
+def test_names_by_stem(tmp_path, there, wanted, expected):
+    touch(tmp_path, *(f"images/{name}" for name in there))
+    assert found(tmp_path, f"images/{wanted}") == [f"images/{expected}"]
+
+
+def test_spellings_of_a_path(tmp_path):
+    touch(tmp_path, "here/images/a.jpg", "images_2/b.jpg", "c.jpg", "here/d.jpg")
+    here = tmp_path / "here"
+    assert found(here, "./images/a.jpg", "images\\a.jpg", "d.jpg") == ["images/a.jpg"] * 2 + ["d.jpg"]
+    assert [p.path.name for p in find_photos(["../images/b.jpg", "../c.jpg"], here)] == ["b.jpg", "c.jpg"]
+    assert [p.path for p in find_photos([str(here / "images" / "a.jpg")], tmp_path)] == [here / "images" / "a.jpg"]
+
+
+@pytest.mark.parametrize("name", ["/home/elsewhere/capture/images/a.jpg", "C:\\captures\\images\\a.jpg"])
+def test_absolute_paths_of_another_machine(tmp_path, name):
+    touch(tmp_path, "images_2/a.jpg")
+    assert found(tmp_path, name) == ["images_2/a.jpg"]
+
+
+@pytest.mark.parametrize("start", ["/home/elsewhere/", "C:\\captures\\", "d:/captures/", "\\\\server\\share\\"])
+@pytest.mark.parametrize("photos", ["images", "images_4", "input"])
+def test_absolute_paths_by_their_ends(tmp_path, start, photos):
+    """As much of the name as there is here counts: the same number may have been taken by several cameras."""
+    touch(tmp_path, f"{photos}/1.jpg", f"{photos}/left/1.jpg", f"{photos}/2.jpg", "elsewhere/2.jpg", "other_2/3.jpg")
+    names = [f"{start}pictures/{name}" for name in ("1.jpg", "left/1.jpg", "2.jpg")]
+    assert found(tmp_path, *names) == [f"{photos}/1.jpg", f"{photos}/left/1.jpg", f"{photos}/2.jpg"]
+    assert found(tmp_path, f"{start}other/3.jpg") == ["other_2/3.jpg"], "a folder that is called the same comes first"
+    assert found(tmp_path, *names, images=tmp_path / photos) == found(tmp_path, *names)
+
+
+def test_absolute_paths_that_are_here(tmp_path):
+    touch(tmp_path, "elsewhere/a.jpg", "elsewhere/images/c.jpg", "here/images/a.jpg", "here/images/b.jpg")
+    elsewhere = tmp_path / "elsewhere"
+    photos = find_photos([str(elsewhere / name) for name in ("a.jpg", "b.jpg", "images/c.jpg")], tmp_path / "here")
+    wanted = ["elsewhere/a.jpg", "here/images/b.jpg", "elsewhere/images/c.jpg"]
+    assert [str(photo.path.relative_to(tmp_path)) for photo in photos] == wanted
+
+
+def test_another_folder(tmp_path, monkeypatch):
+    touch(tmp_path, "images/a.jpg", "other_4/a.jpg", "other_4/train/r_0.png", "other_4/test/r_0.png")
+    assert find_photos(["images/a.jpg"], tmp_path, images=tmp_path / "other_4")[0].factor == 4
+    names = ["images/a.jpg", "train/r_0", "./test/r_0", "elsewhere/deep/a.png", "/x/a.jpg", "../a.jpg"]
+    expected = ["a.jpg", "train/r_0.png", "test/r_0.png", "a.jpg", "a.jpg", "a.jpg"]
+    relative = type(tmp_path)("other_4")
+    assert found(tmp_path, *names, images=relative) == [f"other_4/{name}" for name in expected]
+    monkeypatch.chdir(tmp_path)
+    assert find_photos(["images/a.jpg"], tmp_path / "images", images=relative)[0].path == relative / "a.jpg"
+
+
+def test_captures_without_photographs(tmp_path):
+    (tmp_path / "images_old").mkdir()
+    assert found(tmp_path, "images/a.jpg", "images/b.jpg") is None
+    assert found(tmp_path, "a.jpg", "../b.jpg", scale=4) is None
+    touch(tmp_path, "input/film.mp4")
+    assert found(tmp_path, "images/a.jpg", "images/b.jpg") is None
+
+
+@pytest.mark.parametrize(
+    ("names", "sought"),
+    [
+        (["images/a.jpg", "images/left/b.jpg"], " for 'images', 'input'"),
+        (["train/a", "test/a"], " for 'train', 'test'"),
+        (["a.jpg"], ""),
+        (["a.jpg", "rgb/a.jpg", "../b.jpg"], " for 'rgb', '..'"),
+        (["C:\\x\\rgb\\a.jpg"], " for 'C:/x/rgb', 'rgb', 'images', 'input'"),
+        ([f"{letter}/a.jpg" for letter in "abcdefg"], " for 'a', 'b', 'c', 'd', …"),
+        (["new\nline/a.jpg"], " for 'new\\nline'"),
+    ],
+)
+def test_where_they_were_looked_for(tmp_path, names, sought):
+    assert where_looked(names, tmp_path) == f"{tmp_path}{sought}"
+
+
+def message(root, *names, **options):
+    with pytest.raises(InvalidViewsError) as caught:
+        find_photos(names, root, **options)
+    return str(caught.value)
+
+
+def test_missing_photographs(tmp_path):
+    touch(tmp_path, "images_2/a.jpg", "images_2/c.png")
+    mend = "; add them, or name the folder that has them all (--images)"
+    assert message(tmp_path, *(f"images/{x}.jpg" for x in "abcd")) == (
+        f"2 of 4 photographs are missing, the first is 'images/b.jpg', looked for in {tmp_path}/images_2{mend}"
+    )
+    assert message(tmp_path, "images/b.jpg") == (
+        f"1 of 1 photographs are missing, the first is 'images/b.jpg', looked for in {tmp_path}/images_2{mend}"
+    )
+    assert message(tmp_path, "/else/images/b.jpg", "C:\\else\\rgb\\b.jpg").startswith(
+        f"2 of 2 photographs are missing, the first is '/else/images/b.jpg', looked for in {tmp_path}/images_2; "
+    )
+    assert message(tmp_path, "images/a.jpg", "test/b.jpg") == (
+        f"1 of 2 photographs are missing, the first is 'test/b.jpg', looked for in {tmp_path}/test{mend}"
+    )
+
+
+def test_folders_that_are_not_there(tmp_path):
+    touch(tmp_path, "images/a.jpg", "images_4/a.jpg")
+    where = f"in {tmp_path}, only images, images_4; choose another --scale"
+    assert message(tmp_path, "images/a.jpg", scale=2) == f"there is no folder images_2 {where}"
+    touch(tmp_path, "raw/input/a.jpg")
+    assert message(tmp_path / "raw", "images/a.jpg", scale=4) == (
+        f"there is no folder images_4 in {tmp_path}/raw, only input; choose another --scale"
+    )
+    (tmp_path / "images").rename(tmp_path / "images_8")
+    assert message(tmp_path, "images/a.jpg", scale=1) == (
+        f"there is no folder images in {tmp_path}, only images_4, images_8; choose another --scale"
+    )
+    other = type(tmp_path)("nowhere")
+    assert message(tmp_path, "images/a.jpg", images=other) == (
+        f"there is no folder nowhere of photographs, nor {tmp_path}/nowhere; check --images"
+    )
+    assert message(tmp_path, "images/a.jpg", images=other, scale=2) == (
+        "a folder of photographs and a scale exclude each other; give --images or --scale"
+    )
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+def test_folders_that_may_not_be_read(tmp_path):
+    touch(tmp_path, "images/a.jpg")
+    (tmp_path / "images").chmod(0)
+    assert message(tmp_path, "images/a.jpg") == f"cannot read {tmp_path}/images: permission denied"
+    (tmp_path / "images").chmod(0o700)
+
+
+def test_names_too_long_for_any_folder(tmp_path):
+    touch(tmp_path, "images/a.jpg")
+    assert message(tmp_path, f"images/{'a' * 500}/a.jpg").endswith(": file name too long")
+
+
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.text(st.sampled_from("ab./\\: \0é\ud800"), max_size=8), min_size=1, max_size=3), st.booleans())
+def test_any_names(tmp_path, names, named):
+    touch(tmp_path, "a/b.png")
+    try:
+        photos = find_photos(names, tmp_path, images=tmp_path / "a" if named else None)
+    except InvalidViewsError:
+        return
+    assert photos is None or all(photo.path.is_file() for photo in photos)

@@ -1,0 +1,215 @@
+"""The command line as a user runs it; oracle: the library's own functions, and what the README promises."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import pytest
+from helpers.command_line import KISSGS, failure, run
+
+import kissgs
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("cli") / "scene.ply"
+    kissgs.save(kissgs.sample_scene(600, sh_degree=1), path)
+    return path
+
+
+def test_there_and_back(scene: Path, tmp_path: Path) -> None:
+    assert run("compress", scene, "-o", tmp_path / "a.zip").returncode == 0
+    assert run("decompress", tmp_path / "a.zip", "-o", tmp_path / "b.ply").returncode == 0
+    assert (tmp_path / "a.zip").read_bytes() == kissgs.compress(scene).to_zip()
+    assert len(kissgs.load(tmp_path / "b.ply")) == len(kissgs.decompress(tmp_path / "a.zip"))
+
+
+def test_default_names_lie_beside_the_input(scene: Path, tmp_path: Path) -> None:
+    here = tmp_path / "mine.ply"
+    here.write_bytes(scene.read_bytes())
+    assert run("compress", "mine.ply", cwd=tmp_path).returncode == 0
+    assert zipfile.is_zipfile(tmp_path / "mine.zip")
+    assert "exists already" in failure("decompress", "mine.zip", cwd=tmp_path)
+    assert run("decompress", "mine.zip", "--force", cwd=tmp_path).returncode == 0
+
+
+def test_pipes(scene: Path) -> None:
+    packed = run("compress", "-", "-o", "-", "-q", stdin=scene.read_bytes())
+    assert packed.stdout == kissgs.compress(scene).to_zip()
+    back = run("decompress", "-", "-o", "-", stdin=packed.stdout)
+    assert back.stdout.startswith(b"ply\nformat binary_little_endian")
+
+
+def test_several_files_and_patterns(scene: Path, tmp_path: Path) -> None:
+    for name in ("one.ply", "two.ply"):
+        (tmp_path / name).write_bytes(scene.read_bytes())
+    done = run("compress", tmp_path / "*.ply", "-o", tmp_path / "out", "--json", "-p", "fast")
+    reports = json.loads(done.stdout)
+    assert [Path(report["output"]).name for report in reports] == ["one.zip", "two.zip"]
+    assert all(Path(report["output"]).stat().st_size == report["container_bytes"] for report in reports)
+    assert "cannot all become" in failure("compress", tmp_path / "*.ply", "-o", tmp_path / "x.zip")
+    assert "no file matches" in failure("compress", tmp_path / "*.nothing")
+
+
+def test_json_of_one_file_is_one_report(scene: Path, tmp_path: Path) -> None:
+    report = json.loads(run("compress", scene, "-o", tmp_path / "a.zip", "--json").stdout)
+    assert report["source_count"] == 600
+    assert report["container_bytes"] == (tmp_path / "a.zip").stat().st_size
+
+
+def test_info_of_both_kinds(scene: Path, tmp_path: Path) -> None:
+    container = tmp_path / "a.zip"
+    run("compress", scene, "-o", container, "-q")
+    ply, zipped = json.loads(run("info", scene, container, "--json").stdout)
+    assert (ply["kind"], ply["count"], ply["sh_degree"]) == ("ply", 600, 1)
+    assert (zipped["kind"], zipped["sh_degree"]) == ("sog-xt", 1)
+    assert zipped["count"] == len(kissgs.decompress(container))
+    assert sum(zipped["parts"].values()) < zipped["bytes"] == container.stat().st_size
+    table = run("info", container).stdout.decode()
+    assert "means_bytes_0.webp" in table
+    assert "bits each" in table
+
+
+def test_goals_and_what_was_seen_from_the_command_line(scene: Path, tmp_path: Path) -> None:
+    glance = "--set", "sensitivity_views=4", "--set", "sensitivity_view_size=48"
+    copy = tmp_path / "scene.ply"
+    copy.write_bytes(scene.read_bytes())
+    done = run("compress", copy, "--target-size", "13kB", "--cache", *glance)
+    assert b"searched: " in done.stdout
+    assert 12_610 <= (tmp_path / "scene.zip").stat().st_size <= 13_000
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["scene.ply", "scene.sensitivity.npz", "scene.zip"]
+    report = json.loads(run("compress", copy, "-f", "--psnr", "38", "--cache", "--evaluate", "--json", *glance).stdout)
+    assert "sensitivity" not in report["seconds"]
+    assert any(trial["bytes"] == report["container_bytes"] and trial["psnr"] >= 38 for trial in report["trials"])
+    assert (
+        report["evaluation"]["mean"]["candidate_vs_reference"]["psnr"] > 37
+    )  # from cameras that the search did not use
+    assert "has 150 dB, the finest has" in failure("compress", copy, "-f", "-q", "--psnr", "150", *glance)
+    assert "psnr needs bits that are weighed" in failure("compress", copy, "-f", "-p", "fast", "--psnr", "40")
+    piped = failure("compress", "-", "-o", tmp_path / "b.zip", "--cache", stdin=scene.read_bytes())
+    assert "standard input has no place" in piped
+
+
+def test_settings_from_the_command_line(scene: Path, tmp_path: Path) -> None:
+    run("compress", scene, "-o", tmp_path / "a.zip", "-q", "--set", "gaussians_per_codebook_entry=16", "--seed", "3")
+    settings = json.loads(run("info", tmp_path / "a.zip", "--json").stdout)["details"]["settings"]
+    assert (settings["gaussians_per_codebook_entry"], settings["seed"]) == (16, 3)
+    assert "there is no setting 'bits'" in failure("compress", scene, "-o", tmp_path / "b.zip", "--set", "bits=16")
+    assert "NAME=VALUE" in failure("compress", scene, "-o", tmp_path / "b.zip", "--set", "bits")
+    assert "fast, balanced, small, paper" in failure("compress", scene, "-o", tmp_path / "b.zip", "-p", "huge")
+
+
+def test_errors_are_one_line(scene: Path, tmp_path: Path) -> None:
+    assert "no such file" in failure("compress", tmp_path / "none.ply", "-o", tmp_path / "a.zip").lower()
+    (tmp_path / "text.ply").write_text("hello")
+    failure("compress", tmp_path / "text.ply", "-o", tmp_path / "a.zip")
+    (tmp_path / "bad.zip").write_bytes(b"PK\x03\x04 but no more")
+    failure("decompress", tmp_path / "bad.zip", "-o", tmp_path / "a.ply")
+    failure("info", tmp_path / "none.zip")
+    assert "no folder" in failure("compress", scene, "-o", tmp_path / "missing" / "a.zip")
+    assert "both write" in failure("compress", scene, "-o", "-", "--json")
+    assert "say where to write" in failure("compress", "-", stdin=b"")
+    assert (
+        "standard input is closed"
+        in subprocess.run(
+            f"{KISSGS} compress - -o {tmp_path}/q.zip <&-", shell=True, capture_output=True, text=True, check=False
+        ).stderr
+    )
+    assert "has no name" in failure("decompress", "/")
+    assert (
+        "no space left"
+        in subprocess.run(
+            f"{KISSGS} info {scene} > /dev/full", shell=True, capture_output=True, text=True, check=False
+        ).stderr
+    )
+    full = subprocess.run(
+        f"{KISSGS} info {scene} --json > /dev/full", shell=True, capture_output=True, text=True, check=False
+    )
+    assert (full.returncode, full.stderr) == (2, "kissgs: cannot write to standard output: no space left on device\n")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bad.zip", "text.ply"]
+
+
+def test_one_bad_file_of_several_does_not_stop_the_others(scene: Path, tmp_path: Path) -> None:
+    for name in ("a.ply", "c.ply"):
+        (tmp_path / name).write_bytes(scene.read_bytes())
+    (tmp_path / "b.ply").write_text("not a scene")
+    done = run("compress", tmp_path / "*.ply", "-o", tmp_path / "out", "--json", "-p", "fast")
+    assert done.returncode == 2
+    first, second, third = json.loads(done.stdout)
+    assert second["error"]["code"] == "invalid-scene"
+    assert Path(first["output"]).is_file()
+    assert Path(third["output"]).is_file()
+
+
+def test_a_folder_as_output_means_into_it_for_one_file_as_for_many(scene: Path, tmp_path: Path) -> None:
+    assert run("compress", scene, "-o", tmp_path / "new", "-q").returncode == 0
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["scene.zip"]
+    assert run("compress", scene, "-o", tmp_path / "new", "-q", "--unpacked").returncode == 0
+    assert len(kissgs.load(tmp_path / "new" / "scene.container")) > 0
+
+
+def test_names_are_printed_as_they_are(scene: Path, tmp_path: Path) -> None:
+    """Square brackets once were taken for markup."""
+    done = run("compress", scene, "-o", tmp_path / "[red]x.zip", "-p", "fast")
+    assert "[red]x.zip" in done.stdout.decode()
+
+
+def test_json_errors_have_a_code(tmp_path: Path) -> None:
+    done = run("info", tmp_path / "none.ply", "--json")
+    assert json.loads(done.stdout)["error"]["code"] == "invalid-scene"
+
+
+def test_an_interrupt_inside_a_finalizer_is_not_lost() -> None:
+    """Python prints what is raised there and goes on; numba and torch have such callbacks wherever they import."""
+    lines = (
+        "import signal, time, weakref; from kissgs.cli import app, main",
+        "class Thing: pass",
+        "def work(words):",
+        "    thing = Thing()",
+        "    watch = weakref.ref(thing, lambda _: signal.raise_signal(signal.SIGINT))",
+        "    del thing",
+        "    time.sleep(30)",
+        "app.app = work",
+        "main.main()",
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", "\n".join(lines)], check=False, capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 130
+    assert done.stderr == "kissgs: interrupted; nothing half-written is left\n"
+
+
+def test_interrupt_leaves_nothing(tmp_path: Path) -> None:
+    scene, target = tmp_path / "scene.ply", tmp_path / "a.zip"
+    kissgs.save(kissgs.sample_scene(60_000), scene)
+    process = subprocess.Popen([KISSGS, "compress", scene, "-o", target, "-p", "paper"], stderr=subprocess.PIPE)
+    time.sleep(1.5)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=5)
+    assert process.returncode == 130
+    assert said.decode().splitlines()[-1].startswith("kissgs: interrupted")
+    assert [path.name for path in tmp_path.iterdir()] == ["scene.ply"]
+
+
+def test_sample(tmp_path: Path) -> None:
+    assert run("sample", tmp_path / "s.ply", "--gaussians", 500).returncode == 0
+    assert len(kissgs.load(tmp_path / "s.ply")) == 500
+
+
+def test_help_starts_at_once() -> None:
+    best = min(_seconds("--help") for _ in range(3))
+    assert best < 0.5
+
+
+def _seconds(*words: str) -> float:
+    before = os.times()
+    run(*words)
+    after = os.times()
+    return after.children_user + after.children_system - before.children_user - before.children_system

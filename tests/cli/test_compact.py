@@ -1,0 +1,201 @@
+"""``kissgs compact`` and ``compress --compact`` as a user runs them; oracle: the library's own functions."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.captured_scene import SCENE, write_capture
+from helpers.command_line import KISSGS, failure, run
+from helpers.training_scenes import same
+
+import kissgs
+from kissgs.cli.options import budget_of, count_of
+
+SHORT = {"sparsify_steps": 6, "refine_steps": 4, "prune_rounds": 2, "views": 24, "view_size": 48}
+OPTIONS = [word for name, value in SHORT.items() for word in ("--set", f"{name}={value}")]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("compact")
+    kissgs.save(SCENE, folder / "a.ply")
+    write_capture(folder / "capture")
+    return folder
+
+
+def test_it_writes_what_the_library_finds(folder: Path, tmp_path: Path) -> None:
+    done = run("compact", folder / "a.ply", "--ratio", "0.2", "-o", tmp_path / "b.ply", *OPTIONS, "--evaluate")
+    assert done.returncode == 0, done.stderr
+    settings = kissgs.Settings.from_preset("balanced", compact={**SHORT, "ratio": 0.2})
+    found = kissgs.compact(SCENE, settings=settings, evaluate=True)
+    assert same(kissgs.load(tmp_path / "b.ply"), kissgs.clean(found.splats)[0])
+    text = done.stdout.decode()
+    assert "1,500 -> 300 Gaussians" in text
+    assert "learnt from the scene itself: " in text
+    rows = [row.split() for row in text.splitlines() if row.startswith(("input", "prune", "sparsify", "refine"))]
+    assert [row[1] for row in rows] == [f"{step.count:,}" for step in found.report.steps]
+    assert [row[-1] for row in rows] == [f"{step.bytes:,}" for step in found.report.steps]
+
+
+def test_photographs_teach(folder: Path, tmp_path: Path) -> None:
+    words = ["compact", folder / "a.ply", "-n", "0.3k", "-o", tmp_path / "b.ply", "--views", folder / "capture"]
+    told = json.loads(run(*words, *OPTIONS, "--json").stdout)
+    assert (told["count"], told["target_source"]) == (300, "photos")
+    assert len(kissgs.load(tmp_path / "b.ply")) == 300
+
+
+def test_the_preset_fast_only_prunes(folder: Path, tmp_path: Path) -> None:
+    run("compact", folder / "a.ply", "-n", "99", "-p", "fast", "-o", tmp_path / "b.ply", "--set", "views=24")
+    found = kissgs.load(tmp_path / "b.ply")
+    assert {row.tobytes() for row in found.means} < {row.tobytes() for row in SCENE.means}
+    assert len(found) == 99
+
+
+def test_a_search_tells_its_path(folder: Path, tmp_path: Path) -> None:
+    words = ["-p", "fast", "--set", "views=96", "--set", "view_size=48", "-o", tmp_path / "b.ply"]
+    done = run("compact", folder / "a.ply", "--max-psnr-drop", "1", *words)
+    assert "searched: 375 lose" in done.stdout.decode()
+    assert 1 < len(kissgs.load(tmp_path / "b.ply")) < 1500
+
+
+def test_compress_compacts_first(folder: Path, tmp_path: Path) -> None:
+    changes = [word for name, value in SHORT.items() for word in ("--set", f"compact.{name}={value}")]
+    words = ["-p", "fast", "--compact", "20%", *changes, "-o", tmp_path / "a.zip", "--json", "--evaluate"]
+    told = json.loads(run("compress", folder / "a.ply", *words).stdout)
+    settings = kissgs.Settings.from_preset("fast", compact={**SHORT, "ratio": 0.2})
+    small = kissgs.compact(SCENE, settings=settings).splats
+    plain = kissgs.compress(small, settings=kissgs.Settings.from_preset("fast"))
+    found, expected = (kissgs.decompress(source) for source in (tmp_path / "a.zip", plain.files))
+    assert same(found, expected)
+    assert told["source_count"] == 1500
+    assert told["compaction"]["count"] == 300
+    judged = json.loads(json.dumps(kissgs.evaluate(SCENE, found).as_dict()))
+    assert told["evaluation"]["mean"] == judged["mean"], "beside the scene as it was"
+    info = json.loads(run("info", tmp_path / "a.zip", "--json").stdout)
+    assert info["details"]["source_count"] == 1500
+    assert info["changed"]["compacted"] == 1200
+
+
+def test_the_order_of_the_container_leads_to_the_scene() -> None:
+    settings = kissgs.Settings.from_preset(
+        "fast", compact={**SHORT, "sparsify_steps": 0, "refine_steps": 0, "count": 200}
+    )
+    result = kissgs.compress(SCENE, settings=settings)
+    found = kissgs.decompress(result.files)
+    np.testing.assert_allclose(found.means, SCENE.means[result.order], rtol=0.01, atol=0.05)
+
+
+def test_ctrl_c_leaves_a_checkpoint_to_go_on_from(folder: Path, tmp_path: Path) -> None:
+    scene, target = tmp_path / "a.ply", tmp_path / "b.ply"
+    kissgs.save(SCENE, scene)
+    longer = ["--set", "sparsify_steps=300", "--set", "refine_steps=300", "--set", "views=24", "--set", "view_size=48"]
+    words = ["compact", scene, "-n", "300", "-o", target, "--checkpoint", "--quiet", *longer]
+    program = "import kissgs.training.checkpoint as c; c.SECONDS = 0; from kissgs.cli.main import main; main()"
+    process = subprocess.Popen([KISSGS.with_name("python"), "-c", program, *map(str, words)], stderr=subprocess.PIPE)
+    kept = tmp_path / "a.checkpoint.npz"
+    deadline = time.monotonic() + 90
+    while not kept.exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    assert process.communicate()[1] == b"kissgs: interrupted; nothing half-written is left\n"
+    assert process.returncode == 130
+    assert not target.exists()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.checkpoint.npz", "a.ply"]
+    assert "other work" in failure("compact", scene, "-n", "301", "-o", target, "--checkpoint", *longer)
+    assert run(*words).returncode == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.ply", "b.ply"]
+    settings = {"sparsify_steps": 300, "refine_steps": 300, "views": 24, "view_size": 48, "count": 300}
+    whole = kissgs.compact(SCENE, settings=kissgs.Settings.from_preset("balanced", compact=settings))
+    assert same(kissgs.load(target), kissgs.clean(whole.splats)[0])
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["-o", "b.ply"], "say how many Gaussians to keep: -n 200k, --ratio 0.2 or --max-psnr-drop 0.2"),
+        (["-n", "9"], "say where to write with -o"),
+        (["-n", "many", "-o", "b.ply"], "'many' is no number of Gaussians; write 200000, 200k or 1.5M, or a share"),
+        (["-n", "0", "-o", "b.ply"], "setting count: input should be greater than or equal to 1, not 0"),
+        (["--ratio", "20", "-o", "b.ply"], "setting ratio: input should be less than or equal to 1, not 20.0"),
+        (["-n", "9", "--ratio", "0.2", "-o", "b.ply"], "count and ratio cannot both be met; give one"),
+        (["-n", "9", "-o", "b.ply", "--set", "speed=9"], "there is no setting 'speed' of compact; there are count, "),
+        (["-n", "9", "-o", "b.ply", "--set", "no.speed=9"], "there are settings of compact, encode and finetune"),
+        (["-n", "9", "-o", "b.zip/"], "b.zip"),
+        (["--max-psnr-drop", "1", "-o", "b.ply", "--checkpoint"], "keeps no checkpoint"),
+        (["-n", "9", "-o", "b.ply", "--device", "tpu"], "--device tpu: choose cpu or cuda"),
+    ],
+)
+def test_what_cannot_be_done_is_said(folder: Path, tmp_path: Path, words: list[str], sentence: str) -> None:
+    if words[-1] == "b.zip/":
+        (tmp_path / "b.zip").write_text("in the way")
+    assert sentence in failure("compact", folder / "a.ply", *words, cwd=tmp_path)
+    assert not (tmp_path / "b.ply").exists()
+
+
+def test_what_is_about_training_goes_with_it(folder: Path, tmp_path: Path) -> None:
+    for word in (["--checkpoint"], ["--device", "cuda"]):
+        assert "they go with --compact" in failure("compress", folder / "a.ply", "-o", "b.zip", *word, cwd=tmp_path)
+
+
+def test_a_pipe_leaves_no_checkpoint(folder: Path, tmp_path: Path) -> None:
+    kissgs.save(SCENE, tmp_path / "s.ply")
+    words = ["-o", "-", "--checkpoint", *OPTIONS]
+    assert run("compact", tmp_path / "s.ply", "-n", "300", *words).stdout.startswith(b"ply")
+    short = [word for word in OPTIONS if word != "--set"]
+    options = [word for name in short for word in ("--set", f"compact.{name}")]
+    piped = run("compress", tmp_path / "s.ply", "--compact", "300", "-o", "-", "--checkpoint", "-p", "fast", *options)
+    assert piped.stdout.startswith(b"PK")
+    assert [path.name for path in tmp_path.iterdir()] == ["s.ply"]
+
+
+def test_nothing_is_overwritten(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "b.ply").write_text("mine")
+    assert "exists already" in failure("compact", folder / "a.ply", "-n", "9", "-o", tmp_path / "b.ply")
+    assert (tmp_path / "b.ply").read_text() == "mine"
+
+
+def test_without_torch_it_says_what_is_missing(folder: Path, tmp_path: Path) -> None:
+    program = "import sys; sys.modules['torch'] = None; from kissgs.cli.main import main; main()"
+    words = ["compact", folder / "a.ply", "-n", "99", "-o", tmp_path / "b.ply", "--set", "views=24"]
+    python = [KISSGS.with_name("python"), "-c", program]
+    done = subprocess.run([*python, *map(str, words)], capture_output=True, timeout=120, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith(b"kissgs: training is done with torch, which is missing: pip install 'kissgs[train]'")
+    fast = subprocess.run([*python, *map(str, words), "-p", "fast"], capture_output=True, timeout=120, check=False)
+    assert fast.returncode == 0, fast.stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "budget"),
+    [
+        ("200k", {"count": 200_000}),
+        ("1.5M", {"count": 1_500_000}),
+        ("90,000", {"count": 90_000}),
+        ("20%", {"ratio": 0.2}),
+        ("12.5 %", {"ratio": 0.125}),
+        ("0.2dB", {"max_psnr_drop": 0.2}),
+        (".5 db", {"max_psnr_drop": 0.5}),
+    ],
+)
+def test_budgets_in_a_word(text: str, budget: dict[str, float]) -> None:
+    assert budget_of(text) == pytest.approx(budget)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "%", "dB", "-5", "20%%", "1e5", "k", "0.2 dBs", "nan", "1.2.3", "0.8", "1.4", "0,2", "1,5M"]
+)
+def test_what_is_no_budget(text: str) -> None:
+    with pytest.raises(kissgs.UnsupportedError):
+        budget_of(text)
+
+
+@pytest.mark.parametrize("text", ["", "k", "1.2.3", "0x10", "-4", "½", "0.8", "1.4", "0,2", "1,5M", "1,50"])
+def test_what_is_no_count(text: str) -> None:
+    with pytest.raises(kissgs.UnsupportedError, match="is no number of Gaussians"):
+        count_of(text)

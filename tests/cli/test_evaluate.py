@@ -1,0 +1,209 @@
+"""``kissgs evaluate`` and ``compress --evaluate`` as a user runs them; oracle: the library's own functions."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+from helpers.captured_scene import SCENE, damaged, write_capture
+from helpers.command_line import failure, run
+
+import kissgs
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """a.ply, its container b.zip, a damaged c.ply, and a capture."""
+    folder = tmp_path_factory.mktemp("pictures")
+    kissgs.save(SCENE, folder / "a.ply")
+    kissgs.compress(SCENE, folder / "b.zip")
+    kissgs.save(damaged(), folder / "c.ply")
+    write_capture(folder / "capture")
+    return folder
+
+
+def test_json_is_the_evaluation_and_the_bytes(folder: Path) -> None:
+    capture = folder / "capture"
+    done = run("evaluate", folder / "a.ply", folder / "b.zip", "--views", capture, "--json")
+    told = json.loads(done.stdout)
+    found = kissgs.evaluate(kissgs.load(folder / "a.ply"), kissgs.load(folder / "b.zip"), kissgs.load_views(capture))
+    assert told.pop("bytes") == {
+        side: (folder / name).stat().st_size for side, name in (("reference", "a.ply"), ("candidate", "b.zip"))
+    }
+    assert told == json.loads(json.dumps(found.as_dict()))
+
+
+def test_the_table_says_what_was_compared(folder: Path) -> None:
+    done = run("evaluate", folder / "a.ply", folder / "c.ply", "--views", folder / "capture", "--split", "all")
+    text = done.stdout.decode()
+    found = kissgs.evaluate(SCENE, kissgs.load(folder / "c.ply"), kissgs.load_views(folder / "capture"), split="all")
+    assert "3 photographs, 60x40: " in text
+    assert "c.ply compared with a.ply" in text
+    assert "1.0x smaller" in text
+    assert "1,500 of 1,500 Gaussians" in text
+    rows = {row.split()[0]: row.split()[1:] for row in text.splitlines() if row.startswith(("images/", "mean"))}
+    assert rows["images/a.png"] == found.views[0].comparison.spelled()
+    assert rows["mean"] == found.mean.spelled()
+
+
+def test_without_views_it_draws_cameras_and_folders_are_scenes_too(folder: Path, tmp_path: Path) -> None:
+    kissgs.compress(SCENE, tmp_path / "unpacked")
+    done = run("evaluate", folder / "b.zip", tmp_path / "unpacked")
+    text = done.stdout.decode()
+    assert done.returncode == 0, done.stderr
+    assert "24 cameras, 320x240: drawn over the whole scene, seed 0" in text
+    assert "∞" in text
+    assert "photo" not in text
+
+
+def test_the_worst_view_is_told_and_another_seed_draws_others(folder: Path) -> None:
+    words = ["evaluate", folder / "a.ply", folder / "c.ply"]
+    found = kissgs.evaluate(SCENE, kissgs.load(folder / "c.ply"), seed=7)
+    text = " ".join(run(*words, "--seed", 7).stdout.decode().split())
+    assert f"W{found.extremes[1:]}." in text
+    told = json.loads(run(*words, "--seed", 7, "--json").stdout)
+    assert told["worst"]["psnr"] == min(view["candidate_vs_reference"]["psnr"] for view in told["views"])
+    assert told["worst"]["position"] != json.loads(run(*words, "--json").stdout)["worst"]["position"]
+
+
+def test_what_photographs_do_not_show_is_judged_beside_them(folder: Path) -> None:
+    words = ["evaluate", folder / "a.ply", folder / "c.ply", "--views", folder / "capture"]
+    text = " ".join(run(*words).stdout.decode().split())
+    told = json.loads(run(*words, "--json").stdout)
+    assert told["against"] == "photos"
+    assert told["surroundings"]["against"] == "renderings"
+    assert told["surroundings"]["surroundings"] is None
+    around = told["surroundings"]["mean"]["candidate_vs_reference"]["psnr"]
+    assert f"Elsewhere: PSNR {around:.2f} dB to the scene's own renderings from 24 cameras; worst view" in text
+
+
+def test_views_without_a_test_split_say_so(folder: Path, tmp_path: Path) -> None:
+    capture = write_capture(tmp_path / "one", names=("only.png",))
+    text = run("evaluate", folder / "a.ply", folder / "a.ply", "--views", capture).stdout.decode()
+    assert "1 training photograph, 60x40" in text
+    assert "no view is held out" in text
+
+
+def test_photographs_that_are_not_found_are_missed_aloud(folder: Path, tmp_path: Path) -> None:
+    capture = write_capture(tmp_path / "capture")
+    (capture / "images").rename(capture / "rgb")
+    words = ["evaluate", folder / "a.ply", folder / "c.ply", "--views", capture]
+    note = f"no photographs were found (looked in {capture} for 'images', 'input'); name their folder with --images"
+    text = " ".join(run(*words, "--html", tmp_path / "page.html").stdout.decode().split())
+    assert note.replace(" ", "") in text.replace(" ", "")
+    assert note[1:].replace("'", "&#x27;") in (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert json.loads(run(*words, "--json").stdout)["note"] == note
+    told = json.loads(run(*words, "--images", "rgb", "--json").stdout)
+    assert (told["note"], told["against"]) == ("", "photos")
+
+
+def test_a_page_is_written_whole_and_not_over_another(folder: Path, tmp_path: Path) -> None:
+    page, words = (
+        tmp_path / "page.html",
+        ["evaluate", folder / "a.ply", folder / "c.ply", "--views", folder / "capture"],
+    )
+    done = run(*words, "--html", page)
+    assert str(page) in done.stdout.decode()
+    text = page.read_text(encoding="utf-8")
+    assert text.startswith("<!doctype html>")
+    assert text.rstrip().endswith("</html>")
+    assert "exists already" in failure(*words, "--html", page)
+    assert run(*words, "--html", page, "--force", "-q").stdout == b""
+    assert page.read_text(encoding="utf-8") == text
+    assert "no folder" in failure(*words, "--html", tmp_path / "none" / "page.html")
+    assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
+
+
+def test_errors_are_one_line(folder: Path, tmp_path: Path) -> None:
+    pair, capture = [folder / "a.ply", folder / "b.zip"], folder / "capture"
+    assert "no such file" in failure("evaluate", folder / "none.ply", folder / "b.zip").lower()
+    assert "no such file" in failure("evaluate", folder / "a.ply", folder / "none.zip").lower()
+    assert "name the folder of a capture" in failure("evaluate", *pair, "--views", tmp_path / "none")
+    assert "has no cameras" in failure("evaluate", *pair, "--views", tmp_path)
+    assert "choose test, train or all" in failure("evaluate", *pair, "--split", "val")
+    assert "choose cpu or cuda" in failure("evaluate", *pair, "--device", "tpu")
+    for option in ("--scale", "--images", "--resolution"):
+        assert f"{option} is about the photographs" in failure("evaluate", *pair, option, "2")
+    assert "exclude each other" in failure("evaluate", *pair, "--views", capture, "--scale", 2, "--images", tmp_path)
+    (capture / "images" / "a.png").rename(capture / "images" / "a.away")
+    try:
+        assert "photographs are missing" in failure("evaluate", *pair, "--views", capture)
+    finally:
+        (capture / "images" / "a.away").rename(capture / "images" / "a.png")
+
+
+def test_json_errors_have_a_code(folder: Path, tmp_path: Path) -> None:
+    done = run("evaluate", folder / "a.ply", folder / "b.zip", "--views", tmp_path, "--json")
+    assert done.returncode == 2
+    assert json.loads(done.stdout)["error"]["code"] == "invalid-views"
+
+
+def test_compressing_can_evaluate(folder: Path, tmp_path: Path) -> None:
+    words = ["compress", folder / "a.ply", "-o", tmp_path / "a.zip", "--evaluate", "--views", folder / "capture"]
+    told = json.loads(run(*words, "--json").stdout)["evaluation"]
+    views = kissgs.load_views(folder / "capture")
+    found = kissgs.evaluate(SCENE, kissgs.decompress(tmp_path / "a.zip"), views)
+    assert told == json.loads(json.dumps(found.as_dict()))
+    assert (tmp_path / "a.zip").read_bytes() == kissgs.compress(folder / "a.ply", views=views).to_zip()
+    text = run(*words, "--force").stdout.decode()
+    psnr, ssim = found.mean.candidate.spelled()
+    assert f"PSNR {psnr} dB, SSIM {ssim} to 1 held-out photograph; the scene itself" in text
+    run(*[word for word in words if word != "--evaluate"], "--force")
+    assert (tmp_path / "a.zip").read_bytes() == kissgs.compress(folder / "a.ply", views=views).to_zip()
+
+
+def test_compressing_evaluates_on_drawn_cameras_by_default(tmp_path: Path) -> None:
+    stages: list[str] = []
+    result = kissgs.compress(
+        SCENE, tmp_path / "a.zip", evaluate=True, progress=lambda stage, fraction: stages.append(stage)
+    )
+    assert result.report.evaluation is not None
+    assert result.report.evaluation.against == "renderings"
+    assert 20 < result.report.evaluation.mean.candidate_vs_reference.psnr < math.inf
+    assert list(dict.fromkeys(stages))[-2:] == ["evaluate", "write"]
+    assert result.report.seconds["evaluate"] > 0
+    told = json.loads(json.dumps(result.report.as_dict(), allow_nan=False))
+    assert told["evaluation"]["count"]["reference"] == 1500
+    assert kissgs.compress(SCENE).report.as_dict()["evaluation"] is None
+
+
+def test_cancelling_the_evaluation_writes_nothing(tmp_path: Path) -> None:
+    def stop(stage: str, fraction: float) -> None:
+        if stage == "evaluate" and fraction > 0:
+            raise kissgs.Cancelled("enough")
+
+    with pytest.raises(kissgs.Cancelled, match="enough"):
+        kissgs.compress(SCENE, tmp_path / "a.zip", evaluate=True, progress=stop)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("preset", ["fast", "balanced", "small", "paper"])
+def test_every_preset_takes_views(folder: Path, tmp_path: Path, preset: str) -> None:
+    """So that a loop over presets needs no exception: those that take no pictures are judged by them."""
+    glance = "--set", "sensitivity_views=4", "--set", "sensitivity_view_size=48"
+    words = "compress", folder / "a.ply", "-p", preset, *glance, "--views", folder / "capture", "--json"
+    alone = run(*words, "-o", tmp_path / "a.zip")
+    judged = run(*words, "-o", tmp_path / "b.zip", "--evaluate")
+    assert (alone.returncode, judged.returncode) == (0, 0), alone.stderr + judged.stderr
+    assert (tmp_path / "a.zip").read_bytes() == (tmp_path / "b.zip").read_bytes()
+    note = f"kissgs: {preset} takes no pictures, so --views changes nothing; --evaluate judges by them\n"
+    assert alone.stderr.decode() == (note if preset in ("fast", "paper") else "")
+    assert judged.stderr == b""
+    evaluation = json.loads(judged.stdout)["evaluation"]
+    assert evaluation["mean"]["reference"] is not None, "no photographs were compared"
+
+
+@pytest.mark.parametrize("preset", ["fast", "paper"])
+def test_views_change_no_bytes_of_presets_that_take_no_pictures(folder: Path, preset: str) -> None:
+    settings = kissgs.Settings.from_preset(preset)
+    views = kissgs.load_views(folder / "capture")
+    seen, blind = (kissgs.compress(SCENE, settings=settings, views=some) for some in (views, None))
+    assert seen.files == blind.files
+
+
+def test_a_capture_that_cannot_be_read_is_refused_by_every_preset(folder: Path, tmp_path: Path) -> None:
+    words = "compress", folder / "a.ply", "-p", "fast", "-o", tmp_path / "a.zip"
+    assert "there is no folder" in failure(*words, "--views", tmp_path / "none")
+    assert run(*words, "--views", folder / "capture", "--quiet").stderr == b""

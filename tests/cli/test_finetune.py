@@ -1,0 +1,97 @@
+"""``kissgs compress --finetune`` as a user runs it; oracle: the library's own functions."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+from helpers.captured_scene import SCENE, write_capture
+from helpers.command_line import KISSGS, failure, run
+
+import kissgs
+from kissgs.cli.options import spelled_out
+
+SHORT = {"views": 24, "view_size": 48}
+OPTIONS = [word for name, value in SHORT.items() for word in ("--set", f"finetune.{name}={value}")]
+LOOK = {"sensitivity_views": 8, "sensitivity_view_size": 48}
+OPTIONS += [word for name, value in LOOK.items() for word in ("--set", f"{name}={value}")]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("finetune")
+    kissgs.save(SCENE, folder / "a.ply")
+    write_capture(folder / "capture")
+    return folder
+
+
+def settings(**changes: object) -> kissgs.Settings:
+    return kissgs.Settings.from_preset("balanced", finetune={"enabled": True, **SHORT, **changes}, **LOOK)
+
+
+def test_it_writes_what_the_library_finds_and_says_what_it_gave(folder: Path, tmp_path: Path) -> None:
+    done = run("compress", "--finetune", "6", folder / "a.ply", "-o", tmp_path / "b.zip", *OPTIONS)
+    assert done.returncode == 0, done.stderr
+    found = kissgs.compress(SCENE, settings=settings(steps=6))
+    assert (tmp_path / "b.zip").read_bytes() == found.to_zip()
+    assert found.report.finetuning is not None
+    assert (
+        f"{found.report.finetuning.psnr_before:.2f} -> {found.report.finetuning.psnr_after:.2f} dB"
+        in done.stdout.decode()
+    )
+    assert "fine-tuned by the scene itself" in done.stdout.decode()
+
+
+def test_photographs_teach(folder: Path, tmp_path: Path) -> None:
+    words = ["compress", folder / "a.ply", "-o", tmp_path / "b.zip", "--finetune", "4", "--views", folder / "capture"]
+    told = json.loads(run(*words, *OPTIONS, "--json").stdout)["finetuning"]
+    assert (told["steps"], told["target_source"]) == (4, "photos")
+
+
+def test_without_a_number_it_is_that_of_the_preset() -> None:
+    assert spelled_out(["compress", "a.ply", "--finetune"]) == ["compress", "a.ply", "--finetune", "auto"]
+    assert spelled_out(["--finetune", "a.ply", "-q"]) == ["--finetune", "auto", "a.ply", "-q"]
+    assert spelled_out(["--finetune", "70", "a.ply"]) == ["--finetune", "70", "a.ply"]
+    assert spelled_out(["--finetune", "auto"]) == ["--finetune", "auto"]
+    for preset, steps in (("fast", 200), ("balanced", 1000), ("small", 2000), ("paper", 4000)):
+        assert kissgs.Settings.from_preset(preset, finetune={"enabled": True}).finetune.steps == steps
+
+
+def test_ctrl_c_leaves_a_checkpoint_to_go_on_from(tmp_path: Path) -> None:
+    scene, target = tmp_path / "a.ply", tmp_path / "b.zip"
+    kissgs.save(SCENE, scene)
+    words = ["compress", scene, "-o", target, "--finetune", "300", "--checkpoint", "--quiet", *OPTIONS]
+    program = "import kissgs.training.checkpoint as c; c.SECONDS = 0; from kissgs.cli.main import main; main()"
+    process = subprocess.Popen([KISSGS.with_name("python"), "-c", program, *map(str, words)], stderr=subprocess.PIPE)
+    kept = tmp_path / "a.checkpoint-finetune.npz"
+    deadline = time.monotonic() + 90
+    while not kept.exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    assert process.communicate()[1] == b"kissgs: interrupted; nothing half-written is left\n"
+    assert process.returncode == 130
+    assert sorted(path.name for path in tmp_path.iterdir()) == [kept.name, "a.ply"]
+    other = ["compress", scene, "-o", target, "--finetune", "301", "--checkpoint", *OPTIONS]
+    assert "other work" in failure(*other)
+    assert run(*words).returncode == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.ply", "b.zip"]
+    assert target.read_bytes() == kissgs.compress(SCENE, settings=settings(steps=300)).to_zip()
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--finetune", "0"], "setting steps: input should be greater than or equal to 1, not '0'"),
+        (["--finetune=many"], "--finetune many: write a number of steps, or nothing for that of the preset"),
+        (["--finetune", "--set", "finetune.speed=9"], "there is no setting 'speed' of finetune; there are "),
+        (["--device", "cuda"], "they go with --compact and --finetune"),
+        (["--checkpoint"], "they go with --compact and --finetune"),
+    ],
+)
+def test_wrong_words(folder: Path, tmp_path: Path, words: list[str], sentence: str) -> None:
+    assert sentence in failure("compress", folder / "a.ply", "-o", tmp_path / "b.zip", *words)
+    assert not (tmp_path / "b.zip").exists()

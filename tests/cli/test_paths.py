@@ -1,0 +1,189 @@
+"""Paths that no file system takes, in every place where a command has one: a sentence and exit 2, never a traceback."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from helpers.captured_scene import SCENE, write_capture
+from helpers.command_line import failure
+
+import kissgs
+from kissgs.cli.main import main
+
+PLACES = [
+    "compress BAD",
+    "compress BAD -o out.zip",
+    "compress BAD other.ply -o out",
+    "compress BAD --cache",
+    "compress BAD --checkpoint --compact 20%",
+    "compress scene.ply -p fast -o BAD",
+    "compress scene.ply -p fast -o BAD.zip",
+    "compress scene.ply -p fast -o BAD --unpacked",
+    "compress scene.ply -p paper --evaluate -o out.zip --views BAD",
+    "compress scene.ply -p paper -o out.zip --views BAD",
+    "decompress BAD",
+    "decompress BAD -o out.ply",
+    "decompress BAD.zip -o out.ply",
+    "decompress scene.zip -o BAD",
+    "decompress scene.zip -o BAD.ply",
+    "info BAD",
+    "info BAD.zip",
+    "info BAD BAD",
+    "evaluate BAD scene.zip",
+    "evaluate scene.ply BAD",
+    "evaluate scene.ply scene.zip --views BAD",
+    "evaluate scene.ply scene.zip --views capture --images BAD",
+    "evaluate scene.ply scene.zip --html BAD",
+    "render BAD",
+    "render BAD -o out.png",
+    "render scene.ply -o BAD",
+    "render scene.ply -o BAD.png",
+    "render scene.ply --views BAD",
+    "render scene.ply --views capture --images BAD",
+    "render scene.ply --view BAD.json",
+    "render scene.ply --save-camera BAD -o out.png",
+    "compact BAD --ratio 0.5 -o out.ply",
+    "compact BAD --ratio 0.5 --checkpoint -o out.ply",
+    "compact scene.ply --ratio 0.5 -o BAD",
+    "compact scene.ply --ratio 0.5 -o BAD.ply",
+    "compact scene.ply --ratio 0.5 -o out.ply --views BAD",
+    "sample BAD",
+    "sample BAD.ply",
+    "bench BAD -p fast",
+    "bench scene.ply -p fast --plot BAD",
+    "bench scene.ply -p fast --plot BAD.svg",
+    "bench scene.ply -p fast --views BAD",
+    "remote compress BAD",
+    "remote compress BAD -o out.zip",
+    "remote compress scene.ply -o BAD",
+    "remote compress scene.ply -o BAD.zip",
+    "remote get 123 -o BAD",
+]
+
+KINDS = {
+    "too long": "a" * 300,
+    "a folder that is too long": "a" * 300 + "/b",
+    "within a file": "scene.ply/inner",
+    "a loop": "loop",
+    "no permission": "locked/inner",
+    "a link to what is locked": "link",
+    "too long with an asterisk": "*" + "a" * 300,
+}
+
+
+def may_everything(path: Path) -> bool:
+    """Whether this user, as root can, looks into a folder that forbids it."""
+    return os.access(path, os.R_OK)
+
+
+@pytest.fixture(scope="module")
+def folder() -> Iterator[Path]:
+    """The scene in several forms, and what cannot be used."""
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name)
+        (path / "loop").symlink_to("loop")
+        (path / "locked").mkdir(mode=0o000)
+        (path / "link").symlink_to("locked/inner")
+        scene = SCENE.select(slice(0, 40))
+        for ply in ("scene.ply", "other.ply"):
+            kissgs.save(scene, path / ply)
+        kissgs.compress(scene, path / "scene.zip", settings=kissgs.Settings.from_preset("fast"))
+        write_capture(path / "capture")
+        yield path
+
+
+@pytest.fixture
+def process(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """In the folder; what the command line changes of the process is put back."""
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+def refusal(words: list[str], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> list[str]:
+    """The lines on standard error of a command that ends with exit code 2."""
+    monkeypatch.setattr(sys, "argv", ["kissgs", *words])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    said = capfd.readouterr().err.splitlines()
+    assert ended.value.code == 2, (words, said)
+    return said
+
+
+def takes(place: str, kind: str) -> bool:
+    """Whether such a path cannot be used there: patterns are for inputs, and ``loop.zip`` is no loop."""
+    if kind == "too long with an asterisk":
+        return place.split()[:2][-1] == "BAD" and place != "sample BAD"
+    return not ("BAD." in place and kind in ("a loop", "a link to what is locked"))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.usefixtures("process")
+def test_a_sentence(
+    kind: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    if "lock" in KINDS[kind] + kind and may_everything(folder / "locked"):
+        pytest.skip("this user may do everything")
+    before = sorted(folder.iterdir())
+    for place in PLACES:
+        if takes(place, kind):
+            said = refusal([word.replace("BAD", KINDS[kind]) for word in place.split()], monkeypatch, capfd)
+            assert 1 <= len(said) <= 2, (place, said)
+            assert all(line.startswith("kissgs: ") for line in said), (place, said)
+            if (folder / "out").exists():  # of several inputs, the other one
+                shutil.rmtree(folder / "out")
+            assert sorted(folder.iterdir()) == before, place
+
+
+@pytest.mark.parametrize("words", ["compress BAD", "compress BAD other.ply -o out", "decompress BAD", "render BAD"])
+@pytest.mark.parametrize("kind", ["too long", "a folder that is too long", "within a file", "missing/inner"])
+@pytest.mark.usefixtures("process")
+def test_an_input_that_cannot_be_is_what_is_wrong(
+    words: str, kind: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """It was said of the result, whose name is made from that of the input."""
+    name = KINDS.get(kind, kind)
+    said = refusal([word.replace("BAD", name) for word in words.split()], monkeypatch, capfd)
+    assert said[0].startswith(f"kissgs: cannot read {name[:100]}"), said
+    if (folder / "out").exists():
+        shutil.rmtree(folder / "out")
+
+
+def test_a_name_that_leaves_no_room_for_another_ending(folder: Path, tmp_path: Path) -> None:
+    """What is kept beside the scene has the longer name."""
+    scene = tmp_path / ("a" * 251 + ".ply")
+    shutil.copy(folder / "scene.ply", scene)
+    for words in (["--cache"], ["--checkpoint", "--compact", "50%"], ["--unpacked", "-p", "fast"]):
+        assert "name too long" in failure("compress", scene, *words)
+    assert [path.name for path in tmp_path.iterdir()] == [scene.name]
+
+
+@pytest.mark.parametrize("name", ["a\0b", "a" * 300, "\0.zip", "loop"])
+def test_the_library_says_so_in_its_own_errors(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    kept = "loop/x" if name == "loop" else name  # a link is replaced, wherever it leads
+    for work in (
+        lambda: kissgs.load(name),
+        lambda: kissgs.decompress(name),
+        lambda: kissgs.compress(name),
+        lambda: kissgs.compress(SCENE, name),
+        lambda: kissgs.compress(SCENE, cache=kept),
+        lambda: kissgs.compress(
+            SCENE, checkpoint=kept, settings=kissgs.Settings.from_preset("fast", compact={"count": 9})
+        ),
+        lambda: kissgs.save(SCENE, f"{name}/x.ply"),
+        lambda: kissgs.load_views(Path(name)),
+        lambda: kissgs.read_ply_info(Path(name)),
+    ):
+        with pytest.raises(kissgs.KissgsError):
+            work()

@@ -1,0 +1,230 @@
+"""``kissgs render`` as a user runs it; oracle: the library's own pictures and views, read back by Pillow."""
+
+from __future__ import annotations
+
+import io
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.captured_scene import SCENE, write_capture
+from helpers.command_line import KISSGS, failure, run
+from PIL import Image
+
+import kissgs
+from kissgs.cameras.captures.camera_json import read_cameras
+from kissgs.cameras.views import View, Views
+from kissgs.cameras.virtual.select import best_view
+from kissgs.cli import app as commands
+from kissgs.cli import console
+from kissgs.core.splats import clean
+from kissgs.rendering.images import reframed
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """a.ply, its container b.zip, and a capture."""
+    folder = tmp_path_factory.mktemp("render")
+    kissgs.save(SCENE, folder / "a.ply")
+    kissgs.compress(SCENE, folder / "b.zip")
+    write_capture(folder / "capture")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def virtual() -> Views:
+    return kissgs.virtual_views(SCENE, width=80, height=60)
+
+
+def by_name(views: Views) -> list[View]:
+    return sorted(views.train + views.test, key=lambda view: view.name)
+
+
+def shown(camera: kissgs.Camera, scene: kissgs.Splats = SCENE, background: tuple[float, ...] = (0, 0, 0)) -> np.ndarray:
+    """8 bits per channel, by the definition."""
+    image, _ = kissgs.render(scene, camera, background=background)
+    return (255 * image.astype(np.float64)).round().clip(0, 255).astype(np.uint8)
+
+
+def pixels(source: Path | bytes) -> np.ndarray:
+    with Image.open(io.BytesIO(source) if isinstance(source, bytes) else source) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def close(one: np.ndarray, other: np.ndarray) -> bool:
+    """But for what halves the two ways of rounding make of .5."""
+    return (
+        one.shape == other.shape and int(np.abs(one.astype(int) - other).max()) <= 1 and (one == other).mean() > 0.999
+    )
+
+
+def test_by_default_the_best_virtual_view_beside_the_scene(folder: Path, tmp_path: Path, virtual: Views) -> None:
+    (tmp_path / "mine.ply").write_bytes((folder / "a.ply").read_bytes())
+    done = run("render", "mine.ply", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    best = best_view(SCENE, width=1280, height=960)
+    assert close(pixels(tmp_path / "mine.png"), shown(best.camera))
+    assert done.stdout.decode() == f"mine.png  1280x960, {best.name} (best of the virtual cameras)\n"
+    assert best_view(SCENE, width=80, height=60).name in [view.name for view in by_name(virtual)]
+    assert "exists already" in failure("render", "mine.ply", cwd=tmp_path)
+    assert run("render", "mine.ply", "-f", "-q", "--size", "80x60", cwd=tmp_path).stdout == b""
+    assert pixels(tmp_path / "mine.png").shape == (60, 80, 3)
+
+
+def test_virtual_views_by_number_and_name(folder: Path, tmp_path: Path, virtual: Views) -> None:
+    fourth = by_name(virtual)[3]
+    for which in ("3", fourth.name):
+        done = run("render", folder / "b.zip", "-o", "-", "--view", which, "--size", "80x60", "--background", "#ff8000")
+        scene, _ = clean(kissgs.decompress(folder / "b.zip"))
+        view = by_name(kissgs.virtual_views(scene, width=80, height=60))[3]
+        assert view.name == fourth.name
+        assert close(pixels(done.stdout), shown(view.camera, scene, (1, 128 / 255, 0)))
+    assert "count from 0 to 31" in failure("render", folder / "a.ply", "-o", tmp_path / "a.png", "--view", "32")
+
+
+def test_views_of_a_capture_have_their_own_size(folder: Path, tmp_path: Path) -> None:
+    capture = by_name(kissgs.load_views(folder / "capture"))
+    words = ["render", folder / "a.ply", "--views", folder / "capture", "-o", tmp_path / "a.png", "--force"]
+    for which, view in ((None, capture[0]), ("1", capture[1]), ("c", capture[2]), ("images/b.png", capture[1])):
+        assert run(*words, *(() if which is None else ("--view", which))).returncode == 0
+        assert close(pixels(tmp_path / "a.png"), shown(view.camera))
+    done = run(*words, "--size", "120x40", "--json")
+    told = json.loads(done.stdout)
+    camera = reframed(capture[0].camera, 120, 40)
+    assert close(pixels(tmp_path / "a.png"), shown(camera))
+    assert (told["output"], told["width"], told["height"]) == (str(tmp_path / "a.png"), 120, 40)
+    assert told["bytes"] == (tmp_path / "a.png").stat().st_size
+    assert (told["frames"], len(told["cameras"]), told["cameras"][0]["name"]) == (1, 1, "images/a.png")
+    assert np.array_equal(told["cameras"][0]["K"], camera.K)
+
+
+def test_a_saved_camera_takes_the_same_picture_again(folder: Path, tmp_path: Path) -> None:
+    kept = tmp_path / "kept.json"
+    words = ["render", folder / "a.ply", "-o"]
+    done = run(*words, tmp_path / "a.png", "--size", "80x60", "--view", "5", "--save-camera", kept)
+    assert str(kept) in done.stdout.decode()
+    assert run(*words, tmp_path / "b.png", "--view", kept).returncode == 0
+    assert np.array_equal(pixels(tmp_path / "a.png"), pixels(tmp_path / "b.png"))
+    (tmp_path / "cameras.json").write_text(f"[{kept.read_text()}, {kept.read_text()}]")
+    assert run(*words, tmp_path / "c.webp", "--view", f"{tmp_path}/cameras.json:1", "--quality", "100").returncode == 0
+    assert np.array_equal(pixels(tmp_path / "a.png"), pixels(tmp_path / "c.webp"))
+    assert read_cameras(kept)[0].camera.width == 80
+    taken = failure(*words, tmp_path / "d.png", "--size", "8x6", "--save-camera", kept)
+    assert f"{kept} exists already" in taken
+    assert not (tmp_path / "d.png").exists()
+
+
+def test_an_orbit_is_a_film_or_a_sheet(folder: Path, tmp_path: Path) -> None:
+    words = ["render", folder / "a.ply", "--orbit", "--size", "40x30", "--json", "-o"]
+    told = json.loads(run(*words, tmp_path / "a.webp", "--frames", "9", "--fps", "10", "--quality", "100").stdout)
+    assert (told["width"], told["height"], told["frames"], len(told["cameras"])) == (40, 30, 9, 9)
+    with Image.open(tmp_path / "a.webp") as film:
+        assert (film.n_frames, film.info["loop"]) == (9, 0)
+        durations = []
+        for number in range(9):
+            film.seek(number)
+            film.load()
+            durations.append(film.info["duration"])
+            if number == 4:
+                entry = told["cameras"][4]
+                camera = kissgs.Camera(np.array(entry["viewmat"]), np.array(entry["K"]), 40, 30)
+                assert close(np.asarray(film.convert("RGB")), shown(camera))
+    assert sum(durations) == 900
+    told = json.loads(run(*words, tmp_path / "a.png", "--frames", "6").stdout)
+    assert (told["frames"], len(told["cameras"])) == (1, 6)
+    assert pixels(tmp_path / "a.png").shape == (told["height"], told["width"], 3)
+    assert told["width"] > 2 * 40
+
+
+def test_a_sheet_has_all_views(folder: Path, tmp_path: Path) -> None:
+    words = ["render", folder / "a.ply", "--sheet", "--size", "60x40"]
+    done = run(*words, "--views", folder / "capture", "-o", tmp_path / "a.png")
+    assert ", 3 views, 1 held out (cameras of " in done.stdout.decode()
+    sheet = pixels(tmp_path / "a.png")
+    first = shown(kissgs.load_views(folder / "capture").test[0].camera)
+    assert close(sheet[4:44, 4:64], first)
+    told = json.loads(run(*words, "-o", tmp_path / "b.png", "--json").stdout)
+    assert [camera["name"] for camera in told["cameras"]] == [f"virtual_{n:02}" for n in range(32)]
+
+
+def test_what_cannot_be_is_said_in_a_line(folder: Path, tmp_path: Path) -> None:
+    def fails(*words: object) -> str:
+        """Without a process for each; that every error is a line and exit code 2, those above show."""
+        with pytest.raises(kissgs.KissgsError) as caught:
+            commands.app(["render", str(folder / "a.ply"), *map(str, words)], standalone_mode=False)
+        assert "\n" not in str(caught.value)
+        return str(caught.value)
+
+    there = tmp_path / "a.png"
+    assert "--view and --orbit: choose one" in fails("--view", "3", "--orbit")
+    assert "--orbit and --sheet: choose one" in fails("--sheet", "--orbit")
+    assert "finds its own way" in fails("--orbit", "--views", folder / "capture")
+    assert "is a camera already" in fails("--view", "a.json", "--views", folder / "capture")
+    assert "leave out --save-camera" in fails("--sheet", "--save-camera", tmp_path / "a.json")
+    assert "leave out --frames: it is for --orbit" in fails("--frames", "9")
+    assert "leave out --fps: it is for films" in fails("--orbit", "--fps", "9", "-o", there)
+    assert "leave out --quality" in fails("--quality", "9", "-o", there)
+    assert "written as .png or .webp" in fails("-o", tmp_path / "a.jpg")
+    assert "no folder" in fails("-o", tmp_path / "none" / "a.png")
+    assert "both write to standard output" in fails("-o", "-", "--json")
+    assert fails("-o", there, "--view", "nobody") in failure(
+        "render", folder / "a.ply", "-o", there, "--view", "nobody"
+    )
+    assert "not standard input" in failure("render", "-", "-o", there)
+    assert "no such file" in failure("render", tmp_path / "none.ply", "-o", there).lower()
+    for size in ("10", "0x9", "9x-1", "1e3x9"):
+        assert "write WIDTHxHEIGHT" in fails("-o", there, "--size", size)
+    for colour in ("red", "#12345", "#1234567"):
+        assert "write black, white or #rrggbb" in fails("-o", there, "--background", colour)
+    assert "choose cpu or cuda" in fails("-o", there, "--device", "tpu")
+    assert "--scale is about the photographs" in fails("-o", there, "--scale", "2")
+    assert "no such file" in fails("-o", there, "--view", tmp_path / "none.json")
+    assert "too much memory" in fails("-o", there, "--size", "60000x60000", "--view", "0")
+    assert "16,383 pixels a side" in fails("-o", tmp_path / "a.webp", "--size", "16384x1", "--view", "0")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_json_errors_have_a_code(folder: Path, tmp_path: Path) -> None:
+    done = run("render", folder / "a.ply", "-o", tmp_path / "a.png", "--view", "nobody", "--json")
+    assert done.returncode == 2
+    assert json.loads(done.stdout)["error"]["code"] == "invalid-views"
+
+
+def test_an_interrupted_film_leaves_nothing(folder: Path, tmp_path: Path) -> None:
+    words = ["render", folder / "a.ply", "--orbit", "--frames", "3600", "-o", tmp_path / "a.webp"]
+    with subprocess.Popen([KISSGS, *map(str, words)], stderr=subprocess.PIPE) as process:
+        time.sleep(4)
+        process.send_signal(signal.SIGINT)
+        _, message = process.communicate(timeout=20)
+    assert process.returncode == 130
+    assert message.decode() == "kissgs: interrupted; nothing half-written is left\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_bar_hears_of_kernels_as_often_as_they_are_loaded(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A second "kernels" stage once ended in "threads can only be started once"."""
+    monkeypatch.setattr(console, "SLOW_START_SECONDS", 0.05)
+    with console.progress_bar(False) as progress:
+        for slow in (True, False, True):
+            progress("kernels", 0.0)
+            time.sleep(0.3 if slow else 0)
+            progress("kernels", 1.0)
+        progress("render", 0.5)
+        time.sleep(0.2)
+    assert capsys.readouterr().err.count("compiling kernels") == 2
+
+
+def test_warming_up_compiles_what_renders_and_what_encodes() -> None:
+    lines = (
+        "import sys; from kissgs.cli.app import warmup; warmup(); "
+        "print(*(name in sys.modules for name in ('kissgs.planning.kernels', 'kissgs.rendering.cpu.frame')))"
+    )
+    done = subprocess.run([sys.executable, "-c", lines], capture_output=True, timeout=120, check=True)
+    assert done.stdout.split() == [b"True", b"True"]

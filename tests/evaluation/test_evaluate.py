@@ -1,0 +1,392 @@
+"""Oracle: renderings taken and photographs read here, compared by the textbook formulas; fox's README."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.captured_scene import SCENE, cameras, damaged, picture, write_capture
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+import kissgs
+from kissgs.cameras.captures.load import load_views
+from kissgs.cameras.views import View, Views
+from kissgs.core.errors import Cancelled, InvalidViewsError, UnsupportedError
+from kissgs.core.splats import ATTRIBUTES, Splats
+from kissgs.evaluation import evaluate as pictures
+from kissgs.evaluation.cameras import evaluation_views
+from kissgs.evaluation.evaluate import compare_pictures, evaluate
+from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, ViewComparison, spell
+from kissgs.evaluation.visibility import share_shown
+from kissgs.rendering.camera import look_at
+from kissgs.rendering.metrics import ssim
+from kissgs.rendering.rasterizer import render
+
+WORSE = damaged()
+
+
+def decibels(image, target):
+    return -10 * math.log10(np.mean((image.astype(np.float64) - target) ** 2))
+
+
+def photo_of(view):
+    with Image.open(view.photo) as image:
+        return np.asarray(image.convert("RGB")).astype(np.float32) / 255
+
+
+def assert_likeness(found, image, target):
+    assert found.psnr == pytest.approx(decibels(image, target), abs=1e-5)
+    assert found.ssim == pytest.approx(ssim(image, target), abs=1e-7)
+    assert found.lpips is None
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return load_views(write_capture(tmp_path_factory.mktemp("photos") / "capture"))
+
+
+def test_renderings_are_compared_where_there_are_no_photographs():
+    views = cameras(background=(0.2, 0.5, 1))
+    found = evaluate(SCENE, WORSE, views)
+    assert (found.against, found.split, found.source) == ("renderings", "test", "cameras by hand")
+    assert [each.view for each in found.views] == list(views.test)
+    for each in found.views:
+        pair = [picture(scene, each.view, (0.2, 0.5, 1)) for scene in (WORSE, SCENE)]
+        assert_likeness(each.comparison.candidate_vs_reference, *pair)
+        assert each.comparison.candidate == each.comparison.candidate_vs_reference
+        assert each.comparison.reference is None
+        assert each.comparison.change is None
+
+
+def test_photographs_are_what_counts_where_there_are_any(capture):
+    found = evaluate(SCENE, WORSE, capture, split="all")
+    assert (found.against, found.split) == ("photos", "all")
+    assert [each.view.name for each in found.views] == ["images/a.png", "images/b.png", "images/c.png"]
+    for each in found.views:
+        before, after, photo = picture(SCENE, each.view), picture(WORSE, each.view), photo_of(each.view)
+        assert_likeness(each.comparison.reference, before, photo)
+        assert_likeness(each.comparison.candidate, after, photo)
+        assert_likeness(each.comparison.candidate_vs_reference, after, before)
+        assert each.comparison.change == pytest.approx(decibels(after, photo) - decibels(before, photo), abs=1e-5)
+        assert each.comparison.change < 0
+
+
+def test_means_are_means_of_decibels(capture):
+    found = evaluate(SCENE, WORSE, capture, split="all")
+    for side in ("reference", "candidate", "candidate_vs_reference"):
+        mean, each = getattr(found.mean, side), [getattr(view.comparison, side) for view in found.views]
+        assert mean.psnr == pytest.approx(np.mean([value.psnr for value in each]))
+        assert mean.ssim == pytest.approx(np.mean([value.ssim for value in each]))
+        assert mean.lpips is None
+
+
+def test_equal_scenes_are_infinitely_alike(capture):
+    found = evaluate(SCENE, SCENE, capture, split="train")
+    assert found.mean.candidate_vs_reference == ImageMetrics(psnr=math.inf, ssim=1.0)
+    assert found.mean.change == 0
+    told = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    assert told["mean"]["candidate_vs_reference"] == {"psnr": None, "ssim": 1.0}
+    assert told["mean"]["reference"] == told["mean"]["candidate"]
+
+
+def test_the_json_has_the_layout_it_is_known_for(capture):
+    found = evaluate(SCENE, WORSE.select(slice(0, 900)), capture)
+    told = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    assert told["against"] == "photos"
+    assert told["split"] == "test"
+    assert told["source"] == capture.source
+    assert told["count"] == {"reference": 1500, "candidate": 900}
+    (view,) = told["views"]
+    assert (view["name"], view["width"], view["height"]) == ("images/a.png", 60, 40)
+    assert told["mean"] == {side: view[side] for side in ("reference", "candidate", "candidate_vs_reference")}
+    assert set(view["reference"]) == {"psnr", "ssim"}
+    without = evaluate(SCENE, WORSE, cameras()).as_dict()
+    assert without["mean"]["reference"] is None
+    assert without["mean"]["candidate"] == without["mean"]["candidate_vs_reference"]
+
+
+def test_scenes_need_not_be_alike_nor_clean():
+    """A NaN Gaussian cannot be drawn; it is removed rather than spread over the picture."""
+    arrays = {name: getattr(SCENE, name).copy() for name in ATTRIBUTES}
+    arrays["means"][3] = np.nan
+    arrays["quats"][5] *= 4
+    found = evaluate(Splats(**arrays), SCENE.select(slice(0, 0)), cameras(test=1))
+    assert (found.reference_count, found.candidate_count) == (1499, 0)
+    assert 0 < found.mean.candidate_vs_reference.psnr < 40
+
+
+def test_threads_do_not_change_the_figures():
+    results = [evaluate(SCENE, WORSE, cameras(), threads=threads).as_dict() for threads in (1, 3)]
+    assert results[0] == results[1]
+
+
+def test_drawn_cameras_are_the_default():
+    found, views = evaluate(SCENE, WORSE, seed=3), evaluation_views(SCENE, seed=3)
+    assert (found.against, found.split, found.source) == ("renderings", "all", "drawn over the whole scene, seed 3")
+    assert found.surroundings is None
+    compared = compare_pictures(SCENE, WORSE, views)
+    assert [each.comparison for each in found.views] == [each.comparison for each in compared.views]
+    assert found.shown == share_shown(SCENE, [view.camera for view in views.test])
+
+
+def test_drawn_cameras_judge_beside_those_of_a_capture(capture):
+    found, alone = evaluate(SCENE, WORSE, capture), evaluate(SCENE, WORSE)
+    assert found.against == "photos"
+    assert found.surroundings.as_dict() == alone.as_dict()
+    assert [each.comparison for each in found.views] == [
+        each.comparison for each in compare_pictures(SCENE, WORSE, capture).views
+    ]
+
+
+def test_each_view_has_a_background_of_its_own_or_that_of_all():
+    views = cameras(test=2, background=(1, 0, 0))
+    white = replace(views.test[1], background=np.ones(3, np.float32))
+    found = compare_pictures(SCENE, WORSE, replace(views, test=(views.test[0], white)))
+    for each, background in zip(found.views, ((1, 0, 0), (1, 1, 1)), strict=True):
+        pair = [picture(scene, each.view, background) for scene in (WORSE, SCENE)]
+        assert_likeness(each.comparison.candidate_vs_reference, *pair)
+
+
+def test_pictures_of_the_reference_are_taken_once(monkeypatch):
+    taken, drawn = {}, []
+    first = compare_pictures(SCENE, WORSE, cameras(), taken=taken)
+    monkeypatch.setattr(pictures, "render", lambda *args, **options: drawn.append(args[0]) or render(*args, **options))
+    again = compare_pictures(SCENE, WORSE, cameras(), taken=taken)
+    assert first.as_dict() == again.as_dict()
+    assert len(drawn) == len(taken) == 3
+    assert all((scene.sh0 == WORSE.sh0).all() for scene in drawn)
+
+
+def test_a_removed_object_is_found():
+    """The judge of an encoder that looks at the first object alone: the second is a thousand units away."""
+    away = Splats(**{name: getattr(SCENE, name) + np.float32(1000 * (name == "means")) for name in ATTRIBUTES})
+    both = Splats(**{name: np.concatenate([getattr(SCENE, name), getattr(away, name)]) for name in ATTRIBUTES})
+    found = evaluate(both, SCENE)
+    assert found.worst.comparison.candidate_vs_reference.psnr < 20
+    assert np.linalg.norm(found.worst.view.target - 1000) < 100
+    assert found.fifth_percentile < 25
+    assert found.shown > 0.7
+
+
+def test_fox_is_as_good_as_its_readme_says(shared_data):
+    scene = kissgs.load(shared_data / "fox" / "point_cloud.ply")
+    found = evaluate(scene, scene, load_views(shared_data / "fox", scale=4))
+    assert len(found.views) == 7
+    assert found.mean.reference.psnr == pytest.approx(32.09, abs=0.1)
+    assert found.mean.reference.ssim == pytest.approx(0.913, abs=0.002)
+    each = [view.comparison.reference.psnr for view in found.views]
+    assert each == pytest.approx([34.7, 33.0, 33.2, 29.0, 33.3, 32.7, 28.6], abs=0.1)
+    assert found.mean.candidate_vs_reference.psnr == math.inf
+
+
+# --- Splits ---------------------------------------------------------------------------------------
+
+
+def test_splits():
+    views = cameras(test=2, train=3)
+    for split, wanted in (("test", views.test), ("train", views.train), ("all", views.test + views.train)):
+        found = evaluate(SCENE, SCENE, views, split=split)
+        assert (found.split, [each.view for each in found.views]) == (split, list(wanted))
+
+
+def test_training_views_stand_in_for_missing_test_views_and_the_result_says_so():
+    found = evaluate(SCENE, SCENE, cameras(test=0, train=2))
+    assert (found.split, len(found.views)) == ("train", 2)
+    assert found.views_used == "2 training cameras"
+
+
+def test_empty_splits_are_refused():
+    with pytest.raises(InvalidViewsError, match="the split 'train' of cameras by hand is empty"):
+        evaluate(SCENE, SCENE, cameras(test=2, train=0), split="train")
+    for split in ("test", "all"):
+        with pytest.raises(InvalidViewsError, match="there is no view to evaluate from"):
+            evaluate(SCENE, SCENE, cameras(test=0, train=0), split=split)
+    with pytest.raises(UnsupportedError, match="there is no split 'val'; choose test, train or all"):
+        pictures._chosen(cameras(), "val")
+
+
+def test_photographs_of_some_views_are_refused(capture):
+    """Figures of a part would pass for those of the whole."""
+    mixed = Views(capture.train, cameras(test=1).test, capture.background, "a mixture")
+    with pytest.raises(InvalidViewsError, match="1 of 3 views have no photograph, the first is 'view_00'; give all"):
+        evaluate(SCENE, SCENE, mixed, split="all")
+
+
+def test_missing_photographs_are_an_error(tmp_path):
+    views = load_views(write_capture(tmp_path / "capture"))
+    views.test[0].photo.unlink()
+    with pytest.raises(InvalidViewsError, match="there is no such photograph"):
+        evaluate(SCENE, SCENE, views)
+
+
+# --- Progress, LPIPS, CUDA ------------------------------------------------------------------------
+
+
+def test_progress_and_cancelling():
+    events = []
+    compare_pictures(SCENE, SCENE, cameras(test=4), progress=lambda stage, fraction: events.append((stage, fraction)))
+    assert [fraction for stage, fraction in events if stage == "evaluate"] == [0, 0.25, 0.5, 0.75, 1]
+    assert {stage for stage, _ in events} == {"kernels", "evaluate"}
+    events.clear()
+    evaluate(SCENE, SCENE, cameras(test=4), progress=lambda stage, fraction: events.append((stage, fraction)))
+    told = [fraction for stage, fraction in events if stage == "evaluate"]
+    np.testing.assert_allclose(told, np.arange(29) / 28)
+    assert list(dict.fromkeys(stage for stage, _ in events)) == ["kernels", "cameras", "evaluate"]
+
+    def stop(stage, fraction):
+        if stage == "evaluate" and fraction >= 0.5:
+            raise Cancelled("enough")
+
+    with pytest.raises(Cancelled, match="enough"):
+        evaluate(SCENE, SCENE, cameras(test=4), progress=stop)
+
+
+def test_lpips_is_measured_if_asked_for(monkeypatch, capture):
+    monkeypatch.setattr(pictures, "Lpips", lambda device: lambda image, target: float(np.abs(image - target).max()))
+    found = evaluate(SCENE, WORSE, cameras(), lpips=True)
+    each = [np.abs(picture(WORSE, view) - picture(SCENE, view)).max() for view in cameras().test]
+    assert found.mean.candidate_vs_reference.lpips == pytest.approx(np.mean(each))
+    assert set(found.as_dict()["mean"]["candidate_vs_reference"]) == {"psnr", "ssim", "lpips"}
+
+
+def test_no_cuda_is_one_sentence():
+    import torch
+
+    if torch.cuda.is_available():
+        pytest.skip("this machine has CUDA")
+    with pytest.raises(UnsupportedError, match="torch finds no CUDA device here"):
+        evaluate(SCENE, SCENE, cameras(), device="cuda")
+
+
+# --- Figures --------------------------------------------------------------------------------------
+
+
+def test_a_failed_rendering_is_not_hidden(monkeypatch):
+    def fail_once(splats, camera, **options):
+        image = np.full((camera.height, camera.width, 3), 0.5, np.float32)
+        if camera is views.test[1].camera and len(splats) == 900:
+            image[3, 4, 1] = np.nan
+        return image, image[..., 0]
+
+    views = cameras()
+    monkeypatch.setattr(pictures, "render", fail_once)
+    found = evaluate(SCENE, SCENE.select(slice(0, 900)), views)
+    told = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    assert [view["candidate_vs_reference"]["psnr"] for view in told["views"]] == [None, "NaN", None]
+    assert told["mean"]["candidate_vs_reference"] == {"psnr": "NaN", "ssim": "NaN"}
+
+
+FIGURES = st.floats(0, 100) | st.sampled_from([math.inf, math.nan])
+
+
+@given(st.lists(st.tuples(FIGURES, FIGURES, FIGURES), min_size=1, max_size=5))
+def test_any_figures_survive_means_and_json(figures):
+    view = View("a", cameras(test=1).test[0].camera)
+    rows = [[ImageMetrics(psnr=value, ssim=0.5) for value in row] for row in figures]
+    compared = tuple(
+        ViewComparison(view=view, comparison=Comparison(reference=a, candidate=b, candidate_vs_reference=c))
+        for a, b, c in rows
+    )
+    found = Evaluation(
+        against="photos",
+        split="all",
+        source="",
+        background=np.zeros(3, np.float32),
+        reference_count=1,
+        candidate_count=1,
+        views=compared,
+    )
+    told = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    for i, side in enumerate(("reference", "candidate", "candidate_vs_reference")):
+        column = [row[i] for row in figures]
+        mean = None if set(column) == {math.inf} else pytest.approx(np.mean(np.minimum(column, 60)))
+        assert told["mean"][side]["psnr"] == ("NaN" if any(map(math.isnan, column)) else mean)
+    assert all(len(each.comparison.spelled()) == 7 for each in compared)
+    same = [a == b for a, b, _ in figures]
+    assert all(each.comparison.change == 0 for each, equal in zip(compared, same, strict=True) if equal)
+
+
+def evaluation_of(figures):
+    """Views from one place that have these PSNRs, named by their numbers."""
+    place = cameras(test=1).test[0].camera
+    compared = [
+        ViewComparison(
+            view=View(f"{number}", place),
+            comparison=Comparison(reference=None, candidate=told, candidate_vs_reference=told),
+        )
+        for number, told in enumerate(ImageMetrics(psnr=value, ssim=0.5) for value in figures)
+    ]
+    return Evaluation(
+        against="renderings",
+        split="all",
+        source="",
+        background=np.zeros(3, np.float32),
+        reference_count=1,
+        candidate_count=1,
+        views=tuple(compared),
+    )
+
+
+@pytest.mark.parametrize(
+    ("figures", "mean"),
+    [((10, math.inf), 35), ((10, 120), 35), ((70, 120), 60), ((20, 40), 30), ((math.inf,) * 2, math.inf)],
+)
+def test_a_view_that_has_lost_nothing_does_not_hide_the_others(figures, mean):
+    """One of 120 dB beside one of 10 once told of 65 on average, and an infinite one of infinitely many."""
+    found = evaluation_of(figures)
+    assert found.mean.candidate_vs_reference.psnr == mean
+    assert found.worst.comparison.candidate_vs_reference.psnr == min(figures)
+    assert [each.comparison.candidate_vs_reference.psnr for each in found.views] == list(figures)
+
+
+@given(st.lists(FIGURES, min_size=1, max_size=45))
+def test_the_worst_view_and_the_fifth_percentile(figures):
+    """Oracle: sorting, and NumPy's percentile where all is finite."""
+    found = evaluation_of(figures)
+    place = found.views[0].view.camera
+    failed = [number for number, value in enumerate(figures) if math.isnan(value)]
+    assert int(found.worst.view.name) == (failed[0] if failed else figures.index(min(figures)))
+    told = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    assert told["worst"]["name"] == found.worst.view.name
+    assert told["worst"]["position"] == place.position.tolist()
+    assert told["worst"]["target"] is None
+    if failed:
+        assert math.isnan(found.fifth_percentile)
+    elif all(map(math.isfinite, figures)):
+        assert found.fifth_percentile == pytest.approx(np.percentile(figures, 5))
+    else:
+        assert min(figures) <= found.fifth_percentile
+    assert "worst view" in found.extremes
+
+
+@pytest.mark.parametrize(
+    ("value", "signed", "text"),
+    [
+        (31.456, False, "31.46"),
+        (-0.001, True, "+0.00"),
+        (-0.5, True, "-0.50"),
+        (math.inf, True, "∞"),
+        (math.nan, 0, "NaN"),
+    ],
+)
+def test_spelling(value, signed, text):
+    assert spell(value, 2, signed=bool(signed)) == text
+
+
+def test_pictures_of_nothing_are_told_apart_from_perfect_ones() -> None:
+    """Equal because both are black: 1e12 world units away, beyond what renderers draw."""
+    scene = kissgs.sample_scene(50, sh_degree=0)
+    away = Splats(**{name: getattr(scene, name) + (1e12 if name == "means" else 0) for name in ATTRIBUTES})
+    assert "say nothing" in evaluate(away, scene, looking_away()).note
+    assert evaluate(scene.select(slice(0)), scene, looking_away()).note == ""
+    assert evaluate(scene, scene).note == ""
+
+
+def looking_away() -> Views:
+    camera = look_at(
+        np.array([0.0, 0, -99]), np.array([0.0, 0, -200]), np.array([0.0, -1, 0]), fov=1, width=9, height=8
+    )
+    return Views((), (View("away", camera),), np.zeros(3, np.float32), "one camera")

@@ -1,0 +1,71 @@
+"""Measurements that nobody made."""
+
+from helpers.captured_scene import cameras
+from kissgs.benchmark.results import Measured, Run
+from kissgs.cameras.views import black
+from kissgs.evaluation.attributes import attribute_errors
+from kissgs.evaluation.evaluate import Comparison
+from kissgs.evaluation.results import Evaluation, ImageMetrics, ViewComparison
+from kissgs.synthetic.scene import sample_scene
+
+SCENE = sample_scene(30, sh_degree=1)
+VIEW = cameras().all[0]
+ERRORS = attribute_errors(SCENE, SCENE)
+FILES = ("container_meta.yaml", "means_bytes_0.webp", "scales.webp", "f_dc.webp")
+
+
+def run(seconds=1.0, size=1000, memory=10**8, stages=None):
+    return Run(
+        bytes=size,
+        encode_seconds=seconds,
+        encode_cpu_seconds=2 * seconds,
+        decode_seconds=seconds / 100,
+        decode_cpu_seconds=seconds / 50,
+        stage_seconds=stages or {"order": seconds / 4, "images": 3 * seconds / 4},
+        peak_memory=memory,
+    )
+
+
+def likeness(psnr):
+    return ImageMetrics(psnr=psnr, ssim=0.9)
+
+
+def evaluation(psnr, photo=None):
+    reference = None if photo is None else likeness(32.0)
+    seen = Comparison(reference=reference, candidate=likeness(photo or psnr), candidate_vs_reference=likeness(psnr))
+    view = ViewComparison(view=VIEW, comparison=seen)
+    about = {"against": "renderings", "split": "test", "source": "nowhere", "background": black()}
+    return Evaluation(**about, reference_count=30, candidate_count=30, views=(view,))
+
+
+def measured(
+    encoder, size, psnr, *, photo=None, quality_offset_db=None, peer=False, runs=None, gaussians=30, seconds=1.0
+):
+    files = {encoder: size} if peer else dict.fromkeys(FILES, size // len(FILES))
+    return Measured(
+        scene="scene.ply",
+        encoder=encoder,
+        quality_offset_db=quality_offset_db,
+        gaussians=gaussians,
+        file_bytes=files,
+        runs=runs or (run(seconds, size),),
+        errors=ERRORS,
+        pictures=evaluation(psnr, photo),
+    )
+
+
+def many(photo=False):
+    """Presets, a curve and two peers."""
+
+    def shot(psnr):
+        return psnr - 10 if photo else None
+
+    return [
+        measured("fast", 1000, 36.0, photo=shot(36.0), seconds=0.5),
+        measured("balanced", 700, 40.0, photo=shot(40.0), seconds=5.0),
+        measured("small", 690, 39.9, photo=shot(39.9), seconds=6.0),
+        measured("balanced", 400, 34.0, photo=shot(34.0), quality_offset_db=-6.0),
+        measured("balanced", 1600, 46.0, photo=shot(46.0), quality_offset_db=6.0),
+        measured("sog", 2000, 43.0, photo=shot(43.0), peer=True, seconds=99.0),
+        measured("spz", 1500, 30.0, photo=shot(30.0), peer=True, seconds=0.2),
+    ]

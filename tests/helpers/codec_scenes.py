@@ -1,0 +1,121 @@
+"""Small scenes for the codec's tests, made by hand rather than by the library."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+import kissgs
+from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats
+
+PRESETS = ("fast", "balanced", "small", "paper")
+
+GLANCE = {"sensitivity_views": 4, "sensitivity_view_size": 48}
+"""A look at a small scene that is soon over."""
+
+PLANES = (
+    "active_mask",
+    "means_bytes_0",
+    "means_bytes_1",
+    "opacities",
+    "scales",
+    "quaternions",
+    "f_dc",
+    "f_rest_labels",
+    "f_rest_centroids",
+)
+
+
+def unit(quats):
+    """Float32 quaternions of unit length."""
+    wide = np.asarray(quats, dtype=np.float64)
+    return (wide / np.linalg.norm(wide, axis=1, keepdims=True)).astype(np.float32)
+
+
+def random_scene(count, degree=0, seed=0):
+    """A clean scene with heavy tails: every attribute drawn on its own, so that nothing helps an encoder."""
+    rng = np.random.default_rng(seed)
+    coefficients = SH_REST_COUNTS[degree]
+    return Splats(
+        means=(rng.standard_t(3, (count, 3)) * 3).astype(np.float32),
+        quats=unit(rng.normal(size=(count, 4))),
+        scales=rng.normal(-4, 1.2, (count, 3)).astype(np.float32),
+        opacities=np.clip(rng.normal(1, 3, count), -5.5, 13).astype(np.float32),
+        sh0=rng.normal(0, 1, (count, 3)).astype(np.float32),
+        shN=(rng.normal(0, 0.1, (count, coefficients, 3)) * rng.exponential(1, (count, 1, 1))).astype(np.float32),
+    )
+
+
+def constant_scene(count, degree=0):
+    """Gaussians that are all the same."""
+    return random_scene(1, degree, seed=9).select(np.zeros(count, dtype=np.int64))
+
+
+def replaced(splats, **arrays):
+    """The scene with some arrays exchanged; they are cast to float32."""
+    new = {name: np.asarray(array, dtype=np.float32) for name, array in arrays.items()}
+    return Splats(**{name: new.get(name, getattr(splats, name)) for name in ATTRIBUTES})
+
+
+def covariances(quats, scales):
+    """R diag(s^2) R^T of every Gaussian by the textbook formula of R, in float64; quaternions are normalised first."""
+    w, x, y, z = (np.asarray(quats, np.float64) / np.linalg.norm(np.asarray(quats, np.float64), axis=1)[:, None]).T
+    rotation = np.empty((len(w), 3, 3))
+    rotation[:, 0] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=1)
+    rotation[:, 1] = np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=1)
+    rotation[:, 2] = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    squares = np.exp(2 * np.asarray(scales, np.float64))
+    return np.einsum("nij,nj,nkj->nik", rotation, squares, rotation)
+
+
+def product(p, q):
+    """Hamilton product of w, x, y, z quaternions, as SciPy multiplies rotations. Signs are those of p q."""
+    w, x, y, z = np.moveaxis(np.asarray(p, np.float64), -1, 0)
+    a, b, c, d = np.moveaxis(np.asarray(q, np.float64), -1, 0)
+    parts = [w * a - x * b - y * c - z * d, w * b + x * a + y * d - z * c]
+    return np.stack([*parts, w * c - x * d + y * a + z * b, w * d + x * c - y * b + z * a], axis=-1)
+
+
+def equivalents(quats, scales):
+    """All 48 ways to write each Gaussian, (48, N, 4) and (48, N, 3), from SciPy's list of the cube's rotations.
+
+    A rotation M of the cube takes axis i to ± axis p: R M has the old column p as its column i, up to its sign, so the
+    new scale i is the old scale p.
+    """
+    turns = Rotation.create_group("O")
+    new_quats, new_scales = [], []
+    for turn, matrix in zip(turns.as_quat(scalar_first=True), turns.as_matrix(), strict=True):
+        source = np.abs(matrix).argmax(axis=0)
+        turned = product(quats, turn)
+        new_quats += [turned, -turned]
+        new_scales += [scales[:, source]] * 2
+    return np.stack(new_quats), np.stack(new_scales)
+
+
+def signed_log(x):
+    """In float64."""
+    wide = np.asarray(x, np.float64)
+    return np.sign(wide) * np.log1p(np.abs(wide))
+
+
+def rounding(values):
+    """What the rounding of values, ranges and steps to float32 may cost, by the largest of the values."""
+    return 1e-6 * np.abs(values).max(initial=0) + 1e-44
+
+
+def assert_within(found, wanted, half_steps):
+    """No value is further off than half its step."""
+    excess = np.abs(np.asarray(found, np.float64) - wanted) - np.asarray(half_steps) * (1 + 1e-6)
+    assert excess.max(initial=0) <= rounding(wanted)
+
+
+def assert_round_trip(splats, result):
+    """Each Gaussian comes back within the half steps that the report states, in one of its equivalent forms."""
+    found, wanted, half = kissgs.decompress(result.files), splats.select(result.order), result.report.half_steps
+    assert_within(signed_log(found.means), signed_log(wanted.means), half["means"])
+    assert_within(found.opacities, wanted.opacities, half["opacities"][0])
+    assert_within(found.sh0, wanted.sh0, half["f_dc"])
+    quats, scales = equivalents(wanted.quats, wanted.scales)
+    fits = (np.abs(quats - found.quats) <= np.array(half["quaternions"]) + rounding(quats)).all(axis=2)
+    fits &= (np.abs(scales - found.scales) <= np.array(half["scales"]) + rounding(scales)).all(axis=2)
+    assert fits.any(axis=0).all()

@@ -1,0 +1,105 @@
+"""Data folders with jobs, and services that are opened in this process, without a server."""
+
+import contextlib
+import os
+import shutil
+import sqlite3
+import subprocess
+import sys
+import uuid
+
+import pytest
+
+from helpers.service import ROOT
+from service.core.models import Job, State
+from service.core.settings import ServiceSettings
+from service.http.app import build
+from service.jobs.recovery import recover
+
+
+@pytest.fixture
+def no_variables(monkeypatch):
+    """None of the service's in the environment."""
+    for name in os.environ:
+        if name.startswith("KISSGS_"):
+            monkeypatch.delenv(name)
+
+
+def opened(folder, url=None):
+    return build(ServiceSettings(data_dir=folder, database_url=url))
+
+
+@contextlib.contextmanager
+def service(folder, url=None):
+    context = opened(folder, url)
+    try:
+        recover(context)
+        yield context
+    finally:
+        context.store.close()
+        context.storage.close()
+
+
+def add_a_job(context):
+    """One that waits."""
+    job_id = uuid.uuid4().hex
+    upload = context.storage.new_upload()
+    upload.write_bytes(b"ply")
+    context.storage.adopt(upload, job_id)
+    job = Job(
+        id=job_id, owner="", name="scene", options={"preset": "fast"}, preset="fast", evaluate=False, gaussians=3,
+        sh_degree=0, upload_bytes=3, upload_sha256="0" * 64, fingerprint="0", disk_bytes=3,
+    )  # fmt: skip
+    context.store.add(job, max_queue=1000, max_owner=1000)
+    return job_id
+
+
+def finish_a_job(context, state=State.SUCCEEDED):
+    job_id = add_a_job(context)
+    result = context.storage.result(job_id)
+    result.mkdir()
+    (result / "scene.zip").write_bytes(b"PK")
+    number = context.store.claim().number
+    context.store.move(number, State.SUCCEEDED, expires_at=context.clock() + 1000, result={"a": "b" * 300})
+    if state == State.EXPIRED:
+        context.store.move(number, state)
+    return job_id
+
+
+@pytest.fixture(scope="module")
+def sample_folder(tmp_path_factory):
+    """A data folder with 120 jobs that have succeeded."""
+    folder = tmp_path_factory.mktemp("sample") / "data"
+    with service(folder) as context:
+        for _ in range(120):
+            finish_a_job(context)
+    return folder
+
+
+@pytest.fixture
+def jobs_folder(sample_folder, tmp_path):
+    shutil.copytree(sample_folder, tmp_path / "data")
+    return tmp_path / "data"
+
+
+def listing(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def names(folder):
+    return {path.name for path in folder.iterdir()}
+
+
+def command(folder, **settings):
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("KISSGS_")}
+    chosen = {"PYTHONPATH": str(ROOT), "KISSGS_PORT": "0", "KISSGS_DATA_DIR": str(folder), **settings}
+    return subprocess.run(
+        [sys.executable, "-P", "-m", "service"],
+        env={**kept, **chosen}, capture_output=True, text=True, timeout=30, check=False,
+    )  # fmt: skip
+
+
+def database(folder, *statements):
+    with contextlib.closing(sqlite3.connect(folder / "jobs.sqlite")) as found, found:
+        for statement in statements:
+            found.execute(statement)

@@ -1,0 +1,142 @@
+"""The stages, and how far each is from its oracle in float64: one number for each extreme, 0 where there is nothing."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+import torch
+
+from helpers import reference_float64, reference_rasterizer
+from helpers.extreme_containers import BACKGROUND, BY_NAME, balanced, browser, decode, fast, largest, levels, scene
+from helpers.reference_training import trained
+from helpers.render_scenes import in_float64
+from kissgs.compaction.regularizers import needle_loss
+from kissgs.rendering.differentiable import rasterize
+from kissgs.rendering.rasterizer import removal_scores, render
+from kissgs.rendering.tensors import tensors_of
+from kissgs.training.loop import threads_of_torch
+
+
+def clean(name):
+    """Largest difference of the cleaned scene, of values above 1 relative; infinite where a count is another."""
+    extreme, (found, report) = BY_NAME[name], scene(name)
+    rows, counts = reference_float64.cleaned(extreme.arrays())
+    stated = {change: count for change, count in report.as_dict().items() if count}
+    if len(rows) != len(found) or counts != report.as_dict() or stated != extreme.changes:
+        return math.inf
+    errors = []
+    for n, row in enumerate(rows):
+        for attribute, wanted in row.items():
+            value = getattr(found, attribute)[n].astype(np.float64)
+            value = 1 / (1 + np.exp(-value)) if attribute == "opacities" else value
+            errors.append(np.abs(value - wanted) / np.maximum(np.abs(wanted), 1))
+    return largest(*errors)
+
+
+def picture(name):
+    """Largest difference of a pixel to the naive rasteriser, of colours beyond 1 relative to the brightest."""
+    splats, view = scene(name)[0], BY_NAME[name].camera()
+    expected = reference_rasterizer.draw(in_float64(splats), view, np.array(BACKGROUND))
+    sure = ~expected.doubtful
+    if sure.mean() < 0.9:
+        return math.inf
+    image, alpha = render(splats, view, background=BACKGROUND)
+    colours = [np.abs(layer[3]).max() for layer in expected.layers]
+    brightest = max(1.0, *colours) if colours else 1.0
+    if not (np.isfinite(image).all() and np.isfinite(alpha).all()):
+        return math.inf
+    return largest(np.abs(image - expected.image)[sure] / brightest, np.abs(alpha - expected.alpha)[sure])
+
+
+def gradient(name):
+    """Largest difference of a gradient, relative to the largest of its kind, or to 1e-4 of the largest of all."""
+    splats, view = scene(name)[0], BY_NAME[name].camera()
+    wanted, rng = reference_float64.tensors(splats, leaf=True), np.random.default_rng(1)
+    expected = reference_float64.draw(wanted, view, BACKGROUND)
+    weights = torch.from_numpy(rng.normal(0, 1, (view.height, view.width, 4)) * expected.sure[:, :, None])
+    _weighed(expected.image, expected.alpha, weights).backward()
+    found = {attribute: tensor.clone().requires_grad_() for attribute, tensor in tensors_of(splats).items()}
+    images, alphas = rasterize(**found, **_camera(view))
+    _weighed(images[0], alphas[0], weights).backward()
+    return relative(*({key: tensor.grad for key, tensor in leaves.items()} for leaves in (found, wanted)), splats, view)
+
+
+def _camera(view):
+    pose, K = torch.from_numpy(view.viewmat)[None], torch.from_numpy(view.K)[None]
+    return {
+        "viewmats": pose,
+        "Ks": K,
+        "width": view.width,
+        "height": view.height,
+        "backgrounds": torch.tensor([BACKGROUND]),
+    }
+
+
+def _weighed(image, alpha, weights):
+    return (image * weights[:, :, :3]).sum() + (alpha * weights[:, :, 3]).sum()
+
+
+def relative(found, wanted, splats, view):
+    """Positions are measured in distances of the nearest that is drawn, so that gradients can be compared."""
+    depth = splats.means.astype(np.float64) @ view.viewmat[2, :3] + view.viewmat[2, 3]
+    unit = {"means": depth[depth >= 0.01].min(initial=np.inf) if (depth >= 0.01).any() else 1.0}
+    none = torch.zeros(())
+    sizes = {key: np.abs((none if wanted[key] is None else wanted[key]).numpy()).max(initial=0) for key in found}
+    floor = 1e-4 * max(size * unit.get(key, 1.0) for key, size in sizes.items())
+    errors = []
+    for key, size in sizes.items():
+        target = np.zeros(1) if wanted[key] is None else wanted[key].numpy()
+        scale = max(size, floor / unit.get(key, 1.0), 1e-30)
+        errors.append(np.abs(found[key].numpy().astype(np.float64) - target) / scale)
+    return largest(*errors)
+
+
+def score(name):
+    """Largest difference to the squared change by removal, relative to the largest."""
+    splats, view = scene(name)[0], BY_NAME[name].camera()
+    wanted = reference_float64.removed(
+        reference_float64.draw(reference_float64.tensors(splats), view, BACKGROUND), len(splats), BACKGROUND
+    )
+    found = removal_scores(splats, [view], background=BACKGROUND)
+    return largest(np.abs(found - wanted) / max(wanted.max(initial=0), 1e-30))
+
+
+def rank(name):
+    """Largest error of the loss of effective rank (relative, from 1 up) and of its gradient, which is 2 at most."""
+    scales = torch.from_numpy(scene(name)[0].scales).clone().requires_grad_()
+    loss = needle_loss(scales)
+    loss.sum().backward()
+    wanted, slope = reference_float64.needle_loss(scales.detach())
+    off = np.abs(scales.grad.numpy() - slope).max(axis=1, initial=0)
+    at_kink = wanted < 1e-5  # of a disc, a gradient of 0 is as right as that of what is a little longer
+    off = np.where(at_kink & (scales.grad.numpy() == 0).all(axis=1), 0, off)
+    return largest(np.abs(loss.detach().numpy() - wanted) / np.maximum(wanted, 1), off)
+
+
+def step(name):
+    """Largest difference after three steps of training, in learning rates, beyond what float32 can hold."""
+    return trained(scene(name)[0], BY_NAME[name].camera())
+
+
+STAGES = {
+    "clean": clean,
+    "fast": fast,
+    "balanced": balanced,
+    "decode": decode,
+    "picture": picture,
+    "gradient": gradient,
+    "score": score,
+    "rank": rank,
+    "step": step,
+    "levels": levels,
+    "browser": browser,
+}
+
+
+@functools.cache
+def measured(name, stage):
+    """The error of a stage at an extreme."""
+    with threads_of_torch(1):  # several are slower where tests run side by side
+        return STAGES[stage](name)

@@ -1,0 +1,180 @@
+"""A real service in a process of its own, on loopback."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import httpx
+
+import kissgs
+from kissgs.io.ply import write_ply
+
+ROOT = Path(__file__).parents[2]
+
+
+def scene_bytes(gaussians=300, degree=1, seed=0):
+    file = io.BytesIO()
+    write_ply(file, kissgs.sample_scene(gaussians, sh_degree=degree, seed=seed))
+    return file.getvalue()
+
+
+SMALL = scene_bytes()
+"""Takes a job hardly longer than its process needs to start."""
+
+FAST = json.dumps({"preset": "fast"})
+SLOW = json.dumps({"preset": "paper", "encode": {"plas_radius_decay": 0.99, "sh_kmeans_iterations": 50}})
+"""For scenes that are to keep a worker busy."""
+
+
+class Service:
+    """``with Service(folder, KISSGS_X=…) as service``; ``service.http`` is a client of it."""
+
+    def __init__(self, folder: Path, **settings: object) -> None:
+        self.folder = folder
+        self.settings = {"KISSGS_MIN_FREE_BYTES": 0, **settings}
+        self.log = folder.parent / f"{folder.name}.log"
+        self.process: subprocess.Popen | None = None
+
+    def __enter__(self) -> Service:
+        self.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.http.close()
+        self.kill(signal.SIGKILL)
+
+    def start(self) -> Service:
+        begin = self.log.stat().st_size if self.log.exists() else 0
+        kept = {name: value for name, value in os.environ.items() if not name.startswith("KISSGS_")}
+        chosen = {"KISSGS_PORT": 0, "KISSGS_DATA_DIR": self.folder, **self.settings}
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-P", "-m", "service"],
+                env={**kept, "PYTHONPATH": str(ROOT), **{name: str(value) for name, value in chosen.items()}},
+                stdout=log,
+                stderr=log,
+            )
+        for _ in range(600):
+            said = self.log.read_bytes()[begin:].decode(errors="replace")
+            found = re.search(r"listening on (http://127\.0\.0\.1:([0-9]+))", said)
+            if found:
+                self.url, self.port = found[1], int(found[2])
+                self.http = httpx.Client(base_url=self.url, timeout=60, trust_env=False)
+                return self
+            if self.process.poll() is not None:
+                break
+            time.sleep(0.05)
+        raise AssertionError(f"the service did not start: {self.log.read_text()[-3000:]}")
+
+    def kill(self, number: int) -> int:
+        """Send a signal and wait for the end; the exit status."""
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+        return self.process.wait(timeout=60)
+
+    def restart(self) -> Service:
+        self.http.close()
+        return self.start()
+
+    # What tests do again and again ---------------------------------------------------------------------------------
+
+    def submit(self, data: bytes = SMALL, options: str = FAST, **headers: str) -> dict:
+        answer = self.http.post(
+            "/v1/jobs", content=data, params={"options": options, "name": "a scene.ply"}, headers=headers
+        )
+        assert answer.status_code == 202, answer.text
+        return answer.json()
+
+    def status(self, job: dict, wait: float = 0) -> dict:
+        answer = self.http.get(f"/v1/jobs/{job['id']}", params={"wait": wait})
+        assert answer.status_code == 200, answer.text
+        return answer.json()
+
+    def ended(self, job: dict, seconds: float = 60) -> dict:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            status = self.status(job, wait=5)
+            if status["state"] not in ("queued", "running"):
+                return status
+        raise AssertionError(f"job {job['id']} has not ended: {status}")
+
+    def running(self, job: dict, stage: str | None = None, seconds: float = 30) -> dict:
+        """Once its process is at work (in ``stage``, if that is given)."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            status = self.status(job)
+            progress = status.get("progress")
+            if status["state"] == "running" and progress and stage in (None, progress["stage"]) and self.children():
+                return status
+            assert status["state"] in ("queued", "running"), status
+            time.sleep(0.02)
+        raise AssertionError(f"job {job['id']} does not run: {status}\n{self.log.read_text()[-3000:]}")
+
+    def children(self) -> list[int]:
+        """Process ids of the jobs that run."""
+        with contextlib.suppress(OSError):
+            tasks = Path(f"/proc/{self.process.pid}/task").iterdir()
+            return [int(pid) for task in tasks for pid in (task / "children").read_text().split()]
+        return []
+
+    def memory(self) -> int:
+        """Resident bytes of the server itself, at most so far."""
+        text = Path(f"/proc/{self.process.pid}/status").read_text()
+        return int(re.search(r"VmHWM:\s+([0-9]+) kB", text)[1]) << 10
+
+    def strays(self) -> list[str]:
+        """Files that belong to nothing."""
+        jobs = self.folder / "jobs"
+        found = [*(self.folder / "incoming").iterdir(), *jobs.glob("*/work-*"), *jobs.glob("*/.*")]
+        return [str(path.relative_to(self.folder)) for path in found]
+
+    def raw(self, data: bytes) -> socket.socket:
+        """A connection that has sent these bytes."""
+        connection = socket.create_connection(("127.0.0.1", self.port), timeout=30)
+        connection.sendall(data)
+        return connection
+
+
+def said(connection: socket.socket) -> bytes:
+    """A whole answer from a connection."""
+    answer = b""
+    with contextlib.suppress(ConnectionError):
+        while block := connection.recv(65536):
+            answer += block
+            head, end, body = answer.partition(b"\r\n\r\n")
+            length = re.search(rb"content-length: ([0-9]+)", head)
+            if end and length and len(body) >= int(length[1]):
+                break
+    return answer
+
+
+def problem(answer: httpx.Response, status: int, code: str) -> dict:
+    """The problem document of an answer, which must be this one."""
+    assert (answer.status_code, answer.headers["content-type"]) == (status, "application/problem+json"), answer.text
+    found = answer.json()
+    assert found["code"] == code, found
+    assert found["status"] == status
+    assert found["type"] == f"/v1/problems/{code}"
+    assert set(found) <= {"type", "title", "status", "detail", "code", "retryable", "errors"}
+    assert "Traceback" not in found["detail"]
+    return found
+
+
+def events(text: str) -> list[tuple[int, str, dict]]:
+    """Id, kind and data of each event of a stream, parsed as the standard says."""
+    found = []
+    for block in text.split("\n\n"):
+        fields = dict(line.split(": ", 1) for line in block.splitlines() if not line.startswith(":"))
+        if "data" in fields:
+            found.append((int(fields["id"]), fields["event"], json.loads(fields["data"])))
+    return found

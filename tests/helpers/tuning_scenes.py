@@ -1,0 +1,39 @@
+"""Choices to fine-tune, and what they are made of."""
+
+import numpy as np
+
+from helpers.training_scenes import around, cloud
+from kissgs import Settings
+from kissgs.cameras.views import black
+from kissgs.planning.planner import plan_encoding
+from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
+
+FIELDS = ("means", "opacities", "scales", "quaternions", "f_dc", "f_rest_centroids")
+
+
+def chosen(scene, preset="balanced", **changes):
+    """As ``compress`` would choose."""
+    settings = Settings.from_preset(preset, **changes).encode
+    sensitivity = None
+    if settings.rate_distortion:
+        cameras = [view.camera for view in around(4)]
+        sensitivity = measure_sensitivity(
+            scene, WeightedCameras(cameras, [1.0] * len(cameras), black()), view_uncertainty=0.3
+        )
+    return plan_encoding(scene, settings, sensitivity=sensitivity, threads=1)
+
+
+def choices():
+    """Of all kinds: weighed or not, of every degree, of few and many, with nothing to choose."""
+    found = [(cloud(count, degree, seed=count), "balanced") for count in (1, 7, 8, 9) for degree in (0, 1, 2, 3)]
+    found += [(cloud(300, degree), preset) for degree in (0, 3) for preset in ("fast", "balanced", "paper")]
+    constant = cloud(40, 1).select(np.zeros(40, int))
+    return [*found, (constant, "balanced"), (constant, "paper")]
+
+
+def shuffled(work, seed=0, far=3.0):
+    """Move all latents somewhere."""
+    rng = np.random.default_rng(seed)
+    for name, latents in work.latents.items():
+        latents.data += latents.new_tensor(rng.normal(0, far, latents.shape))
+        latents.data.clamp_(work.planes[name].min_latent, work.planes[name].max_latent)

