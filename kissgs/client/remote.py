@@ -50,7 +50,7 @@ class Remote:
     def __init__(self, server: str, *, key: str | None = None) -> None:
         try:
             import httpx
-        except ImportError as error:
+        except ModuleNotFoundError as error:
             raise UnsupportedError("talking to a service needs httpx; install kissgs[remote]") from error
         if not _is_address(server):
             raise UnsupportedError(

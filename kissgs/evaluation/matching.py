@@ -37,7 +37,7 @@ def pair(reference: Splats, candidate: Splats) -> Int[np.ndarray, " M"]:
         raise InvalidSceneError("no Gaussian can be paired with an empty reference scene")
     try:
         from scipy.spatial import cKDTree
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise UnsupportedError("pairing Gaussians needs SciPy: pip install 'kissgs[bench]'") from error
 
     low, high = np.percentile(_symmetric_log(reference.means), (10, 90), axis=0)

@@ -16,7 +16,7 @@ try:
     import torch
     from torch import Tensor
     from torch.autograd.function import once_differentiable
-except ImportError as error:
+except ModuleNotFoundError as error:
     raise UnsupportedError("gradients are torch's, which is missing: pip install 'kissgs[train]'") from error
 
 

@@ -12,7 +12,7 @@ from kissgs.rendering.metrics import difference_and_ssim
 try:
     import torch
     from torch.autograd.function import BackwardCFunction, FunctionCtx, once_differentiable
-except ImportError as error:
+except ModuleNotFoundError as error:
     raise UnsupportedError("this loss is torch's, which is missing: pip install 'kissgs[train]'") from error
 
 

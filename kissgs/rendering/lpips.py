@@ -32,7 +32,7 @@ class Lpips:
         """
         try:
             package = importlib.import_module("lpips")
-        except ImportError as error:
+        except ModuleNotFoundError as error:
             raise UnsupportedError(
                 f"LPIPS needs packages that are not installed ({error}): pip install 'kissgs[lpips]'"
             ) from error

@@ -8,7 +8,7 @@ from kissgs.core.splats import ATTRIBUTES, Splats
 try:
     import torch
     from torch import Tensor
-except ImportError as error:
+except ModuleNotFoundError as error:
     raise UnsupportedError("tensors are torch's, which is missing: pip install 'kissgs[train]'") from error
 
 

@@ -20,7 +20,7 @@ from kissgs.training.targets import TrainingTargets
 try:
     import torch
     from torch import Tensor
-except ImportError as error:
+except ModuleNotFoundError as error:
     raise UnsupportedError("training is torch's, which is missing: pip install 'kissgs[train]'") from error
 
 SMOOTH = 0.98

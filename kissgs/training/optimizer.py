@@ -12,7 +12,7 @@ from kissgs.core.errors import UnsupportedError
 try:
     import torch
     from torch import Tensor
-except ImportError as error:
+except ModuleNotFoundError as error:
     raise UnsupportedError("training is torch's, which is missing: pip install 'kissgs[train]'") from error
 
 MOMENTS = ("exp_avg", "exp_avg_sq")

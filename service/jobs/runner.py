@@ -27,6 +27,12 @@ OUT_OF_MEMORY = re.compile(
 )
 """Last words of Python, C++, LLVM, OpenBLAS and the C library: which of them meets the limit is chance."""
 
+NEAR_LIMIT = 0.8
+"""The share of its memory from which on a process that dies without a known word is taken to have died of the limit."""
+
+SAMPLE_SECONDS = 0.1
+"""Between two looks at a process's memory."""
+
 MAX_LINE_BYTES = 1 << 20
 """Of one event; the largest is the summary of a result."""
 
@@ -52,6 +58,7 @@ class JobProcess:
         self._seconds = seconds
         self._process: asyncio.subprocess.Process | None = None
         self._killed = False
+        self._peak_data = 0
         self.ended = asyncio.Event()
 
     def kill(self) -> None:
@@ -93,6 +100,7 @@ class JobProcess:
                 limit=MAX_LINE_BYTES,
             )
         self._kill_if_asked()  # while it was starting
+        sampling = asyncio.create_task(self._sample_memory(self._process.pid))
         try:
             async with asyncio.timeout(self._seconds):
                 final = await self._follow(order, on_progress)
@@ -100,11 +108,21 @@ class JobProcess:
         except TimeoutError:
             detail = f"the job took longer than {self._seconds:g} s; choose a faster preset or fewer Gaussians"
             return Outcome("error", {"code": "time-limit", "detail": detail})
+        finally:
+            sampling.cancel()
         if final is not None and "done" in final:
             return Outcome("done", final["done"])
         if final is not None:
             return Outcome("error", final["error"])
-        return self._explain(status, trace)
+        return self._explain(status, trace, order["memory"])
+
+    async def _sample_memory(self, pid: int) -> None:
+        """Note the most memory that the limit counts (``VmData``): a dead process cannot be asked any more."""
+        with contextlib.suppress(OSError):  # it has ended, or this is no Linux
+            while True:
+                pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[5])
+                self._peak_data = max(self._peak_data, pages * os.sysconf("SC_PAGE_SIZE"))
+                await asyncio.sleep(SAMPLE_SECONDS)
 
     async def _follow(self, order: dict[str, Any], on_progress: OnProgress) -> dict[str, Any] | None:
         """Pass progress on until the last word, or until there is none."""
@@ -120,12 +138,13 @@ class JobProcess:
             await on_progress(event["stage"], event["fraction"], event["note"])
         return None
 
-    def _explain(self, status: int, trace: Path) -> Outcome:
+    def _explain(self, status: int, trace: Path, memory: int) -> Outcome:
         if self._killed:
             return Outcome("stopped")
         said = trace.read_text(encoding="utf-8", errors="replace")[-4000:] if trace.exists() else ""
         log.error("a job's process ended with status %d\n%s", status, said)
-        if OUT_OF_MEMORY.search(said):
+        near_limit = self._peak_data >= NEAR_LIMIT * memory and status != -signal.SIGKILL
+        if near_limit or OUT_OF_MEMORY.search(said):
             return Outcome("error", {"code": "memory-limit", "detail": MEMORY_DETAIL})
         if status < 0:
             name = signal.Signals(-status).name

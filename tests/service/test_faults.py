@@ -229,9 +229,26 @@ def test_a_job_that_needs_too_much_memory(start):
 def test_libraries_that_meet_the_memory_limit_in_their_own_words(tmp_path, last_words):
     trace = tmp_path / "stderr.txt"
     trace.write_text(last_words)
-    assert JobProcess(seconds=1)._explain(-signal.SIGABRT, trace).data["code"] == "memory-limit"
+    assert JobProcess(seconds=1)._explain(-signal.SIGABRT, trace, 1 << 30).data["code"] == "memory-limit"
     trace.write_text("Segmentation fault")
-    assert JobProcess(seconds=1)._explain(-signal.SIGSEGV, trace).kind == "crashed"
+    assert JobProcess(seconds=1)._explain(-signal.SIGSEGV, trace, 1 << 30).kind == "crashed"
+
+
+@pytest.mark.parametrize(
+    ("status", "used", "expected"),
+    [
+        (-signal.SIGSEGV, 0.9, "memory-limit"),
+        (-signal.SIGSEGV, 0.7, "crashed"),
+        (-signal.SIGKILL, 0.9, "crashed"),  # from outside: the machine's memory, or a person
+        (1, 0.9, "memory-limit"),
+        (1, 0.7, "internal"),
+    ],
+)
+def test_a_process_that_dies_without_a_word_near_its_memory_limit(tmp_path, status, used, expected):
+    child = JobProcess(seconds=1)
+    child._peak_data = int(used * (1 << 30))
+    outcome = child._explain(status, tmp_path / "stderr.txt", 1 << 30)
+    assert outcome.data.get("code", outcome.kind) == expected
 
 
 def test_a_job_that_takes_too_long(start):
