@@ -1,6 +1,6 @@
-"""Measure every stage at every extreme (tests/extremes), and write the table into numerics.md: python docs/numerics.py.
+"""Measure every stage at every extreme (tests/extremes): ``python docs/numerics.py`` writes docs/reference/numerics.md.
 
-The figures are this machine's, so no test compares them with others: they must only keep what is promised.
+The figures depend on the machine, so no test compares them with those of another: they must stay within the bounds.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "numerics.md"
+PAGE = ROOT / "docs" / "reference" / "numerics.md"
 BEGIN, END = "<!-- measured -->\n", "<!-- end -->\n"
 
 sys.path.append(str(ROOT / "tests"))
@@ -20,7 +20,7 @@ from helpers.extremes import BOUNDS, EXTREMES  # noqa: E402
 
 
 def table(measure: Callable[[str, str], float]) -> str:
-    """A row for each extreme, with what ``measure`` finds at each stage; the first says what is promised."""
+    """Return a table with a row of bounds, then a row per extreme with the errors that ``measure`` finds."""
     lines = [f"| row | given | promise | {' | '.join(BOUNDS)} |", "|---" * (3 + len(BOUNDS)) + "|"]
     lines.append(f"|  |  | unless said otherwise | {' | '.join(f'≤ {figure(bound)}' for bound in BOUNDS.values())} |")
     for extreme in EXTREMES:
@@ -30,12 +30,12 @@ def table(measure: Callable[[str, str], float]) -> str:
 
 
 def cell(value: float, bound: float | None) -> str:
-    """With the bound, where that is the row's own."""
+    """Return an error as text, followed by its bound where the row has a bound of its own."""
     return figure(value) + ("" if bound is None else f" ≤ {figure(bound)}")
 
 
 def figure(value: float) -> str:
-    """With two digits at most."""
+    """Return a number as text with at most two digits."""
     if value == 0 or 0.01 <= value < 100:
         return f"{value:.2g}"
     digits, exponent = f"{value:.1e}".split("e")
@@ -43,7 +43,7 @@ def figure(value: float) -> str:
 
 
 def main() -> None:
-    """Measure all, and replace what the page has between its marks."""
+    """Measure everything, and replace the part of the page between its marks."""
     before, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
     PAGE.write_text(before + BEGIN + table(measured) + END + rest.partition(END)[2], encoding="utf-8")
 

@@ -1,4 +1,4 @@
-"""Take docs/images/page.webp and preview.webp: the sample scene, compressed by a service of its own, on its pages.
+"""Make docs/images/page.webp and preview.webp: screenshots of a service of its own that compresses the sample scene.
 
 Needs Chromium, scripts/vendor, and playwright of the extra ``dev``. Takes two minutes: Chromium draws in software.
 """
@@ -27,7 +27,7 @@ GAUSSIANS = 60_000
 
 
 def main() -> None:
-    """Compress, look, and take the pictures."""
+    """Start a service, compress the sample scene, and save screenshots of both pages."""
     chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))))
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as driver:
         scene = Path(folder) / "sample.ply"
@@ -57,13 +57,13 @@ def main() -> None:
             service.wait()
 
 
-def save(shot: bytes, name: str) -> None:
-    """As a small picture among those of the documentation."""
-    Image.open(io.BytesIO(shot)).convert("RGB").save(HERE / "images" / name, quality=90, method=6)
+def save(screenshot: bytes, name: str) -> None:
+    """Save a screenshot as WebP in docs/images."""
+    Image.open(io.BytesIO(screenshot)).convert("RGB").save(HERE / "images" / name, quality=90, method=6)
 
 
 def pose(page: Page) -> bytes:
-    """Move the camera to where the objects are large."""
+    """Move the camera to where the objects are large, and return a screenshot."""
     page.locator("#live", has_text="Gaussians").wait_for(state="attached")
     for key in KEYS:
         page.keyboard.press(key)
@@ -71,7 +71,7 @@ def pose(page: Page) -> bytes:
 
 
 def settled(page: Page) -> bytes:
-    """A screenshot that stays the same."""
+    """Return a screenshot once two in a row are identical."""
     before, after = b"", page.screenshot()
     while before != after:
         page.wait_for_timeout(1000)
