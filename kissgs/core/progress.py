@@ -1,4 +1,4 @@
-"""How long work reports itself: one callback, used alike by the command line, the service and tests."""
+"""Progress events of long work: one callback for the command line, the service and tests."""
 
 from contextlib import suppress
 from typing import Protocol, runtime_checkable
@@ -10,24 +10,27 @@ from kissgs.core.errors import StopSearch
 class Progress(Protocol):
     """Receives progress events.
 
-    To stop the work, raise :class:`kissgs.Cancelled` from the call; to end a search for a goal with the best that it
-    has found, :class:`kissgs.StopSearch`.
+    To stop the work, raise :class:`kissgs.Cancelled` from the call; to end a search for a goal with the best result so
+    far, raise :class:`kissgs.StopSearch`.
     """
 
     def __call__(self, stage: str, fraction: float, note: str = "", /) -> None:
-        """``stage`` names what is being done ("read", "order", "codebook", …); ``fraction`` of that stage, 0 to 1.
+        """Receive an event.
 
-        ``note`` is for people: what training has come to (Gaussians, loss, PSNR), and where a search for a goal stands.
-        Other stages say nothing.
+        Args:
+            stage: name of the current stage ("read", "order", "codebook", …).
+            fraction: fraction of that stage that is done, 0 to 1.
+            note: text for the user: the state of training (Gaussians, loss, PSNR) and of a search for a goal; empty in
+                other stages.
         """
 
 
 def silent(stage: str, fraction: float, note: str = "") -> None:
-    """The default receiver: ignores every event."""
+    """Ignore every event; the default receiver."""
 
 
 def as_stage(stage: str, progress: Progress) -> Progress:
-    """Passes everything on as the one stage of that name; stages of others with no fraction of it."""
+    """Return a receiver that reports all events as ``stage``; inner stages of other names count as fraction 0."""
 
     def receive(inner: str, fraction: float, note: str = "") -> None:
         progress(stage, fraction if inner == stage else 0.0)
@@ -35,8 +38,8 @@ def as_stage(stage: str, progress: Progress) -> Progress:
     return receive
 
 
-def until_the_end(progress: Progress) -> Progress:
-    """Passes everything on to one who may have had enough: once the search is over, work is finished nevertheless."""
+def ignore_stop_search(progress: Progress) -> Progress:
+    """Return a receiver that ignores :class:`StopSearch`: once the search is over, the work is completed."""
 
     def receive(stage: str, fraction: float, note: str = "") -> None:
         with suppress(StopSearch):
@@ -45,11 +48,11 @@ def until_the_end(progress: Progress) -> Progress:
     return receive
 
 
-class Annotated:
-    """Passes everything on, with a word of where a search stands before the work's own.
+class SearchNote:
+    """Receiver that puts the state of a search before the notes of the events.
 
     Attributes:
-        note: that word.
+        note: state of the search; changed by it.
     """
 
     def __init__(self, progress: Progress) -> None:

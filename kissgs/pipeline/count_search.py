@@ -1,4 +1,4 @@
-"""How many Gaussians serve a goal best: fewer ones, stored finely, or more, stored coarsely."""
+"""Search for the number of Gaussians that serves a goal best: fewer with fine levels, or more with coarse ones."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ if TYPE_CHECKING:
     from kissgs.compaction.result import Compacted
     from kissgs.pipeline.encoding import Encoding
 
-FINELY = 1.4
-"""Bytes that a Gaussian is worth where there are few, in those that it takes where all stay: the first guess."""
+BYTES_GROWTH = 1.4
+"""Bytes per Gaussian expected after compaction, relative to the uncompacted scene; only for the first guess."""
 
-FEW = -2.0
-"""Of which share to begin with where a loss is given, or a PSNR; a power of 2."""
+QUALITY_START_LOG2 = -2.0
+"""log2 of the share of the Gaussians that is tried first where the goal is a PSNR or a drop of it."""
 
-STEPS = {True: 0.5, False: 1.0}
-"""By which counts change at first, as powers of 2: for a size, and for what pictures lose."""
+FIRST_STEP_LOG2 = {True: 0.5, False: 1.0}
+"""First change of log2(count): True where the goal is a size, False where it is a PSNR or a drop of it."""
 
 
 @dataclass(frozen=True, slots=True)
 class CountCandidate:
-    """What came of one count.
+    """The result for one number of Gaussians.
 
     Attributes:
-        cost: what is to be small: of containers of a wanted size minus the PSNR to what judges them, else the bytes;
-            infinite where the goal cannot be met.
-        search: in which the best container was found.
-        compacted: the scene that is in it; None for the scene with all its Gaussians.
+        cost: to be minimised: minus the PSNR of the evaluation where the goal is a size, else the container's bytes;
+            infinite if this count cannot meet the goal.
+        search: the search that made the containers of this count; None if none was made.
+        compacted: the compacted scene; None for the scene with all its Gaussians.
     """
 
     cost: float
@@ -47,107 +47,110 @@ class CountCandidate:
 
 @dataclass(slots=True, eq=False)
 class CountSearch:
-    """Compacts to several counts, and encodes each towards the goal.
+    """Compact the scene to several counts, and search for the best container of each.
 
-    The first guess follows from one encoding of the scene as it is. Pictures are drawn to confirm: of what compaction
-    has left, which tells whether it is worth encoding, and of the container.
+    The uncompacted scene is encoded first; its size gives the first guess of a count. The compacted scene is evaluated
+    before it is encoded, so that a count that already misses the goal costs no encoding.
 
     Attributes:
-        encoding: of the scene with all its Gaussians; fine-tuning is left for later.
-        compactor: of the same scene.
-        trials: containers that were made.
+        encoding: encoding of the scene with all its Gaussians; fine-tuning follows after this search.
+        compactor: compactor of the same scene.
+        trials: all containers that were made, in order.
     """
 
     encoding: Encoding
     compactor: Compactor
     trials: list[Trial] = field(default_factory=list)
     _drops: dict[int, float] = field(default_factory=dict)
-    _offers: dict[int, CountCandidate] = field(default_factory=dict)
-    _whole: RateControl | None = None
+    _candidates: dict[int, CountCandidate] = field(default_factory=dict)
+    _full_search: RateControl | None = None
     _stopped: bool = False
 
     def run(self) -> tuple[Compacted, RateControl, tuple[Trial, ...]]:
-        """The scene that serves the goal best, the search for its container, and the way to it.
+        """Return the compacted scene that serves the goal best, the search that made its container, and all trials.
 
         Raises:
             UnsupportedError: no count meets the goal.
         """
         from kissgs.compaction.budget import unchanged
 
-        splats, most = self.compactor.splats, math.log2(len(self.compactor.splats))
+        splats, log2_all = self.compactor.splats, math.log2(len(self.compactor.splats))
         try:
-            whole = self._offers[len(splats)] = self._encode(splats, None)
-            self._whole = whole.search
-            if not (self._stopped or self._settled(whole)):
+            uncompacted = self._candidates[len(splats)] = self._encode(splats, None)
+            self._full_search = uncompacted.search
+            if not (self._stopped or self._keeps_all(uncompacted)):
                 by_size = self.goal.by_size
-                start = most + (min(self._guess(), 0.0) if by_size else FEW)
-                way_out = -1.0 if by_size else 1.0  # fewer Gaussians are smaller, more are better
+                start = log2_all + (min(self._first_guess(), 0.0) if by_size else QUALITY_START_LOG2)
+                feasible_side = -1.0 if by_size else 1.0  # fewer Gaussians take fewer bytes, more have a higher PSNR
                 attempts = self.encoding.settings.compact.max_compactions
-                minimize_unimodal(self._cost, {most: whole.cost}, start, STEPS[by_size], (0.0, most), way_out, attempts)
+                known, step = {log2_all: uncompacted.cost}, FIRST_STEP_LOG2[by_size]
+                minimize_unimodal(self._cost, known, start, step, (0.0, log2_all), feasible_side, attempts)
         except StopSearch:
-            if all(math.isinf(offer.cost) for offer in self._offers.values()):
+            if all(math.isinf(candidate.cost) for candidate in self._candidates.values()):
                 raise
             self._stopped = True
-        best = self._offers[min(self._offers, key=lambda count: (self._offers[count].cost, count))]
+        best = self._candidates[min(self._candidates, key=lambda count: (self._candidates[count].cost, count))]
         if best.search is None or best.search.best is None:
-            raise UnsupportedError(self.goal.failure_message(self.trials, fewer=False))
+            raise UnsupportedError(self.goal.failure_message(self.trials, suggest_compaction=False))
         best.search.stopped |= self._stopped
-        compacted = best.compacted or unchanged(splats, self._why_all_stay())
+        compacted = best.compacted or unchanged(splats, self._reason_to_keep_all())
         notes = filter(None, [compacted.report.note, self.compactor.note])
         report = replace(compacted.report, trials=tuple(self._drops.items()), note="; ".join(notes))
         return replace(compacted, report=report), best.search, tuple(self.trials)
 
     @property
     def goal(self) -> Goal:
-        """Of the settings."""
+        """The goal that the settings name."""
         return Goal.of(self.encoding.settings.encode)
 
-    def _settled(self, whole: CountCandidate) -> bool:
-        """Whether fewer Gaussians need not be tried.
+    def _keeps_all(self, uncompacted: CountCandidate) -> bool:
+        """Whether no smaller count needs to be tried.
 
-        All of them have room enough as they are stored where no size is asked for, or not even they are good enough, or
-        what is no image takes all the room.
+        Without a target size: if even all Gaussians miss the goal. With one: if all of them fit at the preset's own
+        quality, or if the files that are no images already exceed the target.
         """
-        wanted = self.encoding.settings.encode.target_size
-        if wanted is None or self._whole is None:
-            return math.isinf(whole.cost)
-        return self.trials[0].bytes <= wanted or self._whole.overhead >= wanted
+        target_size = self.encoding.settings.encode.target_size
+        if target_size is None or self._full_search is None:
+            return math.isinf(uncompacted.cost)
+        return self.trials[0].bytes <= target_size or self._full_search.overhead >= target_size
 
-    def _why_all_stay(self) -> str:
+    def _reason_to_keep_all(self) -> str:
         if self._drops:
-            return "and no smaller number that was tried serves the goal better"
+            return "and none of the smaller counts tried serves the goal better"
         if self._stopped:
-            return "and the search was ended before fewer were tried"
-        return "and there is room for all of them"
+            return "and the search was stopped before a smaller count was tried"
+        return "and all of them fit into the target size"
 
-    def _guess(self) -> float:
-        """Of the share of the Gaussians; a power of 2."""
-        wanted = self.encoding.settings.encode.target_size or 1
-        overhead = 0 if self._whole is None else self._whole.overhead
-        room, taken = wanted - overhead, self.trials[0].bytes - overhead
-        return math.log2(max(room, 1) / (FINELY * taken))
+    def _first_guess(self) -> float:
+        """Return log2 of the share of the Gaussians that may fit into the target size at the preset's own quality."""
+        target_size = self.encoding.settings.encode.target_size or 1
+        overhead = 0 if self._full_search is None else self._full_search.overhead
+        available, used = target_size - overhead, self.trials[0].bytes - overhead
+        return math.log2(max(available, 1) / (BYTES_GROWTH * used))
 
     def _cost(self, x: float) -> float:
         splats = self.compactor.splats
         count = min(max(1, round(2**x)), len(splats) - 1)
         if self._stopped:
             return math.inf
-        if count in self._offers:
-            return self._offers[count].cost
+        if count in self._candidates:
+            return self._candidates[count].cost
         self.encoding.progress.note = f"{count:,} Gaussians"
-        found = self.compactor(count)
-        seen = self.compactor.pictures(found)
-        self._drops[count] = drop_of(seen)
-        wanted = self.encoding.settings.encode
-        hopeless = wanted.max_psnr_drop is not None and self._drops[count] > wanted.max_psnr_drop
-        hopeless |= wanted.psnr is not None and psnr_of(seen) < wanted.psnr
-        offer = CountCandidate(math.inf, None, found) if hopeless else self._encode(found.splats, found)
-        self._offers[count] = offer
-        return offer.cost
+        compacted = self.compactor(count)
+        evaluation = self.compactor.pictures(compacted)
+        self._drops[count] = drop_of(evaluation)
+        encode = self.encoding.settings.encode
+        infeasible = encode.max_psnr_drop is not None and self._drops[count] > encode.max_psnr_drop
+        infeasible |= encode.psnr is not None and psnr_of(evaluation) < encode.psnr
+        candidate = (
+            CountCandidate(math.inf, None, compacted) if infeasible else self._encode(compacted.splats, compacted)
+        )
+        self._candidates[count] = candidate
+        return candidate.cost
 
     def _encode(self, splats: Splats, compacted: Compacted | None) -> CountCandidate:
         cache = self.encoding.cache if compacted is None else None
-        search = replace(self.encoding, splats=splats, cache=cache).search(limit=self._least())
+        search = replace(self.encoding, splats=splats, cache=cache).search(byte_limit=self._best_bytes())
         self._stopped = search.stopped
         self.trials += search.trials
         if search.best is None:
@@ -156,11 +159,13 @@ class CountSearch:
         if not search.goal.by_size:
             return CountCandidate(stored_sizes(encoded.files, packed=self.encoding.packed)[0], search, compacted)
         try:
-            psnr = search.pictures(encoded).mean.candidate.psnr
-        except StopSearch:  # as it began
-            self._stopped, psnr = True, search.pictures(encoded).mean.candidate.psnr
+            psnr = search.evaluate(encoded).mean.candidate.psnr
+        except StopSearch:  # raised only once, when the evaluation began
+            self._stopped, psnr = True, search.evaluate(encoded).mean.candidate.psnr
         return CountCandidate(-min(psnr, 1e3), search, compacted)
 
-    def _least(self) -> float:
-        """Bytes of the best offer, where these are the cost."""
-        return math.inf if self.goal.by_size else min((offer.cost for offer in self._offers.values()), default=math.inf)
+    def _best_bytes(self) -> float:
+        """Return the bytes of the best container so far; infinite where bytes are not the cost."""
+        if self.goal.by_size:
+            return math.inf
+        return min((candidate.cost for candidate in self._candidates.values()), default=math.inf)

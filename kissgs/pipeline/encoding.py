@@ -1,4 +1,4 @@
-"""From a scene to a container, as the settings ask: look at it where bits are weighed, choose, fine-tune, write."""
+"""Encode a scene into a container: measure sensitivity, plan, fine-tune, write, towards a goal if there is one."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from kissgs._version import __version__
 from kissgs.cameras.views import Views
 from kissgs.core.array_types import Float32, Int
 from kissgs.core.errors import StopSearch, UnsupportedError
-from kissgs.core.progress import Annotated, Progress, as_stage
+from kissgs.core.progress import Progress, SearchNote, as_stage
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import ATTRIBUTES, Cleaned, Splats
 from kissgs.io.sensitivity_file import read_sensitivity, write_sensitivity
@@ -35,36 +35,36 @@ if TYPE_CHECKING:
     from kissgs.finetuning.tune import Tuner
     from kissgs.rendering.sensitivity import WeightedCameras
 
-HEDGE = {True: 0.1, False: 0.55}
-"""How little pictures say of others: those from a capture's cameras, and those from virtual ones."""
+VIEW_UNCERTAINTY = {True: 0.1, False: 0.55}
+"""Default of the setting ``view_uncertainty``: True with the cameras of a capture, False with virtual cameras only."""
 
-MEASURE = 3
-"""Version of how sensitivity is measured: what an earlier one has kept in a file is measured anew."""
+SENSITIVITY_VERSION = 3
+"""Version of the measurement of sensitivity; a cache file of another version is measured again and replaced."""
 
-TUNED_ATTEMPTS = 4
-"""Containers that are fine-tuned on the way to a goal, at most: each takes a training."""
+MAX_FINETUNED_ENCODES = 4
+"""Largest number of containers that a search for a goal fine-tunes; each takes a training."""
 
-Chooser = Callable[[EncodeSettings, Progress], EncodingPlan]
+Planner = Callable[[EncodeSettings, Progress], EncodingPlan]
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Encoding:
-    """A scene that shall become a container.
+    """The inputs of one encoding: a scene, settings, and where to work.
 
     Attributes:
-        splats: clean.
-        original: from which it was compacted, or the same: pictures of it are what a goal's PSNR is told by, and what
-            fine-tuning learns from where there are no photographs.
-        settings: of all stages.
-        sensitivity: of ``splats``, if it was measured before.
-        cache: file to keep it in.
-        views: a capture.
-        cleaned: what was mended, for the metadata.
-        checkpoint: file for the state of fine-tuning; a search for a goal keeps none.
-        device: where fine-tuning trains.
-        packed: whether the files become a zip; a size is then that of the zip.
-        threads: 0 means one per processor.
-        progress: receives the stages of all that is done; its note tells where a search stands.
+        splats: clean scene to encode.
+        original: scene before compaction, or ``splats`` itself. Its renderings are the reference of a goal's PSNR, and
+            the targets of fine-tuning where there are no photographs.
+        settings: settings of all stages.
+        sensitivity: sensitivity of ``splats`` if measured before; None to measure it if the settings need it.
+        cache: file in which a measured sensitivity is kept; None for no file.
+        views: capture of the scene; None for virtual cameras.
+        cleaned: defects of the input that were corrected, for the metadata.
+        checkpoint: file for the state of fine-tuning; unused in a search for a goal.
+        device: device of fine-tuning.
+        packed: whether the files become a zip, whose size then counts; False for a folder.
+        threads: number of threads; 0 means one per processor.
+        progress: receives the events of all stages; its note says how far a search has come.
     """
 
     splats: Splats
@@ -78,57 +78,57 @@ class Encoding:
     device: Device
     packed: bool
     threads: int
-    progress: Annotated
+    progress: SearchNote
 
     def run(self, search: RateControl | None = None) -> tuple[Container, tuple[Trial, ...]]:
-        """The container, and what was tried on the way to it if the settings name a goal.
+        """Encode the scene; return the container, and the trials of the search if the settings name a goal.
 
         Args:
-            search: for that goal, if it was made before; attempts that it made are not told again.
+            search: search for that goal if it was made before; its trials are not returned again.
 
         Raises:
             InvalidViewsError: a photograph cannot be read.
-            OutputError: ``cache`` or ``checkpoint`` is something else, or ``cache`` cannot be written.
+            OutputError: ``cache`` or ``checkpoint`` is another kind of file, or ``cache`` cannot be written.
             UnsupportedError: the goal cannot be met; the scene is too large for one container.
         """
-        wanted, told = self.settings.encode, 0 if search is None else len(search.trials)
-        if not wanted.has_goal:
-            return self._encoder(self._chooser(), self._tuner(), self.checkpoint)(wanted), ()
-        chooser = None
+        encode, returned = self.settings.encode, 0 if search is None else len(search.trials)
+        if not encode.has_goal:
+            return self._encoder(self._planner(), self._tuner(), self.checkpoint)(encode), ()
+        planner = None
         if search is None:
-            chooser = self._chooser()
-            search = self.search(chooser)
+            planner = self._planner()
+            search = self.search(planner)
         if self.settings.finetune.enabled and len(self.splats) > 0 and not search.stopped:
             rd_lambda = search.trials[-1].rd_lambda if search.best is None else search.best.encoded.rd_lambda
             try:
-                encoder = self._encoder(chooser or self._chooser(), self._tuner(), None)
-                search.run(encoder, rd_lambda, min(TUNED_ATTEMPTS, wanted.max_encodes))
-            except StopSearch:  # while it looked
+                encoder = self._encoder(planner or self._planner(), self._tuner(), None)
+                search.run(encoder, rd_lambda, min(MAX_FINETUNED_ENCODES, encode.max_encodes))
+            except StopSearch:  # raised while sensitivity was measured or targets were rendered
                 if search.best is None:
                     raise
-        found = search.found(all_stay=not self.settings.compact.auto_count)
-        return found, tuple(search.trials[told:])
+        container = search.result(suggest_compaction=not self.settings.compact.auto_count)
+        return container, tuple(search.trials[returned:])
 
-    def search(self, chooser: Chooser | None = None, limit: float = math.inf) -> RateControl:
-        """For the goal of the settings, without fine-tuning; see :class:`RateControl` for ``limit``."""
+    def search(self, planner: Planner | None = None, byte_limit: float = math.inf) -> RateControl:
+        """Search for the goal of the settings without fine-tuning; see :class:`RateControl` for ``byte_limit``."""
         search = RateControl(
             *(self.original, self.settings.encode, self.views, self.threads, self.progress),
             count=len(self.splats),
             packed=self.packed,
-            limit=limit,
+            byte_limit=byte_limit,
         )
-        search.search_all(self._encoder(chooser or self._chooser(), None, None))
+        search.search_all(self._encoder(planner or self._planner(), None, None))
         return search
 
-    def _encoder(self, chooser: Chooser, tuner: Tuner | None, checkpoint: Path | None) -> Encoder:
-        """Chooses, fine-tunes if there is a tuner, and writes."""
+    def _encoder(self, planner: Planner, tuner: Tuner | None, checkpoint: Path | None) -> Encoder:
+        """Return a function that plans, fine-tunes if there is a tuner, and writes the files."""
 
-        def encoder(chosen: EncodeSettings) -> Container:
-            bold = self._bold(chosen)
+        def encoder(settings: EncodeSettings) -> Container:
+            pruned = self._pruned_for_finetune(settings)
 
-            def files(choice: EncodingPlan, finetune_steps: int, progress: Progress) -> Encoded:
+            def files(plan: EncodingPlan, finetune_steps: int, progress: Progress) -> Encoded:
                 return write_files(
-                    *(choice, self.splats, bold if finetune_steps else chosen),
+                    *(plan, self.splats, pruned if finetune_steps else settings),
                     cleaned=self.cleaned,
                     compacted=len(self.original) - len(self.splats),
                     finetune_steps=finetune_steps,
@@ -136,24 +136,21 @@ class Encoding:
                     progress=progress,
                 )
 
-            choice = chooser(chosen, self.progress)
-            if tuner is None or not choice.grid.mask.any():
-                return Container(files(choice, 0, self.progress), chosen)
-            start = choice if bold == chosen else chooser(bold, as_stage("finetune", self.progress))
-            encoded, report = tuner(choice, start, self.splats, files, checkpoint)
-            return Container(encoded, bold if report.kept else chosen, report)
+            plan = planner(settings, self.progress)
+            if tuner is None or not plan.grid.mask.any():
+                return Container(files(plan, 0, self.progress), settings)
+            start = plan if pruned == settings else planner(pruned, as_stage("finetune", self.progress))
+            encoded, report = tuner(plan, start, self.splats, files, checkpoint)
+            return Container(encoded, pruned if report.kept else settings, report)
 
         return encoder
 
-    def _bold(self, chosen: EncodeSettings) -> EncodeSettings:
-        """What training starts from: it closes holes, so more Gaussians may go."""
-        if not chosen.rate_distortion or chosen.prune_threshold_bits == 0:
-            return chosen
-        return chosen.model_copy(
-            update={
-                "prune_threshold_bits": max(chosen.prune_threshold_bits, self.settings.finetune.prune_threshold_bits)
-            }
-        )
+    def _pruned_for_finetune(self, settings: EncodeSettings) -> EncodeSettings:
+        """Return settings that prune more Gaussians: training closes the holes that they leave."""
+        if not settings.rate_distortion or settings.prune_threshold_bits == 0:
+            return settings
+        threshold = max(settings.prune_threshold_bits, self.settings.finetune.prune_threshold_bits)
+        return settings.model_copy(update={"prune_threshold_bits": threshold})
 
     def _tuner(self) -> Tuner | None:
         if not self.settings.finetune.enabled or len(self.splats) == 0:
@@ -167,14 +164,15 @@ class Encoding:
             progress=self.progress,
         )
 
-    def _chooser(self) -> Chooser:
-        return self._looking() if self.settings.encode.rate_distortion and len(self.splats) > 0 else self._blind
+    def _planner(self) -> Planner:
+        rate_distortion = self.settings.encode.rate_distortion and len(self.splats) > 0
+        return self._rd_planner() if rate_distortion else self._plan_without_sensitivity
 
-    def _blind(self, chosen: EncodeSettings, progress: Progress) -> EncodingPlan:
-        return plan_encoding(self.splats, chosen, threads=self.threads, progress=progress)
+    def _plan_without_sensitivity(self, settings: EncodeSettings, progress: Progress) -> EncodingPlan:
+        return plan_encoding(self.splats, settings, threads=self.threads, progress=progress)
 
-    def _looking(self) -> Chooser:
-        """Weighs by pictures of the scene, which are taken once."""
+    def _rd_planner(self) -> Planner:
+        """Measure the sensitivity once; return a planner that uses it for every plan."""
         from kissgs.cameras.virtual.sensitivity_cameras import sensitivity_cameras
         from kissgs.rendering.rasterizer import load_kernels as load_rasterizer
 
@@ -188,7 +186,7 @@ class Encoding:
         recolor = None
         if sensitivity is None or (captured and settings.color_refit_iterations):
             size = settings.sensitivity_view_size
-            watched = sensitivity_cameras(
+            cameras = sensitivity_cameras(
                 *(splats, views),
                 count=settings.sensitivity_views,
                 size=size,
@@ -196,84 +194,88 @@ class Encoding:
                 progress=self.progress,
             )
             if sensitivity is None:
-                view_uncertainty = (
-                    settings.view_uncertainty if settings.view_uncertainty is not None else HEDGE[captured]
-                )
-                sensitivity = _sensitivity(splats, watched, view_uncertainty, self.cache, *common)
-            if captured and settings.color_refit_iterations:  # virtual pictures would mislead it
-                recolor = _recolor(splats, watched, sensitivity, settings.color_refit_iterations, *common)
+                view_uncertainty = settings.view_uncertainty
+                if view_uncertainty is None:
+                    view_uncertainty = VIEW_UNCERTAINTY[captured]
+                sensitivity = _sensitivity(splats, cameras, view_uncertainty, self.cache, *common)
+            if captured and settings.color_refit_iterations:  # a refit to virtual cameras is worse than none
+                recolor = _recolor(splats, cameras, sensitivity, settings.color_refit_iterations, *common)
 
-        def chooser(chosen: EncodeSettings, progress: Progress) -> EncodingPlan:
-            def ready(stage: str, fraction: float, note: str = "") -> None:
-                if stage != "kernels":  # that was before
+        def planner(chosen: EncodeSettings, progress: Progress) -> EncodingPlan:
+            def without_kernels(stage: str, fraction: float, note: str = "") -> None:
+                if stage != "kernels":  # they are loaded already
                     progress(stage, fraction)
 
             return plan_encoding(
-                *(splats, chosen), sensitivity=sensitivity, recolor=recolor, threads=self.threads, progress=ready
+                *(splats, chosen),
+                sensitivity=sensitivity,
+                recolor=recolor,
+                threads=self.threads,
+                progress=without_kernels,
             )
 
-        return chooser
+        return planner
 
 
 def check_finetuning(settings: Settings, views: Views | None, device: Device) -> None:
-    """See that levels can be fine-tuned here, before the work that comes before.
+    """Check that fine-tuning is possible, before any other work.
 
     Raises:
-        UnsupportedError: no torch or no GPU; a goal that it would miss.
+        UnsupportedError: torch or a GPU is missing; the goal is one that fine-tuning would miss.
     """
     if find_spec("torch") is None:
         raise UnsupportedError(
-            "fine-tuning is done with torch, which is missing: pip install 'kissgs[train]' (a CPU build will do)"
+            "fine-tuning needs torch, which is missing: pip install 'kissgs[train]' (a CPU build is enough)"
         )
     if device == "cuda":
         need_cuda()
     if settings.encode.psnr is not None and views is not None and any(view.photo for view in views.train):
         raise UnsupportedError(
-            "psnr is that to the scene's own pictures, and fine-tuning by photographs leaves these for better ones; "
-            "ask for a size (--target-size), or fine-tune without photographs"
+            "psnr is measured against the scene's own renderings, from which fine-tuning on photographs moves away; "
+            "give a target size (--target-size), or fine-tune without photographs"
         )
 
 
 def _sensitivity(
     splats: Splats,
-    watched: WeightedCameras,
+    cameras: WeightedCameras,
     view_uncertainty: float,
     cache: Path | None,
     threads: int,
     progress: Progress,
 ) -> Sensitivity:
-    """Measured, or as it was kept in the file ``cache`` when it was measured before."""
+    """Measure the sensitivity, or read it from the file ``cache`` if that was made for this scene and these cameras."""
     from kissgs.rendering.sensitivity import measure_sensitivity
 
     if cache is None:
         return measure_sensitivity(
-            splats, watched, view_uncertainty=view_uncertainty, threads=threads, progress=progress
+            splats, cameras, view_uncertainty=view_uncertainty, threads=threads, progress=progress
         )
     key = hashlib.sha256(
-        f"{MEASURE} {__version__} {view_uncertainty} {splats.sh_degree} "
-        f"{watched.weights} {watched.spread} {watched.captured}".encode()
+        f"{SENSITIVITY_VERSION} {__version__} {view_uncertainty} {splats.sh_degree} "
+        f"{cameras.weights} {cameras.spread} {cameras.captured}".encode()
     )
-    for camera in watched.cameras:
+    for camera in cameras.cameras:
         key.update(camera.viewmat.tobytes() + camera.K.tobytes() + f"{camera.width} {camera.height} ".encode())
-    for values in (watched.background, *(getattr(splats, name) for name in ATTRIBUTES)):
+    for values in (cameras.background, *(getattr(splats, name) for name in ATTRIBUTES)):
         key.update(values.tobytes())
-    found = read_sensitivity(cache, key.hexdigest())
-    if found is None:
-        found = measure_sensitivity(
-            splats, watched, view_uncertainty=view_uncertainty, threads=threads, progress=progress
+    sensitivity = read_sensitivity(cache, key.hexdigest())
+    if sensitivity is None:
+        sensitivity = measure_sensitivity(
+            splats, cameras, view_uncertainty=view_uncertainty, threads=threads, progress=progress
         )
-        write_sensitivity(cache, found, key.hexdigest())
-    return found
+        write_sensitivity(cache, sensitivity, key.hexdigest())
+    return sensitivity
 
 
 def _recolor(
-    splats: Splats, watched: WeightedCameras, sensitivity: Sensitivity, steps: int, threads: int, progress: Progress
+    splats: Splats, cameras: WeightedCameras, sensitivity: Sensitivity, steps: int, threads: int, progress: Progress
 ) -> ColorRefit:
-    """Refits base colours to pictures of the scene."""
+    """Return a function that refits base colours to renderings of the scene from the capture's cameras."""
     from kissgs.rendering.color_refit import refit_colors
 
     def recolor(decoded: Splats, order: Int[np.ndarray, " M"]) -> Float32[np.ndarray, "M 3"]:
         weights = sensitivity.color_weight[order], sensitivity.prior[order]
-        return refit_colors(decoded, splats, watched, *weights, steps=steps, threads=threads, progress=progress)
+        return refit_colors(decoded, splats, cameras, *weights, steps=steps, threads=threads, progress=progress)
 
     return recolor

@@ -1,4 +1,4 @@
-"""What a scene file holds, without changing anything: for ``kissgs info``."""
+"""Describe the contents of a scene file, for ``kissgs info``."""
 
 from __future__ import annotations
 
@@ -25,20 +25,21 @@ MAX_PLANE_BYTES = 1 << 30
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Info:
-    """What a ``.ply`` or a container holds.
+    """Contents of a ``.ply`` or a container.
 
     Attributes:
-        path: of the file.
+        path: path of the file or folder.
         kind: "ply" or "sog-xt".
         count: Gaussians.
         sh_degree: 0 to 3.
-        bytes: of the file or the folder.
-        parts: bytes per file of a container.
-        ranges: per attribute, over its channels, the smallest and largest finite value (``.ply``), or the values of the
+        bytes: size of the file or the folder.
+        parts: bytes per file of a container; empty for a ``.ply``.
+        ranges: per attribute, over all channels, the smallest and largest finite value (``.ply``), or the values of the
             lowest and highest level (container; where channels share a step, few reach the highest).
-        changed: Gaussians that cleaning removes or mends (``.ply``), or that the encoder did (container), by reason.
-        details: encoding, and whether it is PlayCanvas' packed kind (``.ply``); grid and codebook side, version and
-            settings of the encoder (container).
+        changed: Gaussians that cleaning would remove or correct (``.ply``), or that the encoder removed or corrected
+            (container), by reason.
+        details: encoding and whether it is PlayCanvas' compressed layout (``.ply``); side of grid and codebook, version
+            and settings of the encoder (container).
     """
 
     path: str
@@ -53,16 +54,18 @@ class Info:
 
     @property
     def bits_per_gaussian(self) -> float:
-        """Of the whole file."""
+        """Bits of the whole file per Gaussian."""
         return 8 * self.bytes / max(self.count, 1)
 
     def as_dict(self) -> dict[str, Any]:
-        """For machines."""
+        """Return all fields and derived figures for JSON."""
         return {**asdict(self), "bits_per_gaussian": self.bits_per_gaussian}
 
 
 def describe(path: Path) -> Info:
-    """Read what :class:`Info` says. A container's images are not decoded (but for a mask that nothing else counts).
+    """Describe a scene file.
+
+    No image of a container is decoded, except the mask if the metadata does not state the number of Gaussians.
 
     Raises:
         KissgsError: the file is not a usable scene or container.
@@ -99,7 +102,7 @@ def _describe_container(path: Path) -> Info:
         present = files.names()
         missing = [name for name in PLANES if name not in present]
         if missing:
-            raise InvalidContainerError(f"{path} lacks {', '.join(missing)}")
+            raise InvalidContainerError(f"{path} is incomplete: missing {', '.join(missing)}")
         parts = {name: files.size(name) for name in FILES if name in present}
         count = layout.count if layout.count is not None else _count_mask(files, layout)
     made = layout.provenance

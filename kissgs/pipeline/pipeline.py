@@ -1,4 +1,4 @@
-"""``compact``, ``compress`` and ``decompress``: the stages put together, and the report of what each took and gave."""
+"""``compact``, ``compress`` and ``decompress``: all stages in order, and the report."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import numpy as np
 from kissgs.compaction.result import Compacted
 from kissgs.core.array_types import Int
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.progress import Annotated, Progress, as_stage, silent, until_the_end
+from kissgs.core.progress import Progress, SearchNote, as_stage, ignore_stop_search, silent
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats
-from kissgs.core.timing import Clock, peak_memory
+from kissgs.core.timing import StageTimer, peak_memory
 from kissgs.pipeline.report import Report
 from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, save
 from kissgs.rendering.rasterizer import Device
@@ -38,10 +38,10 @@ class Compressed:
     """A container in memory.
 
     Attributes:
-        files: name -> bytes.
-        order: ``(M,)`` for every Gaussian of the container, in its order, the index it has in the cleaned scene.
-        report: what it took and gave.
-        checkpoints: of compaction and fine-tuning, if they are still there because nothing was written.
+        files: bytes of each file by name.
+        order: ``(M,)`` index in the cleaned scene of each Gaussian of the container, in the container's order.
+        report: sizes, counts, errors, times and settings.
+        checkpoints: files of compaction and fine-tuning that still exist because no destination was given.
     """
 
     files: Mapping[str, bytes]
@@ -50,14 +50,14 @@ class Compressed:
     checkpoints: tuple[Path, ...] = ()
 
     def to_zip(self) -> bytes:
-        """The container as one zip."""
+        """Return the container as the bytes of a zip."""
         return zip_bytes(self.files)
 
     def save(self, path: AnyPath, *, overwrite: bool = False) -> None:
-        """Write a zip (if the name ends in ``.zip``) or a folder, whole or not at all.
+        """Write a zip (if the name ends in ``.zip``) or a folder, atomically.
 
         Raises:
-            OutputError: it exists and ``overwrite`` is false, or the file system refuses.
+            OutputError: the path exists and ``overwrite`` is false, or writing fails.
         """
         write_container(self.files, Path(path), overwrite=overwrite)
 
@@ -75,35 +75,35 @@ def compact(
     device: Device = "cpu",
     progress: Progress = silent,
 ) -> Compacted:
-    """Bring a scene down to fewer Gaussians that show the same.
+    """Reduce the number of Gaussians of a scene while keeping its renderings: score, prune, train.
 
     Args:
-        source: a scene, or the path or the bytes of a ``.ply``, or a container.
+        source: a scene, or the path or the bytes of a ``.ply`` or a container.
         destination: ``.ply`` to write; by default nothing is written.
         settings: their group ``compact`` says how many Gaussians to keep, and how: for example
             ``Settings.from_preset("balanced", compact={"ratio": 0.2})``.
         evaluate: measure PSNR, SSIM and bytes after every step, for the report.
-        views: a capture of the scene to learn from, and its held-out views to judge by; by default virtual cameras, and
-            the scene itself is the teacher.
-        checkpoint: file in which the state of the training is kept every half minute. If the same call is made again,
-            it goes on from there and ends as if nothing had been. When ``destination`` is written it is removed.
+        views: capture whose training photographs are the targets, and whose held-out views are for evaluation; by
+            default renderings of the scene from virtual cameras.
+        checkpoint: file in which the state of the training is saved every half minute. An identical call resumes from
+            it with an identical result. It is removed once ``destination`` is written.
         overwrite: replace ``destination`` if it exists.
-        threads: 0 means one per processor; the result does not depend on it.
-        device: where to train; ``"cuda"`` needs the extra ``kissgs[cuda]``.
-        progress: receives events; raise :class:`kissgs.Cancelled` from it to stop. Nothing is written then.
+        threads: number of threads; 0 means one per processor. The result does not depend on it.
+        device: device of the training; ``"cuda"`` needs the extra ``kissgs[cuda]``.
+        progress: receives events; raise :class:`kissgs.Cancelled` from it to stop, and nothing is written.
 
     Returns:
-        The smaller scene, and the report.
+        The compacted scene and the report.
 
     Raises:
-        KissgsError: one of its children, with a sentence for the user.
+        KissgsError: one of its subclasses, with a message for the user.
     """
     from kissgs.compaction.budget import compact_scene
 
     target = Path(destination) if destination is not None else None
     if target is not None:
         check_ply(target, overwrite=overwrite)
-    clock = Clock(progress)
+    clock = StageTimer(progress)
     splats, cleaned, _ = open_scene(source, threads, clock)
     result = compact_scene(
         *(splats, settings.compact, views),
@@ -114,7 +114,12 @@ def compact(
         progress=clock,
     )
     if target is not None:
-        save(result.splats, target, overwrite=overwrite, progress=until_the_end(clock) if settings.searches else clock)
+        save(
+            result.splats,
+            target,
+            overwrite=overwrite,
+            progress=ignore_stop_search(clock) if settings.searches else clock,
+        )
         forget(result.checkpoint)
     clock.stop()
     report = replace(result.report, cleaned=cleaned, cpu_seconds=clock.cpu_seconds, peak_memory=peak_memory())
@@ -139,31 +144,32 @@ def compress(
     """Compress a scene into a SOG-XT container.
 
     Args:
-        source: a scene, or the path or the bytes of a ``.ply`` (a container is decoded and encoded anew).
+        source: a scene, or the path or the bytes of a ``.ply`` or a container (which is decoded and encoded again).
         destination: ``.zip`` or folder to write; by default nothing is written.
         settings: by default those of the preset ``balanced``. If their group ``compact`` has a budget, the scene is
-            compacted first, see :func:`kissgs.compact`; if their group ``finetune`` is ``wanted``, the levels are then
-            fitted to photographs, or to pictures of the scene.
-        sensitivity: of a clean ``source``, measured before (:func:`kissgs.measure_sensitivity`); by default it is
-            measured if the settings ask for it.
-        cache: ``.npz`` in which to keep the sensitivity that was measured. Next time it is taken from there, if neither
-            the scene nor the cameras have changed, and replaced otherwise.
-        evaluate: decode the result and compare its pictures with those of the cleaned scene, and with the photographs
+            compacted first, see :func:`kissgs.compact`; if their group ``finetune`` is ``enabled``, the levels are then
+            fine-tuned on the photographs of ``views``, or on renderings of the scene.
+        sensitivity: sensitivity of a clean ``source`` (:func:`kissgs.measure_sensitivity`); by default it is measured
+            if the settings need it.
+        cache: ``.npz`` file for the measured sensitivity. It is read if scene and cameras are unchanged since it was
+            written, and replaced otherwise.
+        evaluate: decode the result and compare its renderings with those of the cleaned scene, and with the photographs
             of ``views`` if they have any; see :func:`kissgs.evaluate`. The report then has an ``evaluation``.
-        views: a capture of the scene: its views for training are learned from and weigh the bits, those held out are
-            for evaluation; by default virtual cameras for all. Settings that take no pictures use the latter alone.
-        checkpoint: of the compaction, see :func:`kissgs.compact`. Fine-tuning has one of its own beside it, with
-            "-finetune" in its name; a search for a goal keeps none of that.
+        views: capture of the scene: its training views give the sensitivity and the training targets, its held-out
+            views are for evaluation; by default virtual cameras. Presets without rate-distortion planning use the
+            held-out views only.
+        checkpoint: checkpoint file of the compaction, see :func:`kissgs.compact`. Fine-tuning has another one beside
+            it, with "-finetune" in its name, except in a search for a goal.
         overwrite: replace ``destination`` if it exists.
-        threads: 0 means one per processor; the bytes do not depend on it.
-        device: of compaction's and fine-tuning's training, likewise.
-        progress: receives events; raise :class:`kissgs.Cancelled` from it to stop. Nothing is written then.
+        threads: number of threads; 0 means one per processor. The bytes do not depend on it.
+        device: device of the training in compaction and fine-tuning; ``"cuda"`` needs the extra ``kissgs[cuda]``.
+        progress: receives events; raise :class:`kissgs.Cancelled` from it to stop, and nothing is written.
 
     Returns:
-        The container in memory, and the report.
+        The container in memory and the report.
 
     Raises:
-        KissgsError: one of its children, with a sentence for the user.
+        KissgsError: one of its subclasses, with a message for the user.
     """
     from kissgs.pipeline.encoding import Encoding, check_finetuning
 
@@ -171,12 +177,12 @@ def compress(
     target = Path(destination) if destination is not None else None
     if target is not None:
         check_destination(target, overwrite=overwrite)
-    kept = None
+    finetune_checkpoint = None
     if settings.finetune.enabled:
         check_finetuning(settings, views, device)
         if checkpoint is not None and not settings.encode.has_goal:
-            kept = beside(Path(checkpoint))
-    clock = Clock(progress)
+            finetune_checkpoint = beside(Path(checkpoint))
+    clock = StageTimer(progress)
     original, cleaned, source_bytes = open_scene(source, threads, clock)
     encoding = Encoding(
         splats=original,
@@ -186,24 +192,25 @@ def compress(
         cache=Path(cache) if cache is not None else None,
         views=views,
         cleaned=cleaned,
-        checkpoint=kept,
+        checkpoint=finetune_checkpoint,
         device=device,
         packed=target is None or is_packed(target),
         threads=threads,
-        progress=Annotated(clock),
+        progress=SearchNote(clock),
     )
-    compacted, search, trials = _compacted(encoding, checkpoint)
-    chosen = encoding if compacted is None else replace(encoding, splats=compacted.splats)
-    onwards = until_the_end(clock) if settings.searches else clock
+    compacted, search, trials = _compact_first(encoding, checkpoint)
+    if compacted is not None:
+        encoding = replace(encoding, splats=compacted.splats)
+    after_search = ignore_stop_search(clock) if settings.searches else clock
     if not settings.encode.has_goal:
-        chosen = replace(chosen, progress=Annotated(onwards))
-    container, more = chosen.run(search)
+        encoding = replace(encoding, progress=SearchNote(after_search))
+    container, more = encoding.run(search)
     encoded = container.encoded
     container_bytes, file_bytes = stored_sizes(encoded.files, packed=encoding.packed)
-    evaluation = _evaluate(original, encoded.files, views, threads, onwards) if evaluate else None
-    checkpoints = (None if compacted is None else compacted.checkpoint, kept)
+    evaluation = _evaluate(original, encoded.files, views, threads, after_search) if evaluate else None
+    checkpoints = (None if compacted is None else compacted.checkpoint, finetune_checkpoint)
     if target is not None:
-        onwards("write", 0.0)
+        after_search("write", 0.0)
         write_container(encoded.files, target, overwrite=overwrite)
         forget(*checkpoints)
     clock.stop()
@@ -219,27 +226,27 @@ def compress(
         finetuning=container.finetuning,
         invisible=encoded.invisible,
         pruned_by_rd=encoded.pruned_by_rd,
-        note=encoded.note,
+        note="; ".join(filter(None, [encoded.note, container.note])),
         clipped_colors=encoded.clipped_colors,
         form_error=encoded.form_error,
-        half_steps=encoded.errors,
+        max_quantization_error=encoded.errors,
         rd_lambda=encoded.rd_lambda,
         trials=trials + more,
         seconds=clock.seconds,
         cpu_seconds=clock.cpu_seconds,
         peak_memory=peak_memory(),
-        settings=_as_made(settings, container.settings),
+        settings=_settings_as_used(settings, container.settings),
         evaluation=evaluation,
     )
     order = encoded.order if compacted is None else compacted.index[encoded.order]
-    left = () if target is not None else tuple(path for path in checkpoints if path is not None)
-    return Compressed(encoded.files, order, report, left)
+    remaining = () if target is not None else tuple(path for path in checkpoints if path is not None)
+    return Compressed(encoded.files, order, report, remaining)
 
 
-def _as_made(asked: Settings, made: EncodeSettings) -> dict[str, Any]:
-    """What was asked for, with what a search for a goal and fine-tuning have changed of it."""
-    goals = {name: getattr(asked.encode, name) for name in (*GOALS, "rd_lambda")}
-    return asked.model_copy(update={"encode": made.model_copy(update=goals)}).model_dump(mode="json")
+def _settings_as_used(requested: Settings, used: EncodeSettings) -> dict[str, Any]:
+    """Return the requested settings with the changes by a search for a goal and by fine-tuning."""
+    goals = {name: getattr(requested.encode, name) for name in (*GOALS, "rd_lambda")}
+    return requested.model_copy(update={"encode": used.model_copy(update=goals)}).model_dump(mode="json")
 
 
 def decompress(
@@ -256,17 +263,17 @@ def decompress(
     Args:
         source: path of a zip or a folder, the bytes of a zip, or the files in memory.
         destination: ``.ply`` to write; by default nothing is written.
-        max_gaussians: refuse a container that holds more, before memory is taken for them.
+        max_gaussians: refuse a container that holds more, before memory is allocated for them.
         overwrite: replace ``destination`` if it exists.
-        threads: 0 means one per processor.
+        threads: number of threads; 0 means one per processor.
         progress: receives events.
 
     Returns:
-        The scene exactly as stored: quaternions as quantised, their length only about 1.
+        The scene exactly as stored: quaternions are as quantised, so their length is only approximately 1.
 
     Raises:
         InvalidContainerError: the container is damaged.
-        UnsupportedError: it has a feature that kissgs does not read.
+        UnsupportedError: the container has a feature that kissgs does not read.
         OutputError: ``destination`` cannot be written.
     """
     if destination is not None:
@@ -284,32 +291,32 @@ class _Common(TypedDict):
     progress: Progress
 
 
-def _compacted(
+def _compact_first(
     encoding: Encoding, checkpoint: AnyPath | None
 ) -> tuple[Compacted | None, RateControl | None, tuple[Trial, ...]]:
-    """What compaction leaves, if it is asked for; the search that was made on the way, and all attempts."""
-    splats, chosen, kept = encoding.splats, encoding.settings.compact, Path(checkpoint) if checkpoint else None
-    if not chosen.enabled:
+    """Compact the scene if requested; return the result, the search made with ``auto_count``, and its trials."""
+    splats, settings, path = encoding.splats, encoding.settings.compact, Path(checkpoint) if checkpoint else None
+    if not settings.enabled:
         return None, None, ()
     from kissgs.compaction.budget import NO_CHECKPOINT, Compactor, compact_scene, unchanged
     from kissgs.pipeline.count_search import CountSearch
 
     if encoding.sensitivity is not None:
-        raise UnsupportedError("sensitivity is that of a scene before its compaction; compact first, then measure")
+        raise UnsupportedError("this sensitivity is of the scene before compaction; compact first, then measure it")
     common: _Common = {"threads": encoding.threads, "device": encoding.device, "progress": encoding.progress}
-    if not chosen.auto_count:
-        return compact_scene(splats, chosen, encoding.views, checkpoint=kept, **common), None, ()
-    if kept is not None:
+    if not settings.auto_count:
+        return compact_scene(splats, settings, encoding.views, checkpoint=path, **common), None, ()
+    if path is not None:
         raise UnsupportedError(NO_CHECKPOINT.format("goal"))
     if len(splats) < 2:
-        return unchanged(splats, "and none to spare"), None, ()
-    return CountSearch(encoding, Compactor.of(splats, chosen, encoding.views, **common)).run()
+        return unchanged(splats, "too few to remove any"), None, ()
+    return CountSearch(encoding, Compactor.of(splats, settings, encoding.views, **common)).run()
 
 
 def _evaluate(
     splats: Splats, container: Mapping[str, bytes], views: Views | None, threads: int, progress: Progress
 ) -> Evaluation:
-    """One stage of compression, whatever stages of its own it has: decoding, kernels, pictures."""
+    """Evaluate a container, and report decoding, kernels and rendering as the one stage "evaluate"."""
     from kissgs.evaluation.evaluate import evaluate
 
     progress("evaluate", 0.0)

@@ -1,4 +1,4 @@
-"""Encodes until a goal is met: a size, a PSNR, or a loss of it."""
+"""Rate control: search for the lambda whose container meets a goal, which is a size, a PSNR or a drop of it."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING
 
 from kissgs.cameras.views import Views
 from kissgs.core.errors import StopSearch, UnsupportedError
-from kissgs.core.progress import Annotated
+from kissgs.core.progress import SearchNote
 from kissgs.core.root_finding import find_root
 from kissgs.core.splats import Splats
 from kissgs.evaluation.psnr_loss import SEARCH_SEED
 from kissgs.evaluation.results import MOST
 from kissgs.finetuning.result import FinetuneReport
 from kissgs.pipeline.trial import Trial
+from kissgs.planning.sh_codebook import COEFFICIENTS, codebook_side
 from kissgs.settings import EncodeSettings
 from kissgs.settings.encode import GOALS
 from kissgs.sogxt.container import stored_sizes
@@ -26,22 +27,40 @@ if TYPE_CHECKING:
     from kissgs.evaluation.evaluate import Picture
     from kissgs.evaluation.results import Evaluation
 
-PRICES = (-70.0, -6.0)
-"""Between which prices are sought, as powers of 2."""
+LOG2_LAMBDA_RANGE = (-70.0, -6.0)
+"""log2 of the smallest and the largest lambda that the search tries: the finest and the coarsest container."""
 
 MIN_STEP_LOG2 = 1 / 32
-"""Powers of 2: a size that jumps between prices as near as this jumps for good, and is not looked for any finer."""
+"""Below this interval of log2(lambda), a jump of the size is taken for a discontinuity and not searched further."""
 
-NOT_TUNED = "no fine-tuned container serves the goal better; this one is as it was without"
+FAR_BELOW_LOG2 = 0.5
+"""If the images of the first container could grow by this much (log2 of bytes), the finest container is tried next."""
+
+PLANE_CHANNELS = 21
+"""Bytes per cell of all grid images before compression: mask 1, means 6, opacity 1, scales 3, quaternions 4, base
+colour 3, codebook labels 3."""
+
+WEBP_EXPANSION = 1.1
+"""Generous bound of lossless WebP: bytes of an image in units of its channels times its pixels, beyond small images."""
+
+NOT_FINETUNED = "no fine-tuned container meets the goal better: this one is not fine-tuned"
 
 
 @dataclass(frozen=True, slots=True)
 class Container:
-    """The files, with which settings they were made, and how they were improved, if they were."""
+    """A container in memory.
+
+    Attributes:
+        encoded: its files, with the report of the encoder.
+        settings: the settings that it was made with.
+        finetuning: report of its fine-tuning; None without fine-tuning.
+        note: what the user may not expect of it; empty if there is nothing to say.
+    """
 
     encoded: Encoded
     settings: EncodeSettings
     finetuning: FinetuneReport | None = None
+    note: str = ""
 
 
 Encoder = Callable[[EncodeSettings], Container]
@@ -49,12 +68,12 @@ Encoder = Callable[[EncodeSettings], Container]
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """What a container should be like.
+    """A goal for a container: a size, a PSNR, or a drop of PSNR.
 
     Attributes:
-        settings: with one goal.
-        slope: of :meth:`spare`, per doubling of the price of a bit, about.
-        near: spare that is near enough to none.
+        settings: settings that name exactly one goal.
+        slope: typical change of :meth:`margin` per doubling of lambda.
+        near: margin that is small enough to stop the search.
     """
 
     settings: EncodeSettings
@@ -63,7 +82,7 @@ class Goal:
 
     @classmethod
     def of(cls, settings: EncodeSettings) -> Goal:
-        """The goal of these settings: of sizes 3 % to spare will do, of a PSNR 0.1 dB, of a loss 0.02 dB."""
+        """Return the goal of these settings; near is 3 % of a size, 0.1 dB of a PSNR or 0.02 dB of a drop."""
         if settings.target_size is not None:
             return cls(settings, 0.2, -math.log2(0.97))
         if settings.psnr is not None:
@@ -72,13 +91,14 @@ class Goal:
 
     @property
     def by_size(self) -> bool:
-        """Whether no pictures are needed to tell that it is met."""
+        """Whether the goal is a size, so that no rendering is needed to evaluate it."""
         return self.settings.target_size is not None
 
     def margin(self, trial: Trial) -> float:
-        """At least 0 where the goal is met: sizes and losses as powers of 2, PSNR in decibels.
+        """Return by how much a trial exceeds the goal: at least 0 where it is met.
 
-        Infinite where nothing is lost, so that it is not known how much may still go.
+        The unit is log2 of a ratio for sizes and drops, and decibels for a PSNR. Infinite where no PSNR is lost at all:
+        then the distance to the goal is unknown.
         """
         if self.settings.target_size is not None:
             return math.log2(self.settings.target_size / trial.bytes)
@@ -86,51 +106,52 @@ class Goal:
             return (trial.psnr or 0.0) - self.settings.psnr
         if (
             trial.drop is None or trial.drop == math.inf
-        ):  # infinite where photographs were equal to the scene's pictures
+        ):  # infinite where the photographs equal the renderings of the scene
             return -math.inf
-        if trial.drop <= 0:  # photographs may even find a container better
+        if trial.drop <= 0:  # a container may even be closer to the photographs than the scene
             return math.inf
         return math.log2((self.settings.max_psnr_drop or 1.0) / trial.drop)
 
-    def failure_message(self, trials: Sequence[Trial], *, fewer: bool) -> str:
-        """Why none of these will do; ``fewer``: whether fewer Gaussians have not been tried, and may serve."""
-        at = (max if self.by_size else min)((trial.rd_lambda for trial in trials if trial.rd_lambda), default=None)
-        trials = [trial for trial in trials if trial.rd_lambda in (None, at)]  # where another ends, too
+    def failure_message(self, trials: Sequence[Trial], *, suggest_compaction: bool) -> str:
+        """Return why no trial meets the goal; ``suggest_compaction``: whether fewer Gaussians might, untried so far."""
+        lambdas = [trial.rd_lambda for trial in trials if trial.rd_lambda]
+        extreme = (max if self.by_size else min)(lambdas, default=None)
+        trials = [trial for trial in trials if trial.rd_lambda in (None, extreme)]  # the last resort of each search
         if self.settings.target_size is not None:
-            least, wanted = min(trial.bytes for trial in trials), int(self.settings.target_size)
+            smallest, target = min(trial.bytes for trial in trials), int(self.settings.target_size)
             return (
-                f"no container of this scene that was found has at most {wanted:,} byte{'' if wanted == 1 else 's'}, "
-                f"the smallest has {least:,}; ask for no less than that"
-                + (", or let Gaussians go: --compact auto" if fewer else "")
+                f"target_size {target:,} byte{'' if target == 1 else 's'} cannot be met: the smallest container found "
+                f"has {smallest:,}; ask for at least that"
+                + (", or for fewer Gaussians: --compact auto" * suggest_compaction)
             )
         if self.settings.psnr is not None:
-            most = math.floor(100 * max(trial.psnr or 0.0 for trial in trials)) / 100
+            highest = math.floor(100 * max(trial.psnr or 0.0 for trial in trials)) / 100
             return (
-                f"no container of this scene that was found has {self.settings.psnr:g} dB, the finest has {most:.2f}; "
-                "ask for no more than that"
-                + (f"; views count for at most {MOST:g} dB each" if self.settings.psnr > MOST else "")
+                f"psnr {self.settings.psnr:g} dB cannot be met: the finest container found has {highest:.2f} dB; "
+                "ask for at most that"
+                + (f"; each view counts for at most {MOST:g} dB" if self.settings.psnr > MOST else "")
             )
-        least_lost = 1.005 * min(math.inf if trial.drop is None else trial.drop for trial in trials)
+        smallest_drop = 1.005 * min(math.inf if trial.drop is None else trial.drop for trial in trials)
         return (
-            f"no container of this scene that was found loses at most {self.settings.max_psnr_drop:g} dB, the finest "
-            f"loses {least_lost:.3g}; allow as much"
+            f"max_psnr_drop {self.settings.max_psnr_drop:g} dB cannot be met: the finest container found loses "
+            f"{smallest_drop:.3g} dB; allow at least that"
         )
 
 
 class RateControl:
-    """For the price at which a container meets the goal of the settings, and hardly more.
+    """Search for the lambda at which a container just meets the goal of the settings.
 
-    Among those that meet it the best is the largest, where a size is the goal, or the smallest. Of fine-tuned ones for
-    a size, it is the one that those views which judge them find best.
+    Of the containers that meet the goal, the best is the largest if the goal is a size, else the smallest. Of
+    fine-tuned containers for a size, the best has the highest PSNR in the evaluation views of fine-tuning.
 
     Attributes:
-        goal: of the settings.
-        settings: with which containers are made: those that were asked for, or with another codebook.
-        trials: all attempts.
-        best: of them; None if none met the goal.
-        stopped: whether somebody said that it was enough.
-        hopeless: whether ``limit`` was reached.
-        overhead: bytes of a container that are no images, however few Gaussians it holds.
+        goal: goal of the settings.
+        settings: settings of the containers: those given, with another codebook size where the goal needs it.
+        trials: all containers made so far.
+        best: best container so far; None if none meets the goal.
+        stopped: whether the search was stopped from outside (:class:`kissgs.StopSearch`).
+        cannot_improve: whether ``byte_limit`` was reached.
+        overhead: bytes of the latest container that are no images.
     """
 
     def __init__(
@@ -139,88 +160,85 @@ class RateControl:
         settings: EncodeSettings,
         views: Views | None,
         threads: int,
-        progress: Annotated,
+        progress: SearchNote,
         *,
         count: int | None = None,
         packed: bool = True,
-        limit: float = math.inf,
+        byte_limit: float = math.inf,
     ) -> None:
-        """Nothing is tried yet.
+        """Prepare the search; nothing is encoded yet.
 
         Args:
-            original: whose pictures tell what is lost.
-            settings: with a goal.
-            views: from where; None: cameras drawn over the whole scene.
-            threads: 0 means one per processor.
-            progress: whose note tells where the search stands.
-            count: Gaussians of what is encoded, if it is not the original.
-            packed: whether the files become a zip.
-            limit: where pictures are the goal: bytes that a container must not have to be of use.
+            original: reference scene of the evaluation.
+            settings: settings with one goal.
+            views: views of the evaluation; None for cameras drawn over the whole scene.
+            threads: number of threads; 0 means one per processor.
+            progress: receives events; its note is set to the latest trial.
+            count: number of Gaussians of the scene that is encoded, if it is not ``original``.
+            packed: whether the files become a zip, whose size then counts; False for a folder.
+            byte_limit: for a PSNR or a drop: the search ends if a container of this size or more misses the goal.
         """
         self.original, self.settings, self.goal = original, settings, Goal.of(settings)
         self.views, self.threads, self.progress = views, threads, progress
         self.count = len(original) if count is None else count
-        self.packed, self.limit = packed, limit
+        self.packed, self.byte_limit = packed, byte_limit
         self.trials: list[Trial] = []
         self.best: Container | None = None
-        self.stopped = self.hopeless = False
+        self.stopped = self.cannot_improve = False
         self.overhead = 0
         self._bytes = 0
-        self._known: dict[float, _Sample] = {}
+        self._samples: dict[float, _Sample] = {}
+        self._finest: tuple[EncodeSettings, _Sample] | None = None
         self._jump: tuple[float, int] | None = None
         self._psnr: float | None = None
-        self._tuned: FinetuneReport | None = None
-        self._taken: dict[str, Picture] | None = None
+        self._finetuning: FinetuneReport | None = None
+        self._rendered: dict[str, Picture] | None = None
 
     def search_all(self, encoder: Encoder) -> None:
-        """As many attempts as the settings have; with another codebook where one in balance with the rest will not do.
+        """Search with up to ``max_encodes`` containers; change the codebook size if lambda alone cannot meet the goal.
 
-        Its size is bounded for the sake of time, and its side is a multiple of 8: there may be nothing beyond that
-        bound, and nothing between two sides.
+        The codebook size is limited by ``gaussians_per_codebook_entry`` to save time, and its side is a multiple of 8.
+        So the goal may lie beyond that limit, or between the containers of two sides.
+        If the first container is far below the target size, the second one is the finest; the search ends if it fits.
         """
         self.run(encoder)
-        if (
-            self._short
-            and self.settings.gaussians_per_codebook_entry > 1
-            and self.original.sh_degree > 0
-            and self._known
-        ):
-            largest = max(known.side for known in self._known.values())
-            bounded = max(x for x, known in self._known.items() if known.side == largest)
-            self._known = {x: known for x, known in self._known.items() if known.side < largest}
-            self._again(encoder, 2.0**bounded, gaussians_per_codebook_entry=1.0)
+        if self._samples and self._short and self._is_codebook_limited(self.settings):
+            largest = max(sample.side for sample in self._samples.values())
+            coarsest = max(x for x, sample in self._samples.items() if sample.side == largest)
+            self._samples = {x: sample for x, sample in self._samples.items() if sample.side < largest}
+            self._search_again(encoder, 2.0**coarsest, gaussians_per_codebook_entry=1.0)
         if self._jump is not None:
             rd_lambda, side = self._jump
-            self._known = {x: known for x, known in self._known.items() if known.side <= side}
-            self._again(encoder, rd_lambda, sh_codebook_size=side**2)
-        self._known = {}  # nothing of what fine-tuning will find
+            self._samples = {x: sample for x, sample in self._samples.items() if sample.side <= side}
+            self._search_again(encoder, rd_lambda, sh_codebook_size=side**2)
+        self._samples, self._finest = {}, None  # not comparable with fine-tuned containers
         if self.best is not None:
-            made = self.best.settings
+            used = self.best.settings
             self.settings = self.settings.model_copy(
                 update={
-                    "gaussians_per_codebook_entry": made.gaussians_per_codebook_entry,
-                    "sh_codebook_size": made.sh_codebook_size,
+                    "gaussians_per_codebook_entry": used.gaussians_per_codebook_entry,
+                    "sh_codebook_size": used.sh_codebook_size,
                 }
             )
 
-    def _again(self, encoder: Encoder, rd_lambda: float, **changes: float) -> None:
-        left = self.settings.max_encodes - len(self.trials)
-        if left > 0 and not (self.stopped or self.hopeless):
+    def _search_again(self, encoder: Encoder, rd_lambda: float, **changes: float) -> None:
+        remaining = self.settings.max_encodes - len(self.trials) + (self._finest is not None)
+        if remaining > 0 and not (self.stopped or self.cannot_improve):
             self.settings = self.settings.model_copy(update=changes)
-            self.run(encoder, rd_lambda, left)
+            self.run(encoder, rd_lambda, remaining)
 
     @property
     def _short(self) -> bool:
-        """Whether nothing was good enough, or nothing large enough."""
-        spares = [self.goal.margin(trial) for trial in self.trials]
-        return min(spares) > self.goal.near if self.goal.by_size else max(spares) < 0
+        """Whether all samples are well below the target size, or all miss the quality goal."""
+        margins = [sample.margin for sample in self._samples.values()]
+        return min(margins) > self.goal.near if self.goal.by_size else max(margins) < 0
 
     def run(self, encoder: Encoder, rd_lambda: float | None = None, attempts: int | None = None) -> None:
-        """Make up to ``attempts`` containers, by default as many as the settings allow, the first at ``rd_lambda``."""
+        """Make up to ``attempts`` containers, by default ``max_encodes``, the first at ``rd_lambda``."""
         try:
             self._run(encoder, rd_lambda, attempts or self.settings.max_encodes)
         except _CannotImprove:
-            self.hopeless = True
+            self.cannot_improve = True
         except StopSearch:
             if self.best is None:
                 raise
@@ -228,110 +246,168 @@ class RateControl:
         finally:
             self.progress.note = ""
 
-    def found(self, *, all_stay: bool = True) -> Container:
-        """The best; where fine-tuning has not found it, with a report that says so.
+    def result(self, *, suggest_compaction: bool = True) -> Container:
+        """Return the best container; its reports say if fine-tuning was in vain, or if the target size is out of reach.
 
         Raises:
-            UnsupportedError: none met the goal. ``all_stay``: whether none with fewer Gaussians may be tried.
+            UnsupportedError: no container meets the goal. With ``suggest_compaction``, the message may advise fewer
+                Gaussians.
         """
         if self.best is None:
-            fewer = all_stay and self.count > 1 and self.overhead < (self.settings.target_size or 0)
-            raise UnsupportedError(self.goal.failure_message(self.trials, fewer=fewer))
-        if self._tuned is None or self.best.finetuning is not None:
-            return self.best
-        return replace(self.best, finetuning=replace(self._tuned, kept=False, note=NOT_TUNED))
+            suggest = suggest_compaction and self.count > 1 and self.overhead < (self.settings.target_size or 0)
+            raise UnsupportedError(self.goal.failure_message(self.trials, suggest_compaction=suggest))
+        best = replace(self.best, note=self._surplus_note(self.best))
+        if self._finetuning is None or best.finetuning is not None:
+            return best
+        return replace(best, finetuning=replace(self._finetuning, kept=False, note=NOT_FINETUNED))
+
+    def _surplus_note(self, best: Container) -> str:
+        """Say that the finest container of the scene is below the target size; empty if that is not the case."""
+        target = self.settings.target_size
+        if target is None or best.encoded.rd_lambda != 2.0 ** LOG2_LAMBDA_RANGE[0]:
+            return ""
+        if self._is_codebook_limited(best.settings):
+            return ""
+        if math.log2(target / self._bytes) <= self.goal.near:
+            return ""
+        return f"target_size {int(target):,} bytes is above the finest container of this scene: {self._bytes:,} bytes"
 
     def _run(self, encoder: Encoder, rd_lambda: float | None, attempts: int) -> None:
-        first = encoder(self.settings if rd_lambda is None else self._at(rd_lambda))
-        start = self._judge(first)
-        if first.encoded.rd_lambda is not None:
-            begin = math.log2(first.encoded.rd_lambda)
+        first = encoder(self.settings if rd_lambda is None else self._settings_at(rd_lambda))
+        first_margin = self._evaluate(first)
+        if first.encoded.rd_lambda is None:
+            return
+        if (
+            rd_lambda is None
+            and attempts > 1
+            and self._is_far_below(self.trials[-1].bytes)
+            and self._finest_fits(encoder)
+        ):
+            return
+        start = math.log2(first.encoded.rd_lambda)
 
-            def spare(x: float) -> float:
-                container = first if x == begin else encoder(self._at(2.0**x))
-                found = start if x == begin else self._judge(container)
-                self._known[x] = _Sample(container.encoded.codebook_side, found)
-                return found
+        def margin_at(x: float) -> float:
+            settings = self._settings_at(2.0**x)
+            if x == start:
+                sample = _Sample(first.encoded.codebook_side, first_margin)
+            elif self._finest is not None and settings == self._finest[0]:
+                sample = self._finest[1]
+            else:
+                sample = self._sample(encoder(settings))
+            self._samples[x] = sample
+            return sample.margin
 
-            find_root(
-                spare,
-                *(begin, self.goal.slope, self.goal.near, PRICES),
-                attempts=attempts,
-                settled=self._settled,
-                before={x: known.margin for x, known in self._known.items()},
-            )
+        find_root(
+            margin_at,
+            *(start, self.goal.slope, self.goal.near, LOG2_LAMBDA_RANGE),
+            attempts=attempts,
+            settled=self._is_jump,
+            before={x: sample.margin for x, sample in self._samples.items()},
+        )
 
-    def _settled(self, inside: float, outside: float) -> bool:
-        """Whether what lies between these prices, as powers of 2, is a jump.
+    def _is_far_below(self, size: int) -> bool:
+        """Whether the finest container may fit into the target size, given the bytes of the first container."""
+        target = self.settings.target_size
+        if target is None:
+            return False
+        growth = (target - self.overhead) / max(size - self.overhead, 1)
+        return growth >= 2**FAR_BELOW_LOG2 or target >= min(self._most_bytes(), self.original.nbytes)
 
-        Where a size is the goal, what is made finer with the codebook of ``inside`` is only better than that; pictures
-        are better served by the codebook of the finer one.
+    def _finest_fits(self, encoder: Encoder) -> bool:
+        """Make the finest container, with the largest codebook; it is not counted in ``max_encodes`` if too large."""
+        limited = self._is_codebook_limited(self.settings)
+        unlimited = self.settings.model_copy(update={"gaussians_per_codebook_entry": 1.0} if limited else {})
+        settings = self._settings_at(2.0 ** LOG2_LAMBDA_RANGE[0], unlimited)
+        sample = self._sample(encoder(settings))
+        if sample.margin < 0:
+            self._finest = settings, sample
+        return sample.margin >= 0
+
+    def _is_codebook_limited(self, settings: EncodeSettings) -> bool:
+        """Whether ``gaussians_per_codebook_entry`` may keep the codebook smaller than the goal allows."""
+        return settings.gaussians_per_codebook_entry > 1 and self.original.sh_degree > 0
+
+    def _most_bytes(self) -> float:
+        """Return an upper bound of the size of any container of the scene: all images uncompressed, and the rest."""
+        entries = min(self.settings.sh_codebook_size, self.count)
+        codebook = 3 * COEFFICIENTS * codebook_side(entries) ** 2
+        cells = (math.isqrt(self.count) + 9) ** 2  # the side of the grid is a multiple of 8
+        return WEBP_EXPANSION * (PLANE_CHANNELS * cells + codebook) + 2 * self.overhead
+
+    def _is_jump(self, inside: float, outside: float) -> bool:
+        """Whether the size jumps between two values of log2(lambda), the last that fits and the next that does not.
+
+        If it jumps because the codebook does, the search goes on with the smaller of the two codebooks at the finer
+        lambda. Only for sizes: for a PSNR or a drop, the codebook that belongs to the finer lambda is the better one.
         """
         if not self.goal.by_size:
             return False
-        one, other, gap = self._known[inside], self._known[outside], abs(inside - outside)
+        one, other, gap = self._samples[inside], self._samples[outside], abs(inside - outside)
         smooth = gap * abs(self.goal.slope)
         jumps = gap < 1 and (smooth < self.goal.near or one.margin - other.margin > 2 * smooth)
-        if jumps and one.side != other.side and self._tuned is None:
+        if jumps and one.side != other.side and self._finetuning is None:
             self._jump = 2.0 ** min(inside, outside), min(one.side, other.side)
             return True
         return gap < MIN_STEP_LOG2
 
-    def _at(self, rd_lambda: float) -> EncodeSettings:
-        without = dict.fromkeys(GOALS)
-        return EncodeSettings(**{**self.settings.model_dump(), **without, "rd_lambda": rd_lambda})
+    def _settings_at(self, rd_lambda: float, settings: EncodeSettings | None = None) -> EncodeSettings:
+        no_goal = dict.fromkeys(GOALS)
+        return EncodeSettings(**{**(settings or self.settings).model_dump(), **no_goal, "rd_lambda": rd_lambda})
 
-    def _judge(self, container: Container) -> float:
-        """What is to spare: at least 0 where the goal is met."""
+    def _sample(self, container: Container) -> _Sample:
+        return _Sample(container.encoded.codebook_side, self._evaluate(container))
+
+    def _evaluate(self, container: Container) -> float:
+        """Record a container as a trial, and as the best if it is; return its margin to the goal."""
         encoded = container.encoded
         size, sizes = stored_sizes(encoded.files, packed=self.packed)
         trial = Trial(self.count, encoded.rd_lambda, size)
         if not self.goal.by_size:
-            trial = trial.with_pictures(self.pictures(encoded))
+            trial = trial.with_evaluation(self.evaluate(encoded))
         self.trials.append(trial)
-        self.overhead = size - sum(taken for name, taken in sizes.items() if name.endswith(".webp"))
-        self.progress.note = f"try {len(self.trials) + 1}, after {trial.spelled()}"
-        spare = self.goal.margin(trial)
-        self._tuned = container.finetuning or self._tuned
-        if spare >= 0 and self._better(container, size):
+        self.overhead = size - sum(stored for name, stored in sizes.items() if name.endswith(".webp"))
+        self.progress.note = f"try {len(self.trials) + 1}, last: {trial.summary()}"
+        margin = self.goal.margin(trial)
+        self._finetuning = container.finetuning or self._finetuning
+        if margin >= 0 and self._is_better(container, size):
             self.best, self._bytes = container, size
-        if spare < 0 and not self.goal.by_size and size >= self.limit:
+        if margin < 0 and not self.goal.by_size and size >= self.byte_limit:
             raise _CannotImprove
-        return spare
+        return margin
 
-    def _better(self, container: Container, size: int) -> bool:
-        """Than the best so far; both meet the goal."""
-        tuned = container.finetuning
-        if tuned is None or not self.goal.by_size:
+    def _is_better(self, container: Container, size: int) -> bool:
+        """Whether a container that meets the goal is better than the best so far."""
+        finetuning = container.finetuning
+        if finetuning is None or not self.goal.by_size:
             return self.best is None or (size > self._bytes if self.goal.by_size else size < self._bytes)
-        if self._psnr is None and self.best is not None:  # the first is tuned at the price of the best
-            self._psnr = tuned.psnr_before
-        psnr = tuned.psnr_after if tuned.kept else tuned.psnr_before
+        if self._psnr is None and self.best is not None:  # the first is fine-tuned at the lambda of the best
+            self._psnr = finetuning.psnr_before
+        psnr = finetuning.psnr_after if finetuning.kept else finetuning.psnr_before
         if self._psnr is not None and psnr < self._psnr:
             return False
         self._psnr = psnr
         return True
 
-    def pictures(self, encoded: Encoded) -> Evaluation:
-        """Of a container beside those of the original."""
+    def evaluate(self, encoded: Encoded) -> Evaluation:
+        """Compare the renderings of a container with those of the original, or both with the photographs."""
         from kissgs.evaluation.cameras import evaluation_views
         from kissgs.evaluation.evaluate import compare_pictures
 
         self.progress("evaluate", 0.0)
         if self.views is None:
             self.views = evaluation_views(self.original, seed=SEARCH_SEED, threads=self.threads)
-            self._taken = {}
+            self._rendered = {}
         decoded = decode(encoded.files, max_gaussians=max(len(self.original), MAX_GAUSSIANS), threads=self.threads)
-        return compare_pictures(self.original, decoded, self.views, threads=self.threads, taken=self._taken)
+        return compare_pictures(self.original, decoded, self.views, threads=self.threads, taken=self._rendered)
 
 
 @dataclass(frozen=True, slots=True)
 class _Sample:
-    """Of a container: the side of its codebook's image, and what it left to spare."""
+    """One container: the side of its codebook's image in pixels, and its margin to the goal."""
 
     side: int
     margin: float
 
 
 class _CannotImprove(Exception):
-    """No container of this scene can be better than one that is known of another."""
+    """Raised when no container of this scene can become smaller than one that is known of another scene."""

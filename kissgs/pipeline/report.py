@@ -1,4 +1,4 @@
-"""``Report``: what a compression took and gave."""
+"""``Report``: sizes, counts, errors, times and settings of one compression."""
 
 from __future__ import annotations
 
@@ -14,31 +14,33 @@ from kissgs.pipeline.trial import Trial
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Report:
-    """What a compression took and gave.
+    """Sizes, counts, errors, times and settings of one compression.
 
     Attributes:
         source_count: Gaussians in the scene.
         count: Gaussians in the container.
         sh_degree: 0 to 3.
-        source_bytes: of the scene file; of the arrays if there was none.
-        container_bytes: of the zip.
-        file_bytes: per file of the container, as its zip stores it.
-        cleaned: what was wrong with the input (:class:`kissgs.core.splats.Cleaned`).
-        compaction: of the scene before it was encoded; None unless it was asked for.
-        finetuning: of the levels after they were chosen; None unless it was asked for, and there was a Gaussian.
-        invisible: Gaussians left out because no renderer would draw them.
-        pruned_by_rd: Gaussians left out because their bytes would cost more than they show.
-        clipped_colors: Gaussians whose base colour is such an outlier that it was pulled in, for the others' sake.
-        form_error: largest relative change of a covariance by the choice of its equivalent form.
-        half_steps: largest error of quantisation, per field and channel; where all steps are alike, half of one.
-        rd_lambda: of a bit, squared error; None where bits were not weighed.
-        trials: where the settings name a goal: what was encoded on the way, in this order.
+        source_bytes: size of the scene file; of the arrays if the scene came in memory.
+        container_bytes: size of the zip, or of all files in the folder.
+        file_bytes: size of each file of the container, as its zip stores it.
+        cleaned: defects of the input that were removed or corrected (:class:`kissgs.core.splats.Cleaned`).
+        compaction: report of the compaction before encoding; None unless requested.
+        finetuning: report of the fine-tuning of the levels; None unless requested, or if the scene is empty.
+        invisible: Gaussians left out because no renderer draws them.
+        pruned_by_rd: Gaussians left out because their rate cost exceeds the distortion that they save.
+        clipped_colors: Gaussians with an outlying base colour, which was clipped to keep the range of all others small.
+        form_error: largest relative change of a covariance by the choice of its equivalent rotation form.
+        max_quantization_error: largest error of quantisation, per field and channel; half a step where all steps of a
+            channel are equal.
+        rd_lambda: squared error per bit; None without rate-distortion planning.
+        trials: where the settings name a goal: the containers that were made, in order.
         seconds: wall time per stage.
         cpu_seconds: processor time of all stages, over all threads.
-        peak_memory: bytes, the largest this process has ever had resident.
-        settings: all of them, as used.
-        note: a sentence about Gaussians that were left out, where these are more than a fifth; or empty.
-        evaluation: the container's pictures beside those of the cleaned input; None unless it was asked for.
+        peak_memory: largest resident size of this process so far, bytes.
+        settings: all settings, as used.
+        note: what the user may not expect: more than a fifth of the Gaussians left out, or a target size above the
+            finest container of the scene; empty if there is nothing to say.
+        evaluation: comparison of the container's renderings with those of the cleaned input; None unless requested.
     """
 
     source_count: int
@@ -54,7 +56,7 @@ class Report:
     pruned_by_rd: int
     clipped_colors: int
     form_error: float
-    half_steps: dict[str, list[float]]
+    max_quantization_error: dict[str, list[float]]
     rd_lambda: float | None
     trials: tuple[Trial, ...]
     seconds: dict[str, float]
@@ -71,7 +73,7 @@ class Report:
 
     @property
     def bytes_per_gaussian(self) -> float:
-        """Of the whole zip, per Gaussian of the scene."""
+        """Bytes of the container per Gaussian of the scene file."""
         return self.container_bytes / max(self.source_count, 1)
 
     @property
@@ -80,7 +82,7 @@ class Report:
         return 0 if self.compaction is None else self.compaction.source_count - self.compaction.count
 
     def as_dict(self) -> dict[str, Any]:
-        """For machines."""
+        """Return all fields and derived figures for JSON."""
         derived = {"ratio": self.ratio, "bytes_per_gaussian": self.bytes_per_gaussian}
         evaluation = None if self.evaluation is None else self.evaluation.as_dict()
         compaction = None if self.compaction is None else self.compaction.as_dict()

@@ -1,4 +1,4 @@
-"""``Trial``: a container that a search has made on its way, and what it gave."""
+"""``Trial``: one container that a search for a goal made, with its size and quality."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """A container that was made on the way to the one that was asked for.
+    """One container that a search for a goal made.
 
     Attributes:
         count: Gaussians of the scene that was encoded.
-        rd_lambda: squared error per bit; None where nothing is seen, and bits were not weighed.
-        bytes: of its zip, or of the files in its folder.
-        psnr: of its pictures to those of the scene, as goals count it (:func:`kissgs.evaluation.psnr_loss.psnr_of`),
-            decibels; None where it was not asked for.
-        drop: decibels that they have lost (:func:`kissgs.evaluation.psnr_loss.drop_of`); the same.
-        worst: PSNR of the worst view; the same.
-        fifth_percentile: of the views' PSNR; the same.
+        rd_lambda: squared error per bit; None if no Gaussian is visible, so that there was no rate-distortion planning.
+        bytes: size of the zip, or of all files in the folder.
+        psnr: PSNR of its renderings to those of the scene as goals count it, decibels
+            (:func:`kissgs.evaluation.psnr_loss.psnr_of`); None, as all that follow, where the goal is a size.
+        drop: loss of PSNR as goals count it, decibels (:func:`kissgs.evaluation.psnr_loss.drop_of`).
+        worst: PSNR of the worst view, decibels.
+        fifth_percentile: fifth percentile of the views' PSNR, decibels.
     """
 
     count: int
@@ -35,18 +35,18 @@ class Trial:
     worst: float | None = None
     fifth_percentile: float | None = None
 
-    def with_pictures(self, seen: Evaluation) -> Trial:
-        """The same, with what the pictures say of it."""
-        worst, fifth = seen.worst.comparison.candidate_vs_reference.psnr, seen.fifth_percentile
-        return replace(self, psnr=psnr_of(seen), drop=drop_of(seen), worst=worst, fifth_percentile=fifth)
+    def with_evaluation(self, evaluation: Evaluation) -> Trial:
+        """Return a copy with the figures of an evaluation."""
+        worst, fifth = evaluation.worst.comparison.candidate_vs_reference.psnr, evaluation.fifth_percentile
+        return replace(self, psnr=psnr_of(evaluation), drop=drop_of(evaluation), worst=worst, fifth_percentile=fifth)
 
-    def spelled(self) -> str:
-        """For people."""
-        pictures = "" if self.psnr is None else f" at {self.psnr:.2f} dB"
-        lost = "" if self.drop is None else f" (-{self.drop:.2f})"
+    def summary(self) -> str:
+        """Return size and quality in one phrase: "812 kB at 41.20 dB, drop 0.12 dB, worst view 35.1 dB"."""
+        psnr = "" if self.psnr is None else f" at {self.psnr:.2f} dB"
+        drop = "" if self.drop is None else f", drop {self.drop:.2f} dB"
         worst = "" if self.worst is None else f", worst view {self.worst:.1f} dB"
-        return f"{self.bytes / 1000:,.0f} kB{pictures}{lost}{worst}"
+        return f"{self.bytes / 1000:,.0f} kB{psnr}{drop}{worst}"
 
     def as_dict(self) -> dict[str, Any]:
-        """For machines; what is infinite is null, and NaN, of a picture that failed, the string ``"NaN"``."""
+        """Return all fields for JSON: infinity as null, NaN (a failed rendering) as the string ``"NaN"``."""
         return {name: as_json(value) if isinstance(value, float) else value for name, value in asdict(self).items()}

@@ -1,4 +1,4 @@
-"""Oracle: valleys whose lowest place is known; containers and pictures that are measured anew."""
+"""Oracle: functions with a known minimum; containers that are measured and evaluated again."""
 
 import json
 import math
@@ -15,13 +15,13 @@ from PIL import Image
 import kissgs
 from kissgs import Settings, UnsupportedError
 from kissgs.cameras.views import View, Views, black
-from kissgs.core.progress import Annotated
-from kissgs.core.root_finding import FINEST, minimize_unimodal
+from kissgs.core.progress import SearchNote
+from kissgs.core.root_finding import MIN_STEP, minimize_unimodal
 from kissgs.evaluation.psnr_loss import drop_of
 from kissgs.rendering.rasterizer import render
 
 SCENE = kissgs.sample_scene(600, sh_degree=0, seed=5)
-GLANCE = {"sensitivity_views": 4, "sensitivity_view_size": 48}
+FEW_VIEWS = {"sensitivity_views": 4, "sensitivity_view_size": 48}
 PRUNE = {
     "sparsify_steps": 0,
     "refine_steps": 0,
@@ -33,28 +33,28 @@ PRUNE = {
 
 
 def settings(attempts=3, preset="balanced", **goal):
-    return Settings.from_preset(preset, compact={**PRUNE, "max_compactions": attempts}, **GLANCE, **goal)
+    return Settings.from_preset(preset, compact={**PRUNE, "max_compactions": attempts}, **FEW_VIEWS, **goal)
 
 
 @given(st.floats(2, 14), st.floats(0, 16), st.sampled_from([0.5, 1.0]), st.floats(0.3, 3), st.floats(0.3, 3))
-def test_the_lowest_place_of_a_valley_is_found(valley, start, step, left, right):
-    asked = []
+def test_the_minimum_is_found(minimum, start, step, left, right):
+    evaluated = []
 
     def cost(x):
-        asked.append(x)
-        return (left if x < valley else right) * abs(x - valley)
+        evaluated.append(x)
+        return (left if x < minimum else right) * abs(x - minimum)
 
     known = {}
     minimize_unimodal(cost, known, start, step, (0.0, 16.0), 1.0, 99)
-    assert abs(min(known, key=known.get) - valley) <= 2 * FINEST * max(left, right) / min(left, right)
-    assert sorted(known) == sorted(asked)
-    assert min(asked) >= 0
-    assert max(asked) <= 16
+    assert abs(min(known, key=known.get) - minimum) <= 2 * MIN_STEP * max(left, right) / min(left, right)
+    assert sorted(known) == sorted(evaluated)
+    assert min(evaluated) >= 0
+    assert max(evaluated) <= 16
 
 
 @given(st.floats(1, 9), st.integers(1, 12), st.sampled_from([1.0, -1.0]))
-def test_what_is_impossible_is_left(threshold, attempts, way_out):
-    """Costs grow with the distance from a threshold on one side of it; on the other nothing is possible."""
+def test_infeasible_points_are_left(threshold, attempts, way_out):
+    """The cost grows with the distance from a threshold on one side, and is infinite on the other."""
     known = {}
 
     def cost(x):
@@ -66,25 +66,25 @@ def test_what_is_impossible_is_left(threshold, attempts, way_out):
         assert min(known.values()) <= 1
 
 
-def test_few_attempts_are_few():
+def test_the_number_of_attempts_is_limited():
     known = {}
     minimize_unimodal(lambda x: x, known, 5.0, 1.0, (0.0, 10.0), 1.0, 3)
     assert list(known) == [5.0, 4.0, 3.0]
 
 
-def test_notes_of_a_search_come_before_those_of_its_work():
-    heard = []
-    progress = Annotated(lambda *event: heard.append(event))
+def test_the_note_of_a_search_precedes_that_of_its_work():
+    events = []
+    progress = SearchNote(lambda *event: events.append(event))
     progress("order", 0.5)
     progress.note = "try 2"
     progress("order", 0.6)
     progress("refine", 0.1, "loss 0.2")
-    assert [note for _, _, note in heard] == ["", "try 2", "try 2; loss 0.2"]
+    assert [note for _, _, note in events] == ["", "try 2", "try 2; loss 0.2"]
 
 
-@pytest.mark.parametrize("allowed", [0.1, 1.0])  # 256 levels for each number leave this scene 0.07 from close by
-def test_a_loss_is_met_from_below(allowed):
-    chosen = Settings.from_preset("balanced", max_psnr_drop=allowed, **GLANCE)
+@pytest.mark.parametrize("allowed", [0.1, 1.0])  # 256 levels per value already lose 0.07 dB here
+def test_a_drop_is_met(allowed):
+    chosen = Settings.from_preset("balanced", max_psnr_drop=allowed, **FEW_VIEWS)
     found = kissgs.compress(SCENE, settings=chosen, evaluate=True)
     assert drop_of(found.report.evaluation) < 2 * allowed  # from other cameras
     (drop,) = {trial.drop for trial in found.report.trials if trial.bytes == len(found.to_zip())}
@@ -95,15 +95,15 @@ def test_a_loss_is_met_from_below(allowed):
     assert nearest > allowed - 0.02 or len(tried) == chosen.encode.max_encodes
 
 
-def test_a_loss_is_that_to_photographs_where_there_are_some(tmp_path):
-    """Far from its photographs, a scene loses less by the same errors than one that is modelled as 30 dB from them."""
+def test_a_drop_is_measured_to_photographs_if_there_are_any(tmp_path):
+    """A scene with low PSNR to its photographs loses less by the same errors than the model of 30 dB predicts."""
     scene, held_out = cloud(200), []
     for view in around(3):
-        picture = np.clip(render(scene, view.camera)[0] * 255 + 0.5, 0, 255).astype(np.uint8)
-        Image.fromarray(picture // 2 + 30).save(tmp_path / f"{view.name}.png")
+        image = np.clip(render(scene, view.camera)[0] * 255 + 0.5, 0, 255).astype(np.uint8)
+        Image.fromarray(image // 2 + 30).save(tmp_path / f"{view.name}.png")
         held_out.append(View(view.name, view.camera, tmp_path / f"{view.name}.png"))
     views = Views(around(5), tuple(held_out), black(), "five views")
-    chosen = Settings.from_preset("balanced", max_psnr_drop=0.3, **GLANCE)
+    chosen = Settings.from_preset("balanced", max_psnr_drop=0.3, **FEW_VIEWS)
     found = kissgs.compress(scene, settings=chosen, views=views, evaluate=True)
     mean = found.report.evaluation.mean
     assert mean.reference.psnr - mean.candidate.psnr <= 0.3
@@ -112,24 +112,24 @@ def test_a_loss_is_that_to_photographs_where_there_are_some(tmp_path):
     ]
 
 
-def test_a_loss_that_cannot_be_that_small_is_refused():
-    with pytest.raises(UnsupportedError, match=r"loses at most 1e-09 dB, the finest loses \d\.\d+; allow as much"):
-        kissgs.compress(SCENE, settings=Settings.from_preset("balanced", max_psnr_drop=1e-9, **GLANCE))
+def test_an_unreachable_drop_is_refused():
+    with pytest.raises(UnsupportedError, match=r"max_psnr_drop 1e-09 dB cannot be met: .* loses \d\.\d+ dB; allow"):
+        kissgs.compress(SCENE, settings=Settings.from_preset("balanced", max_psnr_drop=1e-9, **FEW_VIEWS))
 
 
-def test_as_many_attempts_as_are_allowed():
-    plain = len(kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **GLANCE)).to_zip())
-    chosen = Settings.from_preset("balanced", target_size=int(0.9 * plain), max_encodes=1, **GLANCE)
-    with pytest.raises(UnsupportedError, match="the smallest has"):
+def test_max_encodes_limits_the_trials():
+    plain = len(kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **FEW_VIEWS)).to_zip())
+    chosen = Settings.from_preset("balanced", target_size=int(0.9 * plain), max_encodes=1, **FEW_VIEWS)
+    with pytest.raises(UnsupportedError, match="the smallest container found has"):
         kissgs.compress(SCENE, settings=chosen)
-    chosen = Settings.from_preset("balanced", target_size=int(1.5 * plain), max_encodes=1, **GLANCE)
+    chosen = Settings.from_preset("balanced", target_size=int(1.5 * plain), max_encodes=1, **FEW_VIEWS)
     assert len(kissgs.compress(SCENE, settings=chosen).report.trials) == 1
 
 
 @pytest.mark.parametrize("share", [0.45, 0.8])
 def test_fewer_gaussians_for_a_size(share):
-    """Where all Gaussians find no room; or better pictures than they have at that size, by the views that judge."""
-    plain = len(kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **GLANCE)).to_zip())
+    """Either all Gaussians do not fit, or fewer have a higher PSNR at that size in the evaluation views."""
+    plain = len(kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **FEW_VIEWS)).to_zip())
     wanted = int(share * plain)
     found = kissgs.compress(SCENE, settings=settings(target_size=wanted), evaluate=True)
     assert 0.97 * wanted <= len(found.to_zip()) <= wanted
@@ -137,27 +137,27 @@ def test_fewer_gaussians_for_a_size(share):
     assert 1 <= len(counts) <= 3
     assert {trial.count for trial in found.report.trials} == {*counts, 600}
     assert found.report.compaction.count in [*counts, 600]
-    if share == 0.45:  # what all Gaussians cannot do
-        with pytest.raises(UnsupportedError, match="or let Gaussians go: --compact auto"):
-            kissgs.compress(SCENE, settings=Settings.from_preset("balanced", target_size=wanted, **GLANCE))
+    if share == 0.45:  # all Gaussians do not fit
+        with pytest.raises(UnsupportedError, match="or for fewer Gaussians: --compact auto"):
+            kissgs.compress(SCENE, settings=Settings.from_preset("balanced", target_size=wanted, **FEW_VIEWS))
         return
     whole = kissgs.compress(
-        SCENE, settings=Settings.from_preset("balanced", target_size=wanted, **GLANCE), evaluate=True
+        SCENE, settings=Settings.from_preset("balanced", target_size=wanted, **FEW_VIEWS), evaluate=True
     )
     assert found.report.evaluation.mean.candidate.psnr >= whole.report.evaluation.mean.candidate.psnr - 1e-6
 
 
-def test_all_gaussians_stay_where_there_is_room():
+def test_all_gaussians_stay_if_they_fit():
     found = kissgs.compress(SCENE, settings=settings(target_size="1MB"))
     assert found.report.compaction.trials == ()
     assert found.report.compacted == 0
-    assert "there is room for all of them" in found.report.compaction.note
+    assert "all of them fit into the target size" in found.report.compaction.note
 
 
 @pytest.mark.parametrize("goal", [{"max_psnr_drop": 0.4}, {"psnr": 35.0}])
 def test_fewer_gaussians_for_a_quality(goal):
     found = kissgs.compress(SCENE, settings=settings(**goal), evaluate=True)
-    whole = kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **goal, **GLANCE))
+    whole = kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **goal, **FEW_VIEWS))
     assert len(found.to_zip()) <= len(whole.to_zip())
     made = [trial for trial in found.report.trials if trial.bytes == len(found.to_zip())]
     assert any(trial.drop <= 0.4 if "psnr" not in goal else trial.psnr >= 35.0 for trial in made)
@@ -165,7 +165,7 @@ def test_fewer_gaussians_for_a_quality(goal):
     assert drop_of(evaluation) <= 0.8 if "psnr" not in goal else evaluation.mean.candidate_vs_reference.psnr >= 33.0
 
 
-def test_the_same_again():
+def test_the_result_does_not_depend_on_threads():
     one, other = (kissgs.compress(SCENE, settings=settings(target_size="13kB"), threads=n) for n in (1, 2))
     assert one.files == other.files
     assert [(trial.count, trial.bytes) for trial in one.report.trials] == [
@@ -174,58 +174,58 @@ def test_the_same_again():
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7])
-def test_hardly_anything(count):
+def test_scenes_of_few_gaussians(count):
     few = SCENE.select(range(count))
     found = kissgs.compress(few, settings=settings(target_size="9kB"))
     assert len(kissgs.decompress(found.files)) <= count
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_enough_is_what_there_is(count):
-    """Said while the ``count``-th container is made: the best of those before, or nothing if none of them will do."""
-    made, told = 0, []
+def test_a_stopped_search_returns_its_best(count):
+    """Stopped while the ``count``-th container is made: the best before it, or StopSearch if none meets the goal."""
+    made, stopped = 0, []
 
-    def enough(stage, fraction, note=""):
+    def stop(stage, fraction, note=""):
         nonlocal made
         made += stage == "rate_distortion" and fraction == 0
-        if made == count and not told:
-            told.append(stage)
+        if made == count and not stopped:
+            stopped.append(stage)
             raise kissgs.StopSearch
 
-    chosen = Settings.from_preset("balanced", max_psnr_drop=0.3, **GLANCE)
+    chosen = Settings.from_preset("balanced", max_psnr_drop=0.3, **FEW_VIEWS)
     whole = kissgs.compress(SCENE, settings=chosen)
     if count > len(whole.report.trials):
         return
     before = whole.report.trials[: count - 1]
     good = [trial for trial in before if trial.drop <= 0.3]
     if good:
-        found = kissgs.compress(SCENE, settings=chosen, progress=enough)
+        found = kissgs.compress(SCENE, settings=chosen, progress=stop)
         assert found.report.trials == before
         assert len(found.to_zip()) == min(trial.bytes for trial in good)
     else:
         with pytest.raises(kissgs.StopSearch):
-            kissgs.compress(SCENE, settings=chosen, progress=enough)
+            kissgs.compress(SCENE, settings=chosen, progress=stop)
 
 
-def test_enough_of_counts_takes_the_best_count():
+def test_a_stopped_search_for_a_count_returns_the_best_count():
     counts = 0
 
-    def enough(stage, fraction, note=""):
+    def stop(stage, fraction, note=""):
         nonlocal counts
         counts += stage == "score" and fraction == 0
         if counts >= 4:
             counts = -99
             raise kissgs.StopSearch
 
-    found = kissgs.compress(SCENE, settings=settings(9, target_size="12kB"), progress=enough)
+    found = kissgs.compress(SCENE, settings=settings(9, target_size="12kB"), progress=stop)
     assert len(found.to_zip()) <= 12_000
     assert len(found.report.compaction.trials) < 9
 
 
 @pytest.mark.parametrize(
-    ("goal", "changes", "told"),
+    ("goal", "changes", "message"),
     [
-        ({}, {}, "compaction by a goal needs one: give target_size, max_psnr_drop or psnr"),
+        ({}, {}, "auto_count needs a goal: give target_size, max_psnr_drop or psnr"),
         ({"target_size": "1MB"}, {"count": 9}, "count and auto_count cannot both be met; give one"),
         ({"target_size": "1MB", "max_psnr_drop": 1}, {}, "target_size and max_psnr_drop cannot both be met"),
         (
@@ -235,8 +235,8 @@ def test_enough_of_counts_takes_the_best_count():
         ),
     ],
 )
-def test_goals_that_make_no_sense(goal, changes, told):
-    with pytest.raises(UnsupportedError, match=told):
+def test_invalid_goals(goal, changes, message):
+    with pytest.raises(UnsupportedError, match=message):
         Settings.from_preset("balanced", compact={"auto_count": True, **changes}, **goal)
 
 
@@ -245,27 +245,27 @@ def test_no_checkpoint_of_a_search(tmp_path):
         kissgs.compress(SCENE, settings=settings(target_size="20kB"), checkpoint=tmp_path / "c.npz")
 
 
-def test_a_scene_for_itself_has_no_container_to_go_by():
+def test_compact_without_a_container_has_no_goal():
     with pytest.raises(UnsupportedError, match="a goal is that of a container: kissgs compress"):
         kissgs.compact(SCENE, settings=settings(target_size="20kB"))
 
 
-def test_ctrl_c_ends_a_search_with_what_it_has(tmp_path):
-    """Pressed when the first container that meets it is known, which is far better than it need be."""
+def test_ctrl_c_ends_a_search_with_its_best(tmp_path):
+    """Pressed after the first container that meets the goal, which is far better than necessary."""
     scene, target = tmp_path / "a.ply", tmp_path / "a.zip"
     kissgs.save(kissgs.sample_scene(20_000, sh_degree=2), scene)
     program = """
 import os, signal, sys
 from kissgs.cli import compress as command, signals
-told = signals.stoppable
+original = signals.stoppable
 
 def stoppable(progress, searches):
     def receive(stage, fraction, note=""):
-        if "after" in note and not sent:
+        if "last: " in note and not sent:
             sent.append(note)
             os.kill(os.getpid(), signal.SIGINT)
         progress(stage, fraction, note)
-    return told(receive, searches)
+    return original(receive, searches)
 
 sent = []
 command.stoppable = stoppable
@@ -273,11 +273,11 @@ from kissgs.cli.main import main
 main()
 """
     words = ["compress", scene, "-o", target, "--max-psnr-drop", "3", "--json", "--set", "quality_offset_db=8"]
-    words += [word for name, value in GLANCE.items() for word in ("--set", f"{name}={value}")]
+    words += [word for name, value in FEW_VIEWS.items() for word in ("--set", f"{name}={value}")]
     command = [sys.executable, "-c", program, *map(str, words)]
     done = subprocess.run(command, check=False, capture_output=True, timeout=200)
     assert done.returncode == 0, done.stderr
-    assert b"kissgs: enough" in done.stderr
+    assert b"kissgs: stopping" in done.stderr
     trials = json.loads(done.stdout)["trials"]
     assert len(trials) == 1
     assert trials[0]["bytes"] == target.stat().st_size

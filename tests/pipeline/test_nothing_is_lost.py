@@ -1,4 +1,4 @@
-"""Whatever can be seen is kept: random cameras everywhere, against what ``fast``, which looks at nothing, keeps."""
+"""No visible part of a scene is lost: random cameras everywhere; oracle: ``fast``, which measures no sensitivity."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from helpers.whole_scenes import SCENES, cameras, joined, moved, psnrs, two
 from kissgs import Settings, Splats, clean, compress, decompress, evaluate, sample_scene
 
 VIEWS = 6
-"""Of each kind."""
+"""Number of views of each kind."""
 
 
 def kept(scene: Splats, preset: str, **settings: object) -> Splats:
@@ -17,8 +17,8 @@ def kept(scene: Splats, preset: str, **settings: object) -> Splats:
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_no_view_is_much_worse_than_with_the_same_step_for_all(name: str):
-    """One view in 24 may be: where two large Gaussians are nearly equally deep, any rounding may swap their order."""
+def test_no_view_is_much_worse_than_with_uniform_steps(name: str):
+    """One view in 24 may be worse: if two large Gaussians have nearly equal depth, rounding may swap their order."""
     scene = clean(SCENES[name]())[0]
     views = [camera for kind in cameras(scene, count=VIEWS).values() for camera in kind]
     fast = psnrs(scene, kept(scene, "fast"), views)
@@ -27,7 +27,7 @@ def test_no_view_is_much_worse_than_with_the_same_step_for_all(name: str):
     assert short.sum() <= 1, (balanced[short], fast[short])
 
 
-def test_most_of_both_objects_stay():
+def test_most_of_two_distant_objects_is_kept():
     compressed = compress(clean(two(1000))[0])
     places = decompress(compressed.to_zip()).means[:, 0]
     assert (places < 500).sum() > 5000

@@ -1,4 +1,4 @@
-"""Oracle: the parts of which the pipeline is made, called one by one, and the file system before and after."""
+"""Oracle: the parts of the pipeline called one by one, and the file system before and after."""
 
 import dataclasses
 import io
@@ -24,7 +24,7 @@ SCENE = kissgs.sample_scene(120, sh_degree=1, seed=3)
 
 
 def dirty(splats):
-    """With one Gaussian that cannot stay, and one rotation that is too long."""
+    """Return a copy with one invalid Gaussian and one quaternion that is not normalised."""
     arrays = {name: getattr(splats, name).copy() for name in ATTRIBUTES}
     arrays["means"][3] = np.nan
     arrays["quats"][5] *= 4
@@ -40,7 +40,7 @@ def assert_same(found, wanted):
 
 
 def names(folder):
-    """What lies in a folder, hidden or not."""
+    """Return the names of all entries of a folder, including hidden ones."""
     return sorted(entry.name for entry in folder.iterdir())
 
 
@@ -52,7 +52,7 @@ def ply(tmp_path):
 
 
 class Recorder:
-    """Notes all events; raises at one of them if asked to."""
+    """Record all events; raise Cancelled at event number ``stop_at``."""
 
     def __init__(self, stop_at=None):
         self.events, self.stop_at = [], stop_at
@@ -63,7 +63,7 @@ class Recorder:
             raise Cancelled("enough")
 
 
-def test_there_and_back_through_files(tmp_path, ply):
+def test_round_trip_through_files(tmp_path, ply):
     result = compress(ply, tmp_path / "scene.zip")
     assert (tmp_path / "scene.zip").read_bytes() == result.to_zip()
     found = kissgs.decompress(tmp_path / "scene.zip", tmp_path / "back.ply")
@@ -84,7 +84,7 @@ def test_every_kind_of_source_gives_the_same_container(tmp_path, ply):
             assert files == {name: archive.read(name) for name in files}
 
 
-def test_containers_are_encoded_anew(tmp_path):
+def test_containers_are_encoded_again(tmp_path):
     first = compress(SCENE, tmp_path / "scene.zip")
     compress(SCENE, tmp_path / "folder")
     again = [compress(source) for source in (tmp_path / "scene.zip", tmp_path / "folder", first.to_zip())]
@@ -116,9 +116,9 @@ def test_the_report_adds_up(tmp_path, ply):
     assert report.cpu_seconds > 0
     assert report.peak_memory > report.source_bytes
     assert Settings.model_validate(report.settings) == FAST
-    told = json.loads(json.dumps(report.as_dict()))
-    assert told["cleaned"]["non_finite"] == 1
-    assert told["ratio"] == report.ratio
+    report = json.loads(json.dumps(report.as_dict()))
+    assert report["cleaned"]["non_finite"] == 1
+    assert report["ratio"] == report.ratio
 
 
 def test_the_report_of_arrays_counts_their_bytes():
@@ -134,7 +134,7 @@ def test_the_order_leads_back_to_the_input():
     result = compress(SCENE)
     found = kissgs.decompress(result.files)
     logs = [np.sign(x) * np.log1p(np.abs(x)) for x in (found.means, SCENE.means[result.order])]
-    assert np.abs(logs[0] - logs[1]).max() <= max(result.report.half_steps["means"]) + 1e-6
+    assert np.abs(logs[0] - logs[1]).max() <= max(result.report.max_quantization_error["means"]) + 1e-6
 
 
 @pytest.mark.parametrize("threads", [1, 3])
@@ -146,7 +146,7 @@ def test_threads_do_not_change_the_result(threads):
 
 
 @pytest.mark.parametrize("name", ["scene.zip", "folder", "back.ply"])
-def test_nothing_is_overwritten_unless_asked_for_and_that_is_seen_before_the_work(tmp_path, name):
+def test_existing_outputs_are_refused_before_the_work(tmp_path, name):
     path = tmp_path / name
     source = compress(SCENE).to_zip()
     act = kissgs.decompress if name.endswith(".ply") else compress
@@ -187,7 +187,7 @@ def test_a_folder_of_other_things_is_refused_before_the_work(tmp_path):
 
 
 def test_only_ply_is_saved(tmp_path):
-    with pytest.raises(OutputError, match=r"only \.ply files are written here; use compress for containers"):
+    with pytest.raises(OutputError, match=r"a scene is written as \.ply; use compress to write a container"):
         kissgs.save(SCENE, tmp_path / "scene.zip")
     assert names(tmp_path) == []
 
@@ -217,7 +217,7 @@ def test_cancelling_decompression_leaves_no_file(tmp_path, at):
     assert names(tmp_path) == []
 
 
-def test_cancelling_leaves_what_was_there(tmp_path):
+def test_cancelling_keeps_the_existing_file(tmp_path):
     compress(SCENE, tmp_path / "scene.zip")
     before = (tmp_path / "scene.zip").read_bytes()
     with pytest.raises(Cancelled):
@@ -227,7 +227,7 @@ def test_cancelling_leaves_what_was_there(tmp_path):
 
 @pytest.mark.parametrize("name", ["scene.zip", "folder", "back.ply"])
 def test_a_full_disk_is_an_output_error_and_leaves_nothing(tmp_path, name):
-    """A limit of 3 kB per file stands for the disk; the system's message becomes the sentence."""
+    """A limit of 3 kB per file simulates a full disk; the error contains the message of the system."""
     program = """
 import resource, sys, kissgs
 files = kissgs.compress(kissgs.sample_scene(1500, sh_degree=1)).files
@@ -262,7 +262,7 @@ def test_files_have_the_permissions_that_new_files_have(tmp_path):
 # --- Input ----------------------------------------------------------------------------------------
 
 
-def test_what_lies_behind_a_path_decides_and_not_its_name(tmp_path):
+def test_the_content_decides_and_not_the_name(tmp_path):
     compress(SCENE, tmp_path / "scene.zip")
     compress(SCENE, tmp_path / "folder.ply")
     (tmp_path / "scene.zip").rename(tmp_path / "zip.ply")
@@ -294,7 +294,7 @@ def test_a_folder_that_is_no_container(tmp_path):
 @pytest.mark.parametrize("name", ["x" * 300, "x" * 300 + ".zip", "x" * 300 + ".ply", "nul\0.zip", "nul\0.ply", "nul\0"])
 @pytest.mark.parametrize("act", ["load", "compress", "decompress", "write", "save", "write ply"])
 def test_paths_that_no_file_system_has_are_refused_in_a_sentence(tmp_path, act, name):
-    """Asking whether they exist once raised a bare OSError or ValueError."""
+    """Regression: checking whether they exist raised a bare OSError or ValueError."""
     path = tmp_path / name
     with pytest.raises(KissgsError):
         {
@@ -308,13 +308,13 @@ def test_paths_that_no_file_system_has_are_refused_in_a_sentence(tmp_path, act, 
     assert names(tmp_path) == []
 
 
-def test_sensitivity_is_handed_on():
-    """What costs a thousandth in one half of the scene is rounded more coarsely there."""
+def test_given_sensitivity_is_used():
+    """Gaussians with a thousandth of the sensitivity are quantised more coarsely."""
     cameras = [view.camera for view in kissgs.virtual_views(SCENE, width=64, height=64, count=4).all]
     measured = kissgs.measure_sensitivity(
         SCENE, kissgs.WeightedCameras(cameras, [1.0] * 4, np.zeros(3, np.float32)), view_uncertainty=1
     )
-    everywhere = np.ones(120, np.float32)  # a capture's cameras have looked: no bound but the price
+    everywhere = np.ones(120, np.float32)  # as if seen by a capture: only lambda limits errors
     measured = dataclasses.replace(measured, coverage=everywhere, captured=everywhere)
     halves = np.arange(120) < 60
     errors = []
@@ -332,9 +332,9 @@ def test_sensitivity_is_handed_on():
         found = kissgs.decompress(result.files)
         errors.append(np.abs(found.opacities - SCENE.opacities[result.order])[halves[result.order]].mean())
     assert errors[0] < 0.7 * errors[1]
-    with pytest.raises(InvalidSceneError, match="this sensitivity is not that of the scene: position_hessian must be"):
+    with pytest.raises(InvalidSceneError, match="the sensitivity does not fit the scene: position_hessian must be"):
         kissgs.compress(SCENE, sensitivity=kissgs.Sensitivity.none(119, SCENE.sh_degree))
-    with pytest.raises(InvalidSceneError, match="color_weight has a value that is no cost"):
+    with pytest.raises(InvalidSceneError, match="color_weight has a negative or non-finite value"):
         kissgs.compress(
             SCENE, sensitivity=dataclasses.replace(measured, color_weight=measured.color_weight * np.float32(np.nan))
         )

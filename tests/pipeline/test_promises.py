@@ -1,4 +1,4 @@
-"""What the README promises of real scenes; oracle: figures of other encoders on the same files."""
+"""The promises of the README for real scenes. Oracle: figures of other encoders on the same files."""
 
 import functools
 from pathlib import Path
@@ -12,13 +12,13 @@ SPZ_SHN_RMSE = 0.0247038
 """Root mean square error of fox' SH after a round trip through splat-transform's .spz, version 4, default bits."""
 
 PAPER_FOX, PAPER_GUITAR = 1_365_436, 1_120_412
-"""Bytes of the paper's own settings (the preset ``paper``), which leave"""
+"""Bytes with the paper's settings (the preset ``paper``)."""
 
 PAPER_FOX_PSNR, PAPER_FOX_WORST = 42.25, 40.68
-"""decibels to the original from cameras held out: on average, and the worst view; and on guitar"""
+"""PSNR of those settings to the original in held-out views of fox, decibels: mean and worst view."""
 
 PAPER_GUITAR_PSNR, PAPER_GUITAR_WORST = 51.23, 37.12
-"""from cameras drawn over the whole scene."""
+"""PSNR of those settings to the original in virtual views of guitar, decibels: mean and worst view."""
 
 SOG_GUITAR = 1_196_155
 """Bytes of splat-transform 3.7's .sog."""
@@ -34,14 +34,14 @@ def bare_fox(folder: Path) -> Compressed:
     return kissgs.compress(fox(folder)[0])
 
 
-def test_fox_is_small_and_keeps_its_gloss(shared_data: Path) -> None:
+def test_fox_is_small_and_keeps_its_view_dependent_colour(shared_data: Path) -> None:
     scene, result = fox(shared_data)[0], bare_fox(shared_data)
     assert len(result.to_zip()) <= 0.73 * PAPER_FOX
     errors = kissgs.decompress(result.files).shN.astype(np.float64) - scene.shN[result.order]
     assert np.sqrt(np.mean(errors**2)) < 0.7 * SPZ_SHN_RMSE
 
 
-def test_fox_looks_the_same(shared_data: Path) -> None:
+def test_fox_keeps_its_psnr(shared_data: Path) -> None:
     """Held-out photographs; splat-transform's .spz of the same file loses 2.07 dB, at 1.6 times the bytes."""
     scene, views = fox(shared_data)
     result = kissgs.evaluate(scene, kissgs.decompress(bare_fox(shared_data).files), views)
@@ -53,7 +53,7 @@ def test_fox_looks_the_same(shared_data: Path) -> None:
     assert min(view.comparison.candidate_vs_reference.psnr for view in result.views) > PAPER_FOX_WORST - 0.3
 
 
-def test_fox_by_its_cameras_is_half_of_the_papers(shared_data: Path) -> None:
+def test_fox_with_its_capture_has_half_the_bytes_of_the_paper(shared_data: Path) -> None:
     scene, views = fox(shared_data)
     result = kissgs.compress(scene, views=views, evaluate=True)
     assert len(result.to_zip()) <= 0.52 * PAPER_FOX
@@ -65,8 +65,8 @@ def test_fox_by_its_cameras_is_half_of_the_papers(shared_data: Path) -> None:
     assert min(view.comparison.candidate_vs_reference.psnr for view in seen.views) > PAPER_FOX_WORST + 0.5
 
 
-def test_guitar_is_smaller_than_others_make_it_and_hardly_worse(shared_data: Path) -> None:
-    """At the default quality it is as good as the paper's settings make it; at this one it is still hardly worse."""
+def test_guitar_at_lower_quality_is_smaller_than_with_other_encoders(shared_data: Path) -> None:
+    """The default quality equals that of the paper's settings; this one is at most 1.5 dB below."""
     source, settings = (
         shared_data / "guitar" / "guitar.ply",
         kissgs.Settings.model_validate({"encode": {"quality_offset_db": -2}}),
@@ -79,7 +79,7 @@ def test_guitar_is_smaller_than_others_make_it_and_hardly_worse(shared_data: Pat
     assert seen.worst.comparison.candidate_vs_reference.psnr > PAPER_GUITAR_WORST - 1.5
 
 
-def test_guitar_by_default_is_as_good_as_the_papers_in_three_quarters_of_its_bytes(shared_data: Path) -> None:
+def test_guitar_by_default_equals_the_paper_in_three_quarters_of_its_bytes(shared_data: Path) -> None:
     result = kissgs.compress(shared_data / "guitar" / "guitar.ply", evaluate=True)
     assert result.report.container_bytes <= 0.72 * PAPER_GUITAR
     seen = result.report.evaluation

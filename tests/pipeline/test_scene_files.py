@@ -1,4 +1,4 @@
-"""Containers under any name and in any kind of zip: every command takes the same for one."""
+"""Containers under any name and in any kind of zip: all commands agree on what is a container."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from kissgs.pipeline.scene_files import is_container, open_scene
 
 
 def zips() -> dict[str, bytes]:
-    """The same container as a zip in many forms, by file name."""
+    """Return one container as zips in many forms, by file name."""
     packed = kissgs.compress(sample_scene(50), settings=Settings.from_preset("fast"))
 
     def again(method: int = zipfile.ZIP_STORED, folder: str = "", comment: bytes = b"") -> bytes:
@@ -49,7 +49,7 @@ FORMS = zips()
 
 
 @pytest.mark.parametrize("name", FORMS)
-def test_whatever_decompress_reads_all_others_read(name, tmp_path):
+def test_all_commands_read_what_decompress_reads(name, tmp_path):
     path = tmp_path / name
     path.write_bytes(FORMS[name])
     wanted = decompress(FORMS["plain.zip"])
@@ -71,7 +71,7 @@ def test_a_ply_with_a_zip_at_its_end_is_a_ply_to_all(tmp_path):
     assert describe(path).kind == "ply"
 
 
-def test_what_is_named_zip_and_is_none_is_refused_by_all(tmp_path):
+def test_a_false_zip_is_refused_by_all_commands(tmp_path):
     path = tmp_path / "a.zip"
     path.write_bytes(b"<html>no such page</html>")
     for read in (decompress, kissgs.load, describe, kissgs.compress):
