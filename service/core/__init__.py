@@ -1,1 +1,1 @@
-"""Settings, problems, schemas and tables of the service: what every other part uses."""
+"""Settings, problem types, schemas and tables, shared by all other parts of the service."""

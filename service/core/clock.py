@@ -1,4 +1,4 @@
-"""A clock that never jumps: a machine's own may be set forward by a year, and no result should expire from it."""
+"""A clock that never jumps: setting the machine's clock forward must not make results expire."""
 
 from __future__ import annotations
 
@@ -6,21 +6,21 @@ import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 
-MOST_BEHIND = 2 * 86400.0
-"""Seconds."""
+MAX_CLOCK_LEAD_SECONDS = 2 * 86400.0
+"""Largest lead of a recorded time over this clock that is trusted; a larger one was written with a wrong clock."""
 
 
 def ticks() -> float:
-    """Seconds that pass even while the machine sleeps, where the system counts those."""
+    """Return the seconds of a monotonic clock, including suspended time where the system counts it."""
     return time.clock_gettime(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic()
 
 
 class Clock:
-    """Seconds since 1970 that grow as real time does, whatever is done to the machine's clock meanwhile.
+    """Seconds since 1970 that advance with real time, independent of later changes to the machine's clock.
 
     Args:
         wall: the machine's clock, read once.
-        steady: one that only ever ticks.
+        steady: a monotonic clock.
     """
 
     def __init__(self, wall: Callable[[], float] = time.time, steady: Callable[[], float] = ticks) -> None:
@@ -28,19 +28,19 @@ class Clock:
         self._offset = wall() - steady()
 
     def start_after(self, floor: float) -> None:
-        """Do not fall behind ``floor``, the latest time that a former run has written down.
+        """Advance to at least ``floor``, the latest time recorded by a previous run.
 
-        Unless that is days ahead: then it was that run's clock which was wrong.
+        A floor more than :data:`MAX_CLOCK_LEAD_SECONDS` ahead is ignored: the clock of that run was wrong.
         """
         ahead = floor - self()
-        if 0 < ahead < MOST_BEHIND:
+        if 0 < ahead < MAX_CLOCK_LEAD_SECONDS:
             self._offset += ahead
 
     def __call__(self) -> float:
-        """The time."""
+        """Return the current time in seconds since 1970."""
         return self._offset + self._steady()
 
 
 def as_datetime(seconds: float) -> datetime:
-    """With its time zone, for people and JSON."""
+    """Convert seconds since 1970 to a datetime in UTC."""
     return datetime.fromtimestamp(seconds, UTC)

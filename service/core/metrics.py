@@ -1,4 +1,4 @@
-"""What Prometheus may scrape at ``/metrics``."""
+"""Metrics that ``/metrics`` exposes to Prometheus."""
 
 from __future__ import annotations
 
@@ -14,50 +14,55 @@ _SECONDS = (0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60, 120, 300, 600, 1800, 3600)
 
 
 class Metrics:
-    """All metrics of one service, in a registry of its own."""
+    """All metrics of one service, in a separate registry."""
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
         r = self.registry
         ProcessCollector(registry=r)
-        Info("kissgs_build", "Which software this is.", registry=r).info({"version": kissgs.__version__})
-        self.queue_limit = Gauge("kissgs_queue_limit", "Jobs that may wait.", registry=r)
+        Info("kissgs_build", "Version of the software.", registry=r).info({"version": kissgs.__version__})
+        self.queue_limit = Gauge("kissgs_queue_limit", "Maximum number of waiting jobs.", registry=r)
         self.jobs = Gauge("kissgs_jobs", "Jobs by state.", ["state"], registry=r)
-        self.busy = Gauge("kissgs_workers_busy", "Jobs that have a process.", registry=r)
-        self.disk = Gauge("kissgs_disk_bytes", "What the files of all jobs take.", registry=r)
-        self.uploads = Gauge("kissgs_uploads_in_flight", "Uploads that are arriving.", registry=r)
+        self.busy = Gauge("kissgs_workers_busy", "Jobs with a running process.", registry=r)
+        self.disk = Gauge("kissgs_disk_bytes", "Bytes on disk of the files of all jobs.", registry=r)
+        self.uploads = Gauge("kissgs_uploads_in_flight", "Uploads in progress.", registry=r)
         self.submitted = Counter("kissgs_jobs_submitted", "Jobs accepted, by preset.", ["preset"], registry=r)
         self.ended = Counter("kissgs_jobs_ended", "Jobs ended, by state and code.", ["state", "code"], registry=r)
-        self.restarts = Counter("kissgs_job_restarts", "Jobs started again after a crash.", registry=r)
+        self.restarts = Counter("kissgs_job_restarts", "Jobs restarted after a crash.", registry=r)
         self.bytes_in = Counter("kissgs_upload_bytes", "Bytes of accepted uploads.", registry=r)
-        self.bytes_out = Counter("kissgs_container_bytes", "Bytes of containers made.", registry=r)
-        self.waited = Histogram("kissgs_queue_seconds", "From upload to start.", buckets=_SECONDS, registry=r)
+        self.bytes_out = Counter("kissgs_container_bytes", "Bytes of encoded containers.", registry=r)
+        self.waited = Histogram("kissgs_queue_seconds", "Seconds from upload to start.", buckets=_SECONDS, registry=r)
         self.ran = Histogram(
-            "kissgs_job_seconds", "From start to end, by preset.", ["preset"], buckets=_SECONDS, registry=r
+            "kissgs_job_seconds", "Seconds from start to end, by preset.", ["preset"], buckets=_SECONDS, registry=r
         )
-        self.stages = Histogram("kissgs_stage_seconds", "Of a job, by stage.", ["stage"], buckets=_SECONDS, registry=r)
+        self.stages = Histogram(
+            "kissgs_stage_seconds", "Seconds per stage of a job.", ["stage"], buckets=_SECONDS, registry=r
+        )
         self.ratio = Histogram(
-            "kissgs_ratio", "Upload over container.", buckets=(2, 5, 8, 10, 12, 15, 20, 25, 30, 40, 60, 100), registry=r
+            "kissgs_ratio",
+            "Upload bytes divided by container bytes.",
+            buckets=(2, 5, 8, 10, 12, 15, 20, 25, 30, 40, 60, 100),
+            registry=r,
         )
         self.per_second = Histogram(
             "kissgs_gaussians_per_second",
-            "Of a job.",
+            "Gaussians per second of a job.",
             buckets=(1e3, 3e3, 1e4, 3e4, 1e5, 3e5, 1e6, 3e6),
             registry=r,
         )
         self.requests = Counter(
-            "kissgs_http_requests", "By method, route, status.", ["method", "route", "status"], registry=r
+            "kissgs_http_requests", "Requests by method, route and status.", ["method", "route", "status"], registry=r
         )
         self.latency = Histogram(
             "kissgs_http_seconds",
-            "To the first byte of the answer, by route.",
+            "Seconds to the first byte of the response, by route.",
             ["route"],
             buckets=(0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 5, 30),
             registry=r,
         )
 
     def job_ended(self, job: Job, state: State, seconds: float | None) -> None:
-        """Count a job that has ended, after ``seconds`` of running; None if nobody knows."""
+        """Record a job that has ended after running for ``seconds``; None if it never started."""
         self.ended.labels(state, (job.problem or {}).get("code", "")).inc()
         if state != State.SUCCEEDED or job.result is None:
             return
@@ -70,7 +75,7 @@ class Metrics:
             self.per_second.observe(job.gaussians / max(seconds, 1e-3))
 
     def text(self, counts: dict[State, int], disk_bytes: int) -> bytes:
-        """The page, with these gauges up to date."""
+        """Return the metrics in OpenMetrics format, with the gauges for jobs and disk set to these values."""
         for state, count in counts.items():
             self.jobs.labels(state).set(count)
         self.disk.set(disk_bytes)

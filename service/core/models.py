@@ -1,4 +1,4 @@
-"""The tables, as SQLAlchemy models: SQLite by default, PostgreSQL by URL."""
+"""Database tables as SQLAlchemy models, for SQLite (default) and PostgreSQL."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from typing import Any
 from sqlalchemy import JSON, BigInteger, Float, ForeignKey, Index, Integer, String, UniqueConstraint
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
-SCHEMA_VERSION = 3
-"""Of the tables below, and of the results in them. A database of another version is refused rather than misread."""
+SCHEMA_VERSION = 4
+"""Version of the tables below and of the results in them. A database of another version is refused, not misread."""
 
 NOTE_CHARS = 200
-"""Of what a running job has to say; the rest is cut."""
+"""Maximum length of a progress note; longer notes are truncated."""
 
 Number = BigInteger().with_variant(Integer, "sqlite")  # SQLite counts up only in INTEGER columns
 
 
 class State(StrEnum):
-    """Where a job stands."""
+    """Life cycle state of a job."""
 
     QUEUED = "queued"
     RUNNING = "running"
@@ -33,11 +33,11 @@ ENDED = (State.SUCCEEDED, State.FAILED, State.CANCELLED)
 
 
 class Base(DeclarativeBase):
-    """Of all tables."""
+    """Base class of all tables."""
 
 
 class Meta(Base):
-    """A few facts about the database itself."""
+    """Properties of the database itself, by name: schema version, identity, owner, latest time."""
 
     __tablename__ = "meta"
 
@@ -46,11 +46,11 @@ class Meta(Base):
 
 
 class Job(Base):
-    """One upload and what becomes of it. Times are seconds since 1970; sizes are bytes.
+    """One upload, its options, its progress and its result. Times are seconds since 1970; sizes are bytes.
 
-    ``disk_bytes`` is what its files take; from its start to its end, the upload and ``work_bytes``: what its checkpoint
-    takes at most. ``spare_bytes`` is what of that can be given up for new uploads once it has ended: the upload itself,
-    which is kept for comparisons, and the decoded scene.
+    ``disk_bytes`` is the size of its files; while the job runs, that of the upload plus ``work_bytes``, the upper bound
+    for its checkpoints. ``reclaimable_bytes`` is the part that can be deleted for new uploads once the job has ended:
+    the upload, which is kept for comparisons, and the decoded scene.
     """
 
     __tablename__ = "jobs"
@@ -61,8 +61,8 @@ class Job(Base):
         Index("jobs_by_kind", "preset", "evaluate", "state", "number"),
         Index("jobs_by_expiry", "expires_at"),
         Index("jobs_by_size", "disk_bytes"),
-        Index("jobs_by_spare", "spare_bytes"),
-        {"sqlite_autoincrement": True},  # numbers are cursors: none is given twice
+        Index("jobs_by_reclaimable", "reclaimable_bytes"),
+        {"sqlite_autoincrement": True},  # numbers are cursors and must never be reused
     )
 
     number: Mapped[int] = mapped_column(Number, primary_key=True, autoincrement=True)
@@ -80,7 +80,7 @@ class Job(Base):
     fingerprint: Mapped[str] = mapped_column(String(64))
     idempotency_key: Mapped[str | None] = mapped_column(String(255))
     disk_bytes: Mapped[int] = mapped_column(BigInteger)
-    spare_bytes: Mapped[int] = mapped_column(BigInteger, default=0)
+    reclaimable_bytes: Mapped[int] = mapped_column(BigInteger, default=0)
     work_bytes: Mapped[int] = mapped_column(BigInteger, default=0)
     upload_kept: Mapped[bool] = mapped_column(default=True)
     starts: Mapped[int] = mapped_column(Integer, default=0)
@@ -98,7 +98,7 @@ class Job(Base):
 
 
 class Event(Base):
-    """Something that happened to a job; ``seq`` counts from 1 without gaps."""
+    """State change or progress of a job; ``seq`` counts from 1 without gaps."""
 
     __tablename__ = "events"
 

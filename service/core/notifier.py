@@ -1,4 +1,4 @@
-"""Waking those who wait for a job: long polls, event streams, the worker."""
+"""Notification of tasks that wait for a job: long polls, event streams and the worker."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from weakref import WeakValueDictionary
 
 
 class JobNotifier:
-    """Rings are heard by all who wait at that moment. Take a :meth:`subscribe` first, then look, then wait."""
+    """Wakes all current subscribers of a name. Call :meth:`subscribe` first, then read the job, then wait."""
 
     def __init__(self) -> None:
         self._waiting: WeakValueDictionary[str, asyncio.Event] = WeakValueDictionary()
         self.closing = False
 
     def subscribe(self, name: str) -> asyncio.Event:
-        """What is set at the next ring for ``name``."""
+        """Return the event that the next :meth:`notify` for ``name`` sets."""
         event = self._waiting.get(name)
         if event is None:
             event = asyncio.Event()
@@ -24,25 +24,25 @@ class JobNotifier:
         return event
 
     def notify(self, name: str) -> None:
-        """Wake who waits for ``name``."""
+        """Wake all subscribers of ``name``."""
         event = self._waiting.pop(name, None)
         if event is not None:
             event.set()
 
     def close(self) -> None:
-        """Wake everyone: the service is stopping."""
+        """Wake all subscribers, because the service is stopping."""
         self.closing = True
         for event in list(self._waiting.values()):
             event.set()
 
 
 def ended(job_id: str) -> str:
-    """What is rung when a job has ended: who waits for that need not wake for every step of its work."""
+    """Return the name that is notified once a job has ended, for subscribers that do not need its progress."""
     return f"end of {job_id}"
 
 
 async def wait(event: asyncio.Event, seconds: float) -> bool:
-    """Wait for a ring, so long at most; whether there was one."""
+    """Wait for a notification for at most ``seconds``; return whether there was one."""
     try:
         async with asyncio.timeout(seconds):
             await event.wait()

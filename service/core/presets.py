@@ -1,28 +1,28 @@
-"""What each preset costs and gives, for people who have to choose."""
+"""Size, quality and time of each preset, for users and for estimates."""
 
 from __future__ import annotations
 
 from importlib.util import find_spec
 
 import kissgs
-from service.core.schemas import COMPACTED, SOUGHT, TUNED, PresetFacts, Presets
+from service.core.schemas import COMPACTED, FINETUNED, SEARCHED, PresetFacts, Presets
 
 MEASURED_ON = "fox, 79,451 Gaussians of SH degree 3, seven held-out photographs"
 MEASURED_BY = "kissgs compress fox.ply, kissgs evaluate fox.ply fox.zip --views fox"
 
 EVALUATION = 60.0
-"""CPU seconds per million Gaussians, roughly: decoding, finding 24 cameras, and two small pictures from each."""
+"""Approximate CPU seconds per million Gaussians to decode, select 24 cameras, and render two small images from each."""
 
 _FACTS: dict[kissgs.Preset, tuple[str, str, float, float, float]] = {
-    kissgs.Preset.FAST: ("Fast", "Seconds, for uploads that wait.", 13.13, -0.39, 26),
-    kissgs.Preset.BALANCED: ("Balanced", "The best pictures for their size. The default.", 12.32, -0.30, 370),
-    kissgs.Preset.SMALL: ("Small", "A little smaller still, and slower.", 12.22, -0.27, 370),
-    kissgs.Preset.PAPER: ("Paper", "KISS-GS as published, to compare with.", 17.13, -0.38, 460),
+    kissgs.Preset.FAST: ("Fast", "Takes seconds; for previews and quick checks.", 13.13, -0.39, 26),
+    kissgs.Preset.BALANCED: ("Balanced", "The best quality for its size. The default.", 12.32, -0.30, 370),
+    kissgs.Preset.SMALL: ("Small", "Slightly smaller, and slower.", 12.22, -0.27, 370),
+    kissgs.Preset.PAPER: ("Paper", "KISS-GS as published, for comparison.", 17.13, -0.38, 460),
 }
 
 
 def presets() -> Presets:
-    """All presets, cheapest first."""
+    """Return all presets, fastest first."""
     return Presets(
         default=kissgs.Preset.BALANCED,
         measured_on=MEASURED_ON,
@@ -43,10 +43,10 @@ def presets() -> Presets:
 
 
 START_SECONDS = 1.0
-"""What a job takes whatever its size: a process and its imports."""
+"""Fixed seconds of every job, to start a process and import the library."""
 
 BUSY_CORES = 1.8
-"""Of the two of a small server."""
+"""Average number of busy cores on a two-core server."""
 
 
 TRAINING = {
@@ -55,37 +55,37 @@ TRAINING = {
     kissgs.Preset.SMALL: (600.0, 1200.0),
     kissgs.Preset.PAPER: (700.0, 2000.0),
 }
-"""CPU seconds of a compaction to a fifth, roughly: of any, and per million Gaussians."""
+"""Approximate CPU seconds of a compaction to one fifth: a fixed part, and a part per million Gaussians."""
 
 
-TUNING = {
+FINETUNING = {
     kissgs.Preset.FAST: (50.0, 300.0),
     kissgs.Preset.BALANCED: (50.0, 1300.0),
     kissgs.Preset.SMALL: (100.0, 2600.0),
     kissgs.Preset.PAPER: (1000.0, 40_000.0),
 }
-"""The same of fine-tuning all Gaussians."""
+"""Approximate CPU seconds to fine-tune all Gaussians: a fixed part, and a part per million Gaussians."""
 
-SEEKING = 4.0
-"""Times all of it, where a goal is sought."""
+SEARCH_FACTOR = 4.0
+"""Factor on the total time of a job that searches for a goal, which encodes several times."""
 
 
 def usual_seconds(kind: str, evaluate: bool, gaussians: int) -> float:
-    """Wall time of a job on a small server, until this one has its own experience.
+    """Estimate the wall time of a job on a small server, used until this server has measured jobs of its own.
 
-    ``kind`` is that of :class:`service.core.schemas.JobOptions`.
+    ``kind`` is :attr:`service.core.schemas.JobOptions.kind`.
     """
     name, *stages = kind.split("+")
     preset, millions = kissgs.Preset(name), gaussians / 1e6
     cpu = (_FACTS[preset][4] + evaluate * EVALUATION) * millions
-    for suffix, costs in ((COMPACTED, TRAINING), (TUNED, TUNING)):
+    for suffix, costs in ((COMPACTED, TRAINING), (FINETUNED, FINETUNING)):
         if suffix.removeprefix("+") in stages:
-            whatever, each = costs[preset]
-            cpu += whatever + each * millions
-    cpu *= SEEKING if SOUGHT.removeprefix("+") in stages else 1.0
+            fixed, per_million = costs[preset]
+            cpu += fixed + per_million * millions
+    cpu *= SEARCH_FACTOR if SEARCHED.removeprefix("+") in stages else 1.0
     return START_SECONDS + cpu / BUSY_CORES
 
 
 def can_train() -> bool:
-    """Whether there is a torch, which fine-tuning needs, and compaction for all but pruning."""
+    """Return whether torch is installed, which fine-tuning needs, and compaction except for pruning alone."""
     return find_spec("torch") is not None

@@ -1,6 +1,6 @@
-"""Everything that can go wrong, as RFC 9457 problem documents with stable codes.
+"""All errors of the service, as RFC 9457 problem documents with stable codes.
 
-A code of the library (``kissgs.KissgsError.code``) keeps its name here; the others are the service's own.
+Codes of the library (``kissgs.KissgsError.code``) keep their names; the other codes belong to the service.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ MEDIA_TYPE = "application/problem+json"
 
 @dataclass(frozen=True, slots=True)
 class ProblemType:
-    """What all problems of one code have in common."""
+    """HTTP status, title and retryability shared by all problems of one code."""
 
     status: int
     title: str
@@ -26,45 +26,45 @@ class ProblemType:
 
 
 PROBLEM_TYPES: dict[str, ProblemType] = {
-    # The library's own.
-    "invalid-scene": ProblemType(422, "The upload is not a usable Gaussian scene"),
-    "invalid-container": ProblemType(422, "The bytes are not a SOG-XT container"),
-    "unsupported": ProblemType(422, "Beyond a limit, or a feature that kissgs does not have"),
+    # Errors of the library.
+    "invalid-scene": ProblemType(422, "The upload is not a valid Gaussian scene"),
+    "invalid-container": ProblemType(422, "The file is not a valid SOG-XT container"),
+    "unsupported": ProblemType(422, "The scene exceeds a limit or needs an unsupported feature"),
     "output": ProblemType(507, "The result could not be written", retryable=True),
     "cancelled": ProblemType(409, "The job was cancelled"),
-    # What a job can meet.
-    "time-limit": ProblemType(422, "The job took longer than a job may"),
-    "memory-limit": ProblemType(422, "The job needed more memory than a job may have"),
-    "crashed": ProblemType(500, "The job's process was ended from outside or crashed", retryable=True),
-    "internal": ProblemType(500, "A fault of the service", retryable=True),
-    # What a request can meet.
-    "invalid-request": ProblemType(422, "The request is not one the service understands"),
-    "bad-http": ProblemType(400, "The bytes are not a request of HTTP"),
-    "unauthorized": ProblemType(401, "A key is needed"),
-    "foreign": ProblemType(403, "The request comes from another site's page, or under another name"),
-    "not-found": ProblemType(404, "There is no such thing here"),
-    "method-not-allowed": ProblemType(405, "This cannot be done to it"),
-    "media-type": ProblemType(415, "The body is of a type the service does not read"),
-    "too-large": ProblemType(413, "The upload is larger than an upload may be"),
-    "upload-timeout": ProblemType(408, "The upload came too slowly", retryable=True),
+    # Errors of jobs.
+    "time-limit": ProblemType(422, "The job exceeded the time limit"),
+    "memory-limit": ProblemType(422, "The job exceeded the memory limit"),
+    "crashed": ProblemType(500, "The job's process crashed or was killed", retryable=True),
+    "internal": ProblemType(500, "Internal error of the service", retryable=True),
+    # Errors of requests.
+    "invalid-request": ProblemType(422, "The request is invalid"),
+    "bad-http": ProblemType(400, "The bytes are not a valid HTTP request"),
+    "unauthorized": ProblemType(401, "A valid key is required"),
+    "foreign": ProblemType(403, "The request comes from another site or uses an unknown host name"),
+    "not-found": ProblemType(404, "The resource does not exist"),
+    "method-not-allowed": ProblemType(405, "The method is not allowed for this resource"),
+    "media-type": ProblemType(415, "The media type of the body is not supported"),
+    "too-large": ProblemType(413, "The upload exceeds the size limit"),
+    "upload-timeout": ProblemType(408, "The upload was too slow", retryable=True),
     "upload-aborted": ProblemType(400, "The upload ended before it was complete", retryable=True),
-    "key-reused": ProblemType(422, "The Idempotency-Key belongs to another upload"),
+    "key-reused": ProblemType(422, "The Idempotency-Key was used for another submission"),
     "not-finished": ProblemType(409, "The job has not ended yet", retryable=True),
     "not-succeeded": ProblemType(409, "The job has no result"),
-    "gone": ProblemType(410, "It has expired and was removed"),
-    "range": ProblemType(416, "The range lies outside the file"),
+    "gone": ProblemType(410, "The files have expired or were removed"),
+    "range": ProblemType(416, "The requested range is outside the file"),
     "queue-full": ProblemType(429, "Too many jobs are waiting", retryable=True),
     "too-many-jobs": ProblemType(429, "This key has too many jobs waiting or running", retryable=True),
-    "too-many-uploads": ProblemType(429, "Too many uploads at the same time", retryable=True),
-    "disk-full": ProblemType(507, "There is no room for it", retryable=True),
+    "too-many-uploads": ProblemType(429, "Too many simultaneous uploads", retryable=True),
+    "disk-full": ProblemType(507, "The server has not enough disk space", retryable=True),
     "stopping": ProblemType(503, "The service is stopping", retryable=True),
     "database": ProblemType(503, "The job database cannot be used", retryable=True),
 }
-"""Every code there is. A code never changes its meaning."""
+"""All problem codes. The meaning of a code never changes."""
 
 
 class Problem(BaseModel):
-    """RFC 9457: what is wrong, where, and how to mend it."""
+    """RFC 9457 problem document: cause and remedy of an error."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -81,24 +81,24 @@ class Problem(BaseModel):
         }
     )
 
-    type: str = Field(description="Where this code is described.")
-    title: str = Field(description="The same for all problems of this code.")
-    status: int = Field(description="HTTP status.")
-    detail: str = Field(description="One sentence: what is wrong, where, and how to mend it.")
-    code: str = Field(description="Stable; that of kissgs' own exceptions where it is one.")
+    type: str = Field(description="Path of the description of this code.")
+    title: str = Field(description="Summary, identical for all problems of this code.")
+    status: int = Field(description="HTTP status code.")
+    detail: str = Field(description="One sentence with the cause, the limit and the remedy.")
+    code: str = Field(description="Stable code; equal to that of the kissgs exception, if the library raised one.")
     retryable: bool = Field(description="Whether the same request may succeed later.")
-    errors: list[dict[str, Any]] | None = Field(None, description="Where several fields are wrong: each of them.")
+    errors: list[dict[str, Any]] | None = Field(None, description="Every invalid field, if there are several.")
 
 
 class ProblemError(Exception):
-    """Raised anywhere below a route; answered as a problem document.
+    """Error that the service answers with a problem document.
 
     Args:
         code: one of :data:`PROBLEM_TYPES`.
         detail: one sentence for the user.
         retry_after: seconds, sent as ``Retry-After``.
         headers: sent with the answer.
-        errors: where several fields are wrong, each of them.
+        errors: every invalid field, if there are several.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class ProblemError(Exception):
 
 
 def problem(code: str, detail: str, *, errors: list[dict[str, Any]] | None = None) -> Problem:
-    """The document of one problem."""
+    """Build the document of one problem."""
     kind = PROBLEM_TYPES[code]
     return Problem(
         type=f"/v1/problems/{code}",
@@ -132,19 +132,19 @@ def problem(code: str, detail: str, *, errors: list[dict[str, Any]] | None = Non
 
 
 def unusable_database() -> ProblemError:
-    """The problem of a database that fails; the log and ``/readyz`` say more than clients are told."""
+    """Return the problem of a failing database; its cause appears only in the log and in ``/readyz``."""
     return ProblemError("database", "the job database cannot be used for now; try again later", retry_after=5)
 
 
 def answer(error: ProblemError) -> JSONResponse:
-    """The answer that carries it."""
+    """Build the HTTP response for a problem."""
     body = error.problem.model_dump(mode="json", exclude_none=True)
     return JSONResponse(body, error.problem.status, headers=error.headers, media_type=MEDIA_TYPE)
 
 
-def fields_of(errors: Iterable[Mapping[str, Any]]) -> tuple[str, list[dict[str, str]]]:
-    """What pydantic says of several fields: as the beginning of a sentence, and one by one."""
-    first = itertools.islice(errors, 20)  # whoever gets more wrong has other worries
+def field_errors(errors: Iterable[Mapping[str, Any]]) -> tuple[str, list[dict[str, str]]]:
+    """Convert pydantic errors to a text for a sentence and to a list with the field and message of each."""
+    first = itertools.islice(errors, 20)  # enough to correct a request
     found = [{"field": ".".join(map(str, e["loc"]))[:200] or "options", "message": str(e["msg"])} for e in first]
     text = "; ".join(f"{item['field']}: {item['message'][:1].lower()}{item['message'][1:]}" for item in found[:5])
     return text, found

@@ -1,4 +1,4 @@
-"""What goes over the wire, as pydantic models: they are the OpenAPI document."""
+"""Request and response models of the REST interface; OpenAPI is generated from them."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from service.core.models import NOTE_CHARS, State
 from service.core.problems import Problem
 
 COMPACTED = "+compact"
-TUNED = "+finetune"
-SOUGHT = "+seek"
-"""After the preset, in the kind of a job."""
+FINETUNED = "+finetune"
+SEARCHED = "+search"
+"""Suffixes of the preset's name in :attr:`JobOptions.kind`."""
 
 
 class JobOptions(kissgs.Settings):
-    """How to compress: a preset, and single settings of its stages replaced."""
+    """Compression options: a preset, and settings that replace single values of it."""
 
     model_config = ConfigDict(
         title="JobOptions",
@@ -32,142 +32,148 @@ class JobOptions(kissgs.Settings):
         },
     )
 
-    evaluate: bool = Field(False, description="Also render both scenes and compare the pictures (PSNR, SSIM); slower.")
+    evaluate: bool = Field(
+        False, description="Also render both scenes and compare the images (PSNR, SSIM), which takes longer."
+    )
 
     @property
     def kind(self) -> str:
-        """What its duration depends on beside the scene: the preset, and what is done beside encoding it once."""
+        """Preset and further stages (compaction, fine-tuning, search): with the scene, they determine the duration."""
         stages = {
             COMPACTED: self.compact.enabled,
-            TUNED: self.finetune.enabled,
-            SOUGHT: self.searches,
+            FINETUNED: self.finetune.enabled,
+            SEARCHED: self.searches,
         }
         return "".join([self.preset, *(suffix for suffix, wanted in stages.items() if wanted)])
 
     @property
     def retrains(self) -> bool:
-        """Whether Gaussians that stay are to be fitted to pictures of the scene."""
+        """Whether compaction trains the remaining Gaussians on renderings of the scene."""
         return self.compact.enabled and self.compact.trains
 
     @property
     def trains(self) -> bool:
-        """Whether these are, or levels."""
+        """Whether compaction or fine-tuning trains, which needs torch."""
         return self.retrains or self.finetune.enabled
 
     @property
     def resumable(self) -> bool:
-        """Whether its training can be taken up where it was left: searches, which train several times, cannot."""
+        """Whether training can resume from a checkpoint. Searches, which train several times, cannot resume."""
         tunes_once = self.finetune.enabled and not self.encode.has_goal
         compacts_once = self.compact.max_psnr_drop is None and not self.compact.auto_count
         return compacts_once and (self.retrains or tunes_once)
 
 
-class Wire(BaseModel):
-    """Of all answers."""
+class ApiModel(BaseModel):
+    """Base class of all response models."""
 
     model_config = ConfigDict(frozen=True)
 
 
-class Progress(Wire):
-    """Where a running job is, in the library's own words."""
+class Progress(ApiModel):
+    """Stage of a running job, as the library reports it."""
 
-    stage: str = Field(description="What is being done.", examples=["codebook"])
-    fraction: float = Field(ge=0, le=1, description="Of that stage.")
+    stage: str = Field(description="Name of the current stage.", examples=["codebook"])
+    fraction: float = Field(ge=0, le=1, description="Completed fraction of the stage, from 0 to 1.")
     note: str | None = Field(
         None,
         max_length=NOTE_CHARS,
-        description="For people: what training has come to. Other stages have none.",
+        description="State of the training as text; absent in stages that do not train.",
         examples=["15,890 Gaussians, loss 0.0123, PSNR 31.20"],
     )
 
 
-class Estimate(Wire):
-    """When it will be done, judged by earlier jobs of the same preset. A guess, made anew at every look."""
+class Estimate(ApiModel):
+    """Estimated time of completion, from earlier jobs with the same preset; updated in every response."""
 
-    seconds_left: float = Field(ge=0, description="Until the result is there, waiting included.")
-    ready_at: datetime = Field(description="The same as a time.")
+    seconds_left: float = Field(
+        ge=0, description="Estimated seconds until the result is available, including the time in the queue."
+    )
+    ready_at: datetime = Field(description="Estimated time at which the result is available.")
 
 
-class Timings(Wire):
-    """What happened when."""
+class Timings(ApiModel):
+    """Times and durations of a job."""
 
     created_at: datetime
-    started_at: datetime | None = Field(None, description="Of the latest start.")
+    started_at: datetime | None = Field(None, description="Time of the latest start.")
     finished_at: datetime | None = None
-    queue_seconds: float | None = Field(None, description="From upload to start.")
-    run_seconds: float | None = Field(None, description="From start to end, or until now.")
-    stages: dict[str, float] | None = Field(None, description="Wall seconds of each stage.")
-    cpu_seconds: float | None = Field(None, description="Of all threads.")
+    queue_seconds: float | None = Field(None, description="Seconds from upload to start.")
+    run_seconds: float | None = Field(None, description="Seconds from start to end, or until now.")
+    stages: dict[str, float] | None = Field(None, description="Wall-clock seconds of each stage.")
+    cpu_seconds: float | None = Field(None, description="CPU seconds of all threads.")
 
 
-class Sizes(Wire):
-    """What came out, in bytes."""
+class Sizes(ApiModel):
+    """Sizes of the result in bytes."""
 
     container: int
-    files: dict[str, int] = Field(description="Of each file, as the container has it: text is deflated there.")
-    ratio: float = Field(description="Upload over container.")
-    bytes_per_gaussian: float = Field(description="Of the container, per Gaussian of the upload.")
+    files: dict[str, int] = Field(description="Bytes of each file inside the container, where text files are deflated.")
+    ratio: float = Field(description="Upload bytes divided by container bytes.")
+    bytes_per_gaussian: float = Field(description="Container bytes per Gaussian of the upload.")
 
 
-class Links(Wire):
-    """Where to go from here: paths on this server, those that lead somewhere now."""
+class Links(ApiModel):
+    """Paths of related resources on this server; only those that are available now."""
 
     self: str
     events: str
     cancel: str | None = None
     result: str | None = None
-    files: str | None = Field(None, description="A template: put a name of sizes.files for {name}.")
+    files: str | None = Field(None, description="Template: replace {name} by a name from sizes.files.")
     decoded: str | None = None
     source: str | None = None
     report: str | None = None
-    preview: str | None = Field(None, description="A page that shows the container in the browser.")
+    preview: str | None = Field(None, description="Page that shows the container in the browser.")
 
 
-class JobStatus(Wire):
-    """All there is to know of a job."""
+class JobStatus(ApiModel):
+    """Complete status of a job."""
 
     id: str
-    name: str = Field(description="Of the scene, as uploaded.")
+    name: str = Field(description="Name of the uploaded scene.")
     state: State
-    position: int | None = Field(None, ge=1, description="In the queue; 1 is next.")
+    position: int | None = Field(None, ge=1, description="Position in the queue; 1 is next.")
     progress: Progress | None = None
     estimate: Estimate | None = None
     options: JobOptions
-    upload_bytes: int = Field(description="Of the upload.")
-    gaussians: int = Field(description="In the upload.")
+    upload_bytes: int = Field(description="Size of the upload in bytes.")
+    gaussians: int = Field(description="Number of Gaussians in the upload.")
     sh_degree: int = Field(ge=0, le=3)
-    kept: int | None = Field(None, description="Gaussians in the container.")
-    compacted: int | None = Field(None, description="Gaussians left out by compaction, whose work others do.")
-    invisible: int | None = Field(None, description="Gaussians left out because no renderer would draw them.")
-    cleaned: dict[str, int] | None = Field(None, description="What was wrong with the upload and was mended, counted.")
+    kept: int | None = Field(None, description="Number of Gaussians in the container.")
+    compacted: int | None = Field(None, description="Number of Gaussians removed by compaction.")
+    invisible: int | None = Field(None, description="Number of Gaussians removed because no renderer would draw them.")
+    cleaned: dict[str, int] | None = Field(
+        None, description="Number of invalid values repaired in the upload, by kind."
+    )
     evaluation: dict[str, Any] | None = Field(
         None,
-        description="PSNR and SSIM to the upload's own renderings from cameras drawn over the whole scene: means, the "
-        "worst view and where its camera stands, the fifth percentile of PSNR, and the share of the scene that the "
+        description="PSNR and SSIM against renderings of the upload, from cameras sampled over the whole scene: means, "
+        "the worst view and its camera position, the fifth percentile of PSNR, and the share of the scene that the "
         "views show. A PSNR of null is infinite.",
     )
     finetuning: dict[str, Any] | None = Field(
-        None, description="What fine-tuning gave: PSNR and bytes before and after, and whether it was kept."
+        None, description="PSNR and bytes before and after fine-tuning, and whether its result was kept."
     )
     sizes: Sizes | None = None
     timings: Timings
-    starts: int = Field(description="How often its work was begun: more than once after a crash or a restart.")
+    starts: int = Field(description="Number of starts; more than one after a crash or a restart of the service.")
     problem: Problem | None = None
     links: Links
-    expires_at: datetime | None = Field(None, description="When the result is removed.")
+    expires_at: datetime | None = Field(None, description="Time at which the result is removed.")
 
 
-class JobPage(Wire):
-    """Some jobs, newest first."""
+class JobPage(ApiModel):
+    """One page of jobs, newest first."""
 
     jobs: list[JobStatus]
     next: str | None = Field(None, description="Cursor of the next page; null on the last.")
 
 
-class Limits(Wire):
-    """What the service takes. null is no limit."""
+class Limits(ApiModel):
+    """Limits of the service; null means no limit."""
 
-    formats: list[str] = Field(description="Of uploads.")
+    formats: list[str] = Field(description="Supported formats of uploads.")
     max_upload_bytes: int
     max_header_bytes: int
     max_gaussians: int
@@ -182,33 +188,39 @@ class Limits(Wire):
     max_wait_seconds: float
     keys_required: bool
     training: bool = Field(
-        description="Whether anything can train here; if not, nothing is fine-tuned and only the preset fast compacts."
+        description="Whether the server has torch. Without it, it cannot fine-tune, and compacts with preset fast only."
     )
 
 
-class PresetFacts(Wire):
-    """A point on the curve of speed, size and quality, with what it gave on a real scene."""
+class PresetFacts(ApiModel):
+    """A preset, its settings, and its size, quality and time measured on a captured scene."""
 
     name: kissgs.Preset
     title: str
     description: str
-    settings: dict[str, Any] = Field(description="All of them.")
-    bytes_per_gaussian: float = Field(description="Measured on the scene that `measured_on` names.")
-    psnr_change: float = Field(description="Decibels, of renderings to held-out photographs, against the upload's.")
-    cpu_seconds_per_million: float = Field(description="Encoding, both cores of a small server together.")
+    settings: dict[str, Any] = Field(description="All settings of the preset.")
+    bytes_per_gaussian: float = Field(
+        description="Container bytes per Gaussian, measured on the scene that `measured_on` names."
+    )
+    psnr_change: float = Field(
+        description="Change of PSNR against held-out photographs, relative to the upload, in dB."
+    )
+    cpu_seconds_per_million: float = Field(
+        description="CPU seconds to encode a million Gaussians, summed over both cores of a small server."
+    )
 
 
-class Presets(Wire):
-    """All presets, and where their figures come from."""
+class Presets(ApiModel):
+    """All presets, and the scene and command behind their figures."""
 
     default: kissgs.Preset
-    measured_on: str = Field(description="The scene behind the figures.")
-    measured_by: str = Field(description="The command that gave them.")
+    measured_on: str = Field(description="Scene on which the figures were measured.")
+    measured_by: str = Field(description="Commands that measured the figures.")
     presets: list[PresetFacts]
 
 
-class ProblemKind(Wire):
-    """A code and what it means."""
+class ProblemKind(ApiModel):
+    """Problem code with its status, title and retryability."""
 
     code: str
     status: int
@@ -216,16 +228,16 @@ class ProblemKind(Wire):
     retryable: bool
 
 
-class Version(Wire):
-    """Which software this is."""
+class Version(ApiModel):
+    """Versions of the library and of the interface, and the container format."""
 
     kissgs: str
     api: str
     container: str
 
 
-class Health(Wire):
-    """Whether the service does its work, and which part does not."""
+class Health(ApiModel):
+    """Readiness of the service and of each part."""
 
     ready: bool
-    checks: dict[str, str] = Field(description='Of each part: "ok", or what is wrong.')
+    checks: dict[str, str] = Field(description='State of each part: "ok", or the error.')

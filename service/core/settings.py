@@ -1,4 +1,4 @@
-"""What the operator may choose: environment variables ``KISSGS_*``."""
+"""Settings of the service: environment variables ``KISSGS_*``."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 PREFIX = "KISSGS_"
 
 CLIENT_NAMES = {"KISSGS_SERVER", "KISSGS_KEY"}
-"""What `kissgs remote` reads: in the same shell they are no mistake."""
+"""Variables of `kissgs remote`, which are accepted because the same shell may run both."""
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 OWNER = r"[A-Za-z0-9._@-]{1,64}"
-"""What the owner of a key may be called."""
+"""Valid names of key owners."""
 
 Seconds = Annotated[float, Field(gt=0, le=10 * 365 * 86400)]
 
 
 class SettingsError(Exception):
-    """Settings that cannot be used; the message names every problem, one a line."""
+    """Invalid settings; the message names every problem, one per line."""
 
 
 class ApiKey(BaseModel):
-    """Who may use the service: a name, and the SHA-256 of a secret that only its owner has."""
+    """Name of a key's owner and SHA-256 of the key, which only its owner has."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -43,49 +43,62 @@ class ServiceSettings(BaseSettings):
 
     model_config = SettingsConfigDict(env_prefix=PREFIX, extra="forbid", frozen=True, hide_input_in_errors=True)
 
-    host: str = Field("127.0.0.1", description="Address to listen on; 0.0.0.0 is every network there is.")
-    port: int = Field(8000, ge=0, le=65535, description="Port to listen on; 0 takes a free one.")
-    data_dir: Path = Field(Path("kissgs-data"), description="Folder of jobs and results; made if it is not there.")
+    host: str = Field("127.0.0.1", description="Address to listen on; 0.0.0.0 listens on all interfaces.")
+    port: int = Field(8000, ge=0, le=65535, description="Port to listen on; 0 chooses a free port.")
+    data_dir: Path = Field(Path("kissgs-data"), description="Folder of jobs and results; created if missing.")
     database_url: str | None = Field(
-        None, description="SQLAlchemy URL of the job database; by default SQLite within the data folder."
+        None, description="SQLAlchemy URL of the job database; by default an SQLite file in the data folder."
     )
     keys: Annotated[tuple[ApiKey, ...], NoDecode] = Field(
-        (), description="Who may use the service, as owner:sha256 (`kissgs-serve key` makes them); none: everyone."
+        (),
+        description="Keys as owner:sha256 (created by `kissgs-serve key`); without keys, everyone may use the service.",
     )
     names: Annotated[tuple[str, ...], NoDecode] = Field(
         (),
-        description="Host names it answers to; by default localhost if it listens there and has no keys, else all.",
+        description="Accepted host names; by default localhost if the service listens there without keys, else all.",
     )
     cors_origins: Annotated[tuple[str, ...], NoDecode] = Field(
-        (), description="Origins whose pages may call the service; none by default."
+        (), description="Origins whose web pages may use the service (CORS); none by default."
     )
 
-    max_upload_bytes: ByteSize = Field(ByteSize(2 << 30), gt=0, description="Of one upload.")
-    max_header_bytes: ByteSize = Field(ByteSize(64 << 10), ge=1024, le=1 << 20, description="Of a .ply header.")
-    max_gaussians: int = Field(5_000_000, gt=0, le=20_000_000, description="Of one scene.")
-    max_uploads: int = Field(16, gt=0, description="Uploads at the same time.")
-    upload_idle_seconds: Seconds = Field(30, description="An upload that sends nothing for so long is ended.")
+    max_upload_bytes: ByteSize = Field(ByteSize(2 << 30), gt=0, description="Maximum bytes of one upload.")
+    max_header_bytes: ByteSize = Field(
+        ByteSize(64 << 10), ge=1024, le=1 << 20, description="Maximum bytes of a .ply header."
+    )
+    max_gaussians: int = Field(5_000_000, gt=0, le=20_000_000, description="Maximum number of Gaussians of one scene.")
+    max_uploads: int = Field(16, gt=0, description="Maximum number of simultaneous uploads.")
+    upload_idle_seconds: Seconds = Field(30, description="Seconds without data after which an upload is aborted.")
     upload_min_rate: ByteSize = Field(
-        ByteSize(8 << 10), description="Bytes per second, on average, below which an upload is ended."
+        ByteSize(8 << 10), description="Average bytes per second below which an upload is aborted."
     )
-    max_queue: int = Field(100, gt=0, description="Jobs that may wait.")
-    max_jobs_per_key: int = Field(20, gt=0, description="Jobs of one key that may wait or run.")
-    max_disk_bytes: ByteSize = Field(ByteSize(50 << 30), gt=0, description="Of all jobs together.")
-    min_free_bytes: ByteSize = Field(ByteSize(1 << 30), ge=0, description="What must stay free on the disk.")
+    max_queue: int = Field(100, gt=0, description="Maximum number of waiting jobs.")
+    max_jobs_per_key: int = Field(20, gt=0, description="Maximum number of waiting and running jobs of one key owner.")
+    max_disk_bytes: ByteSize = Field(
+        ByteSize(50 << 30), gt=0, description="Maximum bytes on disk of all jobs together."
+    )
+    min_free_bytes: ByteSize = Field(ByteSize(1 << 30), ge=0, description="Bytes that must stay free on the disk.")
 
-    workers: int = Field(1, gt=0, le=64, description="Jobs that run at the same time.")
-    job_threads: int = Field(0, ge=0, description="Threads of one job; 0 is one per processor.")
-    job_seconds: Seconds = Field(3600, description="Wall time after which a job is ended.")
-    job_memory: ByteSize = Field(ByteSize(8 << 30), ge=256 << 20, description="Memory of one job (Linux).")
-    job_starts: int = Field(3, ge=1, description="How often a job may be started, restarts of the service included.")
+    workers: int = Field(1, gt=0, le=64, description="Number of jobs that run simultaneously.")
+    job_threads: int = Field(0, ge=0, description="Threads of one job; 0 uses one per processor.")
+    job_seconds: Seconds = Field(3600, description="Wall-clock seconds after which a job is stopped.")
+    job_memory: ByteSize = Field(
+        ByteSize(8 << 30), ge=256 << 20, description="Maximum bytes of memory of one job (Linux only)."
+    )
+    job_starts: int = Field(
+        3, ge=1, description="Maximum number of starts of a job, including restarts of the service."
+    )
 
-    keep_seconds: Seconds = Field(86400, description="How long results can be fetched once a job has ended.")
-    keep_uploads: bool = Field(True, description="Keep the .ply as long as the result, while there is room.")
-    sweep_seconds: Seconds = Field(30, description="How often what has expired is removed.")
-    sync_seconds: Seconds = Field(30, le=600, description="How long POST /v1/compress waits before it answers 202.")
-    drain_seconds: float = Field(20, ge=0, description="How long a stopping service waits for running jobs.")
+    keep_seconds: Seconds = Field(86400, description="Seconds for which results are kept after a job has ended.")
+    keep_uploads: bool = Field(
+        True, description="Keep the uploaded .ply as long as the result, unless its space is needed."
+    )
+    sweep_seconds: Seconds = Field(30, description="Seconds between two removals of expired jobs.")
+    sync_seconds: Seconds = Field(
+        30, le=600, description="Seconds that POST /v1/compress waits for its job before it answers 202 or 409."
+    )
+    drain_seconds: float = Field(20, ge=0, description="Seconds that a stopping service waits for running jobs.")
     log_level: Annotated[str, Field(pattern="^(debug|info|warning|error)$")] = Field(
-        "info", description="debug, info, warning or error."
+        "info", description="Log level: debug, info, warning or error."
     )
 
     @field_validator("keys", mode="before")
@@ -117,18 +130,18 @@ class ServiceSettings(BaseSettings):
 
     @property
     def is_private(self) -> bool:
-        """Whether only this machine can reach it."""
+        """Whether only this machine can reach the service."""
         return self.host in LOOPBACK
 
     def answers_to(self, name: str) -> bool:
-        """Whether a request may call it by this name, in lower case and without a port."""
+        """Return whether the service accepts this host name (in lower case, without a port)."""
         if self.names:
             return name in self.names or name in LOOPBACK
         return name in LOOPBACK or bool(self.keys) or not self.is_private
 
     @property
     def database(self) -> str:
-        """SQLAlchemy's URL of the job database."""
+        """SQLAlchemy URL of the job database."""
         return self.database_url or f"sqlite:///{(self.data_dir / 'jobs.sqlite').absolute()}"
 
     @classmethod
@@ -136,7 +149,7 @@ class ServiceSettings(BaseSettings):
         """Read ``KISSGS_*``.
 
         Raises:
-            SettingsError: names that are no settings, or values that are not possible; all of them.
+            SettingsError: there are unknown names or invalid values; the message lists all of them.
         """
         known = {PREFIX + name.upper() for name in cls.model_fields}
         given = {name for name in os.environ if name.upper().startswith(PREFIX)}

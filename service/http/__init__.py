@@ -1,1 +1,1 @@
-"""Requests and answers: the application, its routes, uploads and files."""
+"""HTTP interface: the application, its routes, uploads and file downloads."""

@@ -1,4 +1,4 @@
-"""The application: parts put together, errors turned into problem documents, start and stop."""
+"""The ASGI application: construction, conversion of errors to problem documents, start and stop."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ import kissgs
 from service.core.clock import Clock
 from service.core.metrics import Metrics
 from service.core.notifier import JobNotifier
-from service.core.problems import ProblemError, answer, fields_of, unusable_database
+from service.core.problems import ProblemError, answer, field_errors, unusable_database
 from service.core.settings import ServiceSettings, SettingsError
 from service.http.middleware import RequestMiddleware
 from service.http.openapi import describe
@@ -33,7 +33,7 @@ from service.jobs.event_stream import EventStream
 from service.jobs.expiry import ExpiryTask
 from service.jobs.recovery import recover
 from service.jobs.worker import Worker
-from service.storage.database_health import reason_of
+from service.storage.database_health import error_text
 from service.storage.folder_binding import open_store
 from service.storage.job_storage import JobStorage
 
@@ -43,13 +43,12 @@ log = logging.getLogger("kissgs.service")
 
 
 def create_app(settings: ServiceSettings) -> FastAPI:
-    """The service as an ASGI application. Its data folder and database are opened here and now, and what a former
-    service left in them is taken up.
+    """Create the service as an ASGI application. Opens its data folder and database and recovers unfinished jobs.
 
     Raises:
         SettingsError: the data folder or the database cannot be used.
     """
-    context = _begin(settings)
+    context = _build_and_recover(settings)
     app = FastAPI(
         title="kissgs",
         version=facts.API_VERSION,
@@ -64,7 +63,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         app.include_router(router)
     app.mount("/static", page.Fresh(directory=page.STATIC), name="static")
     describe(app, keys_required=bool(settings.keys))
-    app.openapi()  # made now, not while a request waits
+    app.openapi()  # generated at the start, not during a request
     _answer_errors(app)
     if settings.cors_origins:
         app.add_middleware(
@@ -84,7 +83,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     return app
 
 
-def _begin(settings: ServiceSettings) -> ServiceContainer:
+def _build_and_recover(settings: ServiceSettings) -> ServiceContainer:
     try:
         context = build(settings)
         try:
@@ -96,12 +95,12 @@ def _begin(settings: ServiceSettings) -> ServiceContainer:
     except OSError as error:
         raise SettingsError(f"KISSGS_DATA_DIR: cannot use {settings.data_dir}: {str(error).lower()}") from error
     except SQLAlchemyError as error:
-        raise SettingsError(f"KISSGS_DATABASE_URL: the job database cannot be used: {reason_of(error)}") from error
+        raise SettingsError(f"KISSGS_DATABASE_URL: the job database cannot be used: {error_text(error)}") from error
     return context
 
 
 def build(settings: ServiceSettings) -> ServiceContainer:
-    """The parts of a service, ready to start."""
+    """Create all parts of a service without starting them."""
     storage, clock = JobStorage(settings.data_dir), Clock()
     try:
         store = open_store(settings, storage, clock)
@@ -117,16 +116,18 @@ def build(settings: ServiceSettings) -> ServiceContainer:
     )
     admission = Admission(settings, store, storage)
     decoder = Decoder(settings, store, storage, admission)
-    follower = EventStream(store, notifier, settings.workers)
-    return ServiceContainer(settings, store, storage, notifier, metrics, clock, worker, admission, decoder, follower)
+    event_stream = EventStream(store, notifier, settings.workers)
+    return ServiceContainer(
+        settings, store, storage, notifier, metrics, clock, worker, admission, decoder, event_stream
+    )
 
 
 @contextlib.asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     context: ServiceContainer = app.state.context
     context.worker.start()
-    janitor = ExpiryTask(context, context.clock())
-    tasks = [asyncio.create_task(janitor.run()), asyncio.create_task(janitor.show_life())]
+    expiry = ExpiryTask(context, context.clock())
+    tasks = [asyncio.create_task(expiry.run()), asyncio.create_task(expiry.heartbeat())]
     try:
         yield
     finally:
@@ -146,7 +147,7 @@ def _answer_errors(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def invalid(request: Request, error: RequestValidationError) -> JSONResponse:
-        text, found = fields_of(error.errors())
+        text, found = field_errors(error.errors())
         return answer(ProblemError("invalid-request", f"{text}; see /openapi.json", errors=found))
 
     @app.exception_handler(HTTPException)
@@ -155,11 +156,13 @@ def _answer_errors(app: FastAPI) -> None:
         match error.status_code:
             case HTTPStatus.NOT_FOUND:
                 return answer(
-                    ProblemError("not-found", f"there is nothing at {request.scope['path'][:200]}; see /openapi.json")
+                    ProblemError(
+                        "not-found", f"{request.scope['path'][:200]} does not exist; /openapi.json lists all paths"
+                    )
                 )
             case HTTPStatus.METHOD_NOT_ALLOWED:
                 allowed = _allowed(request.scope["path"])
-                text = f"{request.method[:20]} is not possible here; use {allowed}"
+                text = f"{request.method[:20]} is not allowed for this path; use {allowed}"
                 return answer(ProblemError("method-not-allowed", text, headers={"Allow": allowed}))
             case _:
                 return answer(ProblemError("invalid-request", f"{error.detail}; see /openapi.json", headers=headers))
@@ -178,7 +181,7 @@ def _answer_errors(app: FastAPI) -> None:
 
 
 def _allowed(path: str) -> str:
-    """The methods of all routes with this path; FastAPI names those of the first, or none."""
+    """List the methods of all routes with this path; FastAPI lists only those of the first route."""
     routes = [route for router in ROUTERS for route in router.routes if isinstance(route, APIRoute)]
     fitting = [route.methods or set() for route in routes if route.path_regex.match(path)]
     return ", ".join(sorted(set().union(*fitting))) or "GET, HEAD"

@@ -1,4 +1,4 @@
-"""Answers that are files on disk: ranges, conditions, checksums."""
+"""Responses that send files from disk, with ranges, conditional requests and checksums."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from service.core.problems import ProblemError
 
 
 class StoredFile(FileResponse):
-    """A file that never changes: strong ETag, digests, ranges, ``If-None-Match``; HEAD answers what GET would.
+    """Immutable file with strong ETag, digests, ranges and ``If-None-Match``, for GET and HEAD.
 
     Args:
-        path: of the file.
-        sha256: of its bytes, as hexadecimal.
-        media_type: of its bytes.
-        download: the name under which a browser saves it; by default it shows it.
-        headers: further ones.
+        path: path of the file.
+        sha256: SHA-256 of the file, as hexadecimal digits.
+        media_type: media type of the file.
+        download: file name for saving in a browser; None lets the browser show the file.
+        headers: additional response headers.
     """
 
     def __init__(
@@ -42,13 +42,13 @@ class StoredFile(FileResponse):
             fixed["Content-Disposition"] = _attachment(download)
         try:
             stat = path.stat()
-        except FileNotFoundError as error:  # it expired, or made room, a moment ago
-            raise ProblemError("gone", "the file has just been removed; submit the scene again") from error
+        except FileNotFoundError as error:  # expired, or deleted for a new upload, since the job was read
+            raise ProblemError("gone", "the file was removed during the request; submit the scene again") from error
         super().__init__(path, media_type=media_type, headers=fixed, stat_result=stat)
         self._size = stat.st_size
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer 304 if the client has it; else let the file go out, or the range of it that was asked for."""
+        """Send 304 if the client has the current file, else the file or the requested range of it."""
         asked = Headers(scope=scope)
         conditions = scope["method"] in ("GET", "HEAD")
         if conditions and _names(", ".join(asked.getlist("if-none-match")), self.headers["etag"]):
@@ -59,13 +59,13 @@ class StoredFile(FileResponse):
 
         async def corrected(message: Message) -> None:
             if message["type"] == "http.response.start" and message["status"] != 200:
-                del MutableHeaders(raw=message["headers"])["content-digest"]  # of these bytes, which are not the whole
+                del MutableHeaders(raw=message["headers"])["content-digest"]  # it would be that of the whole file
             await send(message)
 
         wanted = asked.getlist("range") if conditions and self._is_same(asked) else []
         if len(wanted) == 1 and _is_range(wanted[0]):
             if _is_outside(wanted[0], self._size):
-                text = f"the file has {self._size} bytes; ask for a range within it"
+                text = f"the range is outside the file, which has {self._size} bytes; request a range within it"
                 raise ProblemError("range", text, headers={"Content-Range": f"bytes */{self._size}"})
             answered = {b"if-range"}
         else:
@@ -74,27 +74,29 @@ class StoredFile(FileResponse):
         await super().__call__({**scope, "headers": headers}, receive, corrected)
 
     def _is_same(self, asked: Headers) -> bool:
-        """Whether a range may be taken from this version of the file."""
+        """Return whether ``If-Range`` allows a range of this version of the file."""
         versions = asked.getlist("if-range")
         return not versions or versions == [self.headers["etag"]]
 
 
 def described(summary: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
-    """The entry at the end of a path of names in a job's summary.
+    """Return the entry of a job's summary at a path of names.
 
     Raises:
-        ProblemError: there is none.
+        ProblemError: it does not exist.
     """
     entry: Any = summary
     for name in names:
         if not isinstance(entry, dict) or name not in entry:
-            raise ProblemError("not-found", f"there is no file {name[:80]!r}; sizes.files of the job names all")
+            raise ProblemError(
+                "not-found", f"the job has no file {name[:80]!r}; sizes.files of its status lists all files"
+            )
         entry = entry[name]
     return dict(entry)
 
 
 def _attachment(name: str) -> str:
-    """RFC 6266: the name in plain letters for old clients, and as it is for all others."""
+    """Format a Content-Disposition header (RFC 6266) with an ASCII fallback of the name."""
     plain = name.encode("ascii", "replace").decode().replace("?", "_").replace('"', "_").replace("\\", "_")
     return f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(name, safe='')}"
 
@@ -105,7 +107,7 @@ def _names(header: str, etag: str) -> bool:
 
 
 def _is_range(header: str) -> bool:
-    """Whether this is one range of bytes. Others may be ignored, says RFC 9110, and are."""
+    """Return whether this is a single range of bytes; all others are ignored, as RFC 9110 permits."""
     found = re.fullmatch(r"\s*bytes\s*=\s*([0-9]{0,18})\s*-\s*([0-9]{0,18})\s*", header, re.IGNORECASE)
     if not found or not (found[1] or found[2]):
         return False
@@ -113,6 +115,6 @@ def _is_range(header: str) -> bool:
 
 
 def _is_outside(header: str, size: int) -> bool:
-    """Whether nothing of a file of this size lies in the range."""
+    """Return whether the range contains no byte of a file of this size."""
     first, _, last = header.partition("=")[2].strip().partition("-")
     return int(first) >= size if first.strip() else int(last) == 0 or size == 0

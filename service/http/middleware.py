@@ -1,4 +1,4 @@
-"""Around every request: who may ask at all, an id that goes through the logs, headers that browsers obey, counting."""
+"""Middleware for every request: host and origin checks, request ids, security headers, metrics and access log."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
     "form-action 'none'; base-uri 'none'; frame-ancestors 'none'"
 )
-"""Of the page: it loads nothing from elsewhere, and nobody frames it."""
+"""Content-Security-Policy of the main page: no external resources, no embedding in frames."""
 
 METHODS = ("GET", "HEAD", "POST", "DELETE", "OPTIONS", "PUT", "PATCH")
 
 
 class RequestMiddleware:
-    """Wraps the application; see above.
+    """ASGI middleware around the application.
 
     Args:
         app: the application.
-        metrics: where requests are counted, by the route's template and never by what a client has put in it.
-        settings: which names and origins are ours.
+        metrics: counters of requests, labelled with the route's template, never with client input.
+        settings: accepted host names and origins.
     """
 
     def __init__(self, app: ASGIApp, metrics: Metrics, settings: ServiceSettings) -> None:
@@ -63,7 +63,7 @@ class RequestMiddleware:
         except Exception:
             log.exception("request %s failed", request_id)
             if status == 0:
-                text = f"the service failed in a way that it should not; please report it with the id {request_id}"
+                text = f"an internal error of the service; report it with the request id {request_id}"
                 await answer(ProblemError("internal", text))(scope, receive, sending)
         finally:
             method = scope["method"] if scope["method"] in METHODS else "other"
@@ -73,20 +73,20 @@ class RequestMiddleware:
             log.info("%s %s %d %.0f ms %s", method, target[:500], status, spent, request_id)
 
     def _refusal(self, method: str, headers: Headers) -> ProblemError | None:
-        """What another site's page makes a browser send is not what its user wants.
+        """Return the error for a foreign host name (DNS rebinding) or a foreign origin (CSRF); None to allow.
 
-        A browser says where a page comes from, and a name that leads here may be another's (DNS rebinding).
+        Requests without an ``Origin`` header do not come from a page of another site.
         """
         host = headers.get("host", "")
         if not self._is_ours(host):
-            text = f"this service does not answer as {host[:100]!r}; its operator may add the name to KISSGS_NAMES"
+            text = f"the host name {host[:100]!r} is not accepted; the operator can add it to KISSGS_NAMES"
             return ProblemError("foreign", text)
         origin = headers.get("origin")
         if method in ("GET", "HEAD", "OPTIONS") or origin is None or origin.lower() in self._settings.cors_origins:
             return None
         if "*" in self._settings.cors_origins or _site(origin) == host.lower():
             return None
-        text = f"pages of {origin[:100]!r} may not use this service; its operator may add it to KISSGS_CORS_ORIGINS"
+        text = f"pages of {origin[:100]!r} may not use this service; the operator can add it to KISSGS_CORS_ORIGINS"
         return ProblemError("foreign", text)
 
     def _is_ours(self, host: str) -> bool:
@@ -95,10 +95,10 @@ class RequestMiddleware:
 
 
 def _site(origin: str) -> str | None:
-    """The name and port of an origin, in lower case; None if it has none, or is malformed."""
+    """Return host and port of an origin in lower case; None if it has none or is malformed."""
     try:
         return urlsplit(origin).netloc.lower() or None
-    except ValueError:  # brackets that hold no address of IPv6
+    except ValueError:  # brackets without a valid IPv6 address
         return None
 
 

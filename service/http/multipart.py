@@ -1,4 +1,4 @@
-"""``multipart/form-data`` as it arrives, part by part and chunk by chunk: nothing is spooled on the way."""
+"""Streaming parser of ``multipart/form-data`` that buffers no part."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from service.core.problems import ProblemError
 MAX_PART_HEADER_BYTES = 8192
 
 MAX_PREAMBLE_BYTES = 8192
-"""The most that may stand before the first boundary; RFC 2046 allows text there, which is ignored."""
+"""Maximum bytes before the first boundary, where RFC 2046 allows text, which is ignored."""
 
 
 @dataclass(frozen=True, slots=True)
 class PartBegin:
-    """A part begins: its field's name, and the file's name if it is one."""
+    """Start of a part: name of its field, and file name if it is a file."""
 
     name: str
     filename: str | None
@@ -27,13 +27,13 @@ class PartBegin:
 
 @dataclass(frozen=True, slots=True)
 class PartData:
-    """Bytes of the part that began last."""
+    """Next bytes of the current part."""
 
     data: bytes
 
 
 class _Parser:
-    """Collects what the library's callbacks say."""
+    """Collects the events of the library's callbacks."""
 
     def __init__(self, boundary: bytes) -> None:
         self.found: list[PartBegin | PartData] = []
@@ -81,7 +81,7 @@ class _Parser:
         _, options = parse_options_header(self._headers.get(b"content-disposition", b""))
         if b"name" not in options:
             raise ProblemError(
-                "invalid-request", "a part of the form has no name; send the fields 'file' and 'options'"
+                "invalid-request", "a part of the form has no field name; send the fields 'file' and 'options'"
             )
         filename = options.get(b"filename")
         self.found.append(
@@ -100,7 +100,7 @@ class _Parser:
 
 
 class _Preamble:
-    """Leaves out what stands before the first boundary, which the library does not."""
+    """Removes the bytes before the first boundary, which the library does not."""
 
     def __init__(self, boundary: bytes) -> None:
         self._line = re.compile(rb"(?:^|\n)--" + re.escape(boundary) + rb"(?:[ \t]*(?=\r\n)|(?=--))")
@@ -108,7 +108,7 @@ class _Preamble:
         self.over = False
 
     def feed(self, chunk: bytes) -> bytes:
-        """Take the next bytes; return those that belong to the parts."""
+        """Process the next bytes; return those that belong to parts."""
         if self.over:
             return chunk
         self._head += chunk
@@ -124,15 +124,17 @@ class _Preamble:
 
 
 async def parts(content_type: str, chunks: AsyncIterable[bytes]) -> AsyncIterator[PartBegin | PartData]:
-    """The parts of a form, in the order they come.
+    """Yield the parts of a form in the order in which they arrive.
 
     Raises:
-        ProblemError: it is no valid form, or it ends too soon.
+        ProblemError: the form is invalid or incomplete.
     """
     _, options = parse_options_header(content_type)
     boundary = options.get(b"boundary", b"")
     if not 1 <= len(boundary) <= 256:
-        raise ProblemError("invalid-request", "the Content-Type names no boundary; let your HTTP library write it")
+        raise ProblemError(
+            "invalid-request", "the Content-Type has no valid boundary; let your HTTP library generate the header"
+        )
     try:
         parser, preamble = _Parser(boundary), _Preamble(boundary)
         async for chunk in chunks:
@@ -141,6 +143,8 @@ async def parts(content_type: str, chunks: AsyncIterable[bytes]) -> AsyncIterato
     except FormParserError as error:
         raise ProblemError("invalid-request", f"the form cannot be read: {error}") from error
     if not preamble.over:
-        raise ProblemError("invalid-request", "the form has no line with its boundary; let your HTTP library write it")
+        raise ProblemError(
+            "invalid-request", "the form has no line with its boundary; let your HTTP library generate the body"
+        )
     if not parser.complete:
         raise ProblemError("invalid-request", "the form ends before its last boundary; send it again")

@@ -1,4 +1,4 @@
-"""The OpenAPI document, where FastAPI's own says less or other than the service does."""
+"""Corrections of the OpenAPI document that FastAPI generates."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ Upload a 3D Gaussian Splatting scene (`.ply`), follow the job, download a SOG-XT
 
     curl -F file=@scene.ply -F 'options={"preset": "balanced"}' localhost:8000/v1/jobs
     curl 'localhost:8000/v1/jobs/ID?wait=30'
-    curl -OJ localhost:8000/v1/jobs/ID/result
+    curl --fail -OJ localhost:8000/v1/jobs/ID/result
 
-Errors are RFC 9457 problem documents. `code` is stable; `detail` says how to mend it; `/v1/problems` lists all.
+Errors are RFC 9457 problem documents. `code` is stable, `detail` has the remedy, and `/v1/problems` lists all codes.
 """
 
 
-_FOLLOWERS = ("status", "events", "cancel", "delete", "result", "file", "decoded", "source", "report")
-"""Operations that take the id of a job."""
+_JOB_OPERATIONS = ("status", "events", "cancel", "delete", "result", "file", "decoded", "source", "report")
+"""Operations with the id of a job as a parameter."""
 
 
 def describe(app: FastAPI, *, keys_required: bool) -> None:
-    """Complete the document that ``app`` serves.
+    """Complete the OpenAPI document of ``app``.
 
-    Schemas that only errors and forms use come in, and no others; where a job is made, links say what can be done with
-    it; where no keys are required, none is asked for.
+    Adds the schemas of errors and of form fields, removes unused schemas, links responses that create a job to the
+    operations on it, and makes authorization optional unless keys are required.
     """
     app.description = DESCRIPTION
     made = app.openapi
@@ -55,11 +55,11 @@ def describe(app: FastAPI, *, keys_required: bool) -> None:
 def _complete(operation: dict[str, Any], keys_required: bool) -> None:
     if "security" in operation and not keys_required:
         operation["security"].append({})
-    for parameter in operation.get("parameters", []):  # one that is not there is not null
+    for parameter in operation.get("parameters", []):  # an absent parameter is not null
         choices = [choice for choice in parameter["schema"].pop("anyOf", []) if choice != {"type": "null"}]
         parameter["schema"] |= choices[0] if choices else {}
     made = operation["responses"].get("202")
     if made is not None:
-        for name in _FOLLOWERS:
+        for name in _JOB_OPERATIONS:
             parameters = {"id": "$response.body#/id", **({"name": "meta.json"} if name == "file" else {})}
             made.setdefault("links", {})[name] = {"operationId": name, "parameters": parameters}

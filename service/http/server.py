@@ -1,5 +1,7 @@
-"""uvicorn, with what a public service needs beyond it: a time limit for silent connections, and a drain that starts at
-the signal rather than after the last stream has ended."""
+"""uvicorn with timeouts for idle and slow connections, and with a shutdown that drains jobs and requests concurrently.
+
+uvicorn itself would begin to drain only after the last stream has ended.
+"""
 
 from __future__ import annotations
 
@@ -21,30 +23,30 @@ from service.jobs.container import ServiceContainer
 log = logging.getLogger("kissgs.service")
 
 HEADER_SECONDS = 20.0
-"""For the headers of a request, from the first byte of the connection or of the next one; and for the rest of a body
-that has been refused, so that the client sees why."""
+"""Timeout for the headers of a request, and for the remaining body of a refused request, whose client is still to
+receive the response."""
 
 READ_SECONDS = 60.0
-"""For a client to take something of an answer that waits for it."""
+"""Timeout for a client to receive any bytes of a pending response."""
 
 READ_BYTES = 32 << 10
-"""At a time."""
+"""Maximum bytes per read from a connection."""
 
-FAIR_SECONDS = 2e-7
-"""For parsing a byte. A body takes a hundredth of it; one in chunks of single bytes takes ten times as much."""
+PARSE_SECONDS_PER_BYTE = 2e-7
+"""Allowed CPU seconds per received byte. A normal body needs a hundredth; one in chunks of single bytes, tenfold."""
 
-MOST_DEBT = 0.1
-"""Seconds of parsing beyond that, after which a connection is closed."""
+MAX_PARSE_DEBT_SECONDS = 0.1
+"""CPU seconds beyond the allowance after which a connection is closed."""
 
 MAX_CONNECTIONS = 1000
 
-SPARE_DESCRIPTORS = 256
-"""For what is not a connection: files on their way in and out, the database, jobs."""
+OTHER_DESCRIPTORS = 256
+"""File descriptors reserved for other uses than connections: uploads, downloads, the database, jobs."""
 
 
-class _Impatient(H11Protocol):
-    """Closes connections that say too little to make a request, or that do not take the answer; and gives none of them
-    more of the processor than is due to it."""
+class TimeoutProtocol(H11Protocol):
+    """HTTP protocol that closes connections that send no complete request, do not receive the response, or need too
+    much CPU time to parse."""
 
     _listening: asyncio.TimerHandle | None = None
     _watching: asyncio.TimerHandle | None = None
@@ -54,6 +56,7 @@ class _Impatient(H11Protocol):
     _taken = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Start the timers of the connection, or abort it if there are too many."""
         super().connection_made(transport)  # type: ignore[arg-type]
         if len(self.connections) > self.most_connections:
             self.transport.abort()
@@ -63,13 +66,14 @@ class _Impatient(H11Protocol):
         self._watching = self.loop.call_later(READ_SECONDS, self._watch)
 
     def data_received(self, data: bytes) -> None:
+        """Parse a piece of a request, and close connections whose requests take too much CPU time to parse."""
         request, begun = self.cycle, time.thread_time()
         super().data_received(data)
-        spent = time.thread_time() - begun - FAIR_SECONDS * len(data)
-        self._debt = max(0.0, self._debt + spent) if self.cycle is request else 0.0  # of one body, not of many requests
+        spent = time.thread_time() - begun - PARSE_SECONDS_PER_BYTE * len(data)
+        self._debt = max(0.0, self._debt + spent) if self.cycle is request else 0.0  # per body, not across requests
         self.transport.max_size = READ_BYTES >> (4 if self._debt else 0)  # type: ignore[attr-defined]
-        if self._debt > MOST_DEBT:
-            log.warning("a connection was closed: its bytes take too long to read")
+        if self._debt > MAX_PARSE_DEBT_SECONDS:
+            log.warning("a connection was closed: parsing its request needs too much CPU time")
             self.transport.abort()
             return
         busy = self.scope is not None and not self.cycle.response_complete
@@ -80,11 +84,12 @@ class _Impatient(H11Protocol):
             self._listening = self.loop.call_later(HEADER_SECONDS, self.transport.close)
 
     def resume_writing(self) -> None:
+        """Note that the client has received a part of the response."""
         super().resume_writing()
         self._taken = True
 
     def _watch(self) -> None:
-        """Give up on a client that has taken nothing of what waits for it since the last look."""
+        """Close the connection if its client has received nothing of the pending response since the last call."""
         unsent = self.transport.get_write_buffer_size()
         if unsent and unsent == self._unsent and not self._taken:
             self.transport.abort()
@@ -93,8 +98,11 @@ class _Impatient(H11Protocol):
         self._watching = self.loop.call_later(READ_SECONDS, self._watch)
 
     def send_400_response(self, msg: str) -> None:
-        """What is no HTTP, or has headers of more than 64 KiB: the same kind of answer as to everything else."""
-        found = problem("bad-http", "this is not HTTP, or its headers take more than 64 KiB")
+        """Answer invalid HTTP and headers of more than 64 KiB with a problem document, like all other errors."""
+        found = problem(
+            "bad-http",
+            "the request is not valid HTTP, or its headers exceed 64 KiB; send a valid request with shorter headers",
+        )
         body = found.model_dump_json(exclude_none=True).encode()
         headers = [
             (b"content-type", MEDIA_TYPE.encode()),
@@ -107,6 +115,7 @@ class _Impatient(H11Protocol):
         self.transport.close()
 
     def connection_lost(self, exc: Exception | None) -> None:
+        """Cancel the timers of the connection."""
         for timer in (self._listening, self._watching):
             if timer is not None:
                 timer.cancel()
@@ -114,20 +123,20 @@ class _Impatient(H11Protocol):
 
 
 def allow_connections() -> None:
-    """Have enough descriptors for all connections; where the system forbids that, have fewer connections."""
-    wanted = MAX_CONNECTIONS + SPARE_DESCRIPTORS
+    """Raise the limit of file descriptors for all connections; if that is not permitted, limit the connections."""
+    wanted = MAX_CONNECTIONS + OTHER_DESCRIPTORS
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft < wanted:
         most = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
-        _Impatient.most_connections = max(10, most - SPARE_DESCRIPTORS)
+        TimeoutProtocol.most_connections = max(10, most - OTHER_DESCRIPTORS)
 
 
 def listen(settings: ServiceSettings) -> socket.socket:
-    """Take the port, before anything else is begun.
+    """Open the listening socket.
 
     Raises:
-        SettingsError: it is taken, or the address is none of this machine.
+        SettingsError: the port is in use, or the address does not belong to this machine.
     """
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     try:
@@ -135,47 +144,47 @@ def listen(settings: ServiceSettings) -> socket.socket:
     except OSError as error:
         where, reason = f"{settings.host}:{settings.port}", (error.strerror or str(error)).lower()
         raise SettingsError(f"KISSGS_HOST, KISSGS_PORT: cannot listen on {where}: {reason}; choose others") from error
-    # Inherited by its connections. asyncio would set it, but not for sockets that it has not made: 40 ms an answer.
+    # Inherited by its connections. asyncio sets it only for sockets of its own; without it, responses take 40 ms more.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return listener
 
 
 class Server(uvicorn.Server):
-    """Serves one application, and tells its parts at once when it is to stop."""
+    """uvicorn server that notifies the application's parts as soon as a shutdown is requested."""
 
     def __init__(self, app: object, context: ServiceContainer) -> None:
         self._context = context
         super().__init__(config_of(app))
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Say where, once it can be reached."""
+        """Log the address once the server accepts connections."""
         await super().startup(sockets)
         for listener in sockets or []:
             host, port = listener.getsockname()[:2]
             log.info("listening on http://%s:%d", f"[{host}]" if ":" in host else host, port)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Let jobs and requests finish at the same time."""
+        """Drain jobs and requests concurrently."""
         await asyncio.gather(self._context.worker.drain(), super().shutdown(sockets))
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Take no more jobs, end streams and long polls, then let uvicorn finish its requests.
+        """Stop starting jobs, end streams and long polls, then let uvicorn finish its requests.
 
-        uvicorn's own would end the process by the same signal afterwards, which looks like a crash.
+        uvicorn's handler would raise the signal again afterwards, so that the exit status would look like a crash.
         """
         if self.should_exit:
             self._context.worker.kill_running()
         self._context.worker.draining = True
         self._context.notifier.close()
-        self.force_exit = self.should_exit  # asked twice
+        self.force_exit = self.should_exit  # on the second signal
         self.should_exit = True
 
 
 def config_of(app: object) -> uvicorn.Config:
-    """How uvicorn is to serve an application."""
+    """Return the uvicorn configuration for an application."""
     return uvicorn.Config(
         app,  # type: ignore[arg-type]
-        http=_Impatient,
+        http=TimeoutProtocol,
         ws="none",
         access_log=False,
         log_config=None,

@@ -1,4 +1,4 @@
-"""From a request with a scene to a job in the queue."""
+"""Conversion of a request with a scene to a queued job."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from starlette.requests import Request
 from service.core.disk_estimates import checkpoint_bytes
 from service.core.models import Job
 from service.core.presets import can_train
-from service.core.problems import ProblemError, fields_of, unusable_database
+from service.core.problems import ProblemError, field_errors, unusable_database
 from service.core.schemas import JobOptions
 from service.http.multipart import PartBegin, PartData, parts
 from service.http.uploads import Received, Spool, scene_name, timed
@@ -30,16 +30,16 @@ FORM_TYPE = "multipart/form-data"
 log = logging.getLogger("kissgs.service")
 
 STOPPING = "stopping"
-"""What nobody rings for: the bell's closing is heard all the same."""
+"""Subscription that only the closing of the notifier wakes."""
 
 MAX_OPTIONS_BYTES = 64 << 10
 MAX_FORM_BYTES = MAX_OPTIONS_BYTES + (32 << 10)
-"""What a form holds beside the scene."""
+"""Maximum bytes of a form in addition to the scene."""
 
 
 @dataclass(frozen=True, slots=True)
 class Submission:
-    """What a request has brought, apart from its owner."""
+    """Content of a request: upload, options, name and idempotency key."""
 
     received: Received
     options: JobOptions
@@ -48,7 +48,7 @@ class Submission:
 
     @property
     def fingerprint(self) -> str:
-        """Equal for requests that ask for the same."""
+        """Hash of the scene and the options; equal for equivalent requests."""
         asked = json.dumps([self.received.sha256, self.options.model_dump(mode="json")], sort_keys=True)
         return hashlib.sha256(asked.encode()).hexdigest()
 
@@ -59,10 +59,11 @@ async def submit(
     """Receive a scene and queue a job for it.
 
     Returns:
-        The job, and whether it is new: not if its idempotency key has been seen with the same scene and options.
+        The job, and whether it is new. A repeated idempotency key with an identical scene and options gives the
+        existing job.
 
     Raises:
-        ProblemError: whatever is wrong with the request, or with the moment.
+        ProblemError: the request is invalid, or a limit or the state of the service prevents the submission.
     """
     if context.worker.draining:
         raise ProblemError("stopping", "the service is stopping; try again in a minute", retry_after=60)
@@ -92,7 +93,7 @@ async def submit(
             try:
                 job, new = await run_sync(_queue, context, submission, owner)
             finally:
-                await run_sync(context.storage.discard, path)  # a job has taken it, or nobody wants it
+                await run_sync(context.storage.discard, path)  # already moved to the job, or not needed
     if new:
         context.metrics.submitted.labels(job.preset).inc()
         context.metrics.bytes_in.inc(job.upload_bytes)
@@ -103,23 +104,23 @@ async def submit(
 
 
 def parse_options(text: str | bytes) -> JobOptions:
-    """Options as JSON.
+    """Parse options from JSON.
 
     Raises:
-        ProblemError: they are none; every field that is wrong is named.
+        ProblemError: they are invalid; the problem lists every invalid field.
     """
     try:
         options = JobOptions.model_validate_json(text)
     except ValidationError as error:
-        named, found = fields_of(error.errors())
+        named, found = field_errors(error.errors())
         raise ProblemError(
-            "invalid-request", f"the options cannot be used: {named}; GET /v1/presets shows all settings", errors=found
+            "invalid-request", f"the options are invalid: {named}; GET /v1/presets lists all settings", errors=found
         ) from error
     if options.trains and not can_train():
         raise ProblemError(
             "invalid-request",
-            "this service has no torch to train with, so it fine-tunes nothing and compacts with the preset fast only; "
-            "whoever runs it can install kissgs[train]",
+            "these options need torch, which this server does not have; use preset fast without fine-tuning, or ask "
+            "the operator to install kissgs[train]",
         )
     return options
 
@@ -127,17 +128,19 @@ def parse_options(text: str | bytes) -> JobOptions:
 def _check_headers(request: Request, kind: str) -> None:
     encoding = request.headers.get("content-encoding", "identity").strip().lower()
     if encoding != "identity":
-        raise ProblemError("media-type", f"the body is encoded with {encoding[:40]!r}; send the .ply as it is")
+        raise ProblemError(
+            "media-type", f"the content encoding {encoding[:40]!r} is not supported; send the .ply without it"
+        )
     if kind != FORM_TYPE and kind not in RAW_TYPES:
         raise ProblemError(
             "media-type",
-            f"the body is said to be {kind[:80]!r}; send a form with the field 'file' (curl -F file=@scene.ply), "
+            f"the media type {kind[:80]!r} is not supported; send a form with the field 'file' (curl -F file=@x.ply) "
             "or the .ply itself as application/octet-stream",
         )
 
 
 def _scene_bytes(request: Request, kind: str, limit: int) -> int | None:
-    """How large the scene can be, judged by the length of the body."""
+    """Return the maximum size of the scene according to Content-Length; None if that is unknown."""
     text = request.headers.get("content-length", "")
     if not (text.isascii() and text.isdigit()):
         return None
@@ -152,13 +155,16 @@ async def _receive_raw(context: ServiceContainer, request: Request, spool: Spool
 
 
 async def _form_bytes(context: ServiceContainer, request: Request, spool: Spool) -> AsyncIterator[bytes]:
-    """The body of a form, as long as there is little in it beside the scene."""
+    """Yield the body of a form; raise an error if it exceeds the limit for bytes other than the scene."""
     received = 0
     async for chunk in timed(request, context.settings, context.notifier.subscribe(STOPPING)):
         yield chunk
         received += len(chunk)
         if received - spool.size > MAX_FORM_BYTES + len(chunk):
-            raise ProblemError("invalid-request", f"the form has more than {MAX_FORM_BYTES} bytes beside the scene")
+            raise ProblemError(
+                "invalid-request",
+                f"the form has more than {MAX_FORM_BYTES} bytes beside the scene, which is the limit; send less",
+            )
 
 
 async def _receive_form(
@@ -169,7 +175,7 @@ async def _receive_form(
     name: str | None,
     key: str | None,
 ) -> Submission:
-    """The fields ``file`` and, before or after it, ``options``."""
+    """Receive a form with the fields ``file`` and ``options``, in any order."""
     seen: list[str] = []
     text = bytearray()
     async for event in parts(request.headers["content-type"], _form_bytes(context, request, spool)):
@@ -177,10 +183,13 @@ async def _receive_form(
             case PartBegin(field, filename):
                 if field not in ("file", "options"):
                     raise ProblemError(
-                        "invalid-request", f"there is no field {field[:40]!r}; send 'file' and 'options'"
+                        "invalid-request",
+                        f"the form has an unknown field {field[:40]!r}; send 'file' and 'options' only",
                     )
                 if field in seen:
-                    raise ProblemError("invalid-request", f"the field {field!r} comes twice; send one scene at a time")
+                    raise ProblemError(
+                        "invalid-request", f"the form has the field {field!r} twice; send each field once"
+                    )
                 seen.append(field)
                 name = name or filename if field == "file" else name
             case PartData(data) if seen[-1] == "file":
@@ -188,11 +197,14 @@ async def _receive_form(
             case PartData(data):
                 text += data
                 if len(text) > MAX_OPTIONS_BYTES:
-                    raise ProblemError("invalid-request", f"the options take more than {MAX_OPTIONS_BYTES} bytes")
+                    raise ProblemError(
+                        "invalid-request",
+                        f"the options exceed {MAX_OPTIONS_BYTES} bytes, which is the limit; send less",
+                    )
     if "file" not in seen:
         raise ProblemError("invalid-request", "the form has no field 'file'; send the scene in it")
     if "options" in seen and options is not None:
-        raise ProblemError("invalid-request", "options stand both in the form and in the URL; send them once")
+        raise ProblemError("invalid-request", "the options are both in the form and in the URL; send them once")
     if "options" in seen:
         options = parse_options(bytes(text))
     return Submission(await spool.finish(), options or JobOptions(), scene_name(name), key)
@@ -230,7 +242,7 @@ def _queue(context: ServiceContainer, submission: Submission, owner: str) -> tup
     try:
         context.storage.adopt(received.path, job.id)
         return context.admission.add(job), True
-    except LimitExceeded:  # another request with the same key was faster
+    except LimitExceeded:  # a concurrent request with the same key was faster
         context.storage.remove_job(job.id)
         known = _known(context, submission, owner)
         if known is None:
@@ -239,7 +251,7 @@ def _queue(context: ServiceContainer, submission: Submission, owner: str) -> tup
     except OSError as error:
         context.storage.remove_job(job.id)
         reason = (error.strerror or str(error)).lower()
-        text = f"the upload cannot be kept: {reason}; try again later"
+        text = f"the upload cannot be stored: {reason}; try again later"
         raise ProblemError("disk-full", text, retry_after=FULL_SECONDS) from error
     except BaseException:
         context.storage.remove_job(job.id)
@@ -253,6 +265,6 @@ def _known(context: ServiceContainer, submission: Submission, owner: str) -> Job
     if job is not None and job.fingerprint != submission.fingerprint:
         raise ProblemError(
             "key-reused",
-            "this Idempotency-Key came with another scene or other options before; use a new key for a new job",
+            "this Idempotency-Key was used with another scene or other options; use a new key for a new job",
         )
     return job

@@ -1,4 +1,4 @@
-"""An upload on its way to the disk: checked as it arrives, hashed, limited, and gone if it does not end well."""
+"""Streaming of an upload to disk: checked and hashed on arrival, limited, and removed on failure."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from service.core.settings import ServiceSettings
 from service.jobs.admission import FULL_SECONDS, Admission
 
 BLOCK_BYTES = 1 << 20
-"""Written at a time. A thread is asked once for each, and memory holds one or two per upload."""
+"""Bytes per write. Each write is one call to a thread; memory holds one or two blocks per upload."""
 
 LAST_LINE = re.compile(rb"\nend_header[ \t\r]*\n")
-"""The last line of a header: all of it, because a comment may end with the same word."""
+"""Last line of a header, matched as a whole because a comment may end with ``end_header``."""
 
 CLOSE = {"Connection": "close"}
 
 STEP_BYTES = 16 << 20
-"""Set aside at a time, as the bytes arrive: what is only announced takes no room from anybody."""
+"""Disk space reserved per step as bytes arrive, so that a large Content-Length alone reserves nothing."""
 
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """A whole upload: where it lies, its size and SHA-256, and what its header says."""
+    """Complete upload: path, size, SHA-256 and header."""
 
     path: Path
     size: int
@@ -44,10 +44,10 @@ class Received:
 
 
 class Spool:
-    """Takes the bytes of one ``.ply``. As a context manager it removes them unless :meth:`finish` has been reached.
+    """Writes one ``.ply`` to disk. As a context manager, removes it unless :meth:`finish` has succeeded.
 
     Args:
-        at_most: bytes that may come, where the client has said so.
+        at_most: maximum number of bytes according to the client; None if unknown.
     """
 
     def __init__(self, settings: ServiceSettings, admission: Admission, path: Path, at_most: int | None = None) -> None:
@@ -70,16 +70,16 @@ class Spool:
 
     @property
     def size(self) -> int:
-        """Bytes so far."""
+        """Number of bytes received so far."""
         return self._size
 
     async def write(self, data: bytes) -> None:
-        """Take the next bytes.
+        """Process the next bytes.
 
         Raises:
-            ProblemError: they cannot be a usable scene, are too many, or do not fit on the disk.
+            ProblemError: the scene is invalid, exceeds a limit, or does not fit on the disk.
         """
-        line = max(self._pending.rfind(b"\n"), 0)  # the last one so far, which may go on
+        line = max(self._pending.rfind(b"\n"), 0)  # start of the last line, which may continue
         self._pending += data
         self._size += len(data)
         self._refuse_size(self._size)
@@ -94,7 +94,7 @@ class Spool:
             await run_sync(self._flush)
 
     async def finish(self) -> Received:
-        """See that the upload is whole and on the disk.
+        """Write the remaining bytes to disk and validate the upload.
 
         Raises:
             ProblemError: as :meth:`write`.
@@ -117,7 +117,7 @@ class Spool:
 
     def _leave(self) -> None:
         if self._file is not None:
-            with contextlib.suppress(OSError):  # what it could not write is thrown away
+            with contextlib.suppress(OSError):  # the file is removed anyway
                 self._file.close()
         if not self._kept:
             self._path.unlink(missing_ok=True)
@@ -147,7 +147,7 @@ class Spool:
             raise ProblemError("disk-full", text, retry_after=FULL_SECONDS) from error
 
     def _check_header(self) -> None:
-        """What the header tells, once it has arrived: long before the last byte of a file that is of no use."""
+        """Validate the header as soon as it has arrived, long before the last byte of an invalid file."""
         head, limit = bytes(self._pending), self._settings.max_header_bytes
         self._checked = True
         whole = self._at_most if self._at_most is not None else self._settings.max_upload_bytes
@@ -161,29 +161,29 @@ class Spool:
         if size > self._settings.max_upload_bytes:
             raise ProblemError(
                 "too-large",
-                f"the upload is larger than {self._settings.max_upload_bytes:,} bytes, which is the limit; "
-                "remove what the scene does not need, or compress it with the command line",
+                f"the upload exceeds {self._settings.max_upload_bytes:,} bytes, which is the limit; "
+                "prune the scene first, or compress it with the command line",
             )
 
     def _refuse_count(self, info: kissgs.PlyInfo) -> None:
         if info.count > self._settings.max_gaussians:
             raise ProblemError(
                 "unsupported",
-                f"the scene has {info.count:,} Gaussians; this service takes {self._settings.max_gaussians:,} at most: "
+                f"the scene has {info.count:,} Gaussians, and the limit is {self._settings.max_gaussians:,}; "
                 "prune it first, or compress it with the command line",
             )
 
     def _named(self, error: kissgs.KissgsError) -> ProblemError:
-        """The library's sentence, about the upload rather than a file of ours."""
+        """Convert an error of the library to a problem that names the upload instead of a path of the server."""
         text = str(error).replace(str(self._path), self._path.name).replace(self._path.name, "the upload")
         return ProblemError(error.code, text.replace("the data", "the upload"))
 
 
 async def timed(request: Request, settings: ServiceSettings, stopping: asyncio.Event) -> AsyncIterator[bytes]:
-    """The body of a request, as long as it comes fast enough, and the service is not ``stopping``.
+    """Yield the body of a request.
 
     Raises:
-        ProblemError: it stalls, drips, or breaks off; or the service stops.
+        ProblemError: the body stalls, is too slow or is incomplete, or the service is ``stopping``.
     """
     clock = asyncio.get_running_loop().time
     idle, begun, received = settings.upload_idle_seconds, clock(), 0
@@ -193,10 +193,10 @@ async def timed(request: Request, settings: ServiceSettings, stopping: asyncio.E
         while (chunk := await _next(chunks, stopped, idle)) is not None:
             received += len(chunk)
             spent = clock() - begun
-            if spent > idle:  # each stretch of so many seconds is judged by itself
+            if spent > idle:  # the rate is measured anew in every interval of this length
                 if received < settings.upload_min_rate * spent:
                     least = f"{settings.upload_min_rate:,} bytes per second"
-                    text = f"the upload is slower than {least}; use a faster connection"
+                    text = f"the upload is slower than {least}, which is the limit; use a faster connection"
                     raise ProblemError("upload-timeout", text, headers=CLOSE)
                 begun, received = clock(), 0
             yield chunk
@@ -205,7 +205,7 @@ async def timed(request: Request, settings: ServiceSettings, stopping: asyncio.E
 
 
 async def _next(chunks: AsyncIterator[bytes], stopped: asyncio.Future[Any], idle: float) -> bytes | None:
-    """The next bytes; None after the last."""
+    """Return the next bytes; None after the last."""
     coming = asyncio.ensure_future(anext(chunks, None))
     try:
         await asyncio.wait((coming, stopped), timeout=idle, return_when=asyncio.FIRST_COMPLETED)
@@ -213,17 +213,19 @@ async def _next(chunks: AsyncIterator[bytes], stopped: asyncio.Future[Any], idle
             text = "the service is stopping; send the upload again in a minute"
             raise ProblemError("stopping", text, retry_after=60, headers=CLOSE)
         if not coming.done():
-            text = f"nothing came for {idle:g} s; send the upload again"
+            text = f"no data arrived for {idle:g} s, which is the limit; send the upload again"
             raise ProblemError("upload-timeout", text, headers=CLOSE)
         return coming.result()
     except ClientDisconnect as error:
-        raise ProblemError("upload-aborted", "the connection closed before the upload was complete") from error
+        raise ProblemError(
+            "upload-aborted", "the connection closed before the upload was complete; send it again"
+        ) from error
     finally:
         coming.cancel()
 
 
 def scene_name(given: str | None) -> str:
-    """What a scene may be called in listings and downloads: no path, no control characters, never empty."""
+    """Return a scene name that is safe in listings and downloads: no path, no control characters, never empty."""
     name = re.split(r"[/\\]", unicodedata.normalize("NFC", given or ""))[-1]
     name = "".join(c for c in name if unicodedata.category(c)[0] != "C" and c not in '"<>|:*?')
     if name.lower().endswith(".ply"):

@@ -85,7 +85,7 @@ class Admission:
             ProblemError: ``disk-full``.
         """
         with self._lock:
-            if not self._fits(size) and not self._fits(size, self.store.spare_bytes()):
+            if not self._fits(size) and not self._fits(size, self.store.reclaimable_bytes()):
                 raise self._full(size)
 
     def reserve(self, size: int) -> None:
@@ -95,10 +95,10 @@ class Admission:
             ProblemError: ``disk-full``.
         """
         with self._lock:
-            if not self._fits(size) and not self._fits(size, self.store.spare_bytes()):
+            if not self._fits(size) and not self._fits(size, self.store.reclaimable_bytes()):
                 raise self._full(size)
             while not self._fits(size):
-                spare = self.store.spare()
+                spare = self.store.reclaimable()
                 if not spare:
                     raise self._full(size)
                 for number, job_id in spare:
@@ -121,9 +121,9 @@ class Admission:
     def _give_up(self, number: int, job_id: str) -> None:
         """Remove the upload of an ended job, and its decoded scene, which can be made anew."""
         self.store.require()
-        for path in self.storage.spare(job_id):
+        for path in self.storage.reclaimable_files(job_id):
             self.storage.discard(path)
-        self.store.update(number, upload_kept=False, spare_bytes=0, disk_bytes=self.storage.job_bytes(job_id))
+        self.store.update(number, upload_kept=False, reclaimable_bytes=0, disk_bytes=self.storage.job_bytes(job_id))
 
     def _fits(self, size: int, spare: int = 0) -> bool:
         taken = self.store.disk_bytes() + self._reserved - spare

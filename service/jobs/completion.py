@@ -37,7 +37,7 @@ class JobCompletion:
         values = {
             "result": summary,
             "upload_kept": kept,
-            "spare_bytes": job.upload_bytes if kept else 0,
+            "reclaimable_bytes": job.upload_bytes if kept else 0,
             "disk_bytes": self.storage.job_bytes(job.id),
         }
         if not self.end(job, State.SUCCEEDED, **values):

@@ -36,7 +36,7 @@ class ServiceContainer:
     worker: Worker
     admission: Admission
     decoder: Decoder
-    follower: EventStream
+    event_stream: EventStream
 
 
 def _context(request: Request) -> ServiceContainer:

@@ -29,7 +29,7 @@ class Decoder:
     storage: JobStorage
     admission: Admission
     _turn: asyncio.Lock = field(default_factory=asyncio.Lock)
-    _children: dict[str, JobProcess] = field(default_factory=dict)
+    _processes: dict[str, JobProcess] = field(default_factory=dict)
 
     async def scene(self, job: Job) -> tuple[Path, dict[str, Any]]:
         """The decoded ``.ply`` of a job that has succeeded, and its size and SHA-256.
@@ -67,31 +67,31 @@ class Decoder:
             await run_sync(self.admission.release, size, 0)
 
     def _account(self, job: Job) -> None:
-        spare = sum(path.stat().st_size for path in self.storage.spare(job.id))
-        self.store.update(job.number, disk_bytes=self.storage.job_bytes(job.id), spare_bytes=spare)
+        spare = sum(path.stat().st_size for path in self.storage.reclaimable_files(job.id))
+        self.store.update(job.number, disk_bytes=self.storage.job_bytes(job.id), reclaimable_bytes=spare)
 
     def stop(self, job_id: str) -> None:
         """End the decoding of a job, if it is going on."""
-        child = self._children.get(job_id)
-        if child is not None:
-            child.kill()
+        process = self._processes.get(job_id)
+        if process is not None:
+            process.kill()
 
     async def _run(self, job: Job, work: Path) -> None:
         async def ignore(stage: str, fraction: float, note: str) -> None:
             pass
 
-        order = {
-            "task": "decode",
+        task = {
+            "kind": "decode",
             "source": str(self.storage.result(job.id) / "scene.zip"),
             "work": str(work),
             "threads": self.settings.job_threads,
             "memory": int(self.settings.job_memory),
         }
-        child = self._children[job.id] = JobProcess(seconds=self.settings.job_seconds)
+        process = self._processes[job.id] = JobProcess(seconds=self.settings.job_seconds)
         try:
-            outcome = await child.run(order, ignore)
+            outcome = await process.run(task, ignore)
         finally:
-            del self._children[job.id]
+            del self._processes[job.id]
         if outcome.kind == "stopped":
             raise _gone()
         if outcome.kind != "done":

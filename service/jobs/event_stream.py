@@ -12,7 +12,7 @@ from anyio.to_thread import run_sync
 
 from service.core.models import ACTIVE, Event, Job
 from service.core.notifier import JobNotifier, wait
-from service.jobs.status import QueueEstimator, status_of
+from service.jobs.status import QueueEstimator, job_status
 from service.storage.job_store import Store
 
 SILENCE_SECONDS = 15.0
@@ -81,6 +81,6 @@ class EventStream:
     async def _spelled(self, event: Event, current: Job | None) -> str:
         data = event.data
         if event.kind == "state" and current is not None and event.seq == current.last_event:  # the whole story, once
-            status = await run_sync(status_of, current, QueueEstimator(self.store, self.workers))
+            status = await run_sync(job_status, current, QueueEstimator(self.store, self.workers))
             data = {**data, "job": status.model_dump(mode="json", exclude_none=True)}
         return f"id: {event.seq}\nevent: {event.kind}\ndata: {json.dumps(data)}\n\n"

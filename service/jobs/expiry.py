@@ -13,7 +13,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from service.core.models import ENDED, State
 from service.core.notifier import ended
 from service.jobs.container import ServiceContainer
-from service.storage.tenancy import SIGN_SECONDS
+from service.storage.database_lease import HEARTBEAT_SECONDS
 
 log = logging.getLogger("kissgs.service")
 
@@ -39,12 +39,12 @@ class ExpiryTask:
             except Exception:
                 log.exception("what has expired could not be removed; trying again")
 
-    async def show_life(self) -> None:
+    async def heartbeat(self) -> None:
         """For ever: what keeps other services from using the same database."""
         while True:
-            await asyncio.sleep(SIGN_SECONDS)
+            await asyncio.sleep(HEARTBEAT_SECONDS)
             with contextlib.suppress(SQLAlchemyError):  # /readyz and the worker tell
-                await run_sync(self.context.store.keep_time)
+                await run_sync(self.context.store.heartbeat)
 
     def sweep(self) -> list[str]:
         """Remove the files of ended jobs whose time is over; forget them altogether after as long again.
@@ -56,12 +56,12 @@ class ExpiryTask:
         """
         store, storage, now = self.context.store, self.context.storage, self.context.clock()
         keep, expired = self.context.settings.keep_seconds, []
-        store.keep_time()
+        store.heartbeat()
         if now - self.began < min(GRACE_SECONDS, keep):
             return []
         while due := store.due(ENDED, now):
             for number, job_id in due:
-                gone = {"upload_kept": False, "disk_bytes": 0, "spare_bytes": 0}
+                gone = {"upload_kept": False, "disk_bytes": 0, "reclaimable_bytes": 0}
                 if store.move(number, State.EXPIRED, expires_at=now + keep, **gone):
                     storage.remove_job(job_id)
                     expired.append(job_id)

@@ -32,19 +32,19 @@ Send = Callable[[dict[str, Any]], None]
 
 def main() -> None:
     """Read what to do, do it, and say what came of it."""
-    order = json.loads(_first_line())
+    task = json.loads(_first_line())
     for number in (signal.SIGINT, signal.SIGTERM):  # meant for the service, which decides what becomes of us
         signal.signal(number, signal.SIG_IGN)
-    threading.Thread(target=_die_with_the_service, daemon=True).start()
+    threading.Thread(target=_exit_with_service, daemon=True).start()
     send = _sender()
-    _be_modest(order["memory"])
+    _limit_resources(task["memory"])
     import kissgs
 
     try:
         tasks: dict[str, Callable[[dict[str, Any], Send], dict[str, Any]]] = {"compress": _compress, "decode": _decode}
-        send({"done": tasks[order["task"]](order, send)})
+        send({"done": tasks[task["kind"]](task, send)})
     except kissgs.KissgsError as error:
-        detail = str(error).replace(str(order["source"]), "the scene").replace(str(order["work"]), "")
+        detail = str(error).replace(str(task["source"]), "the scene").replace(str(task["work"]), "")
         send({"error": {"code": error.code, "detail": detail.replace(" /", " ")}})
     except MemoryError:
         send({"error": {"code": "memory-limit", "detail": MEMORY_DETAIL}})
@@ -54,9 +54,9 @@ def main() -> None:
     os._exit(0)  # nothing is left to do, and no thread of a library needs waiting for
 
 
-def _compress(order: dict[str, Any], send: Send) -> dict[str, Any]:
-    result = _compressed(order, send)
-    folder = Path(order["work"]) / "result"
+def _compress(task: dict[str, Any], send: Send) -> dict[str, Any]:
+    result = _compressed(task, send)
+    folder = Path(task["work"]) / "result"
     folder.mkdir()
     result.save(folder / "scene.zip")
     result.save(folder / "files")
@@ -91,7 +91,7 @@ def _compress(order: dict[str, Any], send: Send) -> dict[str, Any]:
     return summary
 
 
-def _compressed(order: dict[str, Any], send: Send) -> kissgs.Compressed:
+def _compressed(task: dict[str, Any], send: Send) -> kissgs.Compressed:
     """The work itself, from its checkpoint on if there is one.
 
     A checkpoint is a help, no condition: one of no use (damaged, or of another version of kissgs) is replaced, and
@@ -100,17 +100,17 @@ def _compressed(order: dict[str, Any], send: Send) -> kissgs.Compressed:
     import kissgs
 
     checkpoint = None
-    if order["checkpoint"] is not None:  # as seen from here: the report may name it, and is the client's to read
-        checkpoint = Path(os.path.relpath(order["checkpoint"], order["work"]))
+    if task["checkpoint"] is not None:  # as seen from here: the report may name it, and is the client's to read
+        checkpoint = Path(os.path.relpath(task["checkpoint"], task["work"]))
     while True:
         kept = [] if checkpoint is None else sorted(checkpoint.parent.glob(f"{checkpoint.stem}*{checkpoint.suffix}"))
         try:
             return kissgs.compress(
-                Path(order["source"]),
-                settings=kissgs.Settings.model_validate(order["settings"]),
-                evaluate=order["evaluate"],
+                Path(task["source"]),
+                settings=kissgs.Settings.model_validate(task["settings"]),
+                evaluate=task["evaluate"],
                 checkpoint=checkpoint,
-                threads=order["threads"],
+                threads=task["threads"],
                 progress=_Throttle(send),
             )
         except kissgs.OutputError:  # the checkpoint's: nothing else is written yet
@@ -122,11 +122,11 @@ def _compressed(order: dict[str, Any], send: Send) -> kissgs.Compressed:
                 checkpoint = None
 
 
-def _decode(order: dict[str, Any], send: Send) -> dict[str, Any]:
+def _decode(task: dict[str, Any], send: Send) -> dict[str, Any]:
     import kissgs
 
-    target = Path(order["work"]) / "decoded.ply"
-    kissgs.decompress(Path(order["source"]), target, threads=order["threads"], progress=_Throttle(send))
+    target = Path(task["work"]) / "decoded.ply"
+    kissgs.decompress(Path(task["source"]), target, threads=task["threads"], progress=_Throttle(send))
     described = _described(target)
     _write(target.with_suffix(".json"), json.dumps(described).encode())
     return described
@@ -180,7 +180,7 @@ def _sender() -> Send:
     return send
 
 
-def _be_modest(memory: int) -> None:
+def _limit_resources(memory: int) -> None:
     """Take what the service leaves of the processor, no more memory than agreed, and be the first to be ended."""
     os.nice(10)
     if sys.platform == "linux":
@@ -202,7 +202,7 @@ def _first_line() -> bytes:
     return line
 
 
-def _die_with_the_service() -> None:
+def _exit_with_service() -> None:
     while os.read(0, 4096):  # not by sys.stdin, whose lock the interpreter wants when it ends
         pass
     os._exit(1)

@@ -34,7 +34,7 @@ def recover(context: ServiceContainer) -> None:
 def _take_up(context: ServiceContainer, job: Job) -> None:
     store, storage, ending = context.store, context.storage, context.worker.ending
     result = storage.result(job.id)
-    summary = summary_of(result)
+    summary = read_summary(result)
     if summary is None and result.exists():
         log.warning("job %s: its result is damaged", job.id)
     if summary is not None:
@@ -59,7 +59,7 @@ def _finish_removal(storage: JobStorage, job_id: str, *, failed: bool) -> None:
         storage.remove_job(job_id)
 
 
-def summary_of(result: Path) -> dict[str, Any] | None:
+def read_summary(result: Path) -> dict[str, Any] | None:
     """What a whole result says of itself; None if there is none, or if it is damaged."""
     try:
         summary: dict[str, Any] = json.loads((result / "summary.json").read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""Running the heavy part of a job in a child process: its events, its limits, its end."""
+"""Running the heavy part of a job in a process process: its events, its limits, its end."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ MAX_LINE_BYTES = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How a child process ended.
+    """How a process process ended.
 
     Attributes:
         kind: "done" with what it found in ``data``; "error" with a problem's ``code`` and ``detail`` in ``data``;
@@ -52,7 +52,7 @@ class Outcome:
 
 
 class JobProcess:
-    """One child process, from its start to its end. Use :meth:`run` once."""
+    """One process process, from its start to its end. Use :meth:`run` once."""
 
     def __init__(self, *, seconds: float) -> None:
         self._seconds = seconds
@@ -71,30 +71,30 @@ class JobProcess:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self._process.pid, signal.SIGKILL)
 
-    async def run(self, order: dict[str, Any], on_progress: OnProgress) -> Outcome:
+    async def run(self, task: dict[str, Any], on_progress: OnProgress) -> Outcome:
         """Start it with an ``order`` (see :mod:`service.jobs.job_process`), follow it, and say how it ended.
 
         A cancelled caller takes it along.
         """
         try:
-            return await self._run(order, on_progress)
+            return await self._run(task, on_progress)
         finally:
             self.kill()
             if self._process is not None:
                 await self._process.wait()
             self.ended.set()
 
-    async def _run(self, order: dict[str, Any], on_progress: OnProgress) -> Outcome:
+    async def _run(self, task: dict[str, Any], on_progress: OnProgress) -> Outcome:
         if self._killed:
             return Outcome("stopped")
-        trace = Path(order["work"]) / "stderr.txt"
+        trace = Path(task["work"]) / "stderr.txt"
         with trace.open("wb") as errors:
             self._process = await asyncio.create_subprocess_exec(
                 *(sys.executable, "-P", "-m", "service.jobs.job_process"),
                 stdin=asyncio.subprocess.PIPE,
                 stdout=asyncio.subprocess.PIPE,
                 stderr=errors,
-                cwd=order["work"],
+                cwd=task["work"],
                 env=_environment(),
                 start_new_session=True,
                 limit=MAX_LINE_BYTES,
@@ -103,7 +103,7 @@ class JobProcess:
         sampling = asyncio.create_task(self._sample_memory(self._process.pid))
         try:
             async with asyncio.timeout(self._seconds):
-                final = await self._follow(order, on_progress)
+                final = await self._follow(task, on_progress)
                 status = await self._process.wait()
         except TimeoutError:
             detail = f"the job took longer than {self._seconds:g} s; choose a faster preset or fewer Gaussians"
@@ -114,7 +114,7 @@ class JobProcess:
             return Outcome("done", final["done"])
         if final is not None:
             return Outcome("error", final["error"])
-        return self._explain(status, trace, order["memory"])
+        return self._explain(status, trace, task["memory"])
 
     async def _sample_memory(self, pid: int) -> None:
         """Note the most memory that the limit counts (``VmData``): a dead process cannot be asked any more."""
@@ -124,12 +124,12 @@ class JobProcess:
                 self._peak_data = max(self._peak_data, pages * os.sysconf("SC_PAGE_SIZE"))
                 await asyncio.sleep(SAMPLE_SECONDS)
 
-    async def _follow(self, order: dict[str, Any], on_progress: OnProgress) -> dict[str, Any] | None:
+    async def _follow(self, task: dict[str, Any], on_progress: OnProgress) -> dict[str, Any] | None:
         """Pass progress on until the last word, or until there is none."""
         process = self._process
         assert process is not None and process.stdin is not None and process.stdout is not None  # noqa: S101, PT018
         with contextlib.suppress(ConnectionError):  # it has died already: its silence says so
-            process.stdin.write(json.dumps(order).encode() + b"\n")
+            process.stdin.write(json.dumps(task).encode() + b"\n")
             await process.stdin.drain()
         while line := await process.stdout.readline():
             event = json.loads(line)

@@ -59,7 +59,7 @@ class QueueEstimator:
         return max(whole - spent, 0.1 * whole, 0.5)  # it runs: it is not done, however wrong the guess was
 
 
-def status_of(job: Job, queue: QueueEstimator) -> JobStatus:
+def job_status(job: Job, queue: QueueEstimator) -> JobStatus:
     """Everything there is to know of a job, now."""
     waits, runs, result = job.state == State.QUEUED, job.state == State.RUNNING, job.result or {}
     return JobStatus(

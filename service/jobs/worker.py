@@ -1,4 +1,4 @@
-"""The embedded worker: takes jobs in the order they came, gives each a process, records what came of it."""
+"""The embedded worker: takes jobs in the task they came, gives each a process, records what came of it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from service.core.schemas import JobOptions
 from service.core.settings import ServiceSettings
 from service.jobs.completion import JobCompletion
 from service.jobs.runner import JobProcess, Outcome
-from service.storage.database_health import reason_of
+from service.storage.database_health import error_text
 from service.storage.job_storage import JobStorage
 from service.storage.job_store import Store
 
@@ -41,7 +41,7 @@ class Worker:
     metrics: Metrics
     ending: JobCompletion
     draining: bool = False
-    _children: dict[str, JobProcess] = field(default_factory=dict)
+    _processes: dict[str, JobProcess] = field(default_factory=dict)
     _loops: list[asyncio.Task[None]] = field(default_factory=list)
     _looked: dict[int, float] = field(default_factory=dict)
     _complaints: set[str] = field(default_factory=set)
@@ -58,7 +58,7 @@ class Worker:
         for number, loop in enumerate(self._loops):
             if loop.done():
                 return f"worker {number} has ended"
-            if now - self._looked.get(number, now) > 10 * IDLE_SECONDS and not self._children:
+            if now - self._looked.get(number, now) > 10 * IDLE_SECONDS and not self._processes:
                 return f"worker {number} has not looked at the queue for {now - self._looked[number]:.0f} s"
         return None
 
@@ -66,8 +66,8 @@ class Worker:
         """Take no more jobs; give those that run some time; put back in the queue those that need more."""
         self.draining = True
         self.notifier.notify(QUEUE)
-        if self._children:
-            patience, count = self.settings.drain_seconds, len(self._children)
+        if self._processes:
+            patience, count = self.settings.drain_seconds, len(self._processes)
             log.info("waiting up to %g s for %d running jobs; Ctrl-C again ends them now", patience, count)
         if self._loops:
             await asyncio.wait(self._loops, timeout=self.settings.drain_seconds)
@@ -76,17 +76,17 @@ class Worker:
 
     def kill_running(self) -> None:
         """Wait no longer for running jobs."""
-        for child in self._children.values():
-            child.kill()
+        for process in self._processes.values():
+            process.kill()
 
     async def cancel(self, job: Job) -> None:
         """End a job that has not ended yet: its process is gone, and so are its files, when this returns."""
         if not await run_sync(lambda: self.ending.end(job, State.CANCELLED, upload_kept=False, disk_bytes=0)):
             return
-        child = self._children.get(job.id)
-        if child is not None:
-            child.kill()
-            await child.ended.wait()
+        process = self._processes.get(job.id)
+        if process is not None:
+            process.kill()
+            await process.ended.wait()
         await run_sync(self.storage.remove_job, job.id)
         self.notifier.notify(job.id)
         self.notifier.notify(ended(job.id))
@@ -116,34 +116,34 @@ class Worker:
         return self.store.claim()
 
     async def _run(self, job: Job) -> None:
-        child = self._children[job.id] = JobProcess(seconds=self.settings.job_seconds)
+        process = self._processes[job.id] = JobProcess(seconds=self.settings.job_seconds)
         log.info("job %s starts: %d Gaussians, %s", job.id, job.gaussians, job.preset)
         self.metrics.busy.inc()
         if job.starts == 1 and job.started_at is not None:
             self.metrics.waited.observe(job.started_at - job.created_at)
         self.notifier.notify(job.id)
         try:
-            outcome = await self._follow(job, child)
+            outcome = await self._follow(job, process)
         except Exception as error:
             log.exception("job %s: its process could not be run", job.id)
             outcome = _unrunnable(error)
         finally:
-            del self._children[job.id]
-            child.ended.set()
+            del self._processes[job.id]
+            process.ended.set()
             self.metrics.busy.dec()
         health_problem = await run_sync(self.storage.health_problem)
         if health_problem and outcome.kind in ("error", "crashed"):
             outcome = Outcome("postponed")  # no fault of the job
         await self._settle(job, outcome)
 
-    async def _follow(self, job: Job, child: JobProcess) -> Outcome:
-        current = await run_sync(self.store.get, job.id)  # it may have been cancelled before the child was known
+    async def _follow(self, job: Job, process: JobProcess) -> Outcome:
+        current = await run_sync(self.store.get, job.id)  # it may have been cancelled before the process was known
         if current is None or current.state != State.RUNNING:
             return Outcome("stopped")
         work = await run_sync(self.storage.new_work, job.id)
         resumable = JobOptions.model_validate(job.options).resumable
-        order = {
-            "task": "compress",
+        task = {
+            "kind": "compress",
             "source": str(self.storage.upload(job.id)),
             "work": str(work),
             "settings": {name: value for name, value in job.options.items() if name != "evaluate"},
@@ -160,7 +160,7 @@ class Worker:
                 self._complain(f"job {job.id}: progress was not recorded", error)
             self.notifier.notify(job.id)
 
-        return await child.run(order, progress)
+        return await process.run(task, progress)
 
     # How jobs end -----------------------------------------------------------------------------------------------------
 
@@ -172,7 +172,7 @@ class Worker:
                 break
             except (SQLAlchemyError, OSError) as error:
                 if outcome.kind == "done" and await run_sync(self._is_final, error):
-                    log.error("job %s: its result cannot be kept: %s", job.id, reason_of(error))
+                    log.error("job %s: its result cannot be kept: %s", job.id, error_text(error))
                     outcome = _unrunnable(error)
                     continue
                 self._complain(f"job {job.id}: its end was not recorded; trying again", error)
@@ -196,7 +196,7 @@ class Worker:
 
     def _complain(self, what: str, error: Exception) -> None:
         """Log what fails again and again once, until the queue can be read."""
-        reason = f"{what}: {reason_of(error)}"
+        reason = f"{what}: {error_text(error)}"
         if reason not in self._complaints:
             log.error("%s", reason)
             self._complaints.add(reason)

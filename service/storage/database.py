@@ -18,11 +18,11 @@ from service.storage.database_health import (
     IDENTITY,
     IDENTITY_BITS,
     change_nothing,
+    error_text,
     file_of,
     leave_open,
     read_a_row,
     read_every_page,
-    reason_of,
 )
 
 Sessions = sessionmaker[Session]
@@ -83,7 +83,7 @@ def connect(url: str, *, may_be_new: bool = True) -> tuple[sa.Engine, Sessions, 
             first.dispose()
         if isinstance(error, SettingsError):
             raise
-        reason = reason_of(error)
+        reason = error_text(error)
         hint = next((hint for words, hint in _HINTS.items() if words in reason.lower()), "")
         raise SettingsError(
             f"KISSGS_DATABASE_URL: the job database cannot be opened: {reason}" + (f"; {hint}" if hint else "")
@@ -106,7 +106,7 @@ def _engine(url: str, wait: float, opened: list[Any] | None = None) -> sa.Engine
             f"KISSGS_DATABASE_URL: the package {error.name} is missing; for PostgreSQL install kissgs[postgresql]"
         ) from error
     except (ArgumentError, NoSuchModuleError, ValueError) as error:
-        raise SettingsError(f"KISSGS_DATABASE_URL: {reason_of(error)}; write a URL of SQLAlchemy") from error
+        raise SettingsError(f"KISSGS_DATABASE_URL: {error_text(error)}; write a URL of SQLAlchemy") from error
     if engine.dialect.name == "sqlite":
         _tune_sqlite(engine, wait, opened)
     return engine
@@ -170,7 +170,7 @@ def _check(session: Session, *, may_be_new: bool) -> None:
         for _ in connection.execute(sa.select(Job.__table__), execution_options={"yield_per": 100}):
             pass
     except (ValueError, LookupError) as error:
-        raise _damaged(reason_of(error)) from error
+        raise _damaged(error_text(error)) from error
 
 
 def _facts(session: Session) -> dict[str, float]:

@@ -34,7 +34,7 @@ IDENTITY_BITS = 48
 """How large that number is: a column of floats holds it exactly."""
 
 
-class VanishedError(SQLAlchemyError):
+class DatabaseReplacedError(SQLAlchemyError):
     """The database was removed or replaced, or became another service's, while this one had it open."""
 
 
@@ -45,7 +45,7 @@ def file_of(url: sa.URL) -> Path | None:
     return Path(str(url.database).removeprefix("file:")).absolute()
 
 
-def reason_of(error: BaseException) -> str:
+def error_text(error: BaseException) -> str:
     """What a driver says, in one line."""
     lines = str(getattr(error, "orig", None) or error).strip().splitlines()
     return lines[0].strip() if lines else type(error).__name__
@@ -86,7 +86,7 @@ def leave_open(connection: sqlite3.Connection) -> None:
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(connection))
 
 
-class Watch:
+class DatabaseMonitor:
     """Checks an open database.
 
     Args:
@@ -107,7 +107,7 @@ class Watch:
     def close(self) -> None:
         """Let go of the database; if it is no longer there, without touching what stands in its place."""
         if self._file is not None:
-            with contextlib.suppress(VanishedError):
+            with contextlib.suppress(DatabaseReplacedError):
                 self.require()
                 self._keeper.close()
                 return
@@ -122,17 +122,17 @@ class Watch:
         """See that the database's files are those that were opened: a matter of microseconds.
 
         Raises:
-            VanishedError: they are not.
+            DatabaseReplacedError: they are not.
         """
         for path, known in self._files.items():
             found = _inode(path)
             if found != known:
                 done = "removed" if found is None else "replaced"
-                raise VanishedError(
+                raise DatabaseReplacedError(
                     f"{path.name} was {done} while the service runs; put it back and restart the service"
                 )
 
-    def stranger(self, connection: sa.Connection | Session) -> str | None:
+    def ownership_problem(self, connection: sa.Connection | Session) -> str | None:
         """Why an open database is not, or no longer, this service's; None if it is."""
         wanted = sa.select(Meta.name, Meta.value).where(Meta.name.in_((IDENTITY, OWNER)))
         found = {name: value for name, value in connection.execute(wanted)}  # noqa: C416  dict() takes it for a mapping
@@ -170,13 +170,13 @@ class Watch:
             with self._probe.connect() as connection:
                 return self._inspect(connection)
         except (SQLAlchemyError, sqlite3.Error, OSError, ValueError) as error:
-            return reason_of(error)
+            return error_text(error)
 
     def _inspect(self, connection: sa.Connection) -> str:
         mine = sa.select(Meta.value).where(Meta.name == IDENTITY)
         with _short_transaction(connection):
             connection.scalar(mine.with_for_update())
-            if why := self.stranger(connection):
+            if why := self.ownership_problem(connection):
                 return why
             change_nothing(connection)
             read_a_row(connection)

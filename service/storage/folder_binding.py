@@ -16,7 +16,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from service.core.models import ACTIVE
 from service.core.settings import ServiceSettings, SettingsError
 from service.storage.database import NewDatabaseError
-from service.storage.database_health import IDENTITY, IDENTITY_BITS, reason_of
+from service.storage.database_health import IDENTITY, IDENTITY_BITS, error_text
 from service.storage.job_storage import JobStorage, sync_folder
 from service.storage.job_store import Store
 
@@ -37,11 +37,11 @@ def open_store(settings: ServiceSettings, storage: JobStorage, clock: Callable[[
         raise _unknown(storage, held, "the job database is new and knows none of them") from error
     try:
         _pair(store, storage, held)
-        store.claim_database()
+        store.acquire_database()
     except BaseException as error:
         store.leave()
         if isinstance(error, SQLAlchemyError):
-            raise SettingsError(f"KISSGS_DATABASE_URL: the job database cannot be used: {reason_of(error)}") from error
+            raise SettingsError(f"KISSGS_DATABASE_URL: the job database cannot be used: {error_text(error)}") from error
         raise
     return store
 

@@ -113,7 +113,7 @@ class JobStorage:
         for path in (self.jobs / job_id).glob("checkpoint*.npz"):
             self.discard(path)
 
-    def spare(self, job_id: str) -> list[Path]:
+    def reclaimable_files(self, job_id: str) -> list[Path]:
         """What an ended job can do without: its upload and its decoded scene, as far as they are there."""
         return [path for path in (self.upload(job_id), self.decoded(job_id)) if path.exists()]
 

@@ -15,9 +15,9 @@ from sqlalchemy.exc import IntegrityError, SQLAlchemyError
 from sqlalchemy.orm import Session, load_only
 
 from service.core.models import ACTIVE, ENDED, NOTE_CHARS, Event, Job, Meta, State
-from service.storage import tenancy
+from service.storage import database_lease
 from service.storage.database import connect
-from service.storage.database_health import IDENTITY, VanishedError, Watch
+from service.storage.database_health import IDENTITY, DatabaseMonitor, DatabaseReplacedError
 
 _NEXT: dict[State, tuple[State, ...]] = {
     State.RUNNING: (State.QUEUED,),
@@ -52,7 +52,7 @@ class Store:
 
     def __init__(self, url: str, clock: Callable[[], float], *, may_be_new: bool = True) -> None:
         self._engine, self._writing, self._reading = connect(url, may_be_new=may_be_new)
-        self._watch = Watch(self._engine)
+        self._watch = DatabaseMonitor(self._engine)
         self._watch.identity = self.fact(IDENTITY)
         self.clock = clock
 
@@ -60,7 +60,7 @@ class Store:
         """Let go of all connections, and let the next service have the database."""
         if self._watch.owner is not None and self.health_problem() is None:
             with contextlib.suppress(SQLAlchemyError), self._write() as session:
-                tenancy.leave(session)
+                database_lease.release(session)
         self._engine.dispose()
         self._watch.close()
 
@@ -75,7 +75,7 @@ class Store:
         """See that the database's files are those that were opened: a matter of microseconds.
 
         Raises:
-            VanishedError: they are not.
+            DatabaseReplacedError: they are not.
         """
         self._watch.require()
 
@@ -96,21 +96,21 @@ class Store:
             session.merge(Meta(name=IDENTITY, value=identity))
         self._watch.identity = identity
 
-    def claim_database(self) -> None:
-        """Keep other services from using the database as long as this one calls :meth:`keep_time` again and again.
+    def acquire_database(self) -> None:
+        """Keep other services from using the database as long as this one calls :meth:`heartbeat` again and again.
 
         Raises:
             SettingsError: another service is using it.
         """
-        self._watch.owner = tenancy.claim(self._writing, self._reading)
+        self._watch.owner = database_lease.acquire(self._writing, self._reading)
 
     @contextlib.contextmanager
     def _write(self) -> Iterator[Session]:
         """A transaction that counts only if the database is still there when it has ended."""
         self.require()
         with self._writing.begin() as session:
-            if why := self._watch.stranger(session):
-                raise VanishedError(f"the job database is no longer this service's: {why}")
+            if why := self._watch.ownership_problem(session):
+                raise DatabaseReplacedError(f"the job database is no longer this service's: {why}")
             yield session
         self.require()
 
@@ -272,15 +272,15 @@ class Store:
         with self._reading() as session:
             return [(number, job_id) for number, job_id in session.execute(query.limit(limit))]
 
-    def spare(self, limit: int = 50) -> list[tuple[int, str]]:
+    def reclaimable(self, limit: int = 50) -> list[tuple[int, str]]:
         """Number and id of some ended jobs that have something to give up, oldest first."""
-        query = sa.select(Job.number, Job.id).where(Job.spare_bytes > 0, Job.state.in_(ENDED))
+        query = sa.select(Job.number, Job.id).where(Job.reclaimable_bytes > 0, Job.state.in_(ENDED))
         with self._reading() as session:
             return [(number, job_id) for number, job_id in session.execute(query.order_by(Job.number).limit(limit))]
 
-    def spare_bytes(self) -> int:
+    def reclaimable_bytes(self) -> int:
         """What ended jobs could give up."""
-        query = sa.select(sa.func.coalesce(sa.func.sum(Job.spare_bytes), 0)).where(Job.spare_bytes > 0)
+        query = sa.select(sa.func.coalesce(sa.func.sum(Job.reclaimable_bytes), 0)).where(Job.reclaimable_bytes > 0)
         with self._reading() as session:
             return int(session.scalar(query.where(Job.state.in_(ENDED))) or 0)
 
@@ -292,10 +292,10 @@ class Store:
     # The clock -----------------------------------------------------------------------------------------------------
 
     def latest_time(self) -> float:
-        """What :meth:`keep_time` has written last."""
+        """What :meth:`heartbeat` has written last."""
         return self.fact("time") or 0.0
 
-    def keep_time(self) -> None:
+    def heartbeat(self) -> None:
         """Write down the time, and see that the database can be written to."""
         with self._write() as session:
             session.merge(Meta(name="time", value=self.clock()))

@@ -4,14 +4,19 @@ import base64
 import hashlib
 import io
 import json
+import re
+import shutil
+import subprocess
 import time
 import zipfile
+from urllib.parse import quote
 
 import pytest
-from helpers.service import FAST, SLOW, SMALL, events, problem, scene_bytes
+from helpers.service import FAST, ROOT, SLOW, SMALL, events, problem, scene_bytes
 
 import kissgs
 from service.core.problems import ProblemError
+from service.http.routes.common import accepts
 from service.http.submission import parse_options
 
 
@@ -83,7 +88,7 @@ def test_a_service_without_torch_does_not_accept_what_it_cannot_do(monkeypatch):
         parse_options('{"compact": {"ratio": 0.2}}')
     assert parse_options('{"preset": "fast", "compact": {"ratio": 0.2}}').kind == "fast+compact"
     assert parse_options("{}").kind == "balanced"
-    assert parse_options('{"encode": {"target_size": "1MB"}}').kind == "balanced+seek"
+    assert parse_options('{"encode": {"target_size": "1MB"}}').kind == "balanced+search"
 
 
 @pytest.mark.parametrize(
@@ -404,6 +409,69 @@ def test_compressing_becomes_a_job_when_the_time_is_over(start):
     assert answer.headers["location"] == answer.json()["links"]["self"]
     assert answer.json()["state"] in ("queued", "running")
     assert service.status(answer.json())["state"] in ("queued", "running")
+
+
+def test_a_client_that_only_takes_a_zip_gets_an_error_when_the_time_is_over(start):
+    service = start(KISSGS_SYNC_SECONDS=0.5)
+    answer = service.http.post(
+        "/v1/compress",
+        content=scene_bytes(20_000, 3),
+        params={"options": SLOW},
+        headers={"Accept": "application/zip"},
+    )
+    found = problem(answer, 409, "not-finished")
+    job = service.http.get(answer.headers["location"]).json()
+    assert job["state"] in ("queued", "running")
+    assert job["links"]["self"] in found["detail"]
+
+
+@pytest.mark.parametrize(
+    ("headers", "allowed"),
+    [
+        ([], True),
+        ([""], True),
+        (["*/*"], True),
+        (["application/zip"], False),
+        (["application/zip, */*"], True),
+        (["application/zip", "application/json"], True),
+        (["application/*"], True),
+        (["Application/JSON; charset=utf-8"], True),
+        (["application/json;q=0, */*"], False),
+        (["application/json; Q=0.000, application/*"], False),
+        (["application/*;q=0, application/json;q=0.1"], True),
+        (["text/html, application/problem+json"], False),
+        (["application/json;q=nonsense"], True),
+        (["*/*;q=0"], False),
+        ([",;,;q=1"], True),
+    ],
+)
+def test_accept_headers(headers, allowed):
+    """Oracle: RFC 9110, section 12.5.1."""
+    assert accepts(headers, "application/json") is allowed
+
+
+@pytest.mark.skipif(shutil.which("curl") is None, reason="curl is not installed")
+def test_the_documented_command_never_overwrites_a_good_container(start, local, tmp_path):
+    """A 202 answer once replaced a good scene.zip with the job's status, and curl exited with 0."""
+    page = (ROOT / "docs" / "guide" / "service.md").read_text(encoding="utf-8")
+    (command,) = re.findall(r"^\$ (curl .*/v1/compress.*)", page.replace("\\\n", ""), re.MULTILINE)
+    service = start(KISSGS_SYNC_SECONDS=30)
+    hasty = start(KISSGS_SYNC_SECONDS=0.5)
+    target = tmp_path / "scene.zip"
+    target.write_bytes(b"a good container")
+
+    def run(service, scene, options):
+        (tmp_path / "scene.ply").write_bytes(scene)
+        address = f"'{service.url}/v1/compress?options={quote(options)}'"
+        line = command.replace("localhost:8000/v1/compress", address)
+        return subprocess.run(["sh", "-c", line], cwd=tmp_path, capture_output=True, check=False).returncode
+
+    for scene, options, code in ((scene_bytes(20_000, 3), SLOW, "not-finished"), (b"ply\n", FAST, "invalid-scene")):
+        assert run(hasty, scene, options) != 0
+        assert target.read_bytes() == b"a good container"
+        assert json.loads((tmp_path / "scene.zip.part").read_text())["code"] == code
+    assert run(service, SMALL, FAST) == 0
+    assert target.read_bytes() == local.to_zip()
 
 
 def test_evaluating(service):

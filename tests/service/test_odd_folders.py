@@ -123,7 +123,7 @@ def test_a_start_follows_no_links(tmp_path):
     with service(tmp_path / "data") as context:
         assert context.store.get(jobs[2]).state == State.QUEUED
         context.storage.discard_checkpoints(jobs[1])
-        for path in context.storage.spare(jobs[1]):
+        for path in context.storage.reclaimable_files(jobs[1]):
             context.storage.discard(path)
     assert [listing(tmp_path / job) for job in jobs] == before
 

@@ -98,7 +98,7 @@ def test_one_scene_after_the_other_releases_the_first(preview, service):
         tab.fact("Gaussians", f"{count:,}")
         if turn in (1, 19):
             tab.page.locator("#compare").click()  # ends it
-            picture = tab.picture()
+            picture = tab.still_image()
             first = picture if first is None else first
             books.append(tab.page.evaluate("books()"))
     assert colours(first) > 3000
@@ -322,7 +322,7 @@ def test_fingers_mark_a_gaussian(preview, service):
     row, column = divmod(int(np.flatnonzero(mask)[index]), side)
     canvas.tap(position={"x": (column + 0.5) / side * size, "y": (row + 0.5) / side * size})
     readout.get_by_text(f"Column {column}, row {row}: Gaussian {index}").wait_for()
-    assert looks_like(tab.picture(), before) < 50  # it is marked
+    assert looks_like(tab.still_image(), before) < 50  # it is marked
     box = canvas.bounding_box()
     finger = tab.context.new_cdp_session(tab.page)
     for kind, across in (("touchStart", 0.1), *(("touchMove", 0.1 * step) for step in range(2, 9)), ("touchEnd", None)):

@@ -73,34 +73,34 @@ def test_keys_and_mouse_move_the_camera(preview, service, job, decoded):
     page, press = tab.page, tab.page.keyboard.press
     home = tab.shown(len(decoded))
     page.locator("#picture").focus()
-    still = tab.picture()
+    still = tab.still_image()
     frames = page.evaluate("books().frames")
     page.wait_for_timeout(700)
     assert page.evaluate("books().frames") == frames  # nothing moves, so nothing is drawn
     assert (tab.pixels() == still).all()
     for key in ("ArrowLeft", "a"):
         press(key)
-        moved = tab.picture()
+        moved = tab.still_image()
         assert looks_like(moved, still) < 40, key
         press("Home")
-        assert looks_like(tab.picture(), still) > 60, key
+        assert looks_like(tab.still_image(), still) > 60, key
     for key, least, most in (("+", 1.3, 3), ("-", 0.3, 0.8)):
         for _ in range(8):
             press(key)
-        assert least < red(tab.picture()) / red(still) < most, key
+        assert least < red(tab.still_image()) / red(still) < most, key
         press("r")
-    assert looks_like(tab.picture(), still) > 60
+    assert looks_like(tab.still_image(), still) > 60
     middle = page.locator("#picture").bounding_box()
     at = (middle["x"] + middle["width"] / 2, middle["y"] + middle["height"] / 2)
     page.mouse.move(*at)
     page.mouse.wheel(0, -300)
-    assert looks_like(tab.picture(), still) < 35
+    assert looks_like(tab.still_image(), still) < 35
     page.locator("#reset").click()
     page.mouse.move(*at)
     page.mouse.down()
     page.mouse.move(at[0] + 60, at[1], steps=3)
     page.mouse.up()
-    assert looks_like(tab.picture(), home) < 35
+    assert looks_like(tab.still_image(), home) < 35
 
 
 def red(picture):
@@ -116,7 +116,7 @@ def test_panels_can_be_hidden_and_keys_are_listed(preview, service, job, decoded
     page.keyboard.press("h")
     assert not page.locator("#panel").is_visible()
     assert page.locator("#panels").get_attribute("aria-pressed") == "true"
-    wide = tab.picture()
+    wide = tab.still_image()
     assert wide.shape == (400, 820, 3) > narrow.shape
     assert colours(wide) > 5000
     page.locator("#panels").click()
@@ -128,7 +128,7 @@ def test_panels_can_be_hidden_and_keys_are_listed(preview, service, job, decoded
     assert not page.get_by_role("dialog").is_visible()
     page.locator("#background").click()
     assert tab.page.locator("#background").get_attribute("aria-pressed") == "true"
-    before, after = ((picture[:-80].max(axis=2) < 40).sum() for picture in (narrow, tab.picture()))
+    before, after = ((picture[:-80].max(axis=2) < 40).sum() for picture in (narrow, tab.still_image()))
     assert after < before / 2
 
 
@@ -152,11 +152,11 @@ def test_comparing_with_the_original(preview, service, job, decoded):
         page.keyboard.press(key)
         assert share() == place
     free = np.s_[60:-80, 60:-60]  # of the handle, of labels and of tools
-    compressed = tab.picture()
+    compressed = tab.still_image()
     assert looks_like(compressed[free], before[free]) > 60
     page.keyboard.press("End")
     assert share() == 100
-    original = tab.picture()
+    original = tab.still_image()
     between = looks_like(original[free], compressed[free])
     assert 20 < between < 50
     for turned in (original[free][:, ::-1], original[free][::-1]):
@@ -167,13 +167,13 @@ def test_comparing_with_the_original(preview, service, job, decoded):
     page.mouse.move(stage["x"] + 0.25 * stage["width"], stage["y"] + 200, steps=3)
     page.mouse.up()
     assert share() == 25
-    both, width = tab.picture(), before.shape[1]
+    both, width = tab.still_image(), before.shape[1]
     left, right = np.s_[60:-80, 20 : int(0.25 * width) - 30], np.s_[60:-80, int(0.25 * width) + 30 : -20]
     assert looks_like(both[left], original[left]) > 60
     assert looks_like(both[right], compressed[right]) > 60
     page.locator("#picture").focus()
     page.keyboard.press("ArrowLeft")  # both turn
-    turned = tab.picture()
+    turned = tab.still_image()
     assert looks_like(turned[left], both[left]) < 45
     assert looks_like(turned[right], both[right]) < 45
     page.get_by_role("button", name="End comparison").click()
@@ -235,13 +235,13 @@ def test_pointing_at_a_plane(preview, service, job, container, decoded):
         book = len(planes["f_rest_centroids.webp"]) // 3
         assert numbers(shown["SH entry"]) == [label[0] + book * label[1]]
         assert numbers(shown["Levels RGBA"]) == [*planes["scales.webp"][row, column], 255]
-        places[index] = marked(tab.picture(), before)
+        places[index] = marked(tab.still_image(), before)
         assert places[index][2] < 40
     assert places[leftmost][0] < places[rightmost][0] - 50
     assert places[lowest][1] > min(places[leftmost][1], places[rightmost][1])
     padding = np.flatnonzero(mask.reshape(side * side, -1)[:, 0] == 0)[-1]
     assert "padding" in point_at(padding).inner_text()
-    assert looks_like(tab.picture(), before) > 60
+    assert looks_like(tab.still_image(), before) > 60
     canvas.press("ArrowLeft")
     assert f"Column {padding % side - 1}" in page.locator(".readout").inner_text()
     page.get_by_role("button", name="SH codebook").click()
@@ -392,10 +392,10 @@ def test_one_finger_orbits(preview, service, job, decoded):
     ):
         touches = [{"x": left, "y": top} for left, top in points]
         finger.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": touches})
-    assert looks_like(tab.picture(), before) < 30
+    assert looks_like(tab.still_image(), before) < 30
     assert tab.page.evaluate("scrollY") == 0
     tab.page.locator("#reset").tap()
-    assert looks_like(tab.picture()[:-80], before[:-80]) > 60
+    assert looks_like(tab.still_image()[:-80], before[:-80]) > 60
 
 
 def test_without_the_viewer(preview, service, job, decoded):

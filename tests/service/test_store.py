@@ -145,10 +145,10 @@ def test_sums_and_lists(store):
     store.move(jobs[0].number, State.SUCCEEDED, expires_at=5.0, result={"a": 1})
     assert len(store.rates("fast", False)) == 1
     assert store.due(ENDED, 6.0) == [(jobs[0].number, jobs[0].id)]
-    assert (store.spare(), store.spare_bytes()) == ([], 0)
-    store.update(jobs[0].number, spare_bytes=2_000_000_000)
-    store.update(jobs[1].number, spare_bytes=5)  # of one that still waits, nothing can be spared
-    assert (store.spare(), store.spare_bytes()) == ([(jobs[0].number, jobs[0].id)], 2_000_000_000)
+    assert (store.reclaimable(), store.reclaimable_bytes()) == ([], 0)
+    store.update(jobs[0].number, reclaimable_bytes=2_000_000_000)
+    store.update(jobs[1].number, reclaimable_bytes=5)  # of one that still waits, nothing can be spared
+    assert (store.reclaimable(), store.reclaimable_bytes()) == ([(jobs[0].number, jobs[0].id)], 2_000_000_000)
     store.forget(jobs[0].number)
     assert store.get(jobs[0].id) is None
     assert store.events(jobs[0].number) == []
@@ -157,7 +157,7 @@ def test_sums_and_lists(store):
 def test_what_is_written_is_there_again(url):
     first = Store(url, lambda: 5.0)
     number = add(first, name="Schloß \u4e2d", options={"preset": "fast", "encode": {"seed": 2**31 - 1}}).number
-    first.keep_time()
+    first.heartbeat()
     first.close()
     second = Store(url, lambda: 6.0)
     (found,) = second.in_state(State.QUEUED)

@@ -186,12 +186,12 @@ def test_training_tells_what_it_has_come_to(service):
     assert any(data.get("note") == note for data in heard)
 
 
-TUNED = {"preset": "fast", "finetune": {"enabled": True, "steps": 300, "views": 24, "view_size": 48}}
+FINETUNED = {"preset": "fast", "finetune": {"enabled": True, "steps": 300, "views": 24, "view_size": 48}}
 
 
 def test_fine_tuning_is_taken_up_where_it_was_left_and_its_gain_is_told(start_saving):
     service = start_saving(KISSGS_DRAIN_SECONDS=0)
-    job = service.submit(options=json.dumps(TUNED))
+    job = service.submit(options=json.dumps(FINETUNED))
     kept = folder_of(service, job) / "checkpoint-finetune.npz"
     while not (kept.exists() and service.running(job, "finetune")["progress"]["fraction"] > 0.3):
         time.sleep(0.02)
@@ -199,7 +199,7 @@ def test_fine_tuning_is_taken_up_where_it_was_left_and_its_gain_is_told(start_sa
     kill_the_service(service)
     status = service.ended(job)
     assert status["state"] == "succeeded", status
-    expected = kissgs.compress(SMALL, settings=kissgs.Settings.model_validate(TUNED))
+    expected = kissgs.compress(SMALL, settings=kissgs.Settings.model_validate(FINETUNED))
     assert service.http.get(status["links"]["result"]).content == expected.to_zip()
     gain = expected.report.finetuning.as_dict()
     assert {**status["finetuning"], "seconds": 0} == {**gain, "seconds": 0}

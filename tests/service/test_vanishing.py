@@ -16,7 +16,7 @@ from helpers.service import SLOW, SMALL, Service, problem, said, scene_bytes
 
 from service.core.models import State
 from service.storage import database_health as watch
-from service.storage.database_health import VanishedError
+from service.storage.database_health import DatabaseReplacedError
 from service.storage.job_store import Store
 
 HEAD = b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n"
@@ -278,14 +278,16 @@ def test_nothing_is_started_or_written_without_a_database(tmp_path):
     remove(tmp_path)
     for change in (
         store.claim,
-        store.keep_time,
+        store.heartbeat,
         partial(add, store),
         partial(store.forget, waiting.number),
-        partial(store.update, waiting.number, spare_bytes=1),
+        partial(store.update, waiting.number, reclaimable_bytes=1),
         partial(store.progress, running.number, "order", 0.5),
         partial(store.move, running.number, State.RUNNING),
     ):
-        with pytest.raises(VanishedError, match=r"jobs\.sqlite was removed while the service runs; put it back"):
+        with pytest.raises(
+            DatabaseReplacedError, match=r"jobs\.sqlite was removed while the service runs; put it back"
+        ):
             change()
     assert files(tmp_path) == []  # nor was another made
     assert store.counts()[State.QUEUED] == 2
@@ -298,7 +300,7 @@ def test_what_is_written_while_it_vanishes_does_not_count(tmp_path, monkeypatch)
 
     store = Store(f"sqlite:///{tmp_path / 'jobs.sqlite'}", time.time)
     monkeypatch.setattr("service.storage.job_store._note", lambda *arguments: remove(tmp_path))
-    with pytest.raises(VanishedError):
+    with pytest.raises(DatabaseReplacedError):
         add(store)
     store.close()
 
@@ -341,8 +343,8 @@ def test_a_database_server(postgresql):
     assert store.health_problem() is None
     change("UPDATE meta SET value = 7 WHERE name = 'identity'")
     assert store.health_problem() == "it was replaced by another"
-    with pytest.raises(VanishedError):
-        store.keep_time()
+    with pytest.raises(DatabaseReplacedError):
+        store.heartbeat()
     change("ALTER TABLE jobs DROP COLUMN note")
     change("DROP TABLE events")
     assert store.health_problem() is not None

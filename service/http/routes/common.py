@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import re
+from collections.abc import Iterable
 from typing import Annotated, Any
 
 from anyio.to_thread import run_sync
@@ -14,7 +15,7 @@ from service.core.notifier import ended
 from service.core.problems import MEDIA_TYPE, PROBLEM_TYPES, ProblemError
 from service.core.schemas import JobStatus
 from service.jobs.container import Owner, Service, ServiceContainer
-from service.jobs.status import QueueEstimator, status_of
+from service.jobs.status import QueueEstimator, job_status
 
 MAX_WAIT_SECONDS = 30.0
 """Of a long poll: shorter than proxies keep a silent connection."""
@@ -60,7 +61,7 @@ async def show(context: ServiceContainer, *jobs: Job) -> list[JobStatus]:
 
     def look() -> list[JobStatus]:
         queue = QueueEstimator(context.store, context.settings.workers)
-        return [status_of(job, queue) for job in jobs]
+        return [job_status(job, queue) for job in jobs]
 
     return await run_sync(look)
 
@@ -90,6 +91,18 @@ async def finished(context: ServiceContainer, job: Job, seconds: float, request:
             rung.cancel()
     finally:
         gone.cancel()
+
+
+def accepts(headers: Iterable[str], media_type: str) -> bool:
+    """Whether ``Accept`` headers allow a media type. The most specific range decides; no range allows every type."""
+    weights: dict[str, float] = {}
+    for text in ",".join(headers).lower().split(","):
+        name, *parameters = (part.strip() for part in text.split(";"))
+        quality = next((part[2:] for part in parameters if part.startswith("q=")), "1")
+        if name:
+            weights[name] = float(quality) if re.fullmatch(r"[01](\.[0-9]{0,3})?", quality) else 1.0
+    ranges = (media_type, f"{media_type.partition('/')[0]}/*", "*/*")
+    return next((weights[name] > 0 for name in ranges if name in weights), not weights)
 
 
 async def _gone(request: Request) -> None:

@@ -15,7 +15,7 @@ from service.core.problems import PROBLEM_TYPES, ProblemError
 from service.core.schemas import Health, Limits, Presets, ProblemKind, Version
 from service.http.routes.common import MAX_WAIT_SECONDS, NO_STORE, problems
 from service.jobs.container import Service, ServiceContainer
-from service.storage.database_health import reason_of
+from service.storage.database_health import error_text
 from service.storage.job_storage import ORPHANED
 
 router = APIRouter()
@@ -135,9 +135,9 @@ def _database_problem(context: ServiceContainer) -> str | None:
     health_problem = context.store.health_problem()
     if health_problem is None:
         try:
-            context.store.keep_time()
+            context.store.heartbeat()
         except SQLAlchemyError as error:
-            health_problem = reason_of(error)
+            health_problem = error_text(error)
     return None if health_problem is None else f"the job database cannot be used: {health_problem}"
 
 

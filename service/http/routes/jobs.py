@@ -13,7 +13,7 @@ from service.core.models import ACTIVE, Job, State
 from service.core.notifier import ended
 from service.core.problems import ProblemError
 from service.core.schemas import JobPage, JobStatus
-from service.http.routes.common import MAX_WAIT_SECONDS, NO_STORE, Found, finished, fresh, problems, show
+from service.http.routes.common import MAX_WAIT_SECONDS, NO_STORE, Found, accepts, finished, fresh, problems, show
 from service.http.routes.results import container
 from service.http.submission import RAW_TYPES, submit
 from service.jobs.container import Owner, Service, ServiceContainer
@@ -136,7 +136,7 @@ async def submit_job(
             "content": {"application/zip": {"schema": {"type": "string", "format": "binary"}}},
         },
         **_ACCEPTED,
-        **problems(*_REFUSALS, "crashed", "cancelled", "not-found"),
+        **problems(*_REFUSALS, "crashed", "cancelled", "not-finished", "not-found"),
     },
 )
 async def compress_now(
@@ -147,9 +147,11 @@ async def compress_now(
     name: Name = None,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
-    """As submitting, but the answer is the container itself, if it is ready within the time that `/v1/limits` names.
+    """Submit a `.ply` and answer with its container, if the job succeeds within `sync_seconds` of `/v1/limits`.
 
-    If it is not, the answer is 202 and the job goes on.
+    After that time the job continues, and the answer is 202 with its status as JSON. A client whose `Accept` header
+    excludes JSON gets a 409 problem instead (`not-finished`), with `Location`, so that a program that saves every
+    successful answer as a container never saves a status.
     """
     job, _ = await submit(context, request, owner, options=options, name=name, key=idempotency_key)
     job = await finished(context, job, context.settings.sync_seconds, request)
@@ -165,6 +167,12 @@ async def compress_now(
         raise ProblemError("cancelled", "the job was cancelled before it ended; submit the scene again")
     response = Response(status_code=202, media_type="application/json")
     status = await _accepted(context, response, job)
+    if not accepts(request.headers.getlist("accept"), "application/json"):
+        text = (
+            f"the job has not ended yet and continues; wait for it with GET /v1/jobs/{job.id}?wait="
+            f"{MAX_WAIT_SECONDS:g}, then download /v1/jobs/{job.id}/result"
+        )
+        raise ProblemError("not-finished", text, headers={"Location": response.headers["Location"]})
     response.body = status.model_dump_json(exclude_none=True).encode()
     response.headers["Content-Length"] = str(len(response.body))
     return response
@@ -239,7 +247,7 @@ async def follow_job(
     if job.state not in ACTIVE and after >= job.last_event:
         return Response(status_code=204)
     return StreamingResponse(
-        context.follower.stream(job, after),
+        context.event_stream.stream(job, after),
         media_type="text/event-stream",
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
     )
@@ -270,7 +278,7 @@ async def delete_job(context: Service, job: Found) -> Response:
     """Cancel it if need be, and remove everything there is of it."""
     await context.worker.cancel(job)
     context.decoder.stop(job.id)
-    gone = {"upload_kept": False, "disk_bytes": 0, "spare_bytes": 0}
+    gone = {"upload_kept": False, "disk_bytes": 0, "reclaimable_bytes": 0}
     await run_sync(lambda: context.store.move(job.number, State.EXPIRED, **gone))
     await run_sync(context.storage.remove_job, job.id)  # now: a folder that no job owns would be kept
     await run_sync(context.store.forget, job.number)

@@ -14,8 +14,8 @@ from helpers.service import ROOT, SLOW, SMALL, Service, problem, scene_bytes
 
 from service.core.models import State
 from service.core.settings import SettingsError
-from service.storage import tenancy
-from service.storage.database_health import VanishedError
+from service.storage import database_lease
+from service.storage.database_health import DatabaseReplacedError
 from service.storage.job_store import Store
 
 
@@ -31,7 +31,7 @@ def elsewhere(monkeypatch):
     """``elsewhere(n)``: from now on this process is another one, on machine ``n``."""
 
     def move(number):
-        monkeypatch.setattr(tenancy, "_machine", lambda: number)
+        monkeypatch.setattr(database_lease, "_machine", lambda: number)
 
     return move
 
@@ -52,7 +52,7 @@ def test_a_copied_folder_on_the_same_database(tmp_path, url):
         waiting = first.submit()
         begun = time.monotonic()
         ended = command(tmp_path / "second", KISSGS_DATABASE_URL=url)
-        assert time.monotonic() - begun < 3 * tenancy.SIGN_SECONDS
+        assert time.monotonic() - begun < 3 * database_lease.HEARTBEAT_SECONDS
         assert (ended.returncode, ended.stdout) == (2, "")
         line = ended.stderr.splitlines()[-1]
         assert f"another service (process {first.process.pid}) is using the job database; stop that one" in line
@@ -78,7 +78,7 @@ def test_the_next_start_waits_for_nobody(tmp_path, url, number):
 
 @pytest.mark.usefixtures("no_variables")
 def test_one_that_crashed_elsewhere_is_waited_for(tmp_path, url, elsewhere, monkeypatch, caplog):
-    monkeypatch.setattr(tenancy, "PATIENCE_SECONDS", 1.0)
+    monkeypatch.setattr(database_lease, "TAKEOVER_SECONDS", 1.0)
     elsewhere(1)
     first = opened(tmp_path / "data", url)
     add_a_job(first)
@@ -90,11 +90,13 @@ def test_one_that_crashed_elsewhere_is_waited_for(tmp_path, url, elsewhere, monk
         assert context.store.counts()[State.QUEUED] == 1
         assert "waiting 1 s for a sign of its life" in caplog.text
         assert "there was none" in caplog.text
-        with pytest.raises(VanishedError, match="another service has taken it over"):  # it did not crash after all
+        with pytest.raises(
+            DatabaseReplacedError, match="another service has taken it over"
+        ):  # it did not crash after all
             first.store.claim()
         assert "another service has taken it over" in first.store.health_problem()
         first.store.close()
-        context.store.keep_time()
+        context.store.heartbeat()
         assert context.store.health_problem() is None
     assert facts(url)["owner"] is None
 
@@ -107,7 +109,7 @@ def test_one_that_lives_elsewhere(tmp_path, url, elsewhere, ends):
     job = add_a_job(first)
     shutil.copytree(tmp_path / "data", tmp_path / "copy", ignore=shutil.ignore_patterns("lock"))
     elsewhere(2)
-    show = first.store.keep_time if ends == "lives" else first.store.close
+    show = first.store.heartbeat if ends == "lives" else first.store.close
     timer = threading.Timer(1.0, show)
     timer.start()
     begun = time.monotonic()
@@ -133,7 +135,7 @@ def test_one_whose_place_was_taken_says_so(tmp_path, url):
         it.ended(it.submit())
         store = Store(url, time.time)
         with store._writing.begin() as session:
-            session.merge(tenancy.Meta(name="owner", value=7))
+            session.merge(database_lease.Meta(name="owner", value=7))
         store.close()
         ready = it.http.get("/readyz")
         assert ready.status_code == 503
@@ -150,13 +152,13 @@ store = Store(sys.argv[1], time.time)
 print("ready", flush=True)
 sys.stdin.readline()
 try:
-    store.claim_database()
+    store.acquire_database()
     print("mine", flush=True)
 except Exception as error:
     print(error, flush=True)
 while store._watch.owner is not None:
     time.sleep(0.1)
-    store.keep_time()
+    store.heartbeat()
 """
 
 
@@ -184,11 +186,13 @@ def test_many_that_start_at_once(url):
 
 @pytest.mark.parametrize("process", [0, -1, 2.0**40, 1e300])
 def test_process_numbers_that_are_none(process):
-    assert tenancy._is_free({"owner": 5.0, "owner-process": process, "owner-machine": tenancy._machine()})
+    assert database_lease._is_free({"owner": 5.0, "owner-process": process, "owner-machine": database_lease._machine()})
 
 
 def test_a_process_that_may_run():
-    rows = {"owner": 5.0, "owner-process": float(os.getppid()), "owner-machine": tenancy._machine()}
-    assert not tenancy._is_free(rows)
-    assert not tenancy._is_free({**rows, "owner-machine": 1.0, "owner-process": 2.0**22})
-    assert tenancy._is_free({**rows, "owner-process": float(os.getpid())})  # we are it, after a restart of a container
+    rows = {"owner": 5.0, "owner-process": float(os.getppid()), "owner-machine": database_lease._machine()}
+    assert not database_lease._is_free(rows)
+    assert not database_lease._is_free({**rows, "owner-machine": 1.0, "owner-process": 2.0**22})
+    assert database_lease._is_free(
+        {**rows, "owner-process": float(os.getpid())}
+    )  # we are it, after a restart of a container

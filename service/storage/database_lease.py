@@ -25,13 +25,13 @@ from service.storage.database_health import IDENTITY, IDENTITY_BITS, OWNER
 
 log = logging.getLogger("kissgs.service")
 
-SIGN_SECONDS = 5.0
+HEARTBEAT_SECONDS = 5.0
 """Between two signs of life."""
 
-PATIENCE_SECONDS = 20.0
+TAKEOVER_SECONDS = 20.0
 """How long a start waits for a sign of life of a service that may have crashed."""
 
-LOOK_SECONDS = 0.25
+POLL_SECONDS = 0.25
 """Between two looks for one."""
 
 TIME, PROCESS, MACHINE = "time", "owner-process", "owner-machine"
@@ -39,7 +39,7 @@ TIME, PROCESS, MACHINE = "time", "owner-process", "owner-machine"
 Rows = dict[str, float]
 
 
-def claim(writing: Sessions, reading: Sessions) -> float:
+def acquire(writing: Sessions, reading: Sessions) -> float:
     """Write down that the database is this service's, and by which number.
 
     A service that stopped in order has left no row, and one that crashed on this machine is known not to run: after
@@ -51,7 +51,7 @@ def claim(writing: Sessions, reading: Sessions) -> float:
     with reading() as session:
         seen = _rows(session)
     if not _is_free(seen):
-        seen = _outlive(seen, reading)
+        seen = _wait_for_heartbeat(seen, reading)
     number = secrets.randbits(IDENTITY_BITS)
     with writing.begin() as session:
         session.get(Meta, IDENTITY, with_for_update=True)  # two that start at once come one after the other
@@ -62,7 +62,7 @@ def claim(writing: Sessions, reading: Sessions) -> float:
     return number
 
 
-def leave(session: Session) -> None:
+def release(session: Session) -> None:
     """Let the next service have the database at once."""
     session.execute(sa.delete(Meta).where(Meta.name.in_((OWNER, PROCESS, MACHINE))))
 
@@ -72,16 +72,16 @@ def _rows(session: Session) -> Rows:
     return {fact.name: fact.value for fact in session.scalars(wanted)}
 
 
-def _outlive(seen: Rows, reading: Sessions) -> Rows:
+def _wait_for_heartbeat(seen: Rows, reading: Sessions) -> Rows:
     """Wait for a sign of life of the owner.
 
     Returns:
         What stands in the database when there was none, or when the owner has stopped.
     """
-    log.warning("the job database is that of another service; waiting %g s for a sign of its life", PATIENCE_SECONDS)
-    end = time.monotonic() + PATIENCE_SECONDS
+    log.warning("the job database is that of another service; waiting %g s for a sign of its life", TAKEOVER_SECONDS)
+    end = time.monotonic() + TAKEOVER_SECONDS
     while time.monotonic() < end:
-        time.sleep(LOOK_SECONDS)
+        time.sleep(POLL_SECONDS)
         with reading() as session:
             now = _rows(session)
         if OWNER not in now:
