@@ -1,4 +1,4 @@
-"""The command line: thin, prints what the library returns. Heavy imports wait until a command needs them."""
+"""The command line: a thin layer over the library. Heavy imports are deferred until a command needs them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from kissgs.cli.decompress import decompress
 from kissgs.cli.evaluate import evaluate
 from kissgs.cli.files import write_stdout
 from kissgs.cli.info import info
-from kissgs.cli.options import spelled_out
+from kissgs.cli.options import with_finetune_value
 from kissgs.cli.remote import app as remote
 from kissgs.cli.render import render
 from kissgs.cli.sample import sample
@@ -28,7 +28,7 @@ from kissgs.core.errors import KissgsError, UnsupportedError
 
 app = typer.Typer(
     name="kissgs",
-    help="Compress 3D Gaussian Splatting scenes (.ply) into SOG-XT containers that any browser can open.",
+    help="Compress 3D Gaussian Splatting scenes (.ply) into SOG-XT containers, which any browser can decode.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -37,18 +37,18 @@ app = typer.Typer(
 
 
 def run() -> None:
-    """Do what the command line says."""
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # torch's idle threads would take the processor from ours
+    """Run the command line."""
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # torch's idle threads would otherwise spin and slow ours down
     unwinding(_run)
 
 
 def _run() -> None:
     try:
-        app(spelled_out(sys.argv[1:]))
+        app(with_finetune_value(sys.argv[1:]))
     except KissgsError as error:
         _fail(error)
     except OSError as error:
-        if error.filename is None:  # of no file that the user could have named: a bug
+        if error.filename is None:  # concerns no file that the user named: a bug
             raise
         _fail(UnsupportedError(f"cannot use {error.filename!s:.100}: {(error.strerror or str(error)).lower()}"))
 
@@ -67,7 +67,7 @@ def _version(version: Annotated[bool, typer.Option("--version", help="Print the 
 
 def _fail(error: KissgsError) -> NoReturn:
     if "--json" in sys.argv:
-        with contextlib.suppress(KissgsError):  # it may be standard output that failed
+        with contextlib.suppress(KissgsError):  # standard output itself may have failed
             write_stdout((json.dumps({"error": {"code": error.code, "message": str(error)}}) + "\n").encode())
     sys.stderr.write(f"kissgs: {error}\n")
     sys.exit(2)

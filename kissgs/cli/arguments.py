@@ -8,41 +8,52 @@ from typing import Annotated
 import typer
 
 ScenesArgument = Annotated[
-    list[str], typer.Argument(metavar="FILE…", help="Files or patterns; '-' reads standard input.")
+    list[str], typer.Argument(metavar="FILE…", help="Files or glob patterns; '-' reads standard input.")
 ]
-FilesArgument = Annotated[list[str], typer.Argument(metavar="FILE…", help="Files or patterns.")]
+FilesArgument = Annotated[list[str], typer.Argument(metavar="FILE…", help="Files or glob patterns.")]
 PresetOption = Annotated[
-    str, typer.Option("--preset", "-p", help="[bold]fast[/], [bold]balanced[/], [bold]small[/] or [bold]paper[/].")
+    str, typer.Option("--preset", "-p", help="Trade-off of speed, size and quality: fast, balanced, small or paper.")
 ]
 SetOption = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="NAME=VALUE", help="Change one setting of the preset; see docs/settings.md."),
+    typer.Option(
+        "--set",
+        metavar="NAME=VALUE",
+        help="Change a setting of the preset; repeatable. List: docs/reference/settings.md.",
+    ),
 ]
-SeedOption = Annotated[int | None, typer.Option(help="Seed of all random choices.")]
-ForceOption = Annotated[bool, typer.Option("--force", "-f", help="Overwrite files that exist.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON: an object for one file, a list for several.")]
-QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
-ThreadsOption = Annotated[int, typer.Option(min=0, help="0: one per processor. The bytes do not depend on it.")]
+SeedOption = Annotated[int | None, typer.Option(help="Seed of all random choices; same seed, same result. Default: 0.")]
+ForceOption = Annotated[bool, typer.Option("--force", "-f", help="Overwrite existing output files.")]
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="Print a JSON report: an object for one file, a list for several.")
+]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")]
+ThreadsOption = Annotated[
+    int, typer.Option(min=0, help="Number of threads; 0 for one per processor. The output does not depend on it.")
+]
 ViewsOption = Annotated[
     Path | None,
     typer.Option(
         "--views",
         metavar="DATA",
-        help="Cameras, and photographs if there are any: a folder with a COLMAP model or transforms.json. "
-        "By default kissgs places cameras itself.",
+        help="Capture with cameras and optionally photographs: a folder with a COLMAP model or a transforms.json. "
+        "Default: virtual cameras.",
     ),
 ]
 ScaleOption = Annotated[
-    int | None, typer.Option(min=1, help="Take the photographs from the folder of this scale: 4 for images_4.")
+    int | None,
+    typer.Option(min=1, help="Downscaling factor of the photographs of --views: 4 reads the folder images_4."),
 ]
-ImagesOption = Annotated[Path | None, typer.Option(help="Take the photographs from this folder.")]
+ImagesOption = Annotated[
+    Path | None, typer.Option(help="Folder of the photographs of --views, if it is not the capture's own.")
+]
 ResolutionOption = Annotated[
-    int | None, typer.Option(min=1, help="Largest longer side of a picture, pixels; by default 1600.")
+    int | None, typer.Option(min=1, help="Limit of the longer side of the photographs, pixels. Default: 1600.")
 ]
 SplitOption = Annotated[
-    str, typer.Option(help="[bold]test[/] (held-out views), [bold]train[/] or [bold]all[/].", show_default=True)
+    str, typer.Option(help="Views of --views to use: test (held-out), train or all.", show_default=True)
 ]
-RenderDeviceOption = Annotated[str, typer.Option(help="Renders: [bold]cpu[/] or [bold]cuda[/].")]
+RenderDeviceOption = Annotated[str, typer.Option(help="Device of the rasteriser: cpu or cuda.")]
 RenderThreadsOption = Annotated[
-    int, typer.Option(min=0, help="0: one per processor. The pictures do not depend on it.")
+    int, typer.Option(min=0, help="Number of threads; 0 for one per processor. The images do not depend on it.")
 ]

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from kissgs.cli.files import beside, each, show, source, stdout
+from kissgs.cli.files import for_each_input, show, sibling, source, stdout
 from kissgs.cli.options import chosen, count_of, device_of, open_views
 from kissgs.core.errors import UnsupportedError
 
@@ -15,53 +15,69 @@ CHECKPOINT = ".checkpoint.npz"
 
 
 def compact(
-    scenes: Annotated[list[str], typer.Argument(metavar="FILE…", help="Files or patterns; '-' reads standard input.")],
+    scenes: Annotated[
+        list[str], typer.Argument(metavar="FILE…", help="Files or glob patterns; '-' reads standard input.")
+    ],
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="NAME.ply, a folder for them, or '-'. Needed: nothing is overwritten."),
+        typer.Option("--output", "-o", help="Output NAME.ply, a folder, or '-' for standard output. Required."),
     ] = None,
     count: Annotated[
-        str | None, typer.Option("--count", "-n", metavar="N", help="Keep so many Gaussians: 200k, 1.5M.")
+        str | None,
+        typer.Option("--count", "-n", metavar="N", help="Number of Gaussians to keep, such as 200k or 1.5M."),
     ] = None,
-    ratio: Annotated[float | None, typer.Option(metavar="SHARE", help="Keep this share of them: 0.2.")] = None,
+    ratio: Annotated[
+        float | None, typer.Option(metavar="SHARE", help="Share of the Gaussians to keep, 0 to 1, such as 0.2.")
+    ] = None,
     max_psnr_drop: Annotated[
-        float | None, typer.Option(metavar="DB", help="Keep as few as lose no more than this. Takes several attempts.")
+        float | None,
+        typer.Option(metavar="DB", help="Keep as few Gaussians as lose at most this PSNR. Takes several runs."),
     ] = None,
     views: Annotated[
         Path | None,
-        typer.Option("--views", metavar="DATA", help="Photographs to learn from, and held-out ones to judge by."),
+        typer.Option(
+            "--views",
+            metavar="DATA",
+            help="Capture to train on and to evaluate with: a COLMAP or transforms.json folder. "
+            "Default: renderings of the scene.",
+        ),
     ] = None,
     preset: Annotated[
         str,
-        typer.Option(
-            "--preset", "-p", help="[bold]fast[/] only prunes; [bold]balanced[/], [bold]small[/], [bold]paper[/] train."
-        ),
+        typer.Option("--preset", "-p", help="fast only prunes; balanced, small and paper also train."),
     ] = "balanced",
     changes: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Change one setting of the preset; see docs/settings.md."),
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="Change a setting of the preset; repeatable. List: docs/reference/settings.md.",
+        ),
     ] = None,
     seed: Annotated[
-        int | None, typer.Option(help="Of the order of pictures and of virtual cameras. Same seed: same scene.")
+        int | None,
+        typer.Option(help="Seed of the image order and the virtual cameras; same seed, same result. Default: 0."),
     ] = None,
     evaluate: Annotated[
-        bool, typer.Option("--evaluate", help="Measure PSNR, SSIM and bytes after every step.")
+        bool, typer.Option("--evaluate", help="Measure PSNR, SSIM and compressed size after every step.")
     ] = False,
     checkpoint: Annotated[
         bool,
-        typer.Option("--checkpoint", help="Keep the state in a file beside the scene, and go on from it next time."),
+        typer.Option("--checkpoint", help="Save the training state next to the scene, and resume from it next time."),
     ] = False,
     device: Annotated[
-        str, typer.Option(help="Where to train: [bold]cpu[/], or [bold]cuda[/], whose results vary a little.")
+        str, typer.Option(help="Device of the training: cpu (reproducible) or cuda (results vary slightly).")
     ] = "cpu",
-    threads: Annotated[int, typer.Option(min=0, help="0: one per processor. The result does not depend on it.")] = 0,
-    force: Annotated[bool, typer.Option("--force", "-f", help="Overwrite files that exist.")] = False,
+    threads: Annotated[
+        int, typer.Option(min=0, help="Number of threads; 0 for one per processor. The output does not depend on it.")
+    ] = 0,
+    force: Annotated[bool, typer.Option("--force", "-f", help="Overwrite existing output files.")] = False,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print JSON: an object for one file, a list for several.")
+        bool, typer.Option("--json", help="Print a JSON report: an object for one file, a list for several.")
     ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")] = False,
 ) -> None:
-    """Bring scenes down to fewer Gaussians that show the same: score, prune, train, prune, train (POPSpa)."""
+    """Reduce the number of Gaussians of scenes at nearly equal quality: score, prune and train (POPSpa)."""
     from kissgs.cli.console import progress_bar
     from kissgs.cli.signals import stoppable
     from kissgs.io.ply import write_ply
@@ -78,10 +94,12 @@ def compact(
         max_psnr_drop=max_psnr_drop,
     )
     if not settings.compact.enabled:
-        raise UnsupportedError("say how many Gaussians to keep: -n 200k, --ratio 0.2 or --max-psnr-drop 0.2")
+        raise UnsupportedError(
+            "missing the number of Gaussians to keep: give -n 200k, --ratio 0.2 or --max-psnr-drop 0.2"
+        )
     if output is None:
-        raise UnsupportedError("say where to write with -o: beside the scene stands the scene itself")
-    capture, where = open_views(views), device_of(device)
+        raise UnsupportedError("missing -o: by default the output would overwrite the input")
+    capture, training_device = open_views(views), device_of(device)
 
     def work(scene: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"
@@ -92,10 +110,10 @@ def compact(
                 settings=settings,
                 evaluate=evaluate,
                 views=capture,
-                checkpoint=beside(scene, CHECKPOINT) if checkpoint else None,
+                checkpoint=sibling(scene, CHECKPOINT) if checkpoint else None,
                 overwrite=force,
                 threads=threads,
-                device=where,
+                device=training_device,
                 progress=progress,
             )
         if piped:
@@ -110,4 +128,4 @@ def compact(
             show(compaction_table(result.report, str(target)))
         return result.report.as_dict()
 
-    each(scenes, output, ".ply", as_json, work)
+    for_each_input(scenes, output, ".ply", as_json, work)

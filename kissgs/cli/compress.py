@@ -1,4 +1,4 @@
-"""``kissgs compress``: scenes into containers."""
+"""``kissgs compress``: compress scenes into containers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from kissgs.cli.arguments import (
 )
 from kissgs.cli.compact import CHECKPOINT
 from kissgs.cli.console import progress_bar
-from kissgs.cli.files import beside, each, show, source, write_stdout
+from kissgs.cli.files import for_each_input, show, sibling, source, write_stdout
 from kissgs.cli.options import budget_of, chosen, device_of, open_views
 from kissgs.cli.signals import stoppable
 from kissgs.core.errors import UnsupportedError
@@ -30,67 +30,75 @@ def compress(
     scenes: ScenesArgument,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="NAME.zip, a folder for the zips, or '-'; by default beside the scene."),
+        typer.Option(
+            "--output", "-o", help="Output NAME.zip, a folder, or '-' for standard output. Default: next to the scene."
+        ),
     ] = None,
     preset: PresetOption = "balanced",
     changes: SetOption = None,
     psnr: Annotated[
-        float | None, typer.Option(metavar="DB", help="The smallest container with this PSNR to the scene's pictures.")
+        float | None,
+        typer.Option(
+            metavar="DB", help="Find the smallest container with at least this PSNR to the scene's renderings."
+        ),
     ] = None,
     target_size: Annotated[
-        str | None, typer.Option(metavar="SIZE", help="The best container of at most this size: 800kB, 2.5MB.")
+        str | None,
+        typer.Option(metavar="SIZE", help="Find the best container of at most this size, such as 800kB or 2.5MB."),
     ] = None,
     max_psnr_drop: Annotated[
         float | None,
         typer.Option(
-            metavar="DB", help="The smallest container whose pictures lose no more: 0.1; better with --views."
+            metavar="DB",
+            help="Find the smallest container that loses at most this PSNR, such as 0.1. Best with --views.",
         ),
     ] = None,
     compact: Annotated[
         str | None,
         typer.Option(
             metavar="BUDGET",
-            help="Fewer Gaussians first: 200k, 20% or 0.2dB, see 'compact'; or [bold]auto[/]: as many as serve "
-            "--target-size, --max-psnr-drop or --psnr best.",
+            help="First reduce the number of Gaussians, see 'kissgs compact': to a count (200k), a share (20%) or a "
+            "PSNR drop (0.2dB); auto searches the count that is best for --target-size, --max-psnr-drop or --psnr.",
         ),
     ] = None,
     finetune: Annotated[
         str | None,
         typer.Option(
             metavar="[STEPS]",
-            help="Then fit the numbers in the images to --views, or to pictures of the scene: fewer bytes at equal "
-            "PSNR, and a minute or two more. By default as many steps as the preset has.",
+            help="Fine-tune the quantised values on the photographs of --views, or on renderings of the scene: fewer "
+            "bytes at equal PSNR, a minute or two more. Default number of steps: that of the preset.",
         ),
     ] = None,
     seed: SeedOption = None,
-    unpacked: Annotated[bool, typer.Option("--unpacked", help="Write folders instead of zips.")] = False,
-    evaluate: Annotated[bool, typer.Option("--evaluate", help="Measure PSNR and SSIM of the result.")] = False,
+    unpacked: Annotated[bool, typer.Option("--unpacked", help="Write a folder instead of a zip.")] = False,
+    evaluate: Annotated[
+        bool, typer.Option("--evaluate", help="Decode the result, and measure PSNR and SSIM of its renderings.")
+    ] = False,
     views: Annotated[
         Path | None,
         typer.Option(
             "--views",
             metavar="DATA",
-            help="Photographs: learn from them, keep what they see best, and judge by those held out.",
+            help="Capture (COLMAP or transforms.json folder): training views give sensitivity and training targets, "
+            "held-out views evaluate. Default: virtual cameras.",
         ),
     ] = None,
     cache: Annotated[
-        bool, typer.Option("--cache", help="Keep what was seen of a scene in a file beside it, for the next time.")
+        bool, typer.Option("--cache", help="Cache the sensitivity next to the scene as NAME.sensitivity.npz.")
     ] = False,
     checkpoint: Annotated[
         bool,
         typer.Option(
-            "--checkpoint", help="Keep the state of --compact and --finetune beside the scene; see 'compact'."
+            "--checkpoint", help="Save the state of --compact and --finetune next to the scene, and resume from it."
         ),
     ] = False,
-    device: Annotated[
-        str, typer.Option(help="Where --compact and --finetune train: [bold]cpu[/] or [bold]cuda[/].")
-    ] = "cpu",
+    device: Annotated[str, typer.Option(help="Device of --compact and --finetune: cpu or cuda.")] = "cpu",
     threads: ThreadsOption = 0,
     force: ForceOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Compress scenes, each into a container of its own."""
+    """Compress each scene into a SOG-XT container."""
     from kissgs.pipeline.pipeline import compress as run
     from kissgs.training.checkpoint import forget
 
@@ -106,16 +114,16 @@ def compress(
         max_psnr_drop=max_psnr_drop,
     )
     if not (settings.compact.enabled or settings.finetune.enabled) and (checkpoint or device != "cpu"):
-        raise UnsupportedError("--checkpoint and --device are about training; they go with --compact and --finetune")
-    looks = evaluate or settings.encode.rate_distortion or settings.compact.enabled or settings.finetune.enabled
-    capture, where = open_views(views), device_of(device)
-    if views is not None and not looks and not quiet:
-        sys.stderr.write(f"kissgs: {preset} takes no pictures, so --views changes nothing; --evaluate judges by them\n")
+        raise UnsupportedError("--checkpoint and --device only apply to training: add --compact or --finetune")
+    renders = evaluate or settings.encode.rate_distortion or settings.compact.enabled or settings.finetune.enabled
+    capture, training_device = open_views(views), device_of(device)
+    if views is not None and not renders and not quiet:
+        sys.stderr.write(f"kissgs: --views has no effect: the preset {preset} renders no images; add --evaluate\n")
 
     def work(scene: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"
         with progress_bar(quiet or as_json) as bar, stoppable(bar, settings.searches) as progress:
-            if evaluate:  # announced here, because it is no stage of the evaluation
+            if evaluate:  # reported here, because evaluation reports only one stage
                 from kissgs.rendering.rasterizer import load_kernels
 
                 load_kernels(progress)
@@ -123,13 +131,13 @@ def compress(
                 source(scene),
                 None if piped else target,
                 settings=settings,
-                cache=beside(scene, ".sensitivity.npz") if cache else None,
+                cache=sibling(scene, ".sensitivity.npz") if cache else None,
                 evaluate=evaluate,
                 views=capture,
-                checkpoint=beside(scene, CHECKPOINT) if checkpoint else None,
+                checkpoint=sibling(scene, CHECKPOINT) if checkpoint else None,
                 overwrite=force,
                 threads=threads,
-                device=where,
+                device=training_device,
                 progress=progress,
             )
         if piped:
@@ -141,4 +149,4 @@ def compress(
             show(report_table(result.report, str(target)))
         return result.report.as_dict()
 
-    each(scenes, output, "" if unpacked else ".zip", as_json, work)
+    for_each_input(scenes, output, "" if unpacked else ".zip", as_json, work)

@@ -1,4 +1,4 @@
-"""``kissgs decompress``: containers back into ``.ply`` files."""
+"""``kissgs decompress``: decode containers into ``.ply`` files."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from kissgs.cli.arguments import (
     ThreadsOption,
 )
 from kissgs.cli.console import progress_bar
-from kissgs.cli.files import each, show, source, stdout
+from kissgs.cli.files import for_each_input, show, source, stdout
 from kissgs.core.errors import InvalidContainerError
 
 
@@ -24,15 +24,21 @@ def decompress(
     containers: ScenesArgument,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="NAME.ply, a folder for them, or '-'; by default beside the container."),
+        typer.Option(
+            "--output",
+            "-o",
+            help="Output NAME.ply, a folder, or '-' for standard output. Default: next to the container.",
+        ),
     ] = None,
-    max_gaussians: Annotated[int | None, typer.Option(min=0, help="Refuse more; by default 20 million.")] = None,
+    max_gaussians: Annotated[
+        int | None, typer.Option(min=0, help="Refuse containers with more Gaussians. Default: 20 million.")
+    ] = None,
     threads: ThreadsOption = 0,
     force: ForceOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Turn containers back into .ply files."""
+    """Decode containers into .ply files."""
     from kissgs.io.ply import write_ply
     from kissgs.pipeline.pipeline import decompress as run
     from kissgs.sogxt.decode import MAX_GAUSSIANS
@@ -56,4 +62,4 @@ def decompress(
             show(f"{target}  {len(splats):,} Gaussians, SH degree {splats.sh_degree}")
         return {"count": len(splats), "sh_degree": splats.sh_degree, "bytes": target.stat().st_size}
 
-    each(containers, output, ".ply", as_json, work, unreadable=InvalidContainerError)
+    for_each_input(containers, output, ".ply", as_json, work, unreadable=InvalidContainerError)

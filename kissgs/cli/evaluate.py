@@ -1,4 +1,4 @@
-"""``kissgs evaluate``: a scene compared with its original, and with photographs."""
+"""``kissgs evaluate``: compare a scene with its original, and with photographs."""
 
 from __future__ import annotations
 
@@ -23,25 +23,28 @@ from kissgs.cli.options import choice, device_of, open_views
 
 
 def evaluate(
-    reference: Annotated[Path, typer.Argument(metavar="REFERENCE", help="The scene as it was: .ply or container.")],
-    candidate: Annotated[Path, typer.Argument(metavar="CANDIDATE", help="What became of it: .ply or container.")],
+    reference: Annotated[Path, typer.Argument(metavar="REFERENCE", help="Original scene: .ply or container.")],
+    candidate: Annotated[Path, typer.Argument(metavar="CANDIDATE", help="Scene to evaluate: .ply or container.")],
     views: ViewsOption = None,
     scale: ScaleOption = None,
     images: ImagesOption = None,
     resolution: ResolutionOption = None,
     split: SplitOption = "test",
-    seed: Annotated[int, typer.Option(min=0, help="Of the cameras that are drawn: another seed draws others.")] = 0,
-    lpips: Annotated[bool, typer.Option("--lpips", help="Measure LPIPS too; needs kissgs\\[lpips].")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the virtual cameras.")] = 0,
+    lpips: Annotated[
+        bool, typer.Option("--lpips", help="Also measure LPIPS; needs the extra kissgs\\[lpips].")
+    ] = False,
     html: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write a page with pictures of both, and where they differ.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Write an HTML report with renderings of both scenes and error maps."),
     ] = None,
     device: RenderDeviceOption = "cpu",
     threads: RenderThreadsOption = 0,
     force: ForceOption = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON report.")] = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Compare a scene's pictures with those of its original, and with photographs: PSNR and SSIM."""
+    """Compare the renderings of a scene with those of its original, and with photographs: PSNR and SSIM."""
     from kissgs.cli.console import progress_bar
     from kissgs.evaluation.evaluate import evaluate as measure
     from kissgs.evaluation.html import Side, html_report
@@ -49,8 +52,8 @@ def evaluate(
     from kissgs.io.atomic import atomic_file, refuse_existing
     from kissgs.pipeline.scene_files import load, stored_bytes
 
-    used = cast(Split, choice("--split", split, Split))
-    where = device_of(device)
+    used_split = cast(Split, choice("--split", split, Split))
+    render_device = device_of(device)
     if html is not None:
         refuse_existing(html, overwrite=force)
     capture = open_views(views, scale=scale, images=images, resolution=resolution)
@@ -63,17 +66,17 @@ def evaluate(
         result = measure(
             *scenes,
             capture,
-            split=used,
+            split=used_split,
             seed=seed,
             lpips=lpips,
-            device=where,
+            device=render_device,
             threads=threads,
             progress=progress,
         )
         if html is not None:
-            page = html_report(result, sides[0], sides[1], device=where, threads=threads, progress=progress)
+            page = html_report(result, sides[0], sides[1], device=render_device, threads=threads, progress=progress)
             with atomic_file(html, overwrite=force) as file:
-                file.write(page.encode(errors="replace"))  # file names may be no text
+                file.write(page.encode(errors="replace"))  # file names may be invalid UTF-8
     sizes = {"reference": sides[0].bytes, "candidate": sides[1].bytes}
     if as_json:
         print_json({**result.as_dict(), "bytes": sizes})
@@ -82,4 +85,4 @@ def evaluate(
 
         show(evaluation_table(result, sides[0], sides[1], asked=split))
         if html is not None:
-            show(f"\npictures  {html}")
+            show(f"\nreport  {html}")

@@ -1,4 +1,4 @@
-"""What the command line prints about pictures. Nothing here computes."""
+"""Evaluations as tables for the terminal. This module only formats."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from kissgs.benchmark.render_speed import RenderingCost
-from kissgs.cli.tables import elsewhere, size
+from kissgs.cli.tables import size, surroundings_summary
 from kissgs.evaluation.html import Side
 from kissgs.evaluation.results import Evaluation
 
 
 def evaluation_table(evaluation: Evaluation, reference: Side, candidate: Side, *, asked: str) -> RenderableType:
-    """What ``kissgs evaluate`` shows; ``asked`` is the split that was asked for."""
+    """Format the output of ``kissgs evaluate``; ``asked`` is the value of ``--split``."""
     what = Text(f"{evaluation.views_used}, {evaluation.size}: {evaluation.source}")
     notes = [Text(evaluation.note, "yellow")] if evaluation.note else []
     if evaluation.split == "train" != asked:
-        notes.append(Text("no view is held out, so these are those that the scene may have learnt from", "yellow"))
+        notes.append(Text("no view is held out: the scene may have been trained on these views", "yellow"))
     found: list[RenderableType] = [_views(evaluation), Text(), Text(_sentence(evaluation.extremes))]
     if evaluation.surroundings is not None:
-        found.append(Text(_sentence(f"elsewhere: {elsewhere(evaluation.surroundings)}")))
+        found.append(Text(_sentence(f"beyond the capture: {surroundings_summary(evaluation.surroundings)}")))
     return Group(_sizes(evaluation, reference, candidate), what, *notes, Text(), *found)
 
 
-def _sentence(told: str) -> str:
-    return f"{told[0].upper()}{told[1:]}."
+def _sentence(text: str) -> str:
+    return f"{text[0].upper()}{text[1:]}."
 
 
 def _sizes(evaluation: Evaluation, reference: Side, candidate: Side) -> Text:
@@ -59,15 +59,15 @@ def _views(evaluation: Evaluation) -> Table:
 
 
 def _group(title: str, parts: list[str]) -> list[Column]:
-    """Columns with one title: it stands over the first."""
+    """Return columns with one common title, over the first of them."""
     first = Column(f"{title}\n{parts[0]}", justify="right")
     return [first, *(Column(f"\n\n{part}", justify="right") for part in parts[1:])]
 
 
 def rendering_table(rows: Iterable[tuple[str, RenderingCost]]) -> Table:
-    """What ``kissgs bench --rendering`` shows: milliseconds of processor time per picture."""
+    """Format the costs of rendering: milliseconds of processor time per rendered image."""
     works = ("draw", "draw + backward", "L1 + SSIM", "Adam", "draw + scores")
-    head = ("Gaussians", "visible", "picture", *(f"{work} ms" for work in works))
+    head = ("Gaussians", "visible", "image", *(f"{work} ms" for work in works))
     table = Table("scene", *(Column(name, justify="right") for name in head), box=None, pad_edge=False)
     for scene, cost in rows:
         taken = (cost.draw, cost.draw_and_backward, cost.loss, cost.adam, cost.score)

@@ -1,4 +1,4 @@
-"""What the commands share: which files come in, where results go, and what one failure among several means."""
+"""Input and output files of the commands, and the handling of failures among several inputs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 
-def each(
+def for_each_input(
     names: list[str],
     output: Path | None,
     suffix: str,
@@ -30,23 +30,23 @@ def each(
     writes: bool = True,
     unreadable: type[KissgsError] = InvalidSceneError,
 ) -> None:
-    """Do ``work`` for every input. Where one of several fails, the others are done all the same; then it is exit 2.
+    """Call ``work`` for every input. If one of several fails, the others are still processed; the exit code is then 2.
 
     Args:
-        names: of the inputs, as they were given.
-        output: where results go, as it was given.
-        suffix: of a result's name.
-        as_json: whether to print reports.
-        work: takes an input and the place of its result.
-        writes: whether there are results.
-        unreadable: what an input is said to be that no file system would find.
+        names: inputs as given: paths, patterns or "-".
+        output: value of ``--output``; None if not given.
+        suffix: file ending of the outputs.
+        as_json: whether to print reports as JSON.
+        work: processes one input, given the path of its output, and returns the report.
+        writes: whether the command writes outputs.
+        unreadable: error class for an input that cannot be read.
     """
     inputs = expand(names)
     if writes and as_json and str(output) == "-":
-        raise OutputError("--json and -o - would both write to standard output; choose one")
+        raise OutputError("--json and -o - both write to standard output; choose one")
     targets = _targets(inputs, output, suffix) if writes else [Path("-")] * len(inputs)
     if len(inputs) == 1:
-        _look_at(inputs[0], unreadable)
+        _check_input(inputs[0], unreadable)
         report = work(inputs[0], targets[0])
         if as_json:
             print_json(_entry(inputs[0], targets[0], writes, report))
@@ -54,7 +54,7 @@ def each(
     reports, failed = [], False
     for name, target in zip(inputs, targets, strict=True):
         try:
-            _look_at(name, unreadable)
+            _check_input(name, unreadable)
             reports.append(_entry(name, target, writes, work(name, target)))
         except KissgsError as error:
             failed = True
@@ -66,15 +66,15 @@ def each(
         raise typer.Exit(2)
 
 
-def _look_at(name: str, unreadable: type[KissgsError]) -> None:
-    """Say what is wrong with the name of an input before it is said of the result's, which is made from it."""
+def _check_input(name: str, unreadable: type[KissgsError]) -> None:
+    """Check the path of an input, so that an error names it and not the output path derived from it."""
     from kissgs.io.atomic import reason_of
 
     try:
         if name != "-":
-            os.stat(name)  # noqa: PTH116  the name as it is
+            os.stat(name)  # noqa: PTH116  Path would normalise the name
     except FileNotFoundError as error:
-        if not is_folder(Path(name).absolute().parent):  # else reading it says the same, and how to mend it
+        if not is_folder(Path(name).absolute().parent):  # otherwise reading it gives a better message
             raise unreadable(f"cannot read {name}: {reason_of(error)}") from error
     except (OSError, ValueError) as error:
         raise unreadable(f"cannot read {name:.100}: {reason_of(error)}") from error
@@ -85,15 +85,15 @@ def _entry(name: str, target: Path, writes: bool, report: dict[str, Any]) -> dic
 
 
 def _targets(inputs: list[str], output: Path | None, suffix: str) -> list[Path]:
-    """Where each result goes: beside its input, or as ``output`` says, which is one file only if it looks like one."""
+    """Return the output path of each input: next to it, in the folder ``output``, or the file ``output``."""
     if "-" in inputs and (len(inputs) > 1 or output is None):
-        raise OutputError("standard input has no name and comes alone; say where to write with -o")
+        raise OutputError("standard input has no name and must be the only input; give the output with -o")
     if output is not None and (str(output) == "-" or (suffix and output.suffix.lower() == suffix)):
         if len(inputs) > 1:
-            raise OutputError(f"{len(inputs)} inputs cannot all become {output}; name a folder with -o")
+            raise OutputError(f"{len(inputs)} inputs cannot all become {output}; give a folder with -o")
         return [output]
     if output is not None and "-" in inputs:
-        raise OutputError(f"{output} is taken for a folder, and standard input has no name; write -o NAME{suffix}")
+        raise OutputError(f"-o {output} is a folder, but standard input has no name; give -o NAME{suffix}")
     if output is not None:
         make_folder(output)
     targets = []
@@ -101,16 +101,16 @@ def _targets(inputs: list[str], output: Path | None, suffix: str) -> list[Path]:
         path = Path(name).absolute()
         stem = path.name if is_folder(path) else path.stem
         if not stem:
-            raise OutputError(f"{name} has no name to call the result after; say where to write with -o")
+            raise OutputError(f"{name} has no name to derive the output from; give the output with -o")
         folder = output if output is not None else Path(name).parent
         targets.append(folder / (stem + (suffix or ".container")))
     if len(set(targets)) < len(targets):
-        raise OutputError("two inputs have the same name and would become one file; convert them one by one")
+        raise OutputError("two inputs have the same name and would become one file; process them one by one")
     return targets
 
 
 def source(name: str) -> Path | bytes:
-    """A path, or what comes in on standard input."""
+    """Return the path of an input, or the bytes of standard input for "-"."""
     if name != "-":
         return Path(name)
     if sys.stdin is None:
@@ -118,21 +118,21 @@ def source(name: str) -> Path | bytes:
     return sys.stdin.buffer.read()
 
 
-def beside(name: str, suffix: str) -> Path:
-    """The file of the same name with another ending."""
+def sibling(name: str, suffix: str) -> Path:
+    """Return the path next to an input with another ending."""
     if name == "-":
-        raise OutputError("standard input has no place beside which anything could be kept")
+        raise OutputError("standard input has no folder in which --cache or --checkpoint could keep a file")
     path = Path(name).absolute()
     return path.parent / ((path.name if is_folder(path) else path.stem) + suffix)
 
 
 def is_folder(path: Path) -> bool:
-    """Whether there is a folder; whatever is wrong with the name, opening it will tell."""
+    """Whether the path is a folder; False also for invalid names, about which opening them gives an error."""
     return os.path.isdir(path)  # noqa: PTH112  Path.is_dir raises where a name is too long
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and its parents; exists already: fine."""
+    """Make a folder and its parents, if they do not exist."""
     from kissgs.io.atomic import reason_of
 
     try:
@@ -142,10 +142,10 @@ def make_folder(folder: Path) -> None:
 
 
 def expand(names: list[str]) -> list[str]:
-    """Patterns that the shell has not expanded, expanded."""
+    """Expand the glob patterns that the shell has not expanded."""
     found: list[str] = []
     for name in names:
-        if not glob.has_magic(name) or os.path.lexists(name):  # which never raises, as Path.exists may
+        if not glob.has_magic(name) or os.path.lexists(name):  # never raises, unlike Path.exists
             found.append(name)
             continue
         matches = sorted(glob.glob(name))  # noqa: PTH207  Path.glob takes no absolute patterns
@@ -157,18 +157,18 @@ def expand(names: list[str]) -> list[str]:
 
 @contextlib.contextmanager
 def stdout() -> Iterator[None]:
-    """Writing to standard output, which may be full or gone."""
+    """Write to standard output inside this context: errors of a full or closed one become an OutputError."""
     if sys.stdout is None:
         raise OutputError("standard output is closed; there is nowhere to write to")
     try:
         yield
         sys.stdout.flush()
     except BrokenPipeError:
-        os._exit(128 + signal.SIGPIPE)  # whoever read it has seen enough
+        os._exit(128 + signal.SIGPIPE)  # the reader has closed the pipe
     except OSError as error:
         from kissgs.io.atomic import reason_of
 
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is still in the buffer would fail again at the end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # the flush at exit would fail again
         raise OutputError(f"cannot write to standard output: {reason_of(error)}") from error
 
 
@@ -179,7 +179,7 @@ def write_stdout(data: bytes) -> None:
 
 
 def show(what: RenderableType) -> None:
-    """Print a table or a line for people."""
+    """Print a table or a line of text."""
     from kissgs.cli.console import output
 
     with stdout():

@@ -1,4 +1,4 @@
-"""``kissgs info``: what files hold."""
+"""``kissgs info``: describe the contents of scene files."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from kissgs.cli.arguments import (
     FilesArgument,
     JsonOption,
 )
-from kissgs.cli.files import each, show
+from kissgs.cli.files import for_each_input, show
 
 
 def info(files: FilesArgument, as_json: JsonOption = False) -> None:
-    """Show what .ply files and containers hold."""
+    """Describe .ply files and containers: Gaussians, SH degree, bytes per file, value ranges."""
     from kissgs.cli.tables import info_table
     from kissgs.pipeline.inspect import describe
 
@@ -23,4 +23,4 @@ def info(files: FilesArgument, as_json: JsonOption = False) -> None:
             show(info_table(found))
         return found.as_dict()
 
-    each(files, Path("-"), "", as_json, work, writes=False)
+    for_each_input(files, Path("-"), "", as_json, work, writes=False)

@@ -1,4 +1,4 @@
-"""How ``kissgs`` ends on Ctrl-C or a request to end. Imports only what Python has loaded already."""
+"""Exit on Ctrl-C or SIGTERM. Imports only modules that Python has loaded already."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ if TYPE_CHECKING:
 
 
 class Interrupted(BaseException):
-    """Ctrl-C or a request to end: unwinds everything, so that no half-written file stays."""
+    """Raised by Ctrl-C or SIGTERM: unwinds the whole stack, so that partial files are removed."""
 
 
-def leave_when_told() -> None:
-    """Have requests to end take effect at once: while nothing is written yet, or any more."""
-    signal.signal(signal.SIGINT, _leave)
-    signal.signal(signal.SIGTERM, _leave)
+def exit_on_signal() -> None:
+    """Exit at once on SIGINT and SIGTERM: for the time before and after the work, when no file is being written."""
+    signal.signal(signal.SIGINT, _exit)
+    signal.signal(signal.SIGTERM, _exit)
 
 
-def unwind_when_told() -> None:
-    """Have requests to end unwind everything."""
+def unwind_on_signal() -> None:
+    """Raise :class:`Interrupted` on SIGINT and SIGTERM."""
     signal.signal(signal.SIGINT, _interrupt)
     signal.signal(signal.SIGTERM, _interrupt)
 
 
-def reason_of_end(error: BaseException | None) -> int | None:
-    """Number of the signal that led to an error, perhaps by way of others: some libraries raise their own instead."""
+def signal_behind(error: BaseException | None) -> int | None:
+    """Return the number of the signal that caused an error, also if a library has raised its own error in between."""
     for _ in range(100):
         if error is None or isinstance(error, Interrupted):
             break
@@ -36,16 +36,16 @@ def reason_of_end(error: BaseException | None) -> int | None:
     return error.args[0] if isinstance(error, Interrupted) else None
 
 
-def end(number: int) -> NoReturn:
-    """Say so and leave, without waiting for threads inside libwebp, which cannot be stopped, and need not be."""
+def exit_by_signal(number: int) -> NoReturn:
+    """Print a message and exit, without waiting for threads inside libwebp, which cannot be stopped."""
     try:
-        os.write(2, b"kissgs: interrupted; nothing half-written is left\n")  # sys.stderr may be amid a line
+        os.write(2, b"kissgs: interrupted; no partial file is left\n")  # sys.stderr may hold an incomplete line
     finally:
         os._exit(128 + number)
 
 
-def _leave(number: int, frame: FrameType | None) -> NoReturn:
-    end(number)
+def _exit(number: int, frame: FrameType | None) -> NoReturn:
+    exit_by_signal(number)
 
 
 def _interrupt(number: int, frame: FrameType | None) -> NoReturn:

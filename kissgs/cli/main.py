@@ -1,13 +1,13 @@
-"""The entry point ``kissgs``: it listens for Ctrl-C before it imports what takes a while to load."""
+"""Entry point of ``kissgs``: handles Ctrl-C before the slow imports begin."""
 
 from __future__ import annotations
 
-from kissgs.cli.interrupts import leave_when_told
+from kissgs.cli.interrupts import exit_on_signal
 
 
 def main() -> None:
-    """Do what the command line says. Errors a user can cause end in one line and exit code 2, Ctrl-C in 130."""
-    leave_when_told()
+    """Run the command line. Exit code 2 with one line for errors that a user can cause, 130 on Ctrl-C."""
+    exit_on_signal()
     from kissgs.cli.app import run
 
     run()

@@ -1,4 +1,4 @@
-"""From what a user types to settings, captures and devices."""
+"""Conversion of command line options to settings, captures and devices."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ def chosen(
     finetune: str | None = None,
     **options: float | str | None,
 ) -> Settings:
-    """A preset with ``NAME=VALUE`` changes; options of their own, where they are given, override these.
+    """Return the settings of a preset with ``NAME=VALUE`` changes, which ``options`` override.
 
     Args:
-        preset: its name.
-        changes: of settings of ``group``, or of another one as ``GROUP.NAME=VALUE``.
+        preset: name of the preset.
+        changes: changes of settings of ``group``, or of another group as ``GROUP.NAME=VALUE``.
         group: "encode", "compact" or "finetune".
-        budget: settings of "compact".
-        finetune: a number of steps, or "auto" for that of the preset.
-        options: settings of ``group``; None is not given.
+        budget: settings of the group "compact".
+        finetune: a number of steps, or "auto" for that of the preset; None for no fine-tuning.
+        options: settings of ``group``; None if not given.
 
     Raises:
-        UnsupportedError: no such preset or setting, or a value that is not possible.
+        UnsupportedError: there is no such preset or setting, or a value is invalid.
     """
     from kissgs.settings import Settings
 
@@ -47,11 +47,13 @@ def chosen(
             raise UnsupportedError(f"--set {change!r}: write NAME=VALUE, for example --set means_bits=16")
         of, dot, inner = name.strip().partition(".")
         if dot and of not in values:
-            raise UnsupportedError(f"--set {change!r}: there are settings of compact, encode and finetune")
+            raise UnsupportedError(
+                f"--set {change!r}: unknown group {of!r}; the groups are compact, encode and finetune"
+            )
         values[of if dot else group][inner if dot else of] = None if value.strip() == "auto" else value.strip()
     values["compact"].update(budget or {})
     values[group].update({name: value for name, value in options.items() if value is not None})
-    values["finetune"].update(_tuning(finetune))
+    values["finetune"].update(_finetune_values(finetune))
     if group == "encode" and options.get("seed") is not None:
         for other in ("compact", "finetune"):
             values[other].setdefault("seed", options["seed"])
@@ -61,32 +63,32 @@ def chosen(
 FINETUNE = "--finetune"
 
 
-def spelled_out(words: list[str]) -> list[str]:
-    """A command line on which ``--finetune`` without a number means ``--finetune auto``: typer has no such options."""
-    told = list[str]()
+def with_finetune_value(words: list[str]) -> list[str]:
+    """Insert ``auto`` after each ``--finetune`` without a number: typer has no options with an optional value."""
+    result = list[str]()
     for n, word in enumerate(words):
         if word == "--":
-            return told + words[n:]
-        told.append(word)
+            return result + words[n:]
+        result.append(word)
         following = words[n + 1] if n + 1 < len(words) else ""
         if word == FINETUNE and not (following.isdecimal() or following == "auto"):
-            told.append("auto")
-    return told
+            result.append("auto")
+    return result
 
 
-def _tuning(steps: str | None) -> Values:
+def _finetune_values(steps: str | None) -> Values:
     if steps is None:
         return {}
     if steps != "auto" and not steps.isdecimal():
-        raise UnsupportedError(f"{FINETUNE} {steps}: write a number of steps, or nothing for that of the preset")
+        raise UnsupportedError(f"{FINETUNE} {steps}: give a number of steps, or none for that of the preset")
     return {"enabled": True} if steps == "auto" else {"enabled": True, "steps": steps}
 
 
 def count_of(text: str) -> int:
-    """Of Gaussians: 200000, 200,000, 200k, 1.5M.
+    """Parse a number of Gaussians: 200000, 200,000, 200k, 1.5M.
 
     Raises:
-        UnsupportedError: it is none.
+        UnsupportedError: the text is no such number.
     """
     word = text.strip().lower()
     if re.fullmatch(r"[0-9]{1,3}(,[0-9]{3})+|[0-9]+", word):
@@ -94,15 +96,15 @@ def count_of(text: str) -> int:
     if re.fullmatch(r"[0-9]+(\.[0-9]+)?[km]", word):
         return round(float(word[:-1]) * THOUSANDS[word[-1]])
     raise UnsupportedError(
-        f"{text!r} is no number of Gaussians; write 200000, 200k or 1.5M, or a share with --ratio 0.2"
+        f"{text!r} is no number of Gaussians; give 200000, 200k or 1.5M, or a share with --ratio 0.2"
     )
 
 
 def budget_of(text: str) -> Values:
-    """A budget in one word: a count such as 200k, a share such as 20%, a loss such as 0.2dB; auto: what a goal needs.
+    """Parse a budget: a count such as 200k, a share such as 20%, a PSNR drop such as 0.2dB, or auto for a goal's best.
 
     Raises:
-        UnsupportedError: it is none of these.
+        UnsupportedError: the text is none of these.
     """
     word = text.strip().lower().replace(" ", "")
     if word == "auto":
@@ -115,19 +117,19 @@ def budget_of(text: str) -> Values:
         return {"count": count_of(word)}
     except UnsupportedError as error:
         raise UnsupportedError(
-            f"--compact {text}: say how many Gaussians to keep (200k), which share (20%), or how much PSNR may be "
-            "lost (0.2dB); or auto, with a goal"
+            f"--compact {text}: give a number of Gaussians (200k), a share (20%), a PSNR drop (0.2dB), or auto with a "
+            "goal"
         ) from error
 
 
 def open_views(
     path: Path | None, *, scale: int | None = None, images: Path | None = None, resolution: int | None = None
 ) -> Views | None:
-    """The capture at ``path``; None where none is given, and then nothing may be said about its photographs."""
+    """Load the capture at ``path``; return None if there is none, and refuse options of its photographs then."""
     if path is None:
         for name, value in (("--scale", scale), ("--images", images), ("--resolution", resolution)):
             if value is not None:
-                raise UnsupportedError(f"{name} is about the photographs of a capture; say which with --views")
+                raise UnsupportedError(f"{name} only applies to the photographs of a capture; give one with --views")
         return None
     from kissgs.cameras.captures.load import load_views
 
@@ -135,12 +137,12 @@ def open_views(
 
 
 def device_of(name: str) -> Literal["cpu", "cuda"]:
-    """The value of ``--device``, if it is one."""
+    """Check the value of ``--device``."""
     return cast(Literal["cpu", "cuda"], choice("--device", name, Literal["cpu", "cuda"]))
 
 
 def choice(option: str, value: str, allowed: Any) -> str:  # noqa: ANN401  a Literal has no type of its own
-    """The value of an option that is one of ``allowed``, a Literal."""
+    """Check that the value of an option is one of ``allowed``, a Literal."""
     names = get_args(allowed)
     if value not in names:
         raise UnsupportedError(f"{option} {value}: choose {', '.join(names[:-1])} or {names[-1]}")

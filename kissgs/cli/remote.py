@@ -1,4 +1,4 @@
-"""``kissgs remote``: compression by a service elsewhere."""
+"""``kissgs remote``: compress with a kissgs service."""
 
 from __future__ import annotations
 
@@ -7,61 +7,75 @@ from typing import Annotated, Any
 
 import typer
 
-from kissgs.cli.files import each, print_json, show
+from kissgs.cli.files import for_each_input, print_json, show
 
 ServerOption = Annotated[
-    str, typer.Option("--server", envvar="KISSGS_SERVER", metavar="URL", help="Address of the service.")
+    str, typer.Option("--server", envvar="KISSGS_SERVER", metavar="URL", help="URL of the service.")
 ]
 KeyOption = Annotated[
-    str | None, typer.Option("--key", envvar="KISSGS_KEY", help="Where it asks for one; better set KISSGS_KEY.")
+    str | None, typer.Option("--key", envvar="KISSGS_KEY", help="API key, if the service needs one; prefer KISSGS_KEY.")
 ]
 
 DEFAULT_SERVER = "http://127.0.0.1:8000"
 
-app = typer.Typer(name="remote", help="Let a kissgs service do the work.", no_args_is_help=True)
+app = typer.Typer(name="remote", help="Compress with a kissgs service.", no_args_is_help=True)
 
 
 @app.command()
 def compress(
-    scenes: Annotated[list[str], typer.Argument(metavar="FILE…", help="Files or patterns.")],
+    scenes: Annotated[list[str], typer.Argument(metavar="FILE…", help="Files or glob patterns.")],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="NAME.zip, or a folder; by default beside the scene.")
+        Path | None, typer.Option("--output", "-o", help="Output NAME.zip, or a folder. Default: next to the scene.")
     ] = None,
     server: ServerOption = DEFAULT_SERVER,
     key: KeyOption = None,
-    preset: Annotated[str, typer.Option("--preset", "-p", help="fast, balanced, small or paper.")] = "balanced",
+    preset: Annotated[
+        str,
+        typer.Option("--preset", "-p", help="Trade-off of speed, size and quality: fast, balanced, small or paper."),
+    ] = "balanced",
     changes: Annotated[
-        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change one setting of the preset.")
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Change a setting of the preset; repeatable."),
     ] = None,
     psnr: Annotated[
-        float | None, typer.Option(metavar="DB", help="The smallest container with this PSNR to the scene's pictures.")
+        float | None,
+        typer.Option(
+            metavar="DB", help="Find the smallest container with at least this PSNR to the scene's renderings."
+        ),
     ] = None,
     target_size: Annotated[
-        str | None, typer.Option(metavar="SIZE", help="The best container of at most this size: 800kB, 2.5MB.")
+        str | None,
+        typer.Option(metavar="SIZE", help="Find the best container of at most this size, such as 800kB or 2.5MB."),
     ] = None,
     max_psnr_drop: Annotated[
-        float | None, typer.Option(metavar="DB", help="The smallest container whose pictures lose no more: 0.1.")
+        float | None,
+        typer.Option(metavar="DB", help="Find the smallest container that loses at most this PSNR, such as 0.1."),
     ] = None,
     compact: Annotated[
         str | None,
-        typer.Option(metavar="BUDGET", help="Fewer Gaussians first: 200k, 20% or 0.2dB; auto: as the goal needs."),
+        typer.Option(
+            metavar="BUDGET",
+            help="First reduce the number of Gaussians: 200k, 20% or 0.2dB; auto: the best for the goal.",
+        ),
     ] = None,
     finetune: Annotated[
-        str | None, typer.Option(metavar="[STEPS]", help="Then fit the numbers in the images to pictures of the scene.")
+        str | None, typer.Option(metavar="[STEPS]", help="Fine-tune the quantised values on renderings of the scene.")
     ] = None,
-    evaluate: Annotated[bool, typer.Option("--evaluate", help="Measure PSNR and SSIM of the result.")] = False,
-    force: Annotated[bool, typer.Option("--force", "-f", help="Overwrite files that exist.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print what the service reports as JSON.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
+    evaluate: Annotated[
+        bool, typer.Option("--evaluate", help="Decode the result, and measure PSNR and SSIM of its renderings.")
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", "-f", help="Overwrite existing output files.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the response of the service as JSON.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")] = False,
 ) -> None:
-    """Compress scenes on a server. Ctrl-C cancels the job there."""
+    """Compress scenes on a server. Ctrl-C cancels the job."""
     from kissgs.cli.console import progress_bar
     from kissgs.cli.options import budget_of, chosen
     from kissgs.client.remote import Remote
     from kissgs.core.errors import UnsupportedError
 
     if "-" in scenes or str(output) == "-":
-        raise UnsupportedError("remote compression reads and writes files; name them")
+        raise UnsupportedError("kissgs remote reads and writes files only; '-' is not possible")
     settings = chosen(
         preset,
         changes,
@@ -82,17 +96,17 @@ def compress(
                 show(_summary(status, target))
             return status
 
-        each(scenes, output, ".zip", as_json, work)
+        for_each_input(scenes, output, ".zip", as_json, work)
 
 
 @app.command(name="list")
 def list_jobs(
     server: ServerOption = DEFAULT_SERVER,
     key: KeyOption = None,
-    limit: Annotated[int, typer.Option(min=1, max=100, help="How many.")] = 20,
-    as_json: Annotated[bool, typer.Option("--json", help="Print what the service reports as JSON.")] = False,
+    limit: Annotated[int, typer.Option(min=1, max=100, help="Largest number of jobs to list.")] = 20,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the response of the service as JSON.")] = False,
 ) -> None:
-    """Show the latest jobs on a server."""
+    """List the latest jobs on a server."""
     from kissgs.client.remote import Remote
 
     with Remote(server, key=key) as remote:
@@ -107,13 +121,15 @@ def list_jobs(
 
 @app.command()
 def get(
-    job: Annotated[str, typer.Argument(help="Its id, see 'list'.")],
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="NAME.zip; by default the scene's.")] = None,
+    job: Annotated[str, typer.Argument(help="Id of the job, see 'kissgs remote list'.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Output NAME.zip. Default: the name of the scene.")
+    ] = None,
     server: ServerOption = DEFAULT_SERVER,
     key: KeyOption = None,
-    force: Annotated[bool, typer.Option("--force", "-f", help="Overwrite a file that exists.")] = False,
+    force: Annotated[bool, typer.Option("--force", "-f", help="Overwrite an existing output file.")] = False,
 ) -> None:
-    """Wait for a job, and download its container."""
+    """Wait for a job to finish, and download its container."""
     from kissgs.cli.console import progress_bar
     from kissgs.client.remote import Remote
     from kissgs.io.atomic import refuse_existing
@@ -128,11 +144,11 @@ def get(
 
 @app.command()
 def cancel(
-    job: Annotated[str, typer.Argument(help="Its id, see 'list'.")],
+    job: Annotated[str, typer.Argument(help="Id of the job, see 'kissgs remote list'.")],
     server: ServerOption = DEFAULT_SERVER,
     key: KeyOption = None,
 ) -> None:
-    """Stop a job."""
+    """Cancel a job."""
     from kissgs.client.remote import Remote
 
     with Remote(server, key=key) as remote:

@@ -1,4 +1,4 @@
-"""``kissgs sample``: a scene to try things on."""
+"""``kissgs sample``: write a synthetic scene for tests and demos."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from kissgs.cli.arguments import (
 
 
 def sample(
-    output: Annotated[Path, typer.Argument(help="The .ply to write.")],
-    gaussians: Annotated[int, typer.Option(min=0, help="How many.")] = 60_000,
-    degree: Annotated[int, typer.Option(min=0, max=3, help="Of its spherical harmonics.")] = 3,
-    seed: Annotated[int, typer.Option(min=0, help="Another seed makes another scene.")] = 0,
+    output: Annotated[Path, typer.Argument(help="Output NAME.ply.")],
+    gaussians: Annotated[int, typer.Option(min=0, help="Number of Gaussians.")] = 60_000,
+    degree: Annotated[int, typer.Option(min=0, max=3, help="Degree of the spherical harmonics.")] = 3,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the scene.")] = 0,
     force: ForceOption = False,
 ) -> None:
-    """Make a sample scene: glossy, textured things on a table."""
+    """Write a synthetic sample scene: shiny, textured objects on a table."""
     from kissgs.pipeline.scene_files import save
     from kissgs.synthetic.scene import sample_scene
 

@@ -1,4 +1,4 @@
-"""Ctrl-C and requests to end, on the command line."""
+"""Handling of Ctrl-C and SIGTERM while a command works."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
-from kissgs.cli.interrupts import Interrupted, end, leave_when_told, reason_of_end, unwind_when_told
+from kissgs.cli.interrupts import Interrupted, exit_by_signal, exit_on_signal, signal_behind, unwind_on_signal
 from kissgs.core.errors import StopSearch
 
 if TYPE_CHECKING:
@@ -19,27 +19,27 @@ if TYPE_CHECKING:
     from kissgs.core.progress import Progress
 
 
-ENOUGH = b"\nkissgs: enough: the best so far is taken, if there is one; Ctrl-C again: nothing is\n"
+STOPPING = b"\nkissgs: stopping: keeping the best result so far, if any; Ctrl-C again aborts\n"
 
 
 def unwinding(work: Callable[[], None]) -> None:
-    """Do it; meanwhile, a request to end unwinds everything first. Before and after, it ends the process at once."""
-    sys.unraisablehook = _again
+    """Run ``work`` so that a signal unwinds the stack before the process exits; before and after, it exits at once."""
+    sys.unraisablehook = _raise_again
     try:
-        unwind_when_told()
+        unwind_on_signal()
         try:
             work()
         finally:
-            leave_when_told()
+            exit_on_signal()
     except BaseException as error:
-        number = reason_of_end(error)
+        number = signal_behind(error)
         if number is not None:
-            end(number)
+            exit_by_signal(number)
         raise
 
 
-def _again(lost: sys.UnraisableHookArgs) -> None:
-    """A signal that arrives inside a finalizer is printed and forgotten by Python: it is sent once more."""
+def _raise_again(lost: sys.UnraisableHookArgs) -> None:
+    """Send a signal again that arrived inside a finalizer, where Python prints and discards exceptions."""
     if isinstance(lost.exc_value, Interrupted):
         threading.Timer(0.01, os.kill, (os.getpid(), lost.exc_value.args[0])).start()
     else:
@@ -48,25 +48,25 @@ def _again(lost: sys.UnraisableHookArgs) -> None:
 
 @contextlib.contextmanager
 def stoppable(progress: Progress, searches: bool) -> Iterator[Progress]:
-    """While a goal is sought, the first Ctrl-C ends the search with what it has found; another one ends all."""
+    """Yield a receiver with which one Ctrl-C ends a search for a goal with its best result, and a second one aborts."""
     if not searches:
         yield progress
         return
-    told: list[int] = []
+    pending: list[int] = []
     before = signal.getsignal(signal.SIGINT)
 
-    def heard(number: int, frame: FrameType | None) -> None:
-        told.append(number)
+    def on_interrupt(number: int, frame: FrameType | None) -> None:
+        pending.append(number)
         signal.signal(signal.SIGINT, before)
-        os.write(2, ENOUGH)  # at once: it may take a while until progress is told
+        os.write(2, STOPPING)  # at once: the next progress event may take a while
 
     def receive(stage: str, fraction: float, note: str = "") -> None:
-        if told:
-            told.clear()
+        if pending:
+            pending.clear()
             raise StopSearch
         progress(stage, fraction, note)
 
-    signal.signal(signal.SIGINT, heard)
+    signal.signal(signal.SIGINT, on_interrupt)
     try:
         yield receive
     except StopSearch as error:

@@ -1,4 +1,4 @@
-"""What the command line prints: reports as tables. Nothing here computes."""
+"""Reports as tables and lines for the terminal. This module only formats."""
 
 from __future__ import annotations
 
@@ -16,23 +16,24 @@ from kissgs.pipeline.report import Report
 from kissgs.pipeline.trial import Trial
 
 CHANGES = {
-    "invisible": "left out: opacity 1/255 or less, which no renderer draws",
-    "pruned_by_rd": "left out: its bytes would cost more than it shows",
-    "clipped_colors": "base colour far outside all others, pulled in so that it does not coarsen theirs",
-    "compacted": "left out by compaction: others do their work",
-    "non_finite": "removed: NaN or infinite",
-    "far_away": "removed: further away than 1e15",
-    "infinite_opacities": "opacity logit infinite, set to that of 1e-6 or 1 - 1e-6",
-    "saturated_opacities": "opacity logit beyond that of 1e-6 or 1 - 1e-6, set to it",
-    "zero_quats": "rotation of length zero, set to none",
-    "unnormalised_quats": "rotation normalised",
-    "clamped_scales": "log-scale beyond 30, clamped",
-    "clamped_sh": "SH coefficient beyond 1e6, clamped",
+    "invisible": "left out: opacity at most 1/255, which no renderer draws",
+    "pruned_by_rd": "left out: rate cost above the distortion saved",
+    "clipped_colors": "with an outlying base colour: clipped, to keep the quantisation step of all others small",
+    "compacted": "removed by compaction",
+    "non_finite": "removed: a value is NaN or infinite",
+    "far_away": "removed: a coordinate is beyond 1e15",
+    "infinite_opacities": "with an infinite opacity logit: set to that of opacity 1e-6 or 1 - 1e-6",
+    "saturated_opacities": "with an opacity logit beyond that of 1e-6 or 1 - 1e-6: clamped",
+    "zero_quats": "with a rotation of length zero: set to the identity",
+    "unnormalised_quats": "with a rotation that is no unit quaternion: normalised",
+    "clamped_scales": "with a log-scale beyond 30: clamped",
+    "clamped_sh": "with an SH coefficient beyond 1e6: clamped",
 }
+"""Text for each kind of removed or changed Gaussians, by key of the report."""
 
 
 def size(count: float) -> str:
-    """Bytes as people read them."""
+    """Format bytes with a decimal unit: "812 B", "9.41 kB", "61.5 MB"."""
     for unit in ("B", "kB", "MB"):
         if count < 1000:
             return f"{count:.0f} B" if unit == "B" else f"{count:.{2 if count < 10 else 1}f} {unit}"
@@ -41,33 +42,34 @@ def size(count: float) -> str:
 
 
 def report_table(report: Report, target: str) -> RenderableType:
-    """The report of one compression."""
+    """Format the report of one compression."""
     head = Text.assemble(
         (f"{target}", "bold"),
         f"  {size(report.source_bytes)} -> {size(report.container_bytes)}, ",
         (f"{report.ratio:.1f}x smaller", "bold green"),
         f", {report.bytes_per_gaussian:.2f} bytes per Gaussian",
     )
-    took = f"{sum(report.seconds.values()):.1f} s ({report.cpu_seconds:.1f} CPU s), {size(report.peak_memory)} at most"
-    body = f"{report.count:,} of {report.source_count:,} Gaussians, SH degree {report.sh_degree}; {took}"
+    time = f"{sum(report.seconds.values()):.1f} s ({report.cpu_seconds:.1f} CPU s)"
+    cost = f"{time}, peak memory {size(report.peak_memory)}"
+    body = f"{report.count:,} of {report.source_count:,} Gaussians, SH degree {report.sh_degree}; {cost}"
     changed = {
         "invisible": report.invisible,
         "pruned_by_rd": report.pruned_by_rd,
         "clipped_colors": report.clipped_colors,
         **report.cleaned.as_dict(),
     }
-    searched = [Text(f"searched: {_path(report.trials)}")] if report.trials else []
-    pictures = [] if report.evaluation is None else [_pictures(report.evaluation)]
+    search = [Text(f"search: {_trials(report.trials)}")] if report.trials else []
+    evaluation = [] if report.evaluation is None else [_evaluation(report.evaluation)]
     changes = _changes(changed)
     compaction = [] if report.compaction is None else _compaction(report.compaction)
     finetuning = [] if report.finetuning is None else _finetuning(report.finetuning)
     note = [Text(report.note, style="yellow")] if report.note else []
-    told = [*compaction, *searched, *finetuning, *note, *pictures]
-    return Group(head, Text(body), *told, parts_table(report.file_bytes, report.count), *changes)
+    details = [*compaction, *search, *finetuning, *note, *evaluation]
+    return Group(head, Text(body), *details, parts_table(report.file_bytes, report.count), *changes)
 
 
 def compaction_table(report: CompactionReport, target: str) -> RenderableType:
-    """The report of one compaction."""
+    """Format the report of one compaction."""
     seconds = sum(step.seconds for step in report.steps)
     head = Text.assemble(
         (target, "bold"),
@@ -79,22 +81,17 @@ def compaction_table(report: CompactionReport, target: str) -> RenderableType:
 
 
 def _compaction(report: CompactionReport) -> list[RenderableType]:
-    """Where the Gaussians went, step by step."""
+    """Format the steps of a compaction."""
     lines: list[RenderableType] = [Text(report.note, style="yellow")] if report.note else []
     if report.trials:
-        lines.append(Text("searched: " + ", ".join(f"{count:,} lose {drop:.2f} dB" for count, drop in report.trials)))
+        tried = (f"{count:,} Gaussians lose {drop:.2f} dB" for count, drop in report.trials)
+        lines.append(Text(f"search: {'; '.join(tried)}"))
     if not report.steps:
         return lines
-    taught = {"photos": f"photographs: {report.source}", "renderings": f"the scene itself: {report.source}"}
-    lines.append(
-        Text(
-            f"learnt from {taught[report.target_source]}"
-            if report.target_source in taught
-            else f"scored by {report.source}"
-        )
-    )
-    judged = report.steps[0].bytes is not None
-    columns = [_right(name) for name in ("Gaussians", "seconds", *(("PSNR", "SSIM", "bytes") if judged else ()))]
+    trained = {"photos": "trained on photographs", "renderings": "trained on renderings of the scene"}
+    lines.append(Text(f"{trained.get(report.target_source, 'scored with')}: {report.source}"))
+    evaluated = report.steps[0].bytes is not None
+    columns = [_right(name) for name in ("Gaussians", "seconds", *(("PSNR", "SSIM", "bytes") if evaluated else ()))]
     table = Table("step", *columns, box=None, pad_edge=False)
     for step in report.steps:
         cells = [f"{step.count:,}", f"{step.seconds:.1f}"]
@@ -105,48 +102,47 @@ def _compaction(report: CompactionReport) -> list[RenderableType]:
 
 
 def _finetuning(report: FinetuneReport) -> list[Text]:
-    """What it gave, in a line."""
-    taught = "photographs" if report.target_source == "photos" else "the scene itself"
-    told = (
-        f"fine-tuned by {taught}: {size(report.bytes_before)} -> {size(report.bytes_after)}, held-out PSNR "
-        f"{spell(report.psnr_before, 2)} -> {spell(report.psnr_after, 2)} dB, in {report.seconds:.0f} s"
+    """Format the result of fine-tuning in one line, and its note."""
+    targets = "photographs" if report.target_source == "photos" else "renderings of the scene"
+    line = (
+        f"fine-tuned on {targets}: {size(report.bytes_before)} -> {size(report.bytes_after)}, held-out PSNR "
+        f"{spell(report.psnr_before, 2)} -> {spell(report.psnr_after, 2)} dB, {report.seconds:.0f} s"
     )
-    return [Text(told), *([Text(report.note, style="yellow")] if report.note else [])]
+    return [Text(line), *([Text(report.note, style="yellow")] if report.note else [])]
 
 
-def _path(trials: Sequence[Trial]) -> str:
-    """What a search tried, in order."""
-    told, count = list[str](), next(iter(trials)).count
+def _trials(trials: Sequence[Trial]) -> str:
+    """Format the trials of a search in order; the count is named where it changes."""
+    parts, count = list[str](), next(iter(trials)).count
     for trial in trials:
-        if trial.count != count:
-            told.append(f"of {trial.count:,} Gaussians")
-            count = trial.count
-        told.append(trial.spelled())
-    return ", ".join(told)
+        prefix = "" if trial.count == count else f"{trial.count:,} Gaussians: "
+        parts.append(f"{prefix}{trial.summary()}")
+        count = trial.count
+    return "; ".join(parts)
 
 
-def _pictures(evaluation: Evaluation) -> Text:
+def _evaluation(evaluation: Evaluation) -> Text:
     mean = evaluation.mean
-    told = f"PSNR {spell(mean.candidate.psnr, 2)} dB, SSIM {spell(mean.candidate.ssim, 4)}"
+    metrics = f"PSNR {spell(mean.candidate.psnr, 2)} dB, SSIM {spell(mean.candidate.ssim, 4)}"
     if mean.reference is None:
         against = f"to the scene's own renderings from {evaluation.views_used}"
     else:
         own = f"{spell(mean.reference.psnr, 2)} dB, {spell(mean.reference.ssim, 4)}"
         against = f"to {evaluation.views_used}; the scene itself {own}"
-    around = evaluation.surroundings
-    rest = "" if around is None else f"\nelsewhere: {elsewhere(around)}"
+    surroundings = evaluation.surroundings
+    rest = "" if surroundings is None else f"\nbeyond the capture: {surroundings_summary(surroundings)}"
     note = f"; {evaluation.note}" if evaluation.note else ""
-    return Text.assemble(f"{told} {against}; {evaluation.extremes}", (note, "yellow"), rest)
+    return Text.assemble(f"{metrics} {against}; {evaluation.extremes}", (note, "yellow"), rest)
 
 
-def elsewhere(around: Evaluation) -> str:
-    """What views beside those of a capture found."""
-    mean = f"PSNR {spell(around.mean.candidate_vs_reference.psnr, 2)} dB to the scene's own renderings"
-    return f"{mean} from {around.views_used}; {around.extremes}"
+def surroundings_summary(surroundings: Evaluation) -> str:
+    """Format the evaluation from virtual cameras over the whole scene, beyond the views of a capture."""
+    mean = f"PSNR {spell(surroundings.mean.candidate_vs_reference.psnr, 2)} dB to the scene's own renderings"
+    return f"{mean} from {surroundings.views_used}; {surroundings.extremes}"
 
 
 def parts_table(parts: Mapping[str, int], count: int) -> Table:
-    """Bytes per file or attribute, and what that is per Gaussian."""
+    """Return a table of bytes per file or attribute: absolute, share of all, and bits per Gaussian."""
     table = Table("part", _right("bytes"), _right("share"), _right("bits/Gaussian"), box=None, pad_edge=False)
     total = sum(parts.values())
     for name, value in parts.items():
@@ -156,30 +152,31 @@ def parts_table(parts: Mapping[str, int], count: int) -> Table:
 
 
 def info_table(info: Info) -> RenderableType:
-    """What ``kissgs info`` shows."""
+    """Format the output of ``kissgs info``."""
     kind = {"ply": "3DGS scene", "sog-xt": "SOG-XT container"}[info.kind]
     if info.kind == "ply":
-        kind += f" ({info.details['encoding']}{', packed' if info.details['compressed'] else ''})"
+        kind += f" ({info.details['encoding']}{', compressed' if info.details['compressed'] else ''})"
     head = Text.assemble((info.path, "bold"), f"  {kind}, {size(info.bytes)}")
-    body = f"{info.count:,} Gaussians, SH degree {info.sh_degree}, {info.bits_per_gaussian:.1f} bits each"
-    what = "" if info.kind == "ply" else " level's value"  # channels share a step, so few reach the highest
-    ranges = Table("attribute", _right(f"lowest{what}"), _right(f"highest{what}"), box=None, pad_edge=False)
+    body = f"{info.count:,} Gaussians, SH degree {info.sh_degree}, {info.bits_per_gaussian:.1f} bits per Gaussian"
+    what = "value" if info.kind == "ply" else "level"  # channels share a step, so few reach the highest level
+    ranges = Table("attribute", _right(f"lowest {what}"), _right(f"highest {what}"), box=None, pad_edge=False)
     for name, (low, high) in info.ranges.items():
         ranges.add_row(name, f"{low:.5g}", f"{high:.5g}")
     blocks: list[RenderableType] = [head, Text(body), ranges]
     if info.parts:
         blocks.insert(2, parts_table(info.parts, info.count))
     if info.kind == "sog-xt":
-        made = info.details
-        origin = f"kissgs {made['version']} from {made['source_count']:,} Gaussians" if made["version"] else "unknown"
-        grid, book = made["grid_side"], made["codebook_side"]
-        blocks.append(Text(f"grid {grid} x {grid}, codebook {book} x {book}; encoder: {origin}"))
+        details, origin = info.details, "unknown"
+        if details["version"]:
+            origin = f"kissgs {details['version']} from {details['source_count']:,} Gaussians"
+        grid, codebook = details["grid_side"], details["codebook_side"]
+        blocks.append(Text(f"grid {grid} x {grid}, codebook {codebook} x {codebook}; encoder: {origin}"))
     return Group(*blocks, *_changes(info.changed))
 
 
 def _changes(changed: Mapping[str, int]) -> list[Text]:
     return [
-        Text(f"{count:,} {CHANGES[name]}", style="yellow")
+        Text(f"{count:,} Gaussian{'' if count == 1 else 's'} {CHANGES[name]}", style="yellow")
         for name, count in changed.items()
         if count and name in CHANGES
     ]

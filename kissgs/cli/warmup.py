@@ -1,4 +1,4 @@
-"""``kissgs warmup``: compile kernels ahead."""
+"""``kissgs warmup``: compile all kernels in advance."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from kissgs.cli.console import progress_bar
 
 
 def warmup() -> None:
-    """Compile the encoder's and the rasteriser's kernels now, so that no command has to wait for them later."""
+    """Compile and cache the kernels of encoder and rasteriser now, so that later commands start without delay."""
     from kissgs.planning.planner import load_kernels as load_encoder
     from kissgs.rendering.rasterizer import load_kernels as load_rasterizer
 
-    with progress_bar(False) as progress:  # one stage for both: it is announced once
+    with progress_bar(False) as progress:  # one stage for both, so that it is reported once
         progress("kernels", 0.0)
         load_encoder()
         load_rasterizer()

@@ -1,4 +1,4 @@
-"""The command line as a user runs it; oracle: the library's own functions, and what the README promises."""
+"""The command line as a user runs it. Oracle: the library's own functions, and the promises of the README."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_there_and_back(scene: Path, tmp_path: Path) -> None:
+def test_compress_and_decompress(scene: Path, tmp_path: Path) -> None:
     assert run("compress", scene, "-o", tmp_path / "a.zip").returncode == 0
     assert run("decompress", tmp_path / "a.zip", "-o", tmp_path / "b.ply").returncode == 0
     assert (tmp_path / "a.zip").read_bytes() == kissgs.compress(scene).to_zip()
     assert len(kissgs.load(tmp_path / "b.ply")) == len(kissgs.decompress(tmp_path / "a.zip"))
 
 
-def test_default_names_lie_beside_the_input(scene: Path, tmp_path: Path) -> None:
+def test_default_outputs_are_next_to_the_input(scene: Path, tmp_path: Path) -> None:
     here = tmp_path / "mine.ply"
     here.write_bytes(scene.read_bytes())
     assert run("compress", "mine.ply", cwd=tmp_path).returncode == 0
@@ -74,27 +74,31 @@ def test_info_of_both_kinds(scene: Path, tmp_path: Path) -> None:
     assert sum(zipped["parts"].values()) < zipped["bytes"] == container.stat().st_size
     table = run("info", container).stdout.decode()
     assert "means_bytes_0.webp" in table
-    assert "bits each" in table
+    assert "bits per Gaussian" in table
 
 
-def test_goals_and_what_was_seen_from_the_command_line(scene: Path, tmp_path: Path) -> None:
-    glance = "--set", "sensitivity_views=4", "--set", "sensitivity_view_size=48"
+def test_goals_and_cached_sensitivity(scene: Path, tmp_path: Path) -> None:
+    few_views = "--set", "sensitivity_views=4", "--set", "sensitivity_view_size=48"
     copy = tmp_path / "scene.ply"
     copy.write_bytes(scene.read_bytes())
-    done = run("compress", copy, "--target-size", "13kB", "--cache", *glance)
-    assert b"searched: " in done.stdout
+    done = run("compress", copy, "--target-size", "13kB", "--cache", *few_views)
+    assert b"search: " in done.stdout
     assert 12_610 <= (tmp_path / "scene.zip").stat().st_size <= 13_000
     assert sorted(file.name for file in tmp_path.iterdir()) == ["scene.ply", "scene.sensitivity.npz", "scene.zip"]
-    report = json.loads(run("compress", copy, "-f", "--psnr", "38", "--cache", "--evaluate", "--json", *glance).stdout)
+    report = json.loads(
+        run("compress", copy, "-f", "--psnr", "38", "--cache", "--evaluate", "--json", *few_views).stdout
+    )
     assert "sensitivity" not in report["seconds"]
     assert any(trial["bytes"] == report["container_bytes"] and trial["psnr"] >= 38 for trial in report["trials"])
     assert (
         report["evaluation"]["mean"]["candidate_vs_reference"]["psnr"] > 37
-    )  # from cameras that the search did not use
-    assert "has 150 dB, the finest has" in failure("compress", copy, "-f", "-q", "--psnr", "150", *glance)
-    assert "psnr needs bits that are weighed" in failure("compress", copy, "-f", "-p", "fast", "--psnr", "40")
+    )  # from other cameras than those of the search
+    assert "psnr 150 dB cannot be met: the finest container found has" in failure(
+        "compress", copy, "-f", "-q", "--psnr", "150", *few_views
+    )
+    assert "psnr needs rate_distortion" in failure("compress", copy, "-f", "-p", "fast", "--psnr", "40")
     piped = failure("compress", "-", "-o", tmp_path / "b.zip", "--cache", stdin=scene.read_bytes())
-    assert "standard input has no place" in piped
+    assert "standard input has no folder" in piped
 
 
 def test_settings_from_the_command_line(scene: Path, tmp_path: Path) -> None:
@@ -115,7 +119,7 @@ def test_errors_are_one_line(scene: Path, tmp_path: Path) -> None:
     failure("info", tmp_path / "none.zip")
     assert "no folder" in failure("compress", scene, "-o", tmp_path / "missing" / "a.zip")
     assert "both write" in failure("compress", scene, "-o", "-", "--json")
-    assert "say where to write" in failure("compress", "-", stdin=b"")
+    assert "give the output with -o" in failure("compress", "-", stdin=b"")
     assert (
         "standard input is closed"
         in subprocess.run(
@@ -156,7 +160,7 @@ def test_a_folder_as_output_means_into_it_for_one_file_as_for_many(scene: Path, 
 
 
 def test_names_are_printed_as_they_are(scene: Path, tmp_path: Path) -> None:
-    """Square brackets once were taken for markup."""
+    """Regression: square brackets were parsed as rich markup."""
     done = run("compress", scene, "-o", tmp_path / "[red]x.zip", "-p", "fast")
     assert "[red]x.zip" in done.stdout.decode()
 
@@ -167,7 +171,7 @@ def test_json_errors_have_a_code(tmp_path: Path) -> None:
 
 
 def test_an_interrupt_inside_a_finalizer_is_not_lost() -> None:
-    """Python prints what is raised there and goes on; numba and torch have such callbacks wherever they import."""
+    """Python prints and ignores exceptions of finalizers; numba and torch run such callbacks during imports."""
     lines = (
         "import signal, time, weakref; from kissgs.cli import app, main",
         "class Thing: pass",
@@ -183,7 +187,7 @@ def test_an_interrupt_inside_a_finalizer_is_not_lost() -> None:
         [sys.executable, "-c", "\n".join(lines)], check=False, capture_output=True, text=True, timeout=60
     )
     assert done.returncode == 130
-    assert done.stderr == "kissgs: interrupted; nothing half-written is left\n"
+    assert done.stderr == "kissgs: interrupted; no partial file is left\n"
 
 
 def test_interrupt_leaves_nothing(tmp_path: Path) -> None:
@@ -192,9 +196,9 @@ def test_interrupt_leaves_nothing(tmp_path: Path) -> None:
     process = subprocess.Popen([KISSGS, "compress", scene, "-o", target, "-p", "paper"], stderr=subprocess.PIPE)
     time.sleep(1.5)
     process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=5)
+    _, message = process.communicate(timeout=5)
     assert process.returncode == 130
-    assert said.decode().splitlines()[-1].startswith("kissgs: interrupted")
+    assert message.decode().splitlines()[-1].startswith("kissgs: interrupted")
     assert [path.name for path in tmp_path.iterdir()] == ["scene.ply"]
 
 
@@ -203,7 +207,7 @@ def test_sample(tmp_path: Path) -> None:
     assert len(kissgs.load(tmp_path / "s.ply")) == 500
 
 
-def test_help_starts_at_once() -> None:
+def test_help_is_fast() -> None:
     best = min(_seconds("--help") for _ in range(3))
     assert best < 0.5
 

@@ -1,4 +1,4 @@
-"""``kissgs compact`` and ``compress --compact`` as a user runs them; oracle: the library's own functions."""
+"""``kissgs compact`` and ``compress --compact`` as a user runs them. Oracle: the library's own functions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_it_writes_what_the_library_finds(folder: Path, tmp_path: Path) -> None:
+def test_the_output_is_that_of_the_library(folder: Path, tmp_path: Path) -> None:
     done = run("compact", folder / "a.ply", "--ratio", "0.2", "-o", tmp_path / "b.ply", *OPTIONS, "--evaluate")
     assert done.returncode == 0, done.stderr
     settings = kissgs.Settings.from_preset("balanced", compact={**SHORT, "ratio": 0.2})
@@ -37,16 +37,16 @@ def test_it_writes_what_the_library_finds(folder: Path, tmp_path: Path) -> None:
     assert same(kissgs.load(tmp_path / "b.ply"), kissgs.clean(found.splats)[0])
     text = done.stdout.decode()
     assert "1,500 -> 300 Gaussians" in text
-    assert "learnt from the scene itself: " in text
+    assert "trained on renderings of the scene: " in text
     rows = [row.split() for row in text.splitlines() if row.startswith(("input", "prune", "sparsify", "refine"))]
     assert [row[1] for row in rows] == [f"{step.count:,}" for step in found.report.steps]
     assert [row[-1] for row in rows] == [f"{step.bytes:,}" for step in found.report.steps]
 
 
-def test_photographs_teach(folder: Path, tmp_path: Path) -> None:
+def test_photographs_are_training_targets(folder: Path, tmp_path: Path) -> None:
     words = ["compact", folder / "a.ply", "-n", "0.3k", "-o", tmp_path / "b.ply", "--views", folder / "capture"]
-    told = json.loads(run(*words, *OPTIONS, "--json").stdout)
-    assert (told["count"], told["target_source"]) == (300, "photos")
+    report = json.loads(run(*words, *OPTIONS, "--json").stdout)
+    assert (report["count"], report["target_source"]) == (300, "photos")
     assert len(kissgs.load(tmp_path / "b.ply")) == 300
 
 
@@ -57,26 +57,26 @@ def test_the_preset_fast_only_prunes(folder: Path, tmp_path: Path) -> None:
     assert len(found) == 99
 
 
-def test_a_search_tells_its_path(folder: Path, tmp_path: Path) -> None:
+def test_a_search_prints_its_trials(folder: Path, tmp_path: Path) -> None:
     words = ["-p", "fast", "--set", "views=96", "--set", "view_size=48", "-o", tmp_path / "b.ply"]
     done = run("compact", folder / "a.ply", "--max-psnr-drop", "1", *words)
-    assert "searched: 375 lose" in done.stdout.decode()
+    assert "search: 375 Gaussians lose" in done.stdout.decode()
     assert 1 < len(kissgs.load(tmp_path / "b.ply")) < 1500
 
 
 def test_compress_compacts_first(folder: Path, tmp_path: Path) -> None:
     changes = [word for name, value in SHORT.items() for word in ("--set", f"compact.{name}={value}")]
     words = ["-p", "fast", "--compact", "20%", *changes, "-o", tmp_path / "a.zip", "--json", "--evaluate"]
-    told = json.loads(run("compress", folder / "a.ply", *words).stdout)
+    report = json.loads(run("compress", folder / "a.ply", *words).stdout)
     settings = kissgs.Settings.from_preset("fast", compact={**SHORT, "ratio": 0.2})
     small = kissgs.compact(SCENE, settings=settings).splats
     plain = kissgs.compress(small, settings=kissgs.Settings.from_preset("fast"))
     found, expected = (kissgs.decompress(source) for source in (tmp_path / "a.zip", plain.files))
     assert same(found, expected)
-    assert told["source_count"] == 1500
-    assert told["compaction"]["count"] == 300
-    judged = json.loads(json.dumps(kissgs.evaluate(SCENE, found).as_dict()))
-    assert told["evaluation"]["mean"] == judged["mean"], "beside the scene as it was"
+    assert report["source_count"] == 1500
+    assert report["compaction"]["count"] == 300
+    expected_evaluation = json.loads(json.dumps(kissgs.evaluate(SCENE, found).as_dict()))
+    assert report["evaluation"]["mean"] == expected_evaluation["mean"], "compared with the original scene"
     info = json.loads(run("info", tmp_path / "a.zip", "--json").stdout)
     assert info["details"]["source_count"] == 1500
     assert info["changed"]["compacted"] == 1200
@@ -91,7 +91,7 @@ def test_the_order_of_the_container_leads_to_the_scene() -> None:
     np.testing.assert_allclose(found.means, SCENE.means[result.order], rtol=0.01, atol=0.05)
 
 
-def test_ctrl_c_leaves_a_checkpoint_to_go_on_from(folder: Path, tmp_path: Path) -> None:
+def test_ctrl_c_leaves_a_checkpoint_to_resume_from(folder: Path, tmp_path: Path) -> None:
     scene, target = tmp_path / "a.ply", tmp_path / "b.ply"
     kissgs.save(SCENE, scene)
     longer = ["--set", "sparsify_steps=300", "--set", "refine_steps=300", "--set", "views=24", "--set", "view_size=48"]
@@ -103,7 +103,7 @@ def test_ctrl_c_leaves_a_checkpoint_to_go_on_from(folder: Path, tmp_path: Path) 
     while not kept.exists() and time.monotonic() < deadline:
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
-    assert process.communicate()[1] == b"kissgs: interrupted; nothing half-written is left\n"
+    assert process.communicate()[1] == b"kissgs: interrupted; no partial file is left\n"
     assert process.returncode == 130
     assert not target.exists()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.checkpoint.npz", "a.ply"]
@@ -125,22 +125,24 @@ def test_ctrl_c_leaves_a_checkpoint_to_go_on_from(folder: Path, tmp_path: Path) 
         (["--ratio", "20", "-o", "b.ply"], "setting ratio: input should be less than or equal to 1, not 20.0"),
         (["-n", "9", "--ratio", "0.2", "-o", "b.ply"], "count and ratio cannot both be met; give one"),
         (["-n", "9", "-o", "b.ply", "--set", "speed=9"], "there is no setting 'speed' of compact; there are count, "),
-        (["-n", "9", "-o", "b.ply", "--set", "no.speed=9"], "there are settings of compact, encode and finetune"),
+        (["-n", "9", "-o", "b.ply", "--set", "no.speed=9"], "the groups are compact, encode and finetune"),
         (["-n", "9", "-o", "b.zip/"], "b.zip"),
         (["--max-psnr-drop", "1", "-o", "b.ply", "--checkpoint"], "keeps no checkpoint"),
         (["-n", "9", "-o", "b.ply", "--device", "tpu"], "--device tpu: choose cpu or cuda"),
     ],
 )
-def test_what_cannot_be_done_is_said(folder: Path, tmp_path: Path, words: list[str], sentence: str) -> None:
+def test_impossible_requests_are_refused(folder: Path, tmp_path: Path, words: list[str], sentence: str) -> None:
     if words[-1] == "b.zip/":
         (tmp_path / "b.zip").write_text("in the way")
     assert sentence in failure("compact", folder / "a.ply", *words, cwd=tmp_path)
     assert not (tmp_path / "b.ply").exists()
 
 
-def test_what_is_about_training_goes_with_it(folder: Path, tmp_path: Path) -> None:
+def test_options_of_training_need_training(folder: Path, tmp_path: Path) -> None:
     for word in (["--checkpoint"], ["--device", "cuda"]):
-        assert "they go with --compact" in failure("compress", folder / "a.ply", "-o", "b.zip", *word, cwd=tmp_path)
+        assert "add --compact or --finetune" in failure(
+            "compress", folder / "a.ply", "-o", "b.zip", *word, cwd=tmp_path
+        )
 
 
 def test_a_pipe_leaves_no_checkpoint(folder: Path, tmp_path: Path) -> None:
@@ -160,7 +162,7 @@ def test_nothing_is_overwritten(folder: Path, tmp_path: Path) -> None:
     assert (tmp_path / "b.ply").read_text() == "mine"
 
 
-def test_without_torch_it_says_what_is_missing(folder: Path, tmp_path: Path) -> None:
+def test_missing_torch_is_reported(folder: Path, tmp_path: Path) -> None:
     program = "import sys; sys.modules['torch'] = None; from kissgs.cli.main import main; main()"
     words = ["compact", folder / "a.ply", "-n", "99", "-o", tmp_path / "b.ply", "--set", "views=24"]
     python = [KISSGS.with_name("python"), "-c", program]
@@ -183,19 +185,19 @@ def test_without_torch_it_says_what_is_missing(folder: Path, tmp_path: Path) -> 
         (".5 db", {"max_psnr_drop": 0.5}),
     ],
 )
-def test_budgets_in_a_word(text: str, budget: dict[str, float]) -> None:
+def test_budgets(text: str, budget: dict[str, float]) -> None:
     assert budget_of(text) == pytest.approx(budget)
 
 
 @pytest.mark.parametrize(
     "text", ["", "%", "dB", "-5", "20%%", "1e5", "k", "0.2 dBs", "nan", "1.2.3", "0.8", "1.4", "0,2", "1,5M"]
 )
-def test_what_is_no_budget(text: str) -> None:
+def test_invalid_budgets(text: str) -> None:
     with pytest.raises(kissgs.UnsupportedError):
         budget_of(text)
 
 
 @pytest.mark.parametrize("text", ["", "k", "1.2.3", "0x10", "-4", "½", "0.8", "1.4", "0,2", "1,5M", "1,50"])
-def test_what_is_no_count(text: str) -> None:
+def test_invalid_counts(text: str) -> None:
     with pytest.raises(kissgs.UnsupportedError, match="is no number of Gaussians"):
         count_of(text)

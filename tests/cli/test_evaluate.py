@@ -1,4 +1,4 @@
-"""``kissgs evaluate`` and ``compress --evaluate`` as a user runs them; oracle: the library's own functions."""
+"""``kissgs evaluate`` and ``compress --evaluate`` as a user runs them. Oracle: the library's own functions."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ import kissgs
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """a.ply, its container b.zip, a damaged c.ply, and a capture."""
-    folder = tmp_path_factory.mktemp("pictures")
+    """Folder with a.ply, its container b.zip, a damaged c.ply, and a capture."""
+    folder = tmp_path_factory.mktemp("evaluate")
     kissgs.save(SCENE, folder / "a.ply")
     kissgs.compress(SCENE, folder / "b.zip")
     kissgs.save(damaged(), folder / "c.ply")
@@ -27,12 +27,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_json_is_the_evaluation_and_the_bytes(folder: Path) -> None:
     capture = folder / "capture"
     done = run("evaluate", folder / "a.ply", folder / "b.zip", "--views", capture, "--json")
-    told = json.loads(done.stdout)
+    report = json.loads(done.stdout)
     found = kissgs.evaluate(kissgs.load(folder / "a.ply"), kissgs.load(folder / "b.zip"), kissgs.load_views(capture))
-    assert told.pop("bytes") == {
+    assert report.pop("bytes") == {
         side: (folder / name).stat().st_size for side, name in (("reference", "a.ply"), ("candidate", "b.zip"))
     }
-    assert told == json.loads(json.dumps(found.as_dict()))
+    assert report == json.loads(json.dumps(found.as_dict()))
 
 
 def test_the_table_says_what_was_compared(folder: Path) -> None:
@@ -58,25 +58,25 @@ def test_without_views_it_draws_cameras_and_folders_are_scenes_too(folder: Path,
     assert "photo" not in text
 
 
-def test_the_worst_view_is_told_and_another_seed_draws_others(folder: Path) -> None:
+def test_the_worst_view_is_printed_and_depends_on_the_seed(folder: Path) -> None:
     words = ["evaluate", folder / "a.ply", folder / "c.ply"]
     found = kissgs.evaluate(SCENE, kissgs.load(folder / "c.ply"), seed=7)
     text = " ".join(run(*words, "--seed", 7).stdout.decode().split())
     assert f"W{found.extremes[1:]}." in text
-    told = json.loads(run(*words, "--seed", 7, "--json").stdout)
-    assert told["worst"]["psnr"] == min(view["candidate_vs_reference"]["psnr"] for view in told["views"])
-    assert told["worst"]["position"] != json.loads(run(*words, "--json").stdout)["worst"]["position"]
+    report = json.loads(run(*words, "--seed", 7, "--json").stdout)
+    assert report["worst"]["psnr"] == min(view["candidate_vs_reference"]["psnr"] for view in report["views"])
+    assert report["worst"]["position"] != json.loads(run(*words, "--json").stdout)["worst"]["position"]
 
 
-def test_what_photographs_do_not_show_is_judged_beside_them(folder: Path) -> None:
+def test_the_scene_beyond_the_capture_is_evaluated_too(folder: Path) -> None:
     words = ["evaluate", folder / "a.ply", folder / "c.ply", "--views", folder / "capture"]
     text = " ".join(run(*words).stdout.decode().split())
-    told = json.loads(run(*words, "--json").stdout)
-    assert told["against"] == "photos"
-    assert told["surroundings"]["against"] == "renderings"
-    assert told["surroundings"]["surroundings"] is None
-    around = told["surroundings"]["mean"]["candidate_vs_reference"]["psnr"]
-    assert f"Elsewhere: PSNR {around:.2f} dB to the scene's own renderings from 24 cameras; worst view" in text
+    report = json.loads(run(*words, "--json").stdout)
+    assert report["against"] == "photos"
+    assert report["surroundings"]["against"] == "renderings"
+    assert report["surroundings"]["surroundings"] is None
+    around = report["surroundings"]["mean"]["candidate_vs_reference"]["psnr"]
+    assert f"Beyond the capture: PSNR {around:.2f} dB to the scene's own renderings from 24 cameras; worst view" in text
 
 
 def test_views_without_a_test_split_say_so(folder: Path, tmp_path: Path) -> None:
@@ -86,7 +86,7 @@ def test_views_without_a_test_split_say_so(folder: Path, tmp_path: Path) -> None
     assert "no view is held out" in text
 
 
-def test_photographs_that_are_not_found_are_missed_aloud(folder: Path, tmp_path: Path) -> None:
+def test_missing_photographs_are_reported(folder: Path, tmp_path: Path) -> None:
     capture = write_capture(tmp_path / "capture")
     (capture / "images").rename(capture / "rgb")
     words = ["evaluate", folder / "a.ply", folder / "c.ply", "--views", capture]
@@ -95,8 +95,8 @@ def test_photographs_that_are_not_found_are_missed_aloud(folder: Path, tmp_path:
     assert note.replace(" ", "") in text.replace(" ", "")
     assert note[1:].replace("'", "&#x27;") in (tmp_path / "page.html").read_text(encoding="utf-8")
     assert json.loads(run(*words, "--json").stdout)["note"] == note
-    told = json.loads(run(*words, "--images", "rgb", "--json").stdout)
-    assert (told["note"], told["against"]) == ("", "photos")
+    report = json.loads(run(*words, "--images", "rgb", "--json").stdout)
+    assert (report["note"], report["against"]) == ("", "photos")
 
 
 def test_a_page_is_written_whole_and_not_over_another(folder: Path, tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def test_errors_are_one_line(folder: Path, tmp_path: Path) -> None:
     assert "choose test, train or all" in failure("evaluate", *pair, "--split", "val")
     assert "choose cpu or cuda" in failure("evaluate", *pair, "--device", "tpu")
     for option in ("--scale", "--images", "--resolution"):
-        assert f"{option} is about the photographs" in failure("evaluate", *pair, option, "2")
+        assert f"{option} only applies to the photographs" in failure("evaluate", *pair, option, "2")
     assert "exclude each other" in failure("evaluate", *pair, "--views", capture, "--scale", 2, "--images", tmp_path)
     (capture / "images" / "a.png").rename(capture / "images" / "a.away")
     try:
@@ -142,10 +142,10 @@ def test_json_errors_have_a_code(folder: Path, tmp_path: Path) -> None:
 
 def test_compressing_can_evaluate(folder: Path, tmp_path: Path) -> None:
     words = ["compress", folder / "a.ply", "-o", tmp_path / "a.zip", "--evaluate", "--views", folder / "capture"]
-    told = json.loads(run(*words, "--json").stdout)["evaluation"]
+    report = json.loads(run(*words, "--json").stdout)["evaluation"]
     views = kissgs.load_views(folder / "capture")
     found = kissgs.evaluate(SCENE, kissgs.decompress(tmp_path / "a.zip"), views)
-    assert told == json.loads(json.dumps(found.as_dict()))
+    assert report == json.loads(json.dumps(found.as_dict()))
     assert (tmp_path / "a.zip").read_bytes() == kissgs.compress(folder / "a.ply", views=views).to_zip()
     text = run(*words, "--force").stdout.decode()
     psnr, ssim = found.mean.candidate.spelled()
@@ -164,8 +164,8 @@ def test_compressing_evaluates_on_drawn_cameras_by_default(tmp_path: Path) -> No
     assert 20 < result.report.evaluation.mean.candidate_vs_reference.psnr < math.inf
     assert list(dict.fromkeys(stages))[-2:] == ["evaluate", "write"]
     assert result.report.seconds["evaluate"] > 0
-    told = json.loads(json.dumps(result.report.as_dict(), allow_nan=False))
-    assert told["evaluation"]["count"]["reference"] == 1500
+    report = json.loads(json.dumps(result.report.as_dict(), allow_nan=False))
+    assert report["evaluation"]["count"]["reference"] == 1500
     assert kissgs.compress(SCENE).report.as_dict()["evaluation"] is None
 
 
@@ -180,27 +180,27 @@ def test_cancelling_the_evaluation_writes_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("preset", ["fast", "balanced", "small", "paper"])
-def test_every_preset_takes_views(folder: Path, tmp_path: Path, preset: str) -> None:
-    """So that a loop over presets needs no exception: those that take no pictures are judged by them."""
-    glance = "--set", "sensitivity_views=4", "--set", "sensitivity_view_size=48"
-    words = "compress", folder / "a.ply", "-p", preset, *glance, "--views", folder / "capture", "--json"
+def test_every_preset_accepts_views(folder: Path, tmp_path: Path, preset: str) -> None:
+    """A loop over presets needs no exception: presets that render no images use the views for evaluation only."""
+    few_views = "--set", "sensitivity_views=4", "--set", "sensitivity_view_size=48"
+    words = "compress", folder / "a.ply", "-p", preset, *few_views, "--views", folder / "capture", "--json"
     alone = run(*words, "-o", tmp_path / "a.zip")
-    judged = run(*words, "-o", tmp_path / "b.zip", "--evaluate")
-    assert (alone.returncode, judged.returncode) == (0, 0), alone.stderr + judged.stderr
+    evaluated = run(*words, "-o", tmp_path / "b.zip", "--evaluate")
+    assert (alone.returncode, evaluated.returncode) == (0, 0), alone.stderr + evaluated.stderr
     assert (tmp_path / "a.zip").read_bytes() == (tmp_path / "b.zip").read_bytes()
-    note = f"kissgs: {preset} takes no pictures, so --views changes nothing; --evaluate judges by them\n"
+    note = f"kissgs: --views has no effect: the preset {preset} renders no images; add --evaluate\n"
     assert alone.stderr.decode() == (note if preset in ("fast", "paper") else "")
-    assert judged.stderr == b""
-    evaluation = json.loads(judged.stdout)["evaluation"]
+    assert evaluated.stderr == b""
+    evaluation = json.loads(evaluated.stdout)["evaluation"]
     assert evaluation["mean"]["reference"] is not None, "no photographs were compared"
 
 
 @pytest.mark.parametrize("preset", ["fast", "paper"])
-def test_views_change_no_bytes_of_presets_that_take_no_pictures(folder: Path, preset: str) -> None:
+def test_views_do_not_change_the_bytes_of_presets_that_render_no_images(folder: Path, preset: str) -> None:
     settings = kissgs.Settings.from_preset(preset)
     views = kissgs.load_views(folder / "capture")
-    seen, blind = (kissgs.compress(SCENE, settings=settings, views=some) for some in (views, None))
-    assert seen.files == blind.files
+    with_views, without_views = (kissgs.compress(SCENE, settings=settings, views=some) for some in (views, None))
+    assert with_views.files == without_views.files
 
 
 def test_a_capture_that_cannot_be_read_is_refused_by_every_preset(folder: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""``kissgs compress --finetune`` as a user runs it; oracle: the library's own functions."""
+"""``kissgs compress --finetune`` as a user runs it. Oracle: the library's own functions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from helpers.captured_scene import SCENE, write_capture
 from helpers.command_line import KISSGS, failure, run
 
 import kissgs
-from kissgs.cli.options import spelled_out
+from kissgs.cli.options import with_finetune_value
 
 SHORT = {"views": 24, "view_size": 48}
 OPTIONS = [word for name, value in SHORT.items() for word in ("--set", f"finetune.{name}={value}")]
@@ -33,7 +33,7 @@ def settings(**changes: object) -> kissgs.Settings:
     return kissgs.Settings.from_preset("balanced", finetune={"enabled": True, **SHORT, **changes}, **LOOK)
 
 
-def test_it_writes_what_the_library_finds_and_says_what_it_gave(folder: Path, tmp_path: Path) -> None:
+def test_output_and_report_are_those_of_the_library(folder: Path, tmp_path: Path) -> None:
     done = run("compress", "--finetune", "6", folder / "a.ply", "-o", tmp_path / "b.zip", *OPTIONS)
     assert done.returncode == 0, done.stderr
     found = kissgs.compress(SCENE, settings=settings(steps=6))
@@ -43,25 +43,25 @@ def test_it_writes_what_the_library_finds_and_says_what_it_gave(folder: Path, tm
         f"{found.report.finetuning.psnr_before:.2f} -> {found.report.finetuning.psnr_after:.2f} dB"
         in done.stdout.decode()
     )
-    assert "fine-tuned by the scene itself" in done.stdout.decode()
+    assert "fine-tuned on renderings of the scene" in done.stdout.decode()
 
 
-def test_photographs_teach(folder: Path, tmp_path: Path) -> None:
+def test_photographs_are_training_targets(folder: Path, tmp_path: Path) -> None:
     words = ["compress", folder / "a.ply", "-o", tmp_path / "b.zip", "--finetune", "4", "--views", folder / "capture"]
-    told = json.loads(run(*words, *OPTIONS, "--json").stdout)["finetuning"]
-    assert (told["steps"], told["target_source"]) == (4, "photos")
+    report = json.loads(run(*words, *OPTIONS, "--json").stdout)["finetuning"]
+    assert (report["steps"], report["target_source"]) == (4, "photos")
 
 
-def test_without_a_number_it_is_that_of_the_preset() -> None:
-    assert spelled_out(["compress", "a.ply", "--finetune"]) == ["compress", "a.ply", "--finetune", "auto"]
-    assert spelled_out(["--finetune", "a.ply", "-q"]) == ["--finetune", "auto", "a.ply", "-q"]
-    assert spelled_out(["--finetune", "70", "a.ply"]) == ["--finetune", "70", "a.ply"]
-    assert spelled_out(["--finetune", "auto"]) == ["--finetune", "auto"]
+def test_the_default_number_of_steps_is_that_of_the_preset() -> None:
+    assert with_finetune_value(["compress", "a.ply", "--finetune"]) == ["compress", "a.ply", "--finetune", "auto"]
+    assert with_finetune_value(["--finetune", "a.ply", "-q"]) == ["--finetune", "auto", "a.ply", "-q"]
+    assert with_finetune_value(["--finetune", "70", "a.ply"]) == ["--finetune", "70", "a.ply"]
+    assert with_finetune_value(["--finetune", "auto"]) == ["--finetune", "auto"]
     for preset, steps in (("fast", 200), ("balanced", 1000), ("small", 2000), ("paper", 4000)):
         assert kissgs.Settings.from_preset(preset, finetune={"enabled": True}).finetune.steps == steps
 
 
-def test_ctrl_c_leaves_a_checkpoint_to_go_on_from(tmp_path: Path) -> None:
+def test_ctrl_c_leaves_a_checkpoint_to_resume_from(tmp_path: Path) -> None:
     scene, target = tmp_path / "a.ply", tmp_path / "b.zip"
     kissgs.save(SCENE, scene)
     words = ["compress", scene, "-o", target, "--finetune", "300", "--checkpoint", "--quiet", *OPTIONS]
@@ -72,7 +72,7 @@ def test_ctrl_c_leaves_a_checkpoint_to_go_on_from(tmp_path: Path) -> None:
     while not kept.exists() and time.monotonic() < deadline:
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
-    assert process.communicate()[1] == b"kissgs: interrupted; nothing half-written is left\n"
+    assert process.communicate()[1] == b"kissgs: interrupted; no partial file is left\n"
     assert process.returncode == 130
     assert sorted(path.name for path in tmp_path.iterdir()) == [kept.name, "a.ply"]
     other = ["compress", scene, "-o", target, "--finetune", "301", "--checkpoint", *OPTIONS]
@@ -86,12 +86,12 @@ def test_ctrl_c_leaves_a_checkpoint_to_go_on_from(tmp_path: Path) -> None:
     ("words", "sentence"),
     [
         (["--finetune", "0"], "setting steps: input should be greater than or equal to 1, not '0'"),
-        (["--finetune=many"], "--finetune many: write a number of steps, or nothing for that of the preset"),
+        (["--finetune=many"], "--finetune many: give a number of steps, or none for that of the preset"),
         (["--finetune", "--set", "finetune.speed=9"], "there is no setting 'speed' of finetune; there are "),
-        (["--device", "cuda"], "they go with --compact and --finetune"),
-        (["--checkpoint"], "they go with --compact and --finetune"),
+        (["--device", "cuda"], "add --compact or --finetune"),
+        (["--checkpoint"], "add --compact or --finetune"),
     ],
 )
-def test_wrong_words(folder: Path, tmp_path: Path, words: list[str], sentence: str) -> None:
+def test_invalid_options(folder: Path, tmp_path: Path, words: list[str], sentence: str) -> None:
     assert sentence in failure("compress", folder / "a.ply", "-o", tmp_path / "b.zip", *words)
     assert not (tmp_path / "b.zip").exists()

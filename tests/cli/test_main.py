@@ -1,4 +1,4 @@
-"""Ctrl-C while modules are loaded, and at the very end: one line and exit code 130, never a traceback."""
+"""Ctrl-C during imports and at exit: one line and exit code 130, never a traceback."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ import pytest
 import kissgs
 
 HOME = str(Path(kissgs.__file__).parents[1])
-SAID = "kissgs: interrupted; nothing half-written is left\n"
+SAID = "kissgs: interrupted; no partial file is left\n"
 
 PROGRAM = """
 import os, sys
 from kissgs.cli.main import main
 left = int(sys.argv.pop(1))
 count = 0
-def told(event, arguments):
+def on_event(event, arguments):
     global count
     if event == "import":
         count += 1
         if count == left:
             os.kill(os.getpid(), SIGNAL)
-sys.addaudithook(told)
+sys.addaudithook(on_event)
 try:
     main()
 finally:
@@ -36,7 +36,7 @@ finally:
 
 
 def start(left: int, *words: str, number: int = signal.SIGINT) -> subprocess.CompletedProcess[str]:
-    """The command line, told to end at its so-manieth import; with 0 it is not, and counts them."""
+    """Run the command line, with a signal at its ``left``-th import; 0 sends none and prints the number of imports."""
     return subprocess.run(
         [sys.executable, "-P", "-c", PROGRAM.replace("SIGNAL", str(int(number))), str(left), *words],
         env=os.environ | {"PYTHONPATH": HOME},
@@ -56,13 +56,13 @@ def test_interrupts_at_every_stage_of_loading(words: list[str]) -> None:
         assert (done.returncode, done.stderr) == (130, SAID), (left, done.stderr[-2000:])
 
 
-def test_requests_to_end_likewise() -> None:
+def test_sigterm() -> None:
     done = start(40, "--version", number=signal.SIGTERM)
     assert (done.returncode, done.stderr) == (143, SAID)
 
 
 def test_an_interrupt_that_a_library_turns_into_its_own_error() -> None:
-    """Python itself does so with what is raised while a class is made."""
+    """Python itself wraps exceptions that are raised while a class is created."""
     lines = (
         "import signal; from kissgs.cli import app, main",
         "class Thing:",
@@ -78,7 +78,7 @@ def test_an_interrupt_that_a_library_turns_into_its_own_error() -> None:
     assert (done.returncode, done.stderr) == (130, SAID)
 
 
-def test_an_interrupt_while_python_ends() -> None:
+def test_an_interrupt_at_exit() -> None:
     lines = (
         "import atexit, signal; from kissgs.cli import app, main",
         "atexit.register(lambda: signal.raise_signal(signal.SIGINT))",
@@ -89,8 +89,8 @@ def test_an_interrupt_while_python_ends() -> None:
     assert (done.returncode, done.stderr) == (130, SAID)
 
 
-def test_nothing_is_loaded_before_it_listens() -> None:
-    """What Python loads by itself, and of kissgs what is needed to listen."""
+def test_no_module_is_imported_before_signals_are_handled() -> None:
+    """Only modules that Python loads itself, and those of kissgs that handle signals."""
     bare = set(_python("import re, signal, sys; print(*sys.modules)").stdout.split())
     ours = set(_python("import re, signal, sys; import kissgs.cli.main; print(*sys.modules)").stdout.split())
     assert ours - bare <= {

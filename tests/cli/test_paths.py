@@ -1,4 +1,4 @@
-"""Paths that no file system takes, in every place where a command has one: a sentence and exit 2, never a traceback."""
+"""Invalid paths in every argument and option that takes one: a one-line error and exit code 2, never a traceback."""
 
 from __future__ import annotations
 
@@ -78,14 +78,14 @@ KINDS = {
 }
 
 
-def may_everything(path: Path) -> bool:
-    """Whether this user, as root can, looks into a folder that forbids it."""
+def ignores_permissions(path: Path) -> bool:
+    """Whether this user, such as root, can read a folder without permission."""
     return os.access(path, os.R_OK)
 
 
 @pytest.fixture(scope="module")
 def folder() -> Iterator[Path]:
-    """The scene in several forms, and what cannot be used."""
+    """Folder with the scene in several forms, and with unusable paths."""
     with tempfile.TemporaryDirectory() as name:
         path = Path(name)
         (path / "loop").symlink_to("loop")
@@ -101,7 +101,7 @@ def folder() -> Iterator[Path]:
 
 @pytest.fixture
 def process(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """In the folder; what the command line changes of the process is put back."""
+    """Change into the folder; restore the signal handlers and hooks that the command line sets."""
     monkeypatch.chdir(folder)
     monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -111,7 +111,7 @@ def process(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def refusal(words: list[str], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> list[str]:
-    """The lines on standard error of a command that ends with exit code 2."""
+    """Run a command that must end with exit code 2; return its lines on standard error."""
     monkeypatch.setattr(sys, "argv", ["kissgs", *words])
     with pytest.raises(SystemExit) as ended:
         main()
@@ -121,7 +121,7 @@ def refusal(words: list[str], monkeypatch: pytest.MonkeyPatch, capfd: pytest.Cap
 
 
 def takes(place: str, kind: str) -> bool:
-    """Whether such a path cannot be used there: patterns are for inputs, and ``loop.zip`` is no loop."""
+    """Whether this kind of path is invalid there: patterns only apply to inputs, and ``loop.zip`` is no loop."""
     if kind == "too long with an asterisk":
         return place.split()[:2][-1] == "BAD" and place != "sample BAD"
     return not ("BAD." in place and kind in ("a loop", "a link to what is locked"))
@@ -129,18 +129,18 @@ def takes(place: str, kind: str) -> bool:
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.usefixtures("process")
-def test_a_sentence(
+def test_invalid_paths_give_one_line(
     kind: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    if "lock" in KINDS[kind] + kind and may_everything(folder / "locked"):
-        pytest.skip("this user may do everything")
+    if "lock" in KINDS[kind] + kind and ignores_permissions(folder / "locked"):
+        pytest.skip("this user ignores permissions")
     before = sorted(folder.iterdir())
     for place in PLACES:
         if takes(place, kind):
             said = refusal([word.replace("BAD", KINDS[kind]) for word in place.split()], monkeypatch, capfd)
             assert 1 <= len(said) <= 2, (place, said)
             assert all(line.startswith("kissgs: ") for line in said), (place, said)
-            if (folder / "out").exists():  # of several inputs, the other one
+            if (folder / "out").exists():  # the output of the other input
                 shutil.rmtree(folder / "out")
             assert sorted(folder.iterdir()) == before, place
 
@@ -148,10 +148,10 @@ def test_a_sentence(
 @pytest.mark.parametrize("words", ["compress BAD", "compress BAD other.ply -o out", "decompress BAD", "render BAD"])
 @pytest.mark.parametrize("kind", ["too long", "a folder that is too long", "within a file", "missing/inner"])
 @pytest.mark.usefixtures("process")
-def test_an_input_that_cannot_be_is_what_is_wrong(
+def test_the_error_names_the_input(
     words: str, kind: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """It was said of the result, whose name is made from that of the input."""
+    """Regression: the error named the output, whose path is derived from the input."""
     name = KINDS.get(kind, kind)
     said = refusal([word.replace("BAD", name) for word in words.split()], monkeypatch, capfd)
     assert said[0].startswith(f"kissgs: cannot read {name[:100]}"), said
@@ -159,8 +159,8 @@ def test_an_input_that_cannot_be_is_what_is_wrong(
         shutil.rmtree(folder / "out")
 
 
-def test_a_name_that_leaves_no_room_for_another_ending(folder: Path, tmp_path: Path) -> None:
-    """What is kept beside the scene has the longer name."""
+def test_a_name_that_is_too_long_with_another_ending(folder: Path, tmp_path: Path) -> None:
+    """The files next to the scene have longer names than the scene."""
     scene = tmp_path / ("a" * 251 + ".ply")
     shutil.copy(folder / "scene.ply", scene)
     for words in (["--cache"], ["--checkpoint", "--compact", "50%"], ["--unpacked", "-p", "fast"]):
@@ -169,7 +169,7 @@ def test_a_name_that_leaves_no_room_for_another_ending(folder: Path, tmp_path: P
 
 
 @pytest.mark.parametrize("name", ["a\0b", "a" * 300, "\0.zip", "loop"])
-def test_the_library_says_so_in_its_own_errors(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_library_raises_its_own_errors(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     kept = "loop/x" if name == "loop" else name  # a link is replaced, wherever it leads
     for work in (

@@ -1,4 +1,4 @@
-"""``kissgs render`` as a user runs it; oracle: the library's own pictures and views, read back by Pillow."""
+"""``kissgs render`` as a user runs it. Oracle: the library's own renderings and views, read back by Pillow."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ import pytest
 from helpers.captured_scene import SCENE, write_capture
 from helpers.command_line import KISSGS, failure, run
 from PIL import Image
+from rich.console import Console
 
 import kissgs
 from kissgs.cameras.captures.camera_json import read_cameras
@@ -28,7 +30,7 @@ from kissgs.rendering.images import reframed
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """a.ply, its container b.zip, and a capture."""
+    """Folder with a.ply, its container b.zip, and a capture."""
     folder = tmp_path_factory.mktemp("render")
     kissgs.save(SCENE, folder / "a.ply")
     kissgs.compress(SCENE, folder / "b.zip")
@@ -46,7 +48,7 @@ def by_name(views: Views) -> list[View]:
 
 
 def shown(camera: kissgs.Camera, scene: kissgs.Splats = SCENE, background: tuple[float, ...] = (0, 0, 0)) -> np.ndarray:
-    """8 bits per channel, by the definition."""
+    """Render with the library, and round to 8 bits per channel."""
     image, _ = kissgs.render(scene, camera, background=background)
     return (255 * image.astype(np.float64)).round().clip(0, 255).astype(np.uint8)
 
@@ -57,13 +59,13 @@ def pixels(source: Path | bytes) -> np.ndarray:
 
 
 def close(one: np.ndarray, other: np.ndarray) -> bool:
-    """But for what halves the two ways of rounding make of .5."""
+    """Whether two images are equal except for the rounding of values at .5."""
     return (
         one.shape == other.shape and int(np.abs(one.astype(int) - other).max()) <= 1 and (one == other).mean() > 0.999
     )
 
 
-def test_by_default_the_best_virtual_view_beside_the_scene(folder: Path, tmp_path: Path, virtual: Views) -> None:
+def test_the_default_is_the_best_virtual_view_next_to_the_scene(folder: Path, tmp_path: Path, virtual: Views) -> None:
     (tmp_path / "mine.ply").write_bytes((folder / "a.ply").read_bytes())
     done = run("render", "mine.ply", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -94,16 +96,16 @@ def test_views_of_a_capture_have_their_own_size(folder: Path, tmp_path: Path) ->
         assert run(*words, *(() if which is None else ("--view", which))).returncode == 0
         assert close(pixels(tmp_path / "a.png"), shown(view.camera))
     done = run(*words, "--size", "120x40", "--json")
-    told = json.loads(done.stdout)
+    report = json.loads(done.stdout)
     camera = reframed(capture[0].camera, 120, 40)
     assert close(pixels(tmp_path / "a.png"), shown(camera))
-    assert (told["output"], told["width"], told["height"]) == (str(tmp_path / "a.png"), 120, 40)
-    assert told["bytes"] == (tmp_path / "a.png").stat().st_size
-    assert (told["frames"], len(told["cameras"]), told["cameras"][0]["name"]) == (1, 1, "images/a.png")
-    assert np.array_equal(told["cameras"][0]["K"], camera.K)
+    assert (report["output"], report["width"], report["height"]) == (str(tmp_path / "a.png"), 120, 40)
+    assert report["bytes"] == (tmp_path / "a.png").stat().st_size
+    assert (report["frames"], len(report["cameras"]), report["cameras"][0]["name"]) == (1, 1, "images/a.png")
+    assert np.array_equal(report["cameras"][0]["K"], camera.K)
 
 
-def test_a_saved_camera_takes_the_same_picture_again(folder: Path, tmp_path: Path) -> None:
+def test_a_saved_camera_renders_the_same_image(folder: Path, tmp_path: Path) -> None:
     kept = tmp_path / "kept.json"
     words = ["render", folder / "a.ply", "-o"]
     done = run(*words, tmp_path / "a.png", "--size", "80x60", "--view", "5", "--save-camera", kept)
@@ -119,10 +121,10 @@ def test_a_saved_camera_takes_the_same_picture_again(folder: Path, tmp_path: Pat
     assert not (tmp_path / "d.png").exists()
 
 
-def test_an_orbit_is_a_film_or_a_sheet(folder: Path, tmp_path: Path) -> None:
+def test_an_orbit_is_an_animation_or_a_contact_sheet(folder: Path, tmp_path: Path) -> None:
     words = ["render", folder / "a.ply", "--orbit", "--size", "40x30", "--json", "-o"]
-    told = json.loads(run(*words, tmp_path / "a.webp", "--frames", "9", "--fps", "10", "--quality", "100").stdout)
-    assert (told["width"], told["height"], told["frames"], len(told["cameras"])) == (40, 30, 9, 9)
+    report = json.loads(run(*words, tmp_path / "a.webp", "--frames", "9", "--fps", "10", "--quality", "100").stdout)
+    assert (report["width"], report["height"], report["frames"], len(report["cameras"])) == (40, 30, 9, 9)
     with Image.open(tmp_path / "a.webp") as film:
         assert (film.n_frames, film.info["loop"]) == (9, 0)
         durations = []
@@ -131,14 +133,14 @@ def test_an_orbit_is_a_film_or_a_sheet(folder: Path, tmp_path: Path) -> None:
             film.load()
             durations.append(film.info["duration"])
             if number == 4:
-                entry = told["cameras"][4]
+                entry = report["cameras"][4]
                 camera = kissgs.Camera(np.array(entry["viewmat"]), np.array(entry["K"]), 40, 30)
                 assert close(np.asarray(film.convert("RGB")), shown(camera))
     assert sum(durations) == 900
-    told = json.loads(run(*words, tmp_path / "a.png", "--frames", "6").stdout)
-    assert (told["frames"], len(told["cameras"])) == (1, 6)
-    assert pixels(tmp_path / "a.png").shape == (told["height"], told["width"], 3)
-    assert told["width"] > 2 * 40
+    report = json.loads(run(*words, tmp_path / "a.png", "--frames", "6").stdout)
+    assert (report["frames"], len(report["cameras"])) == (1, 6)
+    assert pixels(tmp_path / "a.png").shape == (report["height"], report["width"], 3)
+    assert report["width"] > 2 * 40
 
 
 def test_a_sheet_has_all_views(folder: Path, tmp_path: Path) -> None:
@@ -148,13 +150,13 @@ def test_a_sheet_has_all_views(folder: Path, tmp_path: Path) -> None:
     sheet = pixels(tmp_path / "a.png")
     first = shown(kissgs.load_views(folder / "capture").test[0].camera)
     assert close(sheet[4:44, 4:64], first)
-    told = json.loads(run(*words, "-o", tmp_path / "b.png", "--json").stdout)
-    assert [camera["name"] for camera in told["cameras"]] == [f"virtual_{n:02}" for n in range(32)]
+    report = json.loads(run(*words, "-o", tmp_path / "b.png", "--json").stdout)
+    assert [camera["name"] for camera in report["cameras"]] == [f"virtual_{n:02}" for n in range(32)]
 
 
-def test_what_cannot_be_is_said_in_a_line(folder: Path, tmp_path: Path) -> None:
+def test_impossible_requests_are_refused(folder: Path, tmp_path: Path) -> None:
     def fails(*words: object) -> str:
-        """Without a process for each; that every error is a line and exit code 2, those above show."""
+        """Return the error message; in this process, as other tests check the exit code of the command."""
         with pytest.raises(kissgs.KissgsError) as caught:
             commands.app(["render", str(folder / "a.ply"), *map(str, words)], standalone_mode=False)
         assert "\n" not in str(caught.value)
@@ -163,11 +165,11 @@ def test_what_cannot_be_is_said_in_a_line(folder: Path, tmp_path: Path) -> None:
     there = tmp_path / "a.png"
     assert "--view and --orbit: choose one" in fails("--view", "3", "--orbit")
     assert "--orbit and --sheet: choose one" in fails("--sheet", "--orbit")
-    assert "finds its own way" in fails("--orbit", "--views", folder / "capture")
-    assert "is a camera already" in fails("--view", "a.json", "--views", folder / "capture")
+    assert "computes its own cameras" in fails("--orbit", "--views", folder / "capture")
+    assert "is a camera file" in fails("--view", "a.json", "--views", folder / "capture")
     assert "leave out --save-camera" in fails("--sheet", "--save-camera", tmp_path / "a.json")
-    assert "leave out --frames: it is for --orbit" in fails("--frames", "9")
-    assert "leave out --fps: it is for films" in fails("--orbit", "--fps", "9", "-o", there)
+    assert "leave out --frames: it only applies to --orbit" in fails("--frames", "9")
+    assert "leave out --fps: it only applies to animations" in fails("--orbit", "--fps", "9", "-o", there)
     assert "leave out --quality" in fails("--quality", "9", "-o", there)
     assert "written as .png or .webp" in fails("-o", tmp_path / "a.jpg")
     assert "no folder" in fails("-o", tmp_path / "none" / "a.png")
@@ -178,11 +180,11 @@ def test_what_cannot_be_is_said_in_a_line(folder: Path, tmp_path: Path) -> None:
     assert "not standard input" in failure("render", "-", "-o", there)
     assert "no such file" in failure("render", tmp_path / "none.ply", "-o", there).lower()
     for size in ("10", "0x9", "9x-1", "1e3x9"):
-        assert "write WIDTHxHEIGHT" in fails("-o", there, "--size", size)
+        assert "give WIDTHxHEIGHT" in fails("-o", there, "--size", size)
     for colour in ("red", "#12345", "#1234567"):
-        assert "write black, white or #rrggbb" in fails("-o", there, "--background", colour)
+        assert "give black, white or #rrggbb" in fails("-o", there, "--background", colour)
     assert "choose cpu or cuda" in fails("-o", there, "--device", "tpu")
-    assert "--scale is about the photographs" in fails("-o", there, "--scale", "2")
+    assert "--scale only applies to the photographs" in fails("-o", there, "--scale", "2")
     assert "no such file" in fails("-o", there, "--view", tmp_path / "none.json")
     assert "too much memory" in fails("-o", there, "--size", "60000x60000", "--view", "0")
     assert "16,383 pixels a side" in fails("-o", tmp_path / "a.webp", "--size", "16384x1", "--view", "0")
@@ -195,21 +197,21 @@ def test_json_errors_have_a_code(folder: Path, tmp_path: Path) -> None:
     assert json.loads(done.stdout)["error"]["code"] == "invalid-views"
 
 
-def test_an_interrupted_film_leaves_nothing(folder: Path, tmp_path: Path) -> None:
+def test_an_interrupted_animation_leaves_no_file(folder: Path, tmp_path: Path) -> None:
     words = ["render", folder / "a.ply", "--orbit", "--frames", "3600", "-o", tmp_path / "a.webp"]
     with subprocess.Popen([KISSGS, *map(str, words)], stderr=subprocess.PIPE) as process:
         time.sleep(4)
         process.send_signal(signal.SIGINT)
         _, message = process.communicate(timeout=20)
     assert process.returncode == 130
-    assert message.decode() == "kissgs: interrupted; nothing half-written is left\n"
+    assert message.decode() == "kissgs: interrupted; no partial file is left\n"
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_bar_hears_of_kernels_as_often_as_they_are_loaded(
+def test_the_progress_bar_accepts_several_kernels_stages(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A second "kernels" stage once ended in "threads can only be started once"."""
+    """Regression: a second "kernels" stage raised "threads can only be started once"."""
     monkeypatch.setattr(console, "SLOW_START_SECONDS", 0.05)
     with console.progress_bar(False) as progress:
         for slow in (True, False, True):
@@ -221,7 +223,20 @@ def test_a_bar_hears_of_kernels_as_often_as_they_are_loaded(
     assert capsys.readouterr().err.count("compiling kernels") == 2
 
 
-def test_warming_up_compiles_what_renders_and_what_encodes() -> None:
+def test_the_clock_of_the_progress_bar_runs_through_all_stages(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Regression: it stopped for good when the first stage was complete."""
+    now = 0.0
+    monkeypatch.setattr(console, "Console", partial(Console, force_terminal=True, get_time=lambda: now))
+    with console.progress_bar(False) as progress:
+        progress("read", 1.0)
+        now = 75.0
+        progress("order", 0.5)
+    assert "0:01:15" in capsys.readouterr().err
+
+
+def test_warmup_loads_the_kernels_of_encoder_and_rasteriser() -> None:
     lines = (
         "import sys; from kissgs.cli.app import warmup; warmup(); "
         "print(*(name in sys.modules for name in ('kissgs.planning.kernels', 'kissgs.rendering.cpu.frame')))"

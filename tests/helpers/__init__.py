@@ -1,1 +1,1 @@
-"""What several test modules share: scenes, reference implementations, a running service, a browser."""
+"""Shared test helpers: scenes, reference implementations, a running service, a browser."""

@@ -1,4 +1,4 @@
-"""Measurements that nobody made."""
+"""Made-up measurements."""
 
 from helpers.captured_scene import cameras
 from kissgs.benchmark.results import Measured, Run
@@ -26,22 +26,24 @@ def run(seconds=1.0, size=1000, memory=10**8, stages=None):
     )
 
 
-def likeness(psnr):
+def image_metrics(psnr):
     return ImageMetrics(psnr=psnr, ssim=0.9)
 
 
 def evaluation(psnr, photo=None):
-    reference = None if photo is None else likeness(32.0)
-    seen = Comparison(reference=reference, candidate=likeness(photo or psnr), candidate_vs_reference=likeness(psnr))
+    reference = None if photo is None else image_metrics(32.0)
+    seen = Comparison(
+        reference=reference, candidate=image_metrics(photo or psnr), candidate_vs_reference=image_metrics(psnr)
+    )
     view = ViewComparison(view=VIEW, comparison=seen)
     about = {"against": "renderings", "split": "test", "source": "nowhere", "background": black()}
     return Evaluation(**about, reference_count=30, candidate_count=30, views=(view,))
 
 
 def measured(
-    encoder, size, psnr, *, photo=None, quality_offset_db=None, peer=False, runs=None, gaussians=30, seconds=1.0
+    encoder, size, psnr, *, photo=None, quality_offset_db=None, external=False, runs=None, gaussians=30, seconds=1.0
 ):
-    files = {encoder: size} if peer else dict.fromkeys(FILES, size // len(FILES))
+    files = {encoder: size} if external else dict.fromkeys(FILES, size // len(FILES))
     return Measured(
         scene="scene.ply",
         encoder=encoder,
@@ -55,17 +57,17 @@ def measured(
 
 
 def many(photo=False):
-    """Presets, a curve and two peers."""
+    """Return rows of the presets, a quality curve and two external codecs."""
 
-    def shot(psnr):
+    def photo_psnr(psnr):
         return psnr - 10 if photo else None
 
     return [
-        measured("fast", 1000, 36.0, photo=shot(36.0), seconds=0.5),
-        measured("balanced", 700, 40.0, photo=shot(40.0), seconds=5.0),
-        measured("small", 690, 39.9, photo=shot(39.9), seconds=6.0),
-        measured("balanced", 400, 34.0, photo=shot(34.0), quality_offset_db=-6.0),
-        measured("balanced", 1600, 46.0, photo=shot(46.0), quality_offset_db=6.0),
-        measured("sog", 2000, 43.0, photo=shot(43.0), peer=True, seconds=99.0),
-        measured("spz", 1500, 30.0, photo=shot(30.0), peer=True, seconds=0.2),
+        measured("fast", 1000, 36.0, photo=photo_psnr(36.0), seconds=0.5),
+        measured("balanced", 700, 40.0, photo=photo_psnr(40.0), seconds=5.0),
+        measured("small", 690, 39.9, photo=photo_psnr(39.9), seconds=6.0),
+        measured("balanced", 400, 34.0, photo=photo_psnr(34.0), quality_offset_db=-6.0),
+        measured("balanced", 1600, 46.0, photo=photo_psnr(46.0), quality_offset_db=6.0),
+        measured("sog", 2000, 43.0, photo=photo_psnr(43.0), external=True, seconds=99.0),
+        measured("spz", 1500, 30.0, photo=photo_psnr(30.0), external=True, seconds=0.2),
     ]

@@ -16,7 +16,7 @@ SIZE = (60, 40)
 
 
 def damaged(scene=SCENE, amount=0.3, seed=0):
-    """Colours and sizes with noise on them."""
+    """Return the scene with noise on its colours and scales."""
     rng = np.random.default_rng(seed)
     arrays = {name: getattr(scene, name).copy() for name in ATTRIBUTES}
     for name in ("sh0", "scales"):
@@ -34,22 +34,22 @@ def cameras(test=3, train=2, background=(0, 0, 0), size=SIZE):
     return Views(tuple(views[test:]), tuple(views[:test]), np.array(background, np.float32), "cameras by hand")
 
 
-def picture(scene, view, background=(0, 0, 0)):
+def rendered_view(scene, view, background=(0, 0, 0)):
     return np.clip(render(scene, view.camera, background=background)[0], 0, 1)
 
 
 def write_capture(folder, names=("a.png", "b.png", "c.png"), noise=0.05, size=SIZE):
-    """Photographs of the scene, as a noisy camera would take them, and their transforms.json; a.png is held out."""
+    """Write noisy photographs of the scene and their transforms.json; a.png is held out."""
     rng = np.random.default_rng(1)
     (folder / "images").mkdir(parents=True)
     frames = []
     for i, name in enumerate(names):
-        shot = camera(0.4 * i, size)
-        image = render(SCENE, shot)[0] + rng.normal(0, noise, (size[1], size[0], 3))
+        pose = camera(0.4 * i, size)
+        image = render(SCENE, pose)[0] + rng.normal(0, noise, (size[1], size[0], 3))
         Image.fromarray(np.rint(255 * image.clip(0, 1)).astype(np.uint8)).save(folder / "images" / name)
-        matrix = np.linalg.inv(shot.viewmat) @ np.diag([1.0, -1, -1, 1])
+        matrix = np.linalg.inv(pose.viewmat) @ np.diag([1.0, -1, -1, 1])
         frames.append({"file_path": f"images/{name}", "transform_matrix": matrix.tolist()})
-    focal = float(shot.K[0, 0])
+    focal = float(pose.K[0, 0])
     document = {"fl_x": focal, "w": size[0], "h": size[1], "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(document))
     return folder

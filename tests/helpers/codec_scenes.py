@@ -1,4 +1,4 @@
-"""Small scenes for the codec's tests, made by hand rather than by the library."""
+"""Small scenes for the tests of the codec, made without the library."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats
 PRESETS = ("fast", "balanced", "small", "paper")
 
 GLANCE = {"sensitivity_views": 4, "sensitivity_view_size": 48}
-"""A look at a small scene that is soon over."""
+"""Settings that measure the sensitivity of a small scene quickly."""
 
 PLANES = (
     "active_mask",
@@ -33,7 +33,7 @@ def unit(quats):
 
 
 def random_scene(count, degree=0, seed=0):
-    """A clean scene with heavy tails: every attribute drawn on its own, so that nothing helps an encoder."""
+    """Return a clean scene with heavy tails and independent attributes, which have no redundancy for an encoder."""
     rng = np.random.default_rng(seed)
     coefficients = SH_REST_COUNTS[degree]
     return Splats(
@@ -47,12 +47,12 @@ def random_scene(count, degree=0, seed=0):
 
 
 def constant_scene(count, degree=0):
-    """Gaussians that are all the same."""
+    """Return equal Gaussians."""
     return random_scene(1, degree, seed=9).select(np.zeros(count, dtype=np.int64))
 
 
 def replaced(splats, **arrays):
-    """The scene with some arrays exchanged; they are cast to float32."""
+    """Return the scene with some arrays replaced, cast to float32."""
     new = {name: np.asarray(array, dtype=np.float32) for name, array in arrays.items()}
     return Splats(**{name: new.get(name, getattr(splats, name)) for name in ATTRIBUTES})
 
@@ -77,7 +77,7 @@ def product(p, q):
 
 
 def equivalents(quats, scales):
-    """All 48 ways to write each Gaussian, (48, N, 4) and (48, N, 3), from SciPy's list of the cube's rotations.
+    """Return all 48 equivalent forms of each Gaussian, (48, N, 4) and (48, N, 3), from SciPy's rotations of the cube.
 
     A rotation M of the cube takes axis i to ± axis p: R M has the old column p as its column i, up to its sign, so the
     new scale i is the old scale p.
@@ -93,25 +93,29 @@ def equivalents(quats, scales):
 
 
 def signed_log(x):
-    """In float64."""
+    """Return sign(x) ln(1 + |x|) in float64."""
     wide = np.asarray(x, np.float64)
     return np.sign(wide) * np.log1p(np.abs(wide))
 
 
 def rounding(values):
-    """What the rounding of values, ranges and steps to float32 may cost, by the largest of the values."""
+    """Return the error that rounding of values, ranges and steps to float32 may cause, by the largest value."""
     return 1e-6 * np.abs(values).max(initial=0) + 1e-44
 
 
-def assert_within(found, wanted, half_steps):
-    """No value is further off than half its step."""
-    excess = np.abs(np.asarray(found, np.float64) - wanted) - np.asarray(half_steps) * (1 + 1e-6)
+def assert_within(found, wanted, max_quantization_error):
+    """Assert that no error is larger than half a step."""
+    excess = np.abs(np.asarray(found, np.float64) - wanted) - np.asarray(max_quantization_error) * (1 + 1e-6)
     assert excess.max(initial=0) <= rounding(wanted)
 
 
 def assert_round_trip(splats, result):
-    """Each Gaussian comes back within the half steps that the report states, in one of its equivalent forms."""
-    found, wanted, half = kissgs.decompress(result.files), splats.select(result.order), result.report.half_steps
+    """Assert that each Gaussian decodes within the half steps of the report, in one of its equivalent forms."""
+    found, wanted, half = (
+        kissgs.decompress(result.files),
+        splats.select(result.order),
+        result.report.max_quantization_error,
+    )
     assert_within(signed_log(found.means), signed_log(wanted.means), half["means"])
     assert_within(found.opacities, wanted.opacities, half["opacities"][0])
     assert_within(found.sh0, wanted.sh0, half["f_dc"])

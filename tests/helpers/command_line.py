@@ -1,18 +1,37 @@
-"""The command ``kissgs`` as a user runs it."""
+"""The command ``kissgs``, run in this process, where modules are imported and kernels loaded once for all tests.
+
+Tests of signals, pipes and start-up run the executable ``KISSGS`` as a process of its own.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import os
+import signal
 import subprocess
 import sys
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
+
+from kissgs.cli.main import main
 
 KISSGS = Path(sys.executable).with_name("kissgs")
 
 
 def run(*words: object, stdin: bytes = b"", cwd: Path | None = None) -> subprocess.CompletedProcess[bytes]:
-    return subprocess.run(
-        [KISSGS, *map(str, words)], input=stdin, capture_output=True, cwd=cwd, timeout=120, check=False
-    )
+    """Run ``kissgs WORDS`` with these bytes on standard input and return the exit code and both outputs."""
+    arguments = ["kissgs", *map(str, words)]
+    with tempfile.TemporaryFile() as given, tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+        given.write(stdin)
+        given.seek(0)
+        with _process_state(), _standard_files(given, out, err), contextlib.chdir(cwd or Path.cwd()):
+            sys.argv = arguments
+            code = _exit_code()
+        out.seek(0)
+        err.seek(0)
+        return subprocess.CompletedProcess(arguments, code, out.read(), err.read())
 
 
 def failure(*words: object, stdin: bytes = b"", cwd: Path | None = None) -> str:
@@ -23,3 +42,49 @@ def failure(*words: object, stdin: bytes = b"", cwd: Path | None = None) -> str:
     assert len(lines) == 1, lines
     assert lines[0].startswith("kissgs: ")
     return lines[0]
+
+
+def _exit_code() -> int:
+    code: object = 0
+    try:
+        main()
+    except SystemExit as end:
+        code = end.code or 0
+    assert isinstance(code, int), code
+    return code
+
+
+@contextlib.contextmanager
+def _process_state() -> Iterator[None]:
+    """Restore what the command changes of the process: arguments, signal handlers, the hook for lost exceptions."""
+    arguments, hook = sys.argv, sys.unraisablehook
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        sys.argv, sys.unraisablehook = arguments, hook
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _standard_files(*files: BinaryIO) -> Iterator[None]:
+    """Put files in the place of standard input, output and error, for Python and for libraries in C."""
+    before = sys.stdin, sys.stdout, sys.stderr
+    sys.stdout.flush()
+    sys.stderr.flush()
+    copies = [os.dup(number) for number in range(3)]
+    for number, file in enumerate(files):
+        os.dup2(file.fileno(), number)
+    sys.stdin, sys.stdout, sys.stderr = (
+        os.fdopen(number, mode, encoding="utf-8", closefd=False) for number, mode in enumerate("rww")
+    )
+    try:
+        yield
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        sys.stdin, sys.stdout, sys.stderr = before
+        for number, copy in enumerate(copies):
+            os.dup2(copy, number)
+            os.close(copy)

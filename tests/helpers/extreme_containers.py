@@ -1,4 +1,4 @@
-"""Containers of the extremes, and how far what comes out of them is from oracles: one number for each."""
+"""Containers of the extremes, and the errors of decoded scenes against oracles: one number for each."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FIELDS = ("opacities", "scales", "quaternions", "f_dc")
 
 
 def ply_of(arrays):
-    """A .ply whose properties are float64."""
+    """Return a .ply of float64 properties."""
     count = len(arrays["means"])
     rest = arrays["shN"].transpose(0, 2, 1).reshape(count, -1)
     names = ["x", "y", "z", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(rest.shape[1])), "opacity"]
@@ -41,7 +41,7 @@ def ply_of(arrays):
 
 @functools.cache
 def given(name):
-    """The scene as a user has it: a scene of float32, or the bytes of a file."""
+    """Return the scene as a user gives it: float32 arrays, or the bytes of a file."""
     extreme = BY_NAME[name]
     arrays = extreme.arrays()
     if extreme.as_ply:
@@ -52,7 +52,7 @@ def given(name):
 
 @functools.cache
 def scene(name):
-    """What cleaning leaves of it, and its report."""
+    """Return the cleaned scene and the report of cleaning."""
     source = given(name)
     if isinstance(source, bytes):
         source = read_ply(source)
@@ -61,7 +61,7 @@ def scene(name):
 
 @functools.cache
 def chosen(name, preset):
-    """Its levels; where bits are weighed, by what the row's camera sees."""
+    """Return the plan of a row; with rate-distortion planning, sensitivity is that of the row's camera."""
     splats, settings = scene(name)[0], encode_settings(preset)
     sensitivity = None
     if settings.rate_distortion:
@@ -76,23 +76,23 @@ def encode_settings(preset):
 
 @functools.cache
 def packed(name, preset):
-    """Its container."""
+    """Return the container of a row."""
     return write_files(chosen(name, preset), scene(name)[0], encode_settings(preset), threads=1)
 
 
 def largest(*errors):
-    """Of numbers and arrays; NaN is worse than anything."""
+    """Return the largest of numbers and arrays; infinity if one is NaN."""
     worst = [float(np.max(error, initial=0)) for error in errors]
     return math.inf if any(math.isnan(error) for error in worst) else max(worst, default=0.0)
 
 
 def fast(name):
-    """Largest error of an attribute that comes back, in half steps as the report states them."""
+    """Return the largest error of a decoded attribute, in the half steps that the report states."""
     return _share(scene(name)[0], packed(name, "fast"), "fast")
 
 
 def balanced(name):
-    """The same where bits are weighed: there the report states the largest error that there is."""
+    """Return the largest error with rate-distortion planning, in the largest errors that the report states."""
     return _share(scene(name)[0], packed(name, "balanced"), "balanced")
 
 
@@ -120,7 +120,7 @@ def _share(splats, result, preset):
 
 
 def decode(name):
-    """Largest difference to the oracle's decoder, in ranges of the attribute (positions: in 1 + |x|)."""
+    """Return the largest difference to the oracle's decoder, in ranges of the attribute (positions: in 1 + |x|)."""
     return largest(*(_decode(packed(name, preset).files) for preset in PRESETS))
 
 
@@ -142,7 +142,7 @@ def _decode(files):
 
 
 def levels(name):
-    """How many levels of the round trip of fine-tuning are not those of the container; infinite if gradients are."""
+    """Return how many levels of fine-tuning's quantised scene differ from the container; infinite if a gradient is."""
     return float(sum(_levels(scene(name)[0], chosen(name, preset), encode_settings(preset)) for preset in PRESETS))
 
 
@@ -168,15 +168,15 @@ def _levels(splats, choice, settings):
 
 @functools.cache
 def browsers():
-    """Of all rows, from one process of Node: ulps between JavaScript and Python; infinite if levels differ."""
+    """Return the difference of JavaScript and Python for all rows, ulps; infinite if levels differ."""
     from helpers import web_scenes
 
     files = [dict(packed(name, preset).files) for name in BY_NAME for preset in PRESETS]
     said = web_scenes.in_node(*(web_scenes.job(some, options={"keepPlanes": True}) for some in files))
     found = []
-    for told, some in zip(said, files, strict=True):
+    for answer, some in zip(said, files, strict=True):
         try:
-            found.append(float(web_scenes.assert_scene(told, some)))
+            found.append(float(web_scenes.assert_scene(answer, some)))
         except AssertionError:
             found.append(math.inf)
     return {name: max(found[2 * n : 2 * n + 2]) for n, name in enumerate(BY_NAME)}

@@ -26,13 +26,13 @@ def cloud(count=12, degree=1, seed=5) -> Arrays:
 
 
 def changed(**arrays) -> Arrays:
-    """The cloud with other values; what is smaller is repeated."""
+    """Return the cloud with other values, broadcast to its shapes."""
     before = cloud()
     return before | {name: np.broadcast_to(value, before[name].shape).astype(float) for name, value in arrays.items()}
 
 
 def with_values(attribute, *values) -> Arrays:
-    """The cloud, the first numbers of the first Gaussians of an attribute exchanged."""
+    """Return the cloud with the first numbers of an attribute's first Gaussians replaced."""
     arrays = cloud()
     for n, value in enumerate(values):
         arrays[attribute].reshape(12, -1)[n, 0] = value  # a view
@@ -40,17 +40,17 @@ def with_values(attribute, *values) -> Arrays:
 
 
 def camera() -> Camera:
-    """Sees the cloud."""
+    """Return a camera that sees the cloud."""
     return render_scenes.camera(48, 32)
 
 
 def small() -> Camera:
-    """The same, in fewer pixels."""
+    """Return a camera that sees the cloud in fewer pixels."""
     return render_scenes.camera(24, 16)
 
 
 def straight() -> Camera:
-    """Its axes are those of the world, so that equal z are equal depths to the last bit."""
+    """Return a camera with the axes of the world, so that equal z are bit-identical depths."""
     pose = np.eye(4)
     pose[2, 3] = 3
     return Camera(pose, np.array([[60.0, 0, 24], [0, 60.0, 16], [0, 0, 1]]), 48, 32)
@@ -73,7 +73,7 @@ def micrometre():
 
 
 def microscope():
-    """Nothing nearer than 0.01 is drawn, so it looks from there, through a narrow opening."""
+    """Return a camera at a distance of 0.02 with a narrow field of view: nothing nearer than 0.01 is drawn."""
     return _seen_from([0, 0, -0.02], [0, 0, 0], 1.2e-4)
 
 
@@ -184,7 +184,7 @@ def long_quaternions():
 
 
 def no_numbers():
-    """Of 26 Gaussians, NaN in one number of each attribute, and both infinities where they have no meaning."""
+    """Return 26 Gaussians with NaN in one number of each attribute, and with infinities where these are invalid."""
     arrays, n = cloud(26), 0
     for name, values in arrays.items():
         infinite = () if name in ("scales", "opacities") else (np.inf, -np.inf)
@@ -258,7 +258,7 @@ def two_heaps():
     return {name: values + 1e-6 * rng.integers(0, 2, (24, *values.shape[1:])) for name, values in heap.items()}
 
 
-# In pictures
+# In images
 
 
 def ties():

@@ -1,4 +1,4 @@
-"""The stages, and how far each is from its oracle in float64: one number for each extreme, 0 where there is nothing."""
+"""The stages, and their errors against float64 oracles: one number for each extreme, 0 for an empty scene."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from kissgs.training.loop import threads_of_torch
 
 
 def clean(name):
-    """Largest difference of the cleaned scene, of values above 1 relative; infinite where a count is another."""
+    """Largest difference of the cleaned scene, relative for values above 1; infinite if a count is wrong."""
     extreme, (found, report) = BY_NAME[name], scene(name)
     rows, counts = reference_float64.cleaned(extreme.arrays())
     stated = {change: count for change, count in report.as_dict().items() if count}
@@ -35,7 +35,7 @@ def clean(name):
     return largest(*errors)
 
 
-def picture(name):
+def image_error(name):
     """Largest difference of a pixel to the naive rasteriser, of colours beyond 1 relative to the brightest."""
     splats, view = scene(name)[0], BY_NAME[name].camera()
     expected = reference_rasterizer.draw(in_float64(splats), view, np.array(BACKGROUND))
@@ -56,10 +56,10 @@ def gradient(name):
     wanted, rng = reference_float64.tensors(splats, leaf=True), np.random.default_rng(1)
     expected = reference_float64.draw(wanted, view, BACKGROUND)
     weights = torch.from_numpy(rng.normal(0, 1, (view.height, view.width, 4)) * expected.sure[:, :, None])
-    _weighed(expected.image, expected.alpha, weights).backward()
+    _weighted(expected.image, expected.alpha, weights).backward()
     found = {attribute: tensor.clone().requires_grad_() for attribute, tensor in tensors_of(splats).items()}
     images, alphas = rasterize(**found, **_camera(view))
-    _weighed(images[0], alphas[0], weights).backward()
+    _weighted(images[0], alphas[0], weights).backward()
     return relative(*({key: tensor.grad for key, tensor in leaves.items()} for leaves in (found, wanted)), splats, view)
 
 
@@ -74,7 +74,7 @@ def _camera(view):
     }
 
 
-def _weighed(image, alpha, weights):
+def _weighted(image, alpha, weights):
     return (image * weights[:, :, :3]).sum() + (alpha * weights[:, :, 3]).sum()
 
 
@@ -125,7 +125,7 @@ STAGES = {
     "fast": fast,
     "balanced": balanced,
     "decode": decode,
-    "picture": picture,
+    "image": image_error,
     "gradient": gradient,
     "score": score,
     "rank": rank,

@@ -1,4 +1,4 @@
-"""The extremes: of each what is given, what is promised there, a small scene, a camera that sees it, and bounds."""
+"""The extremes: input, promised behaviour, a small scene, a camera that sees it, and error bounds of each."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ BOUNDS = {
     "fast": 1.0,
     "balanced": 1.0,
     "decode": 2e-7,
-    "picture": 5e-6,
+    "image": 5e-6,
     "gradient": 2e-5,
     "score": 2e-5,
     "rank": 2e-6,
@@ -22,7 +22,7 @@ BOUNDS = {
     "levels": 0.0,
     "browser": 1.0,
 }
-"""What is promised of each stage, unless a row says otherwise."""
+"""Error bound of each stage, unless a row has its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,7 @@ class Extreme:
     as_ply: bool = False
 
     def bound(self, stage: str) -> float:
-        """What is promised of a stage here."""
+        """Return the error bound of a stage."""
         return {**BOUNDS, **self.bounds}[stage]
 
 
@@ -67,7 +67,7 @@ EXTREMES = [
         "kept, but float32 has no more than 16 places in 1 there",
         extreme_scenes.displaced,
         extreme_scenes.displaced_camera,
-        bounds={"step": 5e-2},  # positions cannot move, so the next pictures differ a little
+        bounds={"step": 5e-2},  # positions cannot move, so the next images differ a little
     ),
     Extreme("1e15", "positions from 1e-6 to 1e15", "kept; nothing beyond 1e10 is drawn", extreme_scenes.up_to_1e15),
     Extreme(
@@ -174,7 +174,7 @@ EXTREMES = [
     Extreme(
         "outliers",
         "one outlier in each attribute",
-        "kept; base colours far outside are pulled in",
+        "kept; base colours far outside are clipped",
         extreme_scenes.outliers,
     ),
     Extreme("two-heaps", "two heaps in every attribute, 1e-6 apart", KEPT, extreme_scenes.two_heaps),
@@ -199,7 +199,7 @@ EXTREMES = [
         )
         for degree in (0, 1, 2, 3)
     ),
-    # In pictures
+    # In images
     Extreme("ties", "equal depths", "drawn in the scene's order", extreme_scenes.ties, extreme_scenes.straight),
     Extreme(
         *("near-ties", "depths that float32 cannot tell apart", "drawn in the scene's order"),
@@ -215,5 +215,5 @@ EXTREMES = [
         *("near-plane", "on the camera plane, behind it, and about 0.01 before it", "nearer than 0.01: not drawn"),
         extreme_scenes.near_plane,
     ),
-    Extreme("beside", "none in the picture", "not drawn, gradient and score 0", extreme_scenes.beside),
+    Extreme("beside", "none in the image", "not drawn, gradient and score 0", extreme_scenes.beside),
 ]

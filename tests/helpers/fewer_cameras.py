@@ -1,10 +1,10 @@
-"""Fewer camera candidates, for tests that are about something else."""
+"""Fewer camera candidates, for tests of other things."""
 
 from kissgs.cameras.virtual import candidates, select
 
 
 def try_fewer(patch, azimuths=8, radii=(1.1, 2.6)):
-    """Of the several hundred thumbnails, some dozens: for checks that do not hang on how many cameras were tried."""
+    """Reduce the camera candidates to some dozens, for tests that do not depend on their number."""
     patch.setattr(candidates, "AZIMUTHS", azimuths)
     for module in (candidates, select):
         patch.setattr(module, "WAYS_TO_LOOK", 4)

@@ -1,4 +1,4 @@
-"""A Chromium that draws WebGL in software, and what the tests of the preview page do with it again and again."""
+"""A Chromium with software WebGL, and common actions of the tests of the preview page."""
 
 import base64
 import io
@@ -41,7 +41,7 @@ window.books = () => {
   return { contexts: alive.length, textures: alive.reduce((sum, [, textures]) => sum + textures, 0), frames };
 };
 """
-"""Keeps the books of what the page holds: contexts that live, their textures, frames asked for so far."""
+"""Script that counts live WebGL contexts, their textures and requested animation frames."""
 
 
 @pytest.fixture(scope="module")
@@ -100,23 +100,23 @@ class Preview:
         return self
 
     def shown(self, gaussians):
-        """Once the scene is there, and its picture final."""
+        """Wait for the scene and its final image; return that."""
         self.fact("Gaussians", f"{gaussians:,}")
         self.page.locator("#loading").wait_for(state="hidden")
         self.page.locator("#picture").wait_for()
-        return self.picture()
+        return self.still_image()
 
     def fact(self, name, value):
         exactly = re.compile(f"^{re.escape(name)}{re.escape(value)}$")
         self.page.locator("#statistics .facts > div").filter(has_text=exactly).wait_for()
 
     def pixels(self):
-        """What is seen of the canvas, with all that lies over it."""
-        shot = self.page.locator("#stage").screenshot(animations="disabled")
-        return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
+        """Return a screenshot of the canvas and everything over it."""
+        screenshot = self.page.locator("#stage").screenshot(animations="disabled")
+        return np.asarray(Image.open(io.BytesIO(screenshot)).convert("RGB")).astype(int)
 
-    def picture(self, seconds=20, still=3):
-        """The same, once that many looks at it, 0.2 s apart, were alike: Spark may still be sorting for a while."""
+    def still_image(self, seconds=20, still=3):
+        """Return a screenshot once ``still`` ones, 0.2 s apart, are equal: Spark may still be sorting."""
         end = time.monotonic() + seconds
         seen = [self.pixels()]
         while time.monotonic() < end:
@@ -124,7 +124,7 @@ class Preview:
             seen = [*seen[1 - still :], self.pixels()]
             if len(seen) == still and all(np.array_equal(seen[0], other) for other in seen[1:]):
                 return seen[-1]
-        raise AssertionError("the picture does not come to rest")
+        raise AssertionError("the image does not become still")
 
     def health_problem(self, *words):
         """The one sentence, which has these words."""
@@ -144,7 +144,7 @@ class Preview:
         chooser.value.set_files([{"name": name, "mimeType": kind, "buffer": data} for name, data in files])
 
     def drop(self, *files):
-        """As a hand would: over the page, then let go."""
+        """Drag files over the page and drop them."""
         pairs = [[name, base64.b64encode(data).decode()] for name, data in files]
         transfer = self.page.evaluate_handle(
             """(files) => {
@@ -178,9 +178,9 @@ def preview(software_browser):
 
 
 def looks_like(one, other):
-    """PSNR of two pictures."""
+    """Return the PSNR of two images."""
     return -10 * np.log10(max(np.mean((one - other) ** 2) / 255**2, 1e-10))
 
 
-def colours(picture):
-    return len(np.unique(picture.reshape(-1, 3), axis=0))
+def colours(image):
+    return len(np.unique(image.reshape(-1, 3), axis=0))

@@ -7,7 +7,7 @@ from kissgs.core.sensitivity import Sensitivity
 from kissgs.sogxt.encode import encode
 
 
-def made_up(splats, seed=0, spread=2.0):
+def random_sensitivity(splats, seed=0, spread=2.0):
     """Sensitivity of random size; each shape's form a random positive one."""
     rng = np.random.default_rng(seed)
     count = len(splats)
@@ -26,5 +26,5 @@ def made_up(splats, seed=0, spread=2.0):
     )
 
 
-def weighed(splats, sensitivity, **changes):
+def encode_rd(splats, sensitivity, **changes):
     return encode(splats, Settings.from_preset("balanced", **changes).encode, sensitivity=sensitivity)

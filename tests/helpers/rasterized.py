@@ -1,4 +1,4 @@
-"""Images by the differentiable rasteriser, with the tensors they came from."""
+"""Images of the differentiable rasteriser, with the parameters they were rendered from."""
 
 import numpy as np
 import torch
@@ -9,8 +9,8 @@ from kissgs.rendering.differentiable import rasterize
 from kissgs.rendering.tensors import tensors_of
 
 
-def pictures(splats, cameras, device="cpu", backgrounds=None, **parameters):
-    """Images and alphas as tensors, and the parameters they came from."""
+def render_tensors(splats, cameras, device="cpu", backgrounds=None, **parameters):
+    """Return images and alphas as tensors, and the parameters they were rendered from."""
     tensors = {name: tensor.clone().requires_grad_() for name, tensor in tensors_of(splats, device).items()}
     images, alphas = rasterize(
         **tensors,
@@ -27,7 +27,7 @@ def pictures(splats, cameras, device="cpu", backgrounds=None, **parameters):
 
 
 def all_is_finite(splats, view):
-    images, alphas, tensors = pictures(splats, [view], backgrounds=[[1.0, 0.5, 0.0]])
+    images, alphas, tensors = render_tensors(splats, [view], backgrounds=[[1.0, 0.5, 0.0]])
     assert torch.isfinite(images).all()
     assert torch.isfinite(alphas).all()
     assert ((alphas >= 0) & (alphas <= 1)).all()

@@ -23,7 +23,7 @@ PINHOLE = ("PINHOLE", 120, 80, (110.0, 115.0, 61.0, 39.5))
 
 @dataclass
 class Pose:
-    """From the world to the camera."""
+    """World-to-camera pose."""
 
     name: str
     rotation: Rotation
@@ -87,7 +87,7 @@ def write_text(folder: Path, cameras: dict, images: list[Pose]):
 
 
 def opengl_matrix(pose):
-    """From a camera that looks along -z, y up, to the world."""
+    """Return the camera-to-world matrix of a camera that looks along -z, y up."""
     return (np.linalg.inv(pose.viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()
 
 
@@ -102,7 +102,7 @@ def write_json(path: Path, document):
 
 
 def write_photo(path: Path, width, height, mode="RGB", value=None):
-    """A ramp, so that a photograph can be told from a resized or flipped one."""
+    """Write a ramp, which differs from a resized or flipped one."""
     path.parent.mkdir(parents=True, exist_ok=True)
     y, x = np.mgrid[:height, :width]
     channels = len(mode)

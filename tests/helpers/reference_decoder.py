@@ -1,4 +1,4 @@
-"""Two naive decoders written from the description of the format alone (docs/format.md), as oracles for ours.
+"""Two naive decoders written from the description of the format alone (docs/reference/format.md), as oracles.
 
 ``decode`` does what the paper's Python decoder does: whole arrays, float32, activated values and back.
 ``decode_browser`` does what viewers and other tools do: it looks at ``meta.json`` only, and checks what they check.
@@ -114,7 +114,7 @@ def decode(source):
 
 
 def as_columns(splats):
-    """The same columns of our scene, in float32; SH of missing bands are zero."""
+    """Return the columns of a kissgs scene, in float32; SH of missing bands are zero."""
     count, coefficients = len(splats), splats.shN.shape[1]
     rest = np.zeros((count, 3, 15), dtype=F)
     rest[:, :, :coefficients] = splats.shN.transpose(0, 2, 1)
@@ -136,10 +136,10 @@ def reach_of(ranges, column):
 
 
 def assert_equal_scenes(ours, reference, files):
-    """Our scene equals the oracle's columns, up to float32 rounding: half a millionth of a channel's range.
+    """Assert that a kissgs scene equals the oracle's columns up to float32 rounding, 5e-7 of a channel's range.
 
-    The oracle's detour through opacities o costs it an ulp of o, which is 1.2e-7 * e^logit of the logit; that through
-    scales next to nothing. It is ours that is the better one.
+    The oracle's activation of opacities o costs it an ulp of o, which is 1.2e-7 * e^logit of the logit; that of scales
+    almost nothing.
     """
     ranges = ranges_of(yaml.safe_load(files["container_meta.yaml"]))
     mine = as_columns(ours)
@@ -181,7 +181,7 @@ def check_browser(files):
 
 
 def decode_browser(source, *, means_top=None):
-    """What a viewer shows, float64: quaternions normalised. With ``means_top``, positions are divided by that level."""
+    """Decode as viewers do, in float64, with normalised quaternions; ``means_top`` divides positions by that level."""
     files = as_files(source)
     meta = check_browser(files)
     active = pixels(files, meta["mask"]["files"][0])[:, :, 0].reshape(-1) > 0

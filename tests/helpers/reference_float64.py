@@ -1,7 +1,7 @@
-"""Oracles in float64: cleaning, pictures with gradients, removal, effective rank, training.
+"""Oracles in float64: cleaning, images with gradients, removal, effective rank, training.
 
-The picture is that of reference_rasterizer.py, all pixels at once, so that torch can differentiate it; a
-test compares the two.
+The image is that of reference_rasterizer.py, all pixels at once, so that torch can differentiate it; a test compares
+the two.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ LOGIT = float(np.log(1e-6) - np.log1p(-1e-6))
 
 
 def cleaned(arrays):
-    """What a scene should become, Gaussian by Gaussian, opacities in place of logits; and what has to be counted."""
+    """Return the cleaned scene, Gaussian by Gaussian, opacities instead of logits, and the expected counts."""
     counts = dict.fromkeys(("non_finite", "far_away", "infinite_opacities", "saturated_opacities"), 0)
     counts |= dict.fromkeys(("zero_quats", "unnormalised_quats", "clamped_scales", "clamped_sh"), 0)
     rows = []
@@ -50,10 +50,10 @@ def cleaned(arrays):
 
 
 @dataclass
-class Picture:
+class Rendering:
     image: torch.Tensor  # (H, W, 3)
     alpha: torch.Tensor  # (H, W)
-    sure: np.ndarray  # (H, W): no decision hung on less than float32 can tell
+    sure: np.ndarray  # (H, W): no decision depends on less than float32 can resolve
     order: np.ndarray  # (M,) front to back
     alphas: torch.Tensor  # (M, H W), 0 where not drawn
     colours: torch.Tensor  # (M, 3)
@@ -94,7 +94,7 @@ def exponents(params, camera, W, t):
 
 
 def decisions(raw):
-    """Which are drawn where, where alpha was clamped, where that is doubtful, where a pixel ended."""
+    """Return masks of drawn Gaussians, clamped alphas, pixels that are not doubtful, and pixels that ended early."""
     raw = raw.detach().numpy()
     left, ended, doubtful = np.ones(raw.shape[1]), np.zeros(raw.shape[1], bool), np.zeros(raw.shape[1], bool)
     drawn = np.zeros(raw.shape, bool)
@@ -111,7 +111,7 @@ def decisions(raw):
 
 
 def draw(params, camera, background):
-    """A picture of tensors, float64."""
+    """Render an image from float64 tensors."""
     W, t = torch.from_numpy(camera.viewmat[:3, :3]), torch.from_numpy(camera.viewmat[:3, 3])
     depth = (params["means"].detach() @ W.T + t)[:, 2].numpy()
     order = np.argsort(depth.astype(np.float32), kind="stable")
@@ -125,7 +125,7 @@ def draw(params, camera, background):
     colours = (0.5 + C0 * params["sh0"] + (values[:, :, None] * params["shN"]).sum(1)).clamp_min(0)
     image, left = composed(alphas, colours, torch.as_tensor(background, dtype=torch.float64))
     shape = camera.height, camera.width
-    return Picture(
+    return Rendering(
         image.reshape(*shape, 3),
         (1 - left).reshape(shape),
         sure.reshape(shape),
@@ -144,13 +144,13 @@ def composed(alphas, colours, background):
     return (through[:-1] * alphas).T @ colours + through[-1][:, None] * background, through[-1]
 
 
-def removed(picture, count, background):
-    """Squared change of the picture by the removal of each alone, each pixel's list staying what it is."""
-    alphas, colours = picture.alphas.detach(), picture.colours.detach()
+def removed(rendering, count, background):
+    """Return the squared change of the image by the removal of each Gaussian, with unchanged lists of the pixels."""
+    alphas, colours = rendering.alphas.detach(), rendering.colours.detach()
     background = torch.as_tensor(background, dtype=torch.float64)
     whole, _ = composed(alphas, colours, background)
     scores = np.zeros(count)
-    for place, n in enumerate(picture.order):
+    for place, n in enumerate(rendering.order):
         others = torch.arange(len(alphas)) != place
         without, _ = composed(alphas[others], colours[others], background)
         scores[n] = float((without - whole).square().sum())

@@ -32,7 +32,7 @@ def rotation(quat):
 
 
 def inverse(covariance, transform, R, scales):
-    """Of a footprint's covariance; where float64 cannot tell it, from 120 digits of the same formula."""
+    """Return the determinant of a footprint's covariance; with 120 digits where float64 is not exact enough."""
     if scales.max() - scales.min() < 7 and scales.max() < 7:
         return np.linalg.inv(covariance)
     with localcontext() as context:
@@ -73,7 +73,7 @@ def sh_values(direction, count):
 
 
 def draw(params, camera, background, frozen=None, removed=None, alpha_max=0.99):
-    """``params``: name -> float64 array, as in Splats. ``frozen``: decisions of an earlier picture, kept as they were.
+    """``params``: name -> float64 array, as in Splats. ``frozen``: decisions of an earlier image, kept unchanged.
 
     ``removed``: a Gaussian that is left out. ``alpha_max``: gsplat's releases clamp elsewhere than the rest.
     """

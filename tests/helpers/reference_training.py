@@ -1,4 +1,4 @@
-"""Oracle of training: the loop, the loss and Adam once more, in float64."""
+"""Oracle of training: a second implementation of loop, loss and Adam, in float64."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ STEPS = 3
 RATES = {"means": 1.6e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 0.05, "sh0": 2.5e-3, "shN": 1.25e-4}
 
 
-def lesson(camera):
-    """What the camera should see: stripes, unlike any of the scenes."""
+def stripes(camera):
+    """Return stripes as the training target of the camera, unlike any of the scenes."""
     ys, xs = np.mgrid[0 : camera.height, 0 : camera.width]
-    picture = np.stack([0.5 + 0.4 * np.sin(a * xs + b * ys) for a, b in ((0.3, 0.1), (0.1, 0.4), (0.5, -0.2))], axis=2)
-    return TrainingTargets((camera,), (picture.astype(np.float16),), np.float32([0.25, 0.5, 0.75]), "renderings")
+    image = np.stack([0.5 + 0.4 * np.sin(a * xs + b * ys) for a, b in ((0.3, 0.1), (0.1, 0.4), (0.5, -0.2))], axis=2)
+    return TrainingTargets((camera,), (image.astype(np.float16),), np.float32([0.25, 0.5, 0.75]), "renderings")
 
 
 def trained(splats, camera):
@@ -33,10 +33,10 @@ def trained(splats, camera):
     steepest does: even the sign of these is a matter of rounding.
     """
     away = np.linalg.norm(splats.means.astype(np.float64) - camera.position, axis=1)
-    taught, rates = lesson(camera), RATES | {"means": RATES["means"] * (np.median(away) if len(away) else 1.0)}
+    targets, rates = stripes(camera), RATES | {"means": RATES["means"] * (np.median(away) if len(away) else 1.0)}
     model = GaussianModel(splats)
-    train(model, taught, Plan("step", STEPS, lambda done: rates, 0.2, [0]), threads=1)
-    wanted, clear = oracle(splats, taught, rates)
+    train(model, targets, Plan("step", STEPS, lambda done: rates, 0.2, [0]), threads=1)
+    wanted, clear = oracle(splats, targets, rates)
     worst = 0.0
     for name in ATTRIBUTES:
         found, target = model.parameters[name].detach().numpy(), wanted[name]
@@ -48,16 +48,16 @@ def trained(splats, camera):
     return worst
 
 
-def oracle(splats, taught, rates):
+def oracle(splats, targets, rates):
     """The parameters after the same steps, and which of them have gradients that are clearly not 0."""
     leaves = reference_float64.tensors(splats)
     moments = {name: (torch.zeros_like(leaf), torch.zeros_like(leaf)) for name, leaf in leaves.items()}
     clear = {name: np.ones(leaf.shape, bool) for name, leaf in leaves.items()}
-    target = torch.from_numpy(taught.picture(0)).double()
+    target = torch.from_numpy(targets.picture(0)).double()
     for step in range(1, STEPS + 1):
         params = {name: leaf.clone().requires_grad_() for name, leaf in leaves.items()}
         loss = plain_photometric_loss(
-            reference_float64.draw(params, taught.cameras[0], taught.background).image, target, 0.2
+            reference_float64.draw(params, targets.cameras[0], targets.background).image, target, 0.2
         )
         if loss.requires_grad:
             loss.backward()

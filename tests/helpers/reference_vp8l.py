@@ -1,4 +1,4 @@
-"""A naive reader and a naive writer of VP8L (RFC 9649), bit by bit: what occurs in a stream, and streams by hand."""
+"""A naive reader and a naive writer of VP8L (RFC 9649), bit by bit, to count features and to write streams."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def tiles(size, bits):
 
 @dataclass
 class Facts:
-    """What occurs in a stream."""
+    """Counts of the features that occur in a stream."""
 
     transforms: list = field(default_factory=list)
     modes: Counter = field(default_factory=Counter)
@@ -105,7 +105,7 @@ class Reader:
                 found = self.image(tiles(width, bits), tiles(self.height, bits))
                 if kind == PREDICTOR and width > 1 and self.height > 1:
                     self.facts.modes.update(pixel >> 8 & 15 for pixel in found)
-        self.image(width, self.height, picture=True)
+        self.image(width, self.height, main=True)
 
     def lengths(self, size):
         lengths = [0] * size
@@ -135,10 +135,10 @@ class Reader:
         assert len(lengths) == size
         return lengths
 
-    def image(self, width, height, picture=False):
+    def image(self, width, height, main=False):
         cache_bits = self.read(4) if self.read(1) else 0
         facts, groups, choice, bits = self.facts, 1, [0], 14
-        if picture:
+        if main:
             facts.caches.append(cache_bits)
             if self.read(1):
                 bits = self.read(3) + 2
@@ -254,9 +254,9 @@ class Writer:
         for code, shift in zip(codes, (8, 16, 0, 24), strict=False):
             self.symbol(code, argb >> shift & 255)
 
-    def image(self, pixels, picture=False):
+    def image(self, pixels, main=False):
         """Literals only, without a cache or a choice of codes."""
-        self.put(0, 1 + picture)
+        self.put(0, 1 + main)
         codes = self.literal_codes()
         for argb in pixels:
             self.pixel(codes, int(argb))

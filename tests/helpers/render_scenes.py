@@ -42,7 +42,7 @@ def in_float64(splats):
 
 
 def camera(width=37, height=29, distance=3.0, fov=0.8, seed=None):
-    """At some distance from the origin, looking at it; from a random side if there is a seed."""
+    """Return a camera at a distance from the origin that looks at it; from a random side if there is a seed."""
     direction = np.array([0.1, -0.13, -1.0])
     if seed is not None:
         direction = np.random.default_rng(seed).normal(0, 1, 3)

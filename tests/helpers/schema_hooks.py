@@ -1,4 +1,4 @@
-"""What schemathesis cannot draw from a schema: scenes. It loads this by SCHEMATHESIS_HOOKS."""
+"""Scenes for schemathesis, which cannot derive them from a schema; loaded by SCHEMATHESIS_HOOKS."""
 
 import schemathesis
 from hypothesis import strategies as st

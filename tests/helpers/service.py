@@ -29,11 +29,11 @@ def scene_bytes(gaussians=300, degree=1, seed=0):
 
 
 SMALL = scene_bytes()
-"""Takes a job hardly longer than its process needs to start."""
+"""Scene whose job takes little longer than the start of its process."""
 
 FAST = json.dumps({"preset": "fast"})
 SLOW = json.dumps({"preset": "paper", "encode": {"plas_radius_decay": 0.99, "sh_kmeans_iterations": 50}})
-"""For scenes that are to keep a worker busy."""
+"""Settings that keep a worker busy."""
 
 
 class Service:

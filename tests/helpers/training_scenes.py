@@ -1,4 +1,4 @@
-"""Small scenes and the pictures to train them by."""
+"""Small scenes and their training targets."""
 
 import numpy as np
 
@@ -36,7 +36,7 @@ def around(count=4, size=40):
     return tuple(views)
 
 
-def taught(scene, views=None):
+def targets_of(scene, views=None):
     return training_targets(scene, views or around(), black())
 
 

@@ -1,4 +1,4 @@
-"""Choices to fine-tune, and what they are made of."""
+"""Plans to fine-tune, and their scenes."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ FIELDS = ("means", "opacities", "scales", "quaternions", "f_dc", "f_rest_centroi
 
 
 def chosen(scene, preset="balanced", **changes):
-    """As ``compress`` would choose."""
+    """Return the plan that ``compress`` makes."""
     settings = Settings.from_preset(preset, **changes).encode
     sensitivity = None
     if settings.rate_distortion:
@@ -24,7 +24,7 @@ def chosen(scene, preset="balanced", **changes):
 
 
 def choices():
-    """Of all kinds: weighed or not, of every degree, of few and many, with nothing to choose."""
+    """Return scenes and presets: every planning and SH degree, few and many Gaussians, and constant ones."""
     found = [(cloud(count, degree, seed=count), "balanced") for count in (1, 7, 8, 9) for degree in (0, 1, 2, 3)]
     found += [(cloud(300, degree), preset) for degree in (0, 3) for preset in ("fast", "balanced", "paper")]
     constant = cloud(40, 1).select(np.zeros(40, int))

@@ -126,7 +126,7 @@ def assert_scene(said, files):
     return max(ulps(arrays[name], np.ravel(array)) for name, array in wanted.items())
 
 
-def assert_told(said):
+def assert_progress(said):
     """Progress only grows and ends complete; the mask is first of all, each image comes once."""
     progress = said["progress"]
     for key in ("received", "total", "decoded"):

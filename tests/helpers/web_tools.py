@@ -1,4 +1,4 @@
-"""What the tests of the JavaScript decoder share: Node, Pillow as the judge of pixels, a server."""
+"""Helpers of the tests of the JavaScript decoder: Node, Pillow as the reference for pixels, a server."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def run_node(program, text="", *arguments, timeout=300, flags=()):
 
 
 def decode_all(folder, files, **options):
-    """What ``decodeWebP`` makes of each: dicts of width, height, sha256 and ms, or of name and error."""
+    """Decode each file by ``decodeWebP``: dicts of width, height, sha256 and ms, or of name and error."""
     blob = folder / "files.bin"
     blob.write_bytes(b"".join(files))
     job = {"sizes": [len(data) for data in files], **options}
@@ -70,8 +70,8 @@ def decode_all(folder, files, **options):
 def webp(array, *, exact=True, **options):
     """Lossless WebP by Pillow."""
     buffer = io.BytesIO()
-    picture = Image.fromarray(np.squeeze(array, 2) if array.shape[2] == 1 else array)
-    picture.save(buffer, "WEBP", lossless=True, exact=exact, **options)
+    image = Image.fromarray(np.squeeze(array, 2) if array.shape[2] == 1 else array)
+    image.save(buffer, "WEBP", lossless=True, exact=exact, **options)
     return buffer.getvalue()
 
 
@@ -83,11 +83,11 @@ def as_rgba(array):
 
 
 def pillow(data):
-    """The picture as libwebp has it, four channels; None where it refuses."""
+    """Decode by libwebp to four channels; None if it refuses the file."""
     try:
-        with WebPImagePlugin.WebPImageFile(io.BytesIO(data)) as picture:
-            picture.load()
-            return as_rgba(np.asarray(picture))
+        with WebPImagePlugin.WebPImageFile(io.BytesIO(data)) as image:
+            image.load()
+            return as_rgba(np.asarray(image))
     except (OSError, ValueError, SyntaxError, EOFError, MemoryError, Image.DecompressionBombError):
         return None
 

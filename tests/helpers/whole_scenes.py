@@ -209,7 +209,7 @@ def cameras(
 
 
 def rendered(splats: Splats, camera: Camera) -> Iterator[np.ndarray]:
-    """What a screen shows over each of :data:`BACKGROUNDS`."""
+    """Yield the rendering over each of :data:`BACKGROUNDS`."""
     image, alpha = render(splats, camera, threads=1)
     for background in BACKGROUNDS:
         yield np.clip(image + background * (1 - alpha.reshape(*image.shape[:2], 1)), 0, 1)
