@@ -1,6 +1,6 @@
 # make demo               a service is started, compresses a sample scene, and is stopped; the result is compared
 # make demo SCENE=x.ply   the same with your own
-# make serve              the service, with its page, on http://127.0.0.1:8000 (KISSGS_PORT=… and others: docs/service.md)
+# make serve              the service, with its page, on http://127.0.0.1:8000 (KISSGS_PORT=… and others: docs/guide/service.md)
 # make test               all tests
 # make lint               format, lint, types, import contract; of the JavaScript, format and types
 # make bench              bytes, time, memory and errors of all presets (SCENE=x.ply for your own)

@@ -22,7 +22,8 @@ SUFFIXES = {".css", ".html", ".js", ".json", ".md", ".mjs", ".py", ".svg", ".tom
 
 PRIVATE_WORDS = re.compile(
     r"(?<![a-z])(?:"
-    r"anatomy|at hand|bells?|bold|charges|critics?|economy|envelopes?|exams?|followers?|foretold|gloss(?:y|ier)?|"
+    r"anatomy|at hand|bells?|bold(?![\x22\]]| green)|charges|critics?|economy|envelopes?|exams?|followers?|foretold|"
+    r"gloss(?:y|ier)?|"
     r"hedge[sd]?|hopeless|hurry|janitor|judg(?:e[sd]?|ing|ement)|learners?|lessons?|likeness|modest|negligible|"
     r"outlook|peers?|photographers?|pictures?|pictured|prices?|priced|regrets?|school|semantics|shots?|spare|springs?|"
     r"survey|tam(?:ed|es|ing)|taught|teachers?|tickets?|told|trainees?|wander(?:s|ing)?|weigh(?:s|ed|ing)?|"

@@ -1,4 +1,4 @@
-"""What all tests share."""
+"""Fixtures and shape checks for all tests."""
 
 from pathlib import Path
 
@@ -6,8 +6,8 @@ import helpers.shape_checks  # noqa: F401  # the hook names it
 import pytest
 from jaxtyping import install_import_hook
 
-# The shapes and dtypes in signatures are executed. Not those of Splats, Camera and encode, which have their own
-# sentences for what users hand them, nor of compiled kernels.
+# Shapes and dtypes in the signatures of these modules are checked at run time, except those of Splats, Camera and
+# encode, which have error messages of their own for users, and of compiled kernels.
 ROOT = Path(__file__).parents[1]
 CHECKED = [
     "cameras",
@@ -41,14 +41,14 @@ CHECKED = [
     "synthetic/scene",
 ]
 
-for name in CHECKED:  # a module that has moved is not to go unchecked
+for name in CHECKED:  # a module that has moved must stay checked
     assert (ROOT / "kissgs" / name).is_dir() or (ROOT / "kissgs" / f"{name}.py").is_file(), name
 install_import_hook([f"kissgs.{name.replace('/', '.')}" for name in CHECKED], "helpers.shape_checks.typechecker")
 
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """The folder of real scenes beside this repository. Their licences keep them out of it."""
+    """Return the folder of real scenes beside this repository, which their licences keep out of it."""
     folder = Path(__file__).parents[2] / "shared" / "data"
     if not folder.is_dir():
         pytest.skip("the real scenes (shared/data beside the repository) are not here")

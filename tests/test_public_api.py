@@ -55,13 +55,13 @@ PUBLIC = [
     "save",
     "virtual_views",
 ]
-"""Adding a name is a promise, removing one breaks programs: both are seen here."""
+"""Public names; adding one is a promise, removing one breaks programs."""
 
 HOME = str(Path(kissgs.__file__).parents[1])
 
 
 def fresh(program):
-    """What a new interpreter prints."""
+    """Return the output of a program in a new interpreter."""
     run = subprocess.run(
         [sys.executable, "-P", "-c", program],
         env=os.environ | {"PYTHONPATH": HOME},

@@ -1,4 +1,4 @@
-/** Images of a container to the arrays of a scene. What is done here, the page docs/format.md of kissgs explains. */
+/** Images of a container to the arrays of a scene. docs/reference/format.md of kissgs explains the steps. */
 
 import { crc32 } from "./zip.js";
 

@@ -1,1 +1,1 @@
-"""What everything else is made of: scenes, errors, progress, threads, array types. Imports no other package."""
+"""Basic types: scenes, sensitivity, errors, progress, threads, array types. Imports no other package of kissgs."""

@@ -1,7 +1,7 @@
 """Array types for signatures: dtype and shape, as ``Float32[np.ndarray, "N 3"]``.
 
-They are jaxtyping's, which the tests load first and so execute. At run time nobody evaluates annotations, and without
-it a decoder needs 13 MB less and starts sooner.
+They are jaxtyping's if the tests have loaded it, which check them at run time. Otherwise annotations are not evaluated,
+and without jaxtyping a decoder needs 13 MB less and starts sooner.
 """
 
 import sys
@@ -12,7 +12,7 @@ if TYPE_CHECKING or "jaxtyping" in sys.modules:
 else:
 
     class _Unchecked:
-        """Stands for any of them where nothing is checked."""
+        """Placeholder for the array types when nothing is checked."""
 
         def __class_getitem__(cls, item: object) -> type:
             return cls

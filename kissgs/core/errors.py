@@ -1,16 +1,16 @@
-"""Errors raised by kissgs. Every error that a user's input can cause is in this tree.
+"""Errors raised by kissgs; this tree contains every error that a user's input can cause.
 
 KissgsError
-├─ InvalidSceneError        a scene file, or the arrays handed in, are not a usable Gaussian scene
+├─ InvalidSceneError        a scene file, or the given arrays, are not a usable Gaussian scene
 ├─ InvalidContainerError    the bytes are not a valid SOG-XT container
 ├─ InvalidViewsError        cameras or photographs that cannot be used: COLMAP, transforms.json, images
 ├─ UnsupportedError         valid input beyond a limit or a feature that kissgs does not have
-├─ RemoteError              a kissgs service cannot be reached, or refuses what it was asked
+├─ RemoteError              a kissgs service cannot be reached, or refuses the request
 ├─ OutputError              the result could not be written: it exists already, no space, no permission
 └─ Cancelled                the caller stopped the work through its progress callback
-   └─ StopSearch            its search for a goal: what was found so far will do
+   └─ StopSearch            the caller ended the search for a goal and accepts the best result so far
 
-The message is one sentence for the user: what is wrong, where, and how to mend it.
+The message is one sentence for the user: the problem, its place and the remedy.
 ``code`` is stable: the command line's ``--json`` output and the service use it.
 Any other exception that leaves kissgs is a bug.
 """
@@ -23,7 +23,7 @@ class KissgsError(Exception):
 
 
 class InvalidSceneError(KissgsError):
-    """A scene file, or the arrays handed in, are not a usable Gaussian scene."""
+    """A scene file, or the given arrays, are not a usable Gaussian scene."""
 
     code = "invalid-scene"
 
@@ -47,11 +47,11 @@ class UnsupportedError(KissgsError):
 
 
 class RemoteError(KissgsError):
-    """A kissgs service cannot be reached, or refuses what it was asked.
+    """A kissgs service cannot be reached, or refuses the request.
 
     Attributes:
-        retry_after: seconds after which the same may succeed; None if it never will, or nobody knows.
-        unreachable: whether nobody has answered at all.
+        retry_after: seconds after which a retry may succeed; None if it cannot succeed or the time is unknown.
+        unreachable: whether there was no answer at all.
     """
 
     code = "remote"
@@ -66,16 +66,15 @@ class OutputError(KissgsError):
 
 
 class Cancelled(KissgsError):
-    """The caller stopped the work; nothing was written."""
+    """The caller stopped the work; no output was written."""
 
     code = "cancelled"
 
 
 class StopSearch(Cancelled):
-    """Raised from a progress callback: a search for a goal ends with the best that it has found.
+    """Raised by a progress callback to end a search for a goal with the best result so far.
 
-    Where nothing that meets the goal has been found yet, or nothing is searched for, the work is cancelled; where the
-    search is over already, it is finished.
+    The work is cancelled if no result meets the goal yet or if there is no search, and completed if the search is over.
     """
 
     code = "enough"

@@ -1,9 +1,9 @@
-"""How large the images of a container may be: what encoders keep to and decoders refuse."""
+"""Largest sizes of a container's images; encoders respect them and decoders refuse more."""
 
 from __future__ import annotations
 
 MAX_GRID_SIDE = 13_376
-"""Pillow refuses larger images (a guard against decompression bombs); WebP itself ends at 16383."""
+"""Largest side of the grid, pixels: Pillow refuses larger images as decompression bombs; WebP's limit is 16383."""
 
 MAX_CODEBOOK_SIDE = 256
-"""Labels have two 8-bit coordinates."""
+"""Largest side of the codebook's tiles, pixels: labels have two 8-bit coordinates."""

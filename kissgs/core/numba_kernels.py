@@ -1,7 +1,7 @@
-"""How inner loops are compiled: numba, ahead of the first call, holding no GIL and starting no threads.
+"""Compilation of inner loops by numba, on import, without the GIL and without threads of their own.
 
-Kernels have explicit signatures, so importing their module compiles them or loads them from the cache that numba keeps
-per user. Constants are literals inside the functions, because that cache would not notice a changed global.
+Kernels have explicit signatures, so importing their module compiles them or loads them from numba's per-user cache.
+Constants are literals inside the functions, because that cache does not notice a changed global.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
 
 def compiled(signature: str, **options: Any) -> Callable[[Kernel], Kernel]:  # noqa: ANN401
-    """numba's njit, cached where numba finds a folder that it may write, else compiled anew by every process."""
+    """Compile with numba's njit; cached if numba finds a writable folder, else compiled by every process."""
 
     def decorate(function: Kernel) -> Kernel:
         common = {"nogil": True, "error_model": "numpy", **options}

@@ -1,4 +1,4 @@
-"""``Sensitivity``: what a change of each stored value costs in the pictures of a scene, whoever measured it."""
+"""``Sensitivity``: the squared image error that changes of the stored parameters cause."""
 
 from __future__ import annotations
 
@@ -11,40 +11,40 @@ from kissgs.core.errors import InvalidSceneError
 from kissgs.core.splats import SH_C0, SH_REST_COUNTS, Splats
 
 UNSEEN = 1e-3
-"""Least sensitivity, in units of what it would be if nothing were before a Gaussian."""
+"""Smallest colour sensitivity, in units of the prior, which ignores occlusion."""
 
 FLOOR = 0.55
-"""Least sensitivity where cameras were virtual, in units of the prior times the view uncertainty: a camera nearby still
-finds the Gaussian within a few decibels of what its neighbours keep."""
+"""Smallest sensitivity, in units of the prior times the view uncertainty, so that for a camera nearby the Gaussian's
+quality is within a few decibels of its neighbours'."""
 
-LOOKED_AT = 0.2
-"""Coverage from which on a Gaussian was seen well enough to tell what its like are worth."""
+SEEN_COVERAGE = 0.2
+"""Coverage above which a Gaussian was seen well enough to scale the prior by."""
 
 LARGEST = 1e25
-"""Of a cost: beyond it stand Gaussians so large that squares overflow, and sums of costs would be infinite."""
+"""Largest absolute Hessian entry: squares of enormous Gaussians overflow, and sums of costs would be infinite."""
 
 OPACITY, SCALES, ROTATION = (0,), (7, 13, 18), (22, 25, 27)
-"""Where the diagonal entries of a shape's form stand."""
+"""Indices of the diagonal entries in ``shape_hessian``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sensitivity:
-    """Quadratic forms: the mean squared error of a scene's pictures that small changes of each Gaussian cause.
+    """Quadratic model of the mean squared image error that small changes of each Gaussian cause.
 
-    The error is the mean over pictures, pixels and RGB from 0 to 1, so that -10 log10 of a sum of such costs is the
-    PSNR that they lead to, as far as the errors of different Gaussians are independent.
+    The error is the mean over images, pixels and RGB from 0 to 1, so -10 log10 of a sum of such errors is the PSNR, as
+    far as the errors of different Gaussians are independent.
 
     Attributes:
         position_hessian: ``(N, 6)``, upper triangle of the Hessian by position, world units: xx, xy, xz, yy, yz, zz.
         shape_hessian: ``(N, 28)``, upper triangle, row by row, of the Hessian by (opacity logit; three log-scales; a
-            rotation vector, radians, about the Gaussian's own axes). Its 48 equivalent descriptions only permute it.
-        color_weight: ``(N,)``, of one channel of the colour from 0 to 1: mean of (alpha T)², a third.
+            rotation vector, radians, about the Gaussian's own axes). The 48 equivalent forms only permute it.
+        color_weight: ``(N,)`` weight of one colour channel, 0 to 1: mean of (alpha T)², divided by 3.
         mean_sh_basis: ``(N, K)`` mean of the spherical harmonics without the constant one, over the directions from
-            which the Gaussian is seen, K as in its scene; 0 where it is not seen.
+            which the Gaussian is seen, K as in its scene; 0 if it is not seen.
         prior: ``(N,)`` the part of ``color_weight`` that was not measured, see :meth:`with_prior`.
-        coverage: ``(N,)`` from 0, no camera saw the Gaussian or all from far away, to 1, one looked at it from nearby.
-        captured: ``(N,)`` the same for the cameras of a capture alone, which say where people look.
-        view_uncertainty: from 0 to 1, how little the pictures are taken to say of other pictures.
+        coverage: ``(N,)`` from 0, no camera saw the Gaussian or only from far away, to 1, one saw it from nearby.
+        captured: ``(N,)`` coverage by the cameras of a capture alone, which show where people look.
+        view_uncertainty: from 0 to 1, how strongly sensitivity is shrunk towards the prior for unseen views.
     """
 
     position_hessian: Float32[np.ndarray, "N 6"]
@@ -58,7 +58,7 @@ class Sensitivity:
 
     @classmethod
     def none(cls, count: int, sh_degree: int) -> Sensitivity:
-        """Of a scene that nobody has looked at."""
+        """Return the sensitivity of a scene that no camera has seen: zeros."""
         return cls(
             position_hessian=np.zeros((count, 6), np.float32),
             shape_hessian=np.zeros((count, 28), np.float32),
@@ -70,11 +70,11 @@ class Sensitivity:
         )
 
     def check(self, splats: Splats) -> None:
-        """See that this is the sensitivity of such a scene.
+        """Check that this is a valid sensitivity of ``splats``.
 
         Raises:
-            InvalidSceneError: it has another number of Gaussians or another SH degree, or values that no costs have, or
-                coverage that is not from 0 to 1.
+            InvalidSceneError: wrong shapes or dtypes for the scene, values that are not finite, negative weights, or
+                coverage or view uncertainty outside 0 to 1.
         """
         wanted = Sensitivity.none(len(splats), splats.sh_degree)
         for name in (
@@ -89,21 +89,24 @@ class Sensitivity:
             found, shape = getattr(self, name), getattr(wanted, name).shape
             if found.shape != shape or found.dtype != np.float32:
                 raise InvalidSceneError(
-                    f"this sensitivity is not that of the scene: {name} must be {shape} float32, and is {found.shape} "
-                    f"{found.dtype}; measure it for the scene as it is compressed"
+                    f"the sensitivity does not fit the scene: {name} must be {shape} float32, not {found.shape} "
+                    f"{found.dtype}; measure it for the scene that is compressed"
                 )
             if not np.isfinite(found).all() or (name in ("color_weight", "prior") and (found < 0).any()):
-                raise InvalidSceneError(f"this sensitivity is damaged: {name} has a value that is no cost; measure it")
+                raise InvalidSceneError(
+                    f"the sensitivity is damaged: {name} has a negative or non-finite value; measure it again"
+                )
         for name in ("coverage", "captured"):
             found = getattr(self, name)
             outside = found[(found < 0) | (found > 1)]
             if len(outside):
                 raise InvalidSceneError(
-                    f"this sensitivity is damaged: {name} must be from 0 to 1, and has {outside[0]:g}"
+                    f"the sensitivity is damaged: {name} must be from 0 to 1, and has {outside[0]:g}; measure it again"
                 )
         if not 0 <= self.view_uncertainty <= 1:
             raise InvalidSceneError(
-                f"this sensitivity is damaged: its view_uncertainty is {self.view_uncertainty}, not from 0 to 1"
+                f"the sensitivity is damaged: view_uncertainty must be from 0 to 1, not {self.view_uncertainty}; "
+                "measure it again"
             )
 
     def with_prior(
@@ -113,21 +116,21 @@ class Sensitivity:
         coverage: Float64[np.ndarray, " N"],
         view_uncertainty: float,
     ) -> Sensitivity:
-        """Sensitivity for all cameras, not only for those of the images it was measured in.
+        """Return sensitivity for all cameras, not only for those that it was measured with.
 
-        Logarithms of sensitivity move towards those of a prior, what an unobstructed camera nearby would find: by
-        ``view_uncertainty`` where a Gaussian was looked at from nearby, and all the way where no camera saw it. (Fitted
-        to photographs of a scene, logarithms of sensitivity from virtual cameras count 0.72, the prior 0.23.) Nothing
-        falls below :data:`FLOOR` times ``view_uncertainty`` of the prior, whatever the images say.
+        The logarithm of sensitivity is shrunk towards that of a prior, the sensitivity for an unobstructed camera
+        nearby: by ``view_uncertainty`` for Gaussians seen from nearby, and completely for those that no camera saw.
+        (Fitted to photographs of a scene, logarithms of sensitivity from virtual cameras have weight 0.72, the prior
+        0.23.) The result is at least :data:`FLOOR` · ``view_uncertainty`` times the prior.
 
         Args:
             splats: the scene.
             close_up: ``(N,)`` see :attr:`kissgs.rendering.coverage.Coverage.close_up`.
             coverage: ``(N,)`` from 0 to 1, see :class:`kissgs.rendering.coverage.Coverage`.
-            view_uncertainty: from 0, the images' cameras are the only ones that matter, to 1, they say nothing.
+            view_uncertainty: 0 to 1; at 0 the prior is not used.
         """
         coverage = coverage.astype(np.float32)
-        known = (self.color_weight > 0) & (close_up > 0) & (coverage > LOOKED_AT)
+        known = (self.color_weight > 0) & (close_up > 0) & (coverage > SEEN_COVERAGE)
         if not known.any():
             known = (self.color_weight > 0) & (close_up > 0)
         if view_uncertainty == 0 or not known.any():
@@ -135,12 +138,12 @@ class Sensitivity:
         prior = float(np.median(self.color_weight[known] / close_up[known])) * close_up
         colors = np.maximum(self.color_weight.astype(np.float64), UNSEEN * prior)
         share = 1 - coverage.astype(np.float64) * (1 - view_uncertainty)
-        hedged = np.maximum(colors ** (1 - share) * prior**share, FLOOR * view_uncertainty * prior)
-        raised = np.where(colors > 0, hedged / np.maximum(colors, 1e-300), 1.0)
+        shrunk = np.maximum(colors ** (1 - share) * prior**share, FLOOR * view_uncertainty * prior)
+        raised = np.where(colors > 0, shrunk / np.maximum(colors, 1e-300), 1.0)
         least = colors - self.color_weight
         across = np.exp(-2.0 * np.sort(splats.scales, axis=1)[:, 1].astype(np.float64))
         forms = {}
-        shapes = ((OPACITY, _seen_through(splats) ** 2), (SCALES, 1.0), (ROTATION, 1.0))
+        shapes = ((OPACITY, _transparency(splats) ** 2), (SCALES, 1.0), (ROTATION, 1.0))
         for name, diagonals in (("shape_hessian", shapes), ("position_hessian", (((0, 3, 5), across),))):
             values = getattr(self, name).astype(np.float64)
             for of, unit in diagonals:
@@ -149,9 +152,9 @@ class Sensitivity:
                 values[:, of] += (ratio * least * unit)[:, None]
             forms[name] = np.clip(values * raised[:, None], -LARGEST, LARGEST).astype(np.float32)
         return Sensitivity(
-            color_weight=hedged.astype(np.float32),
+            color_weight=shrunk.astype(np.float32),
             mean_sh_basis=self.mean_sh_basis * np.float32(1 - view_uncertainty),
-            prior=np.maximum(hedged - self.color_weight, 0).astype(np.float32),
+            prior=np.maximum(shrunk - self.color_weight, 0).astype(np.float32),
             coverage=coverage,
             captured=self.captured,
             view_uncertainty=view_uncertainty,
@@ -159,22 +162,22 @@ class Sensitivity:
         )
 
     def diagonal(self, of: tuple[int, ...]) -> Float64[np.ndarray, "N n"]:
-        """Costs of opacity, log-scales or rotation alone; never negative."""
+        """Return diagonal entries of ``shape_hessian``, at least 0; ``of`` is OPACITY, SCALES or ROTATION."""
         return np.maximum(self.shape_hessian[:, of].astype(np.float64), 0)
 
     def base_colors(self) -> Float64[np.ndarray, " N"]:
-        """Costs of one coefficient of ``sh0``."""
+        """Return the squared error per squared unit of one coefficient of ``sh0``."""
         return self.color_weight.astype(np.float64) * SH_C0**2
 
     def removal(self, splats: Splats) -> Float64[np.ndarray, " N"]:
-        """What it costs to leave a Gaussian out: the score of GaussianPOP, section 3.
+        """Return the squared error of removing each Gaussian, the score of GaussianPOP, section 3.
 
-        The picture is linear in alpha; a logit moves alpha by (1 - opacity) of itself, a removal by all of it. So this
-        follows from the form of the opacity.
+        The image is linear in alpha; the derivative of alpha by the logit is (1 - opacity) alpha, a removal changes
+        alpha by all of it. So the score follows from the Hessian's opacity entry.
         """
-        return self.diagonal(OPACITY)[:, 0] / _seen_through(splats) ** 2
+        return self.diagonal(OPACITY)[:, 0] / _transparency(splats) ** 2
 
 
-def _seen_through(splats: Splats) -> Float64[np.ndarray, " N"]:
-    """1 - opacity; at least 1e-7, for logits that :func:`kissgs.clean` would not leave so large."""
+def _transparency(splats: Splats) -> Float64[np.ndarray, " N"]:
+    """Return 1 - opacity, at least 1e-7, the value of the largest logits that :func:`kissgs.clean` allows or more."""
     return 1 / (1 + np.exp(np.clip(splats.opacities.astype(np.float64), None, 16)))

@@ -1,4 +1,4 @@
-"""Real spherical harmonics, as 3DGS numbers and signs them."""
+"""Real spherical harmonics in the order and with the signs of 3DGS."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from kissgs.core.splats import SH_C0
 
 
 def sh_basis(directions: Float[np.ndarray, "M 3"], degree: int) -> Float[np.ndarray, "M K"]:
-    """Values of the (degree + 1)² real spherical harmonics with the signs of 3DGS, at unit vectors.
+    """Return the (degree + 1)² real spherical harmonics with the signs of 3DGS, at unit vectors.
 
     A Gaussian's colour from direction d (from the camera to it) is 0.5 + basis(d) · (sh0, shN).
     """

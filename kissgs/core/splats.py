@@ -1,4 +1,4 @@
-"""``Splats``: one Gaussian scene in canonical form, and how dirty input is brought into it."""
+"""``Splats``: a Gaussian scene in memory, and its cleaning."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ SH_C0 = 0.28209479177387814
 
 OPACITY_LOGIT_MIN = float(np.float32(-13.815509796142578))
 OPACITY_LOGIT_MAX = float(np.float32(13.80231761932373))
-"""float32 logits of the opacities 1e-6 and 1 - 1e-6: further out no 8-bit picture changes and float32 sigmoids fail."""
+"""float32 logits of the opacities 1e-6 and 1 - 1e-6; beyond, no 8-bit image changes and float32 sigmoids fail."""
 
 LOG_SCALE_LIMIT = 30.0
 MEAN_LIMIT = 1e15
 SH_LIMIT = 1e6
-"""Bounds of what is kept as it is; further out, renderers' float32 squares overflow."""
+"""Bounds of absolute values that cleaning leaves unchanged; beyond, renderers' float32 squares overflow."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Splats:
-    """One scene of N Gaussians: stored (pre-activation) parameters, as in the field's ``.ply``.
+    """Scene of N Gaussians: stored (pre-activation) parameters, as in a 3DGS ``.ply``.
 
     Attributes:
         means: ``(N, 3)`` float32, positions in world units.
@@ -38,7 +38,7 @@ class Splats:
         shN: ``(N, K, 3)`` float32, the other SH coefficients, first band first; K is 0, 3, 8 or 15.
 
     Raises:
-        InvalidSceneError: an array has another dtype or shape.
+        InvalidSceneError: an array has a wrong dtype or shape.
     """
 
     means: Float32[np.ndarray, "N 3"]
@@ -84,7 +84,7 @@ class Splats:
         return sum(getattr(self, name).nbytes for name in ATTRIBUTES)
 
     def select(self, index: Int[np.ndarray, " M"] | Bool[np.ndarray, " N"] | slice) -> Splats:
-        """The Gaussians at ``index`` (numbers, a boolean mask or a slice), in that order."""
+        """Return the Gaussians at ``index`` (indices, a boolean mask or a slice), in that order."""
         return Splats(**{name: getattr(self, name)[index] for name in ATTRIBUTES})
 
 
@@ -93,22 +93,22 @@ ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cleaned:
-    """What :func:`clean` changed, as numbers of Gaussians. The first two were removed, the others mended."""
+    """Number of Gaussians that :func:`clean` changed, by reason; the first two were removed, the others repaired."""
 
     non_finite: int = 0
-    """removed: NaN anywhere, or an infinite position, rotation or colour."""
+    """Removed: NaN anywhere, or an infinite position, rotation or colour."""
     far_away: int = 0
-    """removed: a position beyond ±1e15."""
+    """Removed: a position beyond ±1e15."""
     infinite_opacities: int = 0
-    """opacity logit ±inf, set to that of opacity 1e-6 or 1 - 1e-6."""
+    """Opacity logit ±inf, set to that of opacity 1e-6 or 1 - 1e-6."""
     saturated_opacities: int = 0
-    """finite opacity logit beyond those two, set to them: no 8-bit picture changes."""
+    """Finite opacity logit beyond those of opacity 1e-6 and 1 - 1e-6, clamped; no 8-bit image changes."""
     zero_quats: int = 0
-    """rotation of zero length, replaced by the identity."""
+    """Quaternion of zero length, replaced by the identity."""
     unnormalised_quats: int = 0
-    """rotation whose length was off 1 by more than 1e-3, normalised."""
+    """Quaternion whose length differed from 1 by more than 1e-3, normalised."""
     clamped_scales: int = 0
-    """log-scale beyond ±30 (also ±inf, the logarithm of 0), clamped."""
+    """Log-scale beyond ±30 (also ±inf, the logarithm of 0), clamped."""
     clamped_sh: int = 0
     """SH coefficient beyond ±1e6, clamped."""
 
@@ -118,7 +118,7 @@ class Cleaned:
         return self.non_finite + self.far_away
 
     def as_dict(self) -> dict[str, int]:
-        """All counts by name."""
+        """Return all counts by name."""
         return asdict(self)
 
 
@@ -126,12 +126,12 @@ NOTHING_CLEANED = Cleaned()
 
 
 def clean(splats: Splats) -> tuple[Splats, Cleaned]:
-    """Bring a scene into canonical form: finite, bounded, rotations of unit length.
+    """Make a scene finite and bounded, with rotations of unit length.
 
-    Cleaning a clean scene changes nothing. The input is not modified; arrays that need no change are shared.
+    A clean scene is returned unchanged. The input is not modified; arrays that need no change are shared.
 
     Returns:
-        The scene, its Gaussians in their order, and what was changed.
+        The scene, with its Gaussians in their order, and the number of changes.
     """
     finite = _finite_rows(splats)
     near = (np.abs(np.where(np.isfinite(splats.means), splats.means, 0)) <= MEAN_LIMIT).all(axis=1)
@@ -183,7 +183,7 @@ def _unit_quats(quats: Float32[np.ndarray, "N 4"]) -> tuple[Float32[np.ndarray, 
 
 
 def _clamp(values: np.ndarray, limit: float) -> tuple[np.ndarray, Bool[np.ndarray, " N"]]:
-    """``values`` within ±limit (the same array if it already is), and which rows were changed."""
+    """Return ``values`` clamped to ±limit (the given array if nothing changes), and which rows were changed."""
     if values.size == 0 or (values.max() <= limit and values.min() >= -limit):
         return values, np.zeros(len(values), dtype=bool)
     rows = (np.abs(values) > limit).reshape(len(values), -1).any(axis=1)

@@ -1,4 +1,4 @@
-"""Threads: plain ordered maps, so that results do not depend on how many threads there are."""
+"""Thread pools with ordered maps, so that results do not depend on the number of threads."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ class Workers:
     """A thread pool for work that releases the GIL: compiled kernels, BLAS, libwebp, NumPy on large arrays."""
 
     def __init__(self, threads: int) -> None:
-        """``threads`` below 1 means all the processors this process may use."""
+        """Create the pool; ``threads`` below 1 means all processors that this process may use."""
         self.threads = threads if threads >= 1 else _processors()
         self._pool = ThreadPoolExecutor(self.threads)
 
     def map(
         self, function: Callable[[T], R], items: Sequence[T], report: Callable[[float], None] = lambda fraction: None
     ) -> list[R]:
-        """Apply ``function`` to every item, in parallel; the results in the order of the items.
+        """Apply ``function`` to every item, in parallel; return the results in the order of the items.
 
-        ``report`` is told the fraction done, in the calling thread; what it raises stops the work.
+        ``report`` receives the fraction done, 0 to 1, in the calling thread; an exception from it stops the work.
         """
         results = []
-        # One thread needs no pool: handing over many small tasks costs more than they do.
+        # One thread needs no pool: for many small tasks, the pool takes longer than the tasks.
         for result in map(function, items) if self.threads == 1 else self._pool.map(function, items):
             results.append(result)
             report(len(results) / len(items))
@@ -42,12 +42,12 @@ class Workers:
         return self
 
     def __exit__(self, *reason: object) -> None:
-        """Drop what has not started, without waiting for what has: a long libwebp call cannot be interrupted."""
+        """Drop tasks that have not started, without waiting for others: a long libwebp call cannot be interrupted."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _processors() -> int:
-    """How many this process may use, where the system can say; how many there are, where it cannot."""
+    """Return the number of processors that this process may use, or of all where the system does not report it."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -60,14 +60,14 @@ _blas_limits: threadpool_limits | None = None
 
 @contextlib.contextmanager
 def blas_workers(threads: int) -> Iterator[Workers]:
-    """Workers during whose time BLAS runs single-threaded in this process.
+    """Return workers while whose context is open BLAS runs single-threaded in this process.
 
-    Each call is then one task of the pool, and its result the same whatever the number of threads. Several may be open
-    at once: the last one to close gives BLAS its threads back.
+    Each BLAS call then runs in one thread of the pool, and its result does not depend on the number of threads. Several
+    contexts may be open at once: the last one to close restores BLAS's threads.
     """
-    from threadpoolctl import threadpool_limits  # decoding does without
+    from threadpoolctl import threadpool_limits  # not needed for decoding
 
-    global _blas_users, _blas_limits  # noqa: PLW0603  the state of BLAS is the process's
+    global _blas_users, _blas_limits  # noqa: PLW0603  the state of BLAS is that of the process
     with _blas_lock:
         _blas_users += 1
         if _blas_limits is None:

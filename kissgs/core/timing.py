@@ -1,4 +1,4 @@
-"""What work takes: wall time of each stage, processor time, memory."""
+"""Wall time by stage, processor time and peak memory."""
 
 from __future__ import annotations
 
@@ -10,8 +10,14 @@ from kissgs.core.progress import Progress
 
 
 @dataclass
-class Clock:
-    """Passes progress on, and takes the time of each stage on the way."""
+class StageTimer:
+    """Receiver that forwards progress events and measures the time of each stage.
+
+    Attributes:
+        receiver: receiver of the events.
+        seconds: wall time by stage, seconds.
+        cpu_seconds: processor time of this process, seconds, up to the last :meth:`stop`.
+    """
 
     receiver: Progress
     seconds: dict[str, float] = field(default_factory=dict)
@@ -21,11 +27,11 @@ class Clock:
     _cpu_since: float = field(default_factory=time.process_time)
 
     def __call__(self, stage: str, fraction: float, note: str = "") -> None:
-        """Of a stage that may be a new one."""
+        """Forward an event; a new stage ends the current one."""
         if stage != self._stage:
             self.stop()
             self._stage, self._since = stage, time.perf_counter()
-        if note:  # receivers that know nothing of notes can follow all else
+        if note:  # without a note, receivers with two parameters work too
             self.receiver(stage, fraction, note)
         else:
             self.receiver(stage, fraction)
@@ -40,7 +46,7 @@ class Clock:
 
 
 def peak_memory() -> int:
-    """Bytes, the largest resident set this process has had; 0 where the system does not say (Windows)."""
+    """Return the peak resident memory of this process, bytes; 0 where the system does not report it (Windows)."""
     try:
         import resource
     except ImportError:

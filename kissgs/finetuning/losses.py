@@ -11,7 +11,7 @@ from torch import Tensor
 from kissgs.core.array_types import Float32, Float64, Int
 from kissgs.finetuning.quantized_scene import Plane, QuantizedScene
 from kissgs.planning.layout import Grid
-from kissgs.planning.rdo_quantize import UNUSED
+from kissgs.planning.rdo_quantize import UNUSED_COUNT
 from kissgs.training.loop import Parameters, TrainableScene
 
 COUNTED = ("opacities", "scales", "quaternions", "f_dc")
@@ -136,7 +136,7 @@ class _Coder:
         symbols = np.rint(self._begun.cpu().numpy() + latents.detach().cpu().numpy()).astype(np.int64)
         rows = self._rows.cpu().numpy() + symbols
         counts = np.bincount(rows.reshape(-1), minlength=self.table.size).reshape(self.table.shape)
-        likely = counts[:, :, :-1] + UNUSED
+        likely = counts[:, :, :-1] + UNUSED_COUNT
         self.table[:, :, :-1] = np.log2(likely.sum(axis=2, keepdims=True)) - np.log2(likely)
         self.table[:, :, -1] = self.table[:, :, -2]
 

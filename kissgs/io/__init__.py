@@ -1,1 +1,1 @@
-"""Scene files in and out: one module per format."""
+"""Reading and writing of scene files, one module per format. Takes files or bytes; gives Splats, and back."""

@@ -1,4 +1,4 @@
-"""Output that appears whole or not at all: written beside its destination, then renamed into place."""
+"""Atomic output: a temporary file beside the destination, renamed when it is complete."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from typing import BinaryIO
 from kissgs.core.errors import OutputError
 
 BLOCK = 4096
-"""Bytes, for which a file system takes at least one block of its own."""
+"""Bytes that :func:`check_writable` writes: at least one block of the file system."""
 
 
 @contextlib.contextmanager
 def atomic_file(path: Path, *, overwrite: bool = False) -> Iterator[BinaryIO]:
-    """A binary file that replaces ``path`` when the block ends well, and vanishes when it does not.
+    """Open a binary file that replaces ``path`` when the block succeeds, and is deleted when it fails.
 
     Raises:
         OutputError: ``path`` exists and ``overwrite`` is false, or the file system refuses.
@@ -41,35 +41,35 @@ def atomic_file(path: Path, *, overwrite: bool = False) -> Iterator[BinaryIO]:
 
 
 def refuse_existing(path: Path, *, overwrite: bool) -> None:
-    """Raise OutputError if ``path`` cannot become a file: before the work starts, rather than after it."""
-    present, folder = look(path)
+    """Raise OutputError if no file can be written to ``path``; called before the work starts."""
+    present, folder = path_state(path)
     if folder:
         raise OutputError(f"{path} is a folder; name a file")
     if present and not overwrite:
         raise OutputError(f"{path} exists already; choose another name or allow overwriting (--force)")
-    try_out(path)
+    check_writable(path)
 
 
-def try_out(path: Path) -> None:
-    """Raise OutputError if nothing can be written beside ``path``: before the work starts, rather than after it."""
+def check_writable(path: Path) -> None:
+    """Raise OutputError if no file can be written beside ``path``; called before the work starts."""
     try:
         with tempfile.TemporaryFile(dir=path.parent, prefix=".kissgs.", suffix=".part") as file:
-            file.write(bytes(BLOCK))  # a full disk takes names, but no bytes
+            file.write(bytes(BLOCK))  # on a full disk, creating a file succeeds, but writing fails
     except OSError as error:
         raise OutputError(f"cannot write {path}: {reason_of(error)}") from error
 
 
-def look(path: Path) -> tuple[bool, bool]:
-    """Whether there is something at ``path``, and whether it is a folder.
+def path_state(path: Path) -> tuple[bool, bool]:
+    """Return whether ``path`` exists, and whether it is a folder.
 
     Raises:
-        OutputError: there is no folder to put it in, or no file system would take the name.
+        OutputError: the parent folder does not exist, or the name is invalid.
     """
     try:
         present, folder, above = False, path.is_dir(), path.absolute().parent.is_dir()
         with contextlib.suppress(FileNotFoundError):
             path.lstat()
-            present = True  # even if it is a link that leads nowhere
+            present = True  # also for a broken link
     except (OSError, ValueError) as error:
         raise OutputError(f"cannot write {path!s:.100}: {reason_of(error)}") from error
     if not above:
@@ -78,17 +78,17 @@ def look(path: Path) -> tuple[bool, bool]:
 
 
 def umask() -> int:
-    """The permission bits that new files of this process do not get."""
+    """Return the umask: the permission bits that new files of this process do not get."""
     try:
         status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
         return int(status.split("Umask:", 1)[1].split(maxsplit=1)[0], 8)
     except (OSError, IndexError, ValueError):
-        current = os.umask(0o022)  # elsewhere, asking means setting, for all threads for a moment
+        current = os.umask(0o022)  # other systems can only return it while setting it, briefly for all threads
         os.umask(current)
         return current
 
 
 def reason_of(error: OSError | ValueError) -> str:
-    """Why the system refused, as the end of a sentence; ValueError is a name that it cannot even be asked about."""
+    """Return the system's reason, as the end of a sentence; ValueError is an invalid name, such as one with NUL."""
     reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     return reason.lower()

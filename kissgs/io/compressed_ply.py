@@ -1,7 +1,7 @@
 """PlayCanvas' compressed ``.ply``: Gaussians quantised to 16 bytes within chunks of 256, SH coefficients to one byte.
 
-Element ``chunk`` holds the bounds of each 256 Gaussians, ``vertex`` four packed words per Gaussian, and ``sh``, which
-may be absent, their ``f_rest_*``. Older files have no colour bounds: their colours span 0 to 1.
+Element ``chunk`` holds the bounds of each 256 Gaussians, ``vertex`` four packed words per Gaussian, and the optional
+``sh`` their ``f_rest_*``. Older files have no colour bounds: their colours span 0 to 1.
 """
 
 from __future__ import annotations
@@ -16,26 +16,26 @@ from kissgs.io.ply_body import BLOCK_ALIGNMENT, check_complete, rows
 from kissgs.io.ply_header import Element, Header, PlyFile, sh_degree
 
 _CHUNK = BLOCK_ALIGNMENT
-"""Gaussians per row of element ``chunk``; the format's number, which blocks of rows are multiples of."""
+"""Gaussians per row of element ``chunk``, given by the format; blocks of rows are multiples of it."""
 
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
 _QUAT_ORDER = np.array([[0, 1, 2, 3], [1, 0, 2, 3], [1, 2, 0, 3], [1, 2, 3, 0]])
-"""By the place of the largest component: where w, x, y, z stand in (largest, first, second, third of the others)."""
+"""Indices of w, x, y, z in (largest, first, second, third of the others), by the index of the largest component."""
 
 
 def is_compressed(header: Header) -> bool:
-    """Whether the file's Gaussians are packed as this module reads them."""
+    """Whether the file is a PlayCanvas compressed ``.ply``."""
     vertex = header.elements.get("vertex")
     return vertex is not None and any(p.name == "packed_position" for p in vertex.properties)
 
 
 def check_compressed(ply: PlyFile) -> int:
-    """Check everything but the values, without reading them, and return the scene's SH degree.
+    """Check everything except the values, without reading them, and return the scene's SH degree.
 
     Raises:
-        InvalidSceneError: an element or property is missing or of another type, the elements' counts do not fit
-            together, or the file is cut short.
+        InvalidSceneError: an element or property is missing or of another type, the elements' counts are inconsistent,
+            or the file is cut short.
         UnsupportedError: the file is ascii, which no tool writes.
     """
     elements = ply.header.elements
@@ -66,9 +66,9 @@ def check_compressed(ply: PlyFile) -> int:
 
 
 def read_compressed(ply: PlyFile, degree: int, progress: Progress) -> Splats:
-    """Decode all Gaussians. The scene's ``degree`` comes from :func:`check_compressed`, which must have passed.
+    """Decode all Gaussians; ``degree`` is the result of :func:`check_compressed`.
 
-    Opacities 0 and 1, which the packing can hold, become logits -inf and +inf.
+    Opacities 0 and 1, which the packing can represent, become logits -inf and +inf.
     """
     vertex = ply.header.elements["vertex"]
     n, k = vertex.count, SH_REST_COUNTS[degree]
@@ -80,7 +80,7 @@ def read_compressed(ply: PlyFile, degree: int, progress: Progress) -> Splats:
         sh0=np.empty((n, 3), np.float32),
         shN=np.empty((n, k, 3), np.float32),
     )
-    with np.errstate(all="ignore"):  # bounds may be anything; what comes of them is raw, as in any other .ply
+    with np.errstate(all="ignore"):  # bounds may be any floats; values are not cleaned, as for any .ply
         _decode_vertices(ply, splats)
         progress("read", 1.0 if k == 0 else 0.5)
         if k:
@@ -91,7 +91,7 @@ def read_compressed(ply: PlyFile, degree: int, progress: Progress) -> Splats:
 
 def _decode_vertices(ply: PlyFile, splats: Splats) -> None:
     chunk = ply.header.elements["chunk"]
-    none = np.empty(0, chunk.dtype(ply.header.encoding))  # a scene of no Gaussians has no chunks to concatenate
+    none = np.empty(0, chunk.dtype(ply.header.encoding))  # so that a scene without chunks can be concatenated
     ranges = np.concatenate([none, *(block.copy() for block in rows(ply, chunk))])
     alpha = np.arange(256) / 255
     logits = -np.log(1 / alpha - 1)
@@ -112,7 +112,7 @@ def _decode_vertices(ply: PlyFile, splats: Splats) -> None:
 
 def _decode_sh(ply: PlyFile, shN: Float32[np.ndarray, "N K 3"]) -> None:
     k = shN.shape[1]
-    # The encoder truncates (value / 8 + 0.5) * 256: a value is the middle of its step, except at both ends.
+    # The encoder truncates (value / 8 + 0.5) * 256: decode to the middle of the step, except at both ends.
     values = ((np.arange(256) + 0.5) / 256 - 0.5) * 8
     values[[0, 255]] = -4, 4
     table = values.astype(np.float32)
@@ -128,7 +128,7 @@ def _unpack_11_10_11(packed: UInt32[np.ndarray, " B"]) -> Float64[np.ndarray, "B
 
 
 def _unpack_quats(packed: UInt32[np.ndarray, " B"]) -> Float64[np.ndarray, "B 4"]:
-    """The three smaller components in 10 bits each, ±sqrt(1/2); two bits say where the largest stands."""
+    """Unpack smallest-three quaternions: two bits for the index of the largest component, 10 for each of the others."""
     small = (np.stack([packed >> shift & 1023 for shift in (20, 10, 0)], axis=1) / 1023 - 0.5) * np.sqrt(2)
     largest = np.sqrt(np.maximum(0, 1 - (small * small).sum(axis=1, keepdims=True)))
     parts = np.concatenate([largest, small], axis=1)
@@ -140,7 +140,7 @@ def _unpack_quats(packed: UInt32[np.ndarray, " B"]) -> Float64[np.ndarray, "B 4"
 def _lerp(
     ranges: Shaped[np.ndarray, " B"], prefix: str, axes: str, t: Float64[np.ndarray, "B 3"]
 ) -> Float64[np.ndarray, "B 3"]:
-    """From the minima (at 0) to the maxima (at 1) of each row's chunk."""
+    """Interpolate between the minima (at 0) and the maxima (at 1) of each row's chunk."""
     names = _bounds(prefix, axes)
     low = np.stack([ranges[name] for name in names[:3]], axis=1).astype(np.float64)
     high = np.stack([ranges[name] for name in names[3:]], axis=1).astype(np.float64)
@@ -157,7 +157,7 @@ def _has_colour_bounds(chunk: Element) -> bool:
 
 
 def _require(ply: PlyFile, element: Element, names: tuple[str, ...], code: str) -> None:
-    """That ``element`` has the properties ``names``, all of type ``code``."""
+    """Raise InvalidSceneError unless ``element`` has the properties ``names``, all of type ``code``."""
     codes = {p.name: p.code for p in element.properties}
     for name in names:
         if codes.get(name) != code:

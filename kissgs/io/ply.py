@@ -1,4 +1,4 @@
-"""The field's ``.ply``: scenes as INRIA's trainer and its followers store them, read from any tool and written."""
+"""The 3DGS ``.ply``: read scenes of INRIA's trainer and other tools, write INRIA's layout."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ _WRITE_ROWS = 4096
 
 @runtime_checkable
 class BinaryWriter(Protocol):
-    """Any binary stream, a file or not: nothing but its ``write`` is called."""
+    """Binary stream; only its ``write`` is called."""
 
     def write(self, data: bytes | memoryview, /) -> object:
-        """Take all of ``data``."""
+        """Write all of ``data``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlyInfo:
-    """What the header tells of a scene."""
+    """Properties of a scene that the header of its file states."""
 
     count: int
     """Number of Gaussians."""
     sh_degree: int
-    """0 to 3."""
+    """SH degree, 0 to 3."""
     encoding: Encoding
     """Encoding of the body, as the header names it."""
     compressed: bool
@@ -50,35 +50,35 @@ class PlyInfo:
 
 
 def read_ply_info(source: Path | bytes, *, size: int | None = None) -> PlyInfo:
-    """What a ``.ply`` holds, from its header and its size: the body is not read.
+    """Read the header of a ``.ply`` and check it against the file's size, without reading the body.
 
     Args:
-        source: A file, or the bytes of one; of a file that is still arriving, as many as its header takes.
-        size: Bytes of the whole file, where ``source`` is only its beginning.
+        source: A file, or the bytes of one; the beginning with the whole header is enough.
+        size: Bytes of the whole file if ``source`` is only its beginning.
 
     Raises:
-        InvalidSceneError: as :func:`read_ply`, except for what only the body shows.
-        UnsupportedError: as :func:`read_ply`.
+        InvalidSceneError: as for :func:`read_ply`, except for errors in the body.
+        UnsupportedError: as for :func:`read_ply`.
     """
     with open_ply(source, size=size) as ply:
         return _check(ply)
 
 
 def read_ply(source: Path | bytes, *, max_gaussians: int | None = None, progress: Progress = silent) -> Splats:
-    """Read a scene as it is, not cleaned: NaN, infinities and rotations of any length pass through.
+    """Read a scene without cleaning it: NaN, infinities and quaternions of any length are kept.
 
-    Reads binary and ascii files, their properties in any order and of any type, and PlayCanvas' compressed ``.ply``.
+    Reads binary and ascii files, with properties in any order and of any type, and PlayCanvas' compressed ``.ply``.
     Elements and properties that Gaussians do not need are ignored, as are bytes after the end. 8-bit ``red``,
     ``green``, ``blue``, which nerfstudio may write instead of ``f_dc_*``, become the constant SH coefficients.
-    Beside the scene itself, some megabytes of memory are needed.
+    Needs some megabytes of memory besides the scene itself.
 
     Args:
         source: A file, or the bytes of one.
-        max_gaussians: Scenes with more are refused before memory is allocated; None leaves that to the file's size.
-        progress: Hears of stage ``read``.
+        max_gaussians: Largest number of Gaussians; more are refused before memory is allocated. None: no limit.
+        progress: Receives events of stage ``read``.
 
     Raises:
-        InvalidSceneError: the file cannot be read, is no PLY file, is damaged or cut short, or holds no Gaussians.
+        InvalidSceneError: the file cannot be read, is not a PLY file, is damaged or cut short, or has no Gaussians.
         UnsupportedError: 2D Gaussians, an SH degree above 3, lists before or among the Gaussians, or more Gaussians
             than ``max_gaussians``.
     """
@@ -93,12 +93,12 @@ def read_ply(source: Path | bytes, *, max_gaussians: int | None = None, progress
 
 
 def write_ply(file: BinaryWriter, splats: Splats, *, progress: Progress = silent) -> None:
-    """Write ``splats`` in INRIA's layout: float32, little-endian, normals zero, as many ``f_rest_*`` as the degree has.
+    """Write ``splats`` in INRIA's layout: float32, little-endian, normals zero, the ``f_rest_*`` of the SH degree.
 
     Args:
-        file: The stream; it is not flushed or closed, and its own OSErrors pass through.
-        splats: The scene; float32 values arrive bit by bit.
-        progress: Hears of stage ``write``.
+        file: The stream; it is not flushed or closed, and its OSErrors are not caught.
+        splats: The scene; its float32 values are written bit-identically.
+        progress: Receives events of stage ``write``.
     """
     n, k = len(splats), splats.shN.shape[1]
     names = (*_POSITION, *_NORMAL, *_COLOUR, *_rest(k), *_OPACITY, *_SCALE, *_ROTATION)
@@ -115,10 +115,10 @@ def write_ply(file: BinaryWriter, splats: Splats, *, progress: Progress = silent
 
 
 def _check(ply: PlyFile) -> PlyInfo:
-    """Everything that can be checked without reading the body."""
+    """Check everything that does not need the body."""
     vertex = ply.header.elements.get("vertex")
     if vertex is None:
-        raise InvalidSceneError(f"{ply.name} has no element 'vertex', so no Gaussians; name a trained splat scene")
+        raise InvalidSceneError(f"{ply.name} has no element 'vertex', so no Gaussians; name a trained 3DGS scene")
     compressed = is_compressed(ply.header)
     if compressed:
         degree = check_compressed(ply)
@@ -137,8 +137,8 @@ def _require_gaussians(vertex: Element, name: str) -> None:
         return
     if present.isdisjoint({*_OPACITY, *_SCALE, *_ROTATION}):
         raise InvalidSceneError(
-            f"{name} is a point cloud or a mesh, not a trained splat scene: it has no {', '.join(missing)}; "
-            "train Gaussians on it, or name the trainer's result"
+            f"{name} is a point cloud or a mesh, not a trained 3DGS scene: it has no {', '.join(missing)}; "
+            "name the output of a 3DGS trainer"
         )
     if missing == ["scale_2"]:
         raise UnsupportedError(f"{name} holds 2D Gaussians (no scale_2), which are not supported; train 3D Gaussians")
@@ -146,7 +146,7 @@ def _require_gaussians(vertex: Element, name: str) -> None:
 
 
 def _has_rgb(vertex: Element) -> bool:
-    """Whether the colour stands in 8-bit red, green, blue and nowhere else."""
+    """Whether the colour is given only by 8-bit red, green, blue."""
     codes = {p.name: p.code for p in vertex.properties}
     return codes.keys().isdisjoint(_COLOUR) and all(codes.get(name) == "u1" for name in _RGB)
 
@@ -181,7 +181,7 @@ def _read_columns(ply: PlyFile, degree: int, progress: Progress) -> Splats:
 
 
 def _colour_to_sh(colour: Float32[np.ndarray, "N 3"]) -> None:
-    """8-bit colour to the constant SH coefficient, in place."""
+    """Convert 8-bit colour to the constant SH coefficient, in place."""
     colour /= 255
     colour -= 0.5
     colour /= np.float32(SH_C0)

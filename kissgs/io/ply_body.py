@@ -1,4 +1,4 @@
-"""The rows of a PLY element, block by block, whichever way they are encoded."""
+"""Rows of a PLY element, binary or ascii, block by block."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.io.ply_header import Element, PlyFile
 
 BLOCK_BYTES = 1 << 20
-"""What is read at a time: it stays in the processor's cache from reading to the last column copied out of it."""
+"""Bytes per block: small enough to stay in the processor's cache until all columns are copied."""
 
 BLOCK_ALIGNMENT = 256
-"""All blocks of :func:`rows` but the last have a multiple of this many rows, except in ascii files."""
+"""Row count that the blocks of :func:`rows`, except the last, are multiples of in binary files."""
 
 
 def check_complete(ply: PlyFile, element: Element) -> None:
-    """Compare what ``element`` declares with the bytes that are there, before anything of its size is allocated.
+    """Check that the file is large enough for all rows of ``element``, before memory for them is allocated.
 
     Raises:
         InvalidSceneError: the file ends before the last row does.
-        UnsupportedError: a list property makes it unknowable where the rows lie.
+        UnsupportedError: a list property makes the positions of the rows unknown.
     """
     if any(p.is_list for p in element.properties):
         raise UnsupportedError(f"{ply.name} has a list property in element {element.name!r}; export it without")
     if ply.header.encoding == "ascii":
-        # A value takes two bytes at least, a digit and a separator, but the last may lack its own.
+        # A value takes at least two bytes, a digit and a separator; the last separator may be missing.
         row_bytes, available = 2 * len(element.properties), ply.size - ply.header.nbytes + 1
     else:
         row_bytes, available = element.dtype(ply.header.encoding).itemsize, ply.size - _offset(ply, element)
@@ -35,9 +35,9 @@ def check_complete(ply: PlyFile, element: Element) -> None:
 
 
 def rows(ply: PlyFile, element: Element) -> Iterator[np.ndarray]:
-    """All rows of ``element``, in order, as structured arrays with one field per property.
+    """Yield all rows of ``element``, in order, as structured arrays with one field per property.
 
-    The fields have the file's own types; in ascii files all are float64. Each block is overwritten by the next.
+    The fields have the types of the file; in ascii files all are float64. Each block is overwritten by the next.
 
     Raises:
         InvalidSceneError: the file ends too soon, or a line of an ascii file is not a row of numbers.
@@ -48,8 +48,8 @@ def rows(ply: PlyFile, element: Element) -> Iterator[np.ndarray]:
 def _binary_rows(ply: PlyFile, element: Element) -> Iterator[np.ndarray]:
     dtype = element.dtype(ply.header.encoding)
     length = BLOCK_BYTES // (dtype.itemsize * BLOCK_ALIGNMENT) * BLOCK_ALIGNMENT
-    # Read into one buffer rather than mapped: no page of the file counts as ours, and a file that is cut meanwhile
-    # gives a short read instead of killing the process.
+    # Read into one buffer, not mapped: mapped pages would count as memory of this process, and a file that is truncated
+    # meanwhile would kill it instead of giving a short read.
     buffer = np.empty(min(max(length, BLOCK_ALIGNMENT), element.count), dtype)
     ply.file.seek(_offset(ply, element))
     for start in range(0, element.count, max(1, len(buffer))):
@@ -61,12 +61,12 @@ def _binary_rows(ply: PlyFile, element: Element) -> Iterator[np.ndarray]:
 
 
 def _offset(ply: PlyFile, element: Element) -> int:
-    """Where the first row of ``element`` lies in a binary file."""
+    """Return the offset of the first row of ``element`` in a binary file, bytes."""
     offset = ply.header.nbytes
     for other in ply.header.elements.values():
         if other is element:
             break
-        if other.count and any(p.is_list for p in other.properties):  # nobody writes splats after lists
+        if other.count and any(p.is_list for p in other.properties):  # no known tool writes Gaussians after lists
             raise UnsupportedError(
                 f"{ply.name} has element {other.name!r} with a list property before {element.name!r}; "
                 f"export it with {element.name!r} first"
@@ -93,9 +93,9 @@ def _ascii_rows(ply: PlyFile, element: Element) -> Iterator[np.ndarray]:
 
 
 def _numbered_lines(ply: PlyFile, width: int) -> Iterator[list[tuple[int, str]]]:
-    """Lines of an ascii body that are not blank, with their numbers in the file, as many at a time as fill a block.
+    """Yield the non-blank lines of an ascii body with their line numbers, one block at a time.
 
-    A last line that has neither its end nor ``width`` values is left out: there the file was cut.
+    A last line without a line end and with fewer than ``width`` values is skipped: the file was cut there.
     """
     ply.file.seek(ply.header.nbytes)
     number = ply.header.lines
@@ -121,7 +121,7 @@ def _parse(lines: list[tuple[int, str]], dtype: np.dtype, name: str) -> np.ndarr
 
 
 def _check_line(words: list[str], names: tuple[str, ...], where: str) -> None:
-    """Find the fault in one line; the fast parser knows only that a block has one."""
+    """Raise an error if the line is wrong; the fast parser reports only that its block has an error."""
     if len(words) != len(names):
         raise InvalidSceneError(f"{where}: {len(words)} values where the header declares {len(names)} properties")
     for word, name in zip(words, names, strict=True):

@@ -1,4 +1,4 @@
-"""PLY files up to their ``end_header``: opening one, the header's grammar, and what the header alone tells."""
+"""PLY headers: opening a file, parsing its header, and the SH degree that the header declares."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from kissgs.core.splats import SH_REST_COUNTS
 Encoding = Literal["ascii", "binary_little_endian", "binary_big_endian"]
 
 MAX_HEADER_BYTES = 1 << 20
-"""A degree-3 header takes 1.5 kB; a megabyte leaves room for tools that keep metadata in comments."""
+"""Largest header: one of degree 3 takes 1.5 kB; a megabyte leaves room for metadata in comments."""
 
 MAX_PROPERTIES = 4096
-"""Per element. A degree-3 scene has 62; scenes with semantic features have some hundred more."""
+"""Largest number of properties per element; a degree-3 scene has 62, one with feature vectors some hundred more."""
 
 _TYPES = {
     "char": "i1",
@@ -44,7 +44,7 @@ _TYPES = {
     "float32": "f4",
     "float64": "f8",
 }
-"""Numpy's code of every type name: both PLY families, and the half floats that some splat tools write."""
+"""NumPy's code of every type name: both families of PLY names, and the half floats that some 3DGS tools write."""
 
 _LOOKALIKES = {
     b"version https://git-lfs.github.com/spec/": "this is a Git LFS pointer, fetch the real file (git lfs pull)",
@@ -53,12 +53,12 @@ _LOOKALIKES = {
     b"\x1f\x8b": "this is compressed with gzip, unpack it first",
     b"pk\x03\x04": "this is a ZIP archive, unpack it or name the scene by its real extension",
 }
-"""What is often found under the name of a scene, by its first bytes in lower case."""
+"""Hints for other files that are often given as a scene, by their first bytes in lower case."""
 
 
 @dataclass(frozen=True, slots=True)
 class Property:
-    """One property of an element: its numpy type code without byte order, such as ``f4``."""
+    """Property of an element; ``code`` is its NumPy type without byte order, such as ``f4``."""
 
     name: str
     code: str
@@ -67,14 +67,14 @@ class Property:
 
 @dataclass(frozen=True, slots=True)
 class Element:
-    """One element: ``count`` rows of ``properties``, whose names are all different."""
+    """Element: ``count`` rows of ``properties``, whose names are all different."""
 
     name: str
     count: int
     properties: tuple[Property, ...]
 
     def dtype(self, encoding: Encoding) -> np.dtype:
-        """Of one row: as it lies in a binary file, or all float64 once ascii is parsed."""
+        """Return the dtype of a row: that of a binary file, or all float64 for ascii."""
         if encoding == "ascii":
             return np.dtype([(p.name, "f8") for p in self.properties])
         order = ">" if encoding == "binary_big_endian" else "<"
@@ -83,7 +83,7 @@ class Element:
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """A parsed header. ``nbytes`` and ``lines`` are its own size, so the body begins right after them."""
+    """Parsed header; ``nbytes`` and ``lines`` are its size, after which the body begins."""
 
     encoding: Encoding
     elements: dict[str, Element]
@@ -93,7 +93,7 @@ class Header:
 
 @dataclass(frozen=True, slots=True)
 class PlyFile:
-    """An open PLY file: ``name`` for messages, the seekable ``file``, its ``size`` in bytes, and its header."""
+    """Open PLY file: ``name`` for messages, the seekable ``file``, its ``size`` in bytes, and its header."""
 
     name: str
     file: io.BufferedIOBase
@@ -103,18 +103,18 @@ class PlyFile:
 
 @contextlib.contextmanager
 def open_ply(source: Path | bytes, *, size: int | None = None) -> Iterator[PlyFile]:
-    """Open a file, or bytes that are one, and parse the header. The body is not read.
+    """Open a file, or the bytes of one, and parse the header. The body is not read.
 
-    ``size`` is that of the whole file, where ``source`` is only its beginning.
+    ``size`` is that of the whole file if ``source`` is only its beginning.
 
     Raises:
-        InvalidSceneError: the file cannot be read, or its header is not one of a PLY file.
+        InvalidSceneError: the file cannot be read, or it has no valid PLY header.
     """
     if isinstance(source, bytes):
         yield _opened("the data", io.BytesIO(source), size)
         return
     try:
-        if not source.is_file():  # asked first, because opening a named pipe would wait for its writer
+        if not source.is_file():  # before opening, because opening a named pipe would wait for its writer
             reason = "it is a folder or a device" if source.exists() else "there is no such file"
             raise InvalidSceneError(f"cannot read {source}: {reason}; name a .ply file")
         with source.open("rb") as file:
@@ -124,11 +124,11 @@ def open_ply(source: Path | bytes, *, size: int | None = None) -> Iterator[PlyFi
 
 
 def sh_degree(element: Element, name: str) -> int:
-    """SH degree that the ``f_rest_*`` properties of ``element`` make; ``name`` is the file's, for messages.
+    """Return the SH degree of the ``f_rest_*`` properties of ``element``; ``name`` is the file's, for messages.
 
     Raises:
         UnsupportedError: the degree is above 3.
-        InvalidSceneError: their number is that of no degree, or one is missing.
+        InvalidSceneError: their number fits no degree, or one is missing.
     """
     rest = {p.name for p in element.properties if re.fullmatch(r"f_rest_[0-9]+", p.name)}
     count = len(rest)
@@ -174,7 +174,7 @@ def _read_header(file: io.BufferedIOBase, name: str) -> Header:
                 )
             case ["element", element, count]:
                 if element in counts:
-                    raise InvalidSceneError(f"{where}: a second element {_quote(element)}; each may stand once")
+                    raise InvalidSceneError(f"{where}: a second element {_quote(element)}; each may occur once")
                 counts[element] = _count(count, where)
                 properties[element] = {}
             case ["property", *definition] if counts:
@@ -190,7 +190,7 @@ def _read_header(file: io.BufferedIOBase, name: str) -> Header:
 
 
 def _recognise(head: bytes, name: str) -> None:
-    """Refuse what is no PLY file, and say what it is instead."""
+    """Refuse a file that is not PLY, with a hint to its actual format."""
     if not head:
         raise InvalidSceneError(f"{name} is empty; export or download it again")
     start = head.removeprefix(b"\xef\xbb\xbf").lstrip().lower()
@@ -202,7 +202,7 @@ def _recognise(head: bytes, name: str) -> None:
 
 
 def _header_lines(file: io.BufferedIOBase, name: str) -> Iterator[tuple[int, list[str]]]:
-    """Numbered lines, from 1, as words; ends where the file does, even amid a line."""
+    """Yield the lines as words, numbered from 1; an incomplete last line ends the iteration."""
     left = MAX_HEADER_BYTES
     for number in itertools.count(1):
         line = file.readline(left + 1)
@@ -215,7 +215,7 @@ def _header_lines(file: io.BufferedIOBase, name: str) -> Iterator[tuple[int, lis
 
 
 def _count(word: str, where: str) -> int:
-    # 18 digits fit 64 bits. Whether so many rows are there is checked against the file's size, before they are read.
+    # 18 digits fit 64 bits. The count is checked against the file's size before rows are read.
     if not re.fullmatch(r"[0-9]{1,18}", word):
         raise InvalidSceneError(f"{where}: the count is {_quote(word)}, not a whole number from 0 to 10^18")
     return int(word)
@@ -233,12 +233,12 @@ def _add_property(properties: dict[str, Property], definition: list[str], where:
     if unknown is not None:
         raise InvalidSceneError(f"{where}: unknown type {_quote(unknown)}; known are {', '.join(_TYPES)}")
     if name in properties:
-        raise InvalidSceneError(f"{where}: a second property {_quote(name)}; each may stand once")
+        raise InvalidSceneError(f"{where}: a second property {_quote(name)}; each may occur once")
     if len(properties) == MAX_PROPERTIES:
         raise UnsupportedError(f"{where}: more than {MAX_PROPERTIES} properties in one element; remove some")
     properties[name] = Property(name, _TYPES[types[-1]], is_list=len(types) == 2)
 
 
 def _quote(word: str) -> str:
-    """``word`` in quotes, unprintable characters escaped, cut to what fits a sentence."""
+    """Return ``word`` in quotes, unprintable characters escaped, cut to 40 characters."""
     return repr(word if len(word) <= 40 else word[:39] + "…")

@@ -1,4 +1,4 @@
-"""Sensitivity in a file, for the next time that the same scene is looked at from the same places."""
+"""Sensitivity in a file, a cache for later encodings of a scene with equal cameras."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from kissgs.io.atomic import atomic_file, reason_of, refuse_existing
 
 
 def read_sensitivity(path: Path, key: str) -> Sensitivity | None:
-    """What :func:`write_sensitivity` kept under ``key``; None where there is no file, or one with another key.
+    """Read what :func:`write_sensitivity` has written with ``key``; None if the file is missing or has another key.
 
     Raises:
-        OutputError: there is something else, which must not be written over, or nothing can be kept there.
+        OutputError: ``path`` is another file, which must not be replaced, or cannot be written.
     """
-    refuse_existing(path, overwrite=True)  # rather now than after what is kept there has been measured
+    refuse_existing(path, overwrite=True)  # before the measurement, whose result is written there
     try:
         if not path.exists():
             return None
@@ -32,13 +32,13 @@ def read_sensitivity(path: Path, key: str) -> Sensitivity | None:
         raise OutputError(f"cannot read {path}: {reason_of(error)}") from error
     except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise OutputError(
-            f"{path} is not a file in which kissgs keeps sensitivity; move it away or delete it"
+            f"{path} is not a sensitivity file of kissgs; move it away, delete it or choose another path"
         ) from error
     return Sensitivity(**{**arrays, "view_uncertainty": float(arrays["view_uncertainty"])})
 
 
 def write_sensitivity(path: Path, sensitivity: Sensitivity, key: str) -> None:
-    """Keep it in an ``.npz``, whole or not at all; what was kept there before is replaced.
+    """Write sensitivity and ``key`` to an ``.npz``, atomically; an existing file is replaced.
 
     Raises:
         OutputError: the file system refuses.

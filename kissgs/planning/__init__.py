@@ -1,4 +1,4 @@
 """The encoder's decisions: order, rotation forms, codebook, step sizes and levels.
 
-Takes a scene and the sensitivity of its images; gives an encoding plan. Writes nothing and renders nothing.
+Takes a scene and its sensitivity; returns an encoding plan. Writes no files and renders no images.
 """

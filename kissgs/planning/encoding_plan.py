@@ -1,4 +1,4 @@
-"""What an encoder has chosen for a scene: everything that the images will show."""
+"""``EncodingPlan``: the encoder's decisions for a scene, independent of the container format."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from kissgs.planning.sh_codebook import Codebook
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EncodingPlan:
-    """Levels of every cell, and what they lost.
+    """Levels of every cell, and the errors that they cause.
 
     Attributes:
-        grid: which Gaussian sits where.
-        fields: levels by field of the metadata, one row per cell; ``f_rest_centroids``, one per entry.
-        codebook: which entry each Gaussian has.
-        classes: ``(M,)`` kind of each Gaussian, from 0; those of a kind have levels of their own.
+        grid: cell of each Gaussian.
+        fields: levels by field of the metadata, one row per cell; ``f_rest_centroids``: one row per entry.
+        codebook: the SH codebook, and the entry of each Gaussian.
+        classes: ``(M,)`` sensitivity class of each Gaussian, from 0; each class has its own step.
         form_error: largest relative change of a covariance by the choice of its equivalent form.
-        clipped_colors: number of Gaussians whose base colour, an outlier, was pulled in.
-        errors: largest error that the choices may cause, base colours' making up for others included; per field and
-            channel, in the field's own unit (positions: of their signed logarithm; f_rest_centroids: of the codebook's
-            entries).
-        costs: of one unit in each attribute, ``(M,)`` each; None where bits were not weighed.
-        rd_lambda: of a bit, squared error; None where bits were not weighed.
-        note: a sentence for people about Gaussians that were left out, if these are many; or empty.
+        clipped_colors: number of Gaussians whose base colour, an outlier, was clipped.
+        errors: largest quantisation error per field and channel, in the field's own unit (positions: of their signed
+            logarithm; f_rest_centroids: of the codebook's entries). Base colours include the compensation of other
+            errors.
+        costs: squared error of one unit in each attribute, ``(M,)`` each; None for uniform planning.
+        rd_lambda: squared error per bit; None for uniform planning.
+        note: a sentence for the user if many Gaussians were pruned; else empty.
     """
 
     grid: Grid

@@ -1,4 +1,4 @@
-"""Compiled inner loops of the encoder. Everything else of the codec is NumPy."""
+"""Compiled inner loops of the encoder."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from kissgs.core.numba_kernels import compiled
 
 @compiled("void(uint16[:, ::1], uint64[::1])")
 def hilbert_keys(cells: np.ndarray, keys: np.ndarray) -> None:
-    """Position of every cell ``(N, 3)`` uint16 along the 3D Hilbert curve of order 16, as ``(N,)`` uint64.
+    """Write the position of every cell ``(N, 3)`` uint16 along the 3D Hilbert curve of order 16 to ``keys`` ``(N,)``.
 
     Skilling, "Programming the Hilbert curve", AIP Conf. Proc. 707 (2004).
     """
@@ -71,7 +71,7 @@ def weighted_sums(
 
 @compiled("void(float32[:, :, ::1], int64, float32[:, :, ::1], float64[:, ::1])")
 def box_blur_rows(image: np.ndarray, radius: int, out: np.ndarray, total: np.ndarray) -> None:
-    """Mean over 2*radius+1 columns of every row of ``(H, W, C)``, wrapping around; ``total`` is ``(1, C)`` scratch."""
+    """Average 2*radius+1 columns of every row of ``(H, W, C)``, wrapping around; ``total`` is ``(1, C)`` scratch."""
     height, width, channels = image.shape
     scale = 1.0 / (2 * radius + 1)
     for y in range(height):
@@ -90,7 +90,7 @@ def box_blur_rows(image: np.ndarray, radius: int, out: np.ndarray, total: np.nda
 
 @compiled("void(float32[:, :, ::1], int64, float32[:, :, ::1], float64[:, ::1])")
 def box_blur_columns(image: np.ndarray, radius: int, out: np.ndarray, total: np.ndarray) -> None:
-    """Mean over 2*radius+1 rows of every column of ``(H, W, C)``, mirrored at the borders without repeating the edge.
+    """Average 2*radius+1 rows of every column of ``(H, W, C)``, mirrored at the borders without repeating the edge.
 
     ``total`` is ``(W, C)`` scratch.
     """
@@ -117,7 +117,7 @@ def box_blur_columns(image: np.ndarray, radius: int, out: np.ndarray, total: np.
 
 @compiled("uint64(uint64)", inline="always")
 def _mix(state: np.uint64) -> np.uint64:
-    """One step of splitmix64: the same random numbers on every machine, whichever thread asks."""
+    """Return the next number of splitmix64, which is equal on every machine and in every thread."""
     z = state + np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -126,10 +126,10 @@ def _mix(state: np.uint64) -> np.uint64:
 
 @compiled("void(float32[:, ::1], int32[::1], float32[:, ::1], int32[::1], float64[::1])")
 def _sort_four(items: np.ndarray, placed: np.ndarray, target: np.ndarray, cells: np.ndarray, score: np.ndarray) -> None:
-    """Put the four items that lie in ``cells`` where their scalar products with the targets there are largest.
+    """Permute the four items in ``cells`` so that the sum of their scalar products with the cells' targets is largest.
 
-    That is the permutation of least squared distance, since the squares of items and targets do not depend on it.
-    Adds the products before and after to ``score``.
+    This permutation has the smallest squared distance, since the squares of items and targets do not depend on it.
+    The sums before and after are added to ``score``.
     """
     product = np.empty((4, 4), dtype=np.float32)
     for i in range(4):
@@ -159,7 +159,7 @@ def _sort_four(items: np.ndarray, placed: np.ndarray, target: np.ndarray, cells:
     score[1] += best
     if best > before:
         i0, i1, i2, i3 = placed[cells[0]], placed[cells[1]], placed[cells[2]], placed[cells[3]]
-        placed[cells[b0]] = i0  # item 0 goes to place b0: the assignment itself, not its inverse
+        placed[cells[b0]] = i0  # item 0 goes to cell b0: the assignment itself, not its inverse
         placed[cells[b1]] = i1
         placed[cells[b2]] = i2
         placed[cells[b3]] = i3
@@ -169,19 +169,19 @@ def _sort_four(items: np.ndarray, placed: np.ndarray, target: np.ndarray, cells:
 def plas_blocks(
     items: np.ndarray, placed: np.ndarray, target: np.ndarray, tiling: np.ndarray, seed: np.uint64, threshold: float
 ) -> float:
-    """Move the items of some blocks of a shifted tiling towards their target, by random groups of four.
+    """Move the items of some blocks of a shifted tiling towards their target, in random groups of four.
 
     Args:
-        items: ``(S*S, C)``; stay where they are.
-        placed: ``(S*S,)``, which item lies in each cell; changed.
-        target: ``(S*S, C)``, what each cell should look like.
+        items: ``(S*S, C)`` vectors; not modified.
+        placed: ``(S*S,)`` item in each cell; modified.
+        target: ``(S*S, C)`` target vector of each cell.
         tiling: side S of the grid, its shift down and right (on the torus), side of a block (even), first block and
             the one after the last.
-        seed: of this tiling; a block's shuffles follow from it and its number alone, so threads do not matter.
-        threshold: a block is done once a pass has shrunk its squared distance by less than this share.
+        seed: seed of this tiling; a block's shuffles depend on it and the block's number alone, not on threads.
+        threshold: a block ends after a pass that reduces its squared distance by less than this share.
 
     Returns:
-        By how much the sum of squared distances shrank.
+        Reduction of the sum of squared distances.
     """
     side, down, right, size, first, last = tiling
     per_row = side // size
@@ -224,16 +224,16 @@ def nearest_forms(
     permutations: np.ndarray,
     forms: np.ndarray,
 ) -> None:
-    """For each Gaussian the one of its 48 equivalents that differs least from its target, summed over 7 channels.
+    """Choose for each Gaussian the one of its 48 equivalent forms with the smallest L1 distance to its target.
 
     Args:
         quats: ``(N, 4)`` unit quaternions times the proxy's levels per unit.
         scales: ``(N, 3)`` log-scales times the proxy's levels per unit.
-        target: ``(N, 7)`` wanted w, x, y, z and three log-scales, in the same units.
-        rotations: ``(24, 4)`` and
-        permutations: ``(24, 3)``, the table of equivalents.
-        forms: ``(N,)``, numbers of the chosen equivalents: row of the table, plus 24 if the quaternion is negated.
-            The current one, on entry, wins ties.
+        target: ``(N, 7)`` target w, x, y, z and three log-scales, in these units.
+        rotations: ``(24, 4)`` quaternions of the forms.
+        permutations: ``(24, 3)`` order of the scales in the forms.
+        forms: ``(N,)`` chosen forms: row of the table, plus 24 if the quaternion is negated; modified. The form on
+            entry wins ties.
     """
     for n in range(quats.shape[0]):
         w, x, y, z = quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3]

@@ -1,12 +1,12 @@
-"""Vector quantisation: a weighted k-means in two levels, refined across their borders.
+"""Weighted two-level k-means, refined across the borders of the coarse clusters.
 
 Full k-means compares every vector with every centroid. Here vectors are first split among about sqrt(K) coarse
-clusters; each gets centroids in proportion to sqrt(its error × its count) and is clustered on its own; then vectors
-may move to any centroid of the coarse clusters around theirs, and centroids follow, for some rounds. On real scenes
-that is within 2 % of full k-means' error at a fraction of its time.
+clusters; each gets centroids in proportion to sqrt(its error × its count) and is clustered separately; then vectors
+may move to any centroid of the nearest coarse clusters, and centroids are updated, for several iterations. On real
+scenes the error is within 2 % of full k-means at a fraction of the time.
 
-Distances are matrix products on one BLAS thread per task, sums run in a fixed order in float64, and all chance comes
-from one seed: the result does not depend on the number of threads.
+Distances are matrix products on one BLAS thread per task, sums run in a fixed order in float64, and all random numbers
+come from one seed: the result does not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -23,18 +23,24 @@ from kissgs.planning.quantize import clip_outliers
 BLOCK = 1024
 """Vectors per matrix product: its result, against a few thousand centroids, stays in the processor's cache."""
 
-COARSE_ROUNDS = 6
-SPLIT_ROUNDS = 4
+COARSE_ITERATIONS = 6
+SPLIT_ITERATIONS = 4
 SAMPLES_PER_COARSE = 64
 MAX_COARSE = 512
 
 OUTLIERS = 1e-3
-"""Share of entries, at either end of a dimension, that may be pulled in to keep the others' step."""
+"""Share of entries, at either end of a dimension, that may be clipped so that the step of the others stays small."""
 
 
 @dataclass(frozen=True, slots=True)
 class Clusters:
-    """K centroids, which of them each vector is replaced by, and the lattice that the centroids lie on (0: none)."""
+    """Result of a clustering.
+
+    Attributes:
+        centroids: ``(K, D)``.
+        labels: ``(N,)`` centroid of each vector.
+        step: step of the lattice that the centroids lie on; 0 for none.
+    """
 
     centroids: Float32[np.ndarray, "K D"]
     labels: Int32[np.ndarray, " N"]
@@ -48,8 +54,8 @@ def fit(
     pool: Workers,
     *,
     seed: int,
-    rounds: int,
-    reach: int,
+    iterations: int,
+    nprobe: int,
     tolerance: float,
     lattice: float,
     report: Callable[[float], None] = lambda fraction: None,
@@ -58,19 +64,19 @@ def fit(
 
     Args:
         vectors: finite, N at least 1.
-        weights: positive; how much each vector's error counts.
+        weights: positive weight of each vector's squared error.
         size: K, largest number of centroids.
-        pool: where the work runs.
-        seed: of all random choices.
-        rounds: of refinement across the borders of coarse clusters.
-        reach: coarse clusters that a vector may move among in refinement.
+        pool: threads.
+        seed: seed of all random choices.
+        iterations: iterations of refinement across the borders of coarse clusters.
+        nprobe: number of coarse clusters that are searched for a vector's centroid during refinement.
         tolerance: root mean square error per dimension below which a cluster is not split further.
-        lattice: step of the values that centroids are rounded to, in units of the root mean square error that the
-            codebook leaves; vectors then choose among the rounded ones. 0 leaves them as they are.
-        report: told the fraction done.
+        lattice: step that centroids are rounded to, in units of the codebook's root mean square error; vectors are
+            then assigned to the rounded centroids. 0 does not round.
+        report: receives the fraction done, 0 to 1.
 
     Returns:
-        The clusters; they are fewer than ``size`` where the vectors are few, alike or repeated.
+        The clusters; fewer than ``size`` if the vectors are few, similar or repeated.
     """
     rng = np.random.Generator(np.random.PCG64(seed))
     mean = np.average(vectors, axis=0, weights=weights).astype(np.float32)
@@ -90,12 +96,12 @@ def fit(
     tree = _Tree(coarse, _edges(counts), _edges(shares))
     centroids, labels = _split(vectors, weights, tree, rng, pool)
     report(0.4)
-    near = tree.neighbours(reach)
-    for step in range(rounds):
+    near = tree.neighbours(nprobe)
+    for step in range(iterations):
         _update(centroids, vectors, weights, labels)
         distances = _reassign(vectors, centroids, labels, tree, near, pool)
-        _revive(centroids, vectors, weights * distances, labels)
-        report(0.4 + 0.6 * (step + 1) / rounds)
+        _reseed_empty(centroids, vectors, weights * distances, labels)
+        report(0.4 + 0.6 * (step + 1) / iterations)
     _update(centroids, vectors, weights, labels)
     step = 0.0
     if lattice:
@@ -112,7 +118,7 @@ def fit(
 def assign(
     vectors: Float32[np.ndarray, "N D"], centroids: Float32[np.ndarray, "K D"]
 ) -> tuple[Int[np.ndarray, " N"], Float32[np.ndarray, " N"]]:
-    """Nearest centroid of every vector, by brute force, and the squared distance to it."""
+    """Return the nearest centroid of every vector, by brute force, and the squared distance to it."""
     labels = np.empty(len(vectors), dtype=np.int64)
     distances = np.empty(len(vectors), dtype=np.float32)
     norms = np.einsum("kd,kd->k", centroids, centroids)
@@ -130,7 +136,7 @@ def assign(
 
 @dataclass(frozen=True, slots=True)
 class _Tree:
-    """Coarse clusters, and the ranges of (sorted) vectors and of centroids that belong to each."""
+    """Coarse clusters, and the ranges of the sorted vectors and of the centroids in each."""
 
     coarse: Float32[np.ndarray, "J D"]
     vector_edges: Int[np.ndarray, " edges"]
@@ -142,11 +148,11 @@ class _Tree:
     def centroids_of(self, j: int) -> slice:
         return slice(int(self.centroid_edges[j]), int(self.centroid_edges[j + 1]))
 
-    def neighbours(self, reach: int) -> list[Int[np.ndarray, " _"]]:
-        """For every coarse cluster, the centroids of the ``reach`` coarse clusters nearest to it, itself first."""
+    def neighbours(self, nprobe: int) -> list[Int[np.ndarray, " _"]]:
+        """Return for every coarse cluster the centroids of the ``nprobe`` nearest coarse clusters, itself first."""
         norms = np.einsum("jd,jd->j", self.coarse, self.coarse)
         distances = norms - 2 * (self.coarse @ self.coarse.T)
-        nearest = np.argsort(distances, axis=1, kind="stable")[:, :reach]
+        nearest = np.argsort(distances, axis=1, kind="stable")[:, :nprobe]
         every = np.arange(self.centroid_edges[-1])
         return [np.concatenate([every[self.centroids_of(int(j))] for j in row]) for row in nearest]
 
@@ -154,13 +160,13 @@ class _Tree:
 def _coarse(
     vectors: np.ndarray, weights: np.ndarray, size: int, rng: np.random.Generator, pool: Workers
 ) -> tuple[Float32[np.ndarray, "J D"], Int[np.ndarray, " N"], Float64[np.ndarray, " J"]]:
-    """About sqrt(K) clusters from a sample; the owner of every vector and the weighted squared error of each."""
+    """Return about sqrt(K) clusters of a sample, the cluster of every vector, and each cluster's weighted error."""
     number = min(round(1.2 * size**0.5), MAX_COARSE)
     sample = rng.choice(len(vectors), min(len(vectors), SAMPLES_PER_COARSE * number), replace=False)
     some, some_weights = vectors[sample], weights[sample]
-    chances = some_weights.astype(np.float64) / some_weights.sum(dtype=np.float64)
-    coarse = some[rng.choice(len(some), number, replace=False, p=chances)]
-    for _ in range(COARSE_ROUNDS):
+    probabilities = some_weights.astype(np.float64) / some_weights.sum(dtype=np.float64)
+    coarse = some[rng.choice(len(some), number, replace=False, p=probabilities)]
+    for _ in range(COARSE_ITERATIONS):
         labels, _ = assign(some, coarse)
         _update(coarse, some, some_weights, labels.astype(np.int32))
     step = 16 * BLOCK
@@ -173,17 +179,18 @@ def _coarse(
 def _allocate(
     errors: Float64[np.ndarray, " J"], counts: Int[np.ndarray, " J"], size: int, tolerance: float
 ) -> Int[np.ndarray, " J"]:
-    """How many centroids each coarse cluster gets: by sqrt(error × count), at least 1, at most its vectors.
+    """Return the number of centroids of each coarse cluster: in proportion to sqrt(error × count), at most its vectors.
 
-    Clusters whose mean squared error is within ``tolerance`` get one. The sum is at most ``size``.
+    A cluster gets at least one, and only one if its mean squared error is within ``tolerance``. The sum is at most
+    ``size``.
     """
     limit = np.where(errors > tolerance * counts, counts, np.minimum(counts, 1))
-    wish = np.sqrt(errors * counts)
+    demand = np.sqrt(errors * counts)
     shares = np.minimum(counts, 1)
     left = size - int(shares.sum())
-    # Clusters that reach their limit leave the rest to the others; each pass gives out at least half of what is left.
-    while left > 0 and (open_ := (shares < limit) & (wish > 0)).any():
-        portion = np.where(open_, wish, 0)
+    # What clusters at their limit cannot use goes to the others; each pass gives out at least half of the remainder.
+    while left > 0 and (open_ := (shares < limit) & (demand > 0)).any():
+        portion = np.where(open_, demand, 0)
         extra = np.floor(portion / portion.sum() * left).astype(np.int64)
         if not extra.any():
             extra[np.argsort(-portion, kind="stable")[:left]] = 1
@@ -196,7 +203,7 @@ def _allocate(
 def _split(
     vectors: np.ndarray, weights: np.ndarray, tree: _Tree, rng: np.random.Generator, pool: Workers
 ) -> tuple[Float32[np.ndarray, "K D"], Int32[np.ndarray, " N"]]:
-    """Cluster the vectors of every coarse cluster on their own."""
+    """Cluster the vectors of every coarse cluster separately."""
     centroids = np.empty((int(tree.centroid_edges[-1]), vectors.shape[1]), dtype=np.float32)
     labels = np.empty(len(vectors), dtype=np.int32)
     seeds = rng.integers(0, 2**63, len(tree.coarse))
@@ -206,10 +213,12 @@ def _split(
         some, some_weights, number = vectors[rows], weights[rows], own.stop - own.start
         if number == 0:
             return
-        chances = some_weights.astype(np.float64) / some_weights.sum(dtype=np.float64)
-        start = np.random.Generator(np.random.PCG64(int(seeds[j]))).choice(len(some), number, replace=False, p=chances)
+        probabilities = some_weights.astype(np.float64) / some_weights.sum(dtype=np.float64)
+        start = np.random.Generator(np.random.PCG64(int(seeds[j]))).choice(
+            len(some), number, replace=False, p=probabilities
+        )
         local = some[start]
-        for _ in range(SPLIT_ROUNDS):
+        for _ in range(SPLIT_ITERATIONS):
             _update(local, some, some_weights, assign(some, local)[0].astype(np.int32))
         centroids[own] = local
         labels[rows] = assign(some, local)[0] + own.start
@@ -226,7 +235,7 @@ def _reassign(
     near: list[Int[np.ndarray, " _"]],
     pool: Workers,
 ) -> Float32[np.ndarray, " N"]:
-    """Move every vector to the best centroid near its coarse cluster. Changes ``labels``; returns distances."""
+    """Assign every vector to the nearest centroid around its coarse cluster; modify ``labels``, return distances."""
     distances = np.zeros(len(vectors), dtype=np.float32)
 
     def work(j: int) -> None:
@@ -240,7 +249,7 @@ def _reassign(
 
 
 def _update(centroids: np.ndarray, vectors: np.ndarray, weights: np.ndarray, labels: np.ndarray) -> None:
-    """Move every centroid to the weighted mean of its vectors; one that has none stays."""
+    """Move every centroid to the weighted mean of its vectors; one without vectors stays."""
     from kissgs.planning import kernels
 
     sums = np.zeros(centroids.shape)
@@ -250,8 +259,8 @@ def _update(centroids: np.ndarray, vectors: np.ndarray, weights: np.ndarray, lab
     centroids[filled] = sums[filled] / totals[filled, None]
 
 
-def _revive(centroids: np.ndarray, vectors: np.ndarray, errors: np.ndarray, labels: np.ndarray) -> None:
-    """Give centroids that lost all their vectors a new start: the vectors that are represented worst."""
+def _reseed_empty(centroids: np.ndarray, vectors: np.ndarray, errors: np.ndarray, labels: np.ndarray) -> None:
+    """Move centroids without vectors to the vectors of largest weighted error."""
     empty = np.flatnonzero(np.bincount(labels, minlength=len(centroids)) == 0)
     worst = np.argsort(-errors, kind="stable")[: len(empty)]
     centroids[empty] = vectors[worst]
@@ -259,13 +268,13 @@ def _revive(centroids: np.ndarray, vectors: np.ndarray, errors: np.ndarray, labe
 
 
 def _round_to_lattice(centroids: np.ndarray, step: float, tolerance: float) -> float:
-    """Round in place to whole steps from each dimension's smallest value, which a constant one keeps.
+    """Round in place to whole steps from each dimension's smallest value; a constant dimension keeps its value.
 
     Returns:
-        The step: the one asked for, or what 256 levels and the tolerance ask for, if that is larger.
+        The step: ``step``, or the one that 256 levels or the tolerance need if that is larger.
     """
     step = max(step, 2 * tolerance)
-    # Few vectors have no outliers, and an exact codebook has no error that would tell the step.
+    # An exact codebook, of few vectors, has no error that outliers could be compared with.
     wide = (clip_outliers(centroids, step=step, share=OUTLIERS) if step > 2 * tolerance else centroids).astype(
         np.float64
     )

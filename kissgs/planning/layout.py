@@ -1,7 +1,8 @@
-"""Which Gaussian sits in which cell of the grid: row-major along a 3D Hilbert curve.
+"""Order of the Gaussians in the grid: row-major along a 3D Hilbert curve, or sorted by PLAS.
 
-WebP predicts a pixel from its left and upper neighbours and repeats earlier runs; a long one-dimensional chain through
-space serves it better than any two-dimensional arrangement that was measured (docs/format.md has the grid itself).
+WebP predicts a pixel from its left and upper neighbours and repeats earlier runs; with a one-dimensional curve through
+space, planes are smaller than with any two-dimensional arrangement that was measured. The grid is described in
+docs/reference/format.md.
 """
 
 from __future__ import annotations
@@ -21,19 +22,18 @@ from kissgs.planning.quantize import quantize_means
 from kissgs.settings import EncodeSettings
 
 PLAS_HIGH, PLAS_LOW = 1.0, 0.2
-"""Weights of the high and the low position bytes where Gaussians are sorted by PLAS (the public encoder's)."""
+"""Weights of the high and the low position bytes in PLAS, as in the paper's public encoder."""
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Which Gaussian sits in which cell, row-major.
+    """Cells of the grid and their Gaussians, row-major.
 
     Attributes:
         side: G, cells per axis.
-        cells: ``(G*G,)`` index of a Gaussian of the scene; padding repeats one that lies near.
-        mask: ``(G*G,)`` whether the cell is more than padding.
-        cell_to_gaussian: ``(G*G,)`` for each cell, the number, among the cells that are no padding, of the cell that
-            holds the same Gaussian.
+        cells: ``(G*G,)`` index in the scene of each cell's Gaussian; padding repeats a Gaussian.
+        mask: ``(G*G,)`` true for cells with a Gaussian, false for padding.
+        cell_to_gaussian: ``(G*G,)`` for each cell, the rank of its Gaussian among the cells with ``mask``.
     """
 
     side: int
@@ -51,12 +51,13 @@ def layout_grid(
     report: Callable[[float], None],
     classes: Int[np.ndarray, " M"] | None = None,
 ) -> Grid:
-    """Give every Gaussian of ``kept`` a cell.
+    """Assign a cell to every Gaussian of ``kept``.
 
-    Along the Hilbert curve, those of class 0 may come first, then those of class 1, and so on: a curve for each.
+    With ``classes`` and the Hilbert order, the Gaussians of class 0 come first, then those of class 1 and so on, each
+    class along its own curve.
 
     Raises:
-        UnsupportedError: there are more than one image can hold.
+        UnsupportedError: more Gaussians than one image can hold.
     """
     side = grid_side(len(kept))
     if len(kept) == 0:
@@ -83,7 +84,7 @@ def _plas_order(
     pool: Workers,
     report: Callable[[float], None],
 ) -> tuple[Int[np.ndarray, " cells"], Bool[np.ndarray, " cells"]]:
-    """Cells sorted by PLAS on both position bytes; padding is sorted along with the rest."""
+    """Return order and mask of the cells sorted by PLAS on both position bytes, padding included."""
     count = len(levels)
     rng = np.random.Generator(np.random.PCG64(settings.seed))
     padding = rng.integers(0, count, side * side - count)
@@ -98,16 +99,16 @@ def _plas_order(
 
 
 def _standardized(values: np.ndarray) -> np.ndarray:
-    """Zero mean and unit deviation, both over all channels together."""
+    """Scale to zero mean and unit deviation over all channels together."""
     deviation = values.std()
     return (values - values.mean()) / (deviation if deviation > 0 else 1)
 
 
 def grid_side(count: int) -> int:
-    """Side of the square grid for ``count`` Gaussians: the smallest multiple of 8 that holds them, at least 8.
+    """Return the side of the square grid for ``count`` Gaussians: the smallest multiple of 8 that fits, at least 8.
 
     Raises:
-        UnsupportedError: there are more Gaussians than one image can hold.
+        UnsupportedError: more Gaussians than one image can hold.
     """
     side = isqrt(max(count, 1) - 1) + 1
     side = -(-side // 8) * 8
@@ -119,13 +120,13 @@ def grid_side(count: int) -> int:
 
 
 def hilbert_order(levels: UInt16[np.ndarray, "N 3"]) -> Int[np.ndarray, " N"]:
-    """The order in which a 3D Hilbert curve visits the positions.
+    """Return the order in which a 3D Hilbert curve visits the positions.
 
     Args:
         levels: 16-bit positions.
 
     Returns:
-        Indices of the Gaussians along the curve; those in one cell keep their order.
+        Indices of the Gaussians along the curve; Gaussians of equal position keep their order.
     """
     from kissgs.planning import kernels
 

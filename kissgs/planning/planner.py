@@ -1,4 +1,4 @@
-"""The plan of a container: weighed by what changes cost in pictures where that is known, else with even steps."""
+"""``plan_encoding``: rate-distortion planning if the scene's sensitivity is known, else uniform planning."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from kissgs.planning.uniform import plan_uniform
 from kissgs.settings import EncodeSettings
 
 INVISIBLE_LOGIT = -5.5373
-"""Logit of opacity 1/255, rounded up: no renderer draws what is this faint or fainter."""
+"""Logit of opacity 1/255, rounded up; no renderer draws Gaussians of this opacity or less."""
 
 
 def plan_encoding(
@@ -27,16 +27,16 @@ def plan_encoding(
     threads: int = 0,
     progress: Progress = silent,
 ) -> EncodingPlan:
-    """Choose order, forms, codebook and levels for a clean scene.
+    """Choose order, rotation forms, codebook and levels for a clean scene.
 
     Args:
         splats: the scene.
-        settings: see :class:`EncodeSettings`.
-        sensitivity: what changes of the scene cost in pictures. With it all choices are weighed under one price of a
-            bit; without it, or where nothing was seen, steps are those of the settings.
-        recolor: where choices are weighed: given the Gaussians as a decoder will find them, and their indices in the
-            scene, returns better ``sh0``.
-        threads: to use; 0 means one per processor.
+        settings: settings of the encoder.
+        sensitivity: squared image error of changes of the scene, for rate-distortion planning. Without it, or if no
+            camera saw any Gaussian, planning is uniform, with the steps of the settings.
+        recolor: for rate-distortion planning: returns better ``sh0`` for the decoded Gaussians and their indices in
+            the scene.
+        threads: number of threads; 0 means one per processor.
         progress: receives "kernels", "rate_distortion", "order", "forms", "codebook", "sort codebook" and "rounding".
 
     Raises:
@@ -54,14 +54,14 @@ def plan_encoding(
 
 
 def visible_gaussians(splats: Splats, settings: EncodeSettings) -> Int[np.ndarray, " K"]:
-    """Those that any renderer draws."""
+    """Return the indices of the Gaussians that a renderer draws, or of all if ``prune_invisible`` is off."""
     if not settings.prune_invisible:
         return np.arange(len(splats))
     return np.flatnonzero(splats.opacities > np.float32(INVISIBLE_LOGIT))
 
 
 def load_kernels(progress: Progress = silent) -> None:
-    """Compile the encoder's kernels, or load them from numba's cache of earlier times."""
+    """Compile the encoder's kernels, or load them from numba's cache."""
     progress("kernels", 0.0)
     from kissgs.planning import kernels  # noqa: F401
 

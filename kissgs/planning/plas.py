@@ -1,11 +1,11 @@
-"""PLAS: arrange vectors on a square grid so that neighbours are alike.
+"""PLAS: arrange vectors on a square grid so that neighbours are similar.
 
 Parallel Linear Assignment Sorting (Morgenstern et al., "Compact 3D Scene Representation via Self-Organizing Gaussian
-Grids", ECCV 2024). A grid is low-pass filtered; random groups of four items inside blocks are then permuted so that
-each lies as close as it can to the filtered grid; the filter gets narrower, until nothing is left to filter.
+Grids", ECCV 2024). The grid is low-pass filtered; random groups of four items inside blocks are permuted to be as close
+as possible to the filtered grid; this repeats with ever smaller filter radii.
 
-Differences from the public implementation: the cheapest of the 24 permutations is applied as such (not inverted); a
-block stops on its own once it has converged; the filter is a box, which a Gaussian as wide as its own kernel nearly is.
+Differences from the public implementation: the cheapest of the 24 permutations is applied as such (not inverted); each
+block stops once it has converged; the filter is a box, which approximates the wide, truncated Gaussian used there.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ def plas(
     """Arrange ``S*S`` vectors on an S × S grid.
 
     Args:
-        items: vectors in their first arrangement, row-major; their squared distance is what counts, so scale and
-            weight the channels before. S is a multiple of 8.
-        pool: where the blocks are worked on; the result does not depend on its size.
-        seed: of all random choices.
-        decay: factor from one filter radius to the next; smaller is faster and a little rougher.
+        items: vectors in their initial arrangement, row-major; S is a multiple of 8. Squared distances are minimised,
+            so scale and weight the channels before.
+        pool: threads for the blocks; the result does not depend on their number.
+        seed: seed of all random choices.
+        decay: factor from one filter radius to the next; smaller is faster and slightly less smooth.
         threshold: relative improvement of a pass below which a block counts as converged.
-        start_radius: first filter radius; by default half the grid, which forgets the first arrangement. With a good
-            first arrangement (a space-filling curve), a small radius keeps it and saves most of the time.
-        report: told the fraction done.
+        start_radius: first filter radius, cells; by default half the grid, which does not preserve the initial
+            arrangement. A small radius preserves a good one, such as a space-filling curve, and takes less time.
+        report: receives the fraction done, 0 to 1.
 
     Returns:
-        For each cell, row-major, the index of the item that lies there.
+        For each cell, row-major, the index of its item.
     """
     side = round(len(items) ** 0.5)
     placed = np.arange(len(items), dtype=np.int32)
@@ -85,7 +85,7 @@ def _improve(
     threshold: float,
     pool: Workers,
 ) -> float:
-    """One randomly shifted tiling, every block of it sorted to convergence. Changes ``placed``."""
+    """Sort every block of one randomly shifted tiling to convergence; modify ``placed``, return the improvement."""
     from kissgs.planning import kernels
 
     down, right = rng.integers(0, size, 2)
@@ -101,7 +101,7 @@ def _improve(
 
 
 def box_blur(image: Float32[np.ndarray, "H W C"], radius: int, pool: Workers) -> Float32[np.ndarray, "H W C"]:
-    """Mean over a square of ``2*radius + 1`` cells, wrapping around sideways and mirrored up and down."""
+    """Average squares of ``2*radius + 1`` cells, wrapping around horizontally and mirrored vertically."""
     from kissgs.planning import kernels
 
     def work(first: int) -> np.ndarray:

@@ -1,8 +1,8 @@
-"""Level <-> value: uniform quantisers with exact bookkeeping of the ranges that decoders use.
+"""Uniform quantisers, and the ranges that decoders need to invert them.
 
-A SOG-XT decoder knows no level counts. It maps the smallest level observed in an image to each channel's ``low`` and
-the largest to its ``high``, linearly (docs/format.md). So the ranges written must belong to the levels that are really
-in the image; :func:`observed_range` makes them so, whatever happened to the levels in between.
+A SOG-XT decoder does not know the number of levels. It maps the smallest level observed in an image to each channel's
+``low`` and the largest to its ``high``, linearly (docs/reference/format.md). So the ranges that are written must be
+those of the levels that occur in the image; :func:`observed_range` returns them.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from kissgs.core.signed_log import signed_log
 from kissgs.core.splats import Splats
 
 MEANS_TOP = 65_535
-"""Top level of positions. Some readers of meta.json divide by it instead of by what they observe, so it must occur."""
+"""Top level of positions. It must occur, because some readers of meta.json divide by it, not by the observed one."""
 
 
 @dataclass(frozen=True, slots=True)
 class Quantized:
-    """Levels of one plane and what they stand for: ``value = low + level / top * (high - low)``, per channel.
+    """Levels of one plane and the values they stand for: ``value = low + level / top * (high - low)``, per channel.
 
     Attributes:
         levels: ``(N, C)`` from 0 to ``top``.
         low: ``(C,)`` value of level 0.
         high: ``(C,)`` value of level ``top``.
-        top: the level that ``high`` belongs to, whether it occurs or not.
-        level_stride: distance of the levels that a row uses: multiples of it, once ``level_offset`` is added. One for
-            all, or ``(N,)``. Single levels may be others.
-        level_offset: how far multiples are shifted.
+        top: the level of ``high``, whether it occurs or not.
+        level_stride: distance between the levels that a row uses, one for all rows or ``(N,)``: with ``level_offset``
+            added, levels are multiples of it. Single levels may be exceptions.
+        level_offset: offset added to levels before they are multiples of ``level_stride``.
     """
 
     levels: UInt8[np.ndarray, "N C"] | UInt16[np.ndarray, "N C"]
@@ -42,25 +42,25 @@ class Quantized:
     level_offset: int = 0
 
     def values(self) -> Float64[np.ndarray, "N C"]:
-        """What the levels stand for."""
+        """Return the values that the levels stand for."""
         low, high = self.low.astype(np.float64), self.high.astype(np.float64)
         return np.asarray(low + self.levels * ((high - low) / self.top))
 
     def take(self, rows: Int[np.ndarray, " M"] | Bool[np.ndarray, " N"]) -> Quantized:
-        """Those of the rows ``rows`` alone, in that order."""
+        """Return the rows ``rows``, in that order."""
         spacing = self.level_stride if isinstance(self.level_stride, int) else self.level_stride[rows]
         return replace(self, levels=self.levels[rows], level_stride=spacing)
 
 
 def quantize(values: Float[np.ndarray, "N C"], *, step: float, shared: bool = True, max_top: int = 255) -> Quantized:
-    """Round to equal steps, chosen by the distance that is allowed between neighbouring levels.
+    """Round to uniform steps.
 
     Args:
         values: finite values.
-        step: largest allowed step, in the unit of the values. It is exceeded only if ``max_top`` levels do not
-            span the widest channel.
-        shared: one step for all channels (least error for a given entropy). If false every channel spreads
-            ``max_top`` levels over its own range, and ``step`` does not matter.
+        step: largest allowed step, in the unit of the values. It is exceeded only if ``max_top`` steps do not span
+            the widest channel.
+        shared: one step for all channels (least error for a given entropy). If false, every channel spreads
+            ``max_top`` levels over its own range, and ``step`` has no effect.
         max_top: largest level.
 
     Returns:
@@ -72,16 +72,16 @@ def quantize(values: Float[np.ndarray, "N C"], *, step: float, shared: bool = Tr
     widest = float(extent.max(initial=0.0))
     top = max_top
     if shared and widest > 0:
-        top = int(min(max(ceil(widest / step - 1e-3), 1), max_top))  # a whole number of steps stays one
+        top = int(min(max(ceil(widest / step - 1e-3), 1), max_top))  # exactly k steps need k levels
         high = np.where(extent > 0, (low + widest).astype(np.float32), low)
     return Quantized(_levels(wide, low, high, top).astype(np.uint8), low, high, top)
 
 
 def clip_outliers(values: Float[np.ndarray, "N C"], *, step: float, share: float) -> Float[np.ndarray, "N C"]:
-    """Pull in outliers that 256 levels of ``step`` cannot span, so that they do not make the step coarse for all.
+    """Clip outliers that 256 levels of ``step`` cannot span, so that they do not make the step coarse for all.
 
-    Nothing happens where the levels suffice. Else each channel keeps the span of all but the outermost ``share`` of its
-    values at either end, or as much as the levels span if that is more, and values beyond it move to its ends.
+    Values that the levels span are returned unchanged. Else each channel keeps the span of all but the outermost
+    ``share`` of its values at either end, or the span of the levels if that is larger; values beyond are clipped to it.
     """
     low, high = values.min(axis=0, initial=np.inf), values.max(axis=0, initial=-np.inf)
     if len(values) == 0 or float((high.astype(np.float64) - low).max(initial=0)) <= 255 * step:
@@ -90,22 +90,22 @@ def clip_outliers(values: Float[np.ndarray, "N C"], *, step: float, share: float
     inner_high = np.quantile(values, 1 - share, axis=0, method="higher").astype(np.float64)
     span = max(float((inner_high - inner_low).max()), 255 * step)
     middle = (inner_low + inner_high) / 2
-    # As much of the room beside the inner values as is needed, on the side where it is needed.
+    # The span's room beyond the inner values is used on the sides that need it.
     first = np.clip(low, middle - span / 2, None)
     last = np.clip(high, None, middle + span / 2)
     return np.clip(values, first.astype(values.dtype), last.astype(values.dtype))
 
 
 def quantize_means(means: Float32[np.ndarray, "N 3"], *, bits: int | Int[np.ndarray, " N"]) -> Quantized:
-    """Positions as 16-bit levels of their signed logarithm, with one range for all three axes.
+    """Quantise positions to 16-bit levels of their signed logarithm, with one range for all three axes.
 
     Args:
         means: finite positions.
-        bits: precision, 8 to 16, of all or of each. Below 16 the levels are multiples of a power of two (the low
-            bytes then compress); the outermost level stays 65535.
+        bits: precision, 8 to 16, of all Gaussians or of each. Below 16 the levels are multiples of a power of two (the
+            low bytes then compress); the outermost level stays 65535.
 
     Returns:
-        Levels (uint16) with ``low`` and ``high`` in the signed-log domain, alike in all channels.
+        Levels (uint16) with ``low`` and ``high`` in the signed-log domain, equal in all channels.
     """
     wide = signed_log(means)
     low32, high32 = _range(wide.reshape(-1, 1))
@@ -113,13 +113,13 @@ def quantize_means(means: Float32[np.ndarray, "N 3"], *, bits: int | Int[np.ndar
     spacing = np.exp2(16 - np.asarray(bits))
     levels = _levels(wide, low, high, MEANS_TOP, spacing.reshape(-1, 1))
     if high[0] > low[0]:
-        levels[wide == wide.max()] = MEANS_TOP  # rounding, to even or of the range, could stop just short of it
-    meant = int(spacing) if spacing.ndim == 0 else spacing.astype(np.int64)
-    return Quantized(levels.astype(np.uint16), low, high, MEANS_TOP, meant)
+        levels[wide == wide.max()] = MEANS_TOP  # rounding of the level or of the range could miss it
+    stride = int(spacing) if spacing.ndim == 0 else spacing.astype(np.int64)
+    return Quantized(levels.astype(np.uint16), low, high, MEANS_TOP, stride)
 
 
 def means_bits(splats: Splats, kept: Int[np.ndarray, " M"], tolerance: float) -> int:
-    """Bits of position that the scene needs: the median Gaussian moves by at most ``tolerance`` of its size.
+    """Return the position bits, 8 to 16, with which the median Gaussian moves by at most ``tolerance`` of its size.
 
     The step of a signed logarithm grows as 1 + |x|; size is the geometric mean of the two longest axes.
     """
@@ -134,9 +134,9 @@ def means_bits(splats: Splats, kept: Int[np.ndarray, " M"], tolerance: float) ->
 
 
 def observed_range(quantized: Quantized) -> tuple[Float32[np.ndarray, " C"], Float32[np.ndarray, " C"]]:
-    """The ranges to write: values of the smallest and the largest level that occur in the image, over all channels.
+    """Return the range to write: values of the smallest and the largest level that occur, over all channels.
 
-    An image of one level throughout decodes to ``low`` everywhere, so both ends are then that level's value.
+    An image of a single level decodes to ``low`` everywhere, so both ends are then that level's value.
     """
     if quantized.levels.size == 0:
         return quantized.low, quantized.low
@@ -149,7 +149,7 @@ def observed_range(quantized: Quantized) -> tuple[Float32[np.ndarray, " C"], Flo
 
 
 def _range(wide: Float64[np.ndarray, "N C"]) -> tuple[Float32[np.ndarray, " C"], Float32[np.ndarray, " C"]]:
-    """Per-channel minimum and maximum as the float32 numbers that will be written (zeros without rows)."""
+    """Return each channel's minimum and maximum as the float32 numbers that are written (zeros without rows)."""
     if len(wide) == 0:
         zeros = np.zeros(wide.shape[1], dtype=np.float32)
         return zeros, zeros
@@ -164,7 +164,7 @@ def _levels(
     top: int,
     spacing: float | Float64[np.ndarray, "M 1"] = 1,
 ) -> Float64[np.ndarray, "N C"]:
-    """Nearest multiples of ``spacing`` in the rounded ranges, at most ``top``."""
+    """Return the nearest multiples of ``spacing`` in the rounded ranges, at most ``top``."""
     low64 = low.astype(np.float64)
     extent = high.astype(np.float64) - low64
     levels = wide - low64

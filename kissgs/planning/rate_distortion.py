@@ -1,4 +1,4 @@
-"""Choices weighed by what they cost in pictures: order, steps, codebook, levels, omissions; one price for all bits."""
+"""Rate-distortion planning: order, steps, codebook, levels and pruning, all with one lambda."""
 
 from __future__ import annotations
 
@@ -17,38 +17,39 @@ from kissgs.planning import kmeans
 from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.layout import layout_grid
 from kissgs.planning.quantize import MEANS_TOP, Quantized, clip_outliers, means_bits, quantize_means
-from kissgs.planning.rd_model import GLOSS, SEEN, CodebookErrorModel, Costs, default_error, lambda_for, step
+from kissgs.planning.rd_model import SEEN, SH_MEAN_SQUARE, CodebookErrorModel, Costs, default_error, lambda_for, step
 from kissgs.planning.rdo_quantize import largest_changes, quantize_by_class, rdo_quantize_shapes
 from kissgs.planning.rotation_forms import canonicalize
-from kissgs.planning.sh_codebook import COEFFICIENTS, Codebook, bounded_weights, fit_codebook, guessed_weights
+from kissgs.planning.sh_codebook import COEFFICIENTS, Codebook, bounded_weights, fit_codebook, size_weights
 from kissgs.settings import EncodeSettings
 
 ColorRefit = Callable[[Splats, Int[np.ndarray, " M"]], Float32[np.ndarray, "M 3"]]
-"""Given what a decoder will find, and which Gaussians of the scene these are: better base colours for them."""
+"""Function that returns better base colours for the decoded Gaussians and their indices in the scene."""
 
-TRIAL, TRIAL_ENTRIES = 1 << 15, 1024
-"""Gaussians, and entries of the codebook, from which the cost of gloss is told."""
+SAMPLE, SAMPLE_ENTRIES = 1 << 15, 1024
+"""Number of Gaussians and of codebook entries from which the codebook's error is estimated."""
 
-DISPLAYED = 3.0
-"""Largest squared error of a colour that a display can show, summed over RGB from 0 to 1."""
+MAX_DISPLAYED_ERROR = 3.0
+"""Largest squared error of a displayed colour, summed over RGB from 0 to 1."""
 
-MADE_UP = np.float32(0.5 / SH_C0)
-"""Largest change of a base colour for the sake of lost SH coefficients: half of a colour's range."""
+MAX_COMPENSATION = np.float32(0.5 / SH_C0)
+"""Largest change of a base colour that compensates lost SH coefficients: half of a colour's range."""
 
-SH_HEDGE, SIZE_HEDGE = 0.55, 0.64
-"""Weights of the codebook: colour sensitivity to the power of 1 minus the first times the view uncertainty, times what
-large and opaque Gaussians show anywhere (:func:`guessed_weights`) to the second times the view uncertainty; bounded:"""
+SENSITIVITY_SHRINK, SIZE_POWER = 0.55, 0.64
+"""Exponents of the codebook's weights: colour sensitivity to the power of 1 - SENSITIVITY_SHRINK · view uncertainty,
+times (opacity × cross-section) to the power of SIZE_POWER · view uncertainty (:func:`size_weights`)."""
 
 SH_WEIGHTS = (1e-2, 1e2)
-"""in units of the median."""
+"""Bounds of the codebook's weights, in units of their median."""
 
 OUTLIERS = 1e-4
+"""Share of base colours, at either end of a channel, that may be clipped so that the step of the others stays small."""
 
-MANY_DROPPED = 0.2
-"""Share of the Gaussians from which on the report says why they were left out."""
+MANY_PRUNED = 0.2
+"""Share of pruned Gaussians above which the report explains why they were pruned."""
 
 REFIT_GAIN = 0.25
-"""Decibels by a step of refitting base colours: less than what is measured on average, for the sake of the worst."""
+"""PSNR gain per iteration of the colour refit, decibels: below the measured mean, so that it holds for most scenes."""
 
 
 def plan_rate_distortion(
@@ -60,30 +61,33 @@ def plan_rate_distortion(
     pool: Workers,
     progress: Progress,
 ) -> EncodingPlan:
-    """Choose everything for the Gaussians ``kept``, at least one of which is seen."""
+    """Plan the Gaussians ``kept``, at least one of which a camera has seen."""
     progress("rate_distortion", 0.0)
-    costs, gloss = Costs.of(sensitivity, splats).take(kept), _trial(splats, kept, sensitivity, settings, pool)
-    drop = settings.prune_threshold_bits * (1 - sensitivity.view_uncertainty)
-    prices = _Prices(
+    costs, sh_model = (
+        Costs.of(sensitivity, splats).take(kept),
+        _codebook_error_model(splats, kept, sensitivity, settings, pool),
+    )
+    threshold_bits = settings.prune_threshold_bits * (1 - sensitivity.view_uncertainty)
+    lambdas = _LambdaEstimate(
         costs,
-        gloss,
-        drop,
+        sh_model,
+        threshold_bits,
         settings,
         sensitivity.view_uncertainty,
         settings.color_refit_iterations if recolor is not None else 0,
     )
-    rd_lambda, usual_price = prices.wanted(default_error(costs, splats, kept, gloss))
-    slack = max(1.0, float(np.sqrt(rd_lambda / usual_price)))
-    pruned_by_rd = costs.pruned_by_rd(rd_lambda, drop, usual_price)
-    note = _why_dropped(pruned_by_rd, costs)
-    worth = np.flatnonzero(~pruned_by_rd)
-    kept, costs = kept[worth], costs.take(worth)
+    rd_lambda, default_lambda = lambdas.choose(default_error(costs, splats, kept, sh_model))
+    slack = max(1.0, float(np.sqrt(rd_lambda / default_lambda)))
+    pruned_by_rd = costs.pruned_by_rd(rd_lambda, threshold_bits, default_lambda)
+    note = _pruning_note(pruned_by_rd, costs)
+    remaining = np.flatnonzero(~pruned_by_rd)
+    kept, costs = kept[remaining], costs.take(remaining)
     classes = costs.classes(settings.step_classes, splats.means[kept])
     progress("order", 0.0)
     grid = layout_grid(splats.means, kept, 16, settings, pool, lambda fraction: progress("order", fraction), classes)
     order = grid.cells[grid.mask]
     rank = np.searchsorted(kept, order)
-    classes, costs, shown = classes[rank], costs.take(rank), splats.select(order)
+    classes, costs, ordered = classes[rank], costs.take(rank), splats.select(order)
 
     progress("forms", 0.0)
     quats, scales, form_error, forms = canonicalize(
@@ -92,11 +96,11 @@ def plan_rate_distortion(
     quats, scales, forms = quats[grid.mask], scales[grid.mask], forms[grid.mask]
     weights, size = (
         _sh_weights(sensitivity, order, splats),
-        gloss.best_size(rd_lambda, len(order), settings.gaussians_per_codebook_entry),
+        sh_model.best_size(rd_lambda, len(order), settings.gaussians_per_codebook_entry),
     )
-    codebook = fit_codebook(shown, np.arange(len(order)), weights, size, settings, pool, progress)
+    codebook = fit_codebook(ordered, np.arange(len(order)), weights, size, settings, pool, progress)
     progress("rounding", 0.0)
-    values = np.concatenate([shown.opacities[:, None], scales, quats], axis=1).astype(np.float64)
+    values = np.concatenate([ordered.opacities[:, None], scales, quats], axis=1).astype(np.float64)
     captured = sensitivity.captured[order]
     largest = largest_changes(sensitivity.coverage[order], captured, slack)
     parts = (
@@ -110,20 +114,20 @@ def plan_rate_distortion(
         )
     fields = dict(zip(("opacities", "scales", "quaternions"), parts, strict=True))
     coarser = np.rint(captured + np.log2(slack))
-    fields["means"] = _means(shown, costs, classes, rd_lambda, settings.means_tolerance, coarser)
+    fields["means"] = _means(ordered, costs, classes, rd_lambda, settings.means_tolerance, coarser)
 
-    rest = _gloss_of(codebook, shown)
-    made_up = np.einsum("nk,nkc->nc", sensitivity.mean_sh_basis[order], shown.shN - rest) / np.float32(SH_C0)
-    base = shown.sh0 + np.clip(made_up, -MADE_UP, MADE_UP)
+    rest = _decoded_sh(codebook, ordered)
+    compensation = np.einsum("nk,nkc->nc", sensitivity.mean_sh_basis[order], ordered.shN - rest) / np.float32(SH_C0)
+    base = ordered.sh0 + np.clip(compensation, -MAX_COMPENSATION, MAX_COMPENSATION)
     if recolor is not None:
         base = recolor(_decoded(fields, base.astype(np.float32), rest), order)
-    fields["f_dc"], tamed = _colors(base.astype(np.float64), costs, classes, rd_lambda, largest["f_dc"])
+    fields["f_dc"], clipped = _colors(base.astype(np.float64), costs, classes, rd_lambda, largest["f_dc"])
     wanted = {
-        "means": signed_log(shown.means),
+        "means": signed_log(ordered.means),
         "opacities": values[:, :1],
         "scales": values[:, 1:4],
         "quaternions": values[:, 4:],
-        "f_dc": shown.sh0,
+        "f_dc": ordered.sh0,
     }
     errors = {name: np.abs(fields[name].values() - wanted[name]).max(axis=0).tolist() for name in wanted}
     half = (codebook.centroids.high - codebook.centroids.low).astype(np.float64) / codebook.centroids.top / 2
@@ -136,7 +140,7 @@ def plan_rate_distortion(
         codebook=codebook,
         classes=classes,
         form_error=form_error,
-        clipped_colors=tamed,
+        clipped_colors=clipped,
         errors={**errors, "f_rest_centroids": half.tolist()},
         costs=costs,
         rd_lambda=rd_lambda,
@@ -145,96 +149,100 @@ def plan_rate_distortion(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Prices:
-    """Prices at which a scene is left at a given error."""
+class _LambdaEstimate:
+    """Estimate of lambda for a given error of the scene."""
 
     costs: Costs
-    gloss: CodebookErrorModel
-    drop: float
+    sh_model: CodebookErrorModel
+    threshold_bits: float
     settings: EncodeSettings
     view_uncertainty: float
     refits: int
 
-    def wanted(self, usual: float) -> tuple[float, float]:
-        """The price that the settings ask for, and that of default quality, whose mean squared error is ``usual``."""
-        by_default = self.leaving(usual, 0.0)
+    def choose(self, usual: float) -> tuple[float, float]:
+        """Return the lambda of the settings, and that of the default quality, of mean squared error ``usual``."""
+        default_lambda = self.for_error(usual, 0.0)
         if self.settings.rd_lambda is not None:
-            return self.settings.rd_lambda, by_default
+            return self.settings.rd_lambda, default_lambda
         if self.settings.psnr is not None:
-            return self.leaving(10 ** (-self.settings.psnr / 10), 0.0), by_default
-        return self.leaving(usual, self.settings.quality_offset_db), by_default
+            return self.for_error(10 ** (-self.settings.psnr / 10), 0.0), default_lambda
+        return self.for_error(usual, self.settings.quality_offset_db), default_lambda
 
-    def leaving(self, error: float, quality_offset_db: float) -> float:
-        """The price at which the mean squared error is about ``quality_offset_db`` decibels less than ``error``."""
+    def for_error(self, error: float, quality_offset_db: float) -> float:
+        """Return the lambda at which the squared error is about ``quality_offset_db`` decibels below ``error``."""
         error *= 10 ** (-(quality_offset_db - REFIT_GAIN * self.refits) / 10)
         return lambda_for(
-            error, self.costs, self.gloss, self.drop, self.settings.gaussians_per_codebook_entry, self.view_uncertainty
+            error,
+            self.costs,
+            self.sh_model,
+            self.threshold_bits,
+            self.settings.gaussians_per_codebook_entry,
+            self.view_uncertainty,
         )
 
 
-def _why_dropped(pruned_by_rd: Bool[np.ndarray, " M"], costs: Costs) -> str:
-    """A sentence about a drop of more than a fifth of the Gaussians, or nothing."""
+def _pruning_note(pruned_by_rd: Bool[np.ndarray, " M"], costs: Costs) -> str:
+    """Return a sentence if more than a fifth of the Gaussians are pruned, else an empty string."""
     count = int(pruned_by_rd.sum())
-    if count <= MANY_DROPPED * len(pruned_by_rd):
+    if count <= MANY_PRUNED * len(pruned_by_rd):
         return ""
     seen = float((costs.coverage[pruned_by_rd] >= SEEN).mean())
     return (
-        f"{count:,} of {len(pruned_by_rd):,} Gaussians were left out because each shows less than its bytes are worth; "
-        f"{seen:.0%} of them were looked at from nearby (--set prune_threshold_bits=0 keeps all)"
+        f"{count:,} of {len(pruned_by_rd):,} Gaussians were pruned because removing each costs less than its bits; "
+        f"cameras saw {seen:.0%} of them from nearby (--set prune_threshold_bits=0 keeps all)"
     )
 
 
-def _trial(
+def _codebook_error_model(
     splats: Splats, kept: Int[np.ndarray, " M"], sensitivity: Sensitivity, settings: EncodeSettings, pool: Workers
 ) -> CodebookErrorModel:
-    """What gloss costs, told from a small codebook for some of the Gaussians."""
+    """Estimate the codebook's error from a small codebook for a sample of the Gaussians."""
     if splats.sh_degree == 0 or len(kept) < 64:
         return CodebookErrorModel()
     rng = np.random.Generator(np.random.PCG64(settings.seed))
-    some = np.sort(rng.choice(kept, min(TRIAL, len(kept)), replace=False))
+    some = np.sort(rng.choice(kept, min(SAMPLE, len(kept)), replace=False))
     vectors = np.ascontiguousarray(splats.shN[some].reshape(len(some), -1))
-    entries = min(TRIAL_ENTRIES, len(some) // 16)
+    entries = min(SAMPLE_ENTRIES, len(some) // 16)
     clusters = kmeans.fit(
         vectors,
         _sh_weights(sensitivity, some, splats),
         entries,
         pool,
         seed=settings.seed,
-        rounds=2,
-        reach=12,
+        iterations=2,
+        nprobe=12,
         tolerance=settings.sh_tolerance,
         lattice=0.0,
     )
     squared = np.square(vectors - clusters.centroids[clusters.labels], dtype=np.float64).sum(axis=1)
-    squared = np.minimum(squared, DISPLAYED / GLOSS)
-    colors = sensitivity.color_weight[kept].astype(np.float64).sum() * GLOSS
+    squared = np.minimum(squared, MAX_DISPLAYED_ERROR / SH_MEAN_SQUARE)
+    colors = sensitivity.color_weight[kept].astype(np.float64).sum() * SH_MEAN_SQUARE
     share = sensitivity.color_weight[some].astype(np.float64)
-    weighed = float(squared @ share / max(share.sum(), 1e-300) * colors)
-    return CodebookErrorModel(entries, weighed, float(squared.mean() * colors))
+    weighted = float(squared @ share / max(share.sum(), 1e-300) * colors)
+    return CodebookErrorModel(entries, weighted, float(squared.mean() * colors))
 
 
 def _sh_weights(sensitivity: Sensitivity, chosen: Int[np.ndarray, " M"], splats: Splats) -> Float32[np.ndarray, " M"]:
-    """How much the gloss of each counts."""
-    power = np.float32(max(1 - SH_HEDGE * sensitivity.view_uncertainty, 0.0))
-    sizes = guessed_weights(splats, SIZE_HEDGE * sensitivity.view_uncertainty)[chosen]
+    """Return the weight of each Gaussian's SH vector in the codebook."""
+    power = np.float32(max(1 - SENSITIVITY_SHRINK * sensitivity.view_uncertainty, 0.0))
+    sizes = size_weights(splats, SIZE_POWER * sensitivity.view_uncertainty)[chosen]
     return bounded_weights(sensitivity.color_weight[chosen] ** power * sizes, *SH_WEIGHTS)
 
 
 def _means(
-    shown: Splats,
+    ordered: Splats,
     costs: Costs,
     classes: Int[np.ndarray, " M"],
     rd_lambda: float,
     tolerance: float,
     coarser: Float[np.ndarray, " M"],
 ) -> Quantized:
-    """Positions, in each class as many bits as the price asks for.
+    """Quantise positions, with the bits that lambda asks for in each class.
 
-    Each has at most its number in ``coarser`` less than the same step for all would give them, at which the median
-    Gaussian moves by ``tolerance`` of its size.
+    A Gaussian has at most ``coarser`` bits less than :func:`means_bits` gives for ``tolerance``.
     """
-    means = shown.means
-    most = np.clip(16 - means_bits(shown, np.arange(len(shown)), tolerance) + coarser, 0, 8)
+    means = ordered.means
+    most = np.clip(16 - means_bits(ordered, np.arange(len(ordered)), tolerance) + coarser, 0, 8)
     logs = signed_log(means)
     unit = max(float(np.ptp(logs)), 1e-30) / MEANS_TOP
     coarse = [
@@ -251,24 +259,24 @@ def _colors(
     rd_lambda: float,
     coarsest: Float64[np.ndarray, " M"],
 ) -> tuple[Quantized, int]:
-    """Base colours, and how many of them are outliers that were pulled in."""
+    """Quantise base colours; return them and the number of clipped outliers."""
     finest = min(step(float(costs.color[classes == c].mean()), rd_lambda) for c in range(int(classes.max()) + 1))
-    tamed = clip_outliers(base, step=finest, share=OUTLIERS)
-    levels = quantize_by_class(tamed, costs.color, classes, rd_lambda, coarsest)
-    return levels, int((tamed != base).any(axis=1).sum())
+    clipped = clip_outliers(base, step=finest, share=OUTLIERS)
+    levels = quantize_by_class(clipped, costs.color, classes, rd_lambda, coarsest)
+    return levels, int((clipped != base).any(axis=1).sum())
 
 
-def _gloss_of(codebook: Codebook, shown: Splats) -> Float32[np.ndarray, "M K 3"]:
-    """SH rest as a decoder will find it."""
-    kinds = shown.shN.shape[1]
-    entries = codebook.centroids.values().reshape(-1, 3, COEFFICIENTS)[:, :, :kinds].transpose(0, 2, 1)
-    return np.ascontiguousarray(entries.astype(np.float32)[codebook.labels[: len(shown)]])
+def _decoded_sh(codebook: Codebook, ordered: Splats) -> Float32[np.ndarray, "M K 3"]:
+    """Return the decoded shN coefficients."""
+    coefficients = ordered.shN.shape[1]
+    entries = codebook.centroids.values().reshape(-1, 3, COEFFICIENTS)[:, :, :coefficients].transpose(0, 2, 1)
+    return np.ascontiguousarray(entries.astype(np.float32)[codebook.labels[: len(ordered)]])
 
 
 def _decoded(
     fields: dict[str, Quantized], sh0: Float32[np.ndarray, "M 3"], shN: Float32[np.ndarray, "M K 3"]
 ) -> Splats:
-    """As a decoder will find it."""
+    """Return the decoded scene."""
     quats = fields["quaternions"].values()
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     return Splats(

@@ -1,9 +1,9 @@
-"""One price for every bit: how fine each step, how large the codebook, and what is not worth its bytes.
+"""Rate-distortion model: lambda, quantisation steps, codebook size and pruning.
 
-lambda is squared image error per bit (:class:`kissgs.Sensitivity` says what error costs are). Rounding to a step d
-costs H d²/12, and halving d costs a bit: so d² = 6 lambda / (ln 2 H) where the two are in balance, whatever the
-attribute. Gaussians are ordered in classes of like sensitivity, and each class has its own steps: multiples of the
-finest class', so that the decoder need not know of them. WebP's entropy codes, which vary over an image, do the rest.
+lambda is squared image error per bit (:class:`kissgs.Sensitivity` measures the error). Rounding to a step d costs
+H d²/12, and halving d costs one bit, so the optimum for any attribute is d² = 6 lambda / (ln 2 H). Gaussians are
+ordered in classes of similar sensitivity, and each class has its own step, a multiple of the finest class's, so that
+the decoder needs no classes. WebP's entropy codes, which vary over an image, spend no bits on a class's unused levels.
 """
 
 from __future__ import annotations
@@ -21,47 +21,49 @@ from kissgs.planning.quantize import means_bits
 from kissgs.settings import EncodeSettings
 
 FLOOR = 1e-3
-"""Least sensitivity, in units of the median: what no camera saw must still not be ruined."""
+"""Smallest sensitivity, in units of the median, so that Gaussians that no camera saw keep a bounded error."""
 
 SH_SHRINK = 0.42
-"""A codebook's error falls as its size to the power of minus this: measured on real scenes, 1,000 to 10,000 entries."""
+"""Exponent s of the codebook's error ~ entries^-s, measured on real scenes with 1,000 to 10,000 entries."""
 
 ENTRY_BITS = 112
-"""What an entry takes in the codebook's image: measured at 45 dimensions."""
+"""Bits per entry in the codebook's image, measured at 45 dimensions."""
 
 LABEL_SHARE = 0.5
-"""Bits of a label for one more bit of a codebook's size: entropy coding makes popular entries cheap."""
+"""Bits per label for each bit of the codebook's size: less than 1, because frequent entries take fewer bits."""
 
 QUICK = 1 << 13
-"""Entries of a codebook that is found in a few seconds."""
+"""Number of codebook entries that k-means finds in a few seconds."""
 
 DIMENSIONS = 14
-"""Numbers per Gaussian that are rounded: opacity, scales, rotation, base colour, position."""
+"""Rounded degrees of freedom per Gaussian: opacity, scales, rotation, base colour, position."""
 
 GROWTH = 2.2
-"""How much larger than H d²/12 the error of rounding comes out: cheap levels are preferred, and errors meet in pixels.
-Measured."""
+"""Measured ratio of the rounding error to H d²/12: above 1 because RDO quantisation prefers levels of few bits, and the
+errors of several Gaussians add up in a pixel."""
 
-GLOSS = 0.0796
-"""Mean square of a spherical harmonic over all directions, 1 / 4 pi."""
+SH_MEAN_SQUARE = 0.0796
+"""Mean square of a spherical harmonic over all directions, 1 / (4 pi)."""
 
 PAPER_RATIO = 8
-PAPER_GLOSS = 2.0
-"""Errors of gloss that nothing makes up for meet in pixels as if there were twice as many. Measured."""
+"""Gaussians per codebook entry of the paper."""
+
+PAPER_SH_GROWTH = 2.0
+"""Measured factor on uncompensated shN errors, which add up in pixels."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Costs:
-    """Costs of one unit in each attribute, for the Gaussians ``(M,)`` in question; means over channels.
+    """Squared image error per squared unit of each attribute, ``(M,)`` each; means over channels.
 
     Attributes:
-        opacity: logit.
-        scale: log-scale.
-        rotation: radian about one of the own axes.
-        color: of ``sh0``.
-        position: of the signed logarithm of a coordinate.
-        removal: of leaving it out.
-        coverage: from 0, unseen, to 1, looked at from nearby.
+        opacity: for the opacity logit.
+        scale: for a log-scale.
+        rotation: for a rotation about one of the Gaussian's own axes, radians.
+        color: for a coefficient of ``sh0``.
+        position: for the signed logarithm of a coordinate.
+        removal: squared image error of removing the Gaussian.
+        coverage: from 0, unseen, to 1, seen from nearby.
     """
 
     opacity: Float64[np.ndarray, " M"]
@@ -74,27 +76,27 @@ class Costs:
 
     @classmethod
     def of(cls, sensitivity: Sensitivity, splats: Splats) -> Costs:
-        """With the floor under each."""
-        reach = (1 + np.abs(splats.means).astype(np.float64)) ** 2
+        """Return the costs of all Gaussians; those of attributes are at least :data:`FLOOR` of their median."""
+        factor = (1 + np.abs(splats.means).astype(np.float64)) ** 2
         return cls(
             opacity=_floored(sensitivity.diagonal(OPACITY)[:, 0]),
             scale=_floored(sensitivity.diagonal(SCALES).mean(axis=1)),
             rotation=_floored(sensitivity.diagonal(ROTATION).mean(axis=1)),
             color=_floored(sensitivity.base_colors()),
-            position=_floored((sensitivity.position_hessian[:, [0, 3, 5]] * reach).mean(axis=1)),
+            position=_floored((sensitivity.position_hessian[:, [0, 3, 5]] * factor).mean(axis=1)),
             removal=sensitivity.removal(splats),
             coverage=sensitivity.coverage.astype(np.float64),
         )
 
     def take(self, chosen: Int[np.ndarray, " k"]) -> Costs:
-        """Those of the Gaussians ``chosen`` alone."""
+        """Return the costs of the Gaussians ``chosen``."""
         return Costs(**{name: getattr(self, name)[chosen] for name in Costs.__slots__})
 
     def classes(self, number: int, means: Float32[np.ndarray, "M 3"]) -> Int[np.ndarray, " M"]:
-        """Class of each, from 0, the most important; of about the same size, and none between them empty.
+        """Return the sensitivity class of each Gaussian, from 0, the most sensitive; classes have similar sizes.
 
-        Gaussians in one place, by ``means``, are of one class: renderers blend them in the order in which they are
-        stored, and that is by class.
+        Gaussians of equal ``means`` are in one class: renderers blend them in stored order, which is by class. No class
+        number below the largest is unused.
         """
         worth = np.log(self.scale) + np.log(self.rotation) + np.log(self.color)
         rank = np.empty(len(worth), np.int64)
@@ -103,65 +105,67 @@ class Costs:
         key = np.zeros(len(means), np.uint64)
         for axis in (means + np.float32(0)).view(np.uint32).T:
             key = (key ^ axis) * MIX
-        _, place = np.unique(key, return_inverse=True)
+        _, position = np.unique(key, return_inverse=True)
         first = np.full(len(means), number)
-        np.minimum.at(first, place, classes)
-        return np.unique(first[place], return_inverse=True)[1]
+        np.minimum.at(first, position, classes)
+        return np.unique(first[position], return_inverse=True)[1]
 
-    def pruned_by_rd(self, rd_lambda: float, drop: float, usual: float | None = None) -> Bool[np.ndarray, " M"]:
-        """Whose removal costs less than ``drop`` bits; never more than :data:`MOST_DROPPED` of all.
+    def pruned_by_rd(
+        self, rd_lambda: float, threshold_bits: float, default_lambda: float | None = None
+    ) -> Bool[np.ndarray, " M"]:
+        """Return which Gaussians' removal costs less than ``threshold_bits``; at most :data:`MAX_PRUNED` of all.
 
         Args:
             rd_lambda: squared error per bit.
-            drop: bits.
-            usual: price at which the scene keeps its default quality. Up to that, nothing goes that no camera has seen
-                from nearby, and little of it beyond; None counts the seen and the unseen alike.
+            threshold_bits: largest number of bits that a removal may cost.
+            default_lambda: lambda of the default quality. For Gaussians that no camera saw from nearby, only the excess
+                of ``rd_lambda`` over it counts, so that up to it all of them are kept. None treats all alike.
         """
-        unseen = 0.0 if usual is None else min(usual, rd_lambda) * (self.coverage < SEEN)
-        worthless = self.removal < drop * (rd_lambda - unseen)
-        most = int(MOST_DROPPED * len(worthless))
-        if int(worthless.sum()) > most:
-            worthless[np.argsort(np.where(worthless, self.removal, np.inf), kind="stable")[most:]] = False
-        return worthless
+        unseen = 0.0 if default_lambda is None else min(default_lambda, rd_lambda) * (self.coverage < SEEN)
+        pruned = self.removal < threshold_bits * (rd_lambda - unseen)
+        most = int(MAX_PRUNED * len(pruned))
+        if int(pruned.sum()) > most:
+            pruned[np.argsort(np.where(pruned, self.removal, np.inf), kind="stable")[most:]] = False
+        return pruned
 
 
 MIX = np.uint64(0x9E3779B97F4A7C15)
-"""Odd, with bits at random: spreads a hash of places."""
+"""Odd multiplier with random bits, for a hash of positions."""
 
 SEEN = 0.1
-"""Coverage below which a Gaussian was not seen, or from far away only."""
+"""Coverage below which a Gaussian counts as unseen: no camera saw it, or only from far away."""
 
-MOST_DROPPED = 0.5
-"""Share of the Gaussians. What is removed is no longer there to hide what else is: scores hold for few of them."""
+MAX_PRUNED = 0.5
+"""Largest share of pruned Gaussians: each removal uncovers others, so removal scores hold for a limited share."""
 
 
 def step(cost: float, rd_lambda: float) -> float:
-    """The step in balance with ``rd_lambda`` where a unit costs ``cost``."""
+    """Return the optimal quantisation step for a squared error of ``cost`` per squared unit."""
     return float(np.sqrt(6 * rd_lambda / (np.log(2) * cost)))
 
 
 @dataclass(frozen=True, slots=True)
 class CodebookErrorModel:
-    """What a scene's SH rest costs: from a codebook made for a trial.
+    """Error of a scene's shN by codebook size, extrapolated from a small codebook.
 
     Attributes:
-        entries: of that codebook.
-        weighed: squared error it leaves, weighed by sensitivity.
-        plain: what a codebook of as many entries leaves that treats all Gaussians alike.
+        entries: number of entries of that codebook.
+        weighted: its squared image error, weighted by sensitivity.
+        unweighted: squared image error of a codebook of that size with equal weights.
     """
 
     entries: int = 1
-    weighed: float = 0.0
-    plain: float = 0.0
+    weighted: float = 0.0
+    unweighted: float = 0.0
 
     def error(self, entries: float) -> float:
-        """Of a codebook of so many entries."""
-        return self.weighed * (self.entries / entries) ** SH_SHRINK
+        """Return the squared image error of a codebook with that number of entries."""
+        return self.weighted * (self.entries / entries) ** SH_SHRINK
 
     def best_size(self, rd_lambda: float, count: int, ratio: float) -> int:
-        """Entries in balance with ``rd_lambda``, for ``count`` Gaussians.
+        """Return the optimal number of entries for ``count`` Gaussians.
 
-        Beyond :data:`QUICK`, where more would take long to find, not more than one for ``ratio`` of them.
+        Beyond :data:`QUICK` entries, which would take long to find, there are at least ``ratio`` Gaussians per entry.
         """
         low, high = 0.0, np.log(max(count / ratio, min(count / 2, QUICK), 2))
         for _ in range(50):
@@ -172,42 +176,43 @@ class CodebookErrorModel:
         return round(float(np.exp(low)))
 
 
-def default_error(costs: Costs, splats: Splats, kept: Int[np.ndarray, " M"], gloss: CodebookErrorModel) -> float:
-    """Mean squared error to aim at: about that of the paper's own settings, or of ``fast`` where that is less.
+def default_error(costs: Costs, splats: Splats, kept: Int[np.ndarray, " M"], sh_model: CodebookErrorModel) -> float:
+    """Estimate the mean squared error of the default quality: the smaller one of the presets ``paper`` and ``fast``.
 
-    The paper's 100 levels for rotations, 256 for the rest and 65,536 for positions are spread from each channel's least
-    to its largest value, so that a single outlier spoils them; the steps of ``fast`` are absolute.
+    The paper's 100 levels for rotations, 256 for the rest and 65,536 for positions are spread from each channel's
+    smallest to its largest value, so that a single outlier makes them coarse; the steps of ``fast`` are absolute.
 
     Args:
-        costs: of all Gaussians of ``kept``, ``(M,)``.
+        costs: costs of all Gaussians of ``kept``, ``(M,)``.
         splats: the scene.
-        kept: the ``M`` Gaussians that a renderer draws.
-        gloss: error of the view-dependent colour, by codebook size.
+        kept: indices of the ``M`` Gaussians that a renderer draws.
+        sh_model: error of the view-dependent colour, by codebook size.
     """
     spans = [np.ptp(getattr(splats, name)[kept].astype(np.float64), axis=0) for name in ("opacities", "scales", "sh0")]
     opacity, scale, color = (span / 255 for span in spans)
     log_extent = np.ptp(signed_log(splats.means[kept]), axis=0)
-    turns = np.full(3, 2.0)  # a quaternion's change of 1 turns by 2
-    paper = (opacity, scale, turns * 2 / 99, color, log_extent / 65535)
+    rotation = np.full(3, 2.0)  # a change of a quaternion by 1 is a rotation by 2 radians
+    paper = (opacity, scale, rotation * 2 / 99, color, log_extent / 65535)
     defaults = {name: field.default for name, field in EncodeSettings.model_fields.items()}
     levels = 2 ** means_bits(splats, kept, defaults["means_tolerance"]) - 1
     fast = (
         np.float64(defaults["opacity_step"]),
         np.full(3, defaults["scale_step"]),
-        turns * defaults["quat_step"],
+        rotation * defaults["quat_step"],
         np.full(3, defaults["sh0_step"]),
         log_extent / levels,
     )
     return min(
-        _error(paper, PAPER_RATIO, costs, gloss), _error(fast, defaults["gaussians_per_codebook_entry"], costs, gloss)
+        _error(paper, PAPER_RATIO, costs, sh_model),
+        _error(fast, defaults["gaussians_per_codebook_entry"], costs, sh_model),
     )
 
 
-def _error(steps: Sequence[np.ndarray | np.float64], ratio: float, costs: Costs, gloss: CodebookErrorModel) -> float:
-    """About the mean squared error of rounding to such steps of opacity, scale, turn, colour and position.
+def _error(steps: Sequence[np.ndarray | np.float64], ratio: float, costs: Costs, sh_model: CodebookErrorModel) -> float:
+    """Estimate the mean squared error of rounding to such steps of opacity, scale, rotation, colour and position.
 
-    Positions far from the origin may be as coarse as 16 bits let them be, whatever is spent: their error counts no more
-    than that of as many other numbers.
+    The share of positions is bounded by that of as many other numbers: far from the origin, even 16 bits are coarse, at
+    any lambda.
     """
     each = (costs.opacity, costs.scale, costs.rotation, costs.color, costs.position)
     squares = [float(np.sum(np.square(step, dtype=np.float64))) for step in steps]
@@ -215,54 +220,64 @@ def _error(steps: Sequence[np.ndarray | np.float64], ratio: float, costs: Costs,
     total = sum(terms[:-1])
     total += min(terms[-1], total * 3 / (DIMENSIONS - 3))
     entries = max(len(costs.color) / ratio, 1)
-    return total + PAPER_GLOSS * gloss.plain * (gloss.entries / entries) ** SH_SHRINK
+    return total + PAPER_SH_GROWTH * sh_model.unweighted * (sh_model.entries / entries) ** SH_SHRINK
 
 
-UNKNOWN = 9.5
-"""Decibels by which errors that were put where these pictures do not show them exceed, in other pictures, what they are
-in these; per unit of view uncertainty. Codebooks hardly follow the images once they are shrunk towards the prior, so
-SH rest is not among them."""
+OTHER_VIEWS_DB = 9.5
+"""Decibels per unit of view uncertainty by which errors in other views exceed those in the measured views, where
+planning hides them. It does not apply to shN: its codebook hardly adapts to the measured views once sensitivity is
+shrunk towards the prior."""
 
 
-NEARLY = 1.1
-"""Times the least error that a scene can be left at: the last 0.4 dB would take the last bit of everything."""
+MIN_ERROR_RATIO = 1.1
+"""Smallest error to aim at, in units of the smallest possible one: the last 0.4 dB would cost far too many bits."""
 
-KNOWN_GLOSS, UNKNOWN_GLOSS = 0.2, 2.7
-"""Share of the SH rest's errors that base colours cannot make up for, and how much more per unit of view uncertainty.
-Measured."""
+SH_UNCOMPENSATED, SH_UNCOMPENSATED_GROWTH = 0.2, 2.7
+"""Measured share of shN errors that base colours cannot compensate, and its growth per unit of view uncertainty."""
 
 
 def error_at(
-    rd_lambda: float, costs: Costs, gloss: CodebookErrorModel, drop: float, ratio: float, view_uncertainty: float
+    rd_lambda: float,
+    costs: Costs,
+    sh_model: CodebookErrorModel,
+    threshold_bits: float,
+    ratio: float,
+    view_uncertainty: float,
 ) -> float:
-    """About the mean squared error at which everything in balance with ``rd_lambda`` leaves a scene."""
+    """Estimate the mean squared error of a scene that is planned with ``rd_lambda``."""
     count = len(costs.color)
-    dropped = costs.removal[costs.pruned_by_rd(rd_lambda, drop)]
-    rounding = GROWTH * DIMENSIONS * (count - len(dropped)) * rd_lambda / (2 * np.log(2))
-    elsewhere = 10 ** (UNKNOWN * view_uncertainty / 10)
-    made_up = KNOWN_GLOSS + UNKNOWN_GLOSS * view_uncertainty
-    missing = gloss.error(max(gloss.best_size(rd_lambda, count, ratio), 1))
-    return float(elsewhere * (rounding + GROWTH * dropped.sum()) + made_up * missing)
+    pruned = costs.removal[costs.pruned_by_rd(rd_lambda, threshold_bits)]
+    rounding = GROWTH * DIMENSIONS * (count - len(pruned)) * rd_lambda / (2 * np.log(2))
+    other_views = 10 ** (OTHER_VIEWS_DB * view_uncertainty / 10)
+    uncompensated = SH_UNCOMPENSATED + SH_UNCOMPENSATED_GROWTH * view_uncertainty
+    sh_error = sh_model.error(max(sh_model.best_size(rd_lambda, count, ratio), 1))
+    return float(other_views * (rounding + GROWTH * pruned.sum()) + uncompensated * sh_error)
 
 
 def lambda_for(
-    error: float, costs: Costs, gloss: CodebookErrorModel, drop: float, ratio: float, view_uncertainty: float
+    error: float,
+    costs: Costs,
+    sh_model: CodebookErrorModel,
+    threshold_bits: float,
+    ratio: float,
+    view_uncertainty: float,
 ) -> float:
-    """The price at which a scene is left at about this mean squared error, or a little more than the least there is.
+    """Return the lambda at which the mean squared error is about ``error``.
 
-    The codebook has a largest size, so no price leaves less than its error.
+    The error aimed at is at least 1.1 times the smallest possible one: at any lambda, the error of the largest codebook
+    remains.
     """
     low, high = np.log(1e-22), np.log(1e-2)
-    error = max(error, NEARLY * error_at(1e-22, costs, gloss, drop, ratio, view_uncertainty))
+    error = max(error, MIN_ERROR_RATIO * error_at(1e-22, costs, sh_model, threshold_bits, ratio, view_uncertainty))
     for _ in range(60):
         middle = 0.5 * (low + high)
-        small = error_at(float(np.exp(middle)), costs, gloss, drop, ratio, view_uncertainty) < error
+        small = error_at(float(np.exp(middle)), costs, sh_model, threshold_bits, ratio, view_uncertainty) < error
         low, high = (middle, high) if small else (low, middle)
     return float(np.exp(low))
 
 
 def implied_lambda(error: float, count: int) -> float:
-    """The price in balance with the mean squared error at which rounding has left ``count`` Gaussians."""
+    """Return the lambda for which ``error`` is the expected mean squared error of rounding ``count`` Gaussians."""
     return 2 * float(np.log(2)) * error / (GROWTH * DIMENSIONS * max(count, 1))
 
 

@@ -1,8 +1,8 @@
-"""Levels by rate and distortion: each the cheapest sum of squared image error and bits, under one price for both.
+"""RDO quantisation: levels of the smallest squared image error plus lambda · bits.
 
-Rounding to the nearest level treats a Gaussian that fills the picture and one behind a wall alike. Here every class of
-Gaussians has its own step, a whole multiple of the image's; and within a class levels that many others have are
-preferred where the error does not matter, so that the entropy code needs fewer bits.
+Rounding to the nearest level treats a Gaussian that fills the image and one behind a wall alike. Here every sensitivity
+class has its own step, a whole multiple of the plane's; and within a class, frequent levels are preferred where the
+error is small, so that the entropy code needs fewer bits.
 """
 
 from __future__ import annotations
@@ -20,52 +20,56 @@ from kissgs.planning.rotation_forms import PERMUTATIONS, ROTATIONS
 UNSEEN = {"opacities": 0.15, "scales": 0.11, "growth": 0.11, "quaternions": 0.023, "f_dc": 0.055}
 VIRTUAL = {"opacities": 0.4, "scales": 0.13, "growth": 0.12, "quaternions": 0.08, "f_dc": 0.2}
 CAPTURED = {"opacities": 2.0, "scales": 0.6, "growth": 0.3, "quaternions": 0.25, "f_dc": 0.5}
-"""Largest step of each attribute and largest change by rounding, whatever the price.
+"""Largest step of each attribute and largest change by rounding, at any lambda.
 
-The first, the steps of ``fast``, are for Gaussians that no camera has looked at; the second for those that virtual
-cameras have, to which any other may come as near as it likes; the third for those that a capture has, which says who
-looks from where. The first derivative says nothing about larger errors; and a Gaussian smaller than a pixel has no
-derivative by its size, but becomes a blob elsewhere: so growth is held back most.
+``UNSEEN``, the steps of ``fast``, is for Gaussians that no camera saw; ``VIRTUAL`` for those that virtual cameras saw,
+because other cameras may come closer; ``CAPTURED`` for those that a capture's cameras saw. The Hessian does not hold
+for larger errors. A Gaussian smaller than a pixel has no derivative by its size, but would become a visible blob from
+nearby, so scales may grow less than they may shrink (``growth``).
 """
 
-RELAXED = 1 / 3
-"""Power of the coarseness asked for with which these bounds grow. Measured on cameras that the encoder did not use."""
+SLACK_POWER = 1 / 3
+"""Exponent with which these bounds grow with ``slack``, measured with cameras that the encoder did not use."""
 
 
 def largest_changes(
     coverage: Float[np.ndarray, " M"], captured: Float[np.ndarray, " M"], slack: float
 ) -> dict[str, Float64[np.ndarray, " M"]]:
-    """How far each attribute of each Gaussian may be rounded.
+    """Return the largest change by rounding of each attribute of each Gaussian.
 
-    Steps in balance with a price grow as its root. These bounds grow less: they are there for cameras from which a
-    change shows more than it was found to cost, and fewer Gaussians or coarser colours are then the smaller loss.
+    Optimal steps grow as the root of lambda. These bounds grow more slowly: they protect views in which a change is
+    more visible than in the measured ones, where pruning or coarser colours would be the smaller loss.
 
     Args:
         coverage: from 0 to 1, see :class:`kissgs.Sensitivity`.
-        captured: from 0 to ``coverage``, see the same.
-        slack: from 1, how many times coarser than by default the scene is to be.
+        captured: from 0 to ``coverage``, see :class:`kissgs.Sensitivity`.
+        slack: ratio of the optimal steps to those of the default quality, from 1.
     """
-    looked, known = coverage.astype(np.float64), captured.astype(np.float64)
+    seen, by_capture = coverage.astype(np.float64), captured.astype(np.float64)
     return {
         name: np.minimum(
-            UNSEEN[name] ** (1 - looked) * VIRTUAL[name] ** (looked - known) * CAPTURED[name] ** known * slack**RELAXED,
+            UNSEEN[name] ** (1 - seen)
+            * VIRTUAL[name] ** (seen - by_capture)
+            * CAPTURED[name] ** by_capture
+            * slack**SLACK_POWER,
             CAPTURED[name],
         )
         for name in CAPTURED
     }
 
 
-UNUSED = 0.05
-"""Times that a level is taken to occur which does not."""
+UNUSED_COUNT = 0.05
+"""Count that an unused level has in the estimate of its bits."""
 
 ROUNDS, SWEEPS = 3, 1
-"""Of counting levels and choosing by the counts; and of choosing in each."""
+"""Number of iterations of counting levels and choosing by the counts, and of passes over the levels in each."""
 
 CHUNK = 1 << 14
+"""Gaussians per task."""
 
 
-def _mirrors() -> Float64[np.ndarray, "24 3"]:
-    """1, or -1 where the new axis is an old one turned round: entries of the cube's rotation matrices."""
+def _axis_signs() -> Float64[np.ndarray, "24 3"]:
+    """Return 1, or -1 where a new axis is a reversed old one: entries of the cube's rotation matrices."""
     w, x, y, z = ROTATIONS.T
     matrices = np.array(
         [
@@ -78,8 +82,8 @@ def _mirrors() -> Float64[np.ndarray, "24 3"]:
     return np.stack([np.rint(matrices[PERMUTATIONS[row], axes, row]) for row in range(24)])
 
 
-MIRRORS = _mirrors()
-"""For each of the 24 rotations of the cube and each new axis: 1, or -1 where it is an old one turned round."""
+AXIS_SIGNS = _axis_signs()
+"""Direction of each new axis in the 24 rotations of the cube: 1, or -1 if it is a reversed old axis."""
 
 
 def quantize_by_class(
@@ -89,23 +93,23 @@ def quantize_by_class(
     rd_lambda: float,
     coarsest: Float64[np.ndarray, " M"],
 ) -> Quantized:
-    """Round to the nearest of the levels that each class of Gaussians uses.
+    """Round to the nearest of the levels that each sensitivity class uses.
 
     Args:
         values: finite.
-        cost: of one unit, per Gaussian.
-        classes: of each Gaussian, from 0.
-        rd_lambda: of a bit.
+        cost: squared image error per squared unit, per Gaussian.
+        classes: sensitivity class of each Gaussian, from 0.
+        rd_lambda: squared error per bit.
         coarsest: largest step, per Gaussian.
 
     Returns:
-        Levels from 0 to at most 255, of one step for all channels and classes.
+        Levels from 0 to at most 255, with one step for all channels, of which each class uses multiples.
     """
     low32 = values.min(axis=0).astype(np.float32) + np.float32(0)
     low = low32.astype(np.float64)
     widest = float((values - low).max(initial=0))
-    balanced = np.array([step(float(cost[classes == c].mean()), rd_lambda) for c in range(int(classes.max()) + 1)])
-    steps = np.minimum(balanced[classes], coarsest)
+    optimal = np.array([step(float(cost[classes == c].mean()), rd_lambda) for c in range(int(classes.max()) + 1)])
+    steps = np.minimum(optimal[classes], coarsest)
     finest = max(float(steps.min()), widest / 255, 1e-30)
     top = int(min(max(ceil(widest / finest - 1e-3), 1), 255))
     spacing = np.clip(np.rint(steps / finest), 1, 255)
@@ -128,20 +132,20 @@ def rdo_quantize_shapes(
     largest: dict[str, Float64[np.ndarray, " M"]],
     pool: Workers,
 ) -> tuple[Quantized, Quantized, Quantized]:
-    """Choose the levels of opacities, scales and quaternions together.
+    """Choose the levels of opacities, scales and quaternions jointly by squared error plus lambda · bits.
 
     Args:
-        values: opacity logit, log-scales and unit quaternion, in the form in which each Gaussian is stored.
-        parts: them, rounded: opacities, scales, quaternions.
-        shapes: of :class:`kissgs.Sensitivity`.
-        forms: of each Gaussian, see :mod:`kissgs.planning.rotation_forms`.
-        costs: whose floors are kept.
-        classes: of each Gaussian, from 0.
-        rd_lambda: of a bit.
-        largest: change of each attribute, see :func:`largest_changes`.
-        pool: where the work runs.
+        values: opacity logit, log-scales and unit quaternion, in the stored form of each Gaussian.
+        parts: the rounded values: opacities, scales, quaternions.
+        shapes: shape Hessians of :class:`kissgs.Sensitivity`.
+        forms: form of each Gaussian, see :mod:`kissgs.planning.rotation_forms`.
+        costs: costs, whose smallest values are added to the Hessians' diagonals.
+        classes: sensitivity class of each Gaussian, from 0.
+        rd_lambda: squared error per bit.
+        largest: largest change of each attribute, see :func:`largest_changes`.
+        pool: threads.
     """
-    from kissgs.planning import rdo_kernels as rounding_kernels
+    from kissgs.planning import rdo_kernels
 
     levels = np.concatenate([part.levels for part in parts], axis=1).astype(np.int64)
     low = np.concatenate([part.low for part in parts]).astype(np.float64)
@@ -157,13 +161,13 @@ def rdo_quantize_shapes(
     floor = np.array([float(cost.min(initial=np.inf)) for cost in (costs.opacity, costs.scale, costs.rotation)])
 
     for _ in range(ROUNDS):
-        charges = rd_lambda * _bits(levels, classes)
+        rate_table = rd_lambda * _bits(levels, classes)
 
-        def choose(first: int, charges: Float64[np.ndarray, "classes 8 256"] = charges) -> None:
+        def choose(first: int, rate_table: Float64[np.ndarray, "classes 8 256"] = rate_table) -> None:
             rows = slice(first, first + CHUNK)
-            rounding_kernels.round_shapes(
-                *(values[rows], shapes[rows], forms[rows], PERMUTATIONS, MIRRORS),
-                *(classes[rows], low, steps, top, charges),
+            rdo_kernels.choose_levels(
+                *(values[rows], shapes[rows], forms[rows], PERMUTATIONS, AXIS_SIGNS),
+                *(classes[rows], low, steps, top, rate_table),
                 np.stack([change[rows] for change in changes], axis=1),
                 floor,
                 SWEEPS,
@@ -177,7 +181,7 @@ def rdo_quantize_shapes(
 
 
 def _from_zero(levels: Int[np.ndarray, "M C"], part: Quantized) -> Quantized:
-    """These levels, moved so that the lowest is 0."""
+    """Shift the levels so that the smallest is 0."""
     first = int(levels.min(initial=255))
     last = max(int(levels.max(initial=0)), first + 1)
     low, high = part.low.astype(np.float64), part.high.astype(np.float64)
@@ -189,11 +193,11 @@ def _from_zero(levels: Int[np.ndarray, "M C"], part: Quantized) -> Quantized:
 
 
 def _bits(levels: Int[np.ndarray, "M 8"], classes: Int[np.ndarray, " M"]) -> Float64[np.ndarray, "classes 8 256"]:
-    """Of every level of every channel in every class, if they are chosen as they were."""
+    """Estimate the bits of every level of every channel in every class from the counts of ``levels``."""
     number = int(classes.max()) + 1
     counts = np.stack(
         [np.bincount(classes * 256 + column, minlength=number * 256).reshape(number, 256) for column in levels.T],
         axis=1,
     )
-    likely = counts + UNUSED
+    likely = counts + UNUSED_COUNT
     return np.asarray(np.log2(likely.sum(axis=2, keepdims=True)) - np.log2(likely))

@@ -1,12 +1,12 @@
-"""Which of its 48 equivalent (rotation, scales) forms a Gaussian is stored in: the covariance is the same in all.
+"""Choice among the 48 equivalent (rotation, scales) forms of a Gaussian, which all have the same covariance.
 
-The axes of an ellipsoid can be named in 6 orders and pointed in 4 right-handed ways, and q and -q are one rotation:
-6 × 4 × 2 = 48. The 24 quaternions below are those of the cube's rotations; the set is closed, so a form of a form is in
-it too. PRAS is the paper's name (section on permutation-rotation sorting) for choosing among them.
+The axes of an ellipsoid can be ordered in 6 and directed in 4 right-handed ways, and q and -q are one rotation:
+6 × 4 × 2 = 48. The 24 quaternions below are the rotations of the cube, which are closed under multiplication. PRAS is
+the paper's name (section on permutation-rotation sorting) for choosing among them.
 
-* :func:`canonical_forms`, ours: the form nearest to no rotation at all. All quaternions then lie within 63° of the
-  identity, w is nearly constant and x, y, z use 40 % of their range.
-* :func:`pras_forms`, the paper's: the form most like its neighbours on the grid.
+* :func:`canonical_forms`, of kissgs: the form nearest to the identity. All quaternions then lie within 63° of it, w is
+  nearly constant and x, y, z use 40 % of their range.
+* :func:`pras_forms`, of the paper: the form most similar to its neighbours on the grid.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ ROTATIONS: Float64[np.ndarray, "24 4"] = np.array(
     ],
     dtype=np.float64,
 )
-"""g of each form, w x y z: the new rotation is the Hamilton product q g."""
+"""Quaternion g of each form, w x y z: the new rotation is the Hamilton product q g."""
 
 PERMUTATIONS = np.repeat([(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)], 4, axis=0).astype(np.int64)
-"""``(24, 3)``: the new scales are the old ones at these indices."""
+"""Scale order of each form, ``(24, 3)``: the new scales are the old ones at these indices."""
 
 CHUNK = 1 << 16
 
@@ -49,13 +49,13 @@ def canonicalize(
     pool: Workers,
     report: Callable[[float], None],
 ) -> tuple[Float64[np.ndarray, "cells 4"], Float32[np.ndarray, "cells 3"], float, UInt8[np.ndarray, " cells"]]:
-    """Rotations and log-scales of the Gaussians in ``cells``, in the form that the settings choose.
+    """Rewrite rotations and log-scales of the Gaussians in ``cells`` in the form that the settings choose.
 
     Returns:
-        Quaternions, log-scales, the largest relative change of a covariance (rounding only), and the forms.
+        Quaternions, log-scales, the largest relative change of a covariance (by rounding only), and the forms.
     """
     quats, scales = splats.quats[cells].astype(np.float64), splats.scales[cells]
-    quats /= np.linalg.norm(quats, axis=1, keepdims=True)  # float32 knows a unit only to 1e-7
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)  # float32 lengths are exact to 1e-7 only
     if settings.rotation_form == "canonical":
         forms = canonical_forms(quats)
     else:
@@ -67,7 +67,7 @@ def canonicalize(
 def apply_forms(
     quats: Float64[np.ndarray, "N 4"], scales: Float32[np.ndarray, "N 3"], forms: UInt8[np.ndarray, " N"]
 ) -> tuple[Float64[np.ndarray, "N 4"], Float32[np.ndarray, "N 3"]]:
-    """Rewrite each Gaussian in its form: 0 to 23, a row of the table; plus 24, the same with the quaternion negated."""
+    """Rewrite each Gaussian in its form: 0 to 23, a row of the table; plus 24 if the quaternion is negated."""
     row = forms % 24
     turned = _multiply(quats, ROTATIONS[row])
     turned[forms >= 24] *= -1
@@ -75,9 +75,9 @@ def apply_forms(
 
 
 def canonical_forms(quats: Float64[np.ndarray, "N 4"]) -> UInt8[np.ndarray, " N"]:
-    """The form of largest w, that is of the smallest rotation angle. Of equals, the first of the table."""
+    """Return the form of largest w, which has the smallest rotation angle; among equals, the first of the table."""
     forms = np.empty(len(quats), dtype=np.uint8)
-    # w of q g is the scalar product of q with the conjugate of g; rounding makes forms equal that are equal.
+    # w of q g is the scalar product of q with the conjugate of g; without rounding, equal forms would differ.
     conjugates = ROTATIONS * (1, -1, -1, -1)
     for first in range(0, len(quats), CHUNK):
         rows = slice(first, first + CHUNK)
@@ -95,18 +95,18 @@ def pras_forms(
     decay: float = 0.95,
     report: Callable[[float], None] = lambda fraction: None,
 ) -> UInt8[np.ndarray, " N"]:
-    """The forms that make neighbours on the grid alike: 8-bit proxies are blurred, ever less, and followed.
+    """Choose forms that make neighbours on the grid similar: the closest to 8-bit proxies, blurred less and less.
 
     Args:
         quats: unit quaternions, row-major on the grid of ``side`` × ``side`` cells.
         scales: log-scales. One proxy range serves all three axes, so that permuting them changes no proxy.
         side: cells per axis.
-        pool: where the rows are worked on; the result does not depend on its size.
+        pool: threads for the rows; the result does not depend on their number.
         decay: factor from one blur radius to the next.
-        report: told the fraction done.
+        report: receives the fraction done, 0 to 1.
 
     Returns:
-        The chosen forms of the input (not of an intermediate form, so that nothing drifts).
+        The chosen forms of the input, not of an intermediate form, so that rounding errors do not add up.
     """
     from kissgs.planning import kernels
 
@@ -141,11 +141,11 @@ def covariance_error(
     new_quats: Float64[np.ndarray, "N 4"],
     new_scales: Float32[np.ndarray, "N 3"],
 ) -> float:
-    """Largest relative difference of the covariances, Frobenius norm, over all Gaussians."""
+    """Return the largest relative difference of the covariances, Frobenius norm, over all Gaussians."""
     worst = 0.0
     for first in range(0, len(quats), CHUNK):
         rows = slice(first, first + CHUNK)
-        largest = scales[rows].max(axis=1, keepdims=True).astype(np.float64)  # keeps e^±60 out of the squares
+        largest = scales[rows].max(axis=1, keepdims=True).astype(np.float64)  # avoids squares of e^±60
         before = _covariance(quats[rows], scales[rows] - largest)
         after = _covariance(new_quats[rows], new_scales[rows] - largest)
         error = np.linalg.norm(after - before, axis=(1, 2)) / np.linalg.norm(before, axis=(1, 2))
@@ -166,7 +166,7 @@ def _covariance(quats: Float64[np.ndarray, "N 4"], scales: Float64[np.ndarray, "
 
 
 def _multiply(p: Float64[np.ndarray, "N 4"], q: Float64[np.ndarray, "N 4"]) -> Float64[np.ndarray, "N 4"]:
-    """Hamilton product, row by row."""
+    """Return the Hamilton product, row by row."""
     w1, x1, y1, z1 = p.T
     w2, x2, y2, z2 = q.T
     return np.stack(

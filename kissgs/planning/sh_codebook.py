@@ -1,4 +1,4 @@
-"""The SH codebook: how many entries a scene needs, what they are, and where they lie in their image."""
+"""The SH codebook: its entries and their order in the codebook's image."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ COEFFICIENTS = SH_REST_COUNTS[-1]
 MIN_SIDE = 8
 
 WEIGHT_FLOOR, WEIGHT_CEILING = 0.1, 20.0
-"""Bounds of weights, in units of the median: no Gaussian is given up, none rules alone."""
+"""Bounds of weights, in units of the median, so that no Gaussian is ignored and none dominates."""
 
 PAPER_TOP = 99
-"""The paper's codebook has 100 levels in every channel."""
+"""Largest level of the paper's codebook: 100 levels in every channel."""
 
 
 @dataclass(frozen=True, slots=True)
 class Codebook:
-    """S × S entries, and the one that stands for each Gaussian.
+    """Codebook of S × S entries, and the entry of each Gaussian.
 
     Attributes:
         side: S.
         centroids: ``(S*S, 45)`` levels, channel-major (15 of red, 15 of green, 15 of blue), entries row-major.
-        labels: ``(M,)`` entry of each Gaussian; one, for the padding, if there is none.
+        labels: ``(M,)`` entry of each Gaussian; a scene without Gaussians has one label, for padding.
     """
 
     side: int
@@ -53,15 +53,15 @@ def fit_codebook(
 ) -> Codebook:
     """Build the codebook for the Gaussians ``chosen``.
 
-    A scene without SH, or with bands that are zero throughout, pays nothing for them: their tiles are constant.
+    Bands that are missing, or zero in all Gaussians, take almost no bytes: their tiles are constant.
 
     Args:
         splats: the scene.
-        chosen: which of its Gaussians.
-        weights: how much the gloss of each counts.
-        size: largest number of entries; the image's side is a multiple of 8, and what is left of it is filled too.
-        settings: see :class:`EncodeSettings`.
-        pool: where the work runs.
+        chosen: indices of the Gaussians.
+        weights: weight of each Gaussian's squared shN error.
+        size: largest number of entries; the image's side is a multiple of 8, and unused entries repeat others.
+        settings: settings of the encoder.
+        pool: threads.
         progress: receives "codebook" and "sort codebook" events.
     """
     dimensions = splats.shN.shape[1] * 3
@@ -75,13 +75,13 @@ def fit_codebook(
         codebook_side(min(size, settings.sh_codebook_size)) ** 2,
         pool,
         seed=settings.seed,
-        rounds=settings.sh_kmeans_iterations,
-        reach=settings.sh_nprobe,
+        iterations=settings.sh_kmeans_iterations,
+        nprobe=settings.sh_nprobe,
         tolerance=settings.sh_tolerance,
         lattice=settings.sh_step if settings.shared_step_size else 0.0,
         report=lambda fraction: progress("codebook", fraction),
     )
-    # The smallest image that holds the entries found; what is left of it repeats some of them.
+    # The smallest image that holds the entries; unused places repeat some of them.
     side = next(s for s in range(MIN_SIDE, MAX_CODEBOOK_SIDE + 1, 8) if s * s >= len(clusters.centroids))
     entries = clusters.centroids[np.arange(side * side) % len(clusters.centroids)]
     progress("sort codebook", 0.0)
@@ -99,7 +99,7 @@ def fit_codebook(
 
 
 def codebook_side(size: float) -> int:
-    """S for so many entries: a multiple of 8 from 8 to 256, rounded down."""
+    """Return S for at most ``size`` entries: a multiple of 8, rounded down, from 8 to 256."""
     side = int(size**0.5) // 8 * 8
     return min(max(side, MIN_SIDE), MAX_CODEBOOK_SIDE)
 
@@ -110,7 +110,7 @@ def _sort(
     pool: Workers,
     report: Callable[[float], None],
 ) -> Int[np.ndarray, " cells"]:
-    """Entry for each place of the image: neighbours alike, so that the image compresses."""
+    """Return the entry of each pixel of a tile, sorted so that neighbours are similar and the image compresses."""
     if (entries == entries[0]).all():
         return np.arange(len(entries), dtype=np.int32)
     return plas(
@@ -118,8 +118,8 @@ def _sort(
     )
 
 
-def guessed_weights(splats: Splats, power: float) -> Float32[np.ndarray, " N"]:
-    """How much each Gaussian's gloss counts if nobody has looked: (opacity × largest cross-section) to ``power``."""
+def size_weights(splats: Splats, power: float) -> Float32[np.ndarray, " N"]:
+    """Return weights by size: (opacity × largest cross-section) to ``power``, bounded, in units of the median."""
     area = np.sort(splats.scales, axis=1)[:, 1:].sum(axis=1, dtype=np.float64)
     logs = area - np.logaddexp(0, -splats.opacities.astype(np.float64))
     logs = power * (logs - np.median(logs))
@@ -127,6 +127,6 @@ def guessed_weights(splats: Splats, power: float) -> Float32[np.ndarray, " N"]:
 
 
 def bounded_weights(weights: Float32[np.ndarray, " N"], low: float, high: float) -> Float32[np.ndarray, " N"]:
-    """In units of their median, those that are not 0, and within bounds."""
+    """Return the weights in units of the median of those above 0, clipped to ``low`` and ``high``."""
     seen = weights[weights > 0].astype(np.float64)
     return np.clip(weights / (np.median(seen) if len(seen) else 1.0), low, high).astype(np.float32)

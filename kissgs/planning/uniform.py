@@ -1,4 +1,4 @@
-"""Choices without pictures: the same steps for all Gaussians, as the settings say."""
+"""Uniform planning: the steps of the settings for all Gaussians, without rendering the scene."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.layout import layout_grid
 from kissgs.planning.quantize import Quantized, clip_outliers, means_bits, quantize, quantize_means
 from kissgs.planning.rotation_forms import canonicalize
-from kissgs.planning.sh_codebook import fit_codebook, guessed_weights
+from kissgs.planning.sh_codebook import fit_codebook, size_weights
 from kissgs.settings import EncodeSettings
 
 OUTLIERS = 1e-4
-"""Share of base colours, at either end of a channel, that may be pulled in to keep the others' step."""
+"""Share of base colours, at either end of a channel, that may be clipped so that the step of the others stays small."""
 
 
 def plan_uniform(
     splats: Splats, kept: Int[np.ndarray, " M"], settings: EncodeSettings, pool: Workers, progress: Progress
 ) -> EncodingPlan:
-    """Choose everything for the Gaussians ``kept``, of which there may be none."""
+    """Plan the Gaussians ``kept``, which may be none."""
     progress("order", 0.0)
     bits = settings.means_bits or means_bits(splats, kept, settings.means_tolerance)
     grid = layout_grid(splats.means, kept, bits, settings, pool, lambda fraction: progress("order", fraction))
-    # Padding repeats Gaussians of the scene; a scene without any lends it a neutral one.
-    shown, cells = (splats, grid.cells) if len(kept) else (_neutral(splats.sh_degree), grid.cells * 0)
-    sh0 = clip_outliers(shown.sh0, step=settings.sh0_step, share=OUTLIERS) if settings.shared_step_size else shown.sh0
+    # Padding repeats Gaussians of the scene; in a scene without any, padding is a neutral Gaussian.
+    source, cells = (splats, grid.cells) if len(kept) else (_neutral(splats.sh_degree), grid.cells * 0)
+    sh0 = clip_outliers(source.sh0, step=settings.sh0_step, share=OUTLIERS) if settings.shared_step_size else source.sh0
     progress("forms", 0.0)
     quats, scales, form_error, _ = canonicalize(
-        shown, cells, grid.side, settings, pool, lambda fraction: progress("forms", fraction)
+        source, cells, grid.side, settings, pool, lambda fraction: progress("forms", fraction)
     )
     chosen = cells[grid.mask]
-    weights = guessed_weights(shown, settings.sh_weight_power)[chosen]
+    weights = size_weights(source, settings.sh_weight_power)[chosen]
     codebook = fit_codebook(
-        shown, chosen, weights, len(chosen) / settings.gaussians_per_codebook_entry, settings, pool, progress
+        source, chosen, weights, len(chosen) / settings.gaussians_per_codebook_entry, settings, pool, progress
     )
     fields = {
-        "means": quantize_means(shown.means[cells], bits=bits),
-        "opacities": _quantize(shown.opacities[cells, None], settings.opacity_step, settings),
+        "means": quantize_means(source.means[cells], bits=bits),
+        "opacities": _quantize(source.opacities[cells, None], settings.opacity_step, settings),
         "scales": _quantize(scales, settings.scale_step, settings),
         "quaternions": _quantize(quats, settings.quat_step, settings, paper_top=99),
         "f_dc": _quantize(sh0[cells], settings.sh0_step, settings),
@@ -52,13 +52,13 @@ def plan_uniform(
         codebook=codebook,
         classes=np.zeros(len(chosen), np.int64),
         form_error=form_error,
-        clipped_colors=int((sh0 != shown.sh0).any(axis=1).sum()),
+        clipped_colors=int((sh0 != source.sh0).any(axis=1).sum()),
         errors={name: _half_steps(field, bits if name == "means" else 16) for name, field in fields.items()},
     )
 
 
 def _neutral(sh_degree: int) -> Splats:
-    """One Gaussian, as plain as can be."""
+    """Return a scene of one Gaussian at the origin, of unit size and half opacity."""
     return Splats(
         means=np.zeros((1, 3), np.float32),
         quats=np.array([[1, 0, 0, 0]], np.float32),

@@ -1,4 +1,4 @@
-"""What the user may choose: one model per stage, and the presets. Every setting says what it trades."""
+"""Settings of the encoder, compaction and fine-tuning, one model each, and the presets."""
 
 from kissgs.settings.compact import CompactSettings
 from kissgs.settings.encode import EncodeSettings

@@ -1,4 +1,4 @@
-"""``CompactSettings``: how a scene comes to have fewer Gaussians."""
+"""``CompactSettings``: how many Gaussians compaction keeps, and how it prunes and trains."""
 
 from __future__ import annotations
 
@@ -10,102 +10,120 @@ from kissgs.settings.training import TrainingViewSettings
 
 
 class CompactSettings(TrainingViewSettings):
-    """How many Gaussians are left, and how they learn to do the work of the others."""
+    """Settings of compaction: the number of Gaussians to keep, the pruning schedule and the training."""
 
-    count: int | None = Field(None, ge=1, description="Keep so many Gaussians; a scene with fewer stays as it is.")
-    ratio: float | None = Field(None, gt=0, le=1, description="Keep this share of the Gaussians.")
+    count: int | None = Field(None, ge=1, description="Number of Gaussians to keep; a scene with fewer is unchanged.")
+    ratio: float | None = Field(None, gt=0, le=1, description="Share of the Gaussians to keep, up to 1.")
     max_psnr_drop: float | None = Field(
         None,
         gt=0,
         le=20,
-        description="Keep as few as are found whose pictures from held-out views lose at most so many decibels. "
-        "Takes several compactions. Without photographs, from cameras drawn as for 'evaluate', but others, and as if "
-        "the scene were 30 dB from them.",
+        description="Keep as few Gaussians as possible such that renderings of the held-out views lose at most this "
+        "PSNR, decibels. Takes several compactions. Without photographs, the loss is estimated at random cameras, "
+        "other ones than those of 'evaluate', as if the original scene had 30 dB to photographs.",
     )
     auto_count: bool = Field(
         False,
-        description="Keep as many as serve the goal of encode best: where target_size, psnr or max_psnr_drop is given.",
+        description="Choose the number of Gaussians that meets the goal of encode best. Needs target_size, psnr or "
+        "max_psnr_drop of encode.",
     )
     max_compactions: int = Field(
-        3, ge=1, le=20, description="Where auto_count is true: compactions that are tried, at most."
+        3, ge=1, le=20, description="With auto_count: largest number of compactions that are tried."
     )
     min_keep_per_scoring: float = Field(
         0.8,
         ge=0,
         le=0.99,
-        description="The smallest share that one scoring may leave; pruning that goes further scores again in between, "
-        "because Gaussians may cover for each other. 0: one scoring will do.",
+        description="Smallest share of the Gaussians that pruning by one scoring may leave. Deeper pruning scores "
+        "again in between, because a removal changes the scores of overlapping Gaussians. 0: score once.",
     )
     initial_prune_fraction: float = Field(
         0.43,
         ge=0,
         le=1,
-        description="How much of the way the first pruning goes, on a scale of ratios: of a scene that shall keep "
-        "20 %, 0.43 keeps 50 %.",
+        description="Share of the total pruning that the first pruning does, on a logarithmic scale: for a scene that "
+        "shall keep 20 %, 0.43 keeps 50 %.",
     )
     sparsify_steps: int = Field(
-        1500, ge=0, le=1_000_000, description="Steps of training while the rest of the Gaussians go; 0: all go at once."
+        1500, ge=0, le=1_000_000, description="Training steps during gradual pruning; 0: prune all at once."
     )
     prune_rounds: int = Field(
         5,
         ge=1,
         le=1000,
-        description="Prunings along these steps, by the same factor each; the paper has one, at their end.",
+        description="Number of prunings during sparsify_steps, each by the same factor. The paper prunes once, at "
+        "their end.",
     )
-    refine_steps: int = Field(1500, ge=0, le=1_000_000, description="Steps of training when all have gone.")
+    refine_steps: int = Field(1500, ge=0, le=1_000_000, description="Training steps after the last pruning.")
     admm_rho: float = Field(
-        0.0, ge=0, le=10, description="How hard opacities of those that shall go next are drawn to 0 before; 0: not."
+        0.0,
+        ge=0,
+        le=10,
+        description="Penalty weight of ADMM, which pulls opacities of the next pruning candidates towards 0; 0: off.",
     )
     admm_interval: int = Field(
-        50, ge=1, le=100_000, description="Steps between two such pulls, counted anew after each pruning."
+        50, ge=1, le=100_000, description="Steps between two ADMM updates, counted from the last pruning."
     )
     erank_weight: float = Field(
-        0.0, ge=0, le=100, description="Of effective rank in the loss: keeps Gaussians from becoming needles."
+        0.0,
+        ge=0,
+        le=100,
+        description="Weight of the effective rank in the loss: keeps Gaussians from becoming needles.",
     )
     min_scale_weight: float = Field(
         0.0,
         ge=0,
         le=1000,
-        description="Of the smallest extent of each Gaussian in the loss, in extents of the cameras.",
+        description="Weight of each Gaussian's smallest scale in the loss, in units of the extent of the cameras.",
     )
     means_lr_scale: float = Field(
-        1.0, gt=0, le=100, description="Learning rate of positions, in units of that with which 3DGS begins."
+        1.0, gt=0, le=100, description="Learning rate of positions, in units of the initial one of 3DGS."
     )
-    final_means_lr_scale: float = Field(0.01, gt=0, le=100, description="The same at the end of the last steps.")
+    final_means_lr_scale: float = Field(
+        0.01,
+        gt=0,
+        le=100,
+        description="Learning rate of positions at the end of refine_steps, in units of the initial one of 3DGS.",
+    )
     lr_scale: float = Field(
-        2.0, gt=0, le=100, description="All other learning rates, in units of those of 3DGS, until the last steps."
+        2.0, gt=0, le=100, description="All other learning rates before refine_steps, in units of those of 3DGS."
     )
-    final_lr_scale: float = Field(0.1, gt=0, le=100, description="The same at the end of the last steps.")
+    final_lr_scale: float = Field(
+        0.1,
+        gt=0,
+        le=100,
+        description="All other learning rates at the end of refine_steps, in units of those of 3DGS.",
+    )
     synthetic_lr_scale: float = Field(
         0.5,
         gt=0,
         le=100,
-        description="All learning rates times this where renderings of the scene teach: they leave less to learn than "
-        "photographs do.",
+        description="Factor on all learning rates when training targets are renderings: they leave less error to "
+        "correct than photographs do.",
     )
     views: int = Field(
         384,
         ge=1,
         le=10_000,
-        description="Virtual views where there is no capture to learn from, up to four times as many for a scene of "
-        "several objects, an eighth of them held out; every fourth of the rest scores. Without training a quarter of "
-        "them, and all score. Their sides are three fifths of view_size. Beside each that scores there are four "
-        "close-ups with sides a quarter as long.",
+        description="Number of virtual views without a capture, up to four times as many for a scene of several "
+        "objects; an eighth of them is held out, and every fourth of the rest is used for scoring. Without training, "
+        "a quarter of the number, all used for scoring. Their sides are three fifths of view_size. Each scoring view "
+        "comes with four close-ups, with sides a quarter as long.",
     )
 
     @property
     def enabled(self) -> bool:
-        """Whether a budget is given: without one, a scene keeps all its Gaussians."""
+        """Whether a budget is given; without one, all Gaussians are kept."""
         return bool(self._given)
 
     @property
     def steps(self) -> int:
-        """Of training, in all."""
+        """Total number of training steps."""
         return self.sparsify_steps + self.refine_steps
 
     @property
     def trains(self) -> bool:
-        """Whether what is left is fitted to pictures; else it is pruned and nothing more."""
+        """Whether the scene is trained after pruning."""
         return self.steps > 0
 
     @model_validator(mode="after")

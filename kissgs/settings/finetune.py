@@ -1,4 +1,4 @@
-"""``FinetuneSettings``: how levels become better when all else is chosen."""
+"""``FinetuneSettings``: training of the quantised levels through the decoder."""
 
 from __future__ import annotations
 
@@ -8,40 +8,46 @@ from kissgs.settings.training import TrainingViewSettings
 
 
 class FinetuneSettings(TrainingViewSettings):
-    """How the numbers in the images are improved against pictures of what a decoder makes of them."""
+    """Settings of fine-tuning: training of the levels, so that the decoded scene renders closer to the targets."""
 
-    enabled: bool = Field(False, description="Fine-tune. Takes pictures to learn from: photographs are the best.")
-    steps: int = Field(1000, ge=1, le=1_000_000, description="Of training.")
-    batch: int = Field(1, ge=1, le=64, description="Pictures in each step.")
+    enabled: bool = Field(False, description="Fine-tune, against photographs if there are any, else renderings.")
+    steps: int = Field(1000, ge=1, le=1_000_000, description="Number of training steps.")
+    batch: int = Field(1, ge=1, le=64, description="Images per training step.")
     prune_threshold_bits: float = Field(
         100.0,
         ge=0,
         le=200,
-        description="Where bits are weighed: leave out Gaussians that show less than so many bits are worth before "
-        "training, which closes the holes. Without effect where it is less than that of encoding, or that is 0.",
+        description="With rate_distortion: before training, prune Gaussians whose removal costs less than this many "
+        "bits are worth; training closes the holes. No effect below prune_threshold_bits of encode, or if that is 0.",
     )
     lr: float = Field(
-        0.06, gt=0, le=10, description="Learning rate at the beginning, in steps of each attribute; SH's entries apart."
+        0.06,
+        gt=0,
+        le=10,
+        description="Initial learning rate of all attributes but the SH codebook, in quantisation steps.",
     )
-    codebook_lr: float = Field(0.2, gt=0, le=10, description="The same of the SH codebook's entries.")
+    codebook_lr: float = Field(
+        0.2, gt=0, le=10, description="Initial learning rate of the SH codebook, in quantisation steps."
+    )
     synthetic_lr_scale: float = Field(
         0.3,
         gt=0,
         le=10,
-        description="Both times this where renderings of the scene teach: they leave less to learn.",
+        description="Factor on both learning rates when training targets are renderings: they leave less error to "
+        "correct than photographs do.",
     )
-    final_lr_scale: float = Field(0.05, gt=0, le=1, description="What is left of both at the end.")
+    final_lr_scale: float = Field(0.05, gt=0, le=1, description="Factor on both learning rates at the last step.")
     rate_weight: float = Field(
         2.0,
         ge=0,
         le=100,
-        description="Weight of bytes against errors: 1 is that by which levels were chosen. Levels become such as many "
-        "others have.",
+        description="Weight of the estimated rate against the image error, in units of the rd_lambda by which the "
+        "levels were chosen. Moves levels to frequent ones.",
     )
     tv_weight: float = Field(
         0.0,
         ge=0,
         le=100,
-        description="Weight of differences between neighbouring pixels of the images, in units of the paper's; from "
-        "0.35 to 0.6 of the steps it grows from nothing.",
+        description="Weight of the total variation of the planes, in units of the paper's; it grows from 0 between "
+        "0.35 and 0.6 of the steps.",
     )

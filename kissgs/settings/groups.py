@@ -25,22 +25,21 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    preset: Preset = Field(Preset.BALANCED, description="Where settings that are not given come from.")
+    preset: Preset = Field(Preset.BALANCED, description="Preset that settings which are not given come from.")
     compact: CompactSettings = CompactSettings()
     encode: EncodeSettings = EncodeSettings()
     finetune: FinetuneSettings = FinetuneSettings()
 
     @property
     def searches(self) -> bool:
-        """Whether several scenes or containers are made, to find the one that is wanted."""
+        """Whether several scenes or containers are made to find one that meets a goal."""
         return self.encode.has_goal or self.compact.max_psnr_drop is not None
 
     @model_validator(mode="after")
     def _a_goal_to_go_by(self) -> Self:
         if self.compact.auto_count and not self.encode.has_goal:
             raise ValueError(
-                "compaction by a goal needs one: give target_size, max_psnr_drop or psnr, or say how many Gaussians to "
-                "keep"
+                "auto_count needs a goal: give target_size, max_psnr_drop or psnr, or the number of Gaussians to keep"
             )
         return self
 
@@ -48,7 +47,7 @@ class Settings(BaseModel):
     @classmethod
     def _fill_from_preset(cls, given: Any) -> Any:  # noqa: ANN401
         if not isinstance(given, dict) or given.get("preset", Preset.BALANCED) not in list(Preset):
-            return given  # not ours to judge: validation says what is wrong with it
+            return given  # validation reports the error
         chosen = PRESETS[Preset(given.get("preset", Preset.BALANCED))]
         return {**given, **{name: _filled(given.get(name, {}), chosen[name]) for name in GROUPS}}
 
@@ -61,10 +60,16 @@ class Settings(BaseModel):
         finetune: Mapping[str, Any] | FinetuneSettings | None = None,
         **encode: Any,  # noqa: ANN401
     ) -> Settings:
-        """Settings of a preset, with single ones of the encoder replaced, and of ``compact`` and ``finetune``.
+        """Return the settings of a preset, with those that are given replaced.
+
+        Args:
+            preset: name of the preset.
+            compact: settings of compaction to replace.
+            finetune: settings of fine-tuning to replace.
+            encode: settings of the encoder to replace.
 
         Raises:
-            UnsupportedError: no such preset or setting, or a value that is not possible.
+            UnsupportedError: an unknown preset or setting, or a value out of range.
         """
         if preset not in list(Preset):
             raise UnsupportedError(f"there is no preset {preset!r}; choose one of {', '.join(Preset)}")
@@ -85,12 +90,12 @@ class Settings(BaseModel):
             if problem["type"] == "extra_forbidden":
                 known = ", ".join(dict.fromkeys([*GROUPS[group].__annotations__, *GROUPS[group].model_fields]))
                 raise UnsupportedError(f"there is no setting {name!r} of {group}; there are {known}") from error
-            told = problem["msg"][:1].lower() + problem["msg"][1:]
-            raise UnsupportedError(f"setting {name}: {told}, not {problem['input']!r}") from error
+            reason = problem["msg"][:1].lower() + problem["msg"][1:]
+            raise UnsupportedError(f"setting {name}: {reason}, not {problem['input']!r}") from error
 
 
 def _filled(group: Any, preset: Mapping[str, Any]) -> Any:  # noqa: ANN401
-    """What is given of a group, and the rest from the preset."""
+    """Return the values given for a group, completed from the preset."""
     if isinstance(group, BaseModel):
         group = group.model_dump(include=group.model_fields_set)
     return {**preset, **group} if isinstance(group, dict) else group

@@ -1,4 +1,4 @@
-"""The presets: named points on the curve of speed, size and quality, as what differs from the defaults."""
+"""Presets: named trade-offs between speed, size and quality, as differences from the defaults."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 
 class Preset(StrEnum):
-    """Named points on the curve of speed, size and quality."""
+    """Named trade-offs between speed, size and quality."""
 
     FAST = "fast"
     BALANCED = "balanced"
@@ -83,4 +83,4 @@ FINETUNE: dict[Preset, dict[str, Any]] = {
 PRESETS = {
     preset: {"compact": COMPACT[preset], "encode": ENCODE[preset], "finetune": FINETUNE[preset]} for preset in Preset
 }
-"""By preset and group."""
+"""Differences from the defaults, by preset and group."""

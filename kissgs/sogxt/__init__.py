@@ -1,1 +1,4 @@
-"""The SOG-XT codec: Gaussians as nine lossless images and a small metadata file. Needs no camera and no renderer."""
+"""The SOG-XT container: nine lossless images and three metadata files. Takes an encoding plan; gives files, and back.
+
+Needs no cameras and no renderer.
+"""

@@ -1,4 +1,4 @@
-"""A set of named byte strings: a directory, a zip, in memory. Names and sizes are checked before reading."""
+"""The files of a container: in a folder, a zip or memory. Names and sizes are checked before reading."""
 
 from __future__ import annotations
 
@@ -13,28 +13,29 @@ from pathlib import Path
 from typing import BinaryIO, Literal, Protocol, runtime_checkable
 
 from kissgs.core.errors import InvalidContainerError, OutputError
-from kissgs.io.atomic import atomic_file, look, reason_of, refuse_existing, try_out, umask
+from kissgs.io.atomic import atomic_file, check_writable, path_state, reason_of, refuse_existing, umask
 from kissgs.sogxt.names import FILES
 
 MAX_ZIP_ENTRIES = 1000
-"""A container has 12 files; people may add notes and previews, not thousands of entries."""
+"""Largest number of entries: a container has 12 files, to which users may add notes and previews."""
 
 
-ZIP_BEGINNINGS = (b"PK\x03\x04", b"PK\x05\x06")
+ZIP_MAGICS = (b"PK\x03\x04", b"PK\x05\x06")
+"""First bytes of a zip file, and of an empty one."""
 
 
 @runtime_checkable
 class Source(Protocol):
-    """Where a container's files are read from."""
+    """Source that a container's files are read from."""
 
     def names(self) -> frozenset[str]:
-        """Names of the files that are there."""
+        """Return the names of all files."""
 
     def size(self, name: str) -> int:
-        """Bytes of one file of :meth:`names`."""
+        """Return the size of one file of :meth:`names`, bytes; in a zip, the compressed size."""
 
     def read(self, name: str, limit: int) -> bytes:
-        """The bytes of one file; InvalidContainerError if it is missing or has more than ``limit``."""
+        """Return the bytes of one file; raise InvalidContainerError if it is missing or has more than ``limit``."""
 
 
 class MemorySource:
@@ -85,11 +86,11 @@ class DirectorySource:
 
 
 class ZipSource:
-    """Files in a zip, at its top or together in one folder of it. Nothing is ever extracted to disk."""
+    """Files in a zip, at its top or together in a folder. Nothing is extracted to disk."""
 
     def __init__(self, file: BinaryIO, label: str) -> None:
-        if kind_of(file) == "ply":
-            raise InvalidContainerError(f"{label} is a .ply, not a container; name what compress has made of it")
+        if sniff_format(file) == "ply":
+            raise InvalidContainerError(f"{label} is a .ply, not a container; compress it first")
         try:
             self._zip = zipfile.ZipFile(file)
             entries = self._zip.infolist()
@@ -111,7 +112,7 @@ class ZipSource:
         return frozenset(self._entries)
 
     def size(self, name: str) -> int:
-        """See :class:`Source`; as stored."""
+        """See :class:`Source`."""
         return self._entries[name].compress_size
 
     def read(self, name: str, limit: int) -> bytes:
@@ -127,14 +128,14 @@ class ZipSource:
         return data
 
 
-def kind_of(file: BinaryIO) -> Literal["ply", "zip"] | None:
-    """What a file is: a zip may have something before it, such as a program that unpacks it, and a ``.ply`` has not."""
+def sniff_format(file: BinaryIO) -> Literal["ply", "zip"] | None:
+    """Return the format of a file, None for an unknown one; a zip may have data before it, a ``.ply`` may not."""
     file.seek(0)
     head = file.read(4)
     file.seek(0)
     if head[:3] == b"ply" and head[3:].isspace():
         return "ply"
-    return "zip" if head in ZIP_BEGINNINGS or zipfile.is_zipfile(file) else None
+    return "zip" if head in ZIP_MAGICS or zipfile.is_zipfile(file) else None
 
 
 @contextlib.contextmanager
@@ -142,7 +143,7 @@ def open_source(source: Path | bytes | Mapping[str, bytes]) -> Iterator[Source]:
     """Open a container for reading: a folder, a zip file, the bytes of one, or files in memory.
 
     Raises:
-        InvalidContainerError: there is nothing of that kind.
+        InvalidContainerError: ``source`` cannot be read or is not a zip file.
     """
     if isinstance(source, bytes):
         yield ZipSource(io.BytesIO(source), "the input")
@@ -163,7 +164,7 @@ def open_source(source: Path | bytes | Mapping[str, bytes]) -> Iterator[Source]:
 
 
 def zip_bytes(files: Mapping[str, bytes]) -> bytes:
-    """The files as one zip, images as they are and text deflated; equal files give equal bytes (no time, no system)."""
+    """Return a zip of the files, images stored and text deflated; equal files give equal bytes (no time, no system)."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, data in files.items():
@@ -176,7 +177,7 @@ def zip_bytes(files: Mapping[str, bytes]) -> bytes:
 
 
 def stored_sizes(files: Mapping[str, bytes], *, packed: bool) -> tuple[int, dict[str, int]]:
-    """Bytes of what is written, and of each file in it: of a zip, or of a folder."""
+    """Return the total size in bytes, and that of each file: as a zip if ``packed``, else as a folder."""
     if not packed:
         sizes = {name: len(data) for name, data in files.items()}
         return sum(sizes.values()), sizes
@@ -186,18 +187,18 @@ def stored_sizes(files: Mapping[str, bytes], *, packed: bool) -> tuple[int, dict
 
 
 def is_packed(path: Path) -> bool:
-    """Whether a container of that name is a zip, and no folder."""
+    """Whether a container of that name is a zip, not a folder."""
     return path.suffix.lower() == ".zip"
 
 
 def write_container(files: Mapping[str, bytes], path: Path, *, overwrite: bool = False) -> int:
-    """Write a container whole or not at all: a zip if the name ends in ``.zip``, else a folder.
+    """Write a container atomically: a zip if the name ends in ``.zip``, else a folder.
 
     Returns:
         Bytes written.
 
     Raises:
-        OutputError: it exists and ``overwrite`` is false, or the file system refuses. A folder is only ever replaced
+        OutputError: the path exists and ``overwrite`` is false, or the file system refuses. A folder is replaced only
             if it holds a container and nothing else.
     """
     check_destination(path, overwrite=overwrite, names=files.keys())
@@ -211,26 +212,26 @@ def write_container(files: Mapping[str, bytes], path: Path, *, overwrite: bool =
 
 
 def check_destination(path: Path, *, overwrite: bool, names: Collection[str] = FILES) -> None:
-    """Raise OutputError if a container may not be written to ``path``: to be called before the work, not after it.
+    """Raise OutputError if a container may not be written to ``path``; called before the work starts.
 
-    ``names`` are the files that a folder may hold and still be replaced.
+    ``names`` are the only files that a folder may hold to be replaced.
     """
     if is_packed(path):
         refuse_existing(path, overwrite=overwrite)
         return
-    present, folder = look(path)
+    present, folder = path_state(path)
     if present and not overwrite:
         raise OutputError(f"{path} exists already; choose another name or allow overwriting (--force)")
     if present and (not folder or _names_in(path) - set(names)):
         raise OutputError(f"{path} holds more than a container; name an empty or a new folder, or a .zip file")
-    try_out(path)
+    check_writable(path)
 
 
 def _names_in(folder: Path) -> set[str]:
     try:
         return {entry.name for entry in folder.iterdir()}
     except OSError as error:
-        raise OutputError(f"cannot look into {folder}: {reason_of(error)}") from error
+        raise OutputError(f"cannot list {folder}: {reason_of(error)}") from error
 
 
 def _write_directory(files: Mapping[str, bytes], path: Path) -> None:
@@ -250,7 +251,7 @@ def _write_directory(files: Mapping[str, bytes], path: Path) -> None:
     except OSError as error:
         raise OutputError(f"cannot write {path}: {reason_of(error)}") from error
     finally:
-        # Whatever ended the block, an interrupt included: the old container is given up only for the new one.
+        # After any end of the block, also an interrupt: the old container is removed only if the new one is there.
         if old is not None and not path.exists():
             old.rename(path)
         for leftover in (temporary, old):
@@ -262,4 +263,4 @@ def _check(name: str, present: bool, size: int, limit: int) -> None:
     if not present:
         raise InvalidContainerError(f"the container has no file {name!r}")
     if size > limit:
-        raise InvalidContainerError(f"{name} has {size} bytes; at most {limit} are possible here")
+        raise InvalidContainerError(f"{name} has {size} bytes; the limit for this file is {limit}")

@@ -1,7 +1,7 @@
-"""SOG-XT files -> ``Splats``: a small table per channel, one lookup per value, written where it belongs.
+"""SOG-XT files -> ``Splats``, by one lookup table per channel.
 
-The arithmetic is that of the paper's reference decoder (docs/format.md), with tables in float64 and without its detour
-through activated opacities and scales.
+The arithmetic is that of the paper's reference decoder (docs/reference/format.md), with tables in float64 and without
+its activation of opacities and scales and their inverse.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from kissgs.sogxt.metadata_reader import read_layout
 from kissgs.sogxt.planes import decode_plane
 
 CHUNK = 1 << 14
-"""Gaussians per task of lookups."""
+"""Gaussians per task."""
 
 CHANNELS_OF_PLAIN = {"quaternions": 4, "scales": 3, "f_dc": 3, "opacities": 1}
-"""Attributes that are one image of 8-bit levels each."""
+"""Number of channels of the attributes that are one image of 8-bit levels each."""
 
 
 MAX_GAUSSIANS = 20_000_000
-"""By default: 5 GB of arrays. A container of a few kilobytes can declare more than any machine holds."""
+"""Default limit: 5 GB of arrays. A container of a few kilobytes can declare more than any machine's memory holds."""
 
 
 def decode(
@@ -44,17 +44,17 @@ def decode(
     """Decode a container.
 
     Args:
-        source: a folder, a zip file, the bytes of one, or files in memory.
-        max_gaussians: refuse more, before memory is taken for them.
-        threads: to use; 0 means one per processor.
+        source: a folder, a zip file, the bytes of a zip, or files in memory.
+        max_gaussians: largest number of Gaussians; more are refused before memory is allocated.
+        threads: number of threads; 0 means one per processor.
         progress: receives "decode" events.
 
     Returns:
-        The Gaussians in the order of the grid. Quaternions are as stored, their length only about 1.
+        The Gaussians in the order of the grid. Quaternions are as stored, of length about 1.
 
     Raises:
-        InvalidContainerError: something in it is missing, damaged or impossible.
-        UnsupportedError: it uses images other than WebP, or holds more than ``max_gaussians``.
+        InvalidContainerError: a part of the container is missing, damaged or invalid.
+        UnsupportedError: the container has images other than WebP, or more Gaussians than ``max_gaussians``.
     """
     with open_source(source) as files, Workers(threads) as pool:
         progress("decode", 0.0)
@@ -67,7 +67,7 @@ def decode(
 
 
 class _Planes:
-    """The images of one container as rows of levels, with the table of values that belongs to each."""
+    """Images of a container as rows of levels, and their tables of values."""
 
     mask: UInt8[np.ndarray, "cells 1"]
     means: UInt16[np.ndarray, "cells 3"]
@@ -77,18 +77,18 @@ class _Planes:
 
     def __init__(self, files: Source, layout: Layout, max_gaussians: int) -> None:
         self.files, self.layout, self.max_gaussians = files, layout, max_gaussians
-        # Padding is less than half of any grid that follows the size rule, but for the smallest.
+        # Padding is less than half of any grid that follows the size rule, except for the smallest.
         self.refuse_more_than(2 * max_gaussians + 64, layout.grid_side**2, "cells")
         self.refuse_more_than(max_gaussians, layout.count or 0, "Gaussians")
         self.coefficients = SH_REST_COUNTS[layout.sh_degree]
         self.plain: dict[str, tuple[UInt8[np.ndarray, "cells C"], _Lookup]] = {}
 
     def refuse_more_than(self, limit: int, found: int, what: str) -> None:
-        """Raise UnsupportedError if the container is larger than the caller wants to decode."""
+        """Raise UnsupportedError if ``found`` is above ``limit``."""
         if found > limit:
             raise UnsupportedError(
-                f"the container has {found} {what}; with a limit of {self.max_gaussians} Gaussians, {limit} are read: "
-                "raise the limit (--max-gaussians) if you trust it"
+                f"the container has {found} {what}; with a limit of {self.max_gaussians} Gaussians, at most {limit} "
+                "are read: raise the limit (--max-gaussians) if you trust the container"
             )
 
     def load(self, pool: Workers) -> None:
@@ -103,16 +103,16 @@ class _Planes:
         pool.map(lambda job: job(), jobs)
 
     def load_mask(self) -> None:
-        """Which cells hold a Gaussian."""
+        """Load the mask of the cells that hold a Gaussian."""
         self.mask = self.grid_plane("active_mask", 1)
 
     def load_plain(self, field: str, channels: int) -> None:
-        """An attribute of one 8-bit image."""
+        """Load an attribute of one 8-bit image."""
         levels = self.grid_plane(field, channels)
         self.plain[field] = levels, _Lookup(levels, *self.layout.limits(field))
 
     def load_means(self) -> None:
-        """Positions: two images, one table for all axes."""
+        """Load positions: two images, one table for all axes."""
         self.means = self.grid_plane("means_bytes_1", 3).astype(np.uint16)
         self.means <<= 8
         self.means |= self.grid_plane("means_bytes_0", 3)
@@ -120,13 +120,13 @@ class _Planes:
         self.means_table = signed_exp(logs).astype(np.float32)
 
     def load_labels(self) -> None:
-        """The codebook entry of every cell, as its column and row."""
+        """Load the codebook entry of every cell, as its column and row."""
         self.labels, side = self.grid_plane("f_rest_labels", 2), self.layout.codebook_side
         if int(self.labels.max()) >= side and int(_entry(self.labels, side).max()) >= side * side:
             raise InvalidContainerError(f"f_rest_labels.webp points outside the codebook of {side} x {side} entries")
 
     def load_codebook(self) -> None:
-        """The entries, coefficient by coefficient, R, G and B of each.
+        """Load the codebook's entries, coefficient by coefficient, R, G and B of each.
 
         The image has 15 tiles of S × S pixels, three rows of five; tile = coefficient, pixel = entry.
         """
@@ -139,11 +139,11 @@ class _Planes:
         self.codebook = np.ascontiguousarray(entries[:, : 3 * self.coefficients])
 
     def grid_plane(self, name: str, channels: int) -> UInt8[np.ndarray, "cells C"]:
-        """An image on the grid, as one row per cell."""
+        """Return an image of the grid's size, as one row per cell."""
         return self.plane(name, self.layout.grid_side, self.layout.grid_side, channels)
 
     def plane(self, name: str, width: int, height: int, channels: int) -> UInt8[np.ndarray, "pixels C"]:
-        """An image, its checksum compared with the metadata if that has one."""
+        """Return an image as one row per pixel; its checksum is compared if the metadata has one."""
         file = f"{name}.webp"
         data = self.files.read(file, 4096 + 5 * width * height)  # lossless WebP never needs more than 4 bytes a pixel
         expected = self.layout.provenance.sha256.get(file) if self.layout.provenance else None
@@ -153,14 +153,14 @@ class _Planes:
         return decode_plane(data, file, width=width, height=height, channels=channels, crc32=checksum)
 
     def look_up(self, pool: Workers) -> Splats:
-        """Levels to values, some thousand Gaussians at a time, so that everything in between stays in the cache."""
+        """Convert levels to values, some thousand Gaussians at a time, so that temporaries stay in the cache."""
         mask = self.mask[:, 0] > 0
         count = int(np.count_nonzero(mask))
         declared = self.layout.count
         if declared not in (None, count):
             raise InvalidContainerError(f"active_mask.webp marks {count} Gaussians; the metadata declares {declared}")
         self.refuse_more_than(self.max_gaussians, count, "Gaussians")
-        # No cell numbers are needed where all padding is at the end.
+        # No cell indices are needed if all padding is at the end.
         cells = None if mask[:count].all() else np.flatnonzero(mask)
         splats = _empty(count, self.coefficients)
         outputs = (splats.quats, splats.scales, splats.sh0, splats.opacities[:, None])
@@ -182,12 +182,12 @@ class _Planes:
 
 
 def _entry(labels: UInt8[np.ndarray, "N C"], side: int) -> Int[np.ndarray, " N"]:
-    """Number of the codebook entry: row (green) × S + column (red)."""
+    """Return the index of the codebook entry: row (green) × S + column (red)."""
     return labels[:, 1].astype(np.int64) * side + labels[:, 0]
 
 
 def _empty(count: int, coefficients: int) -> Splats:
-    """Memory for a scene, not yet filled."""
+    """Return a scene of uninitialised arrays."""
     return Splats(
         means=np.empty((count, 3), np.float32),
         quats=np.empty((count, 4), np.float32),
@@ -199,12 +199,12 @@ def _empty(count: int, coefficients: int) -> Splats:
 
 
 class _Lookup:
-    """Values of 8-bit levels, one table per channel, all in one array."""
+    """Lookup tables of 8-bit levels, one per channel, in one array."""
 
     def __init__(self, image: UInt8[np.ndarray, "..."], low: np.ndarray, high: np.ndarray) -> None:
         table = _table(image, low, high).astype(np.float32)
         self._table = table.reshape(-1)
-        # As large as a chunk of levels: NumPy adds two long rows faster than many short ones.
+        # One row of offsets per Gaussian of a chunk: NumPy adds equal shapes faster than it broadcasts short rows.
         self._offsets = np.tile(np.arange(len(table), dtype=np.uint16) * table.shape[1], (CHUNK, 1))
 
     def __call__(self, levels: UInt8[np.ndarray, "N C"], out: Float32[np.ndarray, "N C"]) -> None:
@@ -214,7 +214,7 @@ class _Lookup:
 
 
 def _table(image: np.ndarray, low: np.ndarray, high: np.ndarray) -> Float64[np.ndarray, "C levels"]:
-    """Per channel, the value of every level up to the largest that occurs.
+    """Return each channel's values of all levels up to the largest that occurs.
 
     The smallest and the largest level of the image, over all channels and cells, stand for ``low`` and ``high``.
     """

@@ -1,4 +1,4 @@
-"""``Splats`` -> SOG-XT files, readable top to bottom: choose order and levels, draw them as images, compress."""
+"""``Splats`` -> SOG-XT files: plan the encoding, render the planes, compress them, write the metadata."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ from kissgs.sogxt.planes import compress_images, pixels_crc32
 
 @dataclass(frozen=True, slots=True)
 class Encoded:
-    """A container in memory, and how it came about.
+    """A container in memory, and figures of its encoding.
 
     Attributes:
         files: name -> bytes, in the order in which they are best stored.
-        order: ``(M,)`` for every Gaussian of the container, in its order, the index in the scene that was encoded.
-        form_error: largest relative change of a covariance by the choice of its equivalent form.
-        invisible: number of Gaussians left out because no renderer draws them.
-        pruned_by_rd: number of Gaussians left out because their bytes cost more than they show.
+        order: ``(M,)`` index in the encoded scene of every Gaussian of the container, in the container's order.
+        form_error: largest relative change of a covariance by the plan of its equivalent form.
+        invisible: number of Gaussians pruned because no renderer draws them.
+        pruned_by_rd: number of Gaussians pruned because removing them costs less than their bits.
         clipped_colors: number of Gaussians with a clipped base colour (:func:`kissgs.planning.quantize.clip_outliers`).
         errors: largest quantisation error by field and channel (:class:`kissgs.planning.encoding_plan.EncodingPlan`).
-        rd_lambda: of a bit, squared error; None where bits were not weighed.
-        codebook_side: of its image.
-        note: a sentence for people about Gaussians that were left out, if these are many; or empty.
+        rd_lambda: squared error per bit; None for uniform planning.
+        codebook_side: S; the codebook has S × S entries.
+        note: a sentence for the user if many Gaussians were pruned; else empty.
     """
 
     files: dict[str, bytes]
@@ -70,12 +70,12 @@ def encode(
 
     Args:
         splats: the scene.
-        settings: see :class:`EncodeSettings`.
+        settings: settings of the encoder.
         sensitivity: see :func:`~kissgs.planning.planner.plan_encoding`.
-        recolor: see the same.
+        recolor: see :func:`~kissgs.planning.planner.plan_encoding`.
         cleaned: see :func:`write_files`.
-        compacted: see the same.
-        threads: to use; 0 means one per processor. The bytes do not depend on it.
+        compacted: see :func:`write_files`.
+        threads: number of threads; 0 means one per processor. The bytes do not depend on it.
         progress: receives "kernels", "rate_distortion", "order", "forms", "codebook", "sort codebook", "rounding" and
             "images".
 
@@ -83,16 +83,14 @@ def encode(
         InvalidSceneError: ``sensitivity`` does not fit the scene.
         UnsupportedError: the scene is too large for one container.
     """
-    choice = plan_encoding(
-        splats, settings, sensitivity=sensitivity, recolor=recolor, threads=threads, progress=progress
-    )
+    plan = plan_encoding(splats, settings, sensitivity=sensitivity, recolor=recolor, threads=threads, progress=progress)
     return write_files(
-        *(choice, splats, settings), cleaned=cleaned, compacted=compacted, threads=threads, progress=progress
+        *(plan, splats, settings), cleaned=cleaned, compacted=compacted, threads=threads, progress=progress
     )
 
 
 def write_files(
-    choice: EncodingPlan,
+    plan: EncodingPlan,
     splats: Splats,
     settings: EncodeSettings,
     *,
@@ -102,31 +100,31 @@ def write_files(
     threads: int = 0,
     progress: Progress = silent,
 ) -> Encoded:
-    """Make the files that show a choice.
+    """Make the files of a plan.
 
     Args:
-        choice: of :func:`~kissgs.planning.planner.plan_encoding`, or better.
-        splats: the scene for which it was made.
-        settings: with which.
-        cleaned: what was mended before, for the metadata.
-        compacted: by how many Gaussians compaction has made the scene smaller before, for the metadata.
-        finetune_steps: by which the choice became better, for the metadata.
-        threads: to use; 0 means one per processor. The bytes do not depend on it.
+        plan: plan of :func:`~kissgs.planning.planner.plan_encoding`, perhaps fine-tuned.
+        splats: the scene that was planned.
+        settings: settings of the plan.
+        cleaned: changes by cleaning, for the metadata.
+        compacted: number of Gaussians that compaction removed, for the metadata.
+        finetune_steps: number of fine-tuning steps, for the metadata.
+        threads: number of threads; 0 means one per processor. The bytes do not depend on it.
         progress: receives "images".
     """
-    images = render_planes(choice)
+    images = render_planes(plan)
     with blas_workers(threads) as pool:
         files = compress_images(images, settings, pool, _stage(progress, "images"))
-    kept, count = len(visible_gaussians(splats, settings)), int(choice.grid.mask.sum())
-    unsaid = {*GOALS, "max_encodes"} | (
+    kept, count = len(visible_gaussians(splats, settings)), int(plan.grid.mask.sum())
+    omitted = {*GOALS, "max_encodes"} | (
         {"sh_codebook_size"} if settings.sh_codebook_size == MAX_CODEBOOK_SIDE**2 else set()
     )
-    made = {**settings.model_dump(exclude=unsaid), "rd_lambda": choice.rd_lambda}
+    recorded = {**settings.model_dump(exclude=omitted), "rd_lambda": plan.rd_lambda}
     layout = metadata.Layout(
-        grid_side=choice.grid.side,
-        codebook_side=choice.codebook.side,
+        grid_side=plan.grid.side,
+        codebook_side=plan.codebook.side,
         count=count,
-        ranges=_ranges(choice.fields),
+        ranges=_ranges(plan.fields),
         provenance=metadata.Provenance(
             version=__version__,
             sh_degree=splats.sh_degree,
@@ -135,11 +133,11 @@ def write_files(
             changed={
                 "invisible": len(splats) - kept,
                 "pruned_by_rd": kept - count,
-                "clipped_colors": choice.clipped_colors,
+                "clipped_colors": plan.clipped_colors,
                 **({"compacted": compacted} if compacted else {}),
                 **cleaned.as_dict(),
             },
-            settings={**made, **({"finetune_steps": finetune_steps} if finetune_steps else {})},
+            settings={**recorded, **({"finetune_steps": finetune_steps} if finetune_steps else {})},
             sha256={name: hashlib.sha256(data).hexdigest() for name, data in files.items()},
         ),
         crc32={name: pixels_crc32(image) for name, image in images.items()},
@@ -147,21 +145,21 @@ def write_files(
     files = {names.JSON_NAME: layout.to_meta_json(), **files}
     return Encoded(
         files={names.YAML_NAME: layout.to_yaml(), names.SCENE_NAME: metadata.scene_json(files), **files},
-        order=choice.grid.cells[choice.grid.mask],
-        form_error=choice.form_error,
+        order=plan.grid.cells[plan.grid.mask],
+        form_error=plan.form_error,
         invisible=len(splats) - kept,
         pruned_by_rd=kept - count,
-        clipped_colors=choice.clipped_colors,
-        errors=choice.errors,
-        rd_lambda=choice.rd_lambda,
-        codebook_side=choice.codebook.side,
-        note=choice.note,
+        clipped_colors=plan.clipped_colors,
+        errors=plan.errors,
+        rd_lambda=plan.rd_lambda,
+        codebook_side=plan.codebook.side,
+        note=plan.note,
     )
 
 
-def render_planes(choice: EncodingPlan) -> dict[str, UInt8[np.ndarray, "H W C"]]:
-    """The nine images, by file name."""
-    fields, grid, codebook = choice.fields, choice.grid, choice.codebook
+def render_planes(plan: EncodingPlan) -> dict[str, UInt8[np.ndarray, "H W C"]]:
+    """Return the nine images of a plan, by file name."""
+    fields, grid, codebook = plan.fields, plan.grid, plan.codebook
     means = fields["means"].levels
     labels = np.zeros((grid.side**2, 3), dtype=np.uint8)
     labels[:, 1], labels[:, 0] = np.divmod(codebook.labels[grid.cell_to_gaussian], codebook.side)
@@ -177,7 +175,7 @@ def render_planes(choice: EncodingPlan) -> dict[str, UInt8[np.ndarray, "H W C"]]
 
 
 def _tiles(codebook: Codebook) -> UInt8[np.ndarray, "H W 3"]:
-    """The codebook's image: one tile of S × S pixels per coefficient, three rows of five."""
+    """Return the codebook's image: one tile of S × S pixels per coefficient, three rows of five."""
     rows, columns = metadata.TILE_ROWS, metadata.TILE_COLUMNS
     levels = codebook.centroids.levels.reshape(codebook.side, codebook.side, 3, rows, columns)
     tiled = levels.transpose(3, 0, 4, 1, 2)
@@ -185,13 +183,13 @@ def _tiles(codebook: Codebook) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def _ranges(fields: dict[str, Quantized]) -> dict[str, tuple[list[float], list[float]]]:
-    """What the metadata says of each field, in the fewest digits that still give the same float32."""
+    """Return each field's range, in the fewest digits that identify its float32 numbers."""
 
     def digits(name: str, end: Float32[np.ndarray, " C"]) -> list[float]:
         return [float(str(value)) for value in end[: metadata.CHANNELS[name]]]
 
-    anchors = {name: observed_range(field) for name, field in fields.items()}
-    return {name: (digits(name, low), digits(name, high)) for name, (low, high) in anchors.items()}
+    ranges = {name: observed_range(field) for name, field in fields.items()}
+    return {name: (digits(name, low), digits(name, high)) for name, (low, high) in ranges.items()}
 
 
 def _stage(progress: Progress, name: str) -> Callable[[float], None]:

@@ -1,7 +1,6 @@
-"""What stands beside the images: ``container_meta.yaml``, ``meta.json`` and ``scene.json``.
+"""The metadata files ``container_meta.yaml``, ``meta.json`` and ``scene.json``.
 
-One truth, :class:`Layout`, in two spellings: the YAML is what the paper's Python decoder reads, the two JSON files what
-browsers read.
+:class:`Layout` is written in two formats: the paper's Python decoder reads the YAML, browsers read the two JSON files.
 """
 
 from __future__ import annotations
@@ -23,28 +22,28 @@ from kissgs.sogxt.names import CHECKSUM, JSON_NAME
 TILE_ROWS, TILE_COLUMNS = 3, 5
 
 CHANNELS = {"opacities": 1, "means": 1, "scales": 3, "quaternions": 4, "f_dc": 3, "f_rest_centroids": 45}
-"""Fields with a range, and how many numbers it has. One number stands as such, several as a list."""
+"""Fields with a range, and its number of channels. One number is written as such, several as a list."""
 
 CHECKED = ("f_dc", "opacities", "scales", "quaternions", "means", "f_rest_centroids")
 """Order of the ranges in the checksum of the metadata."""
 
-BEYOND = 2.0**128 - 2.0**103
-"""The smallest number that rounds to no finite float32."""
+FLOAT32_OVERFLOW = 2.0**128 - 2.0**103
+"""Smallest number that does not round to a finite float32."""
 
 
-def _no_switch(value: Any) -> Any:  # noqa: ANN401
-    """Refuse true and false, which Python takes for numbers."""
+def _no_bool(value: Any) -> Any:  # noqa: ANN401
+    """Refuse true and false, which Python treats as numbers."""
     if isinstance(value, bool):
-        raise PydanticCustomError("no_switch", "Input should be a valid number, not true or false")
+        raise PydanticCustomError("no_bool", "Input should be a valid number, not true or false")
     return value
 
 
-Number = BeforeValidator(_no_switch)
-Limit = Annotated[FiniteFloat, Field(gt=-BEYOND, lt=BEYOND), Number]
+Number = BeforeValidator(_no_bool)
+Limit = Annotated[FiniteFloat, Field(gt=-FLOAT32_OVERFLOW, lt=FLOAT32_OVERFLOW), Number]
 
 
 class Provenance(BaseModel):
-    """Our own part of the metadata, under the key ``kissgs``; other readers skip it, and it may be missing."""
+    """Metadata of kissgs, under the key ``kissgs``; other readers skip it, and it may be missing."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -54,26 +53,30 @@ class Provenance(BaseModel):
     )
     count: int = Field(ge=0, description="Number of Gaussians: active cells of the mask.")
     source_count: int = Field(ge=0, description="Number of Gaussians in the scene that was encoded.")
-    changed: dict[str, int] = Field(default_factory=dict, description="Gaussians left out or mended, by reason.")
-    settings: dict[str, bool | int | float | str | None] = Field(default_factory=dict, description="Of the encoder.")
+    changed: dict[str, int] = Field(
+        default_factory=dict, description="Number of Gaussians pruned or repaired, by reason."
+    )
+    settings: dict[str, bool | int | float | str | None] = Field(
+        default_factory=dict, description="Settings of the encoder."
+    )
     sha256: dict[str, str] = Field(default_factory=dict, description="SHA-256 of each image file, hexadecimal.")
 
 
 class SimpleQuantize(BaseModel):
-    """Values of the smallest and the largest level that occur in the field's image, per channel."""
+    """Values of the smallest and the largest level in the field's image, per channel."""
 
     min_values: Limit | list[Limit]
     max_values: Limit | list[Limit]
 
 
 class Transform(BaseModel):
-    """One step between image and values."""
+    """One conversion step between levels and values."""
 
     simple_quantize: SimpleQuantize
 
 
 class Op(BaseModel):
-    """How one field is stored."""
+    """Storage of one field."""
 
     input_fields: list[str] = Field(min_length=1, max_length=1)
     transforms: list[Transform] = Field(min_length=1)
@@ -97,7 +100,7 @@ class ContainerMeta(BaseModel):
 
 
 class Layout(BaseModel):
-    """All that a decoder must know beside the images."""
+    """All metadata that a decoder needs besides the images."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -107,16 +110,16 @@ class Layout(BaseModel):
     count: int | None = Field(None, ge=0)
     provenance: Provenance | None = None
     crc32: dict[str, Annotated[int, Field(ge=0, lt=1 << 32)]] = Field(default_factory=dict)
-    """Of each image's pixels (:func:`kissgs.sogxt.planes.pixels_crc32`); in ``meta.json``, as the YAML has SHA-256."""
+    """CRC-32 of each image's pixels (:func:`kissgs.sogxt.planes.pixels_crc32`); in ``meta.json`` only."""
 
     def limits(self, field: str) -> tuple[np.ndarray, np.ndarray]:
-        """``low`` and ``high`` of a field, one number per channel: float32 numbers, as float64."""
+        """Return ``low`` and ``high`` of a field, one number per channel: float32 numbers, as float64."""
         low, high = self.ranges[field]
         return np.array(low, dtype=np.float32).astype(np.float64), np.array(high, dtype=np.float32).astype(np.float64)
 
     @property
     def sh_degree(self) -> int:
-        """Degree that was written, or that the bands which are not zero throughout need, whichever is larger."""
+        """SH degree: the larger one of the written degree and the one that bands with non-zero ranges need."""
         low, high = self.limits("f_rest_centroids")
         coefficients = np.flatnonzero(((low != 0) | (high != 0)).reshape(3, 15).any(axis=0))
         needed = 1 + int(coefficients.max(initial=-1))
@@ -131,7 +134,7 @@ class Layout(BaseModel):
         return zlib.crc32(np.concatenate([sizes, *ends]).astype("<f8").tobytes())
 
     def to_yaml(self) -> bytes:
-        """``container_meta.yaml``: ASCII, floats always with a point, so that YAML 1.1 readers see numbers."""
+        """Return ``container_meta.yaml``: ASCII, floats always with a point, so that YAML 1.1 readers see numbers."""
         document: dict[str, Any] = {
             "meta": {
                 "grid_side": self.grid_side,
@@ -141,7 +144,7 @@ class Layout(BaseModel):
             "ops": [
                 {
                     "input_fields": [field],
-                    "transforms": [{"simple_quantize": self._spelled(field, "min_values", "max_values")}],
+                    "transforms": [{"simple_quantize": self._range_entry(field, "min_values", "max_values")}],
                 }
                 for field in CHANNELS
             ],
@@ -153,13 +156,13 @@ class Layout(BaseModel):
         return yaml.dump(document, Dumper=dumper, sort_keys=False, allow_unicode=False, width=120).encode("ascii")
 
     def to_meta_json(self) -> bytes:
-        """``meta.json``, version 3: the same for browsers."""
+        """Return ``meta.json``, version 3, for browsers."""
 
         def plane(field: str, *files: str, **more: Any) -> dict[str, Any]:  # noqa: ANN401
-            return {**self._spelled(field, "mins", "maxs"), "files": [f"{name}.webp" for name in files], **more}
+            return {**self._range_entry(field, "mins", "maxs"), "files": [f"{name}.webp" for name in files], **more}
 
         observed = {"normalize": "observed-minmax"}
-        centroids = self._spelled("f_rest_centroids", "centroidsMins", "centroidsMaxs")
+        centroids = self._range_entry("f_rest_centroids", "centroidsMins", "centroidsMaxs")
         document = {
             "version": 3,
             "format": "sog-xt",
@@ -184,12 +187,12 @@ class Layout(BaseModel):
             },
         }
         if self.provenance:
-            made = self.provenance.model_dump(include={"version", "sh_degree"})
-            document["kissgs"] = {**made, "crc32": self.crc32}
+            recorded = self.provenance.model_dump(include={"version", "sh_degree"})
+            document["kissgs"] = {**recorded, "crc32": self.crc32}
             document[CHECKSUM] = self.checksum
         return json.dumps(document, separators=(",", ":"), allow_nan=False).encode("ascii")
 
-    def _spelled(self, field: str, low: str, high: str) -> dict[str, float | list[float]]:
+    def _range_entry(self, field: str, low: str, high: str) -> dict[str, float | list[float]]:
         values = self.ranges[field]
         if CHANNELS[field] == 1:
             return {low: values[0][0], high: values[1][0]}
@@ -210,7 +213,7 @@ SCENE_PLANES = {
 
 
 def scene_json(files: Mapping[str, bytes]) -> bytes:
-    """``scene.json``: which file holds what and how large it is, so that viewers can plan their loading."""
+    """Return ``scene.json``: role and size of each file, so that viewers can plan their loading."""
 
     def entry(name: str) -> dict[str, Any]:
         return {"url": name, "bytes": len(files[name])}

@@ -1,4 +1,4 @@
-"""Reading a container's metadata: its YAML if it is there, else ``meta.json``. What we do not know is let pass."""
+"""Reading of a container's metadata: the YAML if it exists, else ``meta.json``. Unknown keys are ignored."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from kissgs.sogxt.metadata import CHANNELS, TILE_COLUMNS, TILE_ROWS, Layout
 from kissgs.sogxt.names import CHECKSUM, JSON_NAME, YAML_NAME
 
 MAX_METADATA_BYTES = 1 << 20
-"""The three metadata files have about 4 kB each."""
+"""Largest size of a metadata file, bytes; kissgs writes about 4 kB each."""
 
 MAX_YAML_DEPTH = 50
-"""Ours is nested 6 deep. libyaml composes by recursion, which no limit of Python's stops before the stack ends."""
+"""Largest nesting; kissgs writes 6 levels. libyaml composes recursively, and Python's limit does not stop it."""
 
 MAX_YAML_ALIASES = 20
-"""Dumpers write one where two fields share a list; a few thousand would take hours to follow."""
+"""Largest number of aliases: dumpers write one if two fields share a list; thousands would take hours to expand."""
 
-ABSENT = object()
-"""Stands for a checksum that nobody wrote: other encoders, and kissgs before it had one."""
+MISSING = object()
+"""Placeholder for a missing checksum: other encoders and early versions of kissgs write none."""
 
 MAX_SIGNED_LOG = 88.7
-"""e to more than this is beyond float32."""
+"""Largest signed logarithm of a position: exp of more exceeds float32."""
 
 
 def read_layout(source: Source) -> Layout:
     """Read and check the metadata of a container.
 
     Raises:
-        InvalidContainerError: there is none, or it says something impossible.
-        UnsupportedError: its images are not WebP.
+        InvalidContainerError: the metadata is missing, damaged or invalid.
+        UnsupportedError: the images are not WebP, or ``meta.json`` is of another format or version.
     """
     names = source.names()
     name = next((name for name in (YAML_NAME, JSON_NAME) if name in names), None)
@@ -46,12 +46,12 @@ def read_layout(source: Source) -> Layout:
     raw = read(source.read(name, MAX_METADATA_BYTES))
     checksum = raw.pop(CHECKSUM)
     try:
-        # Numbers as text occur in YAML, whose dumpers write some so; in JSON they are refused, as browsers do.
+        # Some YAML dumpers write numbers as text, so that is accepted; in JSON it is refused, as in browsers.
         layout = Layout.model_validate(raw, strict=name == JSON_NAME)
     except ValidationError as error:
         raise InvalidContainerError(f"{name}: {_first_problem(error)}") from error
     _check_ranges(layout, name)
-    if checksum is not ABSENT and checksum != layout.checksum:
+    if checksum is not MISSING and checksum != layout.checksum:
         raise InvalidContainerError(f"{name} is damaged: its numbers do not give its {CHECKSUM}; copy it again")
     return layout
 
@@ -70,7 +70,7 @@ def _check_ranges(layout: Layout, name: str) -> None:
 
 
 def _from_yaml(data: bytes) -> dict[str, Any]:
-    """The fields of :class:`Layout` out of the YAML, as forgiving as the reference decoder."""
+    """Return the fields of :class:`Layout` from the YAML, as tolerant as the reference decoder."""
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
         _check_nesting(yaml.parse(data, Loader=loader))
@@ -85,19 +85,19 @@ def _from_yaml(data: bytes) -> dict[str, Any]:
             f"{YAML_NAME} lacks 'meta' or 'ops', or they are not of the expected form"
         ) from error
     _require_webp(sides.get("image_codec") if isinstance(sides, dict) else None)
-    made = document.get("kissgs")
+    recorded = document.get("kissgs")
     return {
-        "count": made.get("count") if isinstance(made, dict) else None,
+        "count": recorded.get("count") if isinstance(recorded, dict) else None,
         "grid_side": sides.get("grid_side"),
         "codebook_side": sides.get("f_rest_centroids_side"),
         "ranges": ranges,
-        "provenance": made,
-        CHECKSUM: document.get(CHECKSUM, ABSENT),
+        "provenance": recorded,
+        CHECKSUM: document.get(CHECKSUM, MISSING),
     }
 
 
 def _check_nesting(events: Iterable[yaml.Event]) -> None:
-    """Raise YAMLError for documents that a few bytes make deep, or, by aliases and merge keys, endless."""
+    """Raise YAMLError for documents that are nested too deeply, or that aliases or merge keys expand without bound."""
     depth = aliases = 0
     for event in events:
         aliases += isinstance(event, yaml.AliasEvent)
@@ -111,7 +111,7 @@ def _check_nesting(events: Iterable[yaml.Event]) -> None:
 
 
 def _ranges_of(op: Mapping[str, Any]) -> Iterator[tuple[str, tuple[list[Any], list[Any]]]]:
-    """Field and range of one op, as often as it gives one (the last counts); nothing for ops on several fields."""
+    """Yield field and range of each range of one op (the last one counts); nothing for ops on several fields."""
     fields = op["input_fields"]
     if len(fields) != 1:
         return
@@ -122,7 +122,7 @@ def _ranges_of(op: Mapping[str, Any]) -> Iterator[tuple[str, tuple[list[Any], li
 
 
 def _from_json(data: bytes) -> dict[str, Any]:
-    """The fields of :class:`Layout` out of ``meta.json``: what ``web_decoder/scene.js`` takes, and nothing else."""
+    """Return the fields of :class:`Layout` from ``meta.json``; accept what ``web_decoder/scene.js`` accepts."""
     try:
         # Every number becomes a float64, as in browsers; NaN and Infinity are not JSON.
         document = json.loads(data.decode("utf-8-sig"), parse_int=float, parse_constant=_refuse_constant)
@@ -145,13 +145,13 @@ def _from_json(data: bytes) -> dict[str, Any]:
             "grid_side": _whole(document["gridSide"]),
             "codebook_side": _whole(rest["centroidSide"]),
             "ranges": ranges,
-            CHECKSUM: document.get(CHECKSUM, ABSENT),
+            CHECKSUM: document.get(CHECKSUM, MISSING),
         }
         if "kissgs" in document:
-            made = document["kissgs"]
-            degree, checksums = _whole(made["sh_degree"]), made.get("crc32", {})
+            recorded = document["kissgs"]
+            degree, checksums = _whole(recorded["sh_degree"]), recorded.get("crc32", {})
             shared = {"count": count, "source_count": count}
-            raw["provenance"] = {"version": made["version"], "sh_degree": degree, **shared}
+            raw["provenance"] = {"version": recorded["version"], "sh_degree": degree, **shared}
             raw["crc32"] = {name: _whole(value) for name, value in checksums.items()}
         return raw
     except (KeyError, TypeError, AttributeError, IndexError) as error:
@@ -163,12 +163,12 @@ def _refuse_constant(name: str) -> NoReturn:
 
 
 def _whole(value: Any) -> Any:  # noqa: ANN401
-    """A whole number as int; anything else as it is, for the check of types to refuse."""
+    """Return a whole number as int; anything else unchanged, which type validation refuses."""
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def _check_dialect(document: Mapping[str, Any]) -> None:
-    """Refuse what would decode without complaint, and wrong."""
+    """Refuse formats that would decode to wrong values without an error."""
     quats, rest, files = document["quats"], document["shN"], document["mask"]["files"]
     for name, found, known in (
         ("format", document.get("format", "sog-xt"), "sog-xt"),
@@ -182,7 +182,7 @@ def _check_dialect(document: Mapping[str, Any]) -> None:
         if found != known:
             raise UnsupportedError(f"{JSON_NAME}: {name} is {repr(_whole(found))[:80]}; only {known!r} is read")
     if not isinstance(files, list):
-        raise TypeError("mask.files is no list")
+        raise TypeError("mask.files is not a list")
     _require_webp(files[0].rsplit(".", 1)[-1])
 
 
@@ -192,7 +192,7 @@ def _require_webp(codec: object) -> None:
 
 
 def _flat(values: Any) -> list[Any]:  # noqa: ANN401
-    """A number as a list of one; nested lists flattened. A few aliases in a YAML could spell millions: stop early."""
+    """Return a number as a list of one, or a flattened list; stop early, since YAML aliases may expand to millions."""
     flat: list[Any] = []
     waiting = [values]
     for _ in range(1000):
@@ -203,11 +203,11 @@ def _flat(values: Any) -> list[Any]:  # noqa: ANN401
             waiting.extend(reversed(value))
         else:
             flat.append(value)
-    raise ValueError("a range of absurd length")
+    raise ValueError("a range has more than 1000 values")
 
 
 def _spread(values: Any, channels: int) -> list[Any]:  # noqa: ANN401
-    """As browsers do: a number, or the first of a list of another length, stands for all channels."""
+    """Return one number per channel: repeat a number, or the first of a list of another length, as browsers do."""
     numbers = values if isinstance(values, list) else [values]
     return numbers if len(numbers) == channels else numbers[:1] * channels
 

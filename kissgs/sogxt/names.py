@@ -1,9 +1,9 @@
-"""Names of the files in a container, and of a key in two of them."""
+"""Names of a container's files, and of the metadata's checksum."""
 
 YAML_NAME, JSON_NAME, SCENE_NAME = "container_meta.yaml", "meta.json", "scene.json"
 
 CHECKSUM = "kissgs_crc32"
-"""Key of the metadata's checksum. It stands outside ``kissgs``, so that it tells if that block is lost."""
+"""Key of the metadata's checksum, outside ``kissgs``, so that it shows a loss of that block."""
 
 PLANES = (
     "active_mask.webp",

@@ -16,6 +16,7 @@ from kissgs.core.threads import Workers
 from kissgs.settings import EncodeSettings
 
 HIGHEST_EFFORT = (100, 6)
+"""Quality and method of libwebp for the smallest files."""
 
 
 def compress_images(
@@ -37,20 +38,20 @@ def compress_images(
 
 
 def encode_plane(image: UInt8[np.ndarray, "H W C"], *, quality: int, method: int) -> bytes:
-    """Compress one image of 1, 3 or 4 channels; ``quality`` and ``method`` are only effort.
+    """Compress one image of 1, 3 or 4 channels losslessly; ``quality`` and ``method`` set libwebp's effort.
 
-    Lossless and ``exact``: without it, libwebp blackens the colour of pixels whose fourth channel is 0.
+    Without ``exact``, libwebp would blacken the colour of pixels whose fourth channel is 0.
     """
-    picture = Image.fromarray(image[:, :, 0] if image.shape[2] == 1 else image)
+    image_file = Image.fromarray(image[:, :, 0] if image.shape[2] == 1 else image)
     buffer = io.BytesIO()
-    picture.save(buffer, "WEBP", lossless=True, exact=True, quality=quality, method=method)
+    image_file.save(buffer, "WEBP", lossless=True, exact=True, quality=quality, method=method)
     return buffer.getvalue()
 
 
 def pixels_crc32(image: UInt8[np.ndarray, "H W C"]) -> int:
-    """CRC-32 of an image of 1, 3 or 4 channels as a browser has it: red, green, blue and alpha of each pixel.
+    """Return the CRC-32 of an image of 1, 3 or 4 channels as a browser decodes it, to RGBA.
 
-    Some browsers' own decoders are fast but not exact, or add noise; this tells when they may be trusted.
+    Some browsers' decoders are fast but not exact, or add noise; with this checksum the web decoder detects it.
     """
     rgba = np.full((*image.shape[:2], 4), 255, dtype=np.uint8)
     rgba[:, :, : max(image.shape[2], 3)] = image
@@ -60,18 +61,18 @@ def pixels_crc32(image: UInt8[np.ndarray, "H W C"]) -> int:
 def decode_plane(
     data: bytes, name: str, *, width: int, height: int, channels: int, crc32: int | None = None
 ) -> UInt8[np.ndarray, "pixels C"]:
-    """Decompress one image, as rows of pixels.
+    """Decompress one image to rows of pixels.
 
     Args:
         data: a WebP file.
-        name: of the file, for error messages.
-        width: that the image must have; it is checked before memory is taken.
-        height: likewise.
-        channels: how many to return: 1 (the first), 3, or 4 (the fourth is 255 where the file has none).
-        crc32: that the pixels must have, if it is known (:func:`pixels_crc32`).
+        name: name of the file, for error messages.
+        width: required width, pixels; checked before memory is allocated.
+        height: required height, pixels; checked before memory is allocated.
+        channels: number of channels to return: 1 (the first), 3, or 4 (the fourth is 255 if the file has none).
+        crc32: required checksum of the pixels (:func:`pixels_crc32`); None if unknown.
 
     Raises:
-        InvalidContainerError: it is no lossless WebP, of another size, or damaged.
+        InvalidContainerError: not a lossless WebP, of a wrong size, or damaged.
     """
     found = probe_webp(data, name)
     if found != (width, height):
@@ -79,10 +80,10 @@ def decode_plane(
             f"{name} is {found[0]} x {found[1]} pixels; the metadata asks for {width} x {height}"
         )
     try:
-        # The class itself: Image.open first imports the plugins of all other formats.
-        with WebPImagePlugin.WebPImageFile(io.BytesIO(data)) as picture:
-            picture.load()
-            pixels = np.asarray(picture)
+        # Image.open would first import the plugins of all other formats.
+        with WebPImagePlugin.WebPImageFile(io.BytesIO(data)) as image_file:
+            image_file.load()
+            pixels = np.asarray(image_file)
     except (OSError, ValueError, SyntaxError, EOFError, MemoryError) as error:
         raise InvalidContainerError(f"{name} is damaged: its WebP data cannot be decoded") from error
     if crc32 is not None and pixels_crc32(pixels) != crc32:
@@ -93,10 +94,10 @@ def decode_plane(
 
 
 def probe_webp(data: bytes, name: str) -> tuple[int, int]:
-    """Width and height in pixels, from the header alone.
+    """Return width and height in pixels, from the header alone.
 
     Raises:
-        InvalidContainerError: it is no WebP, lossy, animated, or cut off.
+        InvalidContainerError: not a WebP file, or lossy, animated or cut off.
     """
     if len(data) < 30 or data[:4] != b"RIFF" or data[8:12] != b"WEBP":
         raise InvalidContainerError(f"{name} is not a WebP image")

@@ -1,1 +1,1 @@
-"""A procedural scene to try things on. Takes a count and a seed; gives Splats."""
+"""Procedural sample scene. Takes a count and a seed; gives Splats."""

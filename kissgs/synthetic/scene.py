@@ -1,7 +1,7 @@
-"""A procedural scene that looks, and is distributed, like a trained 3DGS reconstruction.
+"""Procedural sample scene with the appearance and statistics of a trained 3DGS reconstruction.
 
-Surfaces are covered with flat Gaussians, densest where the texture is busy and where a capture would look most.
-Light and shadow are baked into the constant colour, mirrored lights into the higher SH bands.
+Surfaces are covered with flat Gaussians, densest where the texture has detail and where most cameras of a capture would
+look. Light and shadow are baked into the constant colour, specular reflections into the higher SH bands.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from kissgs.synthetic.surfaces import SHADOW_CASTERS, SURFACES, Column, Rows, Su
 
 
 def sample_scene(count: int = 60_000, *, sh_degree: int = 3, seed: int = 0) -> Splats:
-    """A table top with a glossy ball, a torus knot and a toy block under an open sky, and the haze of a real training.
+    """Return a table top with a shiny ball, a torus knot and a toy block under an open sky, with floaters.
 
-    The scene is canonical (:func:`kissgs.core.splats.clean` changes nothing), yet not tidy: rotations come in many of
-    their equivalent forms, Gaussians in no order, a few per cent of them nearly transparent, some below 1/255.
-    Axes as in COLMAP, y down. The objects stand within 2.5 units of the origin, the sky is 30 away; a camera at
-    (1.2, -2.2, -5.2) looking at (0, -0.8, 0) has them all in view.
+    The scene is clean (:func:`kissgs.core.splats.clean` changes nothing), but rotations have many of their equivalent
+    forms, Gaussians are in random order, and a few per cent of them are nearly transparent, some below 1/255.
+    Axes as in COLMAP, y down. The objects are within 2.5 units of the origin, the sky is 30 away; a camera at
+    (1.2, -2.2, -5.2) looking at (0, -0.8, 0) has all objects in view.
 
     Args:
         count: Number of Gaussians, 0 or more.
         sh_degree: 0 to 3.
-        seed: Equal seeds give equal scenes; to the last bit on equal machines.
+        seed: Random seed, 0 or more; equal seeds give equal scenes, bit-identical on equal machines.
 
     Raises:
         UnsupportedError: ``count`` or ``seed`` is negative, or ``sh_degree`` is not 0, 1, 2 or 3.
@@ -52,7 +52,7 @@ def sample_scene(count: int = 60_000, *, sh_degree: int = 3, seed: int = 0) -> S
 
 
 def _parts(count: int, sh_degree: int, rng: np.random.Generator) -> Iterator[Splats]:
-    """One piece per surface, then the floaters; together ``count`` Gaussians."""
+    """Yield one part per surface, then the floaters; together ``count`` Gaussians."""
     ends = np.rint(np.cumsum([surface.share for surface in SURFACES]) * count).astype(int)
     shadows = [_shadow_map(light.direction, rng) for light in LIGHTS]
     for surface, n in zip(SURFACES, np.diff(ends, prepend=0), strict=True):
@@ -61,7 +61,7 @@ def _parts(count: int, sh_degree: int, rng: np.random.Generator) -> Iterator[Spl
     yield _floaters(count - int(ends[-1]), sh_degree, rng)
 
 
-# --- Where Gaussians lie --------------------------------------------------------------------------
+# --- Geometry of the Gaussians --------------------------------------------------------------------------
 
 
 def _cover(
@@ -90,10 +90,10 @@ def _cover(
 
 
 def _scatter(surface: Surface, n: int, rng: np.random.Generator) -> tuple[Rows, Rows, Column]:
-    """``n`` points of the surface, their normals, and the distance to be expected between neighbours.
+    """Return ``n`` points of the surface, their normals, and the expected distance between neighbours.
 
-    A grid of n to 4n cells covers the surface. Along a Z-order curve through it, every n-th part of what is wanted in
-    total gets a Gaussian. No place goes short; independent draws would leave holes, which training would have filled.
+    A grid of n to 4n cells covers the surface. Along a Z-order curve through it, each n-th part of the integral of the
+    density gets one Gaussian. Independent draws would leave holes, which a trained scene does not have.
     """
     corners, side = _z_order(n)
     points, _, area = surface.shape((corners + 0.5) / np.float32(side))
@@ -111,7 +111,7 @@ def _scatter(surface: Surface, n: int, rng: np.random.Generator) -> tuple[Rows, 
 
 
 def _z_order(n: int) -> tuple[Float32[np.ndarray, "C 2"], int]:
-    """The cells of a square grid of at least ``n`` cells, along the curve, and the grid's side."""
+    """Return the cells of a square grid of at least ``n`` cells along the Z-order curve, and the grid's side."""
     bits = ((n - 1).bit_length() + 1) // 2
     index = np.arange(4**bits)
     corners = np.zeros((4**bits, 2), np.float32)
@@ -122,7 +122,7 @@ def _z_order(n: int) -> tuple[Float32[np.ndarray, "C 2"], int]:
 
 
 def _brightness_gradient(surface: Surface, points: Rows, spacing: Column) -> Rows:
-    """Of the paint, per world unit, from one-sided differences over a third of the spacing."""
+    """Return the paint's brightness gradient per world unit, from one-sided differences over a third of the spacing."""
     here = surface.paint(points).mean(axis=1)
     step = spacing / 3
     there = [surface.paint(points + step[:, None] * axis).mean(axis=1) for axis in np.eye(3, dtype=np.float32)]
@@ -131,7 +131,7 @@ def _brightness_gradient(surface: Surface, points: Rows, spacing: Column) -> Row
 
 
 def _opacities(n: int, rng: np.random.Generator) -> Column:
-    """Logits: most Gaussians all but opaque, a broad translucent rest, a few that training has nearly given up."""
+    """Return logits: 66 % nearly opaque, 30 % translucent and 4 % nearly transparent, as training leaves them."""
     kind = rng.choice(3, n, p=(0.66, 0.30, 0.04))
     logits = rng.normal(np.array([3.2, -0.6, -5.0])[kind], np.array([1.8, 1.3, 0.7])[kind])
     return np.clip(logits, OPACITY_LOGIT_MIN, OPACITY_LOGIT_MAX).astype(np.float32)
@@ -140,11 +140,11 @@ def _opacities(n: int, rng: np.random.Generator) -> Column:
 def _orient(
     normals: Rows, along: Rows, scales: Rows, rng: np.random.Generator
 ) -> tuple[Float32[np.ndarray, "M 4"], Rows]:
-    """Rotations with the third axis on the normal and the first towards ``along``, in one of the equivalent forms."""
+    """Return rotations with the third axis on the normal and the first towards ``along``, in random forms."""
     n = len(normals)
-    normals = normals * rng.choice(f32([-1, 1]), (n, 1))  # a disc has two faces
+    normals = normals * rng.choice(f32([-1, 1]), (n, 1))  # a disc has two sides
     x, y, z = normals.T
-    # The shortest turn of the z axis onto the normal; where that is -z, any turn or none will do.
+    # The smallest rotation of the z axis to the normal; for -z, no rotation, since the axis has no direction.
     w, a, b = (np.stack([1 + z, -y, x]) / np.sqrt(2 * np.maximum(1 + z, 1e-6))).astype(np.float32)
     w = np.where(z < -0.999999, 1, w)
     first = np.stack([1 - 2 * b * b, 2 * a * b, -2 * w * b], axis=1)
@@ -153,15 +153,15 @@ def _orient(
     zero = np.zeros_like(half)
     tilt, spin = np.stack([w, a, b, zero], axis=1), np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1)
 
-    renamings = f32([[1.0, 0.0, 0.0, 0.0], [0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5]])  # axes 012, 120, 201
+    permutations = f32([[1.0, 0.0, 0.0, 0.0], [0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5]])  # axes 012, 120, 201
     pick = rng.integers(3, size=n)
-    quats = _product(_product(tilt, spin), renamings[pick]) * rng.choice(f32([-1, 1]), (n, 1))
+    quats = _product(_product(tilt, spin), permutations[pick]) * rng.choice(f32([-1, 1]), (n, 1))
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     return quats, np.take_along_axis(scales, (np.arange(3) + pick[:, None]) % 3, axis=1)
 
 
 def _product(p: Float32[np.ndarray, "M 4"], q: Float32[np.ndarray, "M 4"]) -> Float32[np.ndarray, "M 4"]:
-    """Hamilton product, components w, x, y, z."""
+    """Return the Hamilton product, components w, x, y, z."""
     (pw, px, py, pz), (qw, qx, qy, qz) = p.T, q.T
     w = pw * qw - px * qx - py * qy - pz * qz
     x = pw * qx + px * qw + py * qz - pz * qy
@@ -171,7 +171,7 @@ def _product(p: Float32[np.ndarray, "M 4"], q: Float32[np.ndarray, "M 4"]) -> Fl
 
 
 def _floaters(n: int, sh_degree: int, rng: np.random.Generator) -> Splats:
-    """Faint, fluffy blobs in the air, as captures of few views leave them."""
+    """Return faint, large Gaussians in the air, as in reconstructions from few views."""
     log_sizes = rng.normal(-2, 0.7, (n, 1)) + rng.normal(0, 0.35, (n, 3))
     normals, along = unit_sphere(rng.random((n, 2), np.float32)), unit_sphere(rng.random((n, 2), np.float32))
     quats, scales = _orient(normals, along, log_sizes.astype(np.float32), rng)
@@ -185,18 +185,18 @@ def _floaters(n: int, sh_degree: int, rng: np.random.Generator) -> Splats:
     )
 
 
-# --- What they look like --------------------------------------------------------------------------
+# --- Appearance of the Gaussians --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Light:
     direction: Float32[np.ndarray, "3"]
-    """towards the light, unit length"""
+    """Unit vector towards the light."""
     colour: Float32[np.ndarray, "3"]
     wrap: float
-    """0 lights the half of a ball that faces it, 1 reaches all around, as an open sky does"""
+    """Extent of diffuse light: 0 lights the half of a ball that faces the light, 1 all of it, as an open sky does."""
     softness: float
-    """width of its mirror image: SH band l is damped by exp(-l (l + 1) softness)"""
+    """Width of the specular lobe: SH band l is damped by exp(-l (l + 1) softness)."""
 
 
 SUN = _Light(direction=f32([-0.48, -0.64, -0.6]), colour=f32([0.78, 0.72, 0.62]), wrap=0.0, softness=0.04)
@@ -209,7 +209,7 @@ SHADOW_EXTENT, SHADOW_CELLS = 5.0, 200
 def _appearance(
     surface: Surface, points: Rows, normals: Rows, shadows: list[Float32[np.ndarray, "S S"]], sh_degree: int
 ) -> tuple[Rows, Float32[np.ndarray, "M K 3"]]:
-    """Diffuse RGB, and the SH coefficients (the constant one first) of the mirrored lights."""
+    """Return diffuse RGB, and the SH coefficients (the constant one first) of the specular reflections."""
     albedo = surface.paint(points)
     sh = np.zeros((len(points), (sh_degree + 1) ** 2, 3), np.float32)
     if surface.luminous:
@@ -221,17 +221,17 @@ def _appearance(
         reach = _look_up(shadow, points) if surface.shadowed else np.ones_like(facing)
         diffuse = np.maximum((facing + light.wrap) / (1 + light.wrap), 0)
         received += (reach * diffuse)[:, None] * light.colour
-        # A camera looking along d meets the light's mirror image where d points along ``mirrored``: a round lobe, whose
-        # SH coefficients are the basis functions at its axis (addition theorem), damped band by band.
+        # A camera looking along d sees the reflected light if d is close to ``mirrored``: a round lobe, whose SH
+        # coefficients are the basis functions at its axis (addition theorem), damped band by band.
         mirrored = light.direction - 2 * facing[:, None] * normals
         lobe = sh_basis(mirrored, sh_degree) * np.exp(-band * (band + 1) * light.softness).astype(np.float32)
-        strength = surface.gloss * reach * np.clip(4 * facing, 0, 1)
+        strength = surface.specular * reach * np.clip(4 * facing, 0, 1)
         sh += lobe[:, :, None] * (strength[:, None] * light.colour)[:, None]
     return albedo * received, sh
 
 
 def _shadow_map(light: Float32[np.ndarray, "3"], rng: np.random.Generator) -> Float32[np.ndarray, "S S"]:
-    """The share of a light that reaches each cell of the ground, ±SHADOW_EXTENT in x and z."""
+    """Return the share of a light that reaches each cell of the ground, ±SHADOW_EXTENT in x and z."""
     points = np.concatenate([shape(rng.random((30_000, 2), np.float32))[0] for shape in SHADOW_CASTERS])
     landed = points - light * (points[:, 1] / light[1])[:, None]
     edges = np.linspace(-SHADOW_EXTENT, SHADOW_EXTENT, SHADOW_CELLS + 1)
@@ -248,8 +248,8 @@ def _look_up(shadow: Float32[np.ndarray, "S S"], points: Rows) -> Column:
 
 
 def _sh_noise(n: int, sh_degree: int, rng: np.random.Generator) -> Float32[np.ndarray, "M K 3"]:
-    """What training leaves: heavy-tailed over the Gaussians, much alike in the three channels."""
-    k = SH_REST_COUNTS[-1]  # always all, so that the degree changes nothing else of the scene
+    """Return noise as in trained scenes: heavy-tailed over the Gaussians, correlated between the three channels."""
+    k = SH_REST_COUNTS[-1]  # always all coefficients, so that the degree changes nothing else of the scene
     noise = 0.5 * rng.standard_normal((n, k, 3), np.float32) + 0.9 * rng.standard_normal((n, k, 1), np.float32)
     strength = 0.016 * np.exp(0.7 * rng.standard_normal((n, 1, 1), np.float32))
     return np.asarray(strength * noise[:, : SH_REST_COUNTS[sh_degree]])

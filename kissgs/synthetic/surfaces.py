@@ -1,4 +1,4 @@
-"""What stands in the sample scene: shapes, each mapping the unit square to a surface, and paint, solid textures.
+"""Surfaces of the sample scene: shapes, which map the unit square to a surface, and paint, solid textures.
 
 Axes as in COLMAP, y pointing down: the ground is y = 0, the camera looks along +z.
 """
@@ -21,25 +21,25 @@ Patch = tuple[Rows, Rows, Column]
 
 
 def f32(values: Sequence[Any] | np.ndarray) -> Float32[np.ndarray, "..."]:
-    """``values`` as a float32 array."""
+    """Return ``values`` as a float32 array."""
     return np.asarray(values, np.float32)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Surface:
-    """One thing to be covered with Gaussians."""
+    """Surface to be covered with Gaussians."""
 
     share: float
-    """of all Gaussians"""
+    """Share of all Gaussians."""
     shape: Callable[[UV], Patch]
     paint: Callable[[Rows], Rows]
-    """points to RGB in 0..1"""
-    gloss: float = 0.0
-    """brightness of a mirrored light of strength 1"""
+    """Map points to RGB in 0..1."""
+    specular: float = 0.0
+    """Brightness of the reflection of a light of strength 1."""
     shadowed: bool = False
-    """receives the objects' shadows, as the ground does"""
+    """Whether the objects cast shadows on the surface."""
     luminous: bool = False
-    """shows its paint as it is, lit by nothing"""
+    """Whether the surface shows its paint without lighting."""
 
 
 # --- Shapes ---------------------------------------------------------------------------------------
@@ -53,34 +53,34 @@ SKY_RADIUS, SKY_HEIGHTS = 30.0, (-1.0, 0.3)
 
 
 def unit_sphere(uv: UV, heights: tuple[float, float] = (-1.0, 1.0)) -> Rows:
-    """Unit vectors, equally dense everywhere, with y between ``heights``."""
+    """Return unit vectors of uniform density with y between ``heights``."""
     height, angle = heights[0] + (heights[1] - heights[0]) * uv[:, 0], 2 * np.pi * uv[:, 1]
     ring = np.sqrt(1 - height**2)
     return np.stack([ring * np.cos(angle), height, ring * np.sin(angle)], axis=1)
 
 
 def ground(uv: UV) -> Patch:
-    """A round table top."""
+    """Return a round table top."""
     r, angle = GROUND_RADIUS * np.sqrt(uv[:, 0]), 2 * np.pi * uv[:, 1]
     points = np.stack([r * np.cos(angle), np.zeros_like(r), r * np.sin(angle)], axis=1)
     return points, np.tile(f32([0, -1, 0]), (len(uv), 1)), np.full_like(r, np.pi * GROUND_RADIUS**2)
 
 
 def ball(uv: UV) -> Patch:
-    """A sphere that rests on the ground."""
+    """Return a sphere that rests on the ground."""
     normals = unit_sphere(uv)
     return BALL_CENTRE + BALL_RADIUS * normals, normals, np.full_like(uv[:, 0], 4 * np.pi * BALL_RADIUS**2)
 
 
 def sky(uv: UV) -> Patch:
-    """A dome seen from within, from somewhat below the horizon upwards."""
+    """Return a dome seen from inside, from slightly below the horizon upwards."""
     outward = unit_sphere(uv, SKY_HEIGHTS)
     area = 2 * np.pi * SKY_RADIUS**2 * (SKY_HEIGHTS[1] - SKY_HEIGHTS[0])
     return SKY_RADIUS * outward, -outward, np.full_like(uv[:, 0], area)
 
 
 def knot(uv: UV) -> Patch:
-    """A tube around a trefoil, which winds twice around and three times through a torus that faces the camera."""
+    """Return a tube along a trefoil knot, which winds twice around and thrice through a torus that faces the camera."""
     major, minor, tube = KNOT_RADII
     t, around = 2 * np.pi * uv[:, 0], 2 * np.pi * uv[:, 1]
     cos2, sin2, cos3, sin3 = np.cos(2 * t), np.sin(2 * t), np.cos(3 * t), np.sin(3 * t)
@@ -91,11 +91,11 @@ def knot(uv: UV) -> Patch:
     outward = np.stack([cos3 * cos2, cos3 * sin2, sin3], axis=1)  # the torus's normal, hence normal to the curve
     sideways = np.cross(tangent / speed[:, None], outward)
     normals = np.cos(around)[:, None] * outward + np.sin(around)[:, None] * sideways
-    return KNOT_CENTRE + centre + tube * normals, normals, (2 * np.pi) ** 2 * tube * speed  # its bends neglected
+    return KNOT_CENTRE + centre + tube * normals, normals, (2 * np.pi) ** 2 * tube * speed  # neglects the curvature
 
 
 def block(uv: UV) -> Patch:
-    """A cube that stands on the ground, turned about the vertical."""
+    """Return a cube that stands on the ground, rotated about the vertical."""
     faces = f32([[1, 0, 0], [-1, 0, 0], [0, 0, 1], [0, 0, -1], [0, -1, 0]])  # none below
     pick = np.minimum((5 * uv[:, 0]).astype(np.intp), 4)
     normals = faces[pick]
@@ -108,12 +108,12 @@ def block(uv: UV) -> Patch:
 
 
 def _noise(points: Rows, frequency: float) -> Column:
-    """Smooth noise of about ±1: three octaves of crossed sines, each warped by the ones before."""
-    turn = 1.9 * f32([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])  # a rotation that fits no tiling
+    """Return smooth noise of about ±1: three octaves of crossed sines, each warped by the ones before."""
+    rotation = 1.9 * f32([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])  # a rotation that fits no tiling
     total = np.zeros(len(points), np.float32)
     q = f32(points * np.float32(frequency))
     for octave in range(3):
-        q = f32(q @ turn)
+        q = f32(q @ rotation)
         total += 0.5**octave * np.sin(q[:, 0] + 2 * total) * np.cos(q[:, 1] + total)
     return total
 
@@ -124,7 +124,7 @@ def _mix(a: tuple[float, float, float] | Rows, b: tuple[float, float, float] | R
 
 
 def tiles(points: Rows) -> Rows:
-    """Marble tiles in two colours, with grout between them."""
+    """Return marble tiles in two colours, with grout between them."""
     cell = points[:, [0, 2]] / np.float32(0.8)
     odd = np.floor(cell).sum(axis=1) % 2
     marble = 0.5 + 0.5 * np.sin(2 * points[:, 0] + 4 * _noise(points, 0.6))
@@ -135,19 +135,19 @@ def tiles(points: Rows) -> Rows:
 
 
 def lacquer(points: Rows) -> Rows:
-    """Red with an orange swirl."""
+    """Return red with an orange swirl."""
     swirl = np.sin(5 * (points[:, 1] + 0.4 * points[:, 0]) + 3 * _noise(points, 1.2))
     return _mix((0.62, 0.05, 0.06), (0.86, 0.25, 0.10), 2 * swirl - 0.6)
 
 
 def candy(points: Rows) -> Rows:
-    """Petrol and cream stripes."""
+    """Return petrol and cream stripes."""
     stripe = np.sin(14 * (points[:, 0] + points[:, 1]) + 6 * points[:, 2])
     return _mix((0.04, 0.40, 0.46), (0.95, 0.80, 0.40), 4 * stripe - 1)
 
 
 def toy(points: Rows) -> Rows:
-    """Wood with a coloured ring and border on each face."""
+    """Return wood with a coloured ring and border on each face."""
     local = (points - BLOCK_CENTRE) @ BLOCK_AXES.T / np.float32(BLOCK_HALF)
     size = np.abs(local)
     inner, middle, _ = np.sort(size, axis=1).T
@@ -158,7 +158,7 @@ def toy(points: Rows) -> Rows:
 
 
 def landscape(points: Rows) -> Rows:
-    """Hills under a blue sky with a few clouds."""
+    """Return hills under a blue sky with a few clouds."""
     direction = points / np.float32(SKY_RADIUS)
     height = -direction[:, 1]
     blue = _mix((0.80, 0.88, 0.94), (0.22, 0.46, 0.82), 2.4 * height)
@@ -169,12 +169,12 @@ def landscape(points: Rows) -> Rows:
 
 
 SURFACES = (
-    Surface(share=0.45, shape=ground, paint=tiles, gloss=0.10, shadowed=True),
-    Surface(share=0.10, shape=ball, paint=lacquer, gloss=0.7),
-    Surface(share=0.16, shape=knot, paint=candy, gloss=0.35),
-    Surface(share=0.15, shape=block, paint=toy, gloss=0.08),
+    Surface(share=0.45, shape=ground, paint=tiles, specular=0.10, shadowed=True),
+    Surface(share=0.10, shape=ball, paint=lacquer, specular=0.7),
+    Surface(share=0.16, shape=knot, paint=candy, specular=0.35),
+    Surface(share=0.15, shape=block, paint=toy, specular=0.08),
     Surface(share=0.12, shape=sky, paint=landscape, luminous=True),
 )
-"""Largest first; the shares leave 0.02 for floaters."""
+"""Surfaces of the scene; the shares leave 0.02 for floaters."""
 
 SHADOW_CASTERS = (ball, knot, block)

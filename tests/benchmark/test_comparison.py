@@ -86,7 +86,7 @@ def test_what_is_measured_is_what_compress_gives(scene, monkeypatch):
         calls.append((format, pictures))
         seconds = 61.0 if format == "sog" else 1.0
         took = {"encode_seconds": seconds, "decode_seconds": 0.1, "encode_cpu_seconds": 1.0, "decode_cpu_seconds": 0.1}
-        row = measured(format, 500, 40.0, peer=True)
+        row = measured(format, 500, 40.0, external=True)
         pictured = row.pictures if pictures else None
         about = {"gaussians": 300, "kept": 300, "bytes": 500, "peak_memory": 5}
         return PeerResult(format=format, **about, **took, errors=row.errors, pictures=pictured)

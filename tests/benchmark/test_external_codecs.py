@@ -1,11 +1,11 @@
 """Oracle: a stand-in for splat-transform that does known harm; the real tool where it is installed."""
 
-import shutil
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.web_tools import node
 
 from kissgs.benchmark.external_codecs import measure_peer
 from kissgs.cameras.views import View, Views
@@ -14,6 +14,8 @@ from kissgs.evaluation.evaluate import evaluate
 from kissgs.io.ply import read_ply, write_ply
 from kissgs.rendering.camera import look_at
 from kissgs.synthetic.scene import sample_scene
+
+SPLAT_TRANSFORM = Path(__file__).parents[2] / "web_decoder/node_modules/.bin/splat-transform"
 
 STAND_IN = """
 import sys
@@ -118,9 +120,9 @@ def test_impossible_requests_are_refused(scene, tmp_path):
         measure_peer(tmp_path / "absent.ply", "spz", command=[sys.executable])
 
 
-@pytest.mark.skipif(shutil.which("splat-transform") is None, reason="splat-transform is not on the PATH")
+@pytest.mark.skipif(not SPLAT_TRANSFORM.exists(), reason="scripts/setup dev installs splat-transform")
 def test_the_real_tool(scene):
-    result = measure_peer(scene, "spz")
+    result = measure_peer(scene, "spz", command=[node(), str(SPLAT_TRANSFORM)])
     assert result.kept == 1000
     assert 10 < result.bytes_per_gaussian < 40
     assert result.errors.rotation_degrees.rmse < 0.3

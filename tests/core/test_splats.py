@@ -34,7 +34,7 @@ def tidy(count=6, degree=1):
     return {name: array.astype(np.float32) for name, array in arrays.items()}
 
 
-def test_shapes_and_sizes_are_told():
+def test_shapes_and_sizes_are_reported():
     for degree, coefficients in enumerate(SH_REST_COUNTS):
         splats = Splats(**tidy(6, degree))
         assert (len(splats), splats.sh_degree) == (6, degree)
@@ -120,7 +120,7 @@ def test_cleaning_leaves_the_input_as_it_was():
 
 @pytest.mark.parametrize("name", ["sh0", "shN"])
 def test_infinities_of_both_signs_in_one_colour(name):
-    """Their sum is NaN, and NumPy once warned of it on the user's terminal."""
+    """The sum of such values is NaN, and NumPy once printed a warning about it."""
     arrays = tidy()
     arrays[name].reshape(6, -1)[2, :2] = np.inf, -np.inf
     cleaned, report = clean(Splats(**arrays))

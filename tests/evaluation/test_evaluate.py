@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.captured_scene import SCENE, cameras, damaged, picture, write_capture
+from helpers.captured_scene import SCENE, cameras, damaged, rendered_view, write_capture
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -54,7 +54,7 @@ def test_renderings_are_compared_where_there_are_no_photographs():
     assert (found.against, found.split, found.source) == ("renderings", "test", "cameras by hand")
     assert [each.view for each in found.views] == list(views.test)
     for each in found.views:
-        pair = [picture(scene, each.view, (0.2, 0.5, 1)) for scene in (WORSE, SCENE)]
+        pair = [rendered_view(scene, each.view, (0.2, 0.5, 1)) for scene in (WORSE, SCENE)]
         assert_likeness(each.comparison.candidate_vs_reference, *pair)
         assert each.comparison.candidate == each.comparison.candidate_vs_reference
         assert each.comparison.reference is None
@@ -66,7 +66,7 @@ def test_photographs_are_what_counts_where_there_are_any(capture):
     assert (found.against, found.split) == ("photos", "all")
     assert [each.view.name for each in found.views] == ["images/a.png", "images/b.png", "images/c.png"]
     for each in found.views:
-        before, after, photo = picture(SCENE, each.view), picture(WORSE, each.view), photo_of(each.view)
+        before, after, photo = rendered_view(SCENE, each.view), rendered_view(WORSE, each.view), photo_of(each.view)
         assert_likeness(each.comparison.reference, before, photo)
         assert_likeness(each.comparison.candidate, after, photo)
         assert_likeness(each.comparison.candidate_vs_reference, after, before)
@@ -146,7 +146,7 @@ def test_each_view_has_a_background_of_its_own_or_that_of_all():
     white = replace(views.test[1], background=np.ones(3, np.float32))
     found = compare_pictures(SCENE, WORSE, replace(views, test=(views.test[0], white)))
     for each, background in zip(found.views, ((1, 0, 0), (1, 1, 1)), strict=True):
-        pair = [picture(scene, each.view, background) for scene in (WORSE, SCENE)]
+        pair = [rendered_view(scene, each.view, background) for scene in (WORSE, SCENE)]
         assert_likeness(each.comparison.candidate_vs_reference, *pair)
 
 
@@ -247,7 +247,7 @@ def test_progress_and_cancelling():
 def test_lpips_is_measured_if_asked_for(monkeypatch, capture):
     monkeypatch.setattr(pictures, "Lpips", lambda device: lambda image, target: float(np.abs(image - target).max()))
     found = evaluate(SCENE, WORSE, cameras(), lpips=True)
-    each = [np.abs(picture(WORSE, view) - picture(SCENE, view)).max() for view in cameras().test]
+    each = [np.abs(rendered_view(WORSE, view) - rendered_view(SCENE, view)).max() for view in cameras().test]
     assert found.mean.candidate_vs_reference.lpips == pytest.approx(np.mean(each))
     assert set(found.as_dict()["mean"]["candidate_vs_reference"]) == {"psnr", "ssim", "lpips"}
 

@@ -6,7 +6,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from helpers.captured_scene import SCENE, camera, cameras, damaged, picture, write_capture
+from helpers.captured_scene import SCENE, camera, cameras, damaged, rendered_view, write_capture
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -91,7 +91,7 @@ def test_pictures_of_every_view_without_photographs():
     assert all(image.shape == (40, 60, 3) for image in first)
     view, wanted = found.views[worst].view, {}
     for at, scene in (("candidate", WORSE), ("reference", SCENE)):
-        wanted[at] = np.rint(255 * picture(scene, view)).astype(np.uint8)
+        wanted[at] = np.rint(255 * rendered_view(scene, view)).astype(np.uint8)
     assert np.abs(first[0].astype(int) - wanted["candidate"]).mean() < 6  # lossy
     np.testing.assert_array_equal(first[3], wanted["reference"])  # crops are lossless
     np.testing.assert_array_equal(first[4], wanted["candidate"])
@@ -238,7 +238,7 @@ def test_a_damaged_spot_is_what_is_enlarged():
     arrays = {name: getattr(SCENE, name).copy() for name in ATTRIBUTES}
     arrays["sh0"][near] += 3
     spoilt = Splats(**arrays)
-    levels = difference(picture(spoilt, view), picture(SCENE, view))
+    levels = difference(rendered_view(spoilt, view), rendered_view(SCENE, view))
     rows, columns = worst_place(levels, 160)
     assert rows.start < 200 < rows.stop
     assert columns.start < 300 < columns.stop

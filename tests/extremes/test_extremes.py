@@ -15,7 +15,7 @@ FIELDS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
 def check(splats, preset="fast", **changes):
-    """What comes out is finite, and as near to the cleaned scene as the report says. Returns it, and the result."""
+    """Assert a finite result within the errors that the report states; return the decoded scene and the result."""
     result = compress(splats, settings=Settings.from_preset(preset, **{"sh_tolerance": 0, **GLANCE, **changes}))
     found = decompress(result.files)
     assert all(np.isfinite(getattr(found, name)).all() for name in ATTRIBUTES)
@@ -27,8 +27,8 @@ def check(splats, preset="fast", **changes):
 
 
 def assert_sh_within(found, cleaned, result):
-    """For fewer Gaussians than codebook entries. All channels are rounded to one lattice, also the constant ones."""
-    assert_within(found.shN, cleaned.shN[result.order], max(result.report.half_steps["f_rest_centroids"]))
+    """Check shN of fewer Gaussians than codebook entries; all channels have one lattice, also constant ones."""
+    assert_within(found.shN, cleaned.shN[result.order], max(result.report.max_quantization_error["f_rest_centroids"]))
 
 
 def with_value(attribute, value, count=20, at=7):
@@ -134,7 +134,7 @@ def test_one_outlier_among_thousands(attribute, preset):
     array.reshape(count, -1)[17, 0] = outlier
     found, result = check(replaced(splats, **{attribute: array}), preset)
     assert len(found) == count
-    half = result.report.half_steps
+    half = result.report.max_quantization_error
     assert max(half["means"]) < 1e-3
     assert max(half["f_dc"]) < (1.1 if attribute == "sh0" else 0.03)
 
@@ -146,7 +146,7 @@ def test_gaussians_that_are_all_the_same(count, preset):
     found, result = check(splats, preset, prune_threshold_bits=0)
     assert sorted(result.order) == list(range(count))
     np.testing.assert_allclose(found.shN, splats.shN, rtol=1e-6)
-    assert max(result.report.half_steps["scales"]) == 0
+    assert max(result.report.max_quantization_error["scales"]) == 0
 
 
 @pytest.mark.parametrize("attribute", FIELDS)
@@ -217,7 +217,7 @@ STRANGE = {
 @pytest.mark.parametrize("kind", STRANGE)
 @pytest.mark.parametrize("count", [1, 9, 200])
 @pytest.mark.parametrize("preset", ["balanced", "small"])
-def test_strange_scenes_can_be_weighed(kind, count, preset):
+def test_strange_scenes_with_rate_distortion(kind, count, preset):
     splats = random_scene(count, 1, seed=count)
     splats = replaced(splats, **STRANGE[kind](splats, np.random.default_rng(count)))
     found, result = check(splats, preset, sensitivity_views=4, sensitivity_view_size=48)

@@ -18,7 +18,7 @@ from kissgs.compaction import regularizers
 from kissgs.core.splats import ATTRIBUTES
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "numerics.md"
+PAGE = ROOT / "docs" / "reference" / "numerics.md"
 NAMES = list(BY_NAME)
 HERE = [stage for stage in STAGES if stage != "browser"]
 
@@ -30,7 +30,7 @@ def test_a_stage_keeps_its_promise(name, stage):
 
 
 def test_the_javascript_decoder_keeps_its_promise():
-    """In one process of Node for all rows."""
+    """One process of Node decodes all rows."""
     assert {name: measured(name, "browser") for name in NAMES if measured(name, "browser") > BOUNDS["browser"]} == {}
 
 
@@ -45,7 +45,7 @@ UNSEEN = {"transparent", "count-0", "beside"}
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_oracles_agree_and_there_is_something_to_see(name):
-    """The picture that torch differentiates is that of the naive rasteriser, and shows what the row is about."""
+    """The image that torch differentiates is that of the naive rasteriser, and shows the row's Gaussians."""
     splats, view = scene(name)[0], BY_NAME[name].camera()
     found = reference_float64.draw(reference_float64.tensors(splats), view, BACKGROUND)
     naive = reference_rasterizer.draw(in_float64(splats), view, np.array(BACKGROUND))
@@ -71,7 +71,7 @@ def test_the_oracles_gradient_is_that_of_differences():
         )
 
 
-def test_the_oracles_removal_is_a_picture_without():
+def test_the_oracles_removal_is_an_image_without():
     splats, view, background = scene("ordinary")[0], BY_NAME["ordinary"].camera(), np.array(BACKGROUND)
     params = in_float64(splats)
     whole = reference_rasterizer.draw(params, view, background).image
@@ -100,7 +100,7 @@ def test_the_oracles_adam_is_that_of_torch():
 
 @pytest.fixture
 def anew():
-    """Nothing is remembered of what was measured before, nor after."""
+    """Clear the caches of scenes before and after the test."""
     for function in (given, scene):
         function.cache_clear()
     yield
@@ -132,7 +132,7 @@ def test_rotations_normalised_in_float32_are_noticed(monkeypatch):
 
 
 def test_effective_rank_by_the_book_is_noticed(monkeypatch):
-    """As the paper writes it, from squares of float32."""
+    """The paper's formula uses squares of float32."""
 
     def by_the_book(scales):
         squares = (2 * scales).exp()
@@ -148,7 +148,7 @@ def test_effective_rank_by_the_book_is_noticed(monkeypatch):
 
 
 def table():
-    """Of the page: row -> column -> text."""
+    """Return the page's table: row -> column -> text."""
     text = PAGE.read_text(encoding="utf-8").partition("<!-- measured -->")[2].partition("<!-- end -->")[0]
     head, _, *rows = [[cell.strip() for cell in line[1:-1].split(" | ")] for line in text.strip().splitlines()]
     return {row[0].strip("` "): dict(zip(head, row, strict=True)) for row in rows}

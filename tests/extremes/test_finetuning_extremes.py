@@ -1,4 +1,4 @@
-"""Oracle: finite numbers, and a container that decoders read, from Gaussians as no training leaves them."""
+"""Oracle: finite numbers, and a container that decoders read, for degenerate Gaussians."""
 
 import numpy as np
 import pytest
@@ -20,8 +20,8 @@ def check(scene, preset="balanced", **changes):
     found = kissgs.decompress(result.to_zip())
     for name in ATTRIBUTES:
         assert np.isfinite(getattr(found, name)).all(), name
-    told = result.report.finetuning
-    assert told is None or not np.isnan([told.psnr_before, told.psnr_after]).any()
+    report = result.report.finetuning
+    assert report is None or not np.isnan([report.psnr_before, report.psnr_after]).any()
     return result
 
 
@@ -30,7 +30,7 @@ def test_degenerate_scenes_are_tuned_without_nan(scene):
     check(scene())
 
 
-def test_all_of_the_papers_wishes_together():
+def test_needles_with_the_papers_settings():
     check(changed(cloud(60), scales=np.tile([0.5, -30, -30], (60, 1))), "paper", batch=2, steps=20)
 
 

@@ -1,10 +1,10 @@
-"""What docs/numerics.md promises beside the table; oracle: the numbers that stand there."""
+"""Promises of docs/reference/numerics.md besides its table; oracle: the numbers written there."""
 
 import numpy as np
 import pytest
 import torch
 from helpers.codec_scenes import GLANCE, random_scene, replaced
-from helpers.rasterized import pictures
+from helpers.rasterized import render_tensors
 from helpers.render_scenes import blobs, camera, one, together
 from helpers.training_scenes import cloud
 
@@ -30,11 +30,11 @@ def test_steps_of_a_world_1e6_across():
     """ln(1 + 5e5) on either side, in 65535 steps."""
     means = np.random.default_rng(0).uniform(-5e5, 5e5, (300, 3))
     means[:2] = [[5e5] * 3, [-5e5] * 3]
-    steps = 2 * np.array(compressed(replaced(random_scene(300), means=means)).report.half_steps["means"])
+    steps = 2 * np.array(compressed(replaced(random_scene(300), means=means)).report.max_quantization_error["means"])
     assert steps == pytest.approx(4e-4, rel=0.01)
 
 
-def test_what_no_picture_shows_has_the_steps_of_the_settings():
+def test_without_any_seen_gaussian_steps_are_those_of_the_settings():
     scene, settings = kissgs.clean(random_scene(200, 1))[0], Settings.from_preset("balanced").encode
     unseen = encode(scene, settings, sensitivity=Sensitivity.none(200, 1))
     assert unseen.rd_lambda is None
@@ -47,13 +47,13 @@ def test_details_of_a_tiny_scene_are_kept():
     tiny = replaced(scene, means=scene.means * 1e-4, scales=scene.scales + np.log(1e-4))
     for preset in ("fast", "balanced"):
         common, small = compressed(scene, preset).report, compressed(tiny, preset).report
-        assert max(small.half_steps["means"]) < 1e-2 * 1e-4
-        assert max(small.half_steps["scales"]) <= 1.2 * max(common.half_steps["scales"])
+        assert max(small.max_quantization_error["means"]) < 1e-2 * 1e-4
+        assert max(small.max_quantization_error["scales"]) <= 1.2 * max(common.max_quantization_error["scales"])
         assert small.count >= common.count - 5
 
 
 def test_costs_are_cut_off():
-    """By hand, as no scene of today's has costs that overflow; and of giants, as they come."""
+    """Costs that overflow are written by hand, as no scene has them; those of giant Gaussians are measured."""
     forms = np.zeros((3, 28), np.float32)
     forms[0], forms[1, OPACITY[0]], forms[2, SCALES[0]] = 3e38, np.nan, 7
     _bound(forms, OPACITY + SCALES + ROTATION)
@@ -90,13 +90,13 @@ def test_values_stay_within_what_a_scene_can_hold(sign):
 
 
 @pytest.mark.parametrize("length", [1e-38, 0.9e-12, 1.1e-12, 1e-6, 1e6, 1e18])
-def test_rotations_of_any_length_in_pictures(length):
-    """Handed to the rasteriser as they are. No rotation is that of 1, 0, 0, 0."""
+def test_rendering_with_quaternions_of_any_length(length):
+    """The rasteriser gets them unnormalised; a zero quaternion is the identity."""
     unit = np.array([0.5, -0.5, 0.1, 0.7]) / 1.0
     unit /= np.linalg.norm(unit)
     shape = {"scale": (0, -1, -3), "opacity": 1.0}
-    found, _, tensors = pictures(one(quat=unit * length, **shape), [camera()])
-    wanted, _, _ = pictures(one(quat=unit if length > 1e-12 else (1, 0, 0, 0), **shape), [camera()])
+    found, _, tensors = render_tensors(one(quat=unit * length, **shape), [camera()])
+    wanted, _, _ = render_tensors(one(quat=unit if length > 1e-12 else (1, 0, 0, 0), **shape), [camera()])
     torch.testing.assert_close(found, wanted, atol=2e-6, rtol=0)
     found.sum().backward()
     assert bool(tensors["quats"].grad.any()) == (length > 1e-12)
@@ -106,11 +106,11 @@ def test_what_is_nearer_than_the_near_plane_has_no_part_in_it():
     view = camera()
     ahead = [(depth, one(mean=view.position + depth * view.viewmat[2, :3])) for depth in (-1, 0, 0.0099, 0.0101, 1)]
     for depth, splats in ahead:
-        images, alphas, tensors = pictures(together(splats, blobs(3, 0)), [view])
+        images, alphas, tensors = render_tensors(together(splats, blobs(3, 0)), [view])
         (images.sum() + alphas.sum()).backward()
         assert any(bool(tensor.grad[0].any()) for tensor in tensors.values()) == (depth > 0.01), depth
-    with_it, _, _ = pictures(together(ahead[2][1], blobs(3, 0)), [view])
-    without, _, _ = pictures(blobs(3, 0), [view])
+    with_it, _, _ = render_tensors(together(ahead[2][1], blobs(3, 0)), [view])
+    without, _, _ = render_tensors(blobs(3, 0), [view])
     assert torch.equal(with_it, without)
 
 

@@ -1,4 +1,4 @@
-"""Oracle: finite numbers, and pictures that are not worse than before, from Gaussians as no training leaves them."""
+"""Oracle: finite numbers, and images that are not worse than before, for degenerate Gaussians."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ STEPS = {
 }
 
 
-def taught(size=1.0):
+def targets_of(size=1.0):
     views = []
     for view in around(5):
         pose = view.camera.viewmat.copy()
@@ -33,8 +33,8 @@ def taught(size=1.0):
 
 
 def error(scene, original, supervision):
-    pictures = [[render(one, view.camera)[0] for one in (scene, original)] for view in supervision.train]
-    return np.mean([np.square(np.clip(a, 0, 1) - np.clip(b, 0, 1)) for a, b in pictures])
+    pairs = [[render(one, view.camera)[0] for one in (scene, original)] for view in supervision.train]
+    return np.mean([np.square(np.clip(a, 0, 1) - np.clip(b, 0, 1)) for a, b in pairs])
 
 
 def check(scene, count, supervision, seen=True, **changes):
@@ -51,21 +51,21 @@ def check(scene, count, supervision, seen=True, **changes):
 
 @pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.__name__)
 def test_degenerate_scenes_train_without_nan(scene):
-    check(scene(), 20, taught(), seen=scene is not loud)  # no picture from 0 to 1 has colours up to a million
+    check(scene(), 20, targets_of(), seen=scene is not loud)  # no image from 0 to 1 has colours of a million
 
 
 @pytest.mark.parametrize("size", [1e-1, 1e3, 1e6])
-def test_worlds_of_any_size_learn_alike(size):
+def test_worlds_of_any_size_train_alike(size):
     """Learning rates of positions are in units of the cameras' extent; scales are logarithms."""
     scene = cloud(60)
     large = changed(scene, means=scene.means * size, scales=scene.scales + np.log(size))
-    reference = check(scene, 20, taught(), admm_rho=0)
-    found = check(large, 20, taught(size), admm_rho=0)
-    near = error(found, large, taught(size)), error(reference, scene, taught())
+    reference = check(scene, 20, targets_of(), admm_rho=0)
+    found = check(large, 20, targets_of(size), admm_rho=0)
+    near = error(found, large, targets_of(size)), error(reference, scene, targets_of())
     assert near[0] == pytest.approx(near[1], rel=0.5)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("count", [2, 7, 8, 9])
 def test_few_gaussians_of_any_degree(count, degree):
-    check(cloud(count, degree, seed=count), count - 1, taught(), sparsify_steps=10, refine_steps=5)
+    check(cloud(count, degree, seed=count), count - 1, targets_of(), sparsify_steps=10, refine_steps=5)

@@ -120,7 +120,7 @@ def test_ascii_is_read_as_people_write_it():
 
 
 def test_nerfstudio_rgb_colours():
-    """Its exporter's --ply-color-mode rgb: 8-bit colours instead of f_dc_*."""
+    """The exporter's --ply-color-mode rgb writes 8-bit colours instead of f_dc_*."""
     columns = random_columns(1, 0)
     geometry = [name for name in columns if not name.startswith("f_dc")]
     lines = ["element vertex 1", *(f"property float {name}" for name in geometry)]
@@ -246,7 +246,7 @@ def test_peak_memory(tmp_path):
 
 
 def test_info_of_a_beginning():
-    """What an upload's first bytes tell, with the size that it will have."""
+    """The first bytes of an upload and its size give the header's information."""
     data = ply_bytes(random_columns(3, 1))
     header = data[: data.index(b"end_header\n") + 11]
     assert read_ply_info(header, size=len(data)) == read_ply_info(data)

@@ -63,7 +63,7 @@ NOT_A_PLY = {
     b"ply\nelement vertex 1000000000000000000\n": (
         ", header line 2: the count is '1000000000000000000', not a whole number from 0 to 10^18"
     ),
-    b"ply\nelement vertex 0\nelement vertex 0\n": (", header line 3: a second element 'vertex'; each may stand once"),
+    b"ply\nelement vertex 0\nelement vertex 0\n": (", header line 3: a second element 'vertex'; each may occur once"),
     b"ply\nelement vertex 0\nproperty float\n": ", header line 3: a property needs a type and a name",
     b"ply\nelement vertex 0\nproperty quad x\n": (
         ", header line 3: unknown type 'quad'; known are char, uchar, short, ushort, int, uint, half, float, double, "
@@ -74,22 +74,22 @@ NOT_A_PLY = {
         "int8, uint8, int16, uint16, int32, uint32, float16, float32, float64"
     ),
     b"ply\nelement vertex 0\nproperty float x\nproperty int x\n": (
-        ", header line 4: a second property 'x'; each may stand once"
+        ", header line 4: a second property 'x'; each may occur once"
     ),
 }
 
 NOT_A_SCENE = {
     header_bytes(["element points 1", "property float x"]): (
-        "has no element 'vertex', so no Gaussians; name a trained splat scene"
+        "has no element 'vertex', so no Gaussians; name a trained 3DGS scene"
     ),
     header_bytes(["element vertex 0"]): (
-        "is a point cloud or a mesh, not a trained splat scene: it has no x, y, z, opacity, scale_0, scale_1, scale_2, "
-        "rot_0, rot_1, rot_2, rot_3, f_dc_0, f_dc_1, f_dc_2; train Gaussians on it, or name the trainer's result"
+        "is a point cloud or a mesh, not a trained 3DGS scene: it has no x, y, z, opacity, scale_0, scale_1, scale_2, "
+        "rot_0, rot_1, rot_2, rot_3, f_dc_0, f_dc_1, f_dc_2; name the output of a 3DGS trainer"
     ),
     header_bytes(["element vertex 1", *(f"property float {axis}" for axis in "xyz"), "property uchar red",
                   "property uchar green", "property uchar blue"]): (
-        "is a point cloud or a mesh, not a trained splat scene: it has no opacity, scale_0, scale_1, scale_2, rot_0, "
-        "rot_1, rot_2, rot_3; train Gaussians on it, or name the trainer's result"
+        "is a point cloud or a mesh, not a trained 3DGS scene: it has no opacity, scale_0, scale_1, scale_2, rot_0, "
+        "rot_1, rot_2, rot_3; name the output of a 3DGS trainer"
     ),
     header_bytes([line for line in VERTEX if not line.endswith(("rot_3", "opacity"))]): (
         "has no opacity, rot_3; export the scene with all its properties"
@@ -227,7 +227,7 @@ def test_folder_and_pipe(tmp_path):
 
 
 def test_no_permission(tmp_path, monkeypatch):
-    """Not by chmod, because root may read everything."""
+    """The test does not use chmod, because root may read everything."""
     path = tmp_path / "scene.ply"
     path.write_bytes(b"ply\n")
 

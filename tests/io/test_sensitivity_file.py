@@ -56,14 +56,14 @@ def test_it_is_measured_anew_when_anything_has_changed(tmp_path, change):
 def test_other_files_are_not_written_over(tmp_path, content):
     file = tmp_path / "a.npz"
     file.write_bytes(content)
-    with pytest.raises(OutputError, match="is not a file in which kissgs keeps sensitivity; move it away"):
+    with pytest.raises(OutputError, match="is not a sensitivity file of kissgs; move it away"):
         compressed(file)
     assert file.read_bytes() == content
 
 
 def test_other_arrays_are_not_written_over(tmp_path):
     np.savez(tmp_path / "a.npz", weights=np.ones(3))
-    with pytest.raises(OutputError, match="is not a file in which kissgs keeps sensitivity"):
+    with pytest.raises(OutputError, match="is not a sensitivity file of kissgs"):
         read_sensitivity(tmp_path / "a.npz", "key")
 
 

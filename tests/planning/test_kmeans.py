@@ -14,7 +14,7 @@ from kissgs.planning.sh_codebook import codebook_side
 
 def run(vectors, size, weights=None, threads=1, **options):
     weights = np.ones(len(vectors), np.float32) if weights is None else weights.astype(np.float32)
-    given = {"seed": 0, "rounds": 6, "reach": MAX_COARSE, "tolerance": 0.0, "lattice": 0.0, **options}
+    given = {"seed": 0, "iterations": 6, "nprobe": MAX_COARSE, "tolerance": 0.0, "lattice": 0.0, **options}
     with blas_workers(threads) as pool:
         return fit(vectors, weights, size, pool, **given)
 
@@ -35,11 +35,11 @@ def error(vectors, clusters, weights=None):
     return np.average(distances, weights=weights)
 
 
-def lloyd(vectors, size, rounds=15, seed=0):
+def lloyd(vectors, size, iterations=15, seed=0):
     """Mean squared error of the textbook's k-means from a random start."""
     start = np.random.default_rng(seed).choice(len(vectors), size, replace=False)
     centroids = vectors[start].astype(np.float64)
-    for _ in range(rounds):
+    for _ in range(iterations):
         labels = squared_distances(vectors, centroids).argmin(axis=1)
         for k in np.unique(labels):
             centroids[k] = vectors[labels == k].mean(axis=0)
@@ -59,7 +59,7 @@ def test_assign_finds_the_nearest_centroid(count, size, dimensions, seed):
 
 @pytest.mark.parametrize("offset", [0, 10])
 def test_labels_are_the_nearest_of_all_where_reach_is_unlimited(offset):
-    """With a lattice the labels are chosen after the centroids have settled, and nothing may move afterwards."""
+    """A lattice chooses the labels after the last update of the centroids, and nothing may change afterwards."""
     vectors = blobs() + np.float32(offset)
     clusters = run(vectors, 64, lattice=0.5)
     distances = squared_distances(vectors, clusters.centroids)
@@ -75,12 +75,12 @@ def test_as_good_as_plain_lloyd(made, size):
     else:
         vectors = sample_scene(2000, sh_degree=1).shN.reshape(2000, 9)
     best = min(lloyd(vectors, size, seed=seed) for seed in range(2))
-    assert error(vectors, run(vectors, size, rounds=8)) < 1.03 * best
+    assert error(vectors, run(vectors, size, iterations=8)) < 1.03 * best
 
 
 def test_a_short_reach_costs_little():
     vectors = blobs(5000)
-    assert error(vectors, run(vectors, 100, reach=4, rounds=2)) < 1.15 * error(vectors, run(vectors, 100))
+    assert error(vectors, run(vectors, 100, nprobe=4, iterations=2)) < 1.15 * error(vectors, run(vectors, 100))
 
 
 def test_the_codebook_is_used_up_but_not_exceeded():

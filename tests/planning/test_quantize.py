@@ -39,7 +39,7 @@ def tables(values=NUMBERS, *, min_rows=1, channels=None):
 
 
 def decoded(quantized):
-    """What a decoder makes of the levels and the ranges that are written: it knows no level count."""
+    """Decode levels with the written ranges, as a decoder that does not know the number of levels."""
     low, high = (end.astype(np.float64) for end in observed_range(quantized))
     levels = quantized.levels.astype(np.float64)
     first, last = levels.min(), levels.max()
@@ -186,8 +186,8 @@ def test_positions_share_one_range_of_all_axes():
 @pytest.mark.parametrize("tolerance", [0.01, 0.04, 0.5])
 @pytest.mark.parametrize("seed", range(5))
 def test_means_bits_keep_the_median_gaussian_in_its_place(seed, tolerance):
-    """With the bits found, half the Gaussians move by at most ``tolerance`` of their size; with one bit less they
-    need not. Size is the geometric mean of the two longest axes."""
+    """Half the Gaussians move by at most ``tolerance`` of their size with the bits found; with one bit less they may
+    move further. Size is the geometric mean of the two longest axes."""
     splats = random_scene(501, 0, seed=seed)
     splats = replaced(splats, scales=splats.scales + seed)
     bits = means_bits(splats, np.arange(501), tolerance)

@@ -1,4 +1,4 @@
-"""Oracle: all choices by brute force, the square law of rounding, and the scenes that break weights."""
+"""Oracle: all levels by brute force, the square law of rounding, and scenes with degenerate sensitivity."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import reference_decoder
 from helpers.codec_scenes import assert_round_trip, constant_scene, covariances, random_scene
-from helpers.random_sensitivity import made_up, weighed
+from helpers.random_sensitivity import encode_rd, random_sensitivity
 from scipy.spatial.transform import Rotation
 
 from kissgs import Settings, compress, decompress
@@ -14,12 +14,12 @@ from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import clean
 from kissgs.core.threads import Workers
 from kissgs.planning.quantize import quantize
-from kissgs.planning.rd_model import NEARLY, CodebookErrorModel, Costs, error_at, lambda_for, step
-from kissgs.planning.rdo_quantize import CAPTURED, MIRRORS, quantize_by_class, rdo_quantize_shapes
+from kissgs.planning.rd_model import MIN_ERROR_RATIO, CodebookErrorModel, Costs, error_at, lambda_for, step
+from kissgs.planning.rdo_quantize import AXIS_SIGNS, CAPTURED, quantize_by_class, rdo_quantize_shapes
 from kissgs.planning.rotation_forms import ROTATIONS, apply_forms
 from kissgs.sogxt.encode import encode
 
-WEIGHED = ["balanced", "small"]
+RD_PRESETS = ["balanced", "small"]
 
 
 def anything(count):
@@ -28,7 +28,7 @@ def anything(count):
 
 
 def test_a_step_costs_what_a_bit_does():
-    """Halving it saves H d²/12 (1 - 1/4) by a bit: at the optimum the derivative by bits is the price."""
+    """Halving it saves H d²/12 (1 - 1/4) by a bit: at the optimum the derivative by bits is lambda."""
     cost, rd_lambda = 3e-4, 2e-9
     best = step(cost, rd_lambda)
 
@@ -39,25 +39,25 @@ def test_a_step_costs_what_a_bit_does():
     assert around[1] < min(around[0], around[2])
 
 
-def test_prices_are_found_for_the_error_asked_for():
+def test_lambda_for_gives_the_requested_error():
     splats = random_scene(4000, 3, seed=1)
-    costs = Costs.of(made_up(splats), splats)
-    gloss = CodebookErrorModel(1024, 1e-6, 2e-6)
+    costs = Costs.of(random_sensitivity(splats), splats)
+    sh_model = CodebookErrorModel(1024, 1e-6, 2e-6)
     for error in (1e-6, 1e-4):
-        rd_lambda = lambda_for(error, costs, gloss, 10, 7, 0.2)
-        np.testing.assert_allclose(error_at(rd_lambda, costs, gloss, 10, 7, 0.2), error, rtol=0.05)
-    least = error_at(1e-22, costs, gloss, 10, 7, 0.2)  # what the largest codebook leaves
-    rd_lambda = lambda_for(least / 100, costs, gloss, 10, 7, 0.2)
-    np.testing.assert_allclose(error_at(rd_lambda, costs, gloss, 10, 7, 0.2), NEARLY * least, rtol=0.05)
-    sizes = [gloss.best_size(rd_lambda, 100_000, 7) for rd_lambda in (1e-14, 1e-12, 1e-10)]
+        rd_lambda = lambda_for(error, costs, sh_model, 10, 7, 0.2)
+        np.testing.assert_allclose(error_at(rd_lambda, costs, sh_model, 10, 7, 0.2), error, rtol=0.05)
+    least = error_at(1e-22, costs, sh_model, 10, 7, 0.2)  # what the largest codebook leaves
+    rd_lambda = lambda_for(least / 100, costs, sh_model, 10, 7, 0.2)
+    np.testing.assert_allclose(error_at(rd_lambda, costs, sh_model, 10, 7, 0.2), MIN_ERROR_RATIO * least, rtol=0.05)
+    sizes = [sh_model.best_size(rd_lambda, 100_000, 7) for rd_lambda in (1e-14, 1e-12, 1e-10)]
     assert sizes == sorted(sizes, reverse=True)
     assert sizes[0] <= round(100_000 / 7)
-    assert gloss.best_size(1e-20, 6000, 7) == 3000
+    assert sh_model.best_size(1e-20, 6000, 7) == 3000
 
 
 def test_classes_are_of_like_sensitivity_and_size():
     splats = random_scene(1000, 0)
-    costs = Costs.of(made_up(splats), splats).take(np.arange(0, 1000, 2))
+    costs = Costs.of(random_sensitivity(splats), splats).take(np.arange(0, 1000, 2))
     places = splats.means[::2]
     classes = costs.classes(5, places)
     assert np.bincount(classes).tolist() == [100] * 5
@@ -69,21 +69,21 @@ def test_classes_are_of_like_sensitivity_and_size():
 
 
 def test_gaussians_in_one_place_keep_their_order():
-    """Which of them is in front is decided by the order in which they are stored."""
+    """The stored order decides which of them is in front."""
     splats = random_scene(600, 0)
     splats = replace(splats, means=np.repeat(splats.means[:20] * np.float32([0, 1, 1]), 30, axis=0))
-    costs = Costs.of(made_up(splats), splats)
+    costs = Costs.of(random_sensitivity(splats), splats)
     classes = costs.classes(5, splats.means).reshape(20, 30)
     assert (classes == classes[:, :1]).all()
     assert len(np.unique(classes)) == classes.max() + 1
-    order = weighed(splats, made_up(splats), prune_threshold_bits=0).order
+    order = encode_rd(splats, random_sensitivity(splats), prune_threshold_bits=0).order
     for place in range(20):
         assert (np.diff(order[order // 30 == place]) > 0).all()
 
 
 def test_what_is_dropped_is_worth_least_and_never_more_than_half():
     splats = random_scene(101, 0, seed=3)
-    costs = Costs.of(made_up(splats), splats)
+    costs = Costs.of(random_sensitivity(splats), splats)
     ranked = np.argsort(costs.removal)
     for rd_lambda, count in ((0.0, 0), (float(costs.removal[ranked[10]]) / 7, 10), (1e9, 50)):
         dropped = costs.pruned_by_rd(rd_lambda, 7)
@@ -106,14 +106,14 @@ def test_levels_of_a_class_are_multiples_of_its_step():
 
 
 @pytest.mark.parametrize("row", range(24))
-def test_mirrored_axes_are_those_of_the_form(row):
+def test_axis_signs_are_those_of_the_form(row):
     """A turn about the original's axis p(i) is one about the form's axis i, or against it."""
     quat = np.array([[0.5, -0.1, 0.7, 0.3]]) / np.linalg.norm([0.5, -0.1, 0.7, 0.3])
     form = np.array([row], np.uint8)
     angle = 1e-6
     from kissgs.planning.rotation_forms import PERMUTATIONS
 
-    for i, sign in enumerate(MIRRORS[row]):
+    for i, sign in enumerate(AXIS_SIGNS[row]):
         turn = [0.0, 0.0, 0.0]
         turn[PERMUTATIONS[row][i]] = angle
         first = Rotation.from_quat(quat, scalar_first=True) * Rotation.from_rotvec(turn)
@@ -134,14 +134,14 @@ def parts_of(values, steps=(0.4, 0.3, 0.1)):
     return tuple(quantize(values[:, a:b], step=s) for (a, b), s in zip(((0, 1), (1, 4), (4, 8)), steps, strict=True))
 
 
-def test_rounding_for_nothing_is_rounding_to_the_nearest_along_each_axis():
+def test_without_a_rate_cost_levels_are_the_nearest_along_each_axis():
     rng = np.random.default_rng(1)
     count = 400
     quats = rng.normal(size=(count, 4)) * 0.2 + [1, 0, 0, 0]
     values = np.concatenate([rng.normal(size=(count, 4)), quats / np.linalg.norm(quats, axis=1, keepdims=True)], axis=1)
     parts = parts_of(values)
     splats = random_scene(count, 0)
-    costs = Costs.of(made_up(splats), splats)
+    costs = Costs.of(random_sensitivity(splats), splats)
     with Workers(1) as pool:
         found = rdo_quantize_shapes(
             *(values, parts, np.tile(packed(np.diag([1.0] * 4 + [0] * 3)), (count, 1)), np.zeros(count, np.uint8)),
@@ -156,7 +156,7 @@ def test_rounding_for_nothing_is_rounding_to_the_nearest_along_each_axis():
         )
 
 
-def test_rounding_by_price_never_costs_more_than_the_nearest():
+def test_rdo_quantisation_never_costs_more_than_the_nearest_level():
     """Error and bits together, the bits as the levels that were chosen then have them; and close to all pairs tried."""
     rng = np.random.default_rng(2)
     count, rd_lambda = 3000, 1e-3
@@ -167,7 +167,8 @@ def test_rounding_by_price_never_costs_more_than_the_nearest():
     parts = parts_of(values)
     splats = random_scene(count, 0)
     costs = replace(
-        Costs.of(made_up(splats), splats), **{name: np.full(count, 1e-9) for name in ("opacity", "scale", "rotation")}
+        Costs.of(random_sensitivity(splats), splats),
+        **{name: np.full(count, 1e-9) for name in ("opacity", "scale", "rotation")},
     )
     with Workers(1) as pool:
         found = rdo_quantize_shapes(
@@ -208,12 +209,12 @@ def test_round_trips(count, degree):
     assert sorted(result.order) == list(range(count))
 
 
-def test_more_fidelity_costs_more_and_errs_less():
+def test_higher_quality_has_more_bytes_and_smaller_errors():
     splats = random_scene(3000, 1, seed=3)
-    sensitivity = made_up(splats)
+    sensitivity = random_sensitivity(splats)
     sizes, errors = [], []
     for quality_offset_db in (-6, 0, 6):
-        result = weighed(splats, sensitivity, quality_offset_db=quality_offset_db, prune_threshold_bits=0)
+        result = encode_rd(splats, sensitivity, quality_offset_db=quality_offset_db, prune_threshold_bits=0)
         sizes.append(sum(map(len, result.files.values())))
         found, wanted = decompress(result.files), splats.select(result.order)
         errors.append(float(sensitivity.diagonal((0,))[result.order, 0] @ (found.opacities - wanted.opacities) ** 2))
@@ -223,18 +224,18 @@ def test_more_fidelity_costs_more_and_errs_less():
 
 def test_the_least_important_are_left_out_and_counted():
     splats = random_scene(1000, 0, seed=4)
-    sensitivity = made_up(splats)
-    result = weighed(splats, sensitivity, rd_lambda=1e-8, prune_threshold_bits=30)
+    sensitivity = random_sensitivity(splats)
+    result = encode_rd(splats, sensitivity, rd_lambda=1e-8, prune_threshold_bits=30)
     removal = sensitivity.removal(splats)
     assert sorted(result.order) == np.flatnonzero(removal >= 30 * 1e-8).tolist()
     assert 0 < result.pruned_by_rd == 1000 - len(result.order)
 
 
 def test_growth_is_held_back():
-    """A Gaussian below a pixel's size costs nothing in these pictures, whatever its size; elsewhere it is a blob."""
+    """A Gaussian below a pixel's size costs nothing in these views, whatever its size, but is a blob from nearby."""
     splats = random_scene(2000, 0, seed=5)
-    sensitivity = made_up(splats)
-    result = weighed(
+    sensitivity = random_sensitivity(splats)
+    result = encode_rd(
         splats,
         replace(sensitivity, shape_hessian=sensitivity.shape_hessian * np.float32(1e-8)),
         rd_lambda=1e-5,
@@ -255,19 +256,19 @@ def torture():
     one_seen = replace(nothing, color_weight=only, shape_hessian=only[:, None] * np.ones((1, 28), np.float32))
     black = replace(scene, sh0=np.full((300, 3), -5, np.float32))
     few = replace(scene, shN=scene.shN[np.arange(300) % 3])
-    huge = made_up(scene, spread=20)
+    huge = random_sensitivity(scene, spread=20)
     return [
         pytest.param(scene, nothing, id="nothing is seen"),
         pytest.param(scene, one_seen, id="one Gaussian is seen"),
-        pytest.param(black, made_up(black), id="all colours are clamped"),
-        pytest.param(few, made_up(few), id="fewer kinds of gloss than entries"),
+        pytest.param(black, random_sensitivity(black), id="all colours are clamped"),
+        pytest.param(few, random_sensitivity(few), id="fewer SH vectors than entries"),
         pytest.param(scene, huge, id="sensitivity over forty orders of magnitude"),
-        pytest.param(constant_scene(300, 2), made_up(scene), id="all alike"),
+        pytest.param(constant_scene(300, 2), random_sensitivity(scene), id="all alike"),
     ]
 
 
 @pytest.mark.parametrize(("splats", "sensitivity"), torture())
-@pytest.mark.parametrize("preset", WEIGHED)
+@pytest.mark.parametrize("preset", RD_PRESETS)
 def test_scenes_that_break_weights(splats, sensitivity, preset):
     once, again = (encode(splats, Settings.from_preset(preset).encode, sensitivity=sensitivity) for _ in range(2))
     assert once.files == again.files
@@ -288,7 +289,7 @@ def test_colours_are_asked_for_once_the_rest_is_known():
         return np.full((len(order), 3), 0.25, np.float32)
 
     settings = Settings.from_preset("balanced").encode
-    result = encode(splats, settings, sensitivity=made_up(splats), recolor=recolor)
+    result = encode(splats, settings, sensitivity=random_sensitivity(splats), recolor=recolor)
     ((decoded, order),) = asked
     found = decompress(result.files)
     np.testing.assert_array_equal(order, result.order)
@@ -301,7 +302,7 @@ def test_colours_are_asked_for_once_the_rest_is_known():
 
 def test_threads_do_not_change_a_byte():
     splats = random_scene(2000, 3, seed=7)
-    sensitivity = made_up(splats)
+    sensitivity = random_sensitivity(splats)
     settings = Settings.from_preset("small").encode
     one, three = (encode(splats, settings, sensitivity=sensitivity, threads=threads).files for threads in (1, 3))
     assert one == three
@@ -310,9 +311,9 @@ def test_threads_do_not_change_a_byte():
 @pytest.mark.parametrize(
     "changes", [{"order": "plas"}, {"rotation_form": "pras"}, {"gaussians_per_codebook_entry": 50}, {"step_classes": 7}]
 )
-def test_every_way_of_the_settings_goes_with_it(changes):
+def test_rate_distortion_works_with_every_order_and_form(changes):
     splats = random_scene(700, 1, seed=8)
-    result = weighed(splats, made_up(splats), prune_threshold_bits=0, sh_tolerance=0, **changes)
+    result = encode_rd(splats, random_sensitivity(splats), prune_threshold_bits=0, sh_tolerance=0, **changes)
     found, wanted = decompress(result.files), splats.select(result.order)
     assert sorted(result.order) == list(range(700))
     for name, field in (("opacities", "opacities"), ("sh0", "f_dc")):

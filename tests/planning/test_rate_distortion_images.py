@@ -1,4 +1,4 @@
-"""Oracle: pictures of the original, beside those that the paper's own settings leave, which take more bytes."""
+"""Oracle: renderings of the original, compared with those of the preset ``paper``, which takes more bytes."""
 
 import functools
 
@@ -22,32 +22,30 @@ def compressed(preset, **changes):
     return kissgs.compress(SCENE, settings=kissgs.Settings.from_preset(preset, **changes))
 
 
-def likeness(scene, found, views, background=(0, 0, 0)):
+def psnrs(scene, found, views, background=(0, 0, 0)):
     """PSNR of each view."""
-    pictures = [
-        [np.clip(render(s, view, background=list(background))[0], 0, 1) for s in (scene, found)] for view in views
-    ]
-    return np.array([psnr(a, b) for a, b in pictures])
+    pairs = [[np.clip(render(s, view, background=list(background))[0], 0, 1) for s in (scene, found)] for view in views]
+    return np.array([psnr(a, b) for a, b in pairs])
 
 
 @pytest.mark.parametrize("background", [(0, 0, 0), (1, 1, 1), (0.2, 0.9, 0.5)])
 @pytest.mark.parametrize("preset", ["balanced", "small"])
 def test_fewer_bytes_than_the_papers_and_better_before_any_background(preset, background):
-    """By default a scene whose range the paper's levels do not fit is to be better than with them: as good as by the
-    steps of ``fast``. Here that is more than 2 dB, and takes some of the bytes that are saved."""
+    """The default quality is that of ``fast`` if the paper's levels are too coarse for the scene's ranges. Here that is
+    more than 2 dB, and takes some of the saved bytes."""
     paper, ours = compressed("paper"), compressed(preset)
     assert len(ours.to_zip()) < 0.85 * len(paper.to_zip())
-    wanted, found = (likeness(SCENE, kissgs.decompress(c.files), cameras(), background) for c in (paper, ours))
+    wanted, found = (psnrs(SCENE, kissgs.decompress(c.files), cameras(), background) for c in (paper, ours))
     assert found.mean() > wanted.mean() + 2
     assert found.min() > wanted.min() + 1
 
 
 @pytest.mark.parametrize("background", [(0, 0, 0), (1, 1, 1), (0.2, 0.9, 0.5)])
 def test_two_thirds_of_the_papers_bytes_are_as_good_before_any_background(background):
-    """Where that is all that is asked for."""
+    """A quality offset of -2 dB gives about the paper's quality."""
     paper, ours = compressed("paper"), compressed("balanced", quality_offset_db=-2)
     assert len(ours.to_zip()) < 0.7 * len(paper.to_zip())
-    wanted, found = (likeness(SCENE, kissgs.decompress(c.files), cameras(), background) for c in (paper, ours))
+    wanted, found = (psnrs(SCENE, kissgs.decompress(c.files), cameras(), background) for c in (paper, ours))
     assert found.mean() > wanted.mean()
     assert found.min() > wanted.min() - 1
 
@@ -60,13 +58,13 @@ def test_what_is_dark_is_kept_for_bright_backgrounds():
         shN=SCENE.shN[:, :0],
     )
     found = kissgs.decompress(kissgs.compress(black).files)
-    assert likeness(black, found, cameras()).min() > 60
-    assert likeness(black, found, cameras(), (1, 1, 1)).min() > 40
+    assert psnrs(black, found, cameras()).min() > 60
+    assert psnrs(black, found, cameras(), (1, 1, 1)).min() > 40
 
 
 @pytest.mark.parametrize("logit", [4.0, 5.0, 8.0, 13.0])
 def test_a_wall_is_kept_however_opaque(logit):
-    """A thing that fills most pictures, and is clamped to the largest alpha in them."""
+    """A Gaussian that fills most images, and is clamped to the largest alpha in them."""
     radius = np.quantile(np.linalg.norm(SCENE.means - SCENE.means.mean(axis=0), axis=1), 0.95)
     wall = kissgs.Splats(
         means=SCENE.means.mean(axis=0, keepdims=True),
@@ -85,12 +83,12 @@ def test_a_wall_is_kept_however_opaque(logit):
 
 
 def test_a_capture_from_one_side_does_not_ruin_the_other():
-    """Which has the weight of the virtual cameras alone."""
+    """The other side has only the weight of the virtual cameras."""
     views = sorted(cameras(24), key=lambda camera: camera.position[0])
     train = tuple(kissgs.View(f"{n}", camera) for n, camera in enumerate(views[12:]))
     capture = kissgs.Views(train, (), np.zeros(3, np.float32), "one side")
     found = kissgs.decompress(kissgs.compress(SCENE, views=capture).files)
-    seen, other = (likeness(SCENE, found, side) for side in (views[12:], views[:12]))
+    seen, other = (psnrs(SCENE, found, side) for side in (views[12:], views[:12]))
     assert seen.mean() > 38
     assert other.mean() > 31
     assert other.min() > 22

@@ -1,11 +1,11 @@
-"""What is left out, how far values may be rounded, and what quality is aimed at; the oracles are sums written down."""
+"""Pruning, bounds of rounding and the default quality; the oracles are sums written by hand."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from helpers.codec_scenes import random_scene
-from helpers.random_sensitivity import made_up, weighed
+from helpers.random_sensitivity import encode_rd, random_sensitivity
 
 import kissgs
 from kissgs.planning.rd_model import CodebookErrorModel, Costs, default_error
@@ -18,17 +18,17 @@ def costs_of(removal, coverage):
     return Costs(removal=np.array(removal, float), coverage=np.array(coverage, float), **none)
 
 
-def test_nothing_that_no_camera_saw_is_dropped_up_to_the_usual_price():
+def test_unseen_gaussians_are_kept_up_to_the_default_lambda():
     removal, coverage = np.tile([1e-9, 1e-3], 10), np.repeat([0.0, 0.09, 0.11, 1.0], 5)
     costs = costs_of(removal, coverage)
     for rd_lambda in (1e-9, 1e-6, 2e-6):
         dropped = costs.pruned_by_rd(rd_lambda, 10, 2e-6)
         np.testing.assert_array_equal(dropped, (removal < 10 * rd_lambda) & (coverage > 0.1))
-    # Alike for all where nothing is said of the usual price.
+    # Without a default lambda, all Gaussians are treated alike.
     np.testing.assert_array_equal(costs.pruned_by_rd(2e-6, 10), removal < 1e-4)
 
 
-def test_beyond_the_usual_price_the_unseen_are_dropped_by_what_it_is_exceeded_by():
+def test_beyond_the_default_lambda_its_excess_prunes_the_unseen():
     removal, coverage = np.array([1e-5, 4e-5, 1e-5, 4e-5, 1, 1, 1, 1]), np.array([0, 0, 1, 1, 0, 0, 1, 1])
     costs = costs_of(removal, coverage)
     found = [
@@ -60,15 +60,15 @@ def test_largest_changes_grow_with_slack_up_to_those_of_a_capture():
         np.testing.assert_allclose(each[2], most)
 
 
-def test_what_nobody_looked_at_is_rounded_no_coarser_than_the_same_step_for_all():
-    """Decoded values, not what was asked for, at a price at which everything would be as coarse as may be."""
+def test_unseen_gaussians_are_rounded_no_coarser_than_by_uniform_planning():
+    """Decoded values, not the bounds, at a lambda at which everything would be as coarse as possible."""
     splats = random_scene(2000, 0, seed=5)
-    sensitivity = made_up(splats)
+    sensitivity = random_sensitivity(splats)
     coverage = np.where(np.arange(2000) < 700, 0.0, 1.0).astype(np.float32)
     sensitivity = replace(
         sensitivity, shape_hessian=sensitivity.shape_hessian * np.float32(1e-8), coverage=coverage, view_uncertainty=0.5
     )
-    result = weighed(splats, sensitivity, quality_offset_db=0.0, prune_threshold_bits=0)
+    result = encode_rd(splats, sensitivity, quality_offset_db=0.0, prune_threshold_bits=0)
     found = kissgs.decompress(result.files)
     opacities = np.abs(found.opacities - splats.opacities[result.order])
     unseen = result.order < 700
@@ -79,11 +79,11 @@ def test_what_nobody_looked_at_is_rounded_no_coarser_than_the_same_step_for_all(
 def test_slack_lets_changes_of_a_scene_grow_up_to_the_wide_limit():
     """Decoded values, not what was asked for: no scale is off by more than rounding may move it."""
     splats = random_scene(2000, 0, seed=5)
-    sensitivity = made_up(splats)
+    sensitivity = random_sensitivity(splats)
     sensitivity = replace(sensitivity, shape_hessian=sensitivity.shape_hessian * np.float32(1e-8), view_uncertainty=0.5)
     errors = []
     for quality_offset_db in (0.0, -12.0):
-        result = weighed(splats, sensitivity, quality_offset_db=quality_offset_db, prune_threshold_bits=0)
+        result = encode_rd(splats, sensitivity, quality_offset_db=quality_offset_db, prune_threshold_bits=0)
         errors.append(np.array([max(result.errors[name]) for name in ("opacities", "scales")]))
     assert (errors[0] <= [VIRTUAL["opacities"] + 1e-4, VIRTUAL["scales"] + 1e-4]).all()
     assert (errors[1] <= [CAPTURED["opacities"] + 1e-4, CAPTURED["scales"] + 1e-4]).all()
@@ -101,7 +101,7 @@ def spoiled(splats, name, far):
 def test_one_outlier_does_not_spoil_the_quality_that_is_aimed_at(name):
     """However far out it is: the paper's levels lie farther and farther apart, the steps of ``fast`` do not."""
     splats = random_scene(3000, 0, seed=2)
-    costs, kept = Costs.of(made_up(splats), splats), np.arange(3000)
+    costs, kept = Costs.of(random_sensitivity(splats), splats), np.arange(3000)
     costs = replace(costs, position=np.zeros(3000))
     scenes = [splats, *(spoiled(splats, name, far) for far in (600, 6000, 60000))]
     usual, *found = (default_error(costs, scene, kept, CodebookErrorModel()) for scene in scenes)
@@ -144,7 +144,7 @@ def test_many_gaussians_that_were_dropped_are_noted_in_the_report(superfluous, m
     assert bool(report.note) == many
     if many:
         drawn = len(scene) - report.invisible
-        assert report.note.startswith(f"{report.pruned_by_rd:,} of {drawn:,} Gaussians were left out")
+        assert report.note.startswith(f"{report.pruned_by_rd:,} of {drawn:,} Gaussians were pruned")
 
 
 def test_an_enormous_coefficient_does_not_change_what_is_kept():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import reference_rasterizer
-from helpers.rasterized import pictures
+from helpers.rasterized import render_tensors
 from helpers.render_scenes import blobs, camera, in_float64, one, together
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -37,7 +37,7 @@ def clamp_of(device):
 
 
 def agree(splats, view, background, device="cpu", tolerance=1e-4):
-    images, alphas, _ = pictures(splats, [view], device, [background])
+    images, alphas, _ = render_tensors(splats, [view], device, [background])
     expected = reference_rasterizer.draw(in_float64(splats), view, np.array(background), alpha_max=clamp_of(device))
     sure = ~expected.doubtful
     np.testing.assert_allclose(images[0].detach().cpu().numpy()[sure], expected.image[sure], atol=tolerance, rtol=0)
@@ -132,7 +132,7 @@ def compare_gradients(splats, view, device, seed, tolerance=1e-3):
     v_image = rng.normal(0, 1, (view.height, view.width, 3)) * sure[:, :, None]
     v_alpha = rng.normal(0, 1, (view.height, view.width)) * sure
     expected = reference_rasterizer.gradient_by_differences(params, view, background, v_image, v_alpha, alpha_max=clamp)
-    images, alphas, tensors = pictures(splats, [view], device, [background])
+    images, alphas, tensors = render_tensors(splats, [view], device, [background])
     loss = (images[0].cpu() * torch.from_numpy(v_image)).sum() + (alphas[0].cpu() * torch.from_numpy(v_alpha)).sum()
     loss.backward()
     for name in ATTRIBUTES:
@@ -148,11 +148,11 @@ def compare_gradients(splats, view, device, seed, tolerance=1e-3):
 def test_several_cameras_give_the_sum_of_their_gradients(device):
     splats, views = blobs(20, 2), [camera(seed=1), camera(seed=2)]
     backgrounds = [[0.1, 0.2, 0.3], [1.0, 0.0, 0.5]]
-    images, alphas, tensors = pictures(splats, views, device, backgrounds)
+    images, alphas, tensors = render_tensors(splats, views, device, backgrounds)
     ((images**2).sum() + alphas.sum()).backward()
     total = {name: torch.zeros_like(tensor) for name, tensor in tensors.items()}
     for view, background, image in zip(views, backgrounds, images, strict=True):
-        single, alpha, parts = pictures(splats, [view], device, [background])
+        single, alpha, parts = render_tensors(splats, [view], device, [background])
         torch.testing.assert_close(single[0], image)
         ((single**2).sum() + alpha.sum()).backward()
         for name, part in parts.items():
@@ -165,7 +165,7 @@ def test_pictures_and_gradients_are_the_same_for_any_number_of_threads():
     splats, view = blobs(300, 3, spread=1.5), camera(130, 70)
     results = []
     for threads in (1, 2, 3, 7):
-        images, alphas, tensors = pictures(splats, [view], threads=threads)
+        images, alphas, tensors = render_tensors(splats, [view], threads=threads)
         (images.square().sum() + alphas.sum()).backward()
         results.append([images, alphas, *(tensor.grad for tensor in tensors.values())])
     for result in results[1:]:
@@ -176,7 +176,7 @@ def test_pictures_and_gradients_are_the_same_for_any_number_of_threads():
 def test_render_is_the_same_without_torch():
     splats, view = blobs(50, 3), camera()
     image, alpha = render(splats, view, background=(1.0, 1.0, 1.0))
-    images, alphas, _ = pictures(splats, [view], backgrounds=[(1.0, 1.0, 1.0)])
+    images, alphas, _ = render_tensors(splats, [view], backgrounds=[(1.0, 1.0, 1.0)])
     assert np.array_equal(image, images[0].detach().numpy())
     assert np.array_equal(alpha, alphas[0].detach().numpy())
 
@@ -195,7 +195,7 @@ def test_the_input_is_not_changed_and_shared():
 
 
 def test_a_parameter_changed_before_the_way_back_is_noticed():
-    images, _, tensors = pictures(blobs(5), [camera()])
+    images, _, tensors = render_tensors(blobs(5), [camera()])
     with torch.no_grad():
         tensors["means"].add_(1)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
@@ -204,7 +204,7 @@ def test_a_parameter_changed_before_the_way_back_is_noticed():
 
 def test_tensors_need_not_be_contiguous():
     splats, view = blobs(30, 2), camera()
-    expected, _, _ = pictures(splats, [view])
+    expected, _, _ = render_tensors(splats, [view])
     tensors = {name: tensor.repeat_interleave(2, 0)[::2] for name, tensor in tensors_of(splats).items()}
     viewmats, Ks = torch.from_numpy(view.viewmat[None]), torch.from_numpy(view.K[None])
     images, _ = rasterize(**tensors, viewmats=viewmats, Ks=Ks, width=view.width, height=view.height)
@@ -250,7 +250,7 @@ def test_loading_the_kernels_is_announced():
 
 def test_cameras_of_any_type_and_layout():
     splats, view = blobs(20), camera()
-    expected, _, _ = pictures(splats, [view, view])
+    expected, _, _ = render_tensors(splats, [view, view])
     viewmats = torch.linalg.inv(torch.linalg.inv(torch.from_numpy(view.viewmat)))[None].expand(2, 4, 4)
     Ks = torch.from_numpy(view.K).expand(2, 3, 3)
     images, _ = rasterize(**tensors_of(splats), viewmats=viewmats, Ks=Ks, width=view.width, height=view.height)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.rasterized import all_is_finite, pictures
+from helpers.rasterized import all_is_finite, render_tensors
 from helpers.render_scenes import blobs, camera, one, together
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -54,7 +54,7 @@ def test_pictures_of_one_pixel_and_of_one_line(size):
 
 def test_a_gaussian_as_large_as_the_world_is_fog_of_its_colour():
     fog = one(scale=(30, 30, 30), opacity=0.0, sh0=(0, 1, 2))
-    images, alphas, _ = pictures(fog, [camera()])
+    images, alphas, _ = render_tensors(fog, [camera()])
     torch.testing.assert_close(alphas, torch.full_like(alphas, 0.5), atol=1e-6, rtol=0)
     expected = 0.5 * (0.5 + 0.28209479177387814 * torch.tensor([0.0, 1.0, 2.0]))
     torch.testing.assert_close(images[0], expected.expand_as(images[0]), atol=1e-6, rtol=0)
@@ -67,7 +67,7 @@ def test_nan_in_a_parameter_that_places_a_gaussian_hides_it():
         for value in (np.nan, np.inf, -np.inf):
             arrays = {field: getattr(good, field).copy() for field in Splats.__slots__}
             arrays[name].flat[0] = value
-            pictures(Splats(**arrays), [camera(200, 100)])
+            render_tensors(Splats(**arrays), [camera(200, 100)])
 
 
 BOUNDS = """

@@ -345,18 +345,18 @@ def test_refitting_without_steps_or_without_sight_changes_nothing():
 def test_the_sensitivity_of_another_scene_is_refused():
     splats = blobs(5, 1)
     for other in (Sensitivity.none(4, 1), Sensitivity.none(5, 2)):
-        with pytest.raises(kissgs.InvalidSceneError, match="not that of the scene"):
+        with pytest.raises(kissgs.InvalidSceneError, match="does not fit the scene"):
             other.check(splats)
     right = measure_sensitivity(splats, looked_at(camera()))
     right.check(splats)
     for name, value, told in (
-        ("color_weight", -right.color_weight - 1, "color_weight has a value that is no cost"),
-        ("prior", right.prior + np.float32(np.nan), "prior has a value that is no cost"),
+        ("color_weight", -right.color_weight - 1, "color_weight has a negative or non-finite value"),
+        ("prior", right.prior + np.float32(np.nan), "prior has a negative or non-finite value"),
         ("coverage", right.coverage + np.float32(1.5), "coverage must be from 0 to 1, and has [12]"),
         ("coverage", right.coverage - np.float32(1.5), "coverage must be from 0 to 1, and has -"),
         ("captured", right.captured + np.float32(1.5), "captured must be from 0 to 1, and has [12]"),
-        ("view_uncertainty", 5.0, "its view_uncertainty is 5.0"),
-        ("view_uncertainty", float("nan"), "its view_uncertainty is nan"),
+        ("view_uncertainty", 5.0, "view_uncertainty must be from 0 to 1, not 5.0"),
+        ("view_uncertainty", float("nan"), "view_uncertainty must be from 0 to 1, not nan"),
     ):
         with pytest.raises(kissgs.InvalidSceneError, match=told):
             replace(right, **{name: value}).check(splats)

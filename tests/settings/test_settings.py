@@ -50,7 +50,7 @@ def test_settings_survive_json(preset):
 
 
 def test_a_group_changes_only_what_was_given_to_it():
-    """What it leaves unset comes from the preset named, not from the default one."""
+    """Unset values come from the given preset, not from the default one."""
     settings = Settings(preset="paper", encode=EncodeSettings(gaussians_per_codebook_entry=99))
     assert settings == Settings.from_preset("paper", gaussians_per_codebook_entry=99)
 
@@ -109,7 +109,7 @@ def test_no_number_is_unbounded(name, value):
 
 
 @pytest.mark.parametrize("name", EncodeSettings.model_fields)
-def test_every_setting_says_what_it_trades(name):
+def test_every_setting_has_a_description(name):
     assert len(EncodeSettings.model_fields[name].description) > 20
 
 
@@ -123,7 +123,7 @@ JSON = st.recursive(
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(JSON)
 def test_any_json_is_valid_or_refused(value):
-    """What a client of a service may send."""
+    """A client of the service may send any JSON."""
     try:
         chosen = Settings.model_validate(value)
     except (ValidationError, KissgsError):

@@ -86,7 +86,7 @@ def test_a_container_is_read_from_anything(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["memory", "folder", "zip"])
-def test_sizes_are_told_without_reading(kind, tmp_path):
+def test_sizes_are_reported_without_reading(kind, tmp_path):
     source = {"memory": FILES, "folder": tmp_path / "folder", "zip": tmp_path / "file.zip"}[kind]
     if kind != "memory":
         write_container(FILES, source)
@@ -104,7 +104,7 @@ def test_missing_and_oversized_files_are_refused(kind, tmp_path):
     if kind != "memory":
         write_container(FILES, source)
     assert refusal(source, "b.webp") == "the container has no file 'b.webp'"
-    assert refusal(source, "a.webp", 1023) == "a.webp has 1024 bytes; at most 1023 are possible here"
+    assert refusal(source, "a.webp", 1023) == "a.webp has 1024 bytes; the limit for this file is 1023"
     with open_source(source) as files:
         assert len(files.read("a.webp", 1024)) == 1024
 
@@ -131,7 +131,7 @@ def test_paths_that_no_file_system_has_are_refused_in_a_sentence(tmp_path, name)
 @pytest.mark.filterwarnings("ignore:Duplicate name")
 @pytest.mark.parametrize("second", ["a.webp", "other/a.webp"])
 def test_two_files_of_one_name_are_refused(second):
-    """Which of them counts? Readers differ, so a checked file could be another than the one that is used."""
+    """Readers differ in which of them they use, so a checked file could differ from the one that is used."""
     data = archive([("a.webp", b"one"), (second, b"two")])
     assert refusal(data) == "the input holds two files named 'a.webp'"
 
@@ -151,7 +151,7 @@ def test_a_zip_bomb_takes_no_memory(honest):
         data = data.replace(size, (1000).to_bytes(4, "little"))
     sentences = []
     assert takes_less_than(8 << 20, lambda: sentences.append(refusal(data)))
-    assert re.search("at most 1048576 are possible here|it is damaged or encrypted", sentences[0])
+    assert re.search("the limit for this file is 1048576|it is damaged or encrypted", sentences[0])
 
 
 def damaged(data, old, new, times):
@@ -226,7 +226,7 @@ def test_a_missing_folder_above_is_an_output_error(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", ["a.zip", "folder"])
-def test_a_full_disk_is_told_before_the_work(tmp_path, monkeypatch, name):
+def test_a_full_disk_is_reported_before_the_work(tmp_path, monkeypatch, name):
     """It still takes names, but no bytes."""
 
     def full(**_):
@@ -297,7 +297,7 @@ def test_a_folder_that_may_not_be_listed_is_refused_in_a_sentence(unreadable_fol
 
 
 def test_a_whole_container_survives_repacking():
-    """What a person does to a container: unpack, pack again with another tool, deflated and in a folder."""
+    """A container that a user has unpacked and packed again with another tool, deflated and in a folder."""
     compressed = compress(random_scene(50, 1))
     repacked = archive([(f"my scene/{name}", data) for name, data in compressed.files.items()], zipfile.ZIP_DEFLATED)
     assert (decompress(repacked).means == decompress(compressed.files).means).all()

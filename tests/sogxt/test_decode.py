@@ -113,7 +113,7 @@ def test_images_with_a_superfluous_alpha_channel():
 
 
 def test_labels_between_the_codebook_side_and_its_end_reach_into_the_next_row():
-    """As in the paper's decoder: entry = row * S + column, even where the column is beyond the row's end."""
+    """The paper's decoder uses entry = row * S + column, even if the column is beyond the row's end."""
     files = made_by_hand(50, 8, 4)
     labels = image_of("f_rest_labels", files)
     labels[0, 0, :2] = 5, 1
@@ -156,7 +156,7 @@ def test_an_image_of_another_size(name):
 
 @pytest.mark.parametrize("active", [True, False])
 def test_labels_outside_the_codebook(active):
-    """In padding, too: the paper's decoder looks all cells up."""
+    """Padding is checked too: the paper's decoder looks up all cells."""
     labels = image_of("f_rest_labels")
     cell = np.argwhere((image_of("active_mask")[:, :, 0] > 0) == active)[0]
     labels[cell[0], cell[1], :2] = 0, 8
@@ -192,7 +192,7 @@ def test_decoding_can_be_cancelled():
         decompress(FILES, progress=stop)
 
 
-def test_progress_is_told():
+def test_progress_is_reported():
     events = []
     decompress(FILES, progress=lambda stage, fraction: events.append((stage, fraction)))
     assert events[0] == ("decode", 0)

@@ -18,7 +18,7 @@ def encoded(splats, preset, **settings):
 
 
 def check(files):
-    """Ours, the paper's and the browsers' decoders agree on ``files``."""
+    """Assert that the decoders of kissgs, the paper and browsers agree on ``files``."""
     ours = decompress(files)
     reference_decoder.assert_equal_scenes(ours, reference_decoder.decode(files), files)
     shown = reference_decoder.decode_browser(files)

@@ -65,14 +65,14 @@ def test_round_trip_for_any_steps(count, seed, coarse, fine, quat_step, bits, sh
 def test_sh_of_scenes_below_the_codebook_size_is_within_its_half_steps(preset):
     splats = random_scene(50, 3, seed=2)
     result = encoded(splats, preset, gaussians_per_codebook_entry=1, rate_distortion=False)
-    half = max(result.report.half_steps["f_rest_centroids"])
+    half = max(result.report.max_quantization_error["f_rest_centroids"])
     assert_within(decompress(result.files).shN, splats.select(result.order).shN, half)
 
 
 def test_the_steps_asked_for_are_kept():
     splats = random_scene(500, 0, seed=1)
     steps = {"opacity_step": 0.2, "scale_step": 0.11, "quat_step": 0.023, "sh0_step": 0.05}
-    half = encoded(splats, **steps).report.half_steps
+    half = encoded(splats, **steps).report.max_quantization_error
     for field, step in zip(("opacities", "scales", "quaternions", "f_dc"), steps.values(), strict=True):
         assert max(half[field]) <= step / 2 * (1 + 1e-5)
         assert max(half[field]) > step / 2 * 0.95, "a smaller step than needed costs bytes"
@@ -80,7 +80,7 @@ def test_the_steps_asked_for_are_kept():
 
 @pytest.mark.parametrize("preset", ["fast", "paper"])
 def test_the_chosen_form_is_the_same_ellipsoid(preset):
-    """Also where ``clean`` left a quaternion a millionth longer than 1, as it may."""
+    """The rotation is exact even if ``clean`` left a quaternion a millionth longer than 1, as it may."""
     splats = random_scene(200, 0, seed=6)
     splats = replaced(splats, quats=splats.quats * np.float32(1 + 7e-7))
     assert clean(splats)[0].quats is splats.quats, "near enough to 1"
@@ -129,7 +129,7 @@ def test_ranges_are_those_of_the_data_to_the_last_bit(preset):
     ranges = reference_decoder.ranges_of(yaml.safe_load(result.files["container_meta.yaml"]))
     for field, data in (("opacities", splats.opacities[:, None]), ("f_dc", splats.sh0)):
         low, high = (np.ravel(limit).astype(np.float32) for limit in ranges[field])
-        half = np.array(result.report.half_steps[field])
+        half = np.array(result.report.max_quantization_error[field])
         assert (low == data.min(axis=0)).all()
         if preset == "paper":
             assert (high == data.max(axis=0)).all()
@@ -167,7 +167,7 @@ def test_every_image_spans_its_levels(count, preset):
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("count", [1, 9, 100])
 def test_padding_repeats_cells_that_are_active(count, preset):
-    """In the paper's order padding may take another form of its Gaussian, to suit its neighbours."""
+    """PRAS may give padding another form of its Gaussian, to be similar to its neighbours."""
     files = encoded(random_scene(count, 2), preset, prune_threshold_bits=0).files
     free = ("scales", "quaternions") if preset == "paper" else ()
     cells = [reference_decoder.pixels(files, f"{name}.webp") for name in PLANES[1:8] if name not in free]
@@ -193,7 +193,7 @@ def test_images_have_the_modes_that_decoders_expect(count):
 
 
 def test_quaternion_images_never_lose_their_fourth_channel():
-    """Where every alpha is 255, libwebp drops the channel and the paper's decoder fails: z is constant here."""
+    """Without varying alpha, libwebp drops the channel and the paper's decoder fails: z is constant here."""
     splats = replaced(random_scene(40, 0), quats=np.tile(unit([[0.9, 0.3, 0.1, 0.2]]), (40, 1)))
     for preset in PRESETS:
         assert reference_decoder.levels(encoded(splats, preset).files, "quaternions", 4).shape[1] == 4

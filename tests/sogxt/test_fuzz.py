@@ -87,7 +87,7 @@ def test_mutated_zips(data):
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(mutated(ZIP[ZIP.index(b"PK\x01\x02") :]))
 def test_mutated_zip_directories(directory):
-    """Where names, sizes and offsets stand."""
+    """Return the positions of names, sizes and offsets."""
     check(ZIP[: ZIP.index(b"PK\x01\x02")] + directory)
 
 
@@ -167,7 +167,7 @@ def test_a_large_declared_side_takes_no_memory(side, name):
 
 
 def test_a_webp_that_announces_more_than_the_metadata_takes_no_memory():
-    """16383 x 16383 pixels in the header of the picture itself: its size is compared before Pillow sees it."""
+    """16383 x 16383 pixels in the header of the image itself: its size is compared before Pillow sees it."""
     data = bytearray(FILES["f_dc.webp"])
     assert data[12:16] == b"VP8L"
     data[21:25] = (0xFFFFFFF | int.from_bytes(data[21:25], "little") & 0xF0000000).to_bytes(4, "little")

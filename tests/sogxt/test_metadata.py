@@ -102,7 +102,7 @@ def ops_of_other_kinds(changed):
 
 
 def fields_we_do_not_need(changed):
-    """Their ranges may be anything: nobody looks at them."""
+    """Unused fields may have any range: no decoder reads it."""
     quantize = {"min_values": ["sweet", None], "max_values": {"sour": ".inf"}}
     changed["ops"] += [{"input_fields": ["flavour"], "transforms": [{"simple_quantize": quantize}]}]
 
@@ -224,7 +224,7 @@ def test_meta_json_alone_gives_the_same_scene(degree):
 
 
 def test_a_scalar_range_in_meta_json_stands_for_all_channels():
-    """As viewers do; and a list of another length by its first number."""
+    """A number stands for all channels, as in viewers, and so does the first number of a list of another length."""
     low, high = -2.0, 3.0
 
     def scalar(meta):

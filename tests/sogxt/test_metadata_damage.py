@@ -59,7 +59,7 @@ def test_no_changed_byte_makes_another_scene(name, step, way):
 
 @pytest.mark.parametrize("name", [YAML_NAME, JSON_NAME])
 def test_whole_decoding_of_damaged_metadata(name):
-    """What :func:`meaning` looks at is all that counts: checksums of images that are lost, or that are wrong."""
+    """Only what :func:`meaning` reads must be unchanged: checksums of images may be lost, or wrong."""
     files = dict(FILES) if name == YAML_NAME else {key: data for key, data in FILES.items() if key != YAML_NAME}
     refused = 0
     for at in np.random.default_rng(3).integers(0, 8 * len(FILES[name]), 150):
@@ -106,7 +106,7 @@ def test_another_checksum_is_refused(name, checksum):
 
 @pytest.mark.parametrize("name", [YAML_NAME, JSON_NAME])
 def test_containers_without_the_checksum_are_read(name):
-    """As kissgs once wrote them, and as other encoders do."""
+    """Early versions of kissgs and other encoders wrote no checksum."""
     changed = yaml.safe_load(FILES[name])
     del changed[CHECKSUM]
     assert meaning(name, json.dumps(changed).encode()) == meaning(name, FILES[name])

@@ -1,4 +1,4 @@
-"""Metadata that must be refused in a sentence; oracle: docs/format.md, and the rules of the reference decoder."""
+"""Metadata that must be refused in a sentence; oracles: docs/reference/format.md, the reference decoder's rules."""
 
 import os
 import subprocess
@@ -179,7 +179,7 @@ def test_impossible_yaml_is_refused(change, sentence):
 
 def test_metadata_of_megabytes_is_refused_unread():
     text = b"# " + b"x" * MAX_METADATA_BYTES
-    sentence = f"has {len(text)} bytes; at most {MAX_METADATA_BYTES} are possible here"
+    sentence = f"has {len(text)} bytes; the limit for this file is {MAX_METADATA_BYTES}"
     assert refusal({"container_meta.yaml": text}) == f"container_meta.yaml {sentence}"
     assert refusal({"meta.json": text}) == f"meta.json {sentence}"
 

@@ -15,19 +15,19 @@ from kissgs.settings import EncodeSettings
 from kissgs.sogxt.planes import compress_images, decode_plane, encode_plane, probe_webp
 
 
-def picture(height, width, channels, seed=0):
+def random_image(height, width, channels, seed=0):
     return np.random.default_rng(seed).integers(0, 256, (height, width, channels), dtype=np.uint8)
 
 
 def webp(image, **options):
-    """As Pillow writes it."""
+    """Compress by Pillow."""
     buffer = io.BytesIO()
     Image.fromarray(image[:, :, 0] if image.shape[2] == 1 else image).save(buffer, "WEBP", **options)
     return buffer.getvalue()
 
 
 def decoded(data, image, channels=None):
-    """By the library, in the shape of ``image``."""
+    """Decode by kissgs, to the shape of ``image``."""
     height, width, own = image.shape
     rows = decode_plane(data, "some.webp", width=width, height=height, channels=channels or own)
     return rows.reshape(height, width, channels or own)
@@ -43,7 +43,7 @@ def decoded(data, image, channels=None):
     st.booleans(),
 )
 def test_every_image_comes_back_as_it_was(height, width, channels, quality, method, few_levels):
-    image = picture(height, width, channels, seed=height)
+    image = random_image(height, width, channels, seed=height)
     if few_levels:
         image //= 128
     data = encode_plane(image, quality=quality, method=method)
@@ -55,7 +55,7 @@ def test_every_image_comes_back_as_it_was(height, width, channels, quality, meth
 
 def test_transparent_pixels_keep_their_colour():
     """Without ``exact``, libwebp blackens pixels of alpha 0: w, x and y of quaternions whose z level is 0."""
-    image = picture(16, 16, 4)
+    image = random_image(16, 16, 4)
     image[::2, :, 3] = 0
     assert (decoded(encode_plane(image, quality=50, method=2), image) == image).all()
     assert not (decoded(webp(image, lossless=True), image) == image).all(), "the trap is gone from libwebp"
@@ -63,7 +63,7 @@ def test_transparent_pixels_keep_their_colour():
 
 def test_an_opaque_fourth_channel_is_given_back():
     """libwebp drops an alpha of 255 throughout; the level 255 of z is meant all the same."""
-    image = picture(8, 8, 4)
+    image = random_image(8, 8, 4)
     image[:, :, 3] = 255
     data = encode_plane(image, quality=50, method=2)
     assert Image.open(io.BytesIO(data)).mode == "RGB"
@@ -74,7 +74,7 @@ def test_an_opaque_fourth_channel_is_given_back():
 @pytest.mark.parametrize("wanted", [1, 3, 4])
 def test_any_channels_are_read_from_any_file(written, wanted):
     """Other encoders store grey as colour, and colour with an alpha channel."""
-    image = picture(8, 8, written)
+    image = random_image(8, 8, written)
     found = decoded(webp(image, lossless=True, exact=True), image, wanted)
     full = np.concatenate([image] * 3 if written == 1 else [image], axis=2)
     full = np.concatenate([full[:, :, :4], np.full((8, 8, 1), 255, np.uint8)], axis=2)
@@ -83,7 +83,7 @@ def test_any_channels_are_read_from_any_file(written, wanted):
 
 def test_all_images_of_a_container_keep_their_names_and_order():
     images = {
-        f"{name}.webp": picture(8, 8, channels) for name, channels in (("b", 3), ("a", 1), ("f_rest_centroids", 3))
+        f"{name}.webp": random_image(8, 8, channels) for name, channels in (("b", 3), ("a", 1), ("f_rest_centroids", 3))
     }
     fractions = []
     with blas_workers(2) as pool:
@@ -93,13 +93,13 @@ def test_all_images_of_a_container_keep_their_names_and_order():
     assert fractions == pytest.approx([1 / 3, 2 / 3, 1])
 
 
-IMAGE = picture(24, 16, 3)
+IMAGE = random_image(24, 16, 3)
 LOSSLESS = webp(IMAGE, lossless=True)
 
 
 def animated():
     buffer = io.BytesIO()
-    frames = [Image.fromarray(picture(8, 8, 3, seed)) for seed in (0, 1)]
+    frames = [Image.fromarray(random_image(8, 8, 3, seed)) for seed in (0, 1)]
     frames[0].save(buffer, "WEBP", save_all=True, append_images=frames[1:], lossless=True)
     return buffer.getvalue()
 
@@ -117,7 +117,7 @@ def png():
         (b"RIFF", "some.webp is not a WebP image"),
         (png(), "some.webp is not a WebP image"),
         (webp(IMAGE), "some.webp is a lossy or animated WebP; planes must be lossless"),
-        (webp(picture(8, 8, 4)), "some.webp is a lossy or animated WebP; planes must be lossless"),
+        (webp(random_image(8, 8, 4)), "some.webp is a lossy or animated WebP; planes must be lossless"),
         (animated(), "some.webp is a lossy or animated WebP; planes must be lossless"),
         (LOSSLESS[:-1], "some.webp is cut off: its header announces more bytes than there are"),
         (LOSSLESS[:100], "some.webp is cut off: its header announces more bytes than there are"),
@@ -132,7 +132,7 @@ def test_what_is_no_lossless_webp_is_refused_by_name(data, sentence):
 
 
 @pytest.mark.parametrize("extra", [{"exif": b"Exif\0\0MM\0*\0\0\0\x08\0\0\0\0\0\0"}, {"icc_profile": b"x" * 131}])
-def test_size_of_images_with_metadata_is_that_of_the_picture(extra):
+def test_size_of_images_with_metadata_is_that_of_the_image(extra):
     data = webp(IMAGE, lossless=True, **extra)
     assert data[12:16] == b"VP8X"
     assert probe_webp(data, "some.webp") == (16, 24)
@@ -140,7 +140,7 @@ def test_size_of_images_with_metadata_is_that_of_the_picture(extra):
 
 
 def test_two_sizes_in_one_file_are_refused():
-    """The outer header says 16 x 24, the picture inside is of another size: which would memory be taken for?"""
+    """The outer header says 16 x 24, the image inside is of another size: for which memory must not be allocated?"""
     data = bytearray(webp(IMAGE, lossless=True, icc_profile=b"x" * 131))
     data[24:27] = struct.pack("<I", 99)[:3]
     with pytest.raises(InvalidContainerError, match="has no lossless WebP image inside"):
@@ -154,7 +154,7 @@ def test_another_size_than_the_metadata_says_is_refused(size):
     assert str(caught.value) == f"some.webp is 16 x 24 pixels; the metadata asks for {size[0]} x {size[1]}"
 
 
-def test_damage_inside_the_picture_is_refused():
+def test_damage_inside_the_image_is_refused():
     """The header is whole, so only decoding can tell; libwebp notices most damage, not all."""
     broken = LOSSLESS[:30] + bytes(len(LOSSLESS) - 30)
     with pytest.raises(InvalidContainerError, match=r"some\.webp is damaged: its WebP data cannot be decoded"):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from helpers.training_scenes import around, cloud, same, taught
+from helpers.training_scenes import around, cloud, same, targets_of
 
 import kissgs
 from kissgs.rendering.losses import plain_photometric_loss
@@ -34,7 +34,7 @@ def dimmed(scene):
 
 def test_it_finds_the_way_back_to_the_pictures():
     scene = cloud(40)
-    targets, begun = taught(scene), dimmed(scene)
+    targets, begun = targets_of(scene), dimmed(scene)
     model = GaussianModel(begun)
     train(model, targets, plan(200))
     assert error(model.splats(), targets) < 0.03 * error(begun, targets)
@@ -43,14 +43,14 @@ def test_it_finds_the_way_back_to_the_pictures():
 def test_nothing_moves_where_nothing_is_to_be_learned():
     """The scene's own pictures, but for their rounding to float16."""
     scene = cloud(40)
-    targets, model = taught(scene), GaussianModel(scene)
+    targets, model = targets_of(scene), GaussianModel(scene)
     train(model, targets, plan(4, rates=lambda done: dict.fromkeys(RATES, 1e-9)))
     np.testing.assert_allclose(model.splats().means, scene.means, atol=1e-7)
 
 
 def test_it_stops_and_goes_on_as_if_nothing_had_been():
     scene = cloud(40)
-    targets, whole = taught(scene), GaussianModel(dimmed(scene))
+    targets, whole = targets_of(scene), GaussianModel(dimmed(scene))
     train(whole, targets, plan(23))
     kept = []
 
@@ -70,7 +70,7 @@ def test_it_stops_and_goes_on_as_if_nothing_had_been():
 @pytest.mark.parametrize("threads", [2, 3])
 def test_no_bit_depends_on_threads(threads):
     scene = cloud(300, 3)
-    targets, found = taught(scene), []
+    targets, found = targets_of(scene), []
     for number in (1, threads):
         model, before = GaussianModel(dimmed(scene)), torch.get_num_threads()
         train(model, targets, plan(8), threads=number)
@@ -83,7 +83,7 @@ def test_another_seed_is_another_order():
     scene, found = cloud(40), []
     for seed in (0, 1):
         model = GaussianModel(dimmed(scene))
-        train(model, taught(scene), plan(7, seed=(seed,)))
+        train(model, targets_of(scene), plan(7, seed=(seed,)))
         found.append(model.splats())
     assert not same(*found)
 
@@ -105,14 +105,14 @@ class Pull:
 def test_regularizers_have_their_say():
     scene, pull = cloud(40), Pull()
     model = GaussianModel(scene)
-    train(model, taught(scene), plan(40, regularizers=(pull,)), first=3)
+    train(model, targets_of(scene), plan(40, regularizers=(pull,)), first=3)
     assert pull.asked == [step for step, _ in pull.updated] == list(range(3, 40))
     assert pull.updated[-1][1] < 0.9 * float((scene.means**2).sum())
 
 
 def test_what_is_told_is_the_loss():
     scene, notes = cloud(40), []
-    targets = taught(scene)
+    targets = targets_of(scene)
     begun = dimmed(scene)
     frozen = plan(3, rates=lambda done: dict.fromkeys(RATES, 0.0))
     train(GaussianModel(begun), targets, frozen, progress=lambda stage, fraction, note="": notes.append(note))
@@ -139,5 +139,5 @@ def test_rates_fall_as_in_3dgs():
 def test_pictures_of_several_sizes_and_one_gaussian():
     scene = cloud(1, 0)
     model = GaussianModel(scene)
-    train(model, taught(scene, (*around(2, 40), *around(3, 24))), plan(6))
+    train(model, targets_of(scene, (*around(2, 40), *around(3, 24))), plan(6))
     assert len(model) == 1

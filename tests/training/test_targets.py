@@ -6,7 +6,7 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from helpers.training_scenes import around, cloud, taught
+from helpers.training_scenes import around, cloud, targets_of
 from PIL import Image
 
 from kissgs.cameras.views import View, black
@@ -37,18 +37,18 @@ def test_photographs_are_what_is_learned_where_there_are_any(tmp_path):
     mixed = training_targets(cloud(), [views[0], around(2)[1]], black())
     assert mixed.target_source == "photos"
     np.testing.assert_array_equal(mixed.picture(0), found.picture(0))
-    np.testing.assert_array_equal(mixed.picture(1), taught(cloud(), around(2)).picture(1))
+    np.testing.assert_array_equal(mixed.picture(1), targets_of(cloud(), around(2)).picture(1))
 
 
 @pytest.mark.parametrize("first", [0, 1, 3, 4, 9])
 def test_the_order_can_be_taken_up_anywhere(first):
-    found = taught(cloud())
+    found = targets_of(cloud())
     whole = list(islice(found.order((7,)), 40))
     assert list(islice(found.order((7,), first), 40 - first)) == whole[first:]
 
 
 def test_every_view_comes_once_in_every_round():
-    found = taught(cloud())
+    found = targets_of(cloud())
     steps = list(islice(found.order((0, 1)), 20))
     assert all(Counter(steps[n : n + 4]) == Counter(range(4)) for n in range(0, 20, 4))
     assert steps != list(islice(found.order((0, 2)), 20))
@@ -57,7 +57,7 @@ def test_every_view_comes_once_in_every_round():
 
 def test_the_extent_is_that_of_the_cameras():
     """A circle of radius 3: in INRIA's code, 1.1 times the largest distance from the mean."""
-    assert taught(cloud()).extent == pytest.approx(3.3)
+    assert targets_of(cloud()).extent == pytest.approx(3.3)
 
 
 def test_the_reach_of_each_object_is_that_of_the_cameras_about_it():

@@ -6,8 +6,8 @@ import shutil
 import pytest
 from helpers.web_scenes import (
     IMAGES,
+    assert_progress,
     assert_scene,
-    assert_told,
     container,
     job,
     with_meta,
@@ -133,7 +133,7 @@ def test_every_way_to_decode(do, site, options, within, large):
     ):
         said = do(job(source, options={**options, "keepPlanes": keep}), within)
         assert assert_scene(said, files) <= WORST
-        assert_told(said)
+        assert_progress(said)
 
 
 @pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 64, 65])
@@ -143,7 +143,7 @@ def test_small_scenes(do, preset, count):
         files = container(preset, degree, count)
         said = do(job(files, options={"keepPlanes": True}))
         assert assert_scene(said, files) <= WORST
-        assert_told(said)
+        assert_progress(said)
 
 
 def test_the_browser_decodes_all_but_rotations_exactly(do, large):
@@ -276,7 +276,7 @@ def test_a_real_scene(do, site, shared_data):
     files = dict(kissgs.compress(shared_data / "guitar" / "guitar.ply", settings=kissgs.Settings(preset="fast")).files)
     said = do(job(site.put("guitar", files), options={"keepPlanes": True}))
     assert assert_scene(said, files) <= WORST
-    assert_told(said)
+    assert_progress(said)
 
 
 def test_a_scene_by_names_of_kind_alone(do):

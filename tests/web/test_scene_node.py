@@ -8,8 +8,8 @@ import pytest
 from helpers.web_scenes import (
     IMAGES,
     array_of,
+    assert_progress,
     assert_scene,
-    assert_told,
     container,
     in_node,
     job,
@@ -44,7 +44,7 @@ def test_every_preset_degree_and_count(preset, degree):
     for said, some in zip(found, files, strict=True):
         assert sorted(said["planes"]) == sorted(IMAGES)
         assert assert_scene(said, some) <= WORST
-        assert_told(said)
+        assert_progress(said)
 
 
 def extremes():
@@ -98,7 +98,7 @@ def test_every_kind_of_source(site):
     )
     for said in found:
         assert assert_scene(said, files) <= WORST
-        assert_told(said)
+        assert_progress(said)
     assert found[9]["progress"][-1]["received"] == sum(len(files[name]) for name in (*IMAGES, "meta.json"))
     assert found[12]["progress"][-1]["received"] == len(zipped(files))
 
@@ -128,7 +128,7 @@ def test_images_in_the_worst_order(site):
         site.late[f"/late/{name}.webp"] = 0.05 * (i + 1)
     (said,) = in_node(job(address))
     assert assert_scene(said, files) <= WORST
-    assert_told(said)
+    assert_progress(said)
 
 
 def test_what_is_known_until_now_is_in_the_scene(site):
@@ -137,7 +137,7 @@ def test_what_is_known_until_now_is_in_the_scene(site):
     address = site.put("coarse", files)
     site.late["/coarse/means_bytes_0.webp"] = 0.3
     (said,) = in_node(job(address, snapshots=["active_mask.webp", "means_bytes_1.webp"]))
-    assert_told(said)
+    assert_progress(said)
     assert assert_scene(said, files) <= WORST
     neutral = {name: array_of(text, name) for name, text in said["snapshots"]["active_mask.webp"].items()}
     assert (neutral["quats"].reshape(-1, 4) == [1, 0, 0, 0]).all()
@@ -208,4 +208,4 @@ def test_a_real_scene(shared_data, preset):
     )
     (said,) = in_node(job(files, options={"keepPlanes": True}))
     assert assert_scene(said, files) <= WORST
-    assert_told(said)
+    assert_progress(said)

@@ -55,7 +55,7 @@ def refused(folder, *writers, why=""):
 def plain(width, height, seed=0):
     writer = Writer(width, height)
     writer.put(0, 1)
-    writer.image(argb(width * height, seed), picture=True)
+    writer.image(argb(width * height, seed), main=True)
     return writer
 
 
@@ -65,7 +65,7 @@ def with_tiles(kind, bits, width, height, pixel):
     writer.transform(kind, bits)
     writer.image([pixel(i) for i in range(tiles(width, bits) * tiles(height, bits))])
     writer.put(0, 1)
-    writer.image(argb(width * height, seed=bits), picture=True)
+    writer.image(argb(width * height, seed=bits), main=True)
     return writer
 
 
@@ -111,7 +111,7 @@ def test_transforms_in_any_order(order, tmp_path):
         if kind != SUBTRACT_GREEN:
             writer.image(np.array(argb(4 * 3, seed=kind)) & (0xFFFFF5FF if kind == PREDICTOR else -1))
     writer.put(0, 1)
-    writer.image(argb(600), picture=True)
+    writer.image(argb(600), main=True)
     accepted(tmp_path, writer)
 
 
@@ -139,7 +139,7 @@ def test_palettes_with_indices_beyond_them(size, before, others, tmp_path):
     if not before:
         put_others()
     writer.put(0, 1)
-    writer.image(argb(across * height), picture=True)
+    writer.image(argb(across * height), main=True)
     accepted(tmp_path, writer)
 
 
@@ -341,7 +341,7 @@ def test_alpha_is_what_is_stored_whatever_the_hint_says(hint, tmp_path):
     writer = Writer(6, 4, alpha=hint)
     writer.put(0, 1)
     pixels = argb(24)
-    writer.image(pixels, picture=True)
+    writer.image(pixels, main=True)
     assert_like_pillow(tmp_path, writer, channels=3 + hint)
     wanted = np.array(pixels, dtype=np.uint32).view(np.uint8).reshape(-1, 4)[:, [2, 1, 0, 3]]
     (got,) = decode_all(tmp_path, [writer.file()])
@@ -361,7 +361,7 @@ def test_a_transform_twice(kind, tmp_path):
         if kind != SUBTRACT_GREEN:
             writer.image([0xFF000000] * (200 if kind == INDEXING else 1))
     writer.put(0, 1)
-    writer.image(argb(16), picture=True)
+    writer.image(argb(16), main=True)
     refused(tmp_path, writer, why="the same transform twice")
 
 
@@ -369,7 +369,7 @@ def test_a_transform_twice(kind, tmp_path):
 def test_other_versions(version, tmp_path):
     writer = Writer(4, 4, version=version)
     writer.put(0, 1)
-    writer.image(argb(16), picture=True)
+    writer.image(argb(16), main=True)
     refused(tmp_path, writer, why="version")
 
 
