@@ -249,7 +249,7 @@ def test_a_psnr_to_the_scene_is_not_sought_where_photographs_teach(tmp_path):
     settings = Settings.from_preset(
         "balanced", finetune=SHORT, psnr=30.0, sensitivity_views=4, sensitivity_view_size=60
     )
-    with pytest.raises(UnsupportedError, match="ask for a size"):
+    with pytest.raises(UnsupportedError, match="give a target size"):
         kissgs.compress(cloud(60), settings=settings, views=Views(tuple(views), (), black(), "photos"))
 
 

@@ -116,9 +116,9 @@ def test_the_report_adds_up(tmp_path, ply):
     assert report.cpu_seconds > 0
     assert report.peak_memory > report.source_bytes
     assert Settings.model_validate(report.settings) == FAST
-    report = json.loads(json.dumps(report.as_dict()))
-    assert report["cleaned"]["non_finite"] == 1
-    assert report["ratio"] == report.ratio
+    decoded = json.loads(json.dumps(report.as_dict()))
+    assert decoded["cleaned"]["non_finite"] == 1
+    assert decoded["ratio"] == report.ratio
 
 
 def test_the_report_of_arrays_counts_their_bytes():

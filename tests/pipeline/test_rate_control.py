@@ -142,7 +142,7 @@ def test_no_goal_is_met_if_an_object_is_lost(goal):
     trial = search.trials[0]
     assert search.best is None
     assert trial.worst < 20
-    assert f"worst view {trial.worst:.1f} dB" in trial.spelled()
+    assert f"worst view {trial.worst:.1f} dB" in trial.summary()
     assert {"worst", "fifth_percentile"} <= set(trial.as_dict())
 
 

@@ -84,7 +84,7 @@ def test_impossible_budgets_are_refused(service, compact):
 
 def test_a_service_without_torch_does_not_accept_what_it_cannot_do(monkeypatch):
     monkeypatch.setattr("service.http.submission.can_train", lambda: False)
-    with pytest.raises(ProblemError, match="no torch to train with"):
+    with pytest.raises(ProblemError, match="need torch, which this server does not have"):
         parse_options('{"compact": {"ratio": 0.2}}')
     assert parse_options('{"preset": "fast", "compact": {"ratio": 0.2}}').kind == "fast+compact"
     assert parse_options("{}").kind == "balanced"
