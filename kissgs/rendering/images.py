@@ -49,8 +49,8 @@ def render_all(
     """
     if 3 * sum(camera.width * camera.height for camera in cameras) > MAX_PIXEL_BYTES:
         raise UnsupportedError(
-            f"{len(cameras)} images of this size would take too much memory, more than {MAX_PIXEL_BYTES >> 30} GiB; make "
-            "them smaller"
+            f"{len(cameras)} images of this size would take too much memory, more than {MAX_PIXEL_BYTES >> 30} GiB; "
+            "make them smaller"
         )
     rendered: dict[int, UInt8[np.ndarray, "H W 3"]] = {}
     for done, camera in enumerate(cameras):
