@@ -17,6 +17,7 @@ from kissgs.core.array_types import Int
 from kissgs.core.errors import InvalidSceneError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
+from kissgs.evaluation.results import ImageMetrics
 from kissgs.settings import CompactSettings
 from kissgs.training.supervision import SCORED, SupervisionViews, supervision_views
 
@@ -144,20 +145,8 @@ def compare_strategies(
         from kissgs.training.targets import training_targets
 
         targets = training_targets(splats, supervised.train, supervised.background, threads=threads, progress=progress)
-
-    def evaluated(strategy: str, scene: Splats, seconds: float, cpu_seconds: float) -> CompactionPoint:
-        metrics, size = evaluate_scene(scene, splats, supervised, threads, progress)
-        return CompactionPoint(
-            strategy=strategy,
-            count=len(scene),
-            psnr=metrics.psnr,
-            ssim=metrics.ssim,
-            bytes=size,
-            seconds=seconds,
-            cpu_seconds=cpu_seconds,
-        )
-
-    points = [evaluated("input", splats, 0.0, 0.0)]
+    metrics, size = evaluate_scene(splats, splats, supervised, threads, progress)
+    points = [_point("input", splats, metrics, size, 0.0, 0.0)]
     for strategy in strategies:
         for ratio in ratios:
             count = max(1, round(len(splats) * ratio))
@@ -174,8 +163,23 @@ def compare_strategies(
                 progress=progress,
             )
             wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-            points.append(evaluated(strategy.name, found.splats, wall, cpu))
+            metrics, size = evaluate_scene(found.splats, splats, supervised, threads, progress)
+            points.append(_point(strategy.name, found.splats, metrics, size, wall, cpu))
     return points
+
+
+def _point(
+    strategy: str, scene: Splats, metrics: ImageMetrics, size: int, seconds: float, cpu_seconds: float
+) -> CompactionPoint:
+    return CompactionPoint(
+        strategy=strategy,
+        count=len(scene),
+        psnr=metrics.psnr,
+        ssim=metrics.ssim,
+        bytes=size,
+        seconds=seconds,
+        cpu_seconds=cpu_seconds,
+    )
 
 
 def _supervision(

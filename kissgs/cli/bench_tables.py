@@ -58,7 +58,9 @@ def ablation_table(rows: Sequence[tuple[str, AblationRow]]) -> RenderableType:
                 else (f"{row.cpu_seconds:.1f}",)
             )
             table.add_row(
-                *(row.name, f"{row.bytes:,}", _share(row.bytes_change)),
+                row.name,
+                f"{row.bytes:,}",
+                _share(row.bytes_change),
                 *((_share(row.equal_psnr_change),) if equal else ()),
                 _signed(row.psnr_change) if row.name != "nothing" else spell(row.psnr, 2),
                 *((_photo(row),) if photographed else ()),
