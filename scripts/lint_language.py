@@ -33,7 +33,7 @@ PRIVATE_WORDS = re.compile(
 )
 """Words with a plain equivalent in docs/glossary.md; camelCase and snake_case parts count as words."""
 
-IGNORED = re.compile(r"scripts/lint_language\.py|LICENSE|package-lock\.json|.*constraints.*|docs/glossary\.md")
+IGNORED = re.compile(r"scripts/lint_language\.py|LICENSE|.*/package-lock\.json|.*constraints.*|docs/glossary\.md")
 
 
 def main(arguments: list[str]) -> int:

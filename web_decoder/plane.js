@@ -1,14 +1,15 @@
-/** One image of a container: decoded and verified. */
+/** Decoding and verification of one image of a container. */
 
 import { decodeWebP } from "./webp.js";
 import { crc32 } from "./zip.js";
 
 /** @import { Plane, Task } from "./types.js" */
 
-/** Where a lossless WebP file has its size, if nothing stands before its picture; the bit above tells of alpha. */
-const [HEADER, SIDE_BITS] = [21, 14];
+/** Offset of the size in a lossless WebP file whose only chunk is the image, and bits per side; alpha is the next bit. */
+const [SIZE_OFFSET, SIDE_BITS] = [21, 14];
 
 /**
+ * Decode an image in JavaScript, and check its size and checksum.
  * @param {Task} task
  * @returns {Plane}
  */
@@ -19,7 +20,7 @@ export function decodePlane({ file, bytes, width, height, checksum }) {
       throw new Error(`${plane.width} x ${plane.height} pixels, not ${width} x ${height}`);
     }
     if (checksum !== undefined && crc32(plane.rgba) !== checksum) {
-      throw new Error("damaged: other pixels than were stored");
+      throw new Error("damaged: its pixels do not match their checksum");
     }
     return plane;
   } catch (error) {
@@ -28,15 +29,15 @@ export function decodePlane({ file, bytes, width, height, checksum }) {
 }
 
 /**
- * By the browser, where a checksum proves what it gives, and for images without alpha: browsers multiply colours by
- * alpha and divide again.
+ * Decode an image by the browser, if it has a checksum that verifies the result and no alpha, which browsers would
+ * premultiply; undefined if that is not possible.
  * @param {Task} task
  * @returns {Promise<Plane | undefined>}
  */
 export async function decodeNatively({ bytes, width, height, checksum, native }) {
-  if (!native || checksum === undefined || !("ImageDecoder" in globalThis) || bytes.length < HEADER + 4)
+  if (!native || checksum === undefined || !("ImageDecoder" in globalThis) || bytes.length < SIZE_OFFSET + 4)
     return undefined;
-  const header = new DataView(bytes.buffer, bytes.byteOffset).getInt32(HEADER, true);
+  const header = new DataView(bytes.buffer, bytes.byteOffset).getInt32(SIZE_OFFSET, true);
   if (header !== ((width - 1) | ((height - 1) << SIDE_BITS))) return undefined;
   const data = /** @type {Uint8Array<ArrayBuffer>} */ (bytes);
   const decoder = new ImageDecoder({ data, type: "image/webp", colorSpaceConversion: "none" });

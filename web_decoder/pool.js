@@ -1,24 +1,24 @@
-/** Threads that decode images. */
+/** A pool of workers that decode images. */
 
 import { decodeNatively, decodePlane } from "./plane.js";
 
 /** @import { Plane, Task } from "./types.js" */
 
-/** Pixels of images that are decoded sooner than a worker can be told. */
-const FEW_PIXELS = 128 ** 2;
+/** Images with fewer pixels are decoded in the caller's thread, which takes less time than a message to a worker. */
+const MIN_WORKER_PIXELS = 128 ** 2;
 const MAX_WORKERS = 4;
 
-/** Workers, started as they are needed, or the caller's thread where there are none. */
+/** Workers, started when needed; the caller's thread where there are none. */
 export class Pool {
-  /** Bytes that each has still to do. @type {Map<Worker, number>} */
+  /** Bytes that each worker has yet to decode. @type {Map<Worker, number>} */
   workers = new Map();
-  /** What the caller's thread is doing. @type {Promise<unknown>} */
+  /** The latest task of the caller's thread. @type {Promise<unknown>} */
   last = Promise.resolve();
   closed = false;
 
-  /** @param {number} [most] workers */
-  constructor(most = Math.min(globalThis.navigator?.hardwareConcurrency ?? 1, MAX_WORKERS)) {
-    this.most = most;
+  /** @param {number} [maxWorkers] */
+  constructor(maxWorkers = Math.min(globalThis.navigator?.hardwareConcurrency ?? 1, MAX_WORKERS)) {
+    this.maxWorkers = maxWorkers;
   }
 
   /**
@@ -26,22 +26,22 @@ export class Pool {
    * @returns {Promise<Plane>}
    */
   async decode(task) {
-    const plane = await decodeNatively(task); // in threads of the browser's own
+    const plane = await decodeNatively(task); // in the browser's own threads
     if (plane) return plane;
-    const worker = task.width * task.height < FEW_PIXELS ? undefined : this.choose();
-    return worker ? this.inWorker(worker, task) : this.here(task);
+    const worker = task.width * task.height < MIN_WORKER_PIXELS ? undefined : this.choose();
+    return worker ? this.inWorker(worker, task) : this.inCaller(task);
   }
 
-  /** The worker with the least to do. */
+  /** Return the worker with the fewest bytes to decode; start another one if all are busy and there may be more. */
   choose() {
     const [[worker, load] = []] = [...this.workers].sort(([, a], [, b]) => a - b);
-    if ((worker && !load) || this.workers.size >= this.most) return worker;
+    if ((worker && !load) || this.workers.size >= this.maxWorkers) return worker;
     try {
-      const another = start();
+      const another = startWorker();
       this.workers.set(another, 0);
       return another;
     } catch {
-      this.most = 0; // Node has none
+      this.maxWorkers = 0; // Node.js has no workers of this kind
       return worker;
     }
   }
@@ -58,21 +58,21 @@ export class Pool {
         if (plane) resolve(plane);
         else reject(new Error(error));
       };
-      // It could not be loaded: a page's policy forbids it, or a bundler left it out.
+      // The worker could not be loaded: the page's policy forbids it, or a bundler omitted it.
       worker.addEventListener("error", () => {
         port1.close();
         this.workers.delete(worker);
-        this.most = 0;
-        resolve(this.here(task));
+        this.maxWorkers = 0;
+        resolve(this.inCaller(task));
       });
       worker.postMessage({ task: { ...task, bytes: task.bytes.slice() }, port: port2 }, [port2]);
     });
   }
 
-  /** One image after the other, and whatever else waits for the thread in between. @type {(task: Task) => Promise<Plane>} */
-  here(task) {
+  /** Decode in the caller's thread, one image after the other, with a turn of the event loop between them. @type {(task: Task) => Promise<Plane>} */
+  inCaller(task) {
     const plane = this.last.then(pause).then(() => {
-      if (this.closed) throw new Error("ended");
+      if (this.closed) throw new Error("closed");
       return decodePlane(task);
     });
     this.last = plane.catch(() => {});
@@ -85,17 +85,17 @@ export class Pool {
   }
 }
 
-function start() {
+function startWorker() {
   try {
     return new Worker(new URL("./worker.js", import.meta.url), { type: "module" });
   } catch {
-    // Scripts from another origin may only be imported.
+    // A script of another origin can only be imported.
     const script = `import ${JSON.stringify(new URL("./worker.js", import.meta.url))}`;
     return new Worker(URL.createObjectURL(new Blob([script], { type: "text/javascript" })), { type: "module" });
   }
 }
 
-/** Let the event loop turn; timers would take 4 ms each. */
+/** Wait for a turn of the event loop; a timer would take 4 ms. */
 const pause = () =>
   new Promise((resolve) => {
     const { port1, port2 } = new MessageChannel();

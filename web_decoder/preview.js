@@ -1,4 +1,4 @@
-/** The page: what is opened, shown and compared, and which keys and buttons do that. */
+/** The preview page: opening, showing and comparing scenes, with its keys and buttons. */
 
 import { decode } from "./sogxt.js";
 import { announce, byId, dropAnywhere, el } from "./preview/dom.js";
@@ -19,29 +19,29 @@ import { Trouble, aborted, trouble } from "./preview/trouble.js";
  * @typedef {import("./preview/loading.js").Load} Load
  */
 
-/** Larger scenes are refused: few browsers could hold them, and a small file may claim any size. */
-const MOST_GAUSSIANS = 10_000_000;
+/** Larger scenes are refused: few browsers have the memory, and a small file may declare any size. */
+const MAX_GAUSSIANS = 10_000_000;
 
 const loads = loader();
 const view = stage(trouble);
-/** What is shown. @type {{scene: Scene, source: Source, seconds: number | null} | null} */
+/** The container on display. @type {{scene: Scene, source: Source, seconds: number | null} | null} */
 let shown = null;
 
 /**
- * Do something that takes a while, with the card that shows how far it is.
+ * Do a long operation, and show its progress.
  * @param {string} what
  * @param {(load: Load) => Promise<void>} work
  */
 async function during(what, work) {
   const load = loads.begin(what);
-  trouble(view.failure); // which stays true, whatever is opened
+  trouble(view.failure); // remains valid, whatever is opened
   try {
     await work(load);
   } catch (error) {
     if (!aborted(error)) trouble(error);
   }
   load.done();
-  byId("empty").hidden = !byId("picture").hidden || !byId("loading").hidden;
+  byId("empty").hidden = !byId("viewport").hidden || !byId("loading").hidden;
 }
 
 /**
@@ -62,14 +62,14 @@ async function openContainer(source, load) {
     arrived.add(file);
     if (shown?.scene !== scene) {
       shown = { scene, source, seconds: null };
-      entitle(source.name);
-      view.conceal(); // another scene's picture under this one's name, if its positions never come
+      setTitle(source.name);
+      view.conceal(); // else the former scene would stay under this name if the positions never arrive
     }
     refine(scene, stageOf(arrived, scene.degree));
   }
   /** @param {import("./types.js").Progress} progress */
   function onProgress({ received, total, decoded, planes }) {
-    // Of a folder the files are announced one by one: unless it has been said before, nobody knows the sum.
+    // The sizes of a folder's files become known one by one, so that the total is known only if the service says it.
     const known = source.zipped ? total : (source.bytes ?? 0);
     load.progress({ received, total: total && known, decoded, planes });
     if (source.zipped) source.bytes = received;
@@ -80,7 +80,7 @@ async function openContainer(source, load) {
       signal: load.signal,
       request,
       keepPlanes: true,
-      maxGaussians: MOST_GAUSSIANS,
+      maxGaussians: MAX_GAUSSIANS,
       onProgress,
       onPlane,
     });
@@ -92,7 +92,7 @@ async function openContainer(source, load) {
     if (shown?.source === source && !load.signal.aborted) refine(shown.scene, lastStageOf(arrived));
     throw error;
   } finally {
-    if (shown?.source === source) showFacts(); // also what there is of it after an error
+    if (shown?.source === source) showFacts(); // after an error, those of the images that arrived
   }
 }
 
@@ -114,7 +114,7 @@ async function openPly(file, load) {
   load.signal.throwIfAborted();
   const gaussians = await readable(view.showPly(bytes));
   shown = null;
-  entitle(file.name);
+  setTitle(file.name);
   byId("statistics").replaceChildren(...plyStatisticsView(gaussians, file.size));
   byId("planes").replaceChildren();
   byId("panel").hidden = false;
@@ -132,7 +132,7 @@ async function compareWith(bytes) {
   announce("Original to the left, compressed to the right of the handle.");
 }
 
-/** @template T @param {Promise<T>} reading */
+/** Replace errors of reading a .ply by a message. @template T @param {Promise<T>} reading */
 const readable = (reading) =>
   reading.catch((error) => {
     throw error instanceof Trouble
@@ -176,7 +176,7 @@ function pick(accept) {
 }
 
 /** @param {string} name */
-function entitle(name) {
+function setTitle(name) {
   byId("title").textContent = name;
   document.title = `${name} · kissgs`;
 }
@@ -197,7 +197,7 @@ byId("file").addEventListener("change", () => {
   byId("file").value = ""; // so that the same file can be chosen again
 });
 dropAnywhere(take);
-listen({ picture: byId("picture"), home: view.home, move: view.press });
+listen({ viewport: byId("viewport"), home: view.home, move: view.press });
 
 const job = jobIn(location);
 if (job) byId("home").href = `../#${job}`;

@@ -1,9 +1,9 @@
-/** Images of a container to the arrays of a scene. docs/reference/format.md of kissgs explains the steps. */
+/** Conversion of decoded images to the arrays of a scene, see docs/reference/format.md of kissgs. */
 
 import { crc32 } from "./zip.js";
 
 /** @import { Scene } from "./types.js" */
-/** Values of the lowest and of the highest level that occur in an image. @typedef {number[]} Range */
+/** Values of the lowest and the highest level that occur in an image. @typedef {number[]} Range */
 
 /** @type {(why: string) => never} */
 const fail = (why) => {
@@ -12,26 +12,26 @@ const fail = (why) => {
 
 export const [META, MASK] = ["meta.json", "active_mask.webp"];
 const [KISSGS, CHECKSUM] = ["kissgs", "kissgs_crc32"];
-/** Stands for the block of kissgs where another encoder has written. */
-const NOT_OURS = { version: "-", sh_degree: 0 };
+/** The block "kissgs" of a container of another encoder. */
+const OTHER_ENCODER = { version: "-", sh_degree: 0 };
 const [HIGH, LOW, QUATS] = ["means_bytes_1.webp", "means_bytes_0.webp", "quaternions.webp"];
 const [LABELS, CENTROIDS] = ["f_rest_labels.webp", "f_rest_centroids.webp"];
-/** In the order in which they make a picture. */
+/** All images, in the order of decoding: those of a coarse rendering first. */
 export const PLANES = [MASK, HIGH, "f_dc.webp", "opacities.webp", "scales.webp", QUATS, LOW, LABELS, CENTROIDS];
-/** Images that hold one field in 8-bit levels, and its number of channels. */
-const PLAIN = /** @type {Record<string, ["sh0" | "opacities" | "scales" | "quats", number]>} */ ({
+/** Images of a single field with 8-bit levels: the field and its number of channels. */
+const SINGLE_FIELD = /** @type {Record<string, ["sh0" | "opacities" | "scales" | "quats", number]>} */ ({
   "f_dc.webp": ["sh0", 3],
   "opacities.webp": ["opacities", 1],
   "scales.webp": ["scales", 3],
   [QUATS]: ["quats", 4],
 });
-/** Of spherical harmonics, by degree. */
+/** Number of SH coefficients beside `sh0`, by degree. */
 export const COEFFICIENTS = [0, 3, 8, 15];
 const [TILE_ROWS, TILE_COLUMNS] = [3, 5];
-const KIND = JSON.stringify(["sog-xt", 3, "direct", "uv-codebook", 15, TILE_ROWS, TILE_COLUMNS]);
+const VARIANT = JSON.stringify(["sog-xt", 3, "direct", "uv-codebook", 15, TILE_ROWS, TILE_COLUMNS]);
 const MAX_GRID_SIDE = 13376;
 const MAX_CODEBOOK_SIDE = 256;
-const MAX_SIGNED_LOG = 88.7; // e to more than this is beyond float32
+const MAX_SIGNED_LOG = 88.7; // exp() of more is not a float32
 
 /** @type {(json: Uint8Array) => any} */
 function parse(json) {
@@ -43,7 +43,7 @@ function parse(json) {
   }
 }
 
-/** A range for each channel; one number stands for all. @type {(field: any, ends: string[], channels: number) => Range[]} */
+/** Return the range of each channel; a single number is that of all channels. @type {(field: any, ends: string[], channels: number) => Range[]} */
 function rangesOf(field, ends, channels) {
   const lists = ends.map((end) => [field?.[end]].flat());
   return Array.from({ length: channels }, (_, i) => {
@@ -55,15 +55,15 @@ function rangesOf(field, ends, channels) {
   });
 }
 
-/** The lowest and the highest level of an image's first channels. @type {(levels: Uint8Array | Uint16Array, channels: number) => Range} */
-function observe(levels, channels) {
+/** Return the lowest and the highest level of an image's first channels. @type {(levels: Uint8Array | Uint16Array, channels: number) => Range} */
+function observedLevels(levels, channels) {
   const seen = new Uint8Array(1 << (8 * levels.BYTES_PER_ELEMENT));
   for (let i = 0; i < levels.length; i += 4) for (let c = 0; c < channels; c++) seen[levels[i + c]] = 1;
   return [seen.indexOf(1), seen.lastIndexOf(1)];
 }
 
 /**
- * The values of all levels, channel by channel.
+ * Return the values of all levels, channel by channel.
  * @param {Range} observed
  * @param {Range[]} ranges
  * @param {number} [levels]
@@ -76,11 +76,11 @@ const valuesOf = ([lowest, highest], ranges, levels = 256, finish = (value) => v
     return finish(low + (level / Math.max(highest - lowest, 1)) * (high - low));
   });
 
-/** A scene, and how images become its values, in whichever order they come. */
+/** A scene that is assembled from decoded images, which may arrive in any order. */
 export class Assembly {
   /** @type {Record<string, Range[]>} */
   ranges = {};
-  /** Images of positions. @type {Record<string, Uint8Array>} */
+  /** Pixels of position images until both have arrived. @type {Record<string, Uint8Array>} */
   bytes = {};
 
   /**
@@ -93,29 +93,33 @@ export class Assembly {
     const { layout = "uv-codebook", coeffs = 15, tileRows = TILE_ROWS, tileCols = TILE_COLUMNS } = shN;
     const { centroidSide: codebookSide } = shN;
     const { encoding = "direct" } = quats;
-    const kind = JSON.stringify([format, version, encoding, layout, coeffs, tileRows, tileCols]);
-    if (kind !== KIND) fail(`${META}: of a kind that is not read: ${kind}`);
+    const variant = JSON.stringify([format, version, encoding, layout, coeffs, tileRows, tileCols]);
+    if (variant !== VARIANT) fail(`${META}: unsupported variant of the format: ${variant}`);
     const files = JSON.stringify(mask?.files);
-    if (!/^\["([^"]*\.)?webp"/.test(files)) fail(`${META}: mask.files are no WebP: ${files}`);
-    // What is ours other encoders leave out; where it is, it is whole.
-    const { version: made, sh_degree, crc32: checksums = {} } = (KISSGS in meta ? meta[KISSGS] : NOT_OURS) ?? {};
-    if (!/^"[\w.+-]{1,40}"$/.test(JSON.stringify(made))) fail(`${META}: ${KISSGS}.version is impossible: ${made}`);
+    if (!/^\["([^"]*\.)?webp"/.test(files)) fail(`${META}: mask.files are not WebP: ${files}`);
+    // Other encoders omit the block "kissgs"; if it is present, it must be complete.
+    const {
+      version: encoder,
+      sh_degree,
+      crc32: checksums = {},
+    } = (KISSGS in meta ? meta[KISSGS] : OTHER_ENCODER) ?? {};
+    if (!/^"[\w.+-]{1,40}"$/.test(JSON.stringify(encoder)))
+      fail(`${META}: ${KISSGS}.version is impossible: ${encoder}`);
     const isObject = Object.getPrototypeOf(checksums ?? 0) === Object.prototype;
-    for (const [name, value, least, most] of [
+    for (const [name, value, min, max] of [
       ["count", count, 0, gridSide ** 2],
       ["gridSide", gridSide, 1, MAX_GRID_SIDE],
       ["shN.centroidSide", codebookSide, 1, MAX_CODEBOOK_SIDE],
       [`${KISSGS}.sh_degree`, sh_degree, 0, 3],
       ...Object.entries(isObject ? checksums : { crc32: NaN }).map((entry) => [...entry, 0, 2 ** 32 - 1]),
     ]) {
-      if (!(Number.isInteger(value) && value >= least && value <= most))
-        fail(`${META}: ${name} is impossible: ${value}`);
+      if (!(Number.isInteger(value) && value >= min && value <= max)) fail(`${META}: ${name} is impossible: ${value}`);
     }
-    // Padding is less than half of any grid that follows the size rule, but for the smallest.
+    // By the size rule, padding is less than half of any grid except the smallest ones.
     if (Math.max(count, (gridSide ** 2 - 64) / 2) > maxGaussians) {
-      fail(`larger than the ${maxGaussians} Gaussians need that are allowed (maxGaussians)`);
+      fail(`larger than ${maxGaussians} Gaussians need, the most allowed (maxGaussians)`);
     }
-    for (const [file, [field, channels]] of Object.entries(PLAIN)) {
+    for (const [file, [field, channels]] of Object.entries(SINGLE_FIELD)) {
       this.ranges[file] = rangesOf(meta[field], ["mins", "maxs"], channels);
     }
     this.ranges[HIGH] = rangesOf(means, ["mins", "maxs"], 1);
@@ -138,13 +142,14 @@ export class Assembly {
     };
   }
 
-  /** @param {string} file */
+  /** Return the width and height of an image. @param {string} file */
   sizeOf(file) {
     const { gridSide, codebookSide } = this.scene;
     return file === CENTROIDS ? [TILE_COLUMNS * codebookSide, TILE_ROWS * codebookSide] : [gridSide, gridSide];
   }
 
   /**
+   * Put a decoded image into the scene; the mask must be the first.
    * @param {string} file
    * @param {Uint8Array} rgba
    */
@@ -152,7 +157,7 @@ export class Assembly {
     if (file === MASK) this.putMask(rgba);
     else if (file === LABELS) this.putLabels(rgba);
     else if (file === CENTROIDS) this.putCentroids(rgba);
-    else if (file in PLAIN) this.putPlain(file, rgba);
+    else if (file in SINGLE_FIELD) this.putField(file, rgba);
     else this.putPositions(file, rgba);
   }
 
@@ -165,16 +170,16 @@ export class Assembly {
     if (count !== scene.count) fail(`${MASK} marks ${count} Gaussians; ${META} declares ${scene.count}`);
     scene.cells = cells.slice(0, count);
     scene.means = new Float32Array(3 * count);
-    for (const [field, channels] of Object.values(PLAIN)) scene[field] = new Float32Array(channels * count);
+    for (const [field, channels] of Object.values(SINGLE_FIELD)) scene[field] = new Float32Array(channels * count);
     for (let i = 0; i < count; i++) scene.quats[4 * i] = 1;
     scene.labels = new Uint16Array(count);
   }
 
   /** @type {(file: string, rgba: Uint8Array) => void} */
-  putPlain(file, rgba) {
-    const [field, channels] = PLAIN[file];
+  putField(file, rgba) {
+    const [field, channels] = SINGLE_FIELD[file];
     const { cells, [field]: out } = this.scene;
-    const values = valuesOf(observe(rgba, channels), this.ranges[file]);
+    const values = valuesOf(observedLevels(rgba, channels), this.ranges[file]);
     for (let i = 0, at = 0; i < cells.length; i++) {
       for (let c = 0; c < channels; c++) out[at++] = values[(c << 8) | rgba[4 * cells[i] + c]];
     }
@@ -190,7 +195,7 @@ export class Assembly {
     const levels = new Uint16Array(high.length);
     for (let i = 0; i < levels.length; i++) levels[i] = (high[i] << 8) | (low ? low[i] : 128);
     const values = valuesOf(
-      observe(levels, 3),
+      observedLevels(levels, 3),
       this.ranges[HIGH],
       1 << 16,
       (log) => Math.sign(log) * Math.expm1(Math.abs(log)),
@@ -214,7 +219,7 @@ export class Assembly {
     const { codebookSide: side, degree } = this.scene;
     const coefficients = COEFFICIENTS[degree];
     const centroids = (this.scene.centroids = new Float32Array(side * side * coefficients * 3));
-    const values = valuesOf(observe(rgba, 3), this.ranges[CENTROIDS]);
+    const values = valuesOf(observedLevels(rgba, 3), this.ranges[CENTROIDS]);
     for (let entry = 0, at = 0; entry < side * side; entry++) {
       const corner = ((entry / side) | 0) * side * TILE_COLUMNS + (entry % side);
       for (let k = 0; k < coefficients; k++) {

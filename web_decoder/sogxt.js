@@ -1,4 +1,4 @@
-/** SOG-XT containers, wherever they are, to typed arrays, image by image as they arrive. */
+/** Decoding of SOG-XT containers to typed arrays, image by image as they arrive. */
 
 import { Pool } from "./pool.js";
 import { Assembly, COEFFICIENTS, MASK, META, PLANES } from "./scene.js";
@@ -8,12 +8,12 @@ import { collect, openZip } from "./zip.js";
 /** @typedef {(file: string, limit: number) => Promise<Uint8Array>} Read */
 /** @typedef {(received: number, total: number) => void} Count */
 
-/** Mask, coarse positions, colours: asked for before all others, which would share the line with them. */
-const PLANES_OF_A_PICTURE = 3;
+/** Number of images of a coarse rendering, which are downloaded before the others: mask, coarse positions, colours. */
+const COARSE_PLANES = 3;
 const MAX_META_BYTES = 1 << 20;
 const MAX_ZIP_BYTES = 1 << 30;
 
-/** What is wrong with a container, in a sentence. */
+/** Error of a container; the message is a sentence. */
 export class SogxtError extends Error {
   name = "SogxtError";
 }
@@ -24,31 +24,31 @@ export class SogxtError extends Error {
  *   meta.json, or of a zip; or a zip
  * @param {Options} [options]
  * @returns {Promise<Scene>}
- * @throws {SogxtError} something is missing, damaged, impossible or not allowed
+ * @throws {SogxtError} a file is missing, damaged, invalid or too large
  */
 export async function decode(source, options = {}) {
   const { signal, maxGaussians = 2e7, native = true } = options;
   const stop = new AbortController();
-  const ends = signal ? AbortSignal.any([signal, stop.signal]) : stop.signal;
+  const aborting = signal ? AbortSignal.any([signal, stop.signal]) : stop.signal;
   const progress = { received: 0, total: 0, decoded: 0, planes: PLANES.length };
   /** @type {unknown[]} */
-  const theirs = []; // what the caller's own functions threw
+  const callbackErrors = []; // thrown by functions of the caller
   /** @type {(work: () => void) => void} */
   const call = (work) => {
     try {
       work();
     } catch (error) {
-      theirs.push(error);
+      callbackErrors.push(error);
       throw error;
     }
   };
-  const tell = () => call(() => options.onProgress?.({ ...progress }));
+  const reportProgress = () => call(() => options.onProgress?.({ ...progress }));
   const pool = new Pool(options.workers);
   try {
-    const read = await open(source, { ...options.request, signal: ends }, (received, total) => {
+    const read = await open(source, { ...options.request, signal: aborting }, (received, total) => {
       progress.received += received;
       progress.total += total;
-      tell();
+      reportProgress();
     });
     const assembly = new Assembly(await read(META, MAX_META_BYTES), maxGaussians);
     const { scene } = assembly;
@@ -56,28 +56,28 @@ export async function decode(source, options = {}) {
     const arriving = [];
     const loads = PLANES.map(async (file, i) => {
       const [width, height] = assembly.sizeOf(file);
-      if (i >= PLANES_OF_A_PICTURE) await Promise.all(arriving.slice(0, PLANES_OF_A_PICTURE)).catch(() => {});
-      arriving[i] = read(file, 4096 + 5 * width * height); // lossless WebP needs no more than 4 a pixel
+      if (i >= COARSE_PLANES) await Promise.all(arriving.slice(0, COARSE_PLANES)).catch(() => {});
+      arriving[i] = read(file, 4096 + 5 * width * height); // lossless WebP takes at most 4 bytes per pixel
       const bytes = await arriving[i];
       const checksum = scene.meta.kissgs?.crc32?.[file];
       const plane = await pool.decode({ file, bytes, width, height, native, checksum });
-      if (file !== MASK) await loads[0]; // it says where Gaussians are
-      ends.throwIfAborted();
+      if (file !== MASK) await loads[0]; // other images need the mask
+      aborting.throwIfAborted();
       scene.sizes[file] = bytes.length;
       if (options.keepPlanes) scene.planes[file] = plane;
       assembly.put(file, plane.rgba);
       progress.decoded++;
-      tell();
+      reportProgress();
       call(() => options.onPlane?.(file, scene));
     });
-    const aborted = new Promise((_, reject) => ends.addEventListener("abort", () => reject(ends.reason)));
-    // What one damaged image costs is that image: the others are still put into the scene.
+    const aborted = new Promise((_, reject) => aborting.addEventListener("abort", () => reject(aborting.reason)));
+    // After an error in one image, the others are still put into the scene.
     await Promise.race([Promise.allSettled(loads), aborted]);
     await Promise.all(loads);
     return scene;
   } catch (error) {
     signal?.throwIfAborted();
-    throw theirs.length ? theirs[0] : new SogxtError(messageOf(error), { cause: error });
+    throw callbackErrors.length ? callbackErrors[0] : new SogxtError(messageOf(error), { cause: error });
   } finally {
     stop.abort();
     pool.close();
@@ -85,7 +85,7 @@ export async function decode(source, options = {}) {
 }
 
 /**
- * The coefficients of every Gaussian, out of the codebook.
+ * Return the SH coefficients of each Gaussian from the codebook.
  * @param {Scene} scene
  * @returns {Float32Array} 3 K N
  */
@@ -140,7 +140,7 @@ async function download(url, limit, request, count) {
     throw new Error(`${file} cannot be fetched: ${why}`);
   };
   const response = await fetch(url, request).catch((error) => fail(messageOf(error)));
-  if (!response.ok || !response.body) return fail(`the server answers ${response.status}`);
+  if (!response.ok || !response.body) return fail(`the server answers with status ${response.status}`);
   count(0, Number(response.headers.get("Content-Length")));
   return collect(response.body, limit, (received) => count(received, 0)).catch((error) => fail(messageOf(error)));
 }

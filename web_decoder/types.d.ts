@@ -1,19 +1,19 @@
-/** An image as it is stored: four bytes a pixel, row by row, alpha not multiplied in. */
+/** An image as it is stored: four bytes per pixel, row by row, alpha not premultiplied. */
 export interface Plane {
   width: number;
   height: number;
   rgba: Uint8Array<ArrayBuffer>;
 }
 
-/** A scene of N Gaussians, row by row of the container's grid. */
+/** A scene of N Gaussians, in the order of the container's grid, row by row. */
 export interface Scene {
-  /** N */
+  /** Number of Gaussians, N. */
   count: number;
-  /** Of the spherical harmonics, 0 to 3: K = 0, 3, 8 or 15 coefficients beside `sh0`. */
+  /** SH degree, 0 to 3: K = 0, 3, 8 or 15 coefficients beside `sh0`. */
   degree: number;
   /** 3 N: x, y, z. */
   means: Float32Array;
-  /** 4 N: w, x, y, z as stored; their length is within a few per cent of 1. */
+  /** 4 N: w, x, y, z as stored; the length is within a few per cent of 1. */
   quats: Float32Array;
   /** 3 N: natural logarithms of the standard deviations. */
   scales: Float32Array;
@@ -23,72 +23,72 @@ export interface Scene {
   sh0: Float32Array;
   /** N: entries of the codebook. */
   labels: Uint16Array;
-  /** 3 K for every entry of the codebook: red, green, blue of each coefficient, in the order of `.ply` files. */
+  /** 3 K per codebook entry: red, green, blue of each coefficient, in the order of `.ply` files. */
   centroids: Float32Array;
-  /** N: places in the grid, row × gridSide + column. */
+  /** N: cells of the grid, row × gridSide + column. */
   cells: Uint32Array;
   gridSide: number;
   codebookSide: number;
   /** Bytes of each file. */
   sizes: Record<string, number>;
-  /** The images by file, if `keepPlanes` asked for them. */
+  /** Decoded images by file, with the option `keepPlanes`. */
   planes: Record<string, Plane>;
-  /** What meta.json says. */
+  /** Content of meta.json. */
   meta: any;
 }
 
 export interface Progress {
-  /** Bytes that have come. */
+  /** Bytes received. */
   received: number;
-  /** Bytes that have been announced until now. */
+  /** Bytes announced so far. */
   total: number;
   /** Images decoded. */
   decoded: number;
-  /** Images in all. */
+  /** Images in total. */
   planes: number;
 }
 
 export interface Options {
-  /** Ends the work, which then throws the signal's reason. */
+  /** Aborts decoding, which then throws the signal's reason. */
   signal?: AbortSignal;
-  /** For every fetch; headers, for example. */
+  /** Options of all requests, for example headers. */
   request?: RequestInit;
-  /** Keep the images, in `scene.planes`. */
+  /** Whether to keep decoded images in `scene.planes`. */
   keepPlanes?: boolean;
-  /** More are refused before memory is taken for them (20 million unless given). */
+  /** Largest number of Gaussians, checked before memory is allocated; default: 20 million. */
   maxGaussians?: number;
-  /** Threads that decode (one per processor, at most 4, unless given); 0: the caller's. */
+  /** Number of workers; 0 for the caller's thread; default: one per processor, at most 4. */
   workers?: number;
   /**
-   * Whether the browser may decode images (unless given: yes). What comes out is compared with the checksums of pixels in
-   * the metadata; where it differs, where there are none, and for images with alpha, `decodeWebP` decodes.
+   * Whether the browser may decode images; default: true. Pixels are verified by the checksums of the metadata. If they
+   * differ, without checksums, and for images with alpha, `decodeWebP` decodes.
    */
   native?: boolean;
   onProgress?: (progress: Progress) => void;
   /**
-   * An image has been decoded and its values are in `scene`, the one that `decode` returns in the end. First of all comes the
-   * mask; coarse positions come before exact ones. What has not come is neutral.
+   * Called when an image is decoded and its values are in `scene`, the object that `decode` returns in the end. The mask
+   * comes first, and coarse positions come before exact ones. Values of images that have not arrived are neutral.
    */
   onPlane?: (file: string, scene: Scene) => void;
 }
 
-/** What is wrong with a container, in a sentence. */
+/** Error of a container; the message is a sentence. */
 export declare class SogxtError extends Error {}
 
 /**
  * Decode a container.
  * @param source address of a folder (with a slash at its end), of its meta.json, or of a zip; or a zip
- * @throws {SogxtError} something is missing, damaged, impossible or not allowed
+ * @throws {SogxtError} a file is missing, damaged, invalid or too large
  */
 export declare function decode(
   source: string | URL | ArrayBuffer | Uint8Array | Blob,
   options?: Options,
 ): Promise<Scene>;
 
-/** The coefficients of every Gaussian, 3 K N, out of the codebook. */
+/** Return the SH coefficients of each Gaussian, 3 K N, from the codebook. */
 export declare function expandSH(scene: Scene): Float32Array;
 
-/** An image to decode and what it must be. */
+/** An image to decode, and its expected size and checksum. */
 export interface Task {
   file: string;
   bytes: Uint8Array;

@@ -1,10 +1,10 @@
 import type { Plane } from "./types.js";
 
-/** What is wrong with a file, in a sentence. */
+/** Error of a WebP file; the message is a sentence. */
 export declare class WebPError extends Error {}
 
 /**
- * Decode a lossless WebP file, exactly.
- * @throws {WebPError} the file is damaged, lossy, animated or has more pixels than allowed (67 million unless given)
+ * Decode a lossless WebP file exactly.
+ * @throws {WebPError} the file is damaged, lossy, animated or has more than `maxPixels` pixels (default: 67 million)
  */
 export declare function decodeWebP(bytes: Uint8Array | ArrayBuffer, limits?: { maxPixels?: number }): Plane;

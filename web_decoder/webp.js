@@ -1,10 +1,10 @@
 /**
- * Lossless WebP (VP8L, RFC 9649) in plain JavaScript: exact to the bit in pages, workers and Node, where canvases are not.
+ * Decoder of lossless WebP (VP8L, RFC 9649) in JavaScript: bit-exact in pages, workers and Node.js, unlike canvases.
  *
- * Inside, a pixel is one 32-bit number, from the lowest byte: red, green, blue, alpha.
+ * A pixel is one 32-bit number, from the lowest byte: red, green, blue, alpha.
  */
 
-/** What is wrong with a file, in a sentence. */
+/** Error of a WebP file; the message is a sentence. */
 export class WebPError extends Error {
   name = "WebPError";
 }
@@ -14,27 +14,28 @@ const fail = (why) => {
   throw new WebPError(why);
 };
 
-/** Bits that one look into a prefix code's table resolves; longer codes take a second look. */
-const ROOT = 9;
-const LONGEST = 15;
+/** Bits of the first lookup in the table of a prefix code; longer codes take a second lookup. */
+const ROOT_BITS = 9;
+/** Longest code, bits. */
+const MAX_LENGTH = 15;
 
-/** Of the tables of an image: 6,000 groups of the largest codes. Encoders write some hundred of small ones. */
-const MOST_ENTRIES = 1 << 24;
+/** Largest size of an image's tables: 6,000 groups of the largest codes. Encoders write some hundred small ones. */
+const MAX_ENTRIES = 1 << 24;
 
 const LITERALS = 256;
 const LENGTHS = 24;
-/** Symbols of the five codes of a group: green with lengths (and cached colours), red, blue, alpha, distances. */
+/** Alphabet sizes of the five codes of a group: green with lengths (and cached colours), red, blue, alpha, distances. */
 const ALPHABETS = [LITERALS + LENGTHS, 256, 256, 256, 40];
-/** Places of green, red, blue and alpha in a pixel. */
+/** Bit offsets of green, red, blue and alpha in a pixel. */
 const SHIFTS = [8, 0, 16, 24];
 const ORDER_OF_LENGTHS = [17, 18, 0, 1, 2, 3, 4, 5, 16, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15];
 const OPAQUE_BLACK = 0xff000000 | 0;
-/** Zeros after the bitstream: reading past the end of an array is slow, even if it happens once. */
+/** Words of zeros after the bitstream: reading beyond the end of an array is slow, even once. */
 const PADDING = 64;
-/** Of the colour cache. */
+/** Hash multiplier of the colour cache. */
 const HASH = 0x1e35a7bd;
 
-/** The 120 nearest pixels that come before one, nearest first: columns to the left, rows up. */
+/** Offsets of the 120 nearest preceding pixels, nearest first: columns to the left, rows up. */
 const NEAR = Array.from({ length: 128 }, (_, i) => ({ left: 8 - (i & 15), up: i >> 4 }))
   .filter(({ left, up }) => up || left > 0)
   .sort((a, b) => a.left ** 2 + a.up ** 2 - b.left ** 2 - b.up ** 2 || b.up - a.up || b.left - a.left);
@@ -43,43 +44,43 @@ const NEAR = Array.from({ length: 128 }, (_, i) => ({ left: 8 - (i & 15), up: i 
 const uint24 = (bytes, at) => bytes[at] | (bytes[at + 1] << 8) | (bytes[at + 2] << 16);
 
 /** @type {(bytes: Uint8Array, at: number) => string} */
-const fourLetters = (bytes, at) => String.fromCharCode(...bytes.subarray(at, at + 4));
+const fourCC = (bytes, at) => String.fromCharCode(...bytes.subarray(at, at + 4));
 
 /**
- * The VP8L bitstream in a WebP file.
+ * Return the VP8L bitstream of a WebP file, and the canvas size that the file declares.
  * @param {Uint8Array} bytes
  */
 function findBitstream(bytes) {
-  if (bytes.length < 20 || fourLetters(bytes, 0) !== "RIFF" || fourLetters(bytes, 8) !== "WEBP") fail("no WebP file");
+  if (bytes.length < 20 || fourCC(bytes, 0) !== "RIFF" || fourCC(bytes, 8) !== "WEBP") fail("not a WebP file");
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.length);
   const end = 8 + view.getUint32(4, true);
   if (end > bytes.length) fail(`cut off: ${bytes.length} of ${end} bytes`);
   let canvas = "";
   for (let at = 12; at + 8 <= end;) {
-    const kind = fourLetters(bytes, at);
+    const kind = fourCC(bytes, at);
     const size = view.getUint32(at + 4, true);
     const start = at + 8;
     at = start + size + (size & 1);
-    if (start + size > end) fail("a part is longer than the file");
+    if (start + size > end) fail("a chunk is longer than the file");
     if (kind === "VP8 " || kind === "ALPH") fail("lossy WebP, whose pixels are not exact: store it lossless");
-    if (kind === "ANIM" || kind === "ANMF") fail("an animation, not one picture");
+    if (kind === "ANIM" || kind === "ANMF") fail("an animation, not a single image");
     if (kind === "VP8X" && size >= 10) canvas = `${uint24(bytes, start + 4) + 1} x ${uint24(bytes, start + 7) + 1}`;
     if (kind === "VP8L") return { stream: bytes.subarray(start, start + size), canvas };
   }
-  return fail("a WebP file without a picture");
+  return fail("a WebP file without an image");
 }
 
-/** Bits of the stream, lowest first, 16 fetched at a time. After the end come zeros, which `check` finds. */
+/** Reader of bits, lowest first, 16 fetched at a time. Beyond the end it reads zeros, which `check` detects. */
 class Bits {
   /** @param {Uint8Array} bytes */
   constructor(bytes) {
     this.words = new Uint16Array((bytes.length >> 1) + PADDING);
     new Uint8Array(this.words.buffer).set(bytes);
     this.length = bytes.length * 8;
-    this.next = 0; // word
-    this.held = 0; // bits of the words before it that are not used yet
-    this.count = 0; // of them
-    this.other = 0; // what ended a run of pixels
+    this.next = 0; // index of the next word
+    this.held = 0; // fetched bits that are not used yet
+    this.count = 0; // number of held bits
+    this.endSymbol = 0; // symbol that ended a run of literals
   }
 
   /** @param {number} count at most 16 */
@@ -96,20 +97,20 @@ class Bits {
 
   /** @type {(entries: ArrayLike<number>, code: Code) => number} */
   symbol(entries, { start, mask }) {
-    if (this.count < LONGEST) {
+    if (this.count < MAX_LENGTH) {
       this.held |= this.words[this.next++] << this.count;
       this.count += 16;
     }
     let entry = entries[start + (this.held & mask)];
-    if ((entry & 15) > ROOT) {
-      entry = entries[start + (entry >> 4) + ((this.held >> ROOT) & ((1 << ((entry & 15) - ROOT)) - 1))];
+    if ((entry & 15) > ROOT_BITS) {
+      entry = entries[start + (entry >> 4) + ((this.held >> ROOT_BITS) & ((1 << ((entry & 15) - ROOT_BITS)) - 1))];
     }
     this.held >>>= entry & 15;
     this.count -= entry & 15;
     return entry >> 4;
   }
 
-  /** What a symbol of lengths or distances stands for. @param {number} symbol */
+  /** Return the length or distance code of a prefix symbol. @param {number} symbol */
   number(symbol) {
     if (symbol < 4) return symbol + 1;
     const extra = (symbol - 2) >> 1;
@@ -118,25 +119,25 @@ class Bits {
   }
 
   check() {
-    if (this.next * 16 - this.count > this.length) fail("the picture's data ends too soon");
+    if (this.next * 16 - this.count > this.length) fail("the image data ends too soon");
   }
 }
 
-/** A prefix code: where its table begins, bits of the first look into it (0: one symbol). @typedef {{start: number, mask: number}} Code */
+/** A prefix code: start of its table, mask of the first lookup (0: a single symbol). @typedef {{start: number, mask: number}} Code */
 
 /**
- * Add the lookup table of a canonical code to others. An entry is symbol × 16 + length of its code; where that is longer
- * than the first look, place of a second table × 16 + length of the longest code in it.
+ * Append the lookup table of a canonical code. An entry is symbol × 16 + length of its code; for codes longer than the
+ * first lookup, offset of a second table × 16 + length of the longest code in it.
  * @type {(entries: number[], lengths: Uint8Array) => Code}
  */
 function addTable(entries, lengths) {
   const symbols = [];
-  const codes = []; // the first bit of each lowest
+  const codes = []; // bit-reversed: the first bit is the lowest
   /** @type {number[][]} */
-  const byLength = Array.from({ length: LONGEST + 1 }, () => []);
+  const byLength = Array.from({ length: MAX_LENGTH + 1 }, () => []);
   lengths.forEach((length, symbol) => byLength[length].push(symbol));
   let [code, open] = [0, 1];
-  for (let length = 1; length <= LONGEST; length++) {
+  for (let length = 1; length <= MAX_LENGTH; length++) {
     open *= 2;
     for (const symbol of byLength[length]) {
       open--;
@@ -148,8 +149,8 @@ function addTable(entries, lengths) {
     }
   }
   const single = symbols.length === 1;
-  if (open && !single) fail("a prefix code that does not add up");
-  const root = single ? 0 : Math.min(lengths[symbols[symbols.length - 1]], ROOT);
+  if (open && !single) fail("an incomplete or oversubscribed prefix code");
+  const root = single ? 0 : Math.min(lengths[symbols[symbols.length - 1]], ROOT_BITS);
   const start = entries.length;
   for (let i = 0; i < 1 << root; i++) entries.push(0);
   for (let i = symbols.length - 1; i >= 0; i--) {
@@ -157,7 +158,7 @@ function addTable(entries, lengths) {
     let [code, step, at, size] = [codes[i], 1 << length, start, 1 << root];
     if (length > root) {
       const prefix = start + (code & (size - 1));
-      // Longer codes come first, so this one tells how large the second table is.
+      // Longer codes come first, so the first one determines the size of the second table.
       if (!entries[prefix]) {
         entries[prefix] = ((entries.length - start) << 4) | length;
         for (let i = 1 << (length - root); i; i--) entries.push(0);
@@ -172,22 +173,22 @@ function addTable(entries, lengths) {
   return { start, mask: (1 << root) - 1 };
 }
 
-/** The lengths of a code for an alphabet of this size. @type {(bits: Bits, size: number) => Uint8Array} */
+/** Read the code lengths of an alphabet. @type {(bits: Bits, size: number) => Uint8Array} */
 function readLengths(bits, size) {
   const lengths = new Uint8Array(size);
   if (bits.read(1)) {
-    const two = bits.read(1);
-    lengths[bits.read(bits.read(1) ? 8 : 1)] = 1; // outside the alphabet it counts for nothing
-    if (two) lengths[bits.read(8)] = 1;
+    const hasTwo = bits.read(1);
+    lengths[bits.read(bits.read(1) ? 8 : 1)] = 1; // a symbol outside the alphabet is ignored
+    if (hasTwo) lengths[bits.read(8)] = 1;
     return lengths;
   }
-  const ofLengths = new Uint8Array(19);
-  for (let i = 0, count = 4 + bits.read(4); i < count; i++) ofLengths[ORDER_OF_LENGTHS[i]] = bits.read(3);
+  const metaLengths = new Uint8Array(19);
+  for (let i = 0, count = 4 + bits.read(4); i < count; i++) metaLengths[ORDER_OF_LENGTHS[i]] = bits.read(3);
   let left = bits.read(1) ? 2 + bits.read(2 + 2 * bits.read(3)) : size;
   if (left > size) fail("more code lengths than symbols");
   /** @type {number[]} */
   const entries = [];
-  const code = addTable(entries, ofLengths);
+  const code = addTable(entries, metaLengths);
   let last = 8;
   for (let i = 0; i < size && left--;) {
     const length = bits.symbol(entries, code);
@@ -208,18 +209,18 @@ const swapRedAndBlue = (pixel) => (pixel & 0xff00ff00) | ((pixel >> 16) & 255) |
 const tilesOf = (size, bits) => (size + (1 << bits) - 1) >> bits;
 
 /**
- * An entropy-coded image: the picture, or what a transform or the choice of codes is stored in.
- * @type {(bits: Bits, width: number, height: number, picture?: boolean) => Int32Array}
+ * Read an entropy-coded image: the main one, or the data of a transform or of the choice of codes.
+ * @type {(bits: Bits, width: number, height: number, isMain?: boolean) => Int32Array}
  */
-function readImage(bits, width, height, picture) {
+function readImage(bits, width, height, isMain) {
   const cached = bits.read(1);
   const cacheBits = cached && bits.read(4);
-  if (cached && (cacheBits < 1 || cacheBits > 11)) fail("a colour cache of impossible size");
+  if (cached && (cacheBits < 1 || cacheBits > 11)) fail("a colour cache of invalid size");
   let tileBits = 14;
-  let choice = Int32Array.of(0); // of a group of codes for each tile
-  if (picture && bits.read(1)) {
+  let groups = Int32Array.of(0); // group of codes of each tile
+  if (isMain && bits.read(1)) {
     tileBits = 2 + bits.read(3);
-    choice = readImage(bits, tilesOf(width, tileBits), tilesOf(height, tileBits)).map(
+    groups = readImage(bits, tilesOf(width, tileBits), tilesOf(height, tileBits)).map(
       (pixel) => ((pixel & 255) << 8) | ((pixel >> 8) & 255),
     );
   }
@@ -227,25 +228,25 @@ function readImage(bits, width, height, picture) {
   const tables = [];
   /** @type {Code[]} */
   const codes = [];
-  const used = new Set(choice);
-  for (let group = 0, last = choice.reduce((a, b) => Math.max(a, b)); group <= last; group++) {
+  const used = new Set(groups);
+  for (let group = 0, last = groups.reduce((a, b) => Math.max(a, b)); group <= last; group++) {
     ALPHABETS.forEach((size, i) => {
       const lengths = readLengths(bits, i || !cacheBits ? size : size + (1 << cacheBits));
       if (used.has(group)) codes[5 * group + i] = addTable(tables, lengths);
     });
     bits.check();
-    if (tables.length > MOST_ENTRIES) fail("prefix codes without end");
+    if (tables.length > MAX_ENTRIES) fail("too many prefix codes");
   }
   const entries = Int32Array.from(tables);
   const pixels = new Int32Array(width * height);
   const cache = new Int32Array(1 << cacheBits);
   /** @type {(from: number, to: number) => void} */
-  const keep = (from, to) => {
+  const addToCache = (from, to) => {
     for (let i = from; cacheBits && i < to; i++) {
       cache[Math.imul(HASH, swapRedAndBlue(pixels[i])) >>> (32 - cacheBits)] = pixels[i];
     }
   };
-  const plan = new Int32Array(12);
+  const channels = new Int32Array(12);
   let [fixed, group, tileEnd, steps] = [0, 0, 0, 0];
   for (let i = 0; i < pixels.length;) {
     if (i >= tileEnd) {
@@ -253,33 +254,33 @@ function readImage(bits, width, height, picture) {
       const y = (i / width) | 0;
       const x = i - y * width;
       tileEnd = y * width + Math.min(((x >> tileBits) + 1) << tileBits, width);
-      group = 5 * choice[(y >> tileBits) * tilesOf(width, tileBits) + (x >> tileBits)];
+      group = 5 * groups[(y >> tileBits) * tilesOf(width, tileBits) + (x >> tileBits)];
       [fixed, steps] = [0, 0];
       for (let channel = 0; channel < 4; channel++) {
         const { start, mask } = codes[group + channel];
         if (mask || !channel) {
-          plan[steps++] = start;
-          plan[steps++] = mask;
-          plan[steps++] = SHIFTS[channel];
+          channels[steps++] = start;
+          channels[steps++] = mask;
+          channels[steps++] = SHIFTS[channel];
         } else fixed |= (entries[start] >> 4) << SHIFTS[channel];
       }
     }
     const start = i;
-    i = readLiterals(bits, entries, plan, steps, fixed, pixels, i, tileEnd);
-    keep(start, i);
+    i = readLiterals(bits, entries, channels, steps, fixed, pixels, i, tileEnd);
+    addToCache(start, i);
     if (i === tileEnd) continue;
-    const symbol = bits.other - LITERALS;
+    const symbol = bits.endSymbol - LITERALS;
     if (symbol >= LENGTHS) {
       pixels[i] = cache[symbol - LENGTHS];
-      keep(i, ++i); // it is new to the cache if nothing had been put there: transparent black
+      addToCache(i, ++i); // an empty slot is transparent black, which is added too
     } else {
       const [from, end] = [i, i + bits.number(symbol)];
       const code = bits.number(bits.symbol(entries, codes[group + 4]));
       const { left, up } = NEAR[Math.min(code, NEAR.length) - 1];
       const back = code > NEAR.length ? code - NEAR.length : Math.max(up * width + left, 1);
-      if (back > i || end > pixels.length) fail("a copy from outside the picture");
+      if (back > i || end > pixels.length) fail("a copy from outside the image");
       for (; i < end; i++) pixels[i] = pixels[i - back];
-      keep(from, end);
+      addToCache(from, end);
     }
   }
   bits.check();
@@ -287,41 +288,41 @@ function readImage(bits, width, height, picture) {
 }
 
 /**
- * Pixels that are written out, from i until the end or something else, which is left in `bits.other`. Most time is spent
- * here: a function of its own, called often, is compiled well, and soon.
+ * Read literal pixels from i until the end or another symbol, which is stored in `bits.endSymbol`. Most of the time is
+ * spent here; a separate function that is called often is optimised early.
  * @param {Bits} bits
  * @param {Int32Array} entries
- * @param {Int32Array} plan table, mask and place of each channel that is read
- * @param {number} steps of the plan
- * @param {number} fixed the channels that have one value
+ * @param {Int32Array} channels table, mask and bit offset of each channel that is read
+ * @param {number} steps number of used values in `channels`
+ * @param {number} fixed channels with a single value
  * @param {Int32Array} pixels
  * @param {number} i
  * @param {number} end
  */
-function readLiterals(bits, entries, plan, steps, fixed, pixels, i, end) {
+function readLiterals(bits, entries, channels, steps, fixed, pixels, i, end) {
   const { words } = bits;
   let { next, held, count } = bits;
   literals: for (; i < end; i++) {
     let pixel = fixed;
     for (let step = 0; step < steps; step += 3) {
-      if (count < LONGEST) {
+      if (count < MAX_LENGTH) {
         held |= words[next++] << count;
         count += 16;
       }
-      const start = plan[step];
-      let entry = entries[start + (held & plan[step + 1])];
+      const start = channels[step];
+      let entry = entries[start + (held & channels[step + 1])];
       let length = entry & 15;
-      if (length > ROOT) {
-        entry = entries[start + (entry >> 4) + ((held >> ROOT) & ((1 << (length - ROOT)) - 1))];
+      if (length > ROOT_BITS) {
+        entry = entries[start + (entry >> 4) + ((held >> ROOT_BITS) & ((1 << (length - ROOT_BITS)) - 1))];
         length = entry & 15;
       }
       held >>>= length;
       count -= length;
       if (entry >= LITERALS << 4) {
-        bits.other = entry >> 4;
+        bits.endSymbol = entry >> 4;
         break literals;
       }
-      pixel |= (entry >> 4) << plan[step + 2];
+      pixel |= (entry >> 4) << channels[step + 2];
     }
     pixels[i] = pixel;
   }
@@ -331,14 +332,14 @@ function readLiterals(bits, entries, plan, steps, fixed, pixels, i, end) {
   return i;
 }
 
-/** Sums of the four channels, modulo 256. @type {(a: number, b: number) => number} */
+/** Return sums of the four channels, modulo 256. @type {(a: number, b: number) => number} */
 const add = (a, b) =>
   (((a & 0xff00ff00) + (b & 0xff00ff00)) & 0xff00ff00) | (((a & 0xff00ff) + (b & 0xff00ff)) & 0xff00ff);
 
-/** Means of the four channels, rounded down. @type {(a: number, b: number) => number} */
+/** Return means of the four channels, rounded down. @type {(a: number, b: number) => number} */
 const mean = (a, b) => ((((a ^ b) >>> 1) & 0x7f7f7f7f) + (a & b)) | 0;
 
-/** Two channels + 256, brought into 0 to 255. @type {(pair: number) => number} */
+/** Clamp two channels, each offset by 256, to 0 to 255. @type {(pair: number) => number} */
 const clamp = (pair) => {
   const inside = (pair >>> 8) & 0x10001;
   const above = (pair >>> 9) & 0x10001;
@@ -346,22 +347,22 @@ const clamp = (pair) => {
 };
 
 /** @type {(a: number, b: number, c: number) => number} */
-const sumOfTwo = (a, b, c) => clamp((a & 0xff00ff) + (b & 0xff00ff) - (c & 0xff00ff) + 0x1000100);
+const addSubtractOfTwo = (a, b, c) => clamp((a & 0xff00ff) + (b & 0xff00ff) - (c & 0xff00ff) + 0x1000100);
 
-/** a + b - c, clamped. @type {(a: number, b: number, c: number) => number} */
-const sum = (a, b, c) => sumOfTwo(a, b, c) | (sumOfTwo(a >>> 8, b >>> 8, c >>> 8) << 8);
+/** Return a + b - c, clamped (ClampAddSubtractFull). @type {(a: number, b: number, c: number) => number} */
+const addSubtract = (a, b, c) => addSubtractOfTwo(a, b, c) | (addSubtractOfTwo(a >>> 8, b >>> 8, c >>> 8) << 8);
 
 /** @type {(a: number, c: number) => number} */
-const beyondOfTwo = (a, c) => {
+const addHalfOfTwo = (a, c) => {
   const difference = (a & 0xff00ff) - (c & 0xff00ff) + 0x1000100;
   const half = ((difference + (~(difference >>> 8) & 0x10001)) >>> 1) & 0xff00ff;
   return clamp((a & 0xff00ff) + half + 0x800080);
 };
 
-/** a + (a - c) / 2, the half rounded towards zero, clamped. @type {(a: number, c: number) => number} */
-const beyond = (a, c) => beyondOfTwo(a, c) | (beyondOfTwo(a >>> 8, c >>> 8) << 8);
+/** Return a + (a - c) / 2, rounded towards zero and clamped (ClampAddSubtractHalf). @type {(a: number, c: number) => number} */
+const addHalf = (a, c) => addHalfOfTwo(a, c) | (addHalfOfTwo(a >>> 8, c >>> 8) << 8);
 
-/** Whichever left + top - corner is nearer to. @type {(top: number, left: number, corner: number) => number} */
+/** Return the one that left + top - corner is nearer to. @type {(top: number, left: number, corner: number) => number} */
 const select = (top, left, corner) => {
   let nearer = 0;
   for (let shift = 0; shift < 32; shift += 8) {
@@ -372,7 +373,7 @@ const select = (top, left, corner) => {
 };
 
 /**
- * Undo a predictor for pixels i to end of an image of width w; a loop for each, so that none has to choose.
+ * Undo each predictor for pixels i to end of an image of width w; one loop for each mode is faster than a choice per pixel.
  * @type {((p: Int32Array, i: number, end: number, w: number) => void)[]}
  */
 const PREDICTORS = [
@@ -413,14 +414,14 @@ const PREDICTORS = [
     for (; i < end; i++) p[i] = add(p[i], select(p[i - w], p[i - 1], p[i - w - 1]));
   },
   (p, i, end, w) => {
-    for (; i < end; i++) p[i] = add(p[i], sum(p[i - 1], p[i - w], p[i - w - 1]));
+    for (; i < end; i++) p[i] = add(p[i], addSubtract(p[i - 1], p[i - w], p[i - w - 1]));
   },
   (p, i, end, w) => {
-    for (; i < end; i++) p[i] = add(p[i], beyond(mean(p[i - 1], p[i - w]), p[i - w - 1]));
+    for (; i < end; i++) p[i] = add(p[i], addHalf(mean(p[i - 1], p[i - w]), p[i - w - 1]));
   },
 ];
 
-/** Undoes a transform. @typedef {(pixels: Int32Array, width: number, height: number) => Int32Array} Undo */
+/** Function that undoes a transform. @typedef {(pixels: Int32Array, width: number, height: number) => Int32Array} Undo */
 
 /** @type {(tiles: Int32Array, tileBits: number) => Undo} */
 const undoPrediction = (tiles, tileBits) => (pixels, width, height) => {
@@ -482,28 +483,28 @@ const undoIndexing = (palette, packing) => (pixels, width, height) => {
 /**
  * Decode a lossless WebP file.
  * @param {Uint8Array | ArrayBuffer} bytes
- * @param {{maxPixels?: number}} [limits] more pixels are refused before memory is taken: 60 bytes can declare 268 million
- * @returns {{width: number, height: number, rgba: Uint8Array<ArrayBuffer>}} four bytes a pixel, row by row, alpha not multiplied in
+ * @param {{maxPixels?: number}} [limits] checked before memory is allocated: 60 bytes can declare 268 million pixels
+ * @returns {{width: number, height: number, rgba: Uint8Array<ArrayBuffer>}} four bytes per pixel, row by row, alpha not premultiplied
  * @throws {WebPError} the file is damaged, lossy, animated or larger than allowed
  */
 export function decodeWebP(bytes, { maxPixels = 1 << 26 } = {}) {
   const { stream, canvas } = findBitstream(bytes instanceof Uint8Array ? bytes : new Uint8Array(bytes));
   const bits = new Bits(stream);
-  if (bits.read(8) !== 0x2f) fail("its picture is not VP8L");
+  if (bits.read(8) !== 0x2f) fail("its image is not VP8L");
   const [width, height] = [1 + bits.read(14), 1 + bits.read(14)];
-  bits.read(1); // a hint whether alpha is used, not to be relied on
-  if (bits.read(3)) fail("a version of VP8L that does not exist yet");
+  bits.read(1); // a hint whether alpha is used; unreliable
+  if (bits.read(3)) fail("an unknown version of VP8L");
   bits.check();
-  if (canvas && canvas !== `${width} x ${height}`) fail(`a picture of ${width} x ${height} on a canvas of ${canvas}`);
+  if (canvas && canvas !== `${width} x ${height}`) fail(`an image of ${width} x ${height} on a canvas of ${canvas}`);
   if (width * height > maxPixels) fail(`${width} x ${height} pixels, more than the ${maxPixels} allowed`);
 
   /** @type {[Undo, number][]} */
   const steps = [];
   let across = width;
-  for (let seen = 0; bits.read(1);) {
+  for (let kinds = 0; bits.read(1);) {
     const kind = bits.read(2);
-    if (seen & (1 << kind)) fail("the same transform twice");
-    seen |= 1 << kind;
+    if (kinds & (1 << kind)) fail("a transform that occurs twice");
+    kinds |= 1 << kind;
     if (kind === 2) steps.push([undoSubtraction, across]);
     else if (kind === 3) {
       const size = 1 + bits.read(8);

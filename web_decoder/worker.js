@@ -1,4 +1,4 @@
-/** A thread of the pool. */
+/** A worker of the pool: decodes images. */
 
 import { decodePlane } from "./plane.js";
 

@@ -1,17 +1,17 @@
-/** What is wrong with a zip, in a sentence. */
+/** Error of a zip file; the message is a sentence. */
 export declare class ZipError extends Error {}
 
 /**
- * The files of a zip by their names without folders, and what reads each, up to so many bytes. `read` may give a part of
- * `bytes`.
- * @throws {ZipError} it is no zip, or cut off; and from `read`: damaged, encrypted, larger than the limit
+ * Return functions that read the files of a zip, by file name without folders, given the largest size allowed. Their
+ * results may share the memory of `bytes`.
+ * @throws {ZipError} not a zip, or truncated; the functions: damaged, encrypted or larger than the limit
  */
 export declare function openZip(bytes: Uint8Array): Map<string, (limit: number) => Promise<Uint8Array>>;
 
-/** CRC-32 as zip, PNG and zlib have it. */
+/** Return the CRC-32 of zip, PNG and zlib. */
 export declare function crc32(bytes: Uint8Array): number;
 
-/** All that a stream gives, up to so many bytes; `count` is told of each part. */
+/** Read a stream of at most `limit` bytes; `count` is called with the size of each chunk. */
 export declare function collect(
   stream: ReadableStream<Uint8Array>,
   limit: number,

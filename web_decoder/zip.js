@@ -1,6 +1,6 @@
-/** Files in a zip: stored or deflated, checked, never larger than allowed. */
+/** Reader of zip files: stored or deflated entries, with checksums and limits. */
 
-/** What is wrong with a zip, in a sentence. */
+/** Error of a zip file; the message is a sentence. */
 export class ZipError extends Error {
   name = "ZipError";
 }
@@ -12,7 +12,7 @@ const END_SIZE = 22;
 const MAX_COMMENT = 0xffff;
 const MAX_ENTRIES = 1000;
 
-/** CRC-32 of four bytes at once takes four tables. */
+/** Four tables, for four bytes at a time. */
 const CRC = new Int32Array(4 * 256);
 for (let i = 0; i < CRC.length; i++) {
   let value = i < 256 ? i : CRC[i - 256];
@@ -21,11 +21,11 @@ for (let i = 0; i < CRC.length; i++) {
 }
 
 /**
- * CRC-32 as zip, PNG and zlib have it.
+ * Return the CRC-32 of zip, PNG and zlib.
  * @param {Uint8Array} bytes
  */
 export function crc32(bytes) {
-  if (bytes.byteOffset & 3) bytes = new Uint8Array(bytes); // a copy, which slice() of a Buffer is not
+  if (bytes.byteOffset & 3) bytes = new Uint8Array(bytes); // a copy; slice() of a Buffer would share memory
   const words = new Int32Array(bytes.buffer, bytes.byteOffset, bytes.length >> 2);
   let crc = -1;
   for (let i = 0; i < words.length; i++) {
@@ -37,10 +37,10 @@ export function crc32(bytes) {
 }
 
 /**
- * The files of a zip by their names without folders.
+ * Return functions that read the files of a zip, by file name without folders.
  * @param {Uint8Array} bytes the zip
- * @returns {Map<string, (limit: number) => Promise<Uint8Array>>} what reads each, up to so many bytes; it throws ZipError too
- * @throws {ZipError} it is no zip, or cut off
+ * @returns {Map<string, (limit: number) => Promise<Uint8Array>>} functions of the largest size allowed; they throw ZipError too
+ * @throws {ZipError} it is not a zip, or truncated
  */
 export function openZip(bytes) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.length);
@@ -50,7 +50,7 @@ export function openZip(bytes) {
   if (end < 0) throw new ZipError("not a zip file, or one that is cut off");
   const count = view.getUint16(end + 10, true);
   if (count === 0xffff || view.getUint32(end + 16, true) === 0xffffffff)
-    throw new ZipError("a zip of the 64-bit kind, which is not read: store fewer and smaller files");
+    throw new ZipError("a 64-bit zip, which is not supported: store fewer and smaller files");
   if (count > MAX_ENTRIES) throw new ZipError(`a zip of more than ${MAX_ENTRIES} files`);
   const files = new Map();
   let at = view.getUint32(end + 16, true);
@@ -81,7 +81,7 @@ export function openZip(bytes) {
  * @param {number} limit
  */
 async function read(bytes, view, { name, flags, method, crc, packed, size, local }, limit) {
-  if (size > limit) throw new ZipError(`${name} has ${size} bytes, more than the ${limit} that it can need`);
+  if (size > limit) throw new ZipError(`${name} has ${size} bytes, more than the ${limit} that it may have`);
   if (flags & 1) throw new ZipError(`${name} is encrypted`);
   if (local + 30 > bytes.length || view.getUint32(local, true) !== LOCAL)
     throw new ZipError(`${name} is not where the zip says`);
@@ -94,18 +94,18 @@ async function read(bytes, view, { name, flags, method, crc, packed, size, local
       throw new ZipError(`${name} is damaged: it cannot be unpacked`);
     });
   } else if (method !== 0) {
-    throw new ZipError(`${name} is compressed in a way (${method}) that is not read: store or deflate it`);
+    throw new ZipError(`${name} has compression method ${method}, which is not supported: store or deflate it`);
   }
   if (content.length !== size || crc32(content) !== crc)
-    throw new ZipError(`${name} is damaged: its checksum is another`);
+    throw new ZipError(`${name} is damaged: it does not match its checksum`);
   return content;
 }
 
 /**
- * All that a stream gives.
+ * Read a stream to its end.
  * @param {ReadableStream<Uint8Array>} stream
- * @param {number} limit of bytes
- * @param {(bytes: number) => void} [count]
+ * @param {number} limit largest number of bytes
+ * @param {(bytes: number) => void} [count] called with the size of each chunk
  */
 export async function collect(stream, limit, count) {
   const chunks = [];
@@ -116,6 +116,6 @@ export async function collect(stream, limit, count) {
     chunks.push(/** @type {Uint8Array<ArrayBuffer>} */ (value));
     length += value.length;
     count?.(value.length);
-    if (length > limit) throw new ZipError(`more than the ${limit} bytes that it can need`);
+    if (length > limit) throw new ZipError(`more than the ${limit} bytes that it may have`);
   }
 }

@@ -1,1 +1,1 @@
-"""Measurements of the codec and of other tools on scenes of the user. Takes scenes; gives results, tables and plots."""
+"""Measurements of presets, parts of the codec and external codecs: takes scenes, returns results and plots."""

@@ -1,4 +1,4 @@
-"""Bytes against quality: curves, what two of them differ by, and which points nothing beats."""
+"""Rate curves (bytes over quality), the average difference of two of them, and the Pareto front of points."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from kissgs.settings.encode import GOALS
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RateCurve:
-    """Bytes over quality: logarithms of bytes, with straight lines between the points.
+    """Bytes over quality: the logarithm of bytes, interpolated linearly between points.
 
     Attributes:
-        quality: ``(P,)`` ascending, such as decibels.
-        log_bytes: ``(P,)`` natural logarithms.
+        quality: ``(P,)`` ascending; any measure that grows with quality, such as PSNR in decibels.
+        log_bytes: ``(P,)`` natural logarithms of bytes.
     """
 
     quality: Float64[np.ndarray, " P"]
@@ -28,21 +28,21 @@ class RateCurve:
 
     @classmethod
     def of(cls, points: Iterable[tuple[float, float]]) -> RateCurve:
-        """Through (quality, bytes), in any order. Where quality is infinite or NaN, a point says nothing."""
+        """Return the curve through (quality, bytes) in any order; points of infinite or NaN quality are ignored."""
         kept = sorted((quality, math.log(size)) for quality, size in points if math.isfinite(quality))
         return cls(np.array([q for q, _ in kept], np.float64), np.array([b for _, b in kept], np.float64))
 
     def bytes_at(self, quality: float) -> float | None:
-        """Where the curve has that quality; None beyond its ends."""
+        """Return the bytes at this quality, interpolated; None beyond the ends of the curve."""
         if not len(self.quality) or not self.quality[0] <= quality <= self.quality[-1]:
             return None
         return float(np.exp(np.interp(quality, self.quality, self.log_bytes)))
 
     def saving(self, other: RateCurve) -> float | None:
-        """By what share ``other`` is smaller at equal quality, on average; negative if larger.
+        """Return the share of bytes that ``other`` saves at equal quality, on average; negative if it needs more.
 
-        Bjøntegaard's measure (VCEG-M33) with straight lines: the mean difference of the logarithms of bytes over the
-        range of quality that both curves cover. None where there is no such range.
+        The Bjøntegaard delta rate (VCEG-M33), negated, with linear interpolation: the mean difference of the logarithms
+        of bytes over the range of quality that both curves cover. None if there is no such range.
         """
         low = max(curve.quality.min(initial=np.inf) for curve in (self, other))
         high = min(curve.quality.max(initial=-np.inf) for curve in (self, other))
@@ -53,10 +53,11 @@ class RateCurve:
         return 1 - float(np.exp(np.mean(others - own)))
 
 
-def pareto(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Which of these (bytes, quality) nothing beats, fewest bytes first; a NaN is beaten by all.
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Return the indices of the points (bytes, quality) that no other point dominates, fewest bytes first.
 
-    One beats another if it has no more bytes and no less quality, and is not the same in both. Of equals, the first.
+    A point dominates another if it has no more bytes and no less quality, and differs in one of them. Of equal points,
+    the first is returned; a point with NaN quality never is.
     """
     front: list[int] = []
     for index in sorted(range(len(points)), key=lambda n: (points[n][0], -points[n][1])):
@@ -65,16 +66,17 @@ def pareto(points: Sequence[tuple[float, float]]) -> list[int]:
     return front
 
 
-def at_fidelity(settings: Settings, quality_offset_db: float) -> Settings:
-    """The same but for the quality_offset_db, and for goals that would contradict it.
+def at_quality_offset(settings: Settings, quality_offset_db: float) -> Settings:
+    """Return the settings with another quality offset (decibels), and without a lambda or a goal, which it replaces.
 
     Raises:
-        UnsupportedError: they weigh no bits, and so know no quality_offset_db.
+        UnsupportedError: the settings have no rate-distortion planning, which a quality offset needs.
     """
     if not settings.encode.rate_distortion:
         raise UnsupportedError(
-            f"the preset {settings.preset} weighs no bits, and knows no quality_offset_db; choose another"
+            f"quality_offset_db needs rate-distortion planning, which the preset {settings.preset} does not have; "
+            "choose balanced or small"
         )
-    asked = {"quality_offset_db": quality_offset_db, "rd_lambda": None, **dict.fromkeys(GOALS)}
-    encode = EncodeSettings(**{**settings.encode.model_dump(), **asked})
+    changes = {"quality_offset_db": quality_offset_db, "rd_lambda": None, **dict.fromkeys(GOALS)}
+    encode = EncodeSettings(**{**settings.encode.model_dump(), **changes})
     return settings.model_copy(update={"encode": encode})

@@ -1,4 +1,4 @@
-"""Ways to have fewer Gaussians, side by side: what each gives at the same count, after the same number of steps."""
+"""Strategies of compaction compared: quality, bytes and time at equal counts after equal numbers of training steps."""
 
 from __future__ import annotations
 
@@ -17,27 +17,29 @@ from kissgs.core.array_types import Int
 from kissgs.core.errors import InvalidSceneError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
+from kissgs.evaluation.results import ImageMetrics
 from kissgs.settings import CompactSettings
 from kissgs.training.supervision import SCORED, SupervisionViews, supervision_views
 
 RATIOS = (0.7, 0.5, 0.3, 0.2, 0.1, 0.05)
+"""Shares of the Gaussians that are kept, by default."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Point:
-    """One way at one count.
+class CompactionPoint:
+    """Result of one strategy at one count.
 
     Attributes:
-        way: its name in :data:`WAYS`, or "input".
-        count: Gaussians left.
-        psnr: decibels, mean over held-out views: to photographs, or to the input's renderings where there are none.
-        ssim: the same.
-        bytes: of its container as the preset ``fast`` makes it.
-        seconds: wall time, without that of taking the pictures to learn from, which all ways share.
-        cpu_seconds: the same of all threads.
+        strategy: its name in :data:`STRATEGIES`, or "input" for the uncompacted scene.
+        count: number of Gaussians left.
+        psnr: decibels, mean over held-out views, to photographs or, without those, to renderings of the input.
+        ssim: SSIM of the same images, mean over views.
+        bytes: size of its container with the preset ``fast``.
+        seconds: wall time, without the rendering of training targets, which all strategies share.
+        cpu_seconds: CPU time of all threads in that time.
     """
 
-    way: str
+    strategy: str
     count: int
     psnr: float
     ssim: float
@@ -46,29 +48,29 @@ class Point:
     cpu_seconds: float
 
     def as_dict(self) -> dict[str, Any]:
-        """For machines."""
+        """Return all attributes by name, for JSON."""
         return asdict(self)
 
 
-def by_chance(splats: Splats, count: int) -> Int[np.ndarray, " M"]:
-    """Any, the same each time."""
+def random_subset(splats: Splats, count: int) -> Int[np.ndarray, " M"]:
+    """Return ``count`` random indices, ascending, with a fixed seed."""
     return np.sort(np.random.default_rng(0).permutation(len(splats))[:count])
 
 
-def by_opacity(splats: Splats, count: int) -> Int[np.ndarray, " M"]:
-    """The most opaque ones."""
+def most_opaque(splats: Splats, count: int) -> Int[np.ndarray, " M"]:
+    """Return the indices of the ``count`` most opaque Gaussians, ascending."""
     return highest(splats.opacities, count)
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
-    """One of them.
+class Strategy:
+    """A strategy to reduce the number of Gaussians.
 
     Attributes:
-        name: for people.
-        training: none; after one pruning; or while Gaussians go, and after that.
-        start: which Gaussians are left, given the scene and the count; None for those that score best.
-        changes: of the settings.
+        name: name in tables and of the option ``--strategy``.
+        training: "none", "after" a single pruning, or "along" with prunings and after the last one.
+        start: function of the scene and the count that returns the indices to keep; None to keep the highest scores.
+        changes: changes of the compaction settings.
     """
 
     name: str
@@ -76,103 +78,118 @@ class Way:
     start: Callable[[Splats, int], Int[np.ndarray, " M"]] | None = None
     changes: Mapping[str, Any] = field(default_factory=dict)
 
-    def settings(self, chosen: CompactSettings) -> CompactSettings:
-        """Of the recipe, with as many steps in all as there were."""
-        steps = {"sparsify_steps": 0, "refine_steps": chosen.steps if self.training == "after" else 0}
-        return chosen.model_copy(update={**(steps if self.training != "along" else {}), **self.changes})
+    def apply(self, settings: CompactSettings) -> CompactSettings:
+        """Return the settings of this strategy; if it trains, with as many steps in total as ``settings``."""
+        steps = {"sparsify_steps": 0, "refine_steps": settings.steps if self.training == "after" else 0}
+        return settings.model_copy(update={**(steps if self.training != "along" else {}), **self.changes})
 
 
 AT_ONCE, IN_ROUNDS = {"min_keep_per_scoring": 0.0}, {"min_keep_per_scoring": 0.8}
-ONE, FIVE = ({**IN_ROUNDS, "prune_rounds": rounds, "admm_rho": 0.0, "erank_weight": 0.0} for rounds in (1, 5))
-RHO, NEEDLES = {"admm_rho": 5e-4}, {"erank_weight": 0.01}
-"""Of GaussianSpa's and of effective rank's published code."""
-
-WAYS = (
-    Way("random", "none", by_chance),
-    Way("opacity", "none", by_opacity),
-    Way("POP", "none", changes=AT_ONCE),
-    Way("POP in rounds", "none", changes=IN_ROUNDS),
-    Way("opacity + refine", "after", by_opacity),
-    Way("POP + refine", "after", changes=AT_ONCE),
-    Way("POP in rounds + refine", "after", changes=IN_ROUNDS),
-    Way("POP + train + POP + refine", "along", changes=ONE),
-    Way("POP + sparsify + POP + refine", "along", changes={**ONE, **RHO}),
-    Way("POPSpa", "along", changes={**ONE, **RHO, **NEEDLES}),
-    Way("prunings along the way", "along", changes=FIVE),
-    Way("prunings along the way + sparsify", "along", changes={**FIVE, **RHO}),
-    Way("prunings along the way + erank", "along", changes={**FIVE, **NEEDLES}),
+ONE_ROUND, FIVE_ROUNDS = (
+    {**IN_ROUNDS, "prune_rounds": rounds, "admm_rho": 0.0, "erank_weight": 0.0} for rounds in (1, 5)
 )
-"""All of them, the cheapest first. What a name says does not depend on the settings; all else does."""
+ADMM, ERANK = {"admm_rho": 5e-4}, {"erank_weight": 0.01}
+"""Weights in the published code of GaussianSpa and of the effective-rank loss."""
+
+STRATEGIES = (
+    Strategy("random", "none", random_subset),
+    Strategy("opacity", "none", most_opaque),
+    Strategy("POP", "none", changes=AT_ONCE),
+    Strategy("POP in rounds", "none", changes=IN_ROUNDS),
+    Strategy("opacity + refine", "after", most_opaque),
+    Strategy("POP + refine", "after", changes=AT_ONCE),
+    Strategy("POP in rounds + refine", "after", changes=IN_ROUNDS),
+    Strategy("POP + train + POP + refine", "along", changes=ONE_ROUND),
+    Strategy("POP + sparsify + POP + refine", "along", changes={**ONE_ROUND, **ADMM}),
+    Strategy("POPSpa", "along", changes={**ONE_ROUND, **ADMM, **ERANK}),
+    Strategy("prunings along the way", "along", changes=FIVE_ROUNDS),
+    Strategy("prunings along the way + sparsify", "along", changes={**FIVE_ROUNDS, **ADMM}),
+    Strategy("prunings along the way + erank", "along", changes={**FIVE_ROUNDS, **ERANK}),
+)
+"""All strategies, the fastest first. Each fixes the settings that its name mentions and takes the others as given."""
 
 
-def study(
+def compare_strategies(
     splats: Splats,
     settings: CompactSettings,
     views: Views | None = None,
     *,
     ratios: Sequence[float] = RATIOS,
-    ways: Sequence[Way] = WAYS,
-    learn_from: Source = "photos",
+    strategies: Sequence[Strategy] = STRATEGIES,
+    supervision: Source = "photos",
     threads: int = 0,
     progress: Progress = silent,
-) -> list[Point]:
-    """Try every way at every ratio.
+) -> list[CompactionPoint]:
+    """Return the results of the uncompacted scene, then of each strategy at each ratio.
 
     Args:
-        splats: clean.
-        settings: of the recipe; all ways that train have as many steps in all. Without steps, they are left out.
-        views: a capture; by default virtual views, with the scene as the teacher.
-        ratios: counts, as shares of the scene's.
-        ways: some of :data:`WAYS`.
-        learn_from: how much of the capture is learned from; its held-out views judge in any case.
-        threads: 0 means one per processor.
-        progress: receives the stages of the recipe.
+        splats: a clean scene.
+        settings: compaction settings; every strategy that trains takes as many steps in total. Strategies that train
+            are left out if there are none.
+        views: a capture; None for virtual views with the scene's own renderings as targets.
+        ratios: shares of the Gaussians to keep, above 0 and up to 1.
+        strategies: some of :data:`STRATEGIES`.
+        supervision: the part of the capture that training uses; its held-out views evaluate in any case.
+        threads: number of threads; 0 means one per processor.
+        progress: receives the stages of compaction.
 
     Raises:
-        InvalidSceneError: there are no Gaussians.
+        InvalidSceneError: the scene has no Gaussians.
     """
     if not len(splats):
-        raise InvalidSceneError("the scene has no Gaussians, and cannot have fewer")
-    taught = _taught(splats, settings, views, learn_from, threads, progress)
-    ways = [way for way in ways if settings.trains or way.training == "none"]
-    taken = None
-    if any(way.training != "none" for way in ways):
+        raise InvalidSceneError("the scene has no Gaussians to compact; give one that has some")
+    supervised = _supervision(splats, settings, views, supervision, threads, progress)
+    strategies = [strategy for strategy in strategies if settings.trains or strategy.training == "none"]
+    targets = None
+    if any(strategy.training != "none" for strategy in strategies):
         from kissgs.training.targets import training_targets
 
-        taken = training_targets(splats, taught.train, taught.background, threads=threads, progress=progress)
-
-    def judged(way: str, scene: Splats, seconds: float, cpu_seconds: float) -> Point:
-        likeness, size = evaluate_scene(scene, splats, taught, threads, progress)
-        return Point(
-            way=way,
-            count=len(scene),
-            psnr=likeness.psnr,
-            ssim=likeness.ssim,
-            bytes=size,
-            seconds=seconds,
-            cpu_seconds=cpu_seconds,
-        )
-
-    points = [judged("input", splats, 0.0, 0.0)]
-    for way in ways:
+        targets = training_targets(splats, supervised.train, supervised.background, threads=threads, progress=progress)
+    metrics, size = evaluate_scene(splats, splats, supervised, threads, progress)
+    points = [_point("input", splats, metrics, size, 0.0, 0.0)]
+    for strategy in strategies:
         for ratio in ratios:
             count = max(1, round(len(splats) * ratio))
             wall, cpu = time.perf_counter(), time.process_time()
-            scene = splats if way.start is None else splats.select(way.start(splats, count))
+            scene = splats if strategy.start is None else splats.select(strategy.start(splats, count))
             found = popspa(
-                *(scene, count, way.settings(settings), taught),
+                scene,
+                count,
+                strategy.apply(settings),
+                supervised,
                 reference=splats,
-                targets=taken,
+                targets=targets,
                 threads=threads,
                 progress=progress,
             )
-            points.append(judged(way.name, found.splats, time.perf_counter() - wall, time.process_time() - cpu))
+            wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+            metrics, size = evaluate_scene(found.splats, splats, supervised, threads, progress)
+            points.append(_point(strategy.name, found.splats, metrics, size, wall, cpu))
     return points
 
 
-def _taught(
-    splats: Splats, settings: CompactSettings, views: Views | None, learn_from: Source, threads: int, progress: Progress
+def _point(
+    strategy: str, scene: Splats, metrics: ImageMetrics, size: int, seconds: float, cpu_seconds: float
+) -> CompactionPoint:
+    return CompactionPoint(
+        strategy=strategy,
+        count=len(scene),
+        psnr=metrics.psnr,
+        ssim=metrics.ssim,
+        bytes=size,
+        seconds=seconds,
+        cpu_seconds=cpu_seconds,
+    )
+
+
+def _supervision(
+    splats: Splats,
+    settings: CompactSettings,
+    views: Views | None,
+    supervision: Source,
+    threads: int,
+    progress: Progress,
 ) -> SupervisionViews:
     scored = SCORED if settings.trains else 1
-    learned = None if views is None else views.to_learn(learn_from)
-    return supervision_views(splats, learned, settings, scored=scored, threads=threads, progress=progress)
+    used = None if views is None else views.to_learn(supervision)
+    return supervision_views(splats, used, settings, scored=scored, threads=threads, progress=progress)

@@ -1,4 +1,4 @@
-"""Presets and other tools on one scene: bytes, times, memory and likeness, each measured in a process of its own."""
+"""Presets and external codecs measured on one scene: bytes, times, memory and quality, each in a separate process."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from kissgs.benchmark.bd_rate import at_fidelity
-from kissgs.benchmark.external_codecs import SPLAT_TRANSFORM, PeerResult, check_peer, measure_peer
+from kissgs.benchmark.bd_rate import at_quality_offset
+from kissgs.benchmark.external_codecs import SPLAT_TRANSFORM, ExternalResult, check_external, measure_external
 from kissgs.benchmark.render_speed import resampled
-from kissgs.benchmark.results import Measured, Run
+from kissgs.benchmark.results import Measurement, Run
 from kissgs.benchmark.roundtrip import isolated_roundtrip
 from kissgs.cameras.views import Views
 from kissgs.core.errors import KissgsError
@@ -18,61 +18,68 @@ from kissgs.core.progress import Progress, silent
 from kissgs.pipeline.scene_files import load, save
 from kissgs.settings import Settings
 
-PATIENCE = 60.0
-"""Seconds: what takes a peer longer is not repeated."""
+MAX_REPEATED_SECONDS = 60.0
+"""An external codec that takes longer, encoding and decoding together, is measured once only, seconds."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
-    """What to measure.
+class BenchmarkPlan:
+    """Arguments of :func:`compare`.
 
     Attributes:
-        presets: as they are, each ``repeats`` times.
-        curved: presets that weigh bits, once at every quality_offset_db.
-        fidelities: settings of that name.
-        peers: formats.
-        command: how to start splat-transform.
-        sog_iterations: of ``.sog``'s SH clustering; None leaves the tool's default.
-        repeats: 1 or more.
-        pictures: whether they are compared.
-        views: a capture, whose cameras weigh bits and whose held-out views are compared.
-        threads: 0 means one per processor.
+        presets: settings that are measured as they are, ``repeats`` times each.
+        curve_presets: settings with rate-distortion planning, measured once at each of ``quality_offsets``.
+        quality_offsets: values of ``quality_offset_db``, decibels.
+        external_codecs: formats of :data:`kissgs.benchmark.external_codecs.EXTERNAL_FORMATS`.
+        splat_transform: command that starts splat-transform, the tool of the external codecs.
+        sog_iterations: k-means iterations over the SH of ``.sog``; None for the tool's default.
+        repeats: number of measurements, 1 or more.
+        evaluate: whether to compare rendered images.
+        views: capture for rate-distortion planning and, by its held-out views, for the evaluation; None to evaluate
+            with cameras drawn over the whole scene.
+        threads: number of threads; 0 means one per processor.
     """
 
     presets: Sequence[Settings]
-    curved: Sequence[Settings] = ()
-    fidelities: Sequence[float] = ()
-    peers: Sequence[str] = ()
-    command: Sequence[str] = SPLAT_TRANSFORM
+    curve_presets: Sequence[Settings] = ()
+    quality_offsets: Sequence[float] = ()
+    external_codecs: Sequence[str] = ()
+    splat_transform: Sequence[str] = SPLAT_TRANSFORM
     sog_iterations: int | None = None
     repeats: int = 1
-    pictures: bool = False
+    evaluate: bool = False
     views: Views | None = None
     threads: int = 0
 
 
 def compare(
-    scene: Path, plan: Plan, *, failed: Callable[[str], None] | None = None, progress: Progress = silent
-) -> list[Measured]:
-    """Measure all that is planned on one scene: presets, then points of curves, then peers.
+    scene: Path, plan: BenchmarkPlan, *, on_failure: Callable[[str], None] | None = None, progress: Progress = silent
+) -> list[Measurement]:
+    """Measure a scene as planned: presets, then points of quality curves, then external codecs.
 
     Args:
-        scene: a ``.ply``.
-        plan: what.
-        failed: told of a peer that fails, which then ends nothing: all else has taken long to find.
-        progress: receives "measure", with what is measured as a note.
+        scene: a ``.ply`` file.
+        plan: what to measure.
+        on_failure: receives the error message of an external codec that fails, and the measurements go on; None to
+            raise the error.
+        progress: receives the stage "measure" with the name of the codec as a note.
 
     Raises:
-        InvalidSceneError: the scene, or what a peer made of it, cannot be read.
-        UnsupportedError: a peer is missing, or fails and there is nobody to tell; a measurement was killed.
+        InvalidSceneError: the scene, or the output of an external codec, cannot be read.
+        UnsupportedError: an external codec is missing, or it fails and ``on_failure`` is None; a measurement was
+            killed.
     """
-    for peer in plan.peers:
-        check_peer(peer, plan.command)
-    points = [(at_fidelity(settings, value), value) for settings in plan.curved for value in plan.fidelities]
-    jobs: list[tuple[str, Callable[[], Measured]]] = [
-        *((settings.preset, lambda s=settings: _preset(scene, s, None, plan)) for settings in plan.presets),
-        *((at.preset, lambda at=at, value=value: _preset(scene, at, value, plan)) for at, value in points),
-        *((peer, lambda peer=peer: _peer(scene, peer, plan)) for peer in plan.peers),
+    for codec in plan.external_codecs:
+        check_external(codec, plan.splat_transform)
+    points = [
+        (at_quality_offset(settings, offset), offset)
+        for settings in plan.curve_presets
+        for offset in plan.quality_offsets
+    ]
+    jobs: list[tuple[str, Callable[[], Measurement]]] = [
+        *((settings.preset, lambda s=settings: _measure_preset(scene, s, None, plan)) for settings in plan.presets),
+        *((s.preset, lambda s=s, offset=offset: _measure_preset(scene, s, offset, plan)) for s, offset in points),
+        *((codec, lambda codec=codec: _measure_external(scene, codec, plan)) for codec in plan.external_codecs),
     ]
     rows = []
     for done, (name, job) in enumerate(jobs):
@@ -80,14 +87,16 @@ def compare(
         try:
             rows.append(job())
         except KissgsError as error:
-            if failed is None or name not in plan.peers:
+            if on_failure is None or name not in plan.external_codecs:
                 raise
-            failed(str(error))
+            on_failure(str(error))
     return rows
 
 
-def growth(scene: Path, counts: Sequence[int], plan: Plan, *, progress: Progress = silent) -> list[Measured]:
-    """Compare on the scene made larger or smaller (:func:`kissgs.benchmark.render_speed.resampled`), at each count."""
+def compare_at_counts(
+    scene: Path, counts: Sequence[int], plan: BenchmarkPlan, *, progress: Progress = silent
+) -> list[Measurement]:
+    """Measure the scene resampled to each count (:func:`kissgs.benchmark.render_speed.resampled`), as planned."""
     splats = load(scene, threads=plan.threads, progress=progress)
     rows = []
     with tempfile.TemporaryDirectory(prefix="kissgs-bench-") as folder:
@@ -98,52 +107,54 @@ def growth(scene: Path, counts: Sequence[int], plan: Plan, *, progress: Progress
     return rows
 
 
-def _preset(scene: Path, settings: Settings, quality_offset_db: float | None, plan: Plan) -> Measured:
-    """Pictures of equal containers are equal, so they are taken once; points of a curve are about bytes, not times."""
+def _measure_preset(
+    scene: Path, settings: Settings, quality_offset_db: float | None, plan: BenchmarkPlan
+) -> Measurement:
+    """Measure a preset, or once only a point of its curve, whose times do not matter; evaluate the first container."""
     repeats = plan.repeats if quality_offset_db is None else 1
     results = [
         isolated_roundtrip(
-            *(scene, settings), pictures=plan.pictures and not number, views=plan.views, threads=plan.threads
+            scene, settings, evaluate=plan.evaluate and not number, views=plan.views, threads=plan.threads
         )
         for number in range(repeats)
     ]
     first = results[0]
-    return Measured(
+    return Measurement(
         scene=scene.name,
-        encoder=str(settings.preset),
+        codec=str(settings.preset),
         quality_offset_db=quality_offset_db,
         gaussians=first.report.source_count,
         file_bytes=first.report.file_bytes,
         runs=tuple(map(Run.of, results)),
         errors=first.errors,
-        pictures=first.pictures,
+        evaluation=first.evaluation,
         details=first.as_dict(),
     )
 
 
-def _peer(scene: Path, peer: str, plan: Plan) -> Measured:
-    """As often as presets, if it is quick."""
+def _measure_external(scene: Path, codec: str, plan: BenchmarkPlan) -> Measurement:
+    """Measure an external codec, as often as presets if that takes at most :data:`MAX_REPEATED_SECONDS` each time."""
 
-    def measure(pictures: bool) -> PeerResult:
-        iterations = plan.sog_iterations if peer == "sog" else None
-        return measure_peer(
-            *(scene, peer),
-            command=plan.command,
-            sh_iterations=iterations,
-            pictures=pictures,
+    def measure(evaluate: bool) -> ExternalResult:
+        return measure_external(
+            scene,
+            codec,
+            command=plan.splat_transform,
+            sh_iterations=plan.sog_iterations if codec == "sog" else None,
+            evaluate=evaluate,
             views=plan.views,
         )
 
-    first = measure(plan.pictures)
-    quick = first.encode_seconds + first.decode_seconds <= PATIENCE
+    first = measure(plan.evaluate)
+    quick = first.encode_seconds + first.decode_seconds <= MAX_REPEATED_SECONDS
     results = [first, *(measure(False) for _ in range(1, plan.repeats if quick else 1))]
-    return Measured(
+    return Measurement(
         scene=scene.name,
-        encoder=peer,
+        codec=codec,
         gaussians=first.gaussians,
-        file_bytes={peer: first.bytes},
+        file_bytes={codec: first.bytes},
         runs=tuple(map(Run.of, results)),
         errors=first.errors,
-        pictures=first.pictures,
+        evaluation=first.evaluation,
         details=first.as_dict(),
     )

@@ -1,4 +1,4 @@
-"""Other tools on the same scene: what their files weigh, what they cost in time, and what they lose."""
+"""File size, time, memory and errors of external codecs, the formats that splat-transform writes."""
 
 from __future__ import annotations
 
@@ -24,84 +24,94 @@ from kissgs.evaluation.results import Evaluation
 from kissgs.io.atomic import reason_of
 from kissgs.io.ply import read_ply
 
-PEER_FORMATS = ("sog", "spz")
+EXTERNAL_FORMATS = ("sog", "spz")
+"""Formats that can be measured, by file extension."""
 
 SPLAT_TRANSFORM = ("splat-transform",)
-"""PlayCanvas' converter, as ``npm install -g @playcanvas/splat-transform`` puts it on the PATH."""
+"""Command of PlayCanvas' converter, as ``npm install -g @playcanvas/splat-transform`` installs it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PeerResult:
-    """One scene through one format of another tool, and back."""
+class ExternalResult:
+    """Measurements of a scene that an external codec encoded and decoded.
+
+    Attributes:
+        format: one of :data:`EXTERNAL_FORMATS`.
+        gaussians: number of Gaussians in the scene, after cleaning.
+        kept: number of Gaussians in the decoded file.
+        bytes: size of the encoded file.
+        encode_seconds: wall time of the encoding process, with start-up and reading the ``.ply``.
+        decode_seconds: wall time of the decoding process, with start-up and writing the ``.ply``.
+        encode_cpu_seconds: CPU time of the encoding process, user and system, all threads.
+        decode_cpu_seconds: CPU time of the decoding process, user and system, all threads.
+        peak_memory: largest resident set of both processes, bytes.
+        errors: errors of the visible Gaussians: no renderer draws an opacity of 1/255 or less, and codecs change what
+            such an opacity hides.
+        evaluation: comparison of rendered images; None if not requested.
+    """
 
     format: str
     gaussians: int
-    """in the scene, once cleaned"""
     kept: int
-    """in the peer's file"""
     bytes: int
     encode_seconds: float
     decode_seconds: float
-    """both: wall time of the tool's process, start-up and .ply included"""
     encode_cpu_seconds: float
     decode_cpu_seconds: float
-    """the same of all threads, user and system time"""
     peak_memory: int
-    """bytes, the largest resident set of the tool's processes"""
     errors: AttributeErrors
-    """of the Gaussians that show: an opacity of at most 1/255 no renderer draws, and tools scramble what it hides"""
-    pictures: Evaluation | None = None
+    evaluation: Evaluation | None = None
 
     @property
     def bytes_per_gaussian(self) -> float:
-        """Of the scene's Gaussians, kept or not."""
+        """Encoded bytes per Gaussian of the scene, whether kept or not."""
         return self.bytes / self.gaussians
 
     def as_dict(self) -> dict[str, Any]:
-        """All numbers by name, nested as the fields are."""
-        pictures = None if self.pictures is None else self.pictures.as_dict()
-        numbers = asdict(replace(self, pictures=None))
-        return {**numbers, "bytes_per_gaussian": self.bytes_per_gaussian, "pictures": pictures}
+        """Return all attributes by name, nested, for JSON."""
+        evaluation = None if self.evaluation is None else self.evaluation.as_dict()
+        numbers = asdict(replace(self, evaluation=None))
+        return {**numbers, "bytes_per_gaussian": self.bytes_per_gaussian, "evaluation": evaluation}
 
 
-def measure_peer(
+def measure_external(
     scene: Path,
     format: str,
     *,
     command: Sequence[str] = SPLAT_TRANSFORM,
     sh_iterations: int | None = None,
-    pictures: bool = False,
+    evaluate: bool = False,
     views: Views | None = None,
-) -> PeerResult:
-    """Write ``scene`` in a peer's format, read it back by the same tool, and compare.
+) -> ExternalResult:
+    """Encode ``scene`` in an external format, decode it with the same tool, and compare the two.
 
     Without a GPU, ``.sog`` of a scene of SH degree 3 takes 10 minutes and more per SH iteration.
 
     Args:
-        scene: A ``.ply`` file.
-        format: ``"sog"`` or ``"spz"``.
-        command: How to start splat-transform.
-        sh_iterations: k-means iterations over the SH of ``.sog``; None leaves the tool's default.
-        pictures: compare pictures too (:func:`kissgs.evaluation.evaluate.compare_pictures`).
-        views: from where; by default cameras drawn over the whole scene.
+        scene: a ``.ply`` file.
+        format: one of :data:`EXTERNAL_FORMATS`.
+        command: command that starts splat-transform.
+        sh_iterations: k-means iterations over the SH of ``.sog``; None for the tool's default.
+        evaluate: whether to compare rendered images too (:func:`kissgs.evaluation.evaluate.compare_pictures`).
+        views: views of that comparison; None for cameras drawn over the whole scene.
 
     Raises:
-        InvalidSceneError: ``scene``, or what the tool made of it, cannot be read or has no usable Gaussian.
-        UnsupportedError: unknown format; the tool is missing or failed; SciPy is not installed; this is Windows,
-            which does not say what a process took.
+        InvalidSceneError: ``scene`` or the tool's output cannot be read, or has no usable Gaussian.
+        UnsupportedError: unknown format; the tool is missing or fails; SciPy is not installed; the system is Windows,
+            which does not report the resources that a process used.
     """
-    check_peer(format, command)
+    check_external(format, command)
     reference, _ = clean(read_ply(scene))
     if not len(reference):
         raise InvalidSceneError(f"{scene} has no usable Gaussian")
     iterations = [] if sh_iterations is None else ["-i", str(sh_iterations)]
-    with tempfile.TemporaryDirectory(prefix="kissgs-peer-") as folder:
-        packed, unpacked = Path(folder, f"scene.{format}"), Path(folder, "unpacked.ply")
-        encoding = _convert(command, scene.resolve(), packed, iterations)
-        decoding = _convert(command, packed, unpacked, [])
-        size = packed.stat().st_size
-        candidate, _ = clean(read_ply(unpacked))
-    return PeerResult(
+    with tempfile.TemporaryDirectory(prefix="kissgs-external-") as folder:
+        encoded, decoded = Path(folder, f"scene.{format}"), Path(folder, "unpacked.ply")
+        encoding = _convert(command, scene.resolve(), encoded, iterations)
+        decoding = _convert(command, encoded, decoded, [])
+        size = encoded.stat().st_size
+        candidate, _ = clean(read_ply(decoded))
+    return ExternalResult(
         format=format,
         gaussians=len(reference),
         kept=len(candidate),
@@ -112,22 +122,22 @@ def measure_peer(
         decode_cpu_seconds=decoding.cpu,
         peak_memory=max(encoding.memory, decoding.memory),
         errors=_errors_of_visible(reference, candidate),
-        pictures=compare_pictures(reference, candidate, views or evaluation_views(reference)) if pictures else None,
+        evaluation=compare_pictures(reference, candidate, views or evaluation_views(reference)) if evaluate else None,
     )
 
 
-def check_peer(format: str, command: Sequence[str]) -> None:
-    """See that a peer can be measured, before work that comes before.
+def check_external(format: str, command: Sequence[str]) -> None:
+    """Check that an external codec can be started, before a long measurement.
 
     Raises:
         UnsupportedError: unknown format, or the tool is missing.
     """
-    if format not in PEER_FORMATS:
-        raise UnsupportedError(f"unknown peer format {format!r}; there are {', '.join(PEER_FORMATS)}")
+    if format not in EXTERNAL_FORMATS:
+        raise UnsupportedError(f"unknown external codec {format!r}; choose {' or '.join(EXTERNAL_FORMATS)}")
     if not command or shutil.which(command[0]) is None:
         raise UnsupportedError(
-            f"cannot start {' '.join(command[:1]) or 'nothing'}: install it with "
-            "npm install -g @playcanvas/splat-transform, or say how to start it (--splat-transform)"
+            f"cannot start {' '.join(command[:1]) or 'an empty command'}: install it with "
+            "npm install -g @playcanvas/splat-transform, or give its command with --splat-transform"
         )
 
 
@@ -138,39 +148,42 @@ def _errors_of_visible(reference: Splats, candidate: Splats) -> AttributeErrors:
 
 
 @dataclass(frozen=True, slots=True)
-class _Cost:
-    """Of one process: seconds, seconds of all threads, bytes."""
+class _Resources:
+    """Resources that a process used: wall time and CPU time in seconds, largest resident set in bytes."""
 
     wall: float
     cpu: float
     memory: int
 
 
-def _convert(command: Sequence[str], source: Path, target: Path, options: list[str]) -> _Cost:
-    """Run the tool; returns what it took."""
+def _convert(command: Sequence[str], source: Path, target: Path, options: list[str]) -> _Resources:
+    """Run the tool, and return the resources that it used."""
     call = [*command, "-g", "cpu", "-w", *options, str(source), str(target)]
     with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as errors:
         try:
-            status, cost = _run(call, output, errors)
+            status, resources = _run(call, output, errors)
         except OSError as error:
             raise UnsupportedError(f"cannot start {command[0]}: {reason_of(error)}") from error
         if status != 0 or not target.is_file():
-            last = (_told(errors) or _told(output) or "no message").splitlines()[-1]
+            last = (_text(errors) or _text(output) or "no message").splitlines()[-1]
             raise UnsupportedError(
-                f"{command[0]} could not turn {source.name} into {target.suffix} (status {status}): {last}"
+                f"{command[0]} could not convert {source.name} to {target.suffix} (status {status}): {last}"
             )
-    return cost
+    return resources
 
 
-def _told(file: IO[bytes]) -> str:
+def _text(file: IO[bytes]) -> str:
     file.seek(0)
     return file.read().decode(errors="replace").strip()
 
 
-def _run(call: Sequence[str], output: IO[bytes], errors: IO[bytes]) -> tuple[int, _Cost]:
-    """The exit status of a process, and what it and those it has waited for took."""
+def _run(call: Sequence[str], output: IO[bytes], errors: IO[bytes]) -> tuple[int, _Resources]:
+    """Run a process; return its exit status and the resources that it and the children it waited for used."""
     if sys.platform == "win32":
-        raise UnsupportedError("Windows does not say what a process took: measure other tools elsewhere")
+        raise UnsupportedError(
+            "external codecs cannot be measured on Windows, which does not report the resources of a process; use "
+            "another system"
+        )
     begin = time.perf_counter()
     process = subprocess.Popen(call, stdin=subprocess.DEVNULL, stdout=output, stderr=errors)
     try:
@@ -181,4 +194,4 @@ def _run(call: Sequence[str], output: IO[bytes], errors: IO[bytes]) -> tuple[int
         raise
     process.returncode = os.waitstatus_to_exitcode(status)
     resident = usage.ru_maxrss if sys.platform == "darwin" else usage.ru_maxrss * 1024
-    return process.returncode, _Cost(time.perf_counter() - begin, usage.ru_utime + usage.ru_stime, resident)
+    return process.returncode, _Resources(time.perf_counter() - begin, usage.ru_utime + usage.ru_stime, resident)

@@ -1,4 +1,4 @@
-"""Bytes and PSNR of a scene at several fidelities: as they are chosen, and fine-tuned."""
+"""Bytes and quality of a scene at several quality offsets, with and without fine-tuning."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from kissgs.benchmark.bd_rate import RateCurve, at_fidelity
+from kissgs.benchmark.bd_rate import RateCurve, at_quality_offset
 from kissgs.cameras.views import Source, Views
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.progress import Progress, as_stage, silent
@@ -17,28 +17,30 @@ from kissgs.evaluation.evaluate import compare_pictures
 from kissgs.pipeline.pipeline import compact, compress, decompress
 from kissgs.settings import Settings
 
-FIDELITIES = (-8.0, -5.0, -2.0, 1.0)
-CHOSEN, TUNED = "as chosen", "fine-tuned"
+QUALITY_OFFSETS = (-8.0, -5.0, -2.0, 1.0)
+"""Default quality offsets, decibels."""
+
+NOT_TUNED, TUNED = "not fine-tuned", "fine-tuned"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RatePoint:
-    """One container.
+    """Measurements of one container.
 
     Attributes:
-        way: :data:`CHOSEN` or :data:`TUNED`.
-        count: Gaussians of the scene that was encoded.
-        quality_offset_db: the setting.
-        bytes: of the zip.
-        psnr: decibels, mean over held-out views: to photographs, or to the scene's own renderings.
-        ssim: the same.
-        psnr_to_scene: decibels to renderings of the scene as it was before compaction.
+        variant: :data:`NOT_TUNED` or :data:`TUNED`.
+        count: number of Gaussians of the encoded scene.
+        quality_offset_db: the setting, decibels.
+        bytes: size of the zip.
+        psnr: decibels, mean over held-out views, to photographs or, without those, to renderings of the scene.
+        ssim: SSIM of the same images, mean over views.
+        psnr_to_scene: decibels, mean over the same views, to renderings of the scene before compaction.
         seconds: wall time of compression.
-        cpu_seconds: the same of all threads.
-        peak_memory: bytes, the largest the process has had resident so far.
+        cpu_seconds: CPU time of compression, all threads.
+        peak_memory: largest resident set of the process so far, bytes.
     """
 
-    way: str
+    variant: str
     count: int
     quality_offset_db: float
     bytes: int
@@ -50,7 +52,7 @@ class RatePoint:
     peak_memory: int
 
     def as_dict(self) -> dict[str, Any]:
-        """For machines."""
+        """Return all attributes by name, for JSON."""
         return asdict(self)
 
 
@@ -59,69 +61,69 @@ def rate_curves(
     settings: Settings,
     views: Views | None = None,
     *,
-    fidelities: Sequence[float] | None = None,
+    quality_offsets: Sequence[float] | None = None,
     ratios: Sequence[float] = (),
-    learn_from: Source = "photos",
+    supervision: Source = "photos",
     threads: int = 0,
     progress: Progress = silent,
 ) -> list[RatePoint]:
-    """Compress a scene at every quality_offset_db, with fine-tuning and without it.
+    """Compress a scene at each quality offset, with and without fine-tuning.
 
     Args:
-        splats: clean.
-        settings: of all else.
-        views: a capture; by default cameras drawn over the whole scene judge, and the scene itself is the teacher.
-        fidelities: settings of that name; by default :data:`FIDELITIES`, or that of the settings if there are ratios.
-        ratios: compact the scene to these shares first, and compress each of what is left as a scene of its own.
-        learn_from: how much of the capture is learned from; its held-out views judge in any case.
-        threads: 0 means one per processor.
-        progress: receives the stages of compaction and compression.
+        splats: a clean scene.
+        settings: all other settings.
+        views: a capture; None to fine-tune by renderings of the scene and to evaluate with cameras drawn over it.
+        quality_offsets: values of ``quality_offset_db``; None for :data:`QUALITY_OFFSETS` or, with ``ratios``, the
+            value of the settings.
+        ratios: shares of the Gaussians to keep; the scene is compacted to each of them first, and each result is
+            compressed as a scene of its own.
+        supervision: the part of the capture that training uses; its held-out views evaluate in any case.
+        threads: number of threads; 0 means one per processor.
+        progress: receives the stages of compaction and compression, and "evaluate".
 
     Raises:
-        UnsupportedError: the settings weigh no bits, and so know no quality_offset_db; or ask for fewer Gaussians.
+        UnsupportedError: the settings have no rate-distortion planning, or enable compaction.
     """
-    at = [
-        at_fidelity(settings, f) for f in fidelities or ([settings.encode.quality_offset_db] if ratios else FIDELITIES)
-    ]
+    offsets = quality_offsets or ([settings.encode.quality_offset_db] if ratios else QUALITY_OFFSETS)
+    variants = _variants([at_quality_offset(settings, offset) for offset in offsets])
     if settings.compact.enabled:
         raise UnsupportedError(
-            "fine-tuning is measured on a scene as it is; compact it first: kissgs compact, or ratios"
+            "fine-tuning is measured without compaction settings; compact the scene first with kissgs compact, or give "
+            "--ratio"
         )
-    judges = views or evaluation_views(splats, threads=threads, progress=progress)
-    taught = None if views is None or learn_from == "scene" else views.to_learn(learn_from)
+    evaluated = views or evaluation_views(splats, threads=threads, progress=progress)
+    training = None if views is None or supervision == "scene" else views.to_learn(supervision)
     points = []
     shares: list[float | None] = [*ratios] or [None]
     for ratio in shares:
         scene = splats
         if ratio is not None:
             budget = settings.compact.model_copy(update={"ratio": ratio})
-            kept = settings.model_copy(update={"compact": budget})
-            scene = compact(splats, settings=kept, views=taught, threads=threads, progress=progress).splats
-        for encoded in at:
-            for way in (CHOSEN, TUNED):
-                tuning = settings.finetune.model_copy(update={"enabled": way == TUNED})
-                chosen = encoded.model_copy(update={"finetune": tuning})
-                points.append(_point(way, splats, scene, chosen, taught, judges, threads, progress))
+            compacting = settings.model_copy(update={"compact": budget})
+            scene = compact(splats, settings=compacting, views=training, threads=threads, progress=progress).splats
+        for name, variant in variants:
+            points.append(_point(name, splats, scene, variant, training, evaluated, threads, progress))
     return points
 
 
 def _point(
-    way: str,
+    variant: str,
     original: Splats,
     scene: Splats,
     settings: Settings,
-    taught: Views | None,
-    judges: Views,
+    training: Views | None,
+    evaluated: Views,
     threads: int,
     progress: Progress,
 ) -> RatePoint:
+    """Compress ``scene`` with the views ``training``, and compare with ``original`` in the views ``evaluated``."""
     wall, cpu = time.perf_counter(), time.process_time()
-    result = compress(scene, settings=settings, views=taught, threads=threads, progress=progress)
+    result = compress(scene, settings=settings, views=training, threads=threads, progress=progress)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     decoded = decompress(result.files, threads=threads)
-    mean = compare_pictures(original, decoded, judges, threads=threads, progress=as_stage("judge", progress)).mean
+    mean = compare_pictures(original, decoded, evaluated, threads=threads, progress=as_stage("evaluate", progress)).mean
     return RatePoint(
-        way=way,
+        variant=variant,
         count=len(scene),
         quality_offset_db=settings.encode.quality_offset_db,
         bytes=result.report.container_bytes,
@@ -134,13 +136,30 @@ def _point(
     )
 
 
-def saved(points: Sequence[RatePoint], figure: str = "psnr") -> float | None:
-    """By what share fine-tuned containers are smaller than others of the same quality, on average; negative if larger.
+def _variants(curve: Sequence[Settings]) -> list[tuple[str, Settings]]:
+    """Return each of the settings without and with fine-tuning, and the name of that variant."""
+    return [
+        (
+            name,
+            settings.model_copy(update={"finetune": settings.finetune.model_copy(update={"enabled": name == TUNED})}),
+        )
+        for settings in curve
+        for name in (NOT_TUNED, TUNED)
+    ]
 
-    See :meth:`kissgs.benchmark.bd_rate.RateCurve.saving`.
+
+def bytes_saved(points: Sequence[RatePoint], metric: str = "psnr") -> float | None:
+    """Return the share of bytes that fine-tuning saves at equal quality, on average; negative if it needs more.
+
+    Args:
+        points: points of both variants.
+        metric: "psnr", "ssim" or "psnr_to_scene".
+
+    Returns:
+        See :meth:`kissgs.benchmark.bd_rate.RateCurve.saving`.
     """
-    chosen, tuned = (
-        RateCurve.of((getattr(point, figure), point.bytes) for point in points if point.way == way)
-        for way in (CHOSEN, TUNED)
+    not_tuned, tuned = (
+        RateCurve.of((getattr(point, metric), point.bytes) for point in points if point.variant == variant)
+        for variant in (NOT_TUNED, TUNED)
     )
-    return chosen.saving(tuned)
+    return not_tuned.saving(tuned)

@@ -1,7 +1,7 @@
-"""KISS-GS' codec with one of its parts left out: what the bytes would be, and what a decoder would then find.
+"""The codec of the KISS-GS paper with one part left out: the bytes that result, and the scene that a decoder would get.
 
-No container has these forms; they say what each part is worth. Where levels are left out, float32 numbers stand in
-their place, byte by byte and deflated.
+No decoder reads these files; they only measure what each part contributes. Where the levels of an attribute are left
+out, its float32 values are stored instead, split into byte planes and deflated.
 """
 
 from __future__ import annotations
@@ -28,178 +28,180 @@ from kissgs.sogxt.planes import compress_images
 
 Images = Mapping[str, UInt8[np.ndarray, "H W C"]]
 
-STORED = ("container_meta.yaml", "meta.json", "scene.json")
+METADATA = ("container_meta.yaml", "meta.json", "scene.json")
+"""Files of a container that are not images."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Coded:
-    """A scene in parts.
+class EncodedParts:
+    """An encoded scene before its images are compressed, and its decoded version.
 
     Attributes:
-        splats: the scene that was encoded.
-        choice: what was chosen for it.
-        images: that WebP compresses, by file name.
-        stored: what is no image, by name.
-        exact: what is in the container, in the order of the grid and in the forms that were chosen, as it was.
-        decoded: what a decoder finds.
+        splats: the scene.
+        plan: the encoder's decisions.
+        images: images that WebP compresses, by file name.
+        other_files: all other files, by name.
+        exact: the Gaussians of the container in its order and rotation forms, not quantised.
+        decoded: the scene that a decoder would get.
     """
 
     splats: Splats
-    choice: EncodingPlan
+    plan: EncodingPlan
     images: Images
-    stored: Mapping[str, bytes]
+    other_files: Mapping[str, bytes]
     exact: Splats
     decoded: Splats
 
     def size(self, settings: EncodeSettings, threads: int) -> int:
-        """Bytes of a zip of all parts, compressed."""
+        """Return the bytes of a zip of all files, with the images compressed."""
         with blas_workers(threads) as pool:
             files = compress_images(self.images, settings, pool, lambda fraction: None)
-        return len(zip_bytes({**files, **self.stored}))
+        return len(zip_bytes({**files, **self.other_files}))
 
     def without(self, *names: str) -> dict[str, UInt8[np.ndarray, "H W C"]]:
-        """All images but these."""
+        """Return all images except those of these names, which have no ``.webp``."""
         return {name: image for name, image in self.images.items() if name.removesuffix(".webp") not in names}
 
 
-LeaveOut = Callable[[Coded, EncodeSettings, int], Coded]
+LeaveOut = Callable[[EncodedParts, EncodeSettings, int], EncodedParts]
+"""Function of the encoded parts, the settings and the number of threads that leaves a part out."""
 
 
-def coded(splats: Splats, settings: EncodeSettings, threads: int) -> Coded:
-    """As settings that weigh nothing have it."""
-    choice = plan_encoding(splats, settings, threads=threads)
-    files = write_files(choice, splats, settings, threads=threads).files
+def encode_parts(splats: Splats, settings: EncodeSettings, threads: int) -> EncodedParts:
+    """Encode a scene with uniform planning; ``threads``: 0 means one per processor."""
+    plan = plan_encoding(splats, settings, threads=threads)
+    files = write_files(plan, splats, settings, threads=threads).files
     decoded = decode(files, threads=threads)
-    exact = _in_forms_of(splats.select(choice.grid.cells[choice.grid.mask]), decoded)
-    stored = {name: files[name] for name in STORED}
-    return Coded(splats, choice, render_planes(choice), stored, exact, decoded)
+    exact = _in_forms_of(splats.select(plan.grid.cells[plan.grid.mask]), decoded)
+    other_files = {name: files[name] for name in METADATA}
+    return EncodedParts(splats, plan, render_planes(plan), other_files, exact, decoded)
 
 
 def as_floats(field: str, *images: str) -> LeaveOut:
-    """Numbers instead of the levels of one attribute, and of the images that hold them."""
+    """Return a function that stores the float32 values of an attribute instead of its levels in ``images``."""
 
-    def leave_out(whole: Coded, settings: EncodeSettings, threads: int) -> Coded:
+    def leave_out(whole: EncodedParts, settings: EncodeSettings, threads: int) -> EncodedParts:
         values = getattr(whole.exact, field)
         return replace(
             whole,
             images=whole.without(*images),
-            stored={**whole.stored, field: deflated(values)},
+            other_files={**whole.other_files, field: deflated(values)},
             decoded=replace(whole.decoded, **{field: values}),
         )
 
     return leave_out
 
 
-def codebook_levels(whole: Coded, settings: EncodeSettings, threads: int) -> Coded:
-    """Numbers instead of levels in the SH codebook: means of those Gaussians that have the entry."""
-    book, count = whole.choice.codebook, len(whole.exact)
+def codebook_levels(whole: EncodedParts, settings: EncodeSettings, threads: int) -> EncodedParts:
+    """Store float32 values in the SH codebook instead of levels: means over the Gaussians of each entry."""
+    book, count = whole.plan.codebook, len(whole.exact)
     rows = whole.exact.shN.reshape(count, -1)
     entries = np.zeros((book.side**2, rows.shape[1]))
     np.add.at(entries, book.labels[:count], rows)
     entries /= np.maximum(np.bincount(book.labels[:count], minlength=len(entries)), 1)[:, None]
-    numbers = entries.astype(np.float32)
+    values = entries.astype(np.float32)
     return replace(
         whole,
         images=whole.without("f_rest_centroids"),
-        stored={**whole.stored, "shN": deflated(numbers)},
-        decoded=replace(whole.decoded, shN=numbers[book.labels[:count]].reshape(whole.exact.shN.shape)),
+        other_files={**whole.other_files, "shN": deflated(values)},
+        decoded=replace(whole.decoded, shN=values[book.labels[:count]].reshape(whole.exact.shN.shape)),
     )
 
 
-def sh_codebook(whole: Coded, settings: EncodeSettings, threads: int) -> Coded:
-    """An image of 100 levels for every SH coefficient, and no codebook."""
+def sh_codebook(whole: EncodedParts, settings: EncodeSettings, threads: int) -> EncodedParts:
+    """Store an image of 100 levels for each SH coefficient instead of labels and a codebook."""
     count, coefficients, _ = whole.exact.shN.shape
     levels = quantize(whole.exact.shN.reshape(count, 3 * coefficients), step=1, shared=False, max_top=PAPER_TOP)
-    side = whole.choice.grid.side
+    side = whole.plan.grid.side
     cells = np.zeros((side**2, coefficients, 3), np.uint8)
-    cells[whole.choice.grid.mask] = levels.levels.reshape(count, coefficients, 3)
+    cells[whole.plan.grid.mask] = levels.levels.reshape(count, coefficients, 3)
     images = {f"sh_{n}.webp": cells[:, n].reshape(side, side, 3) for n in range(coefficients)}
     decoded = replace(whole.decoded, shN=levels.values().astype(np.float32).reshape(count, coefficients, 3))
     return replace(whole, images={**whole.without("f_rest_centroids", "f_rest_labels"), **images}, decoded=decoded)
 
 
-def webp(whole: Coded, settings: EncodeSettings, threads: int) -> Coded:
-    """Levels as they are, a byte each; labels are two of the three that their image has."""
+def webp(whole: EncodedParts, settings: EncodeSettings, threads: int) -> EncodedParts:
+    """Store levels uncompressed, one byte each; labels take two bytes, although their image has three channels."""
     images = {**whole.images, "f_rest_labels.webp": whole.images["f_rest_labels.webp"][:, :, :2]}
-    return replace(whole, images={}, stored={**whole.stored, **{n: i.tobytes() for n, i in images.items()}})
+    return replace(whole, images={}, other_files={**whole.other_files, **{n: i.tobytes() for n, i in images.items()}})
 
 
-def scene_order(whole: Coded, settings: EncodeSettings, threads: int) -> Coded:
-    """Gaussians in the order in which the scene has them, padding between them."""
-    order = np.argsort(whole.choice.grid.cells, kind="stable")
+def scene_order(whole: EncodedParts, settings: EncodeSettings, threads: int) -> EncodedParts:
+    """Leave the Gaussians in the order of the scene, with the padding among them."""
+    order = np.argsort(whole.plan.grid.cells, kind="stable")
     planes = {name: image for name, image in whole.images.items() if name != "f_rest_centroids.webp"}
     moved = {name: image.reshape(len(order), -1)[order].reshape(image.shape) for name, image in planes.items()}
     return replace(whole, images={**whole.images, **moved})
 
 
-def codebook_order(whole: Coded, settings: EncodeSettings, threads: int) -> Coded:
-    """Entries of the codebook in random order."""
-    book = whole.choice.codebook
+def codebook_order(whole: EncodedParts, settings: EncodeSettings, threads: int) -> EncodedParts:
+    """Put the codebook's entries in random order."""
+    book = whole.plan.codebook
     order = np.random.Generator(np.random.PCG64(settings.seed)).permutation(book.side**2)
-    place = np.argsort(order).astype(np.int32)
-    shuffled = replace(book, centroids=book.centroids.take(order), labels=place[book.labels])
-    return replace(whole, images=render_planes(replace(whole.choice, codebook=shuffled)))
+    position = np.argsort(order).astype(np.int32)
+    shuffled = replace(book, centroids=book.centroids.take(order), labels=position[book.labels])
+    return replace(whole, images=render_planes(replace(whole.plan, codebook=shuffled)))
 
 
-def label_pairs(whole: Coded, settings: EncodeSettings, threads: int) -> Coded:
-    """Labels as one number in two images, its high and its low byte, instead of as column and row."""
-    book, grid = whole.choice.codebook, whole.choice.grid
+def label_pairs(whole: EncodedParts, settings: EncodeSettings, threads: int) -> EncodedParts:
+    """Store labels as the high and the low byte of one number, in two images, instead of as column and row."""
+    book, grid = whole.plan.codebook, whole.plan.grid
     labels = book.labels[grid.cell_to_gaussian].reshape(grid.side, grid.side, 1)
     halves = {"labels_0.webp": (labels & 255).astype(np.uint8), "labels_1.webp": (labels >> 8).astype(np.uint8)}
     return replace(whole, images={**whole.without("f_rest_labels"), **halves})
 
 
-def forms(top: int) -> LeaveOut:
-    """Rotations and sizes in the forms that the scene has; so many levels of rotations above the lowest."""
+def rotation_forms(top: int) -> LeaveOut:
+    """Return a function that leaves rotations and scales in the scene's own forms; ``top`` is the largest level."""
 
-    def leave_out(whole: Coded, settings: EncodeSettings, threads: int) -> Coded:
-        grid = whole.choice.grid
+    def leave_out(whole: EncodedParts, settings: EncodeSettings, threads: int) -> EncodedParts:
+        grid = whole.plan.grid
         scene = whole.splats.select(grid.cells)
         levels = {
             "quaternions": quantize(scene.quats, step=1, shared=False, max_top=top),
             "scales": quantize(scene.scales, step=1, shared=False),
         }
-        choice = replace(whole.choice, fields={**whole.choice.fields, **levels})
+        plan = replace(whole.plan, fields={**whole.plan.fields, **levels})
         quats, scales = (levels[name].values()[grid.mask].astype(np.float32) for name in ("quaternions", "scales"))
-        return replace(whole, images=render_planes(choice), decoded=replace(whole.decoded, quats=quats, scales=scales))
+        return replace(whole, images=render_planes(plan), decoded=replace(whole.decoded, quats=quats, scales=scales))
 
     return leave_out
 
 
-def mask(whole: Coded, settings: EncodeSettings, threads: int) -> Coded:
-    """Only as many Gaussians as fill a square without padding, the most opaque."""
+def mask(whole: EncodedParts, settings: EncodeSettings, threads: int) -> EncodedParts:
+    """Keep the most opaque Gaussians only, as many as fill a square without padding, so that no mask is needed."""
     side = max(int(len(whole.splats) ** 0.5) // 8 * 8, 8)
     keep = np.sort(np.argsort(-whole.splats.opacities, kind="stable")[: side**2])
-    pruned = coded(whole.splats.select(keep), settings, threads)
+    pruned = encode_parts(whole.splats.select(keep), settings, threads)
     return replace(pruned, images=pruned.without("active_mask"))
 
 
-def signed_log(whole: Coded, settings: EncodeSettings, threads: int) -> Coded:
-    """Levels of positions evenly over the scene's extent."""
-    grid = whole.choice.grid
+def signed_log(whole: EncodedParts, settings: EncodeSettings, threads: int) -> EncodedParts:
+    """Quantise positions uniformly over the scene's extent, not their signed logarithm."""
+    grid = whole.plan.grid
     means = whole.splats.means[grid.cells].astype(np.float64)
     low, extent = means.min(), max(np.ptp(means), 1e-30)
     levels = np.rint((means - low) / extent * MEANS_TOP)
-    choice = replace(
-        whole.choice,
-        fields={**whole.choice.fields, "means": replace(whole.choice.fields["means"], levels=levels.astype(np.uint16))},
+    plan = replace(
+        whole.plan,
+        fields={**whole.plan.fields, "means": replace(whole.plan.fields["means"], levels=levels.astype(np.uint16))},
     )
     decoded = (low + levels[grid.mask] * (extent / MEANS_TOP)).astype(np.float32)
-    return replace(whole, images=render_planes(choice), decoded=replace(whole.decoded, means=decoded))
+    return replace(whole, images=render_planes(plan), decoded=replace(whole.decoded, means=decoded))
 
 
 def deflated(values: Float32[np.ndarray, "..."]) -> bytes:
-    """All first bytes of the numbers, then all second ones, and so on: what is alike lies together."""
+    """Deflate float32 values split into byte planes: all first bytes, then all second bytes, and so on."""
     return zlib.compress(np.ascontiguousarray(values).reshape(-1).view(np.uint8).reshape(-1, 4).T.tobytes(), 6)
 
 
 def _in_forms_of(splats: Splats, decoded: Splats) -> Splats:
-    """The same Gaussians in the equivalent forms that lie nearest to those decoded."""
+    """Return the Gaussians in the equivalent rotation forms that are nearest to the decoded rotations."""
     quats = splats.quats.astype(np.float64)
     best, form = np.full(len(splats), -np.inf), np.zeros(len(splats), np.uint8)
     for number in range(48):
         every = np.full(len(splats), number, np.uint8)
-        likeness = (apply_forms(quats, splats.scales, every)[0] * decoded.quats).sum(axis=1)
-        form[likeness > best], best = number, np.maximum(best, likeness)
-    turned, scales = apply_forms(quats, splats.scales, form)
-    return replace(splats, quats=turned.astype(np.float32), scales=scales)
+        dots = (apply_forms(quats, splats.scales, every)[0] * decoded.quats).sum(axis=1)
+        form[dots > best], best = number, np.maximum(best, dots)
+    rotated, scales = apply_forms(quats, splats.scales, form)
+    return replace(splats, quats=rotated.astype(np.float32), scales=scales)

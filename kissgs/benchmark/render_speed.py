@@ -1,4 +1,4 @@
-"""What pictures cost: processor time of the rasteriser, its gradients, the loss, a step of Adam, and removal scores."""
+"""CPU time of rendering and training: rasteriser, its gradients, loss, a step of Adam, and removal scores."""
 
 from __future__ import annotations
 
@@ -20,36 +20,52 @@ if TYPE_CHECKING:
     from torch.optim import Optimizer
 
 REPEATS = 5
+"""Number of measurements per view."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RenderingCost:
-    """Milliseconds of processor time over all threads, for one picture; medians over views and repeats."""
+    """CPU time per rendered image: milliseconds over all threads, medians over views and repeats.
+
+    Attributes:
+        gaussians: number of Gaussians in the scene.
+        visible: number of Gaussians that touch the image, mean over views.
+        width: of the images, pixels.
+        height: of the images, pixels.
+        views: number of views.
+        render: forward pass.
+        render_and_backward: forward and backward pass.
+        loss: L1 + SSIM, forward and backward.
+        adam: one step over all parameters of all Gaussians.
+        removal_scores: forward pass and removal scores of all Gaussians.
+    """
 
     gaussians: int
     visible: int
-    """that touch the picture; mean over the views"""
     width: int
     height: int
     views: int
-    draw: float
-    draw_and_backward: float
+    render: float
+    render_and_backward: float
     loss: float
-    """L1 + SSIM, forward and backward"""
     adam: float
-    """one step over all parameters of all Gaussians"""
-    score: float
-    """the picture and the removal scores of all Gaussians"""
+    removal_scores: float
 
     def as_dict(self) -> dict[str, Any]:
-        """All numbers by name."""
+        """Return all attributes by name, for JSON."""
         return asdict(self)
 
 
 def rendering_cost(
     splats: Splats, cameras: Sequence[Camera], *, threads: int = 0, progress: Progress = silent
 ) -> RenderingCost:
-    """Measure on a scene from these cameras, all of one size.
+    """Measure CPU times on a scene.
+
+    Args:
+        splats: a clean scene.
+        cameras: one or more cameras, all of one size.
+        threads: number of threads; 0 means one per processor.
+        progress: receives the stages "kernels" and "measure".
 
     Raises:
         UnsupportedError: torch is not installed.
@@ -69,12 +85,12 @@ def rendering_cost(
         width=cameras[0].width,
         height=cameras[0].height,
         views=len(cameras),
-        **{name: float(np.median([taken[name] for _, taken in measured])) for name in measured[0][1]},
+        **{name: float(np.median([times[name] for _, times in measured])) for name in measured[0][1]},
     )
 
 
 def _adam(tensors: dict[str, Tensor]) -> Optimizer:
-    """That changes nothing: every repeat finds the same scene."""
+    """Return an Adam optimizer with a learning rate of 0, so that every repeat finds the same scene."""
     from torch.optim import Adam
 
     return Adam([{"params": [tensor]} for tensor in tensors.values()], lr=0.0, eps=1e-15, fused=True)
@@ -83,7 +99,7 @@ def _adam(tensors: dict[str, Tensor]) -> Optimizer:
 def _one_view(
     splats: Splats, tensors: dict[str, Tensor], adam: Optimizer, camera: Camera, threads: int
 ) -> tuple[int, dict[str, list[float]]]:
-    """How many Gaussians it sees, and milliseconds of each repeat, by what was done."""
+    """Return the number of visible Gaussians, and the milliseconds of each repeat by attribute of the cost."""
     import torch
 
     from kissgs.rendering.cpu.frame import draw
@@ -103,24 +119,29 @@ def _one_view(
         return images.detach()
 
     images = step().requires_grad_()
-    works: dict[str, Callable[[], object]] = {
-        "draw": lambda: render(splats, camera, threads=threads),
-        "draw_and_backward": step,
+    operations: dict[str, Callable[[], object]] = {
+        "render": lambda: render(splats, camera, threads=threads),
+        "render_and_backward": step,
         "loss": lambda: torch.autograd.backward(photometric_loss(images, weights, threads=threads)),
         "adam": adam.step,
-        "score": lambda: removal_scores(splats, [camera], threads=threads),
+        "removal_scores": lambda: removal_scores(splats, [camera], threads=threads),
     }
-    taken = {name: [_cpu(work) for _ in range(REPEATS)] for name, work in works.items()}
+    times = {name: [_cpu_milliseconds(operation) for _ in range(REPEATS)] for name, operation in operations.items()}
     with Workers(threads) as pool:
         frame = draw(splats, camera, np.zeros(3, np.float32), pool)
-    return len(frame.footprints.visible), taken
+    return len(frame.footprints.visible), times
 
 
 def resampled(splats: Splats, count: int, *, seed: int = 0) -> Splats:
-    """A scene of another size that looks much the same, to see how costs grow.
+    """Return a similar scene with another number of Gaussians, to measure how costs scale.
 
-    Surfaces stay covered. Fewer: evenly many are left out and the rest enlarged. More: Gaussians are replaced by
-    several smaller ones within their own shape.
+    Surfaces stay covered. For fewer, Gaussians are removed at even intervals and the others enlarged. For more, each
+    Gaussian is replaced by several smaller ones at random positions within it.
+
+    Args:
+        splats: a finite scene; an empty one is returned as it is.
+        count: number of Gaussians of the result, 0 or more.
+        seed: seed of the random positions.
     """
     if not len(splats):
         return splats
@@ -133,22 +154,22 @@ def resampled(splats: Splats, count: int, *, seed: int = 0) -> Splats:
     w, x, y, z = many.quats.T
     steps = rng.standard_normal((count, 3), np.float32) * np.exp(many.scales) * np.float32(0.7)
     axis = np.stack([x, y, z], axis=1)
-    turned = steps + 2 * np.cross(axis, np.cross(axis, steps) + w[:, None] * steps)
-    return _rescaled(many, many.means + turned, -np.log(count / len(splats)) / 2)
+    rotated = steps + 2 * np.cross(axis, np.cross(axis, steps) + w[:, None] * steps)
+    return _rescaled(many, many.means + rotated, -np.log(count / len(splats)) / 2)
 
 
-def _rescaled(splats: Splats, means: np.ndarray, growth: float) -> Splats:
+def _rescaled(splats: Splats, means: np.ndarray, log_growth: float) -> Splats:
     return Splats(
         means=np.ascontiguousarray(means),
         quats=splats.quats,
-        scales=splats.scales + np.float32(growth),
+        scales=splats.scales + np.float32(log_growth),
         opacities=splats.opacities,
         sh0=splats.sh0,
         shN=splats.shN,
     )
 
 
-def _cpu(work: Callable[[], object]) -> float:
+def _cpu_milliseconds(operation: Callable[[], object]) -> float:
     begin = time.process_time()
-    work()
+    operation()
     return 1e3 * (time.process_time() - begin)

@@ -1,4 +1,4 @@
-"""What was measured of encoders on a scene: runs, medians, and bytes of different tools at equal quality."""
+"""Measurements of codecs on scenes: runs, medians, and bytes of different codecs at equal quality."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from statistics import median
 from typing import Any, Literal
 
 from kissgs.benchmark.bd_rate import RateCurve
-from kissgs.benchmark.external_codecs import PeerResult
+from kissgs.benchmark.external_codecs import ExternalResult
 from kissgs.benchmark.roundtrip import RoundTrip
 from kissgs.evaluation.attributes import AttributeErrors
 from kissgs.evaluation.results import Evaluation
 
-Figure = Literal["original", "photographs"]
-"""What a PSNR is told against: pictures of the scene as it was, or those that a camera took."""
+PsnrTarget = Literal["original", "photographs"]
+"""The images that a PSNR compares with: renderings of the original scene, or photographs."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Run:
-    """What one run took, or several by their medians.
+    """Resources of one run, or medians of several.
 
     Attributes:
-        bytes: of the container.
-        encode_seconds: wall time from file to container; of a peer, of its process.
-        encode_cpu_seconds: the same of all threads.
-        decode_seconds: wall time back, to arrays; a peer writes a ``.ply``.
-        decode_cpu_seconds: the same of all threads.
-        stage_seconds: wall time of encoding, by stage; a peer has one.
-        peak_memory: bytes, the largest resident set of encoding and decoding.
+        bytes: size of the container or file.
+        encode_seconds: wall time from ``.ply`` to container; of an external codec, of its process.
+        encode_cpu_seconds: CPU time of encoding, all threads.
+        decode_seconds: wall time from container to arrays; of an external codec, to a ``.ply``.
+        decode_cpu_seconds: CPU time of decoding, all threads.
+        stage_seconds: wall time of encoding by stage; an external codec has one stage.
+        peak_memory: largest resident set of encoding and decoding, bytes.
     """
 
     bytes: int
@@ -41,9 +41,9 @@ class Run:
     peak_memory: int
 
     @classmethod
-    def of(cls, result: RoundTrip | PeerResult) -> Run:
-        """One measurement."""
-        if isinstance(result, PeerResult):
+    def of(cls, result: RoundTrip | ExternalResult) -> Run:
+        """Return the resources of one measurement."""
+        if isinstance(result, ExternalResult):
             size, stages, cpu = result.bytes, {result.format: result.encode_seconds}, result.encode_cpu_seconds
         else:
             report = result.report
@@ -59,8 +59,8 @@ class Run:
         )
 
     @classmethod
-    def typical(cls, runs: Sequence[Run]) -> Run:
-        """Medians of times, each by itself; the most of memory; the bytes of the first."""
+    def median_of(cls, runs: Sequence[Run]) -> Run:
+        """Return the median of each time, the largest ``peak_memory`` and the bytes of the first run."""
         times = ("encode_seconds", "encode_cpu_seconds", "decode_seconds", "decode_cpu_seconds")
         stages = dict.fromkeys(name for run in runs for name in run.stage_seconds)
         return cls(
@@ -72,130 +72,139 @@ class Run:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Measured:
-    """One encoder on one scene.
+class Measurement:
+    """Measurements of one codec on one scene.
 
     Attributes:
-        scene: its file's name, or as much of the path as tells it from others.
-        encoder: a preset, or a peer's format.
-        quality_offset_db: of a point of a curve; None of a preset as it is, and of a peer.
-        gaussians: of the scene, before anything is left out.
-        file_bytes: per file of the container; of a peer, of the one that there is.
-        runs: all repeats, in their order.
-        errors: of the first.
-        pictures: of the first, if they were compared.
-        details: all that is known of the first, for machines.
+        scene: file name of the scene, with as much of its path as distinguishes it from others.
+        codec: name of a preset, or format of an external codec.
+        quality_offset_db: quality offset of a point of a preset's curve, decibels; None for a preset as it is and for
+            external codecs.
+        gaussians: number of Gaussians in the scene, before any is left out.
+        file_bytes: bytes by file of the container; of an external codec, of its only file.
+        runs: all repeats, in order.
+        errors: attribute errors of the first run.
+        evaluation: comparison of rendered images of the first run; None if not requested.
+        details: complete measurement of the first run, for JSON.
     """
 
     scene: str
-    encoder: str
+    codec: str
     quality_offset_db: float | None = None
     gaussians: int
     file_bytes: Mapping[str, int]
     runs: tuple[Run, ...]
     errors: AttributeErrors
-    pictures: Evaluation | None = None
+    evaluation: Evaluation | None = None
     details: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def took(self) -> Run:
-        """The runs in one."""
-        return Run.typical(self.runs)
+    def median_run(self) -> Run:
+        """The median of the runs."""
+        return Run.median_of(self.runs)
 
     @property
     def bytes(self) -> int:
-        """Of the first container."""
+        """Size of the container or file of the first run."""
         return self.runs[0].bytes
 
     @property
-    def steady(self) -> bool:
-        """Whether all repeats have as many bytes."""
+    def reproducible(self) -> bool:
+        """Whether all runs have the same number of bytes."""
         return len({run.bytes for run in self.runs}) == 1
 
     @property
     def name(self) -> str:
-        """For people: the preset, or ``.sog``; where it is on its curve."""
-        name = f".{self.encoder}" if self.is_peer else self.encoder
+        """Name in tables: the preset, with its quality offset if it is a point of a curve, or for example ``.sog``."""
+        name = f".{self.codec}" if self.is_external else self.codec
         return name if self.quality_offset_db is None else f"{name} at {self.quality_offset_db:g}"
 
     @property
-    def is_peer(self) -> bool:
-        """Whether another tool did it."""
+    def is_external(self) -> bool:
+        """Whether the codec is an external one, which has a single file."""
         return len(self.file_bytes) == 1
 
-    def psnr(self, figure: Figure) -> float | None:
-        """Decibels, mean over views; None where there are none to compare with."""
-        if self.pictures is None or (figure == "photographs" and self.pictures.mean.reference is None):
+    def psnr(self, target: PsnrTarget) -> float | None:
+        """Return the PSNR to these images, decibels, mean over views; None if they were not compared with."""
+        if self.evaluation is None or (target == "photographs" and self.evaluation.mean.reference is None):
             return None
-        mean = self.pictures.mean
-        return mean.candidate_vs_reference.psnr if figure == "original" else mean.candidate.psnr
+        mean = self.evaluation.mean
+        return mean.candidate_vs_reference.psnr if target == "original" else mean.candidate.psnr
 
     def as_dict(self) -> dict[str, Any]:
-        """For machines: details of the first run, over which medians and the most of memory are laid; then all runs."""
+        """Return the details of the first run, with times and memory replaced by their medians, and all runs."""
         return {
             "scene": self.scene,
-            "encoder": self.encoder,
+            "codec": self.codec,
             "quality_offset_db": self.quality_offset_db,
             **self.details,
             "gaussians": self.gaussians,
             "bytes_per_gaussian": self.bytes / max(self.gaussians, 1),
-            **asdict(self.took),
+            **asdict(self.median_run),
             "file_bytes": dict(self.file_bytes),
-            "steady": self.steady,
+            "reproducible": self.reproducible,
             "runs": [asdict(run) for run in self.runs],
         }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Equal:
-    """A peer's container beside one of ours of the same quality.
+class EqualPsnr:
+    """Bytes of a preset at the PSNR of an external codec.
 
     Attributes:
-        scene: its file's name.
-        peer: the format.
-        preset: whose curve.
-        figure: which PSNR is the same.
-        psnr: decibels, of the peer.
-        peer_bytes: of the peer.
-        bytes: of ours; None where the peer is beyond the curve.
+        scene: file name of the scene.
+        external: format of the external codec.
+        preset: preset whose rate curve is used.
+        target: images that the PSNR compares with.
+        psnr: PSNR of the external codec, decibels.
+        external_bytes: bytes of the external codec.
+        bytes: bytes of the preset at this PSNR, interpolated; None if the PSNR is beyond the ends of the curve.
     """
 
     scene: str
-    peer: str
+    external: str
     preset: str
-    figure: Figure
+    target: PsnrTarget
     psnr: float
-    peer_bytes: int
+    external_bytes: int
     bytes: float | None
 
     @property
     def ratio(self) -> float | None:
-        """Ours to the peer's."""
-        return None if self.bytes is None else self.bytes / self.peer_bytes
+        """Bytes of the preset divided by those of the external codec; None as for ``bytes``."""
+        return None if self.bytes is None else self.bytes / self.external_bytes
 
     def as_dict(self) -> dict[str, Any]:
-        """For machines."""
+        """Return all attributes and the ratio by name, for JSON."""
         return {**asdict(self), "ratio": self.ratio}
 
 
-def at_equal_psnr(rows: Sequence[Measured]) -> list[Equal]:
-    """What a preset's curve takes at the PSNR of every peer; between the curve's points by :class:`RateCurve`."""
+def at_equal_psnr(rows: Sequence[Measurement]) -> list[EqualPsnr]:
+    """Return the bytes of each preset with a curve at the PSNR of each external codec on the same scene."""
     found = []
+    targets: tuple[PsnrTarget, ...] = ("original", "photographs")
     for scene in dict.fromkeys(row.scene for row in rows):
         here = [row for row in rows if row.scene == scene]
-        figures: tuple[Figure, ...] = ("original", "photographs")
-        for peer in (row for row in here if row.is_peer):
-            for preset in dict.fromkeys(row.encoder for row in here if row.quality_offset_db is not None):
-                for figure in figures:
-                    psnr = peer.psnr(figure)
+        for external in (row for row in here if row.is_external):
+            for preset in dict.fromkeys(row.codec for row in here if row.quality_offset_db is not None):
+                for target in targets:
+                    psnr = external.psnr(target)
                     if psnr is not None and math.isfinite(psnr):
-                        size = rate_curve(here, preset, figure).bytes_at(psnr)
-                        told = {"scene": scene, "peer": peer.encoder, "preset": preset}
-                        found.append(Equal(**told, figure=figure, psnr=psnr, peer_bytes=peer.bytes, bytes=size))
+                        found.append(
+                            EqualPsnr(
+                                scene=scene,
+                                external=external.codec,
+                                preset=preset,
+                                target=target,
+                                psnr=psnr,
+                                external_bytes=external.bytes,
+                                bytes=rate_curve(here, preset, target).bytes_at(psnr),
+                            )
+                        )
     return found
 
 
-def rate_curve(rows: Sequence[Measured], preset: str, figure: Figure) -> RateCurve:
-    """Of one scene and preset: through all its fidelities, its own included."""
-    points = ((row.psnr(figure), row.bytes) for row in rows if row.encoder == preset)
+def rate_curve(rows: Sequence[Measurement], preset: str, target: PsnrTarget) -> RateCurve:
+    """Return the rate curve of a preset on one scene, through all its quality offsets and the preset as it is."""
+    points = ((row.psnr(target), row.bytes) for row in rows if row.codec == preset)
     return RateCurve.of((psnr, size) for psnr, size in points if psnr is not None)

@@ -1,4 +1,4 @@
-"""A scene through the codec and back: what it took, what it weighs, what it lost."""
+"""Compress and decompress a scene, and measure time, memory, size and errors."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from kissgs.settings import Settings
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RoundTrip:
-    """One scene, compressed and decompressed.
+    """Measurements of a scene that was compressed and decompressed.
 
     Attributes:
-        report: of the compression.
-        decode_seconds: wall time of decoding, from the zip's bytes to arrays.
-        decode_cpu_seconds: processor time of that, over all threads.
-        peak_memory: bytes, the largest the process had resident before errors were computed.
-        errors: of the Gaussians that are in the container.
-        pictures: what became of the scene's pictures, if asked for.
+        report: report of the compression.
+        decode_seconds: wall time of decoding, from the bytes of the zip to arrays.
+        decode_cpu_seconds: CPU time of decoding, all threads.
+        peak_memory: largest resident set of the process before errors were computed, bytes.
+        errors: errors of the Gaussians that are in the container.
+        evaluation: comparison of rendered images; None if not requested.
     """
 
     report: Report
@@ -43,34 +43,36 @@ class RoundTrip:
     decode_cpu_seconds: float
     peak_memory: int
     errors: AttributeErrors
-    pictures: Evaluation | None = None
+    evaluation: Evaluation | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """For machines."""
-        pictures = None if self.pictures is None else self.pictures.as_dict()
-        told = replace(self, pictures=None)
-        return {**asdict(told), "report": self.report.as_dict(), "errors": self.errors.as_dict(), "pictures": pictures}
+        """Return all attributes by name, nested, for JSON."""
+        evaluation = None if self.evaluation is None else self.evaluation.as_dict()
+        numbers = asdict(replace(self, evaluation=None))
+        nested = {"report": self.report.as_dict(), "errors": self.errors.as_dict(), "evaluation": evaluation}
+        return {**numbers, **nested}
 
 
 def roundtrip(
     source: Splats | Path,
     settings: Settings,
     *,
-    pictures: bool = False,
+    evaluate: bool = False,
     views: Views | None = None,
     threads: int = 0,
     progress: Progress = silent,
 ) -> RoundTrip:
-    """Compress a scene, decompress it, and compare.
+    """Compress a scene, decompress it, and compare the two.
 
     Args:
-        source: a scene, or the path of a ``.ply``.
-        settings: of the compression.
-        pictures: compare pictures too (:func:`kissgs.evaluation.evaluate.compare_pictures`); no part of the times.
-        views: a capture of the scene: weighs the bits, and its held-out views are compared; by default cameras drawn
-            over the whole scene are.
-        threads: 0 means one per processor.
-        progress: receives the events of both directions.
+        source: a scene, or the path of a ``.ply`` file.
+        settings: settings of the compression.
+        evaluate: whether to compare rendered images too (:func:`kissgs.evaluation.evaluate.compare_pictures`); the
+            times do not include this.
+        views: capture for rate-distortion planning and, by its held-out views, for the evaluation; None to evaluate
+            with cameras drawn over the whole scene.
+        threads: number of threads; 0 means one per processor.
+        progress: receives the stages of compression and decompression.
     """
     result = compress(source, settings=settings, views=views, threads=threads, progress=progress)
     archive = result.to_zip()
@@ -85,27 +87,30 @@ def roundtrip(
         decode_cpu_seconds=cpu,
         peak_memory=peak,
         errors=attribute_errors(scene.select(result.order), decoded),
-        pictures=_compared(clean(scene)[0], decoded, views, threads, progress) if pictures else None,
+        evaluation=_evaluation(clean(scene)[0], decoded, views, threads, progress) if evaluate else None,
     )
 
 
-def _compared(scene: Splats, decoded: Splats, views: Views | None, threads: int, progress: Progress) -> Evaluation:
-    judges = views or evaluation_views(scene, threads=threads, progress=progress)
-    return compare_pictures(scene, decoded, judges, threads=threads, progress=progress)
+def _evaluation(scene: Splats, decoded: Splats, views: Views | None, threads: int, progress: Progress) -> Evaluation:
+    views = views or evaluation_views(scene, threads=threads, progress=progress)
+    return compare_pictures(scene, decoded, views, threads=threads, progress=progress)
 
 
 def isolated_roundtrip(
-    source: Path, settings: Settings, *, pictures: bool = False, views: Views | None = None, threads: int = 0
+    source: Path, settings: Settings, *, evaluate: bool = False, views: Views | None = None, threads: int = 0
 ) -> RoundTrip:
-    """:func:`roundtrip` in a process of its own, so that times and peak memory are those of this scene alone.
+    """Run :func:`roundtrip` in a separate process, so that times and peak memory are those of this scene alone.
 
     Raises:
-        UnsupportedError: the process was killed, most likely for want of memory.
+        UnsupportedError: the process was killed, most likely for lack of memory.
     """
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context) as pool:
         try:
-            work = pool.submit(roundtrip, source, settings, pictures=pictures, views=views, threads=threads)
+            work = pool.submit(roundtrip, source, settings, evaluate=evaluate, views=views, threads=threads)
             return work.result()
         except BrokenProcessPool as error:
-            raise UnsupportedError(f"{source}: the measurement was killed, most likely for want of memory") from error
+            raise UnsupportedError(
+                f"{source}: the measurement was killed, most likely for lack of memory; free some or give a "
+                "smaller scene"
+            ) from error

@@ -1,4 +1,4 @@
-"""``kissgs bench``: presets and other tools measured on the user's scenes, and what pictures of them cost."""
+"""``kissgs bench``: measurements of presets, external codecs, parts of the codec and the rasteriser."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kissgs.cli.arguments import ImagesOption, ResolutionOption, ScaleOption, ViewsOption
-from kissgs.cli.bench_scenes import Asked
+from kissgs.cli.arguments import FilesArgument, ImagesOption, ResolutionOption, ScaleOption, ViewsOption
+from kissgs.cli.bench_scenes import BenchOptions
 from kissgs.cli.files import expand, print_json, show
 from kissgs.cli.options import open_views
 from kissgs.core.errors import UnsupportedError
@@ -17,66 +17,76 @@ from kissgs.core.errors import UnsupportedError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-GOES_WITH = {
+VALID_WITH = {
     "--preset": ("", "--ablate", "--compaction", "--finetuning"),
     "--set": ("", "--ablate", "--compaction", "--finetuning"),
-    "--peer": ("",),
+    "--external": ("",),
     "--sog-iterations": ("",),
     "--repeats": ("",),
-    "--pictures": ("",),
+    "--evaluate": ("",),
     "--quality-offset": ("", "--finetuning"),
     "--ratio": ("--compaction", "--finetuning"),
-    "--way": ("--compaction",),
-    "--learn-from": ("--compaction", "--finetuning"),
+    "--strategy": ("--compaction",),
+    "--supervision": ("--compaction", "--finetuning"),
     "--plot": ("", "--compaction", "--finetuning"),
     "--gaussians": ("", "--rendering"),
 }
-"""Options that not all measurements have; "" is the one that none of the others asks for."""
+"""Measurements that an option applies to; "" is the measurement of codecs, made if no other is asked for."""
 
-ThreadsOption = Annotated[int, typer.Option(min=0, help="0: one per processor.")]
+ThreadsOption = Annotated[int, typer.Option(min=0, help="Number of threads; 0 for one per processor.")]
 
 
 def bench(
-    scenes: Annotated[list[str], typer.Argument(metavar="FILE…", help="Files or patterns.")],
+    scenes: FilesArgument,
     presets: Annotated[
-        list[str] | None, typer.Option("--preset", "-p", help="Repeat for several; default: all.")
+        list[str] | None, typer.Option("--preset", "-p", help="Preset to measure; repeatable. Default: all.")
     ] = None,
     changes: Annotated[
-        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change one setting of all these presets.")
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Change a setting of all these presets; repeatable."),
     ] = None,
-    peers: Annotated[list[str] | None, typer.Option("--peer", help="sog or spz, by splat-transform.")] = None,
-    splat_transform: Annotated[str, typer.Option(help="How to start it.")] = "splat-transform",
+    external_codecs: Annotated[
+        list[str] | None,
+        typer.Option("--external", help="External codec to measure, sog or spz, by splat-transform; repeatable."),
+    ] = None,
+    splat_transform: Annotated[str, typer.Option(help="Command that starts splat-transform.")] = "splat-transform",
     sog_iterations: Annotated[
-        int | None, typer.Option(min=1, help="Of .sog's SH k-means: without a GPU each takes minutes.")
+        int | None,
+        typer.Option(min=1, help="K-means iterations over the SH of .sog; each takes minutes without a GPU."),
     ] = None,
     repeats: Annotated[
-        int, typer.Option(min=1, max=1000, help="Measure each preset so often: medians of times, the most of memory.")
+        int,
+        typer.Option(min=1, max=1000, help="Number of runs per codec: times are medians, memory is the maximum."),
     ] = 1,
-    pictures: Annotated[
-        bool, typer.Option("--pictures", help="Compare pictures too; implied by --views, --quality-offset and --plot.")
+    evaluate: Annotated[
+        bool,
+        typer.Option(
+            "--evaluate", help="Compare rendered images too; implied by --views, --quality-offset and --plot."
+        ),
     ] = False,
     ablate: Annotated[
         bool,
-        typer.Option("--ablate", help="Measure what each part of paper and balanced is worth instead: leave one out."),
+        typer.Option("--ablate", help="Measure paper and balanced with one part of the codec left out at a time."),
     ] = False,
     rendering: Annotated[
-        bool, typer.Option("--rendering", help="Measure the rasteriser instead: pictures, gradients, loss, scores.")
+        bool,
+        typer.Option("--rendering", help="Measure the rasteriser: forward, backward, loss, Adam and removal scores."),
     ] = False,
     compaction: Annotated[
         bool,
-        typer.Option("--compaction", help="Measure ways to have fewer Gaussians instead, with each preset's training."),
+        typer.Option("--compaction", help="Compare strategies of compaction, with the training of the preset."),
     ] = False,
     finetuning: Annotated[
         bool,
-        typer.Option("--finetuning", help="Measure bytes and PSNR with fine-tuning and without instead."),
+        typer.Option("--finetuning", help="Measure bytes and PSNR with and without fine-tuning."),
     ] = False,
-    fidelities: Annotated[
+    quality_offsets: Annotated[
         list[float] | None,
         typer.Option(
             "--quality-offset",
             min=-30,
             max=30,
-            help="Measure balanced, or the presets that are named, at this one too. Repeat for a curve.",
+            help="Measure balanced, or the presets of --preset, at this quality offset (dB) too; repeatable.",
         ),
     ] = None,
     ratios: Annotated[
@@ -85,27 +95,29 @@ def bench(
             "--ratio",
             min=0,
             max=1,
-            help="With --compaction, --finetuning: keep this share. Repeat for several.",
+            help="With --compaction or --finetuning: share of the Gaussians to keep; repeatable.",
         ),
     ] = None,
-    ways: Annotated[
-        list[str] | None, typer.Option("--way", help="With --compaction: only this way. Repeat for several.")
+    strategies: Annotated[
+        list[str] | None,
+        typer.Option("--strategy", help="With --compaction: strategy to measure; repeatable. Default: all."),
     ] = None,
-    learn_from: Annotated[
+    supervision: Annotated[
         str,
         typer.Option(
             metavar="WHAT",
-            help="With --compaction and --finetuning: from the [bold]photos[/] of --views, from its [bold]cameras[/] "
-            "alone, or from the [bold]scene[/] alone. --views judges in any case.",
+            help="With --compaction or --finetuning: train with the [bold]photos[/] of --views, with renderings by its "
+            "[bold]cameras[/], or with virtual cameras of the [bold]scene[/] alone. The evaluation uses --views in any "
+            "case.",
         ),
     ] = "photos",
     plot: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Draw what was measured of one scene, as .svg, .png or .pdf."),
+        typer.Option(metavar="FILE", help="Plot the results of one scene as .svg, .png or .pdf."),
     ] = None,
     gaussians: Annotated[
         list[int] | None,
-        typer.Option(min=1, help="Resample the scene to so many, to see how times grow. Repeat for several."),
+        typer.Option(min=1, help="Measure the scene resampled to this number of Gaussians; repeatable."),
     ] = None,
     views: ViewsOption = None,
     scale: ScaleOption = None,
@@ -114,90 +126,99 @@ def bench(
     threads: ThreadsOption = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Measure bytes, time, memory and errors of presets and of other tools, each in a process of its own."""
-    studies = {"--ablate": ablate, "--compaction": compaction, "--finetuning": finetuning, "--rendering": rendering}
+    """Measure bytes, time, memory and errors of presets and external codecs, each in a separate process."""
+    measurements = {
+        "--ablate": ablate,
+        "--compaction": compaction,
+        "--finetuning": finetuning,
+        "--rendering": rendering,
+    }
     given = {
         "--preset": presets,
         "--set": changes,
-        "--peer": peers,
+        "--external": external_codecs,
         "--sog-iterations": sog_iterations,
         "--repeats": repeats > 1,
-        "--pictures": pictures,
-        "--quality-offset": fidelities,
+        "--evaluate": evaluate,
+        "--quality-offset": quality_offsets,
         "--ratio": ratios,
-        "--way": ways,
-        "--learn-from": learn_from != "photos",
+        "--strategy": strategies,
+        "--supervision": supervision != "photos",
         "--plot": plot,
         "--gaussians": gaussians,
     }
-    study = _only_one([name for name, wanted in studies.items() if wanted])
-    _check_options(study, given)
-    if study in ("--compaction", "--finetuning") and len(presets or []) > 1:
-        raise UnsupportedError(f"{study} goes with one --preset")
+    measurement = _only_one([name for name, wanted in measurements.items() if wanted])
+    _check_options(measurement, given)
+    if measurement in ("--compaction", "--finetuning") and len(presets or []) > 1:
+        raise UnsupportedError(f"{measurement} measures one preset; give --preset once")
     capture = open_views(views, scale=scale, images=images, resolution=resolution)
-    asked = Asked(
+    options = BenchOptions(
         scenes=list(dict.fromkeys(map(Path, expand(scenes)))),
         presets=presets or [],
         changes=changes,
-        peers=peers or [],
+        external_codecs=external_codecs or [],
         splat_transform=splat_transform,
         sog_iterations=sog_iterations,
         repeats=repeats,
-        pictures=pictures,
-        fidelities=fidelities or [],
+        evaluate=evaluate,
+        quality_offsets=quality_offsets or [],
         ratios=ratios or [],
-        ways=ways or [],
-        learn_from=learn_from,
+        strategies=strategies or [],
+        supervision=supervision,
         plot=plot,
         gaussians=gaussians or [],
         views=capture,
         threads=threads,
     )
-    _measure(study, asked, as_json)
+    _measure(measurement, options, as_json)
 
 
-def _measure(study: str, asked: Asked, as_json: bool) -> None:
+def _measure(measurement: str, options: BenchOptions, as_json: bool) -> None:
     from kissgs.cli import bench_comparison, bench_curves
 
-    if asked.plot is not None:  # before the work that it is to show
+    if options.plot is not None:  # before a long measurement
         from kissgs.benchmark.plots import check_plot
 
-        if len(asked.scenes) > 1:
-            raise UnsupportedError("--plot draws one scene; name one")
-        check_plot(asked.plot)
+        if len(options.scenes) > 1:
+            raise UnsupportedError("--plot takes one scene; give one FILE")
+        check_plot(options.plot)
     measure = {
         "": bench_comparison.comparison,
         "--ablate": bench_comparison.ablation,
         "--compaction": bench_curves.compaction,
         "--finetuning": bench_curves.finetuning,
         "--rendering": bench_comparison.rendering,
-    }[study]
-    outcome = measure(asked)
-    try:  # what has taken long to find is told where one can be written to, and drawn where the other can
+    }[measurement]
+    output = measure(options)
+    try:  # results that took long are plotted even if they cannot be printed
         if as_json:
-            print_json(outcome.rows)
-        elif outcome.rows:
-            show(outcome.table)
+            print_json(output.rows)
+        elif output.rows:
+            show(output.table)
     finally:
-        if asked.plot is not None and outcome.draw is not None:
-            outcome.draw(asked.plot)
-    for failure in outcome.failures:
+        if options.plot is not None and output.draw is not None:
+            output.draw(options.plot)
+    for failure in output.failures:
         sys.stderr.write(f"kissgs: {failure}\n")
-    if outcome.failures:
+    if output.failures:
         raise typer.Exit(2)
 
 
-def _only_one(studies: list[str]) -> str:
-    if len(studies) > 1:
-        raise UnsupportedError(f"{' and '.join(studies)} are several measurements; make one after the other")
-    return studies[0] if studies else ""
+def _only_one(measurements: list[str]) -> str:
+    if len(measurements) > 1:
+        raise UnsupportedError(f"{' and '.join(measurements)} cannot be combined; run one at a time")
+    return measurements[0] if measurements else ""
 
 
-def _check_options(study: str, given: Mapping[str, object]) -> None:
-    """Whether all that is given means something to this measurement."""
-    if study == "--rendering" and (given["--preset"] or given["--peer"]):
-        raise UnsupportedError("--rendering measures the rasteriser, no presets and no peers")
+def _check_options(measurement: str, given: Mapping[str, object]) -> None:
+    """Check that all given options apply to this measurement."""
+    if measurement == "--rendering" and (given["--preset"] or given["--external"]):
+        raise UnsupportedError("--rendering measures the rasteriser only; leave out --preset and --external")
     for option, value in given.items():
-        if value and study not in GOES_WITH[option]:
-            others = " or ".join(filter(None, GOES_WITH[option]))
-            raise UnsupportedError(f"{option} does not go with {study}" if study else f"{option} goes with {others}")
+        if value and measurement not in VALID_WITH[option]:
+            others = " or ".join(filter(None, VALID_WITH[option]))
+            raise UnsupportedError(
+                f"{option} does not apply to {measurement}; leave one of them out"
+                if measurement
+                else f"{option} needs {others}"
+            )

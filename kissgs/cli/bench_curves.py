@@ -1,4 +1,4 @@
-"""``kissgs bench --compaction`` and ``--finetuning``: curves as tables and plots."""
+"""``kissgs bench --compaction`` and ``--finetuning``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rich.console import Group
 from rich.table import Column, Table
 from rich.text import Text
 
-from kissgs.cli.bench_scenes import Asked, Outcome, each_scene
+from kissgs.cli.bench_scenes import BenchOptions, BenchOutput, each_scene
 from kissgs.cli.options import choice, chosen
 from kissgs.core.errors import UnsupportedError
 from kissgs.evaluation.results import spell
@@ -19,87 +19,91 @@ if TYPE_CHECKING:
 
     from rich.console import RenderableType
 
-    from kissgs.benchmark.compaction_study import Point
+    from kissgs.benchmark.compaction_study import CompactionPoint
     from kissgs.benchmark.finetuning_curves import RatePoint
     from kissgs.cameras.views import Source
     from kissgs.core.progress import Progress
 
 
-def compaction(asked: Asked) -> Outcome:
-    """All ways to have fewer Gaussians on all scenes."""
-    from kissgs.benchmark.compaction_study import RATIOS, WAYS, study
+def compaction(options: BenchOptions) -> BenchOutput:
+    """Compare strategies of compaction."""
+    from kissgs.benchmark.compaction_study import RATIOS, STRATEGIES, compare_strategies
     from kissgs.benchmark.plots import compaction_plot
     from kissgs.pipeline.scene_files import load
 
-    known = {way.name: way for way in WAYS}
-    for name in asked.ways:
+    known = {strategy.name: strategy for strategy in STRATEGIES}
+    for name in options.strategies:
         if name not in known:
-            raise UnsupportedError(f"there is no way {name!r}; there are: {'; '.join(known)}")
-    source = _teacher(asked)
-    settings = chosen(asked.preset, asked.changes, group="compact").compact
+            raise UnsupportedError(f"--strategy {name!r}: unknown strategy; choose one of: {'; '.join(known)}")
+    supervision = _supervision(options)
+    settings = chosen(options.preset, options.changes, group="compact").compact
 
-    def measure(scene: Path, progress: Progress) -> list[Point]:
-        return study(
-            *(load(scene, threads=asked.threads, progress=progress), settings, asked.views),
-            ratios=asked.ratios or RATIOS,
-            ways=[known[name] for name in asked.ways or known],
-            learn_from=source,
-            threads=asked.threads,
+    def measure(scene: Path, progress: Progress) -> list[CompactionPoint]:
+        return compare_strategies(
+            load(scene, threads=options.threads, progress=progress),
+            settings,
+            options.views,
+            ratios=options.ratios or RATIOS,
+            strategies=[known[name] for name in options.strategies or known],
+            supervision=supervision,
+            threads=options.threads,
             progress=progress,
         )
 
-    rows, failures = each_scene(asked, measure)
-    return Outcome(
+    rows, failures = each_scene(options, measure)
+    return BenchOutput(
         rows=[{"scene": scene, **point.as_dict()} for scene, point in rows],
-        table=curves_table(rows),
+        table=compaction_table(rows),
         draw=partial(compaction_plot, [point for _, point in rows]),
         failures=failures,
     )
 
 
-def _teacher(asked: Asked) -> Source:
-    """What to learn from, once it is known that it can be, and that something will be left to teach."""
+def _supervision(options: BenchOptions) -> Source:
+    """Return the value of ``--supervision``, after a check of the options of training."""
     from kissgs.cameras.views import Source
 
-    if 0 in asked.ratios:
-        raise UnsupportedError("--ratio 0 keeps nothing; give a share above 0")
-    source = cast(Source, choice("--learn-from", asked.learn_from, Source))
-    if asked.views is None and source == "cameras":
-        raise UnsupportedError("--learn-from cameras: say whose with --views")
-    return source
+    if 0 in options.ratios:
+        raise UnsupportedError("--ratio 0 keeps no Gaussian; give a share above 0")
+    supervision = cast(Source, choice("--supervision", options.supervision, Source))
+    if options.views is None and supervision == "cameras":
+        raise UnsupportedError("--supervision cameras needs a capture; give one with --views")
+    return supervision
 
 
-def curves_table(rows: list[tuple[str, Point]]) -> Table:
-    """For people."""
+def compaction_table(rows: list[tuple[str, CompactionPoint]]) -> Table:
+    """Return the results of compaction as a table for the terminal."""
     names = ("Gaussians", "PSNR", "SSIM", "bytes", "seconds", "CPU s")
-    table = Table("scene", "way", *(Column(name, justify="right") for name in names), box=None, pad_edge=False)
+    table = Table("scene", "strategy", *(Column(name, justify="right") for name in names), box=None, pad_edge=False)
     for scene, point in rows:
-        figures = f"{point.count:,}", spell(point.psnr, 2), spell(point.ssim, 4), f"{point.bytes:,}"
-        table.add_row(scene, point.way, *figures, f"{point.seconds:.1f}", f"{point.cpu_seconds:.1f}")
+        metrics = f"{point.count:,}", spell(point.psnr, 2), spell(point.ssim, 4), f"{point.bytes:,}"
+        table.add_row(scene, point.strategy, *metrics, f"{point.seconds:.1f}", f"{point.cpu_seconds:.1f}")
     return table
 
 
-def finetuning(asked: Asked) -> Outcome:
-    """With fine-tuning and without, at all fidelities on all scenes."""
+def finetuning(options: BenchOptions) -> BenchOutput:
+    """Measure bytes and quality with and without fine-tuning."""
     from kissgs.benchmark.finetuning_curves import rate_curves
     from kissgs.benchmark.plots import finetuning_plot
     from kissgs.pipeline.scene_files import load
 
-    source = _teacher(asked)
-    settings = chosen(asked.preset, asked.changes, group="finetune")
+    supervision = _supervision(options)
+    settings = chosen(options.preset, options.changes, group="finetune")
 
     def measure(scene: Path, progress: Progress) -> list[RatePoint]:
         return rate_curves(
-            *(load(scene, threads=asked.threads, progress=progress), settings, asked.views),
-            fidelities=asked.fidelities or None,
-            ratios=asked.ratios,
-            learn_from=source,
-            threads=asked.threads,
+            load(scene, threads=options.threads, progress=progress),
+            settings,
+            options.views,
+            quality_offsets=options.quality_offsets or None,
+            ratios=options.ratios,
+            supervision=supervision,
+            threads=options.threads,
             progress=progress,
         )
 
-    rows, failures = each_scene(asked, measure)
-    return Outcome(
+    rows, failures = each_scene(options, measure)
+    return BenchOutput(
         rows=[{"scene": scene, **point.as_dict()} for scene, point in rows],
         table=finetuning_table(rows),
         draw=partial(finetuning_plot, [point for _, point in rows]),
@@ -108,32 +112,32 @@ def finetuning(asked: Asked) -> Outcome:
 
 
 def finetuning_table(rows: list[tuple[str, RatePoint]]) -> RenderableType:
-    """For people."""
-    from kissgs.benchmark.finetuning_curves import saved
+    """Return the results of fine-tuning as a table for the terminal, with the bytes that it saves on average."""
+    from kissgs.benchmark.finetuning_curves import bytes_saved
 
     names = ("Gaussians", "offset, dB", "bytes", "PSNR", "SSIM", "to the scene", "seconds", "CPU s", "MB")
-    table = Table("scene", "way", *(Column(name, justify="right") for name in names), box=None, pad_edge=False)
+    table = Table("scene", "variant", *(Column(name, justify="right") for name in names), box=None, pad_edge=False)
     lines = []
     for scene in dict.fromkeys(name for name, _ in rows):
         points = [point for name, point in rows if name == scene]
         for point in points:
             quality = spell(point.psnr, 2), spell(point.ssim, 4), spell(point.psnr_to_scene, 2)
-            took = f"{point.seconds:.1f}", f"{point.cpu_seconds:.1f}", f"{point.peak_memory / 1e6:.0f}"
+            resources = f"{point.seconds:.1f}", f"{point.cpu_seconds:.1f}", f"{point.peak_memory / 1e6:.0f}"
             table.add_row(
                 scene,
-                point.way,
+                point.variant,
                 f"{point.count:,}",
                 f"{point.quality_offset_db:g}",
                 f"{point.bytes:,}",
                 *quality,
-                *took,
+                *resources,
             )
-        kinds = {"PSNR": "psnr", "SSIM": "ssim", "PSNR to the scene's own pictures": "psnr_to_scene"}
+        metrics = {"PSNR": "psnr", "SSIM": "ssim", "PSNR to renderings of the scene": "psnr_to_scene"}
         if all(point.psnr == point.psnr_to_scene for point in points):
-            kinds.pop("PSNR to the scene's own pictures")
-        for figure, name in kinds.items():
-            share = saved(points, name)
+            metrics.pop("PSNR to renderings of the scene")
+        for metric, name in metrics.items():
+            share = bytes_saved(points, name)
             if share is not None:
-                word = "fewer" if share >= 0 else "more"
-                lines.append(f"{scene}: {100 * abs(share):.1f} % {word} bytes at equal {figure}, on average")
+                comparative = "fewer" if share >= 0 else "more"
+                lines.append(f"{scene}: {100 * abs(share):.1f} % {comparative} bytes at equal {metric}, on average")
     return Group(table, *(Text(line) for line in lines))

@@ -1,4 +1,4 @@
-"""What the measurements of ``kissgs bench`` share: what was asked for, and what came of it."""
+"""Options and output that the measurements of ``kissgs bench`` share."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ Row = TypeVar("Row")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Asked:
-    """The options, as the command line has them; those of other measurements are empty."""
+class BenchOptions:
+    """Options of the command line; those of other measurements have their defaults."""
 
     scenes: list[Path]
     presets: list[str] = field(default_factory=list)
     changes: list[str] | None = None
-    peers: list[str] = field(default_factory=list)
+    external_codecs: list[str] = field(default_factory=list)
     splat_transform: str = "splat-transform"
     sog_iterations: int | None = None
     repeats: int = 1
-    pictures: bool = False
-    fidelities: list[float] = field(default_factory=list)
+    evaluate: bool = False
+    quality_offsets: list[float] = field(default_factory=list)
     ratios: list[float] = field(default_factory=list)
-    ways: list[str] = field(default_factory=list)
-    learn_from: str = "photos"
+    strategies: list[str] = field(default_factory=list)
+    supervision: str = "photos"
     plot: Path | None = None
     gaussians: list[int] = field(default_factory=list)
     views: Views | None = None
@@ -41,13 +41,20 @@ class Asked:
 
     @property
     def preset(self) -> str:
-        """Where a measurement is of one."""
+        """The first preset, by default "balanced", for measurements that take one."""
         return self.presets[0] if self.presets else "balanced"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Outcome:
-    """For machines, for people, how it is drawn, if it is, and a sentence for each part that failed."""
+class BenchOutput:
+    """Output of a measurement.
+
+    Attributes:
+        rows: results for JSON.
+        table: results for the terminal.
+        draw: writes a plot to a file; None if there is no plot.
+        failures: an error message for each part that failed.
+    """
 
     rows: list[dict[str, Any]]
     table: RenderableType
@@ -55,8 +62,10 @@ class Outcome:
     failures: list[str] = field(default_factory=list)
 
 
-def each_scene(asked: Asked, measure: Callable[[Path, Progress], list[Row]]) -> tuple[list[tuple[str, Row]], list[str]]:
-    """What ``measure`` finds of every scene, beside its name; and a sentence for each of several that failed.
+def each_scene(
+    options: BenchOptions, measure: Callable[[Path, Progress], list[Row]]
+) -> tuple[list[tuple[str, Row]], list[str]]:
+    """Return the results of ``measure`` on each scene with the scene's name, and the error messages of failed scenes.
 
     Raises:
         KissgsError: there is one scene, and it failed.
@@ -65,18 +74,18 @@ def each_scene(asked: Asked, measure: Callable[[Path, Progress], list[Row]]) -> 
 
     rows, failures = list[tuple[str, Row]](), list[str]()
     with progress_bar(False) as progress:
-        for scene, name in zip(asked.scenes, _names(asked.scenes), strict=True):
+        for scene, name in zip(options.scenes, _names(options.scenes), strict=True):
             try:
                 rows += [(name, row) for row in measure(scene, progress)]
             except KissgsError as error:
-                if len(asked.scenes) == 1:
+                if len(options.scenes) == 1:
                     raise
-                failures.append(str(error))  # what the others took an hour to find is not lost
+                failures.append(str(error))  # the results of other scenes may have taken hours
     return rows, failures
 
 
 def _names(scenes: list[Path]) -> list[str]:
-    """As much of the end of each path as tells it from the others: many captures have a ``point_cloud.ply``."""
+    """Return the shortest ends of the paths that are all different: many captures have a ``point_cloud.ply``."""
     longest = max(len(scene.parts) for scene in scenes)
     for depth in range(1, longest + 1):
         names = [str(Path(*scene.parts[-depth:])) for scene in scenes]

@@ -217,9 +217,9 @@ def _colour(text: str | None) -> tuple[float, float, float] | None:
 
 
 def _encoded(rendered: RenderedImages, suffix: str, fps: int, quality: int) -> bytes:
-    from kissgs.rendering.images import film, png
+    from kissgs.rendering.images import animated_webp, png
 
-    return png(rendered.pictures[0]) if suffix == ".png" else film(rendered.pictures, fps=fps, quality=quality)
+    return png(rendered.pictures[0]) if suffix == ".png" else animated_webp(rendered.pictures, fps=fps, quality=quality)
 
 
 def _report(rendered: RenderedImages, size: int) -> dict[str, Any]:

@@ -1,1 +1,1 @@
-"""A kissgs service elsewhere, used from Python."""
+"""Client of a kissgs service: uploads scenes, follows jobs, downloads containers."""

@@ -1,4 +1,4 @@
-"""A kissgs service elsewhere, used as if it were here: upload, follow, download."""
+"""``Remote``: compression by a kissgs service over HTTP."""
 
 from __future__ import annotations
 
@@ -24,40 +24,46 @@ if TYPE_CHECKING:
     import httpx
 
 BLOCK_BYTES = 1 << 18
-PATIENCE_SECONDS = 300.0
-"""How long a crowded or restarting service is asked again."""
+"""Size of the blocks in which files are uploaded and downloaded."""
 
-FIRST_SECONDS = 8.0
-"""How long one is that has never answered: its address may be wrong."""
+RETRY_SECONDS = 300.0
+"""Time for which requests to an overloaded or restarting service are repeated."""
+
+FIRST_RETRY_SECONDS = 8.0
+"""Time for which requests to a service that has never answered are repeated: its address may be wrong."""
 
 _ERRORS: dict[str, type[KissgsError]] = {kind.code: kind for kind in (InvalidSceneError, UnsupportedError)}
-"""Problems that are the scene's or the settings': raised as the library itself would."""
+"""Errors by problem type, for problems of the scene or the settings that the library itself would raise."""
 
 T = TypeVar("T")
 
 
 class Remote:
-    """A kissgs service.
+    """Client of a kissgs service.
 
     Args:
-        server: its address, such as ``http://localhost:8000``.
-        key: where it asks for one.
+        server: address of the service, such as ``http://localhost:8000``.
+        key: access key; None if the service needs none.
 
     Raises:
-        UnsupportedError: httpx is not installed, or this is no address.
+        UnsupportedError: httpx is not installed; the address or the key is malformed.
     """
 
     def __init__(self, server: str, *, key: str | None = None) -> None:
         try:
             import httpx
         except ModuleNotFoundError as error:
-            raise UnsupportedError("talking to a service needs httpx; install kissgs[remote]") from error
+            raise UnsupportedError(
+                "a kissgs service needs httpx, which is not installed: pip install 'kissgs[remote]'"
+            ) from error
         if not _is_address(server):
             raise UnsupportedError(
-                f"{server!r} is no address of a service; write it as http://localhost:8000, without a path"
+                f"{server!r} is not the address of a service; write it as http://localhost:8000, without a path"
             )
         if key and not re.fullmatch(r"[!-~]+", key):
-            raise UnsupportedError("this is no key: keys have no spaces and no letters beyond ASCII")
+            raise UnsupportedError(
+                "the key is malformed: a key has only printable ASCII characters without spaces; check it"
+            )
         headers = {"Authorization": f"Bearer {key}"} if key else {}
         timeout = httpx.Timeout(60.0, connect=10.0)
         self._http = httpx.Client(base_url=server.rstrip("/"), headers=headers, timeout=timeout)
@@ -79,24 +85,24 @@ class Remote:
         overwrite: bool = False,
         progress: Progress = silent,
     ) -> dict[str, Any]:
-        """Have a ``.ply`` compressed there, and write the container here.
+        """Compress a ``.ply`` file on the service, and write the container to a local file.
 
         Args:
-            source: the ``.ply``.
-            destination: the ``.zip`` to write, whole or not at all.
-            settings: by default those of the preset ``balanced``.
-            evaluate: also have the pictures compared.
-            overwrite: replace ``destination`` if it exists.
-            progress: hears of ``upload``, ``queue``, the service's own stages, and ``download``. Whatever it raises
-                cancels the job.
+            source: the ``.ply`` file.
+            destination: the ``.zip`` file to write, atomically.
+            settings: None for the preset ``balanced``.
+            evaluate: whether the service also compares rendered images.
+            overwrite: whether to replace ``destination`` if it exists.
+            progress: receives "upload", "queue", the stages of the service, "download", and "wait for server". An
+                exception that it raises cancels the job.
 
         Returns:
-            What the service knows of the job: sizes, timings and so on, see its API.
+            The status of the job: sizes, times and so on, see the API of the service.
 
         Raises:
-            InvalidSceneError: the ``.ply`` cannot be read, or the service finds it is no scene.
-            UnsupportedError: a limit or a setting that is not possible.
-            RemoteError: the service cannot be reached, or refuses or fails.
+            InvalidSceneError: the ``.ply`` cannot be read, or is not a scene.
+            UnsupportedError: a limit is exceeded, or a setting is invalid.
+            RemoteError: the service cannot be reached, refuses the job or fails.
             OutputError: ``destination`` cannot be written.
         """
         target = Path(destination)
@@ -107,15 +113,15 @@ class Remote:
             self.download(status, target, overwrite=overwrite, progress=progress)
         except KissgsError as error:
             if isinstance(error, Cancelled):
-                self._forget(status["id"])
-            raise _about(error, source) from error
+                self._cancel_quietly(status["id"])
+            raise _with_file_name(error, source) from error
         except BaseException:
-            self._forget(status["id"])
+            self._cancel_quietly(status["id"])
             raise
         return status
 
-    def _forget(self, job: str) -> None:
-        with contextlib.suppress(KissgsError):  # what brought us here matters more
+    def _cancel_quietly(self, job: str) -> None:
+        with contextlib.suppress(KissgsError):  # the original error matters more
             self.cancel(job)
 
     def submit(
@@ -126,7 +132,13 @@ class Remote:
         evaluate: bool = False,
         progress: Progress = silent,
     ) -> dict[str, Any]:
-        """Upload a ``.ply``. A broken connection or a crowded service is tried again, without making a second job.
+        """Upload a ``.ply`` file; retry if the connection breaks or the service is overloaded, without a second job.
+
+        Args:
+            source: the ``.ply`` file.
+            settings: None for the preset ``balanced``.
+            evaluate: whether the service also compares rendered images.
+            progress: receives "upload" and "wait for server".
 
         Returns:
             The status of the job.
@@ -146,45 +158,45 @@ class Remote:
         def send() -> dict[str, Any]:
             body = _blocks(path, size, progress)
             params = {"options": json.dumps(options), "name": path.name}
-            answer = self._http.post("/v1/jobs", params=params, headers=headers, content=body)
-            return _checked(answer).json()
+            response = self._http.post("/v1/jobs", params=params, headers=headers, content=body)
+            return _checked(response).json()
 
         try:
-            return self._patiently(send, progress)
+            return self._with_retries(send, progress)
         except KissgsError as error:
-            raise _about(error, path) from error
+            raise _with_file_name(error, path) from error
 
     def follow(self, job: str, progress: Progress = silent) -> dict[str, Any]:
-        """Wait until a job has ended.
+        """Wait until a job has ended, and pass its progress on.
 
         Returns:
-            Its status.
+            The status of the job, which has succeeded.
 
         Raises:
-            KissgsError: it failed, or was cancelled.
+            KissgsError: the job failed or was cancelled.
         """
         last = ""
 
         def listen() -> None:
             nonlocal last
             headers = {"Last-Event-ID": last} if last else {}
-            with self._http.stream("GET", f"/v1/jobs/{job}/events", headers=headers) as answer:
-                if answer.is_error:
-                    answer.read()
-                for number, event, data in _events(_checked(answer)):
+            with self._http.stream("GET", f"/v1/jobs/{job}/events", headers=headers) as response:
+                if response.is_error:
+                    response.read()
+                for number, event, data in _events(_checked(response)):
                     last = number
                     if event == "progress":
-                        # Receivers that know nothing of notes can follow all else.
+                        # Without a note, only two arguments: receivers need not accept notes.
                         progress(data["stage"], data["fraction"], *([data["note"]] if "note" in data else []))
                     elif data["state"] == "queued":
                         progress("queue", 0.0)
 
         while True:
-            self._patiently(listen, progress)
-            status = self._patiently(lambda: self.status(job), progress)
+            self._with_retries(listen, progress)
+            status = self._with_retries(lambda: self.status(job), progress)
             if status["state"] not in ("queued", "running"):
                 break
-            time.sleep(0.2)  # the stream broke off: the service is stopping
+            time.sleep(0.2)  # the stream ended early: the service is stopping
         if status["state"] == "succeeded":
             return status
         problem = status.get("problem", {"code": "cancelled", "detail": f"the job was {status['state']} on the server"})
@@ -193,78 +205,78 @@ class Remote:
     def download(
         self, status: dict[str, Any], destination: Path, *, overwrite: bool = False, progress: Progress = silent
     ) -> None:
-        """Write the container of a job that has succeeded, its checksum verified.
+        """Write the container of a job that has succeeded, and verify its checksum.
 
         Raises:
             KissgsError: see :meth:`compress`.
         """
 
         def fetch() -> None:
-            with self._http.stream("GET", status["links"]["result"]) as answer:
-                if answer.is_error:
-                    answer.read()
-                _checked(answer)
-                size, digest, done = int(answer.headers["Content-Length"]), hashlib.sha256(), 0
+            with self._http.stream("GET", status["links"]["result"]) as response:
+                if response.is_error:
+                    response.read()
+                _checked(response)
+                size, digest, done = int(response.headers["Content-Length"]), hashlib.sha256(), 0
                 with atomic_file(destination, overwrite=overwrite) as file:
-                    for block in answer.iter_bytes(BLOCK_BYTES):
+                    for block in response.iter_bytes(BLOCK_BYTES):
                         file.write(block)
                         digest.update(block)
                         done += len(block)
                         progress("download", done / size)
                     expected = f"sha-256=:{base64.b64encode(digest.digest()).decode()}:"
-                    if answer.headers.get("Repr-Digest") != expected:
-                        raise RemoteError("the container was damaged on its way; try again")
+                    if response.headers.get("Repr-Digest") != expected:
+                        raise RemoteError("the container was damaged during the download; try again")
 
-        self._patiently(fetch, progress)
+        self._with_retries(fetch, progress)
 
     def status(self, job: str, *, wait: float = 0.0) -> dict[str, Any]:
-        """What is known of a job; waits up to ``wait`` seconds (30 at most) for its end.
+        """Return the status of a job, after waiting up to ``wait`` seconds (at most 30) for its end.
 
         Raises:
-            RemoteError: the service cannot be reached, or knows no such job.
+            RemoteError: the service cannot be reached, or there is no such job.
         """
         return self._once(lambda: _checked(self._http.get(f"/v1/jobs/{job}", params={"wait": wait})).json())
 
     def cancel(self, job: str) -> dict[str, Any]:
-        """Stop a job's work.
+        """Cancel a job, and return its status.
 
         Raises:
-            RemoteError: the service cannot be reached, or knows no such job.
+            RemoteError: the service cannot be reached, or there is no such job.
         """
         return self._once(lambda: _checked(self._http.post(f"/v1/jobs/{job}/cancel")).json())
 
     def jobs(self, limit: int = 20) -> list[dict[str, Any]]:
-        """The latest jobs, newest first: the status of each.
+        """Return the status of the ``limit`` latest jobs, newest first.
 
         Raises:
             RemoteError: the service cannot be reached.
         """
         return self._once(lambda: _checked(self._http.get("/v1/jobs", params={"limit": limit})).json()["jobs"])
 
-    def _once(self, ask: Callable[[], T]) -> T:
+    def _once(self, request: Callable[[], T]) -> T:
         import httpx
 
         try:
-            answer = ask()
+            result = request()
         except httpx.HTTPError as error:
             reason = str(error).lower() or type(error).__name__
-            failed = RemoteError(f"cannot reach {self._http.base_url}: {reason}; is kissgs-serve running there?")
-            failed.unreachable = True
-            raise failed from error
+            remote_error = RemoteError(f"cannot reach {self._http.base_url}: {reason}; is kissgs-serve running there?")
+            remote_error.unreachable = True
+            raise remote_error from error
         self._has_answered = True
-        return answer
+        return result
 
-    def _patiently(self, ask: Callable[[], T], progress: Progress) -> T:
-        """Ask again while the service is crowded or away, for a few minutes."""
-        begun, pause = time.monotonic(), 0.5
+    def _with_retries(self, request: Callable[[], T], progress: Progress) -> T:
+        """Repeat a request while the service is overloaded or unreachable, for :data:`RETRY_SECONDS`."""
+        start, pause = time.monotonic(), 0.5
         while True:
             try:
-                return self._once(ask)
+                return self._once(request)
             except RemoteError as error:
                 pause = min(30.0, 2 * pause)
                 delay = pause if error.unreachable else error.retry_after
-                patience = PATIENCE_SECONDS if self._has_answered or not error.unreachable else FIRST_SECONDS
-                if delay is None or time.monotonic() + delay > begun + patience:
+                limit = RETRY_SECONDS if self._has_answered or not error.unreachable else FIRST_RETRY_SECONDS
+                if delay is None or time.monotonic() + delay > start + limit:
                     raise
                 _sleep(delay, progress)
 
@@ -280,7 +292,7 @@ def _is_address(server: str) -> bool:
 
 
 def _sleep(seconds: float, progress: Progress) -> None:
-    """In steps, so that who follows can stop it."""
+    """Sleep in short steps that call ``progress``, which may raise."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         progress("wait for server", 0.0)
@@ -310,10 +322,10 @@ def _blocks(path: Path, size: int, progress: Progress) -> Iterator[bytes]:
         raise InvalidSceneError(f"cannot read {path}: {reason_of(error)}") from error
 
 
-def _events(answer: httpx.Response) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Id, kind and data of each server-sent event; the service writes each on lines of its own."""
+def _events(response: httpx.Response) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Yield id, event and data of each server-sent event; each field is on one line."""
     fields: dict[str, str] = {}
-    for line in answer.iter_lines():
+    for line in response.iter_lines():
         if line:
             name, _, value = line.partition(": ")
             fields[name] = value
@@ -323,24 +335,26 @@ def _events(answer: httpx.Response) -> Iterator[tuple[str, str, dict[str, Any]]]
             fields = {}
 
 
-def _about(error: KissgsError, source: str | PathLike[str]) -> KissgsError:
-    """The same error, about the file rather than the upload that it has become."""
+def _with_file_name(error: KissgsError, source: str | PathLike[str]) -> KissgsError:
+    """Return the error with "the upload" replaced by the file name in its message."""
     text = str(error)
-    named = type(error)(text.replace("the upload", str(source)))
-    return named if text != str(named) else error
+    renamed = type(error)(text.replace("the upload", str(source)))
+    return renamed if text != str(renamed) else error
 
 
-def _checked(answer: httpx.Response) -> httpx.Response:
-    if not answer.is_error:
-        return answer
+def _checked(response: httpx.Response) -> httpx.Response:
+    if not response.is_error:
+        return response
     try:
-        problem = answer.json()
+        problem = response.json()
         hint = "; set KISSGS_KEY or give --key" if problem["code"] == "unauthorized" else ""
         error = _error({"code": problem["code"], "detail": problem["detail"] + hint})
     except (ValueError, KeyError, TypeError):
-        error = RemoteError(f"{answer.url.host} answered {answer.status_code}; is it a kissgs service?")
-    after = answer.headers.get("Retry-After", "")
-    if isinstance(error, RemoteError) and answer.status_code in (429, 503) and after.isdigit():
+        error = RemoteError(
+            f"{response.url.host} answered with status {response.status_code}; check that it is a kissgs service"
+        )
+    after = response.headers.get("Retry-After", "")
+    if isinstance(error, RemoteError) and response.status_code in (429, 503) and after.isdigit():
         error.retry_after = float(after)
     raise error
 

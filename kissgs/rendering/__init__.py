@@ -1,1 +1,1 @@
-"""From Gaussians to pictures: cameras, the rasteriser and its backends, and how pictures are compared."""
+"""Cameras, the rasteriser with its CPU and CUDA backends, sensitivity, losses and image metrics."""

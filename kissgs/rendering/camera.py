@@ -1,4 +1,4 @@
-"""``Camera``: a pinhole with a pose, in the conventions of COLMAP and gsplat."""
+"""``Camera``: a pinhole camera with a pose, in the conventions of COLMAP and gsplat."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from kissgs.core.array_types import Float64
 from kissgs.core.errors import InvalidViewsError
 
 MAX_SIDE = 1 << 16
-"""Of a picture, pixels; already such a square has 50 GB."""
+"""Largest side of an image, pixels; a square of this size already takes 50 GB."""
 
 MAX_FOCAL = 1e15
+"""Largest focal length, pixels."""
 
 
 @dataclass(frozen=True, slots=True)
 class Camera:
     """A pinhole camera: x right, y down, z forward; the centre of the first pixel is at (0.5, 0.5).
 
-    Matrices of any type and layout are taken, and copied.
+    Matrices may have any dtype and layout; they are copied.
 
     Attributes:
-        viewmat: ``(4, 4)`` float64, rigid transform from the world to the camera.
+        viewmat: ``(4, 4)`` float64, rigid transform from world to camera.
         K: ``(3, 3)`` float64, intrinsics in pixels: fx, fy, cx, cy; no skew.
-        width: of the picture, pixels.
-        height: of the picture, pixels.
+        width: of the image, pixels, 1 to :data:`MAX_SIDE`.
+        height: of the image, pixels, 1 to :data:`MAX_SIDE`.
 
     Raises:
-        InvalidViewsError: a matrix is not finite or not of that kind; a focal length or a side is not positive, or
-            immense.
+        InvalidViewsError: a matrix is not finite or not of this kind; a focal length or a side is outside its limits.
     """
 
     viewmat: Float64[np.ndarray, "4 4"]
@@ -60,16 +60,16 @@ class Camera:
 
     @property
     def position(self) -> Float64[np.ndarray, "3"]:
-        """Where it stands, in world units."""
+        """Centre of projection, ``(3,)``, world units."""
         return np.asarray(-self.viewmat[:3, :3].T @ self.viewmat[:3, 3])
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same view on another grid of pixels."""
+        """Return the same view with another number of pixels; the aspect ratio of pixels may change."""
         scale = np.array([[width / self.width], [height / self.height], [1.0]])
         return Camera(self.viewmat, self.K * scale, width, height)
 
     def at_most(self, size: int) -> Camera:
-        """The same view with at most so many pixels on its longer side."""
+        """Return the same view with at most ``size`` pixels on the longer side."""
         shrink = size / max(self.width, self.height)
         if shrink >= 1:
             return self
@@ -85,10 +85,16 @@ def look_at(
     width: int,
     height: int,
 ) -> Camera:
-    """A camera at ``position`` with ``target`` in the middle of its picture and ``up`` pointing up in it.
+    """Return a camera with ``target`` in the middle of its image.
 
-    ``fov`` is the angle of view along the longer side, in radians. Where ``up`` is along the line of sight, any roll
-    may come out.
+    Args:
+        position: ``(3,)`` centre of projection, world units.
+        target: ``(3,)`` point in the middle of the image, world units.
+        up: ``(3,)`` direction that points up in the image, of any length. The roll is arbitrary if it is zero or along
+            the line of sight.
+        fov: angle of view along the longer side, radians.
+        width: of the image, pixels.
+        height: of the image, pixels.
     """
     forward = target - position
     forward = forward / max(float(np.linalg.norm(forward)), 1e-30)
@@ -104,6 +110,6 @@ def look_at(
 
 
 def pinhole(fov: float, width: int, height: int) -> Float64[np.ndarray, "3 3"]:
-    """Intrinsics of a camera that looks through the middle of its picture; ``fov`` as for :func:`look_at`."""
+    """Return intrinsics with the principal point in the middle of the image; ``fov`` as for :func:`look_at`."""
     focal = 0.5 * max(width, height) / np.tan(0.5 * fov)
     return np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]])

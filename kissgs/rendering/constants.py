@@ -1,31 +1,36 @@
-"""What a picture of Gaussians is: the constants of gsplat's classic mode, which are those of the original 3DGS.
+"""The image model: how Gaussians are rendered, with the constants of gsplat's classic mode and the original 3DGS.
 
-A Gaussian with mean m, rotation R, standard deviations s and opacity o is drawn by a camera (W, t; fx, fy, cx, cy) so:
+A camera (W, t; fx, fy, cx, cy) renders a Gaussian with mean m, rotation R, standard deviations s and opacity o thus:
 
 1. m' = W m + t; it is left out if its depth z' is outside [:data:`NEAR`, :data:`FAR`].
 2. Its footprint has the centre (fx x'/z' + cx, fy y'/z' + cy) and the covariance J W R diag(s²) (J W R)ᵀ +
    :data:`DILATION` · 1, with J the derivative of that projection at m'. For J alone, x'/z' and y'/z' are clamped to the
-   picture widened by :data:`FRUSTUM_MARGIN` of half its size on either side (EWA splatting, Zwicker et al. 2001).
+   image widened by :data:`FRUSTUM_MARGIN` of half its size on either side (EWA splatting, Zwicker et al. 2001).
 3. At a pixel centre p, its alpha is o exp(-½ (p - centre)ᵀ covariance⁻¹ (p - centre)), at most :data:`ALPHA_MAX`, and
-   none where that is below :data:`ALPHA_MIN`. The box and tiles that renderers put around a footprint leave out only
-   pixels where this holds, so they are no part of the picture.
+   0 if that is below :data:`ALPHA_MIN`. The bounding boxes and tiles of renderers leave out only pixels where alpha is
+   0, so the image does not depend on them.
 4. Its colour is max(0, ½ + SH(direction from the camera's centre to m)).
 5. Front to back by depth z' as a float32 (equal depths in the scene's order): colour += T alpha colour, T *= 1 - alpha.
-   The first one that would take T to :data:`TRANSMITTANCE_MIN` or below is not drawn, nor is anything behind it. What
-   is left of T shows the background.
+   The first Gaussian that would take T to :data:`TRANSMITTANCE_MIN` or below is not drawn, nor is any behind it. The
+   background is added with the remaining T.
 
 gsplat up to 1.5.3 has 0.999 for :data:`ALPHA_MAX`; later versions, like the original 3DGS, 0.99.
 """
 
 NEAR = 0.01
+"""Depth of the near plane, world units."""
 FAR = 1e10
+"""Depth of the far plane, world units."""
 DILATION = 0.3
-"""Pixels²: no footprint is narrower than a pixel or so."""
+"""Variance added to both axes of a footprint, pixels², so that none is much narrower than a pixel."""
 FRUSTUM_MARGIN = 0.3
+"""Margin around the image within which the projection's derivative is not clamped, in units of half the image."""
 ALPHA_MIN = 1 / 255
+"""Smallest alpha that is drawn."""
 ALPHA_MAX = 0.99
+"""Largest alpha; larger ones are clamped."""
 TRANSMITTANCE_MIN = 1e-4
-"""(1 - ALPHA_MAX)²: two opaque Gaussians end a pixel."""
+"""Transmittance at which a pixel is complete: (1 - ALPHA_MAX)², two opaque Gaussians."""
 
 TILE = 16
-"""Side of the squares of pixels that are drawn at a time. Not part of what the picture is."""
+"""Side of the squares of pixels that are rendered together, pixels; the image does not depend on it."""

@@ -1,4 +1,4 @@
-"""How much of what each Gaussian could show the rendered images have shown, and from how near."""
+"""Coverage: how well the best camera has seen each Gaussian, by visibility and resolution."""
 
 from __future__ import annotations
 
@@ -11,23 +11,22 @@ from kissgs.rendering.constants import NEAR
 from kissgs.rendering.local_scale import local_scale
 
 VISIBLE = 0.003
-"""A Gaussian has been looked at once so much of its squared alpha came through to an image: with less than a twentieth
-of its opacity in front of everything else, it is hidden from there."""
+"""Share of a Gaussian's squared alpha in an image from which on it counts as seen; with less than a twentieth of its
+opacity unobstructed, it is hidden."""
 
 RESOLVED = 3.0
-"""Pixels that the distance to the 128th neighbour must span for the surroundings to be seen in detail."""
+"""Length in the image of the distance to the 128th neighbour from which on a Gaussian counts as resolved, pixels."""
 
-
-ISOLATED, NEARER = 16.0, 3.0
-"""A Gaussian farther than so many of its sizes from its neighbours is taken to be looked at by itself, from so many
-times nearer at most."""
+ISOLATED, MAX_APPROACH = 16.0, 3.0
+"""A Gaussian whose neighbours are more than :data:`ISOLATED` times its size away counts as an object of its own, which
+is viewed from up to :data:`MAX_APPROACH` times nearer."""
 
 
 class Coverage:
-    """Keeps, for each Gaussian, the best view that any image has given of it.
+    """The best coverage of each Gaussian over the images added so far.
 
     Args:
-        splats: finite.
+        splats: a finite scene.
     """
 
     def __init__(self, splats: Splats) -> None:
@@ -36,23 +35,22 @@ class Coverage:
         self._sizes = np.exp(np.sort(splats.scales, axis=1)[:, 1:].astype(np.float64))
         self._squared_opacity = (1 / (1 + np.exp(-splats.opacities.astype(np.float64)))) ** 2
         self.share = np.zeros(len(splats))
-        """``(N,)`` from 0, seen by no camera or from far away only, to 1, looked at from nearby."""
+        """``(N,)`` coverage from 0, seen by no camera or only from far away, to 1, seen from nearby."""
 
     @property
     def close_up(self) -> Float64[np.ndarray, " N"]:
-        """``(N,)`` squared alpha over an image in which the surroundings of each Gaussian fill the frame and nothing is
-        in front of it, as a share of that image, from 0 to 1."""
-        near = np.maximum(np.minimum(self._scale, ISOLATED * self._sizes[:, 0]), self._scale / NEARER)
+        """``(N,)`` mean squared alpha, 0 to 1, of each Gaussian in an unobstructed image that its surroundings fill."""
+        near = np.maximum(np.minimum(self._scale, ISOLATED * self._sizes[:, 0]), self._scale / MAX_APPROACH)
         area = np.pi * self._sizes[:, 0] * self._sizes[:, 1] / near**2
         return self._squared_opacity * np.minimum(area, 1)
 
     def add(self, camera: Camera, seen: Float[np.ndarray, " N"], finer: float = 1.0) -> None:
-        """Take account of one image.
+        """Update the coverage by one rendered image.
 
         Args:
-            camera: it was rendered from.
-            seen: ``(N,)`` sum over its pixels of (alpha T)², T being the transmittance of what is in front.
-            finer: how many times more pixels the image has, in each direction, for which it stands.
+            camera: camera of the image.
+            seen: ``(N,)`` sum over pixels of (alpha T)², T being the transmittance in front of the Gaussian.
+            finer: ratio of the resolution of the image that this one is a thumbnail of to its own.
         """
         distance = np.linalg.norm(self._means - camera.position, axis=1)
         pixels = np.sqrt(camera.K[0, 0] * camera.K[1, 1]) / np.maximum(distance, NEAR)

@@ -1,4 +1,4 @@
-"""The rasteriser with gradients, for torch: one function, on whichever device the parameters are."""
+"""The differentiable rasteriser for torch, on the device of the parameters."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ try:
     from torch import Tensor
     from torch.autograd.function import once_differentiable
 except ModuleNotFoundError as error:
-    raise UnsupportedError("gradients are torch's, which is missing: pip install 'kissgs[train]'") from error
+    raise UnsupportedError("gradients need torch, which is not installed: pip install 'kissgs[train]'") from error
 
 
 def rasterize(
@@ -35,46 +35,46 @@ def rasterize(
     backgrounds: Tensor | None = None,
     threads: int = 0,
 ) -> tuple[Tensor, Tensor]:
-    """Take pictures of a scene; gradients flow to all of its parameters.
+    """Render images of a scene, with gradients by all of its parameters.
 
-    On the processor by kissgs' own kernels, on CUDA by gsplat (extra ``kissgs[cuda]``); both draw what
-    :mod:`kissgs.rendering.constants` says. The parameters are those stored in a scene, float32 and finite:
+    On the CPU by kissgs' own kernels, on CUDA by gsplat (extra ``kissgs[cuda]``), both with the image model of
+    :mod:`kissgs.rendering.constants`. The parameters are those stored in a scene, float32 and finite.
 
     Args:
         means: ``(N, 3)`` world units.
-        quats: ``(N, 4)`` w, x, y, z of any length; shorter than 1e-12 means no rotation, with no gradient.
-        scales: ``(N, 3)`` natural logarithms.
+        quats: ``(N, 4)`` w, x, y, z of any length; a length below 1e-12 means no rotation, and gradient 0.
+        scales: ``(N, 3)`` natural logarithms of standard deviations.
         opacities: ``(N,)`` logits.
-        sh0: ``(N, 3)``.
-        shN: ``(N, K, 3)``, K one of 0, 3, 8, 15.
+        sh0: ``(N, 3)`` constant SH coefficients.
+        shN: ``(N, K, 3)`` other SH coefficients, K one of 0, 3, 8, 15.
         viewmats: ``(C, 4, 4)`` world to camera; x right, y down, z forward. No gradient.
         Ks: ``(C, 3, 3)`` intrinsics in pixels. No gradient.
-        width: pixels.
-        height: pixels.
+        width: of the images, pixels.
+        height: of the images, pixels.
         backgrounds: ``(C, 3)`` RGB; black by default. No gradient.
-        threads: of the processor; 0 means one each. Results do not depend on it.
+        threads: number of CPU threads; 0 means one per processor. The result does not depend on it.
 
     Returns:
-        Pictures ``(C, H, W, 3)``, not clamped, and alphas ``(C, H, W)``.
+        Images ``(C, H, W, 3)``, not clamped, and alphas ``(C, H, W)``.
 
     Raises:
-        UnsupportedError: a gradient by the cameras or the background is asked for; a parameter is not float32, or not
-            where the others are; the pictures would take too much memory; no gsplat.
-        InvalidSceneError: the parameters' shapes do not fit.
-        InvalidViewsError: no camera, not as many of them as of backgrounds; not a rigid pose, or not a pinhole.
+        UnsupportedError: cameras or backgrounds require a gradient; a parameter is not float32 or is on another device;
+            the images would take too much memory; gsplat is not installed.
+        InvalidSceneError: the shapes of the parameters do not fit together.
+        InvalidViewsError: no camera; another number of backgrounds than of cameras; not a rigid pose, or not a pinhole.
     """
     parameters = (means, quats, scales, opacities, sh0, shN)
     if backgrounds is None:
         backgrounds = torch.zeros((len(viewmats), 3))
     _check_views(viewmats, Ks, backgrounds)
     if any(tensor.dtype != torch.float32 or tensor.device != means.device for tensor in parameters):
-        raise UnsupportedError("the rasteriser takes float32 parameters only, all on one device")
+        raise UnsupportedError("the rasteriser takes float32 parameters on one device only; convert or move the others")
     if means.device.type == "cuda":
         from kissgs.rendering.gsplat_backend import rasterize_on_cuda
 
         return rasterize_on_cuda(*parameters, viewmats, Ks, width, height, backgrounds)
     if means.device.type != "cpu":
-        raise UnsupportedError(f"the rasteriser draws on cpu and cuda, not on {means.device.type}")
+        raise UnsupportedError(f"the rasteriser runs on cpu and cuda, not on {means.device.type}; move the parameters")
     poses, pinholes, colours = (tensor.cpu().numpy() for tensor in (viewmats, Ks, backgrounds))
     cameras = [Camera(pose, K, width, height) for pose, K in zip(poses, pinholes, strict=True)]
     images, alphas = _Rasterize.apply(*parameters, cameras, colours, threads)  # type: ignore[no-untyped-call]
@@ -84,12 +84,12 @@ def rasterize(
 def _check_views(viewmats: Tensor, Ks: Tensor, backgrounds: Tensor) -> None:
     count = len(viewmats)
     if not count:
-        raise InvalidViewsError("there is no camera to render from")
+        raise InvalidViewsError("there is no camera to render from; give at least one")
     for name, tensor, shape in (("viewmats", viewmats, (4, 4)), ("Ks", Ks, (3, 3)), ("backgrounds", backgrounds, (3,))):
         if tensor.shape != (count, *shape):
             raise InvalidViewsError(f"{name} must be of shape {(count, *shape)}, not {tuple(tensor.shape)}")
         if tensor.requires_grad:
-            raise UnsupportedError("gradients flow to the Gaussians only, not to cameras and backgrounds: detach them")
+            raise UnsupportedError("the rasteriser has no gradients by cameras and backgrounds; detach them")
 
 
 class _Rasterize(torch.autograd.Function):
@@ -101,7 +101,7 @@ class _Rasterize(torch.autograd.Function):
         with Workers(threads) as pool:
             frames = [draw(splats, camera, colour, pool) for camera, colour in zip(cameras, backgrounds, strict=True)]
         ctx.frames, ctx.threads = frames, threads
-        ctx.save_for_backward(*parameters)  # torch then notices if one is changed before the way back
+        ctx.save_for_backward(*parameters)  # so that torch notices if one is changed before the backward pass
         return _stack([frame.image for frame in frames]), 1 - _stack([frame.transmittance for frame in frames])
 
     @staticmethod
@@ -119,5 +119,5 @@ class _Rasterize(torch.autograd.Function):
         return (*totals, None, None, None)
 
 
-def _stack(pictures: list[np.ndarray]) -> Tensor:
-    return torch.from_numpy(pictures[0][None] if len(pictures) == 1 else np.stack(pictures))
+def _stack(images: list[np.ndarray]) -> Tensor:
+    return torch.from_numpy(images[0][None] if len(images) == 1 else np.stack(images))

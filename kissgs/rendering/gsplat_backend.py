@@ -1,4 +1,4 @@
-"""The rasteriser on CUDA: gsplat in its classic mode, with the constants of ``semantics``."""
+"""The rasteriser on CUDA: gsplat in its classic mode, with :mod:`kissgs.rendering.constants`."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ import numpy as np
 from kissgs.core.array_types import Float32
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.splats import SH_REST_COUNTS, Splats
-from kissgs.rendering import constants as semantics
+from kissgs.rendering import constants
 from kissgs.rendering.camera import Camera
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 
-Picture = tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]
-"""Colours and alphas."""
+RenderedImage = tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]
+"""Colours and alphas of an image."""
 
-ImageRenderer = Callable[[Camera, Sequence[float]], Picture]
-"""Takes a picture over a background."""
+ImageRenderer = Callable[[Camera, Sequence[float]], RenderedImage]
+"""Function of a camera and a background (RGB) that renders an image of a scene."""
 
-MISSING = "rendering on CUDA is gsplat's work, which is missing: pip install 'kissgs[cuda]'"
+GSPLAT_MISSING = "rendering on CUDA needs gsplat, which is not installed: pip install 'kissgs[cuda]'"
 
 
 def rasterize_on_cuda(
@@ -40,20 +40,20 @@ def rasterize_on_cuda(
     height: int,
     backgrounds: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """:func:`kissgs.rendering.differentiable.rasterize` for tensors on CUDA.
+    """Render as :func:`kissgs.rendering.differentiable.rasterize`, for tensors on CUDA.
 
     Raises:
-        UnsupportedError: gsplat is not installed, or cannot use this GPU.
+        UnsupportedError: gsplat is not installed.
     """
     import torch
 
     try:
         from gsplat import rasterization
     except ImportError as error:
-        raise UnsupportedError(MISSING) from error
+        raise UnsupportedError(GSPLAT_MISSING) from error
     device = means.device
     backgrounds = backgrounds.to(device, torch.float32)
-    if not len(means):  # which gsplat does not promise to draw
+    if not len(means):  # gsplat does not promise to render an empty scene
         empty = backgrounds[:, None, None, :].expand(-1, height, width, -1)
         return empty.contiguous(), torch.zeros((len(viewmats), height, width), device=device)
     images, alphas, _ = rasterization(
@@ -66,11 +66,11 @@ def rasterize_on_cuda(
         Ks=Ks.to(device, torch.float32),
         width=width,
         height=height,
-        near_plane=semantics.NEAR,
-        far_plane=semantics.FAR,
-        eps2d=semantics.DILATION,
+        near_plane=constants.NEAR,
+        far_plane=constants.FAR,
+        eps2d=constants.DILATION,
         sh_degree=SH_REST_COUNTS.index(shN.shape[1]),
-        tile_size=semantics.TILE,
+        tile_size=constants.TILE,
         backgrounds=backgrounds,
         rasterize_mode="classic",
     )
@@ -78,9 +78,9 @@ def rasterize_on_cuda(
 
 
 def alpha_max() -> float:
-    """The largest alpha that the installed gsplat draws: releases up to 1.5.3 have 0.999 built in, later ones tell.
+    """Return the largest alpha of the installed gsplat: 0.999 in releases up to 1.5.3, which do not export it.
 
-    Pictures then differ from those of the processor by a few hundredths where opaque Gaussians overlap.
+    With 0.999, images differ from those of the CPU by a few hundredths where opaque Gaussians overlap.
     """
     try:
         from gsplat.cuda import _constants
@@ -90,26 +90,26 @@ def alpha_max() -> float:
 
 
 def need_cuda() -> None:
-    """See that there is a GPU to work on, before the work.
+    """Check that CUDA can be used, before a long computation.
 
     Raises:
-        UnsupportedError: no torch, no CUDA or no gsplat here.
+        UnsupportedError: torch or gsplat is not installed, or torch finds no CUDA device.
     """
     try:
         import torch
     except ImportError as error:
-        raise UnsupportedError("work on CUDA needs torch, which is missing: pip install 'kissgs[cuda]'") from error
+        raise UnsupportedError("CUDA needs torch, which is not installed: pip install 'kissgs[cuda]'") from error
     if not torch.cuda.is_available():
-        raise UnsupportedError("torch finds no CUDA device here; leave the work to the processor")
+        raise UnsupportedError("torch finds no CUDA device; use the device cpu")
     if find_spec("gsplat") is None:
-        raise UnsupportedError(MISSING)
+        raise UnsupportedError(GSPLAT_MISSING)
 
 
 def image_renderer(splats: Splats) -> ImageRenderer:
-    """Takes pictures of a scene that goes to the GPU once.
+    """Return a renderer of a scene, which is copied to the GPU once.
 
     Raises:
-        UnsupportedError: no torch, no CUDA or no gsplat here.
+        UnsupportedError: torch or gsplat is not installed, or torch finds no CUDA device.
     """
     need_cuda()
     import torch
@@ -118,7 +118,7 @@ def image_renderer(splats: Splats) -> ImageRenderer:
 
     parameters = tensors_of(splats, "cuda")
 
-    def take(camera: Camera, background: Sequence[float]) -> Picture:
+    def render(camera: Camera, background: Sequence[float]) -> RenderedImage:
         with torch.no_grad():
             images, alphas = rasterize_on_cuda(
                 **parameters,
@@ -130,4 +130,4 @@ def image_renderer(splats: Splats) -> ImageRenderer:
             )
         return images[0].cpu().numpy(), alphas[0].cpu().numpy()
 
-    return take
+    return render

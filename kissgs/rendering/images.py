@@ -1,4 +1,4 @@
-"""Pictures as files: 8 bits per channel, as PNG or WebP, alone or as a film."""
+"""Rendered images with 8 bits per channel, as PNG, WebP or animated WebP."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from kissgs.rendering.camera import Camera
 from kissgs.rendering.rasterizer import BLACK, Colour, Device, render
 
 LOSSLESS = 100
-"""The quality of WebP that keeps every pixel."""
+"""Value of ``quality`` that means lossless WebP."""
 
 MAX_WEBP_SIDE = 16_383
-"""Pixels; the format has 14 bits for a side."""
+"""Largest side of a WebP image, pixels: the format has 14 bits for it."""
 
-MAX_FILM_BYTES = 4 << 30
-"""Of a film's pixels, which are all in memory at once."""
+MAX_PIXEL_BYTES = 4 << 30
+"""Largest size of the pixels of all images together, bytes: they are all in memory at once."""
 
 
 def render_all(
@@ -34,38 +34,41 @@ def render_all(
     device: Device = "cpu",
     progress: Progress = silent,
 ) -> list[UInt8[np.ndarray, "H W 3"]]:
-    """Take pictures as a screen shows them; of a camera that comes again, it is the same array.
+    """Render an image for each camera, with 8 bits per channel; a repeated camera object gives the same array.
 
     Args:
-        splats: finite (:func:`kissgs.clean`).
-        cameras: from where.
+        splats: a finite scene (:func:`kissgs.clean`).
+        cameras: cameras, of any sizes.
         background: RGB from 0 to 1.
-        threads: of the processor; 0 means one each.
-        device: ``"cuda"`` needs the extra ``kissgs[cuda]``.
-        progress: receives the stage ``"render"``.
+        threads: number of CPU threads; 0 means one per processor.
+        device: "cpu" or "cuda", which needs the extra ``kissgs[cuda]``.
+        progress: receives the stage "render".
 
     Raises:
-        UnsupportedError: the pictures would take too much memory; no CUDA here.
+        UnsupportedError: the images would take more than :data:`MAX_PIXEL_BYTES`, or CUDA cannot be used.
     """
-    if 3 * sum(camera.width * camera.height for camera in cameras) > MAX_FILM_BYTES:
-        raise UnsupportedError(f"{len(cameras)} pictures of this size would take too much memory; make them smaller")
-    taken: dict[int, UInt8[np.ndarray, "H W 3"]] = {}
+    if 3 * sum(camera.width * camera.height for camera in cameras) > MAX_PIXEL_BYTES:
+        raise UnsupportedError(
+            f"{len(cameras)} images of this size would take too much memory, more than {MAX_PIXEL_BYTES >> 30} GiB; "
+            "make them smaller"
+        )
+    rendered: dict[int, UInt8[np.ndarray, "H W 3"]] = {}
     for done, camera in enumerate(cameras):
         progress("render", done / len(cameras))
-        if id(camera) not in taken:
+        if id(camera) not in rendered:
             image, _ = render(splats, camera, background=background, threads=threads, device=device)
-            taken[id(camera)] = to_bytes(image)
+            rendered[id(camera)] = to_bytes(image)
     progress("render", 1.0)
-    return [taken[id(camera)] for camera in cameras]
+    return [rendered[id(camera)] for camera in cameras]
 
 
 def to_bytes(image: Float32[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
-    """0 to 1 as 0 to 255, rounded; what is beyond is clamped."""
+    """Return values from 0 to 1 as 0 to 255, rounded; values outside are clamped, NaN becomes 0."""
     return np.rint(255 * np.clip(np.nan_to_num(image), 0, 1)).astype(np.uint8)
 
 
 def reframed(camera: Camera, width: int, height: int) -> Camera:
-    """The same place and direction in a picture of another size; in another shape, more is seen, never less."""
+    """Return the camera with another image size; with another aspect ratio it sees more on two sides, never less."""
     scale = min(width / camera.width, height / camera.height)
     K = camera.K * scale
     K[2, 2] = 1
@@ -75,22 +78,22 @@ def reframed(camera: Camera, width: int, height: int) -> Camera:
 
 
 def png(pixels: UInt8[np.ndarray, "H W 3"]) -> bytes:
-    """As a PNG file."""
+    """Return the image as a PNG file."""
     stream = io.BytesIO()
     Image.fromarray(pixels).save(stream, "PNG")
     return stream.getvalue()
 
 
-def film(frames: Sequence[UInt8[np.ndarray, "H W 3"]], *, fps: float, quality: int) -> bytes:
-    """As an animated WebP that repeats for ever; a plain one if it has a single frame.
+def animated_webp(frames: Sequence[UInt8[np.ndarray, "H W 3"]], *, fps: float, quality: int) -> bytes:
+    """Return the frames as an animated WebP file that repeats for ever, or a single frame as a still one.
 
     Args:
         frames: one or more, all of one size.
-        fps: frames per second; each is shown for a whole number of milliseconds, so that the film takes the right time.
-        quality: 0 to 100, which is lossless.
+        fps: frames per second; durations are whole milliseconds such that the total duration is right.
+        quality: 0 to 100; :data:`LOSSLESS`, 100, means lossless.
 
     Raises:
-        UnsupportedError: a side is too long for the format.
+        UnsupportedError: a side is longer than :data:`MAX_WEBP_SIDE`.
     """
     height, width = frames[0].shape[:2]
     if max(width, height) > MAX_WEBP_SIDE:

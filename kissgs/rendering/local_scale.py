@@ -1,4 +1,4 @@
-"""How far apart Gaussians lie, place by place: the distance from which a Gaussian's surroundings fill an image."""
+"""Local scale: the distance between Gaussians around each one, from which its surroundings fill an image."""
 
 from __future__ import annotations
 
@@ -10,45 +10,48 @@ from kissgs.core.array_types import Bool, Float64, Int
 from kissgs.core.splats import Splats
 
 LEAF = 512
-"""Gaussians among which neighbours are sought, at most."""
+"""Largest number of Gaussians in a leaf of the tree, among which neighbours are searched."""
 
 NEIGHBOURS = 4
-"""The distance is that within which one in so many of the leaf's Gaussians lies."""
+"""The local scale is the distance within which 1 / NEIGHBOURS of the leaf's Gaussians lie."""
 
 SAMPLED = 4
-"""One in so many of a leaf's Gaussians is measured to."""
+"""Stride of the leaf's Gaussians to which distances are measured."""
 
 GAP = 0.2
-"""Where fewer neighbours lie so much nearer than on a surface of even density, there are no more in the same object."""
+"""Share of the distance expected on a surface of uniform density: if the nearest half, quarter or eighth of the
+neighbours is nearer than that, the object has no more Gaussians, and their distance is used."""
 
 
 def local_scale(splats: Splats) -> Float64[np.ndarray, " N"]:
-    """Distance from each Gaussian to about its 128th neighbour, world units, positive.
+    """Return the distance from each Gaussian to about its 128th neighbour, ``(N,)``, world units, positive.
 
-    A k-d tree with equal numbers in its leaves adapts to scenes whose parts differ by any factor in size; distances are
-    measured within a leaf. Where an object has fewer Gaussians, it is the distance at which there would be so many if
-    its surface went on. A Gaussian larger than its neighbourhood counts by its own size.
+    Distances are measured within the leaves of a k-d tree of equal counts, which adapts to parts of any size. For an
+    object of fewer Gaussians, the distance is extrapolated as if its surface continued. The result is at least the
+    Gaussian's own size.
 
     Args:
-        splats: finite.
+        splats: a finite scene.
     """
     means = splats.means.astype(np.float64)
     found = np.empty(len(means))
     for leaf in _leaves(means):
         points = means[leaf]
-        squared = sum(np.square(axis[:, None] - axis[::SAMPLED]) for axis in points.T)  # keeps the digits of near ones
+        squared = sum(
+            np.square(axis[:, None] - axis[::SAMPLED]) for axis in points.T
+        )  # accurate for near ones, unlike |a|² + |b|² - 2ab
         rank = min(squared.shape[1] // NEIGHBOURS, squared.shape[1] - 1)
         ranks = [rank, *(few for few in (rank // 2, rank // 4, rank // 8) if few > 1)]
         nearest = np.partition(squared, ranks, axis=1)[:, ranks] * (rank / np.maximum(ranks, 1))
-        least = nearest.min(axis=1)
-        found[leaf] = np.sqrt(np.where(least < GAP**2 * nearest[:, 0], least, nearest[:, 0]))
+        smallest = nearest.min(axis=1)
+        found[leaf] = np.sqrt(np.where(smallest < GAP**2 * nearest[:, 0], smallest, nearest[:, 0]))
     sizes = np.exp(np.sort(splats.scales, axis=1)[:, 1].astype(np.float64))
-    least = np.maximum(1e-6 * np.abs(means).max(axis=1, initial=0), 1e-12)  # float32 positions are hardly finer
+    least = np.maximum(1e-6 * np.abs(means).max(axis=1, initial=0), 1e-12)  # about the resolution of float32 positions
     return np.maximum(np.maximum(found, sizes), least)
 
 
 def _leaves(means: Float64[np.ndarray, "N 3"]) -> Iterator[Int[np.ndarray, " n"]]:
-    """Split at the median of the longest side until no part has more than :data:`LEAF` points."""
+    """Yield the indices of each leaf: parts are split at the median of the longest side down to :data:`LEAF` points."""
     parts = [np.arange(len(means))] if len(means) else []
     while parts:
         part = parts.pop()
@@ -61,7 +64,7 @@ def _leaves(means: Float64[np.ndarray, "N 3"]) -> Iterator[Int[np.ndarray, " n"]
 
 
 def _lower_half(values: Float64[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-    """Which values are the lower half, of equal ones the first: argpartition's choice depends on the processor."""
+    """Return a mask of the lower half, the first of equal values: argpartition's choice depends on the processor."""
     count = len(values) // 2
     middle = np.partition(values, count)[count]
     lower = values < middle

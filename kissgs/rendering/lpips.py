@@ -1,4 +1,4 @@
-"""LPIPS, the perceptual distance, through the ``lpips`` package (the extra ``kissgs[lpips]``)."""
+"""LPIPS, a perceptual distance of images, by the package ``lpips`` (extra ``kissgs[lpips]``)."""
 
 from __future__ import annotations
 
@@ -12,23 +12,24 @@ from kissgs.core.array_types import Shaped
 from kissgs.core.errors import UnsupportedError
 from kissgs.rendering.metrics import image_pair
 
-SMALLEST = 16  # pixels: the network halves its input four times
+MIN_SIDE = 16
+"""Smallest side of an image, pixels: the network halves its input four times."""
 
 
 class Lpips:
-    """LPIPS with VGG-16: from 0 for equal images up to about 1. Load it once, call it often.
+    """LPIPS with VGG-16: from 0 for equal images up to about 1. Construct it once and call it often.
 
-    It is what papers on Gaussian splatting report: the evaluation script of 3DGS hands images in [0, 1] to the
-    network, although that was calibrated on [-1, 1], and everyone after has kept to it. So does this.
+    This is the LPIPS of papers on Gaussian splatting: like the evaluation script of 3DGS, it passes images in [0, 1] to
+    the network, which was calibrated on [-1, 1].
 
     Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018.
     """
 
     def __init__(self, device: str = "cpu") -> None:
-        """Load the network, which torchvision downloads the first time: 528 MB.
+        """Load the network, whose weights (528 MB) torchvision downloads on first use.
 
         Raises:
-            UnsupportedError: the packages are not installed, or the weights cannot be had.
+            UnsupportedError: the packages are not installed, or the weights cannot be loaded.
         """
         try:
             package = importlib.import_module("lpips")
@@ -38,7 +39,7 @@ class Lpips:
             ) from error
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # how lpips asks torchvision for weights is out of fashion
+                warnings.simplefilter("ignore")  # lpips loads weights by a deprecated function of torchvision
                 self._network = package.LPIPS(net="vgg", verbose=False).to(device)
         except (OSError, RuntimeError, http.client.HTTPException) as error:
             raise UnsupportedError(
@@ -49,18 +50,18 @@ class Lpips:
         self._device = device
 
     def __call__(self, image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "..."]) -> float:
-        """Distance of two images ``(H, W, 3)``, in [0, 1] or uint8. NaN in either makes it NaN.
+        """Return the distance of two images ``(H, W, 3)``, floats in [0, 1] or uint8; NaN if either has a NaN.
 
         Raises:
             InvalidViewsError: the arrays are not two images of the same size.
-            UnsupportedError: the images are smaller than 16x16 pixels.
+            UnsupportedError: a side is below :data:`MIN_SIDE`.
         """
         import torch
 
         pair = image_pair(image, reference)
         height, width, _ = pair[0].shape
-        if min(height, width) < SMALLEST:
-            raise UnsupportedError(f"LPIPS needs images of at least {SMALLEST}x{SMALLEST} pixels, not {width}x{height}")
-        first, second = (torch.from_numpy(side).to(self._device).permute(2, 0, 1)[None] for side in pair)
+        if min(height, width) < MIN_SIDE:
+            raise UnsupportedError(f"LPIPS needs images of at least {MIN_SIDE}x{MIN_SIDE} pixels, not {width}x{height}")
+        first, second = (torch.from_numpy(array).to(self._device).permute(2, 0, 1)[None] for array in pair)
         with torch.no_grad():
             return float(self._network(first, second).item())

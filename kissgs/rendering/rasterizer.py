@@ -1,7 +1,7 @@
-"""The rasteriser: Gaussians and a camera -> a picture. On the processor by kissgs' own kernels, on CUDA by gsplat.
+"""The rasteriser for NumPy: an image of a scene, on the CPU by kissgs' own kernels, on CUDA by gsplat.
 
-What a picture is stands in :mod:`kissgs.rendering.constants`. This module is for NumPy and does without torch unless
-``device`` asks for CUDA; with gradients it is :func:`kissgs.rendering.differentiable.rasterize`.
+:mod:`kissgs.rendering.constants` defines the image. Torch is needed on CUDA only. With gradients, the rasteriser is
+:func:`kissgs.rendering.differentiable.rasterize`.
 """
 
 from __future__ import annotations
@@ -26,23 +26,24 @@ BLACK: Colour = (0.0, 0.0, 0.0)
 def render(
     splats: Splats, camera: Camera, *, background: Colour = BLACK, threads: int = 0, device: Device = "cpu"
 ) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]:
-    """Take a picture.
+    """Render an image of a scene.
+
+    The first image on a computer compiles the kernels, which takes some seconds; :func:`load_kernels` does it in
+    advance.
 
     Args:
-        splats: finite (:func:`kissgs.clean`).
-        camera: from where.
-        background: RGB from 0 to 1, what is seen where no Gaussian is.
-        threads: of the processor; 0 means one each. The picture does not depend on it.
-        device: ``"cuda"`` needs the extra ``kissgs[cuda]``.
+        splats: a finite scene (:func:`kissgs.clean`).
+        camera: the camera, with the size of the image.
+        background: RGB from 0 to 1.
+        threads: number of CPU threads; 0 means one per processor. The image does not depend on it.
+        device: "cpu" or "cuda", which needs the extra ``kissgs[cuda]``.
 
     Returns:
-        The picture, from 0 to 1 where the scene is (some SH overshoot: clamp to show it), and its alpha.
-
-    The first picture on a machine compiles the kernels, which takes some seconds; :func:`load_kernels` does it ahead.
+        The image ``(H, W, 3)``, RGB, 0 and up, not clamped to 1 (SH may overshoot), and its alpha ``(H, W)``, 0 to 1.
 
     Raises:
         InvalidViewsError: the background is not three finite numbers.
-        UnsupportedError: the picture would take too much memory; no CUDA here.
+        UnsupportedError: the image would take too much memory, or CUDA cannot be used.
     """
     if device == "cuda":
         from kissgs.rendering.gsplat_backend import image_renderer
@@ -63,37 +64,37 @@ def removal_scores(
     threads: int = 0,
     progress: Progress = silent,
 ) -> Float64[np.ndarray, " N"]:
-    """For each Gaussian, the squared error over all pictures that its removal alone would cause.
+    """Return, for each Gaussian, the squared image error that its removal alone would cause.
 
-    The score of GaussianPOP (section 3), exact but for what lies behind the end of a pixel's list. Summed over pixels
-    and RGB in [0, 1]; 0 for what no camera sees.
+    The score of GaussianPOP, section 3, exact except for Gaussians behind the end of a pixel's list. A sum over images,
+    pixels and RGB in [0, 1]; 0 for a Gaussian that no camera sees.
 
     Args:
-        splats: finite.
-        cameras: pictures to take.
-        background: of all of them.
-        threads: 0 means one per processor; the scores do not depend on it.
-        progress: receives the stage ``"score"``.
+        splats: a finite scene.
+        cameras: cameras of the images.
+        background: RGB from 0 to 1.
+        threads: number of threads; 0 means one per processor. The scores do not depend on it.
+        progress: receives the stage "score".
 
     Raises:
         InvalidViewsError: the background is not three finite numbers.
-        UnsupportedError: a picture would take too much memory.
+        UnsupportedError: an image would take too much memory.
     """
     from kissgs.rendering.cpu.frame import draw
-    from kissgs.rendering.cpu.frame import removal_scores as of_frame
+    from kissgs.rendering.cpu.frame import removal_scores as frame_scores
 
     scores = np.zeros(len(splats), np.float64)
     colour = np.asarray(background, np.float32)
     with Workers(threads) as pool:
         for done, camera in enumerate(cameras):
             progress("score", done / len(cameras))
-            scores += of_frame(draw(splats, camera, colour, pool), pool)
+            scores += frame_scores(draw(splats, camera, colour, pool), pool)
     progress("score", 1.0)
     return scores
 
 
 def load_kernels(progress: Progress = silent) -> None:
-    """Compile the rasteriser's kernels, or load them from numba's cache of earlier times."""
+    """Compile the rasteriser's kernels, or load them from numba's cache; ``progress`` receives the stage "kernels"."""
     progress("kernels", 0.0)
     from kissgs.rendering import ssim_kernels
     from kissgs.rendering.cpu import frame  # noqa: F401

@@ -1,4 +1,4 @@
-"""Measures what a change of each stored value costs in pictures: exactly, with one pass per picture."""
+"""Measurement of the sensitivity of a scene, exactly to first order, with one backward pass per image."""
 
 from __future__ import annotations
 
@@ -20,17 +20,18 @@ from kissgs.rendering.coverage import Coverage
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WeightedCameras:
-    """Where a scene is looked at from, and how much each picture counts.
+    """Cameras from which sensitivity is measured, with the weights of their images.
 
     Attributes:
-        cameras: at the size to render.
-        weights: of each, positive; they need not sum to 1.
-        background: ``(3,)`` red, green, blue.
-        spread: standard deviation of each channel of the background: how little is known of it.
-        captured: how many of the cameras, the first ones, are a capture's.
+        cameras: one or more, with the sizes of the images to render.
+        weights: one for each camera, positive; they need not sum to 1.
+        background: ``(3,)`` mean of the background, RGB from 0 to 1.
+        spread: standard deviation of each channel of the background, which is unknown in general.
+        captured: number of cameras of a capture, which come first.
 
     Raises:
-        InvalidViewsError: no camera; not as many weights as cameras; a weight or the spread is negative or not finite.
+        InvalidViewsError: no camera; another number of weights than of cameras; a weight that is not positive and
+            finite; a spread that is negative or not finite.
     """
 
     cameras: Sequence[Camera]
@@ -42,14 +43,16 @@ class WeightedCameras:
     def __post_init__(self) -> None:
         if not self.cameras or len(self.cameras) != len(self.weights):
             raise InvalidViewsError(
-                f"a scene is watched by one camera or more with a weight each, not by {len(self.cameras)} cameras with "
+                f"sensitivity needs at least one camera and a weight for each, not {len(self.cameras)} cameras with "
                 f"{len(self.weights)} weights"
             )
         if not all(0 < weight < math.inf for weight in self.weights) or not 0 <= self.spread < math.inf:
-            raise InvalidViewsError("weights of cameras must be positive and finite, and the spread not negative")
+            raise InvalidViewsError(
+                "weights of cameras must be positive and finite, and the spread finite and not negative"
+            )
 
     def per_pixel(self) -> list[float]:
-        """Weights of the squared error of one channel of one pixel, so that a weighted sum is a mean."""
+        """Return the weight of a single value of each image, such that the weighted sum of squared errors is a mean."""
         total = float(sum(self.weights))
         pixels = [3 * camera.width * camera.height for camera in self.cameras]
         return [weight / total / count for weight, count in zip(self.weights, pixels, strict=True)]
@@ -57,40 +60,39 @@ class WeightedCameras:
 
 def measure_sensitivity(
     splats: Splats,
-    watch: WeightedCameras,
+    cameras: WeightedCameras,
     *,
     view_uncertainty: float = 0.0,
     threads: int = 0,
     progress: Progress = silent,
 ) -> Sensitivity:
-    """Look at a scene from all of ``watch`` and see what every small change would cost there.
+    """Measure the sensitivity of a scene: the Gauss-Newton Hessian of the squared image error, a block per Gaussian.
 
-    Costs are those of the first derivative: J ᵀ J of the pictures, its blocks per Gaussian, without sampling. Left out
-    are what a move does to a footprint's shape and to the colour seen from there, and changes of which Gaussian is in
-    front: all small beside a move's effect on its own.
+    The Hessian is J ᵀ J with J the derivative of the images, without sampling. Of a change of position, J omits the
+    small effects on the footprint's shape, on the view-dependent colour and on the depth order.
 
     Args:
-        splats: finite (:func:`kissgs.clean`).
-        watch: at least one camera.
-        view_uncertainty: from 0 to 1, how far to move towards a prior for cameras that are not among them
+        splats: a finite scene (:func:`kissgs.clean`).
+        cameras: cameras and weights of the images.
+        view_uncertainty: from 0 to 1, how strongly to shrink towards the prior for other cameras
             (:meth:`kissgs.Sensitivity.with_prior`).
-        threads: 0 means one per processor; the result does not depend on it.
-        progress: receives the stage ``"sensitivity"``.
+        threads: number of threads; 0 means one per processor. The result does not depend on it.
+        progress: receives the stage "sensitivity".
 
     Raises:
-        UnsupportedError: a picture would take too much memory.
+        UnsupportedError: an image would take too much memory.
     """
     from kissgs.rendering.cpu.frame import add_sensitivities, draw
 
     found = Sensitivity.none(len(splats), splats.sh_degree)
     coverage, captured = Coverage(splats), np.zeros(len(splats))
     with Workers(threads) as pool:
-        for done, (camera, weight) in enumerate(zip(watch.cameras, watch.per_pixel(), strict=True)):
-            progress("sensitivity", done / len(watch.cameras))
+        for done, (camera, weight) in enumerate(zip(cameras.cameras, cameras.per_pixel(), strict=True)):
+            progress("sensitivity", done / len(cameras.cameras))
             before = found.color_weight.copy()
-            add_sensitivities(draw(splats, camera, watch.background, pool), weight, watch.spread, found, pool)
+            add_sensitivities(draw(splats, camera, cameras.background, pool), weight, cameras.spread, found, pool)
             coverage.add(camera, np.maximum(found.color_weight - before, 0) / weight)
-            if done < watch.captured:
+            if done < cameras.captured:
                 captured = coverage.share.copy()
     _bound(found.position_hessian, (0, 3, 5))
     _bound(found.shape_hessian, OPACITY + SCALES + ROTATION)
@@ -98,16 +100,14 @@ def measure_sensitivity(
     np.nan_to_num(found.mean_sh_basis, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
     seen = found.color_weight > 0
     found.mean_sh_basis[seen] /= found.color_weight[seen, None]
-    found.captured[:] = (
-        captured if view_uncertainty else 1.0
-    )  # where nothing is hedged, these cameras are all that matters
+    found.captured[:] = captured if view_uncertainty else 1.0  # at view uncertainty 0, no other cameras count
     progress("sensitivity", 1.0)
     return found.with_prior(splats, coverage.close_up, coverage.share, view_uncertainty)
 
 
-def _bound(forms: Float32[np.ndarray, "N n"], diagonal: tuple[int, ...]) -> None:
-    """Where a form overflows, keep its diagonal, at most as large as can be."""
-    wild = ~(np.abs(forms) <= LARGEST).all(axis=1)
-    kept = np.nan_to_num(forms[wild][:, diagonal], nan=LARGEST)
-    forms[wild] = 0
-    forms[np.ix_(wild, diagonal)] = np.minimum(kept, LARGEST)
+def _bound(hessians: Float32[np.ndarray, "N n"], diagonal: tuple[int, ...]) -> None:
+    """Replace Hessians that overflow by their diagonals, at most :data:`LARGEST`."""
+    overflowing = ~(np.abs(hessians) <= LARGEST).all(axis=1)
+    kept = np.nan_to_num(hessians[overflowing][:, diagonal], nan=LARGEST)
+    hessians[overflowing] = 0
+    hessians[np.ix_(overflowing, diagonal)] = np.minimum(kept, LARGEST)

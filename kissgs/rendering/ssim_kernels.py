@@ -1,20 +1,20 @@
-"""Compiled inner loops of SSIM: its sum over a tile of an image and, in the same pass, its gradient.
+"""Numba kernels of SSIM: its sum over a tile of an image and, in the same pass, its gradient.
 
 SSIM needs the images x and y only as their sum s = x + y and difference d = x - y. With G the blur, S = G s,
 D = G d, p = G s² - S² and q = G d² - D² (four blurs instead of five),
 
-    SSIM = (S² - D² + 2 C1) / (S² + D² + 2 C1) · (p - q + 2 C2) / (p + q + 2 C2) = light · shape,
+    SSIM = (S² - D² + 2 C1) / (S² + D² + 2 C1) · (p - q + 2 C2) / (p + q + 2 C2) = luminance · structure,
 
-and its gradient by x takes three more: 2 (G M + s G ∂p + d G ∂q), where M = S (∂S² - ∂p) + D (∂D² - ∂q). Equal images
-have d = 0 and score exactly 1, and swapping them changes no bit.
+and its gradient by x takes three more blurs: 2 (G M + s G ∂p + d G ∂q), where M = S (∂S² - ∂p) + D (∂D² - ∂q). Equal
+images have d = 0 and SSIM exactly 1, and swapping them changes no bit.
 
-A tile is worked through row by row; the last eleven rows of s and d, and of the three maps, stay in the cache. They lie
-in rings that are written twice, at a row and eleven further down, so that eleven rows always follow each other: all
-taps of a blur are then constant distances from one address, which is what lets the compiler vectorise it.
+A tile is processed row by row; the last eleven rows of s and d, and of the three maps, stay in the cache, in ring
+buffers. Each row is written twice, the second time eleven rows further, so that the last eleven rows are always
+contiguous: all taps of a blur then have constant offsets, and the compiler can vectorise it.
 
-The constants: a tile has at most 480 columns (160 pixels of 3 channels); the maps reach 15 further on both sides and
-lie 512 apart, s and d reach 30 further and lie 576 apart. A row of the first ring is s, d; of the second M, ∂p, ∂q.
-
+Constants: a tile has at most 480 columns (160 pixels of 3 channels). The maps extend 15 columns further on both sides
+and have a stride of 512; s and d extend 30 columns further and have a stride of 576. A row of the first ring buffer is
+s, d; a row of the second is M, ∂p, ∂q.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ import numpy as np
 
 from kissgs.core.numba_kernels import compiled
 
-_FAST = {"contract", "nsz", "reassoc"}  # and NaN stays NaN
+_FAST = {"contract", "nsz", "reassoc"}  # without "nnan", so that NaN stays NaN
 
 
 @compiled("float32(float32[::1], int64, int64)", inline="always")
 def _blur(x: np.ndarray, i: int, step: int) -> np.float32:
-    """The 11-tap Gaussian of standard deviation 1.5 at ``x[i], x[i + step], ...``."""
+    """Return the 11-tap Gaussian of standard deviation 1.5 over ``x[i], x[i + step], ...``."""
     return (
         np.float32(0.00102838008447911) * (x[i] + x[i + 10 * step])
         + np.float32(0.007598758135239185) * (x[i + step] + x[i + 9 * step])
@@ -41,7 +41,7 @@ def _blur(x: np.ndarray, i: int, step: int) -> np.float32:
 
 @compiled("float32(float32[::1], int64, int64)", inline="always")
 def _blur_squares(x: np.ndarray, i: int, step: int) -> np.float32:
-    """The same of the squares."""
+    """Return the 11-tap Gaussian over the squares of ``x[i], x[i + step], ...``."""
     return (
         np.float32(0.00102838008447911) * (x[i] * x[i] + x[i + 10 * step] * x[i + 10 * step])
         + np.float32(0.007598758135239185) * (x[i + step] * x[i + step] + x[i + 9 * step] * x[i + 9 * step])
@@ -54,11 +54,11 @@ def _blur_squares(x: np.ndarray, i: int, step: int) -> np.float32:
 
 @compiled("void(float32[::1], float32[::1], float32[::1])", fastmath=_FAST)
 def _sum_and_difference(x: np.ndarray, y: np.ndarray, ring: np.ndarray) -> None:
-    """Of a row of both images. Beyond 1e9, values count as 1e9: their fourth powers stay finite, and NaN stays NaN."""
-    most = np.float32(1e9)
+    """Write s and d of a row, twice; values beyond ±1e9 are clamped, so that fourth powers are finite; NaN stays."""
+    largest = np.float32(1e9)
     for j in range(len(x)):
-        a = most if x[j] > most else (-most if x[j] < -most else x[j])
-        b = most if y[j] > most else (-most if y[j] < -most else y[j])
+        a = largest if x[j] > largest else (-largest if x[j] < -largest else x[j])
+        b = largest if y[j] > largest else (-largest if y[j] < -largest else y[j])
         ring[j] = a + b
         ring[j + 576] = a - b
         ring[j + 12672] = a + b
@@ -67,7 +67,7 @@ def _sum_and_difference(x: np.ndarray, y: np.ndarray, ring: np.ndarray) -> None:
 
 @compiled("void(float32[::1], int64, float32[::1])", fastmath=_FAST)
 def _moments(ring: np.ndarray, count: int, out: np.ndarray) -> None:
-    """Blur ``count`` columns of s and d and of their squares, over the eleven rows that ``ring`` begins with."""
+    """Blur ``count`` columns of s, d and their squares vertically, over the first eleven rows of ``ring``."""
     for j in range(count):
         out[j] = _blur(ring, j, 1152)
         out[j + 576] = _blur(ring, j + 576, 1152)
@@ -77,7 +77,7 @@ def _moments(ring: np.ndarray, count: int, out: np.ndarray) -> None:
 
 @compiled("void(float32[::1], float32[::1], float32[::1])", fastmath=_FAST)
 def _maps(moments: np.ndarray, values: np.ndarray, ring: np.ndarray) -> None:
-    """Blur the moments sideways; SSIM into ``values``, and its derivatives M, ∂p and ∂q into the ring."""
+    """Blur the moments horizontally; write SSIM into ``values`` and its derivatives M, ∂p and ∂q into ``ring``."""
     c1 = np.float32(2 * 0.01**2)
     c2 = np.float32(2 * 0.03**2)
     zero, one, two = np.float32(0), np.float32(1), np.float32(2)
@@ -88,17 +88,18 @@ def _maps(moments: np.ndarray, values: np.ndarray, ring: np.ndarray) -> None:
         DD = D * D
         p = _blur(moments, j + 1152, 3) - SS
         q = _blur(moments, j + 1728, 3) - DD
-        p = zero if p < zero else p  # they are not negative, their rounding may be
+        p = zero if p < zero else p  # a variance may be negative by rounding
         q = zero if q < zero else q
-        light = (SS - DD + c1) / (SS + DD + c1)
-        shape = (p - q + c2) / (p + q + c2)
-        by_light = one / (SS + DD + c1)
-        by_shape = one / (p + q + c2)
-        dp = two * light * (q * by_shape) * by_shape  # 1 - shape = 2 q / (p + q + 2 C2), without the cancellation
-        dq = -light * (one + shape) * by_shape
-        dSS = two * shape * (DD * by_light) * by_light
-        dDD = -shape * (one + light) * by_light
-        values[j] = light * shape
+        luminance = (SS - DD + c1) / (SS + DD + c1)
+        structure = (p - q + c2) / (p + q + c2)
+        by_luminance = one / (SS + DD + c1)
+        by_structure = one / (p + q + c2)
+        # 1 - structure = 2 q / (p + q + 2 C2), without cancellation.
+        dp = two * luminance * (q * by_structure) * by_structure
+        dq = -luminance * (one + structure) * by_structure
+        dSS = two * structure * (DD * by_luminance) * by_luminance
+        dDD = -structure * (one + luminance) * by_luminance
+        values[j] = luminance * structure
         M = S * (dSS - dp) + D * (dDD - dq)
         ring[j] = M
         ring[j + 512] = dp
@@ -110,7 +111,7 @@ def _maps(moments: np.ndarray, values: np.ndarray, ring: np.ndarray) -> None:
 
 @compiled("void(float32[::1], int64, float32[::1])", fastmath=_FAST)
 def _blur_maps(ring: np.ndarray, count: int, out: np.ndarray) -> None:
-    """Blur ``count`` columns of the maps over the eleven rows that ``ring`` begins with."""
+    """Blur ``count`` columns of the maps vertically, over the first eleven rows of ``ring``."""
     for j in range(count):
         out[j] = _blur(ring, j, 1536)
         out[j + 512] = _blur(ring, j + 512, 1536)
@@ -119,7 +120,7 @@ def _blur_maps(ring: np.ndarray, count: int, out: np.ndarray) -> None:
 
 @compiled("void(float32[::1], float32[::1], float32, float32, float32[::1])", fastmath=_FAST)
 def _gradient(blurred: np.ndarray, row: np.ndarray, l1: np.float32, ssim: np.float32, out: np.ndarray) -> None:
-    """Blur the maps sideways; ``l1`` times the gradient of |d| plus ``ssim`` times half that of SSIM."""
+    """Blur the maps horizontally; write ``l1`` times the gradient of |d| plus ``ssim`` times half that of SSIM."""
     zero, one = np.float32(0), np.float32(1)
     for j in range(len(out)):
         s = row[j]
@@ -142,7 +143,7 @@ def _add(differences: np.ndarray, values: np.ndarray, sums: np.ndarray) -> None:
 
 @compiled("void(float32[::1], int64, int64)")
 def _clear(ring: np.ndarray, slot: int, length: int) -> None:
-    """Make a row of a ring zero, both times that it is written there."""
+    """Set both copies of a row of a ring buffer to zero."""
     for j in range(length):
         ring[slot * length + j] = np.float32(0)
         ring[(slot + 11) * length + j] = np.float32(0)
@@ -158,23 +159,23 @@ def ssim_tile(
     gradient: np.ndarray,
     sums: np.ndarray,
 ) -> None:
-    """Sums over one tile, and ``l1`` times the gradient of Σ|image - target| plus ``ssim`` times half that of Σ SSIM.
+    """Compute sums over one tile, and ``l1`` times the gradient of Σ|image - target| plus ``ssim`` / 2 that of Σ SSIM.
 
     Args:
-        image: ``(H, 3 W)``, channels side by side; any values.
-        target: likewise.
-        tile: first row and the one after the last, first column and the one after the last; columns count channels,
-            and there are at most 480. What lies around the tile is read as far as a gradient reaches.
-        l1: factor of the first gradient.
-        ssim: factor of the second.
-        gradient: ``(H, 3 W)``, of which the tile is written; ``(0, 0)`` if only the sums are wanted.
-        sums: ``(2,)``, to which Σ|image - target| and Σ SSIM over the tile are added.
+        image: ``(H, 3 W)``, interleaved channels of any values.
+        target: ``(H, 3 W)``, interleaved channels of any values.
+        tile: top, bottom, left, right, ends exclusive; columns count channels, at most 480. Pixels around the tile are
+            read too, as far as the gradient depends on them.
+        l1: factor of the gradient of Σ|image - target|.
+        ssim: factor of half the gradient of Σ SSIM.
+        gradient: out, ``(H, 3 W)``, only the tile; ``(0, 0)`` for the sums only.
+        sums: ``(2,)``; Σ|image - target| and Σ SSIM over the tile are added.
     """
     height, width = image.shape
     top, bottom, left, right = tile
     count = right - left
-    first, last = max(left - 30, 0), min(right + 30, width)  # columns of s and d that the image has
-    near, far = max(15 - left, 0), min(count + 30, width - left + 15)  # and of the maps; the others stay zero
+    first, last = max(left - 30, 0), min(right + 30, width)  # columns of s and d inside the image
+    near, far = max(15 - left, 0), min(count + 30, width - left + 15)  # of the maps; the others stay zero
     ring = np.zeros(22 * 1152, dtype=np.float32)
     moments = np.zeros(4 * 576, dtype=np.float32)
     values = np.zeros(512, dtype=np.float32)
@@ -190,7 +191,7 @@ def ssim_tile(
             _clear(ring, slot, 1152)
         if step < 10:
             continue
-        y -= 5  # the row of the maps
+        y -= 5  # row of the maps
         if 0 <= y < height:
             _moments(ring[oldest * 1152 :], count + 60, moments)
             _maps(moments[near:], values[near:far], map_ring[slot * 1536 + near :])
@@ -200,6 +201,6 @@ def ssim_tile(
             _clear(map_ring, slot, 1536)
         if step < 20 or gradient.size == 0:
             continue
-        y -= 5  # the row of the gradient
+        y -= 5  # row of the gradient
         _blur_maps(map_ring[oldest * 1536 :], count + 30, blurred)
         _gradient(blurred, ring[oldest * 1152 + 30 :], l1, ssim, gradient[y, left:right])

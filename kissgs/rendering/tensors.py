@@ -1,4 +1,4 @@
-"""A scene's parameters as torch tensors."""
+"""Conversion of a scene to torch tensors."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ try:
     import torch
     from torch import Tensor
 except ModuleNotFoundError as error:
-    raise UnsupportedError("tensors are torch's, which is missing: pip install 'kissgs[train]'") from error
+    raise UnsupportedError("tensors need torch, which is not installed: pip install 'kissgs[train]'") from error
 
 
 def tensors_of(splats: Splats, device: str = "cpu") -> dict[str, Tensor]:
-    """The scene's parameters by name, as :func:`kissgs.rendering.differentiable.rasterize` takes
-    them; on the processor they share its memory."""
+    """Return the parameters by name, for :func:`kissgs.rendering.differentiable.rasterize`;
+    on the CPU they share memory with ``splats``."""
     return {name: torch.from_numpy(getattr(splats, name)).to(device) for name in ATTRIBUTES}

@@ -1,4 +1,4 @@
-"""Oracle: the ways called by themselves; for plots, that they are drawn and can be read."""
+"""Relations between strategies that are known; plots are files of the right format that are not blank."""
 
 import math
 from dataclasses import replace
@@ -10,86 +10,95 @@ from helpers.training_scenes import around, cloud
 from PIL import Image
 
 from kissgs import CompactSettings, InvalidSceneError, UnsupportedError
-from kissgs.benchmark.compaction_study import WAYS, study
+from kissgs.benchmark.compaction_study import STRATEGIES, compare_strategies
 from kissgs.benchmark.plots import check_plot, compaction_plot
 from kissgs.cameras.views import Views, black
 from kissgs.cli.bench_curves import compaction
-from kissgs.cli.bench_scenes import Asked
+from kissgs.cli.bench_scenes import BenchOptions
 
 SHORT = CompactSettings(sparsify_steps=6, refine_steps=6, prune_rounds=2, synthetic_view_share=0)
 
 
 @pytest.fixture(scope="module")
 def points():
-    return study(cloud(80), SHORT, Views(around(5), around(3), black(), "five views"), ratios=[0.5, 0.2])
+    return compare_strategies(cloud(80), SHORT, Views(around(5), around(3), black(), "five views"), ratios=[0.5, 0.2])
 
 
-def test_all_ways_at_all_ratios(points):
+def test_all_strategies_at_all_ratios(points):
     first, *others = points
-    assert (first.way, first.count, first.psnr) == ("input", 80, math.inf)
-    assert [(point.way, point.count) for point in others] == [(way.name, count) for way in WAYS for count in (40, 16)]
+    assert (first.strategy, first.count, first.psnr) == ("input", 80, math.inf)
+    assert [(point.strategy, point.count) for point in others] == [
+        (strategy.name, count) for strategy in STRATEGIES for count in (40, 16)
+    ]
     assert all(0 < point.psnr < 100 and 0 < point.bytes < first.bytes for point in others)
 
 
-def test_who_is_best_is_left(points):
-    """Scores beat chance, and training beats none."""
-    psnr = {point.way: point.psnr for point in points if point.count == 16}
+def test_scores_are_better_than_chance_and_training_better_than_none(points):
+    psnr = {point.strategy: point.psnr for point in points if point.count == 16}
     assert psnr["random"] < psnr["POP in rounds"] < psnr["POP in rounds + refine"]
     assert psnr["opacity"] < psnr["opacity + refine"]
 
 
-@pytest.mark.parametrize("learn_from", ["photos", "cameras", "scene"])
-def test_who_judges_does_not_depend_on_what_is_learned_from(tmp_path, learn_from):
-    """Photographs are black here: what learned from them shows it."""
+@pytest.mark.parametrize("supervision", ["photos", "cameras", "scene"])
+def test_evaluation_views_do_not_depend_on_the_supervision(tmp_path, supervision):
+    """Photographs are black here, so that only training with them improves the PSNR to them."""
     black_photo = tmp_path / "black.png"
     Image.new("RGB", (24, 24)).save(black_photo)
     taken = [tuple(replace(view, photo=black_photo) for view in views) for views in (around(5), around(3))]
     views = Views(*taken, black(), "five views")
     short = SHORT.model_copy(update={"views": 16, "view_size": 24})
-    (refined,) = [way for way in WAYS if way.name == "POP + refine"]
-    before, after = study(cloud(80), short, views, ratios=[0.5], ways=[refined], learn_from=learn_from)
-    (blank,) = study(cloud(80), short, views, ratios=[], ways=[])
+    (refined,) = [strategy for strategy in STRATEGIES if strategy.name == "POP + refine"]
+    before, after = compare_strategies(
+        cloud(80), short, views, ratios=[0.5], strategies=[refined], supervision=supervision
+    )
+    (blank,) = compare_strategies(cloud(80), short, views, ratios=[], strategies=[])
     assert before.psnr == blank.psnr
-    unheld = replace(views, train=views.test, test=())
-    (seen,) = study(cloud(80), short, unheld, ratios=[], ways=[], learn_from=learn_from)
-    assert seen.psnr == blank.psnr, "where no view is held out, those to learn from judge"
-    (cut,) = [way for way in WAYS if way.name == "POP"]
-    pruned = study(cloud(80), short, views, ratios=[0.5], ways=[cut], learn_from=learn_from)[-1]
-    assert (after.psnr > pruned.psnr + 1) == (learn_from == "photos")
+    not_held_out = replace(views, train=views.test, test=())
+    (without_held_out,) = compare_strategies(
+        cloud(80), short, not_held_out, ratios=[], strategies=[], supervision=supervision
+    )
+    assert without_held_out.psnr == blank.psnr, "without held-out views, the training views evaluate"
+    (pruning,) = [strategy for strategy in STRATEGIES if strategy.name == "POP"]
+    pruned = compare_strategies(cloud(80), short, views, ratios=[0.5], strategies=[pruning], supervision=supervision)[
+        -1
+    ]
+    assert (after.psnr > pruned.psnr + 1) == (supervision == "photos")
 
 
-def test_names_mean_the_same_whatever_the_settings():
-    """The preset's own rounds and shares change nothing; without steps, ways that train are left out."""
+def test_settings_that_a_strategy_fixes_have_no_effect():
+    """Without training steps, strategies that train are left out."""
     scene, views = cloud(80), Views(around(5), around(3), black(), "five views")
-    usual = study(scene, SHORT, views, ratios=[0.3])
+    usual = compare_strategies(scene, SHORT, views, ratios=[0.3])
     other = SHORT.model_copy(
         update={"prune_rounds": 7, "min_keep_per_scoring": 0.3, "admm_rho": 0.1, "erank_weight": 1.0}
     )
-    assert [point.psnr for point in study(scene, other, views, ratios=[0.3])] == [point.psnr for point in usual]
-    none = SHORT.model_copy(update={"sparsify_steps": 0, "refine_steps": 0})
-    ways = [point.way for point in study(scene, none, views, ratios=[0.3])]
-    assert ways == ["input", "random", "opacity", "POP", "POP in rounds"]
+    assert [point.psnr for point in compare_strategies(scene, other, views, ratios=[0.3])] == [
+        point.psnr for point in usual
+    ]
+    no_steps = SHORT.model_copy(update={"sparsify_steps": 0, "refine_steps": 0})
+    names = [point.strategy for point in compare_strategies(scene, no_steps, views, ratios=[0.3])]
+    assert names == ["input", "random", "opacity", "POP", "POP in rounds"]
 
 
 def test_an_empty_scene_is_refused():
     with pytest.raises(InvalidSceneError, match="has no Gaussians"):
-        study(cloud(1).select(slice(0)), SHORT)
+        compare_strategies(cloud(1).select(slice(0)), SHORT)
 
 
-def test_a_plot_of_nothing_finite_is_drawn(tmp_path, points):
+def test_a_plot_without_finite_values_is_drawn(tmp_path, points):
     compaction_plot([replace(point, psnr=math.inf) for point in points], tmp_path / "p.svg")
     assert (tmp_path / "p.svg").exists()
 
 
-def test_nobodys_cameras_cannot_be_learned_from():
+def test_invalid_options_are_refused():
     for message, options in (
-        ("say whose with --views", {"learn_from": "cameras"}),
-        ("choose photos, cameras or scene", {"learn_from": "books"}),
-        ("--ratio 0 keeps nothing", {"ratios": [0.5, 0.0]}),
-        ("there is no way 'mine'; there are: random; opacity; ", {"ways": ["mine"]}),
+        ("needs a capture; give one with --views", {"supervision": "cameras"}),
+        ("choose photos, cameras or scene", {"supervision": "books"}),
+        ("--ratio 0 keeps no Gaussian", {"ratios": [0.5, 0.0]}),
+        ("unknown strategy; choose one of: random; opacity; ", {"strategies": ["mine"]}),
     ):
         with pytest.raises(UnsupportedError, match=message):
-            compaction(Asked(scenes=[Path("x.ply")], presets=["fast"], **options))
+            compaction(BenchOptions(scenes=[Path("x.ply")], presets=["fast"], **options))
 
 
 @pytest.mark.parametrize("kind", ["png", "svg", "pdf"])
@@ -104,6 +113,6 @@ def test_the_plot_is_drawn(tmp_path, points, kind):
     assert path.read_bytes() == data
 
 
-def test_what_cannot_be_drawn_is_said_before_the_work(tmp_path):
-    with pytest.raises(UnsupportedError, match="plots are svg, png, pdf"):
+def test_an_unknown_plot_format_is_refused(tmp_path):
+    with pytest.raises(UnsupportedError, match=r"ends in \.svg, \.png or \.pdf"):
         check_plot(tmp_path / "plot.jpg")

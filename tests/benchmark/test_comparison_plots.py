@@ -1,4 +1,4 @@
-"""Oracle: the same bytes twice, pictures that are not blank, and labels that cover nothing."""
+"""Plots have the same bytes each time, are not blank, and have labels that cover neither each other nor points."""
 
 from contextlib import contextmanager
 
@@ -9,9 +9,9 @@ from PIL import Image
 
 from kissgs import UnsupportedError
 from kissgs.benchmark import comparison_plots
-from kissgs.benchmark.comparison_plots import comparison_plot, growth_plot
+from kissgs.benchmark.comparison_plots import comparison_plot, scaling_plot
 
-SIZES = [
+SCALING = [
     *(
         measured(preset, 9, 30.0, gaussians=n, seconds=n / 1e4 * k)
         for k, preset in ((1, "fast"), (5, "paper"), (9, "small"))
@@ -22,9 +22,9 @@ SIZES = [
 
 @pytest.mark.parametrize(
     ("kind", "draw", "rows"),
-    [("png", comparison_plot, many(photo=True)), ("svg", comparison_plot, many()), ("pdf", growth_plot, SIZES)],
+    [("png", comparison_plot, many(photo=True)), ("svg", comparison_plot, many()), ("pdf", scaling_plot, SCALING)],
 )
-def test_a_plot_is_drawn_and_always_the_same(tmp_path, kind, draw, rows):
+def test_a_plot_has_the_same_bytes_each_time(tmp_path, kind, draw, rows):
     path = tmp_path / f"plot.{kind}"
     draw(rows, path)
     data = path.read_bytes()
@@ -35,51 +35,51 @@ def test_a_plot_is_drawn_and_always_the_same(tmp_path, kind, draw, rows):
     assert path.read_bytes() == data
 
 
-def test_all_times_are_in_sight(tmp_path, monkeypatch):
-    """The slowest preset comes last, and its axes reach as far as its lines."""
+def test_the_axes_include_all_times(tmp_path, monkeypatch):
+    """The slowest preset is the last one here."""
     figures, real = [], comparison_plots.new_figure
 
     @contextmanager
-    def keeping(*args):
+    def recording(*args):
         with real(*args) as figure:
             figures.append(figure)
             yield figure
 
-    monkeypatch.setattr(comparison_plots, "new_figure", keeping)
-    growth_plot(SIZES, tmp_path / "p.png")
+    monkeypatch.setattr(comparison_plots, "new_figure", recording)
+    scaling_plot(SCALING, tmp_path / "p.png")
     panels = [axes for axes in figures[0].axes if axes.axison]
     assert [axes.get_title() for axes in panels] == ["fast", "paper", "small"]
     for axes in panels:
         low, high = axes.get_ylim()
-        seen = [axes.get_lines()[n].get_ydata() for n in range(3)]
-        assert all(low < value < high for values in seen for value in values)
+        lines = [axes.get_lines()[n].get_ydata() for n in range(3)]
+        assert all(low < value < high for values in lines for value in values)
 
 
 @pytest.mark.parametrize("photo", [False, True])
 def test_labels_cover_neither_each_other_nor_points(tmp_path, monkeypatch, photo):
-    """Where they are when all is placed; 'small' and 'balanced' nearly coincide."""
-    spread, seen = comparison_plots._spread, []
+    """The points of 'small' and 'balanced' nearly coincide."""
+    place_labels, boxes_by_panel = comparison_plots._place_labels, []
 
-    def spying(figure, axes, labels):
-        spread(figure, axes, labels)
-        seen.append([label.get_window_extent() for label in labels])
+    def recording(figure, axes, labels):
+        place_labels(figure, axes, labels)
+        boxes_by_panel.append([label.get_window_extent() for label in labels])
         points = axes.transData.transform([label.xy for label in labels])
-        assert not any(box.contains(*point) for box in seen[-1] for point in points)
+        assert not any(box.contains(*point) for box in boxes_by_panel[-1] for point in points)
 
-    monkeypatch.setattr(comparison_plots, "_spread", spying)
+    monkeypatch.setattr(comparison_plots, "_place_labels", recording)
     comparison_plot(many(photo=photo), tmp_path / "p.png")
-    assert [len(boxes) for boxes in seen] == [5] * (3 if photo else 2)
-    for boxes in seen:
+    assert [len(boxes) for boxes in boxes_by_panel] == [5] * (3 if photo else 2)
+    for boxes in boxes_by_panel:
         assert not any(one.overlaps(other) for n, one in enumerate(boxes) for other in boxes[:n])
 
 
-def test_a_plot_of_little_is_drawn(tmp_path):
+def test_a_plot_of_one_measurement_is_drawn(tmp_path):
     comparison_plot([measured("fast", 100, float("inf"))], tmp_path / "p.png")
-    growth_plot(SIZES[:1], tmp_path / "q.png")
+    scaling_plot(SCALING[:1], tmp_path / "q.png")
     for name in ("p.png", "q.png"):
         assert np.asarray(Image.open(tmp_path / name).convert("L")).std() > 5
 
 
 def test_other_formats_are_refused(tmp_path):
-    with pytest.raises(UnsupportedError, match="plots are svg, png, pdf"):
+    with pytest.raises(UnsupportedError, match=r"ends in \.svg, \.png or \.pdf"):
         comparison_plot(many(), tmp_path / "plot.jpg")

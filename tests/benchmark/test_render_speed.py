@@ -1,4 +1,4 @@
-"""Oracle: what a measurement must hold whatever the machine: sizes, counts, positive times, more work for more."""
+"""Properties of a measurement on any computer: sizes, counts and positive times."""
 
 import json
 
@@ -21,23 +21,23 @@ def table():
     return sample_scene(4000, sh_degree=1)
 
 
-def test_what_is_measured_is_told(table):
-    told = []
-    cost = rendering_cost(table, [VIEW], progress=lambda stage, fraction: told.append(stage))
+def test_a_cost_has_sizes_counts_and_positive_times(table):
+    stages = []
+    cost = rendering_cost(table, [VIEW], progress=lambda stage, fraction: stages.append(stage))
     assert (cost.gaussians, cost.width, cost.height, cost.views) == (4000, 96, 64, 1)
     assert 100 < cost.visible <= 4000
-    assert min(cost.draw, cost.draw_and_backward, cost.loss, cost.score) > 0
-    assert "measure" in told
+    assert min(cost.render, cost.render_and_backward, cost.loss, cost.removal_scores) > 0
+    assert "measure" in stages
     assert json.loads(json.dumps(cost.as_dict()))["gaussians"] == 4000
 
 
 @pytest.mark.parametrize("count", [0, 1, 1000, 4000, 9001])
-def test_a_resampled_scene_has_as_many_and_looks_much_the_same(table, count):
+def test_a_resampled_scene_has_the_count_and_looks_similar(table, count):
     other = resampled(table, count)
     assert len(other) == count
     if count >= 1000:
-        picture, same = render(table, VIEW)[0], render(other, VIEW)[0]
-        assert psnr(same.clip(0, 1), picture.clip(0, 1)) > (60 if count == 4000 else 15)
+        image, resampled_image = render(table, VIEW)[0], render(other, VIEW)[0]
+        assert psnr(resampled_image.clip(0, 1), image.clip(0, 1)) > (60 if count == 4000 else 15)
 
 
 def test_resampling_is_repeatable(table):

@@ -1,4 +1,4 @@
-"""``kissgs bench`` as a user runs it; oracle: the library's own functions, and sentences for what cannot be."""
+"""``kissgs bench`` as a user runs it; reference: the library's functions, and the texts of errors."""
 
 from __future__ import annotations
 
@@ -20,79 +20,78 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_each_preset_is_measured(scene: Path) -> None:
     rows = json.loads(run("bench", scene, "-p", "fast", "-p", "paper", "--repeats", 2, "--json").stdout)
-    assert [(row["encoder"], len(row["runs"])) for row in rows] == [("fast", 2), ("paper", 2)]
+    assert [(row["codec"], len(row["runs"])) for row in rows] == [("fast", 2), ("paper", 2)]
     for row in rows:
-        result = kissgs.compress(scene, settings=kissgs.Settings(preset=row["encoder"]))
+        result = kissgs.compress(scene, settings=kissgs.Settings(preset=row["codec"]))
         assert row["report"]["container_bytes"] == row["bytes"] == len(result.to_zip())
         assert row["file_bytes"] == result.report.file_bytes
-        assert row["steady"] is True
-        assert row["pictures"] is None
+        assert row["reproducible"] is True
+        assert row["evaluation"] is None
         assert sum(row["runs"][0]["stage_seconds"].values()) == pytest.approx(row["runs"][0]["encode_seconds"])
 
 
-def test_a_curve_is_drawn_and_pictures_are_compared(scene: Path, tmp_path: Path) -> None:
+def test_a_curve_is_plotted_and_images_are_compared(scene: Path, tmp_path: Path) -> None:
     quick = ["--set", "sensitivity_views=4", "--set", "sensitivity_view_size=60"]
-    words = ["-p", "balanced", "--quality-offset", -3, *quick, "--plot", tmp_path / "p.svg"]
-    done = run("bench", scene, *words)
+    options = ["-p", "balanced", "--quality-offset", -3, *quick, "--plot", tmp_path / "p.svg"]
+    done = run("bench", scene, *options)
     assert done.returncode == 0, done.stderr
     assert "balanced at -3" in done.stdout.decode()
     assert "f_rest_centroids.webp" in done.stdout.decode()
     assert (tmp_path / "p.svg").read_bytes().startswith(b"<?xml")
 
 
-def test_other_sizes_are_measured_and_drawn(scene: Path, tmp_path: Path) -> None:
-    words = ["-p", "fast", "--gaussians", 200, "--gaussians", 900, "--json", "--plot", tmp_path / "p.png"]
-    done = run("bench", scene, *words)
+def test_other_sizes_are_measured_and_plotted(scene: Path, tmp_path: Path) -> None:
+    options = ["-p", "fast", "--gaussians", 200, "--gaussians", 900, "--json", "--plot", tmp_path / "p.png"]
+    done = run("bench", scene, *options)
     assert done.returncode == 0, done.stderr
     assert [row["gaussians"] for row in json.loads(done.stdout)] == [200, 900]
     assert (tmp_path / "p.png").stat().st_size > 10_000
 
 
-def test_pictures_are_compared_and_the_rasteriser_is_measured(scene: Path) -> None:
-    rows = json.loads(run("bench", scene, "-p", "fast", "--pictures", "--json").stdout)
-    assert rows[0]["pictures"]["mean"]["candidate_vs_reference"]["psnr"] > 20
+def test_images_are_compared_and_the_rasteriser_is_measured(scene: Path) -> None:
+    rows = json.loads(run("bench", scene, "-p", "fast", "--evaluate", "--json").stdout)
+    assert rows[0]["evaluation"]["mean"]["candidate_vs_reference"]["psnr"] > 20
     rows = json.loads(run("bench", scene, "--rendering", "--gaussians", 100, "--json").stdout)
     assert [row["gaussians"] for row in rows] == [100]
 
 
 @pytest.mark.parametrize(
-    ("words", "sentence"),
+    ("options", "message"),
     [
-        ("--rendering -p fast", "no presets and no peers"),
-        ("--rendering --ablate", "--ablate and --rendering are several measurements"),
-        ("--rendering --repeats 2", "--repeats does not go with --rendering"),
-        ("--gaussians 5 --peer spz", "without --peer and --quality-offset"),
-        ("--gaussians 5 --compaction", "--gaussians does not go with --compaction"),
-        ("--quality-offset 1 -p fast", "--quality-offset is of presets that weigh bits"),
-        ("--quality-offset 1 --ablate", "--quality-offset does not go with --ablate"),
-        ("--ablate -p fast", "not of fast"),
-        ("--ratio 0.5", "--ratio goes with --compaction"),
-        ("--learn-from scene", "--learn-from goes with --compaction or --finetuning"),
-        ("--compaction -p fast -p paper", "--compaction goes with one --preset"),
-        ("--plot curve.jpg", "plots are svg, png, pdf"),
+        ("--rendering -p fast", "leave out --preset and --external"),
+        ("--rendering --ablate", "--ablate and --rendering cannot be combined"),
+        ("--rendering --repeats 2", "--repeats does not apply to --rendering"),
+        ("--gaussians 5 --external spz", "leave out --external and --quality-offset"),
+        ("--gaussians 5 --compaction", "--gaussians does not apply to --compaction"),
+        ("--quality-offset 1 -p fast", "--quality-offset needs a preset with rate-distortion planning"),
+        ("--quality-offset 1 --ablate", "--quality-offset does not apply to --ablate"),
+        ("--ablate -p fast", "balanced or small, not fast"),
+        ("--ratio 0.5", "--ratio needs --compaction"),
+        ("--supervision scene", "--supervision needs --compaction or --finetuning"),
+        ("--compaction -p fast -p paper", "--compaction measures one preset"),
+        ("--plot curve.jpg", "ends in .svg, .png or .pdf"),
         ("--scale 4", "--views"),
-        ("--peer rar -p fast", "unknown peer format 'rar'; there are sog, spz"),
+        ("--external rar -p fast", "unknown external codec 'rar'; choose sog or spz"),
     ],
 )
-def test_what_does_not_go_together_is_refused(scene: Path, words: str, sentence: str) -> None:
-    assert sentence in failure("bench", scene, *words.split())
+def test_options_that_exclude_each_other_are_refused(scene: Path, options: str, message: str) -> None:
+    assert message in failure("bench", scene, *options.split())
 
 
-def test_two_scenes_are_not_one_plot(scene: Path, tmp_path: Path) -> None:
-    assert "--plot draws one scene" in failure("bench", scene, "other.ply", "--plot", tmp_path / "p.svg")
+def test_a_plot_of_two_scenes_is_refused(scene: Path, tmp_path: Path) -> None:
+    assert "--plot takes one scene" in failure("bench", scene, "other.ply", "--plot", tmp_path / "p.svg")
 
 
-@pytest.mark.parametrize("study", [["--ablate", "-p", "paper"], ["--rendering"], ["-p", "fast"]])
-def test_a_scene_that_fails_costs_the_others_nothing(scene: Path, study: list[str]) -> None:
-    """What the first took long to find is told all the same, and so is what is wrong with the second."""
-    done = run("bench", scene, scene.with_name("none.ply"), *study, "--json")
+@pytest.mark.parametrize("measurement", [["--ablate", "-p", "paper"], ["--rendering"], ["-p", "fast"]])
+def test_the_results_of_other_scenes_are_printed_if_one_fails(scene: Path, measurement: list[str]) -> None:
+    done = run("bench", scene, scene.with_name("none.ply"), *measurement, "--json")
     assert done.returncode == 2
     assert b"none.ply: there is no such file" in done.stderr
     assert {row["scene"] for row in json.loads(done.stdout)} == {"scene.ply"}
 
 
-def test_scenes_of_equal_names_are_told_apart(scene: Path, tmp_path: Path) -> None:
-    """A capture's scene is often called point_cloud.ply; a peer must be compared with its own."""
+def test_scenes_of_equal_file_names_have_different_names(scene: Path, tmp_path: Path) -> None:
+    """Many captures have a scene called point_cloud.ply."""
     other = tmp_path / "other" / scene.name
     other.parent.mkdir()
     kissgs.save(kissgs.sample_scene(50, sh_degree=0), other)
@@ -101,13 +100,13 @@ def test_scenes_of_equal_names_are_told_apart(scene: Path, tmp_path: Path) -> No
     assert [(row["scene"], row["gaussians"]) for row in rows] == [(names[0], 600), (names[1], 50)]
 
 
-def test_nothing_has_no_other_size(tmp_path: Path) -> None:
+def test_an_empty_scene_is_not_resampled(tmp_path: Path) -> None:
     kissgs.save(kissgs.sample_scene(0), tmp_path / "none.ply")
     rows = json.loads(run("bench", tmp_path / "none.ply", "-p", "fast", "--gaussians", 5, "--json").stdout)
     assert [row["gaussians"] for row in rows] == [0]
 
 
-def test_scenes_that_all_fail_make_no_table() -> None:
+def test_there_is_no_table_if_all_scenes_fail() -> None:
     done = run("bench", "none.ply", "nothing.ply", "-p", "fast")
     assert (done.returncode, done.stdout) == (2, b"")
     assert done.stderr.count(b"there is no such file") == 2

@@ -1,7 +1,7 @@
-"""Made-up measurements."""
+"""Synthetic measurements of codecs, for tests of tables and plots."""
 
 from helpers.captured_scene import cameras
-from kissgs.benchmark.results import Measured, Run
+from kissgs.benchmark.results import Measurement, Run
 from kissgs.cameras.views import black
 from kissgs.evaluation.attributes import attribute_errors
 from kissgs.evaluation.evaluate import Comparison
@@ -41,18 +41,18 @@ def evaluation(psnr, photo=None):
 
 
 def measured(
-    encoder, size, psnr, *, photo=None, quality_offset_db=None, external=False, runs=None, gaussians=30, seconds=1.0
+    codec, size, psnr, *, photo=None, quality_offset_db=None, external=False, runs=None, gaussians=30, seconds=1.0
 ):
-    files = {encoder: size} if external else dict.fromkeys(FILES, size // len(FILES))
-    return Measured(
+    files = {codec: size} if external else dict.fromkeys(FILES, size // len(FILES))
+    return Measurement(
         scene="scene.ply",
-        encoder=encoder,
+        codec=codec,
         quality_offset_db=quality_offset_db,
         gaussians=gaussians,
         file_bytes=files,
         runs=runs or (run(seconds, size),),
         errors=ERRORS,
-        pictures=evaluation(psnr, photo),
+        evaluation=evaluation(psnr, photo),
     )
 
 

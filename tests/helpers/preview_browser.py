@@ -103,7 +103,7 @@ class Preview:
         """Wait for the scene and its final image; return that."""
         self.fact("Gaussians", f"{gaussians:,}")
         self.page.locator("#loading").wait_for(state="hidden")
-        self.page.locator("#picture").wait_for()
+        self.page.locator("#viewport").wait_for()
         return self.still_image()
 
     def fact(self, name, value):

@@ -1,4 +1,4 @@
-"""Coverage and local scale; the oracles are brute-force neighbours and hand-placed cameras."""
+"""Coverage and local scale; reference: neighbours by brute force, and cameras placed by hand."""
 
 from __future__ import annotations
 
@@ -22,13 +22,15 @@ def neighbour(splats: Splats, rank: int) -> np.ndarray:
     return np.array([np.partition(np.linalg.norm(means - mean, axis=1), rank)[rank] for mean in means])
 
 
-def test_local_scale_is_the_distance_of_some_hundredth_neighbour():
+def test_local_scale_is_the_distance_of_about_the_128th_neighbour():
     scene = sample_scene(3000)
     found = local_scale(scene)
     sizes = np.exp(np.sort(scene.scales, axis=1)[:, 1])
     by_neighbours = found > 1.01 * sizes
     share = found[by_neighbours]
-    assert (share >= 0.99 * neighbour(scene, 20)[by_neighbours]).mean() > 0.97  # the rest: at the end of something
+    assert (
+        share >= 0.99 * neighbour(scene, 20)[by_neighbours]
+    ).mean() > 0.97  # the others are at the edge of an object
     assert np.median(share / neighbour(scene, 128)[by_neighbours]) < 1.6
 
 
@@ -39,7 +41,7 @@ def test_local_scale_follows_the_scale_of_the_scene(scale: float):
 
 
 def test_a_far_object_does_not_change_local_scales():
-    """As far as float32 can hold its shape: at ten times the distance it could not."""
+    """Float32 positions could not represent its shape at ten times the distance."""
     scene = sample_scene(2000)
     both = joined(scene, moved(sample_scene(2000, seed=1), by=(1e4, 0, 0), scale=0.01))
     there = both.means[:, 0] > 5e3
@@ -50,7 +52,7 @@ def test_a_far_object_does_not_change_local_scales():
 
 @pytest.mark.parametrize("count", [60, 100])
 def test_the_scale_of_an_object_of_few_gaussians_is_its_own(count: int):
-    """The next objects are three hundred times as far."""
+    """The other objects are three hundred times their size away."""
     one = replace(sample_scene(count, seed=2), scales=np.full((count, 3), -9, np.float32))
     extent = np.ptp(one.means, axis=0).max()
     many = joined(*(moved(one, by=(n % 5 * 6000.0, n // 5 * 6000.0, 0)) for n in range(20)))
@@ -59,7 +61,7 @@ def test_the_scale_of_an_object_of_few_gaussians_is_its_own(count: int):
 
 @pytest.mark.parametrize("far", [1e8, 1e12, 1e18])
 def test_one_gaussian_however_far_out_does_not_change_local_scales(far: float):
-    """Distances in its leaf keep their digits."""
+    """Distances in its leaf are accurate too."""
     scene = sample_scene(2000)
     means = scene.means.copy()
     means[0, 0] = far
@@ -71,24 +73,24 @@ def test_one_gaussian_however_far_out_does_not_change_local_scales(far: float):
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 8, 9, 513])
 def test_small_and_coincident_scenes_have_positive_scales(count: int):
     scene = sample_scene(count)
-    together = moved(scene, scale=1e-6)
-    for splats in (scene, together):
+    coincident = moved(scene, scale=1e-6)
+    for splats in (scene, coincident):
         found = local_scale(splats)
         assert found.shape == (count,)
         assert (found > 0).all()
         assert np.isfinite(found).all()
 
 
-def looked_at(splats: Splats, *cameras: Camera) -> np.ndarray:
+def coverage_of(splats: Splats, *cameras: Camera) -> np.ndarray:
     from kissgs.core.sensitivity import Sensitivity
     from kissgs.rendering.cpu.frame import add_sensitivities, draw
 
     coverage = Coverage(splats)
     with Workers(1) as pool:
         for camera in cameras:
-            shown = Sensitivity.none(len(splats), splats.sh_degree)
-            add_sensitivities(draw(splats, camera, np.zeros(3, np.float32), pool), 1.0, 0.0, shown, pool)
-            coverage.add(camera, shown.color_weight)
+            found = Sensitivity.none(len(splats), splats.sh_degree)
+            add_sensitivities(draw(splats, camera, np.zeros(3, np.float32), pool), 1.0, 0.0, found, pool)
+            coverage.add(camera, found.color_weight)
     return coverage.share
 
 
@@ -106,29 +108,29 @@ def plate(z: float, opacity: float = 10.0, n: int = 900) -> Splats:
     )
 
 
-def camera(place: tuple[float, float, float], target: tuple[float, float, float]) -> Camera:
-    return look_at(np.array(place), np.array(target), UP, fov=np.radians(60), width=128, height=128)
+def camera(position: tuple[float, float, float], target: tuple[float, float, float]) -> Camera:
+    return look_at(np.array(position), np.array(target), UP, fov=np.radians(60), width=128, height=128)
 
 
-def test_what_is_behind_an_opaque_plate_is_not_covered_and_what_is_in_front_is():
+def test_gaussians_behind_an_opaque_plate_are_not_covered():
     front, behind = plate(0.0), plate(1.0)
     both = Splats(**{name: np.concatenate([getattr(front, name), getattr(behind, name)]) for name in front.__slots__})
-    share = looked_at(both, camera((0, 0, -2.2), (0, 0, 0)))
+    share = coverage_of(both, camera((0, 0, -2.2), (0, 0, 0)))
     inner = (np.abs(both.means[:, :2]) < 0.7).all(axis=1)
     assert (share[inner & (both.means[:, 2] == 0)] > 0.5).all()
     assert (share[inner & (both.means[:, 2] == 1)] < 0.05).all()
-    from_both = looked_at(both, camera((0, 0, -2.2), (0, 0, 0)), camera((0, 0, 3.2), (0, 0, 0)))
+    from_both = coverage_of(both, camera((0, 0, -2.2), (0, 0, 0)), camera((0, 0, 3.2), (0, 0, 0)))
     assert (from_both[inner] > 0.5).all()
 
 
-def test_what_is_seen_from_afar_only_is_hardly_covered():
+def test_gaussians_seen_only_from_far_away_are_hardly_covered():
     scene = plate(0.0)
-    near, far = (looked_at(scene, camera((0, 0, -z), (0, 0, 0))) for z in (2.2, 220.0))
+    near, far = (coverage_of(scene, camera((0, 0, -z), (0, 0, 0))) for z in (2.2, 220.0))
     inner = (np.abs(scene.means[:, :2]) < 0.7).all(axis=1)
     assert (near[inner] > 0.5).all()
     assert (far < 0.05).all()
 
 
-def test_close_up_depends_on_no_camera_and_on_no_scale():
+def test_close_up_does_not_depend_on_the_scale_of_the_scene():
     scene = sample_scene(1500)
     assert Coverage(moved(scene, scale=100)).close_up == pytest.approx(Coverage(scene).close_up, rel=0.05, abs=1e-6)

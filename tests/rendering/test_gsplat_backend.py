@@ -1,6 +1,6 @@
-"""Oracle: a stand-in for gsplat that draws with the CPU backend what it is asked for, in gsplat's own terms.
+"""Reference: a fake gsplat, with gsplat's interface, that renders with the CPU backend.
 
-So what is handed over is checked where there is no GPU; where there is one, test_rasterizer.py draws on it.
+It checks the arguments of gsplat without a GPU; with one, test_rasterizer.py renders on it.
 """
 
 import sys
@@ -19,13 +19,23 @@ from kissgs.rendering.tensors import tensors_of
 CLASSIC = {"near_plane": 0.01, "far_plane": 1e10, "eps2d": 0.3, "tile_size": 16, "rasterize_mode": "classic"}
 
 
-def stand_in(means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree, backgrounds, **rest):
-    """gsplat.rasterization: scales and opacities activated, colours the coefficients of all bands."""
+def fake_rasterization(
+    means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree, backgrounds, **rest
+):
+    """Render like gsplat.rasterization: scales and opacities are activated, colours are all SH coefficients."""
     assert rest == CLASSIC
     assert colors.shape[1] == (sh_degree + 1) ** 2
     images, alphas = rasterize(
-        *(means, quats, torch.log(scales), torch.logit(opacities.double()).float(), colors[:, 0], colors[:, 1:]),
-        *(viewmats, Ks, width, height),
+        means,
+        quats,
+        torch.log(scales),
+        torch.logit(opacities.double()).float(),
+        colors[:, 0],
+        colors[:, 1:],
+        viewmats,
+        Ks,
+        width,
+        height,
         backgrounds=backgrounds,
     )
     return images, alphas[..., None], {}
@@ -34,7 +44,7 @@ def stand_in(means, quats, scales, opacities, colors, viewmats, Ks, width, heigh
 @pytest.fixture
 def gsplat(monkeypatch):
     module = types.ModuleType("gsplat")
-    module.rasterization = stand_in
+    module.rasterization = fake_rasterization
     monkeypatch.setitem(sys.modules, "gsplat", module)
 
 
@@ -51,21 +61,21 @@ def arguments(count, degree):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_gsplat_is_asked_for_the_same_picture(gsplat, degree):
-    wanted = arguments(30, degree)
-    images, alphas = rasterize_on_cuda(**wanted)
-    expected_images, expected_alphas = rasterize(**wanted)
+def test_gsplat_gets_the_arguments_of_the_same_image(gsplat, degree):
+    tensors = arguments(30, degree)
+    images, alphas = rasterize_on_cuda(**tensors)
+    expected_images, expected_alphas = rasterize(**tensors)
     torch.testing.assert_close(images, expected_images, atol=2e-5, rtol=0)
     torch.testing.assert_close(alphas, expected_alphas, atol=2e-5, rtol=0)
 
 
 def test_an_empty_scene_is_its_background(gsplat):
-    wanted = arguments(0, 1)
-    for found, expected in zip(rasterize_on_cuda(**wanted), rasterize(**wanted), strict=True):
+    tensors = arguments(0, 1)
+    for found, expected in zip(rasterize_on_cuda(**tensors), rasterize(**tensors), strict=True):
         assert torch.equal(found, expected)
 
 
-def test_without_gsplat_the_extra_is_named(monkeypatch):
+def test_an_error_names_the_extra_if_gsplat_is_missing(monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", None)
     with pytest.raises(UnsupportedError, match=r"kissgs\[cuda\]"):
         rasterize_on_cuda(**arguments(3, 0))

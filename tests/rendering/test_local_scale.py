@@ -1,4 +1,4 @@
-"""Oracle: a stable sort, which has only one answer; and grids, of which it is known how far apart their points lie."""
+"""Reference: a stable sort, which has only one result, and grids of known spacing."""
 
 from dataclasses import replace
 
@@ -13,13 +13,13 @@ from kissgs.rendering.local_scale import _lower_half, local_scale
 
 @given(st.lists(st.integers(-3, 3), min_size=2, max_size=60))
 def test_of_equal_values_the_first_are_in_the_lower_half(values):
-    """The choice among equal ones is the same on every processor."""
+    """The choice among equal values is the same on every processor."""
     lower = np.flatnonzero(_lower_half(np.array(values, float)))
     assert lower.tolist() == sorted(np.argsort(values, kind="stable")[: len(values) // 2].tolist())
 
 
 @pytest.mark.parametrize("spacing", [1e-3, 1.0, 1e4])
-def test_on_a_grid_it_is_as_many_spacings_at_any_scale(spacing):
+def test_on_a_grid_it_is_the_same_number_of_spacings_at_any_scale(spacing):
     scene = sample_scene(4096)
     grid = np.stack(np.meshgrid(np.arange(64), np.arange(64), [0], indexing="ij"), axis=-1).reshape(-1, 3)
     flat = replace(

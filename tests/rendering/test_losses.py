@@ -1,4 +1,4 @@
-"""The photometric loss. Oracles: the textbook formula in float64, its finite differences, torch's autograd."""
+"""The photometric loss. Reference: the textbook formula in float64, its finite differences, torch's autograd."""
 
 import math
 
@@ -13,7 +13,7 @@ from kissgs.rendering.metrics import ssim
 
 
 def textbook_loss(image, target, weight=0.2):
-    """With means, variances and the covariance of both images, in float64."""
+    """Return the loss by means, variances and the covariance of both images, in float64."""
     profile = np.exp(-(np.arange(-5.0, 6.0) ** 2) / (2 * 1.5**2))
     profile /= profile.sum()
 
@@ -23,12 +23,12 @@ def textbook_loss(image, target, weight=0.2):
     x, y = np.asarray(image, dtype=np.float64), np.asarray(target, dtype=np.float64)
     mx, my = blur(x), blur(y)
     vx, vy, cov = blur(x * x) - mx**2, blur(y * y) - my**2, blur(x * y) - mx * my
-    likeness = (2 * mx * my + 1e-4) * (2 * cov + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))
-    return (1 - weight) * np.abs(x - y).mean() + weight * (1 - likeness.mean())
+    similarity = (2 * mx * my + 1e-4) * (2 * cov + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))
+    return (1 - weight) * np.abs(x - y).mean() + weight * (1 - similarity.mean())
 
 
 def pair(*shape, seed=0):
-    """A noisy copy of smooth images, as renderings are: partly outside [0, 1]."""
+    """Return noisy and smooth images, partly outside [0, 1], as renderings are."""
     rng = np.random.default_rng(seed)
     rows, columns = np.mgrid[: shape[-3], : shape[-2]][..., None]
     target = 0.5 + 0.5 * np.sin(columns / 6 + np.arange(3)) * np.cos(rows / 4) + 0.02 * rng.standard_normal(shape)
@@ -47,7 +47,7 @@ SIZES = [(1, 1), (1, 30), (7, 4), (11, 11), (40, 23), (130, 9), (8, 170), (140, 
 
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
 @pytest.mark.parametrize(("height", "width"), SIZES)
-def test_the_value_is_that_of_the_textbook(height, width, weight):
+def test_the_value_agrees_with_the_textbook_formula(height, width, weight):
     image, target = pair(height, width, 3)
     expected = textbook_loss(image, target, weight)
     assert photometric_loss(image, target, ssim_weight=weight).item() == pytest.approx(expected, abs=1e-6)
@@ -56,39 +56,39 @@ def test_the_value_is_that_of_the_textbook(height, width, weight):
 
 
 @pytest.mark.parametrize("weight", [0.2, 1.0])
-def test_the_gradient_is_that_of_finite_differences(weight):
+def test_the_gradient_agrees_with_finite_differences(weight):
     image, target = pair(9, 13, 3)
     gradient = gradient_of(lambda leaf: photometric_loss(leaf, target, ssim_weight=weight), image).numpy()
     step, expected = 1e-6, np.empty(image.shape)
     for index in np.ndindex(*image.shape):
         shift = np.zeros(image.shape)
         shift[index] = step
-        high, low = (textbook_loss(image.double().numpy() + side * shift, target, weight) for side in (1, -1))
+        high, low = (textbook_loss(image.double().numpy() + sign * shift, target, weight) for sign in (1, -1))
         expected[index] = (high - low) / (2 * step)
     np.testing.assert_allclose(gradient, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
 @pytest.mark.parametrize(("height", "width"), SIZES)
-def test_the_gradient_is_that_of_autograd_in_float64(height, width, weight):
-    """At borders, where tiles meet, and for images smaller than the window."""
+def test_the_gradient_agrees_with_autograd_in_float64(height, width, weight):
+    """Sizes include several tiles and images smaller than the window."""
     image, target = pair(height, width, 3)
     gradient = gradient_of(lambda leaf: photometric_loss(leaf, target, ssim_weight=weight), image)
     expected = gradient_of(lambda leaf: plain_photometric_loss(leaf, target.double(), weight), image.double())
     torch.testing.assert_close(gradient.double(), expected, rtol=0, atol=3e-5 * expected.abs().max().item())
 
 
-def test_a_stack_is_the_mean_of_its_views():
+def test_the_loss_of_a_stack_is_the_mean_over_views():
     images, targets = pair(3, 20, 17, 3)
     gradient = gradient_of(lambda leaf: photometric_loss(leaf, targets), images)
-    each = [photometric_loss(image, target).item() for image, target in zip(images, targets, strict=True)]
-    assert photometric_loss(images, targets).item() == pytest.approx(np.mean(each), abs=1e-7)
+    losses = [photometric_loss(image, target).item() for image, target in zip(images, targets, strict=True)]
+    assert photometric_loss(images, targets).item() == pytest.approx(np.mean(losses), abs=1e-7)
     for view in range(3):
-        alone = gradient_of(lambda leaf: photometric_loss(leaf, targets[view]), images[view])  # noqa: B023
-        torch.testing.assert_close(gradient[view], alone / 3)
+        single = gradient_of(lambda leaf: photometric_loss(leaf, targets[view]), images[view])  # noqa: B023
+        torch.testing.assert_close(gradient[view], single / 3)
 
 
-def test_it_agrees_with_the_metric():
+def test_the_loss_agrees_with_the_metric():
     image, target = pair(50, 60, 3)
     assert photometric_loss(image, target, ssim_weight=1.0).item() == pytest.approx(
         1 - ssim(image.numpy(), target.numpy()), abs=1e-7
@@ -104,7 +104,7 @@ def test_equal_images_have_no_loss_and_no_gradient():
     assert (leaf.grad == 0).all()
 
 
-def test_the_gradient_is_scaled_by_what_follows_and_added_up():
+def test_the_gradient_is_scaled_by_the_upstream_gradient_and_accumulated():
     image, target = pair(20, 20, 3)
     once = gradient_of(lambda leaf: photometric_loss(leaf, target), image)
     torch.testing.assert_close(gradient_of(lambda leaf: -3 * photometric_loss(leaf, target), image), -3 * once)
@@ -115,16 +115,16 @@ def test_the_gradient_is_scaled_by_what_follows_and_added_up():
     torch.testing.assert_close(leaf.grad, 2 * once)
 
 
-def test_the_gradient_reaches_what_the_image_was_made_of():
+def test_the_gradient_flows_to_parameters_of_the_image():
     image, target = pair(14, 25, 3)
     gain = torch.tensor(0.7, requires_grad=True)
-    photometric_loss((gain * image).transpose(0, 1), target.transpose(0, 1)).backward()  # and not contiguous
-    wide = torch.tensor(0.7, dtype=torch.float64, requires_grad=True)
-    plain_photometric_loss(wide * image.double(), target.double(), 0.2).backward()
-    assert gain.grad.item() == pytest.approx(wide.grad.item(), rel=1e-5)
+    photometric_loss((gain * image).transpose(0, 1), target.transpose(0, 1)).backward()  # not contiguous either
+    gain64 = torch.tensor(0.7, dtype=torch.float64, requires_grad=True)
+    plain_photometric_loss(gain64 * image.double(), target.double(), 0.2).backward()
+    assert gain.grad.item() == pytest.approx(gain64.grad.item(), rel=1e-5)
 
 
-def test_threads_change_no_bit():
+def test_the_result_does_not_depend_on_threads():
     image, target = pair(2, 150, 170, 3)
     losses = [photometric_loss(image, target, threads=threads).item() for threads in (0, 1, 2, 5)]
     assert len(set(losses)) == 1
@@ -148,8 +148,8 @@ def test_without_a_gradient_the_value_is_the_same():
 
 
 @pytest.mark.parametrize("value", [50.0, -2e4, 1e9, -1e30, 3e38, math.inf])
-def test_extreme_renderings_give_numbers(value):
-    """A Gaussian that has run away must not spoil the others through NaN."""
+def test_extreme_renderings_give_finite_values(value):
+    """A diverged Gaussian must not spoil the others by NaN."""
     image, target = pair(30, 30, 3)
     image[10:13, 7] = value
     leaf = image.clone().requires_grad_()
@@ -180,7 +180,7 @@ def test_float64_is_plain_torch():
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_a_gpu_computes_the_same():
-    """To float32, not to TF32: that would lose the variances."""
+    """The accuracy is that of float32; TF32 would lose the variances."""
     image, target = pair(64, 70, 3)
     expected = gradient_of(lambda leaf: photometric_loss(leaf, target), image)
     on_gpu = gradient_of(lambda leaf: photometric_loss(leaf, target.cuda()), image.cuda())
@@ -190,11 +190,13 @@ def test_a_gpu_computes_the_same():
 @pytest.mark.parametrize(
     ("first", "second"), [((4, 4, 3), (4, 5, 3)), ((4, 4, 4), (4, 4, 4)), ((4, 3), (4, 3)), ((2, 0, 4, 3),) * 2]
 )
-def test_what_are_not_images_of_one_size_is_refused(first, second):
-    with pytest.raises(InvalidViewsError, match=r"both be \(height, width, 3\) or stacks of such, not \("):
+def test_images_of_different_or_invalid_shapes_are_refused(first, second):
+    with pytest.raises(
+        InvalidViewsError, match=r"one shape, \(height, width, 3\) or \(count, height, width, 3\), not \("
+    ):
         photometric_loss(torch.zeros(first), torch.zeros(second))
 
 
-def test_a_target_that_wants_a_gradient_is_refused():
+def test_a_target_that_requires_a_gradient_is_refused():
     with pytest.raises(ValueError, match="detach it"):
         photometric_loss(torch.zeros(4, 4, 3), torch.zeros(4, 4, 3, requires_grad=True))

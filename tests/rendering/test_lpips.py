@@ -1,4 +1,4 @@
-"""LPIPS. A stand-in for the package notes how it is called; what lpips 0.1.4 expects is written beside it."""
+"""LPIPS, with a fake package of the interface of lpips 0.1.4 that records its calls."""
 
 import math
 import sys
@@ -15,7 +15,7 @@ from kissgs.rendering.lpips import Lpips
 
 
 class FakeNetwork(torch.nn.Module):
-    """Like lpips.LPIPS: two (N, 3, H, W) tensors in, (N, 1, 1, 1) out."""
+    """A module with the interface of lpips.LPIPS: from two (N, 3, H, W) tensors to (N, 1, 1, 1)."""
 
     def __init__(self, net, verbose):
         super().__init__()
@@ -35,8 +35,8 @@ def package(monkeypatch):
     return module
 
 
-def test_images_go_in_as_the_field_does_it(package):
-    """VGG, channels first, in [0, 1] and not rescaled to [-1, 1]; silent, whatever torchvision deprecates."""
+def test_the_network_gets_images_as_in_the_evaluation_of_3dgs(package):
+    """VGG, channels first, in [0, 1] and not rescaled to [-1, 1]; warnings are suppressed."""
     rng = np.random.default_rng(0)
     image, reference = rng.random((2, 20, 33, 3), dtype=np.float32)
     metric = Lpips()
@@ -61,18 +61,18 @@ def test_nan_is_not_hidden(package):
     assert math.isnan(Lpips()(image, np.zeros_like(image)))
 
 
-def test_images_that_the_network_cannot_halve_four_times_are_refused(package):
+def test_images_that_are_too_small_are_refused(package):
     image = np.zeros((1, 4096, 3), dtype=np.float32)
     with pytest.raises(UnsupportedError, match="at least 16x16 pixels, not 4096x1"):
         Lpips()(image, image)
 
 
 def test_images_of_different_sizes_are_refused(package):
-    with pytest.raises(InvalidViewsError, match="both be"):
+    with pytest.raises(InvalidViewsError, match="must have one shape"):
         Lpips()(np.zeros((16, 16, 3), dtype=np.float32), np.zeros((16, 17, 3), dtype=np.float32))
 
 
-def test_a_missing_package_names_the_extra(monkeypatch):
+def test_an_error_names_the_extra_if_the_package_is_missing(monkeypatch):
     monkeypatch.setitem(sys.modules, "lpips", None)
     with pytest.raises(UnsupportedError, match=r"not installed \(.*lpips.*\): pip install 'kissgs\[lpips\]'"):
         Lpips()
@@ -82,11 +82,11 @@ def test_a_missing_package_names_the_extra(monkeypatch):
     "reason",
     [
         urllib.error.URLError("Name or service not known"),
-        ConnectionResetError("reset by peer"),
+        ConnectionResetError("connection reset"),
         RuntimeError("invalid hash value"),
     ],
 )
-def test_weights_that_cannot_be_had_say_how_to_get_them(package, monkeypatch, reason):
+def test_an_error_says_how_to_get_the_weights(package, monkeypatch, reason):
     def offline(**options):
         raise reason
 

@@ -1,4 +1,4 @@
-"""PSNR and SSIM. Oracles: the textbook formula window by window in float64, and values known in closed form."""
+"""PSNR and SSIM. Reference: the textbook formula for each window in float64, and values in closed form."""
 
 import math
 import subprocess
@@ -18,31 +18,31 @@ C1, C2 = 0.01**2, 0.03**2
 
 
 def naive_ssim(image, reference):
-    """Five weighted means for each window, as Wang et al. write it; nothing but zeros beyond the border."""
+    """Return SSIM by five weighted means for each window, as in Wang et al., with zeros beyond the border."""
     profile = np.exp(-(np.arange(-5.0, 6.0) ** 2) / (2 * 1.5**2))
     window = np.outer(profile, profile)[..., None] / profile.sum() ** 2
-    x, y = (np.pad(side.astype(np.float64), ((5, 5), (5, 5), (0, 0))) for side in (image, reference))
+    x, y = (np.pad(array.astype(np.float64), ((5, 5), (5, 5), (0, 0))) for array in (image, reference))
     height, width, _ = image.shape
     values = np.empty((height, width, 3))
     for i in range(height):
         for j in range(width):
             a, b = x[i : i + 11, j : j + 11], y[i : i + 11, j : j + 11]
             mx, my, xx, yy, xy = ((window * m).sum(axis=(0, 1)) for m in (a, b, a * a, b * b, a * b))
-            likeness = (2 * mx * my + C1) * (2 * (xy - mx * my) + C2)
-            values[i, j] = likeness / ((mx**2 + my**2 + C1) * (xx - mx**2 + yy - my**2 + C2))
+            numerator = (2 * mx * my + C1) * (2 * (xy - mx * my) + C2)
+            values[i, j] = numerator / ((mx**2 + my**2 + C1) * (xx - mx**2 + yy - my**2 + C2))
     return values.mean()
 
 
-def picture(rng, height, width):
-    """Smooth with some noise, in [0, 1]."""
+def smooth_image(rng, height, width):
+    """Return a smooth image with some noise, in [0, 1]."""
     y, x = np.mgrid[:height, :width][..., None]
     wave = 0.5 + 0.4 * np.sin(x / 5 + np.arange(3)) * np.cos(y / 7)
     return np.clip(wave + 0.1 * rng.standard_normal((height, width, 3)), 0, 1).astype(np.float32)
 
 
-def pictures(height, width, seed=0):
+def image_pair(height, width, seed=0):
     rng = np.random.default_rng(seed)
-    image = picture(rng, height, width)
+    image = smooth_image(rng, height, width)
     return image, np.clip(image + 0.1 * rng.standard_normal(image.shape), 0, 1).astype(np.float32)
 
 
@@ -51,18 +51,18 @@ def pictures(height, width, seed=0):
 )
 def test_ssim_is_that_of_the_textbook(height, width):
     """Smaller than the window, and with one or several tiles in either direction."""
-    image, reference = pictures(height, width)
+    image, reference = image_pair(height, width)
     assert ssim(image, reference) == pytest.approx(naive_ssim(image, reference), abs=1e-6)
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 4096), (4096, 1)])
 def test_ssim_of_a_line(height, width):
-    image, reference = pictures(height, width)
+    image, reference = image_pair(height, width)
     assert ssim(image, reference) == pytest.approx(naive_ssim(image, reference), abs=1e-6)
 
 
-def test_ssim_keeps_its_digits_where_images_are_bright_and_flat():
-    """There the variance is a small difference of large numbers: in float32, none of its digits is right."""
+def test_ssim_of_bright_and_uniform_images_is_accurate():
+    """The variance is a small difference of large numbers: computed in float32, it would have no correct digit."""
     rng = np.random.default_rng(3)
     image = np.float32(0.9) + np.float32(0.001) * rng.standard_normal((30, 30, 3), dtype=np.float32)
     reference = image + np.float32(0.01) * rng.standard_normal((30, 30, 3), dtype=np.float32)
@@ -70,18 +70,18 @@ def test_ssim_keeps_its_digits_where_images_are_bright_and_flat():
 
 
 @pytest.mark.parametrize("value", [0.0, 0.3, 1.0, 7.0, -3.0])
-def test_equal_constant_images_score_exactly_one(value):
+def test_ssim_of_equal_constant_images_is_exactly_one(value):
     image = np.full((20, 33, 3), value, dtype=np.float32)
     assert ssim(image, image.copy()) == 1
     assert psnr(image, image.copy()) == math.inf
 
 
 def test_one_pixel_in_closed_form():
-    """Beyond it there are zeros, so that the means are w x and w y, and the moments w x² and so on."""
+    """It is surrounded by zeros, so that the means are w x and w y, and the moments w x² and so on."""
     x, y, w = 0.8, 0.5, (1 / np.exp(-(np.arange(-5.0, 6.0) ** 2) / 4.5).sum()) ** 2
-    light = (2 * w * w * x * y + C1) / (w * w * (x * x + y * y) + C1)
+    luminance = (2 * w * w * x * y + C1) / (w * w * (x * x + y * y) + C1)
     v = w - w * w
-    expected = light * (2 * v * x * y + C2) / (v * (x * x + y * y) + C2)
+    expected = luminance * (2 * v * x * y + C2) / (v * (x * x + y * y) + C2)
     images = (np.full((1, 1, 3), value, dtype=np.float32) for value in (x, y))
     assert ssim(*images) == pytest.approx(expected, abs=1e-6)
 
@@ -102,21 +102,21 @@ def test_bytes_are_255ths():
     assert psnr(image, a.astype(np.float32)) > 140
 
 
-def test_views_into_larger_arrays_will_do():
-    image, reference = pictures(40, 40)
-    whole = ssim(np.ascontiguousarray(image[::2, 5:30]), np.ascontiguousarray(reference[::2, 5:30]))
-    assert ssim(image[::2, 5:30], reference[::2, 5:30]) == whole
-    assert ssim(image[::2, 5:30].astype(np.float64), reference[::2, 5:30]) == whole
+def test_arrays_need_not_be_contiguous():
+    image, reference = image_pair(40, 40)
+    expected = ssim(np.ascontiguousarray(image[::2, 5:30]), np.ascontiguousarray(reference[::2, 5:30]))
+    assert ssim(image[::2, 5:30], reference[::2, 5:30]) == expected
+    assert ssim(image[::2, 5:30].astype(np.float64), reference[::2, 5:30]) == expected
 
 
 sizes = st.tuples(st.integers(1, 14), st.integers(1, 14), st.just(3))
 
 
 @settings(max_examples=60, deadline=None)
-@given(data=st.data(), shape=sizes, most=st.sampled_from([1.0, 100.0, 1e6, 2.0**127]))
-def test_properties(data, shape, most):
-    """Symmetric to the bit, in [-1, 1], and 1 for an image and itself, whatever a renderer may produce."""
-    values = st.floats(-most, most, width=32, allow_nan=False)
+@given(data=st.data(), shape=sizes, limit=st.sampled_from([1.0, 100.0, 1e6, 2.0**127]))
+def test_properties_of_the_metrics(data, shape, limit):
+    """SSIM is exactly symmetric, in [-1, 1], and 1 for equal images, for any values that a renderer may produce."""
+    values = st.floats(-limit, limit, width=32, allow_nan=False)
     image, reference = (data.draw(arrays(np.float32, shape, elements=values)) for _ in range(2))
     score = ssim(image, reference)
     assert -1 - 1e-6 <= score <= 1 + 1e-6
@@ -126,8 +126,8 @@ def test_properties(data, shape, most):
 
 
 @pytest.mark.parametrize("extreme", [math.inf, -math.inf, 3e38, 1e9, -1e20, 1e-40])
-def test_extreme_values_give_a_number(extreme):
-    image, reference = pictures(25, 25)
+def test_extreme_values_give_a_finite_value(extreme):
+    image, reference = image_pair(25, 25)
     image[12, 12] = extreme
     assert -1 <= ssim(image, reference) <= 1
     assert not math.isnan(psnr(image, reference))
@@ -135,7 +135,7 @@ def test_extreme_values_give_a_number(extreme):
 
 @pytest.mark.parametrize("where", [0, 1])
 def test_nan_is_not_hidden(where):
-    pair = pictures(200, 200)
+    pair = image_pair(200, 200)
     pair[where][199, 0, 1] = math.nan
     assert math.isnan(ssim(*pair))
     assert math.isnan(psnr(*pair))
@@ -146,8 +146,8 @@ def test_nan_is_not_hidden(where):
     [((4, 4, 3), (4, 5, 3)), ((4, 4, 4), (4, 4, 4)), ((4, 4), (4, 4)), ((0, 4, 3), (0, 4, 3)), ((1, 4, 4, 3),) * 2],
 )
 @pytest.mark.parametrize("metric", [psnr, ssim])
-def test_what_are_not_two_images_is_refused(metric, first, second):
-    with pytest.raises(InvalidViewsError, match=r"both be \(height, width, 3\), not \("):
+def test_images_of_different_or_invalid_shapes_are_refused(metric, first, second):
+    with pytest.raises(InvalidViewsError, match=r"must have one shape, \(height, width, 3\), not \("):
         metric(np.zeros(first, dtype=np.float32), np.zeros(second, dtype=np.float32))
 
 
@@ -156,8 +156,10 @@ def test_integers_other_than_bytes_are_refused():
         psnr(np.zeros((2, 2, 3), dtype=np.int64), np.zeros((2, 2, 3), dtype=np.int64))
 
 
-def test_threads_change_no_bit():
-    images, targets = (np.stack(side) for side in zip(pictures(140, 330), pictures(140, 330, seed=5), strict=True))
+def test_the_result_does_not_depend_on_threads():
+    images, targets = (
+        np.stack(images) for images in zip(image_pair(140, 330), image_pair(140, 330, seed=5), strict=True)
+    )
     results = []
     for threads in (1, 2, 5):
         gradient = np.full_like(images, np.nan)
@@ -168,15 +170,15 @@ def test_threads_change_no_bit():
     assert results[0] == results[1] == results[2]
 
 
-def test_the_inputs_are_left_alone():
-    pair = pictures(20, 20)
-    before = [side.copy() for side in pair]
+def test_the_inputs_are_not_changed():
+    pair = image_pair(20, 20)
+    before = [image.copy() for image in pair]
     ssim(*pair)
     psnr(*pair)
-    assert all((now == then).all() for now, then in zip(pair, before, strict=True))
+    assert all((after == image).all() for after, image in zip(pair, before, strict=True))
 
 
-def test_metrics_do_without_torch():
+def test_metrics_do_not_import_torch():
     code = "import numpy, sys; from kissgs.rendering.metrics import ssim; " \
         "ssim(*numpy.zeros((2, 4, 4, 3), numpy.float32)); sys.exit('torch' in sys.modules)"  # fmt: skip
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

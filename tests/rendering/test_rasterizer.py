@@ -1,4 +1,4 @@
-"""Oracle: reference_rasterizer, a float64 renderer that shares nothing with the one under test. On all devices."""
+"""Reference: reference_rasterizer, a float64 renderer that shares no code with the tested one. On all devices."""
 
 import numpy as np
 import pytest
@@ -36,20 +36,24 @@ def clamp_of(device):
     return alpha_max() if device == "cuda" else 0.99
 
 
-def agree(splats, view, background, device="cpu", tolerance=1e-4):
+def check_image(splats, view, background, device="cpu", tolerance=1e-4):
     images, alphas, _ = render_tensors(splats, [view], device, [background])
     expected = reference_rasterizer.draw(in_float64(splats), view, np.array(background), alpha_max=clamp_of(device))
-    sure = ~expected.doubtful
-    np.testing.assert_allclose(images[0].detach().cpu().numpy()[sure], expected.image[sure], atol=tolerance, rtol=0)
-    np.testing.assert_allclose(alphas[0].detach().cpu().numpy()[sure], expected.alpha[sure], atol=tolerance, rtol=0)
+    certain = ~expected.doubtful
+    np.testing.assert_allclose(
+        images[0].detach().cpu().numpy()[certain], expected.image[certain], atol=tolerance, rtol=0
+    )
+    np.testing.assert_allclose(
+        alphas[0].detach().cpu().numpy()[certain], expected.alpha[certain], atol=tolerance, rtol=0
+    )
     return expected
 
 
 @devices
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 60])
-def test_pictures_are_those_of_the_oracle(count, degree, device):
-    agree(blobs(count, degree, seed=count), camera(seed=count), (0.2, 0.5, 0.9), device)
+def test_images_agree_with_the_reference(count, degree, device):
+    check_image(blobs(count, degree, seed=count), camera(seed=count), (0.2, 0.5, 0.9), device)
 
 
 @settings(max_examples=40, deadline=None)
@@ -59,27 +63,27 @@ def test_pictures_are_those_of_the_oracle(count, degree, device):
     distance=st.floats(0.05, 8),
     log_scale=st.floats(-6, 0.5),
 )
-def test_pictures_are_those_of_the_oracle_whatever_the_size(seed, size, distance, log_scale):
+def test_images_of_any_size_agree_with_the_reference(seed, size, distance, log_scale):
     splats = blobs(12, seed % 4, seed=seed, log_scale=log_scale)
-    agree(splats, camera(*size, distance=distance, seed=seed), (1.0, 0.3, 0.0))
+    check_image(splats, camera(*size, distance=distance, seed=seed), (1.0, 0.3, 0.0))
 
 
 def test_needles_lose_no_digits():
-    """A footprint 4000 pixels long and half a pixel wide: the classic form of the exponent would be off by 2 %."""
+    """Footprints are 4000 pixels long and half a pixel wide: the usual form of the exponent would be wrong by 2 %."""
     needles = together(
         *(one(mean=(0, 0, 0.1 * i), quat=(1, 0.1 * i, 0.2, 0.5 * i), scale=(4, -6, -6)) for i in range(5))
     )
-    agree(needles, camera(64, 64), BLACK)
+    check_image(needles, camera(64, 64), BLACK)
 
 
-def test_an_opaque_pile_ends_where_the_oracle_ends():
+def test_pixels_behind_opaque_gaussians_end_where_those_of_the_reference_do():
     pile = together(*(one(mean=(0, 0, 0.2 * i), scale=(0, 0, 0), opacity=4.0, sh0=(i, 1, -i)) for i in range(-4, 9)))
-    expected = agree(pile, camera(), (1.0, 1.0, 1.0))
+    expected = check_image(pile, camera(), (1.0, 1.0, 1.0))
     drawn = np.sum([drawn for _, drawn, _ in expected.decisions], axis=0)
-    assert drawn.min() < 5, "some pixels end after a few of the thirteen"
+    assert drawn.min() < 5, "some pixels are complete after a few of the thirteen"
 
 
-def test_equal_depths_are_drawn_in_the_scenes_order():
+def test_gaussians_of_equal_depth_are_drawn_in_the_order_of_the_scene():
     straight = Camera(np.eye(4), np.array([[20.0, 0, 8], [0, 20.0, 8], [0, 0, 1]]), 16, 16)
     pair = [one(mean=(0, 0, 2), scale=(-1, -1, -1), opacity=1.0, sh0=colour) for colour in ((1, 0, -1), (-1, 0, 1))]
     first, _ = render(together(*pair), straight)
@@ -91,13 +95,13 @@ def test_equal_depths_are_drawn_in_the_scenes_order():
 def test_off_axis_principal_points_and_unequal_focal_lengths():
     view = camera(40, 30)
     K = np.array([[35.0, 0, 3.0], [0, 61.0, 40.0], [0, 0, 1]])
-    agree(blobs(40, 2, spread=2.0), Camera(view.viewmat, K, 40, 30), (0.1, 0.1, 0.1))
+    check_image(blobs(40, 2, spread=2.0), Camera(view.viewmat, K, 40, 30), (0.1, 0.1, 0.1))
 
 
 @devices
-def test_gradients_are_finite_differences(device):
+def test_gradients_agree_with_finite_differences(device):
     for seed, degree in enumerate([0, 1, 2, 3]):
-        compare_gradients(blobs(10, degree, seed=seed), camera(25, 19, seed=seed), device, seed)
+        check_gradients(blobs(10, degree, seed=seed), camera(25, 19, seed=seed), device, seed)
 
 
 @pytest.mark.parametrize(
@@ -114,38 +118,41 @@ def test_gradients_are_finite_differences(device):
         "transparent": (together(one(opacity=-5.4), one(opacity=-30.0), one(opacity=-6.0)), camera(21, 17)),
         "opaque": (together(one(opacity=9.0), one(mean=(0, 0, 1), scale=(0, 0, 0), opacity=30.0)), camera(21, 17)),
         "black": (together(one(sh0=(-3, 1, -3)), one(mean=(0.1, 0, 1), sh0=(1, -9, 1))), camera(21, 17)),
-        "rotations of odd lengths": (together(one(quat=(1e-3, 2e-3, 0, 0), scale=(-1, -2, -3))), camera(21, 17)),
+        "quaternions that are not normalised": (
+            together(one(quat=(1e-3, 2e-3, 0, 0), scale=(-1, -2, -3))),
+            camera(21, 17),
+        ),
     }.values(),
     ids=lambda value: "",
 )
-def test_gradients_in_hard_places(splats, view):
-    compare_gradients(splats, view, "cpu", seed=1)
+def test_gradients_of_difficult_scenes_agree_with_finite_differences(splats, view):
+    check_gradients(splats, view, "cpu", seed=1)
 
 
-def compare_gradients(splats, view, device, seed, tolerance=1e-3):
-    """Every gradient within 0.1 % of the largest of its kind of the same Gaussian, or of next to nothing."""
+def check_gradients(splats, view, device, seed, tolerance=1e-3):
+    """Check that errors are within 0.1 % of the largest gradient by the same attribute of the same Gaussian."""
     rng = np.random.default_rng(seed)
     background = rng.random(3)
     params = in_float64(splats)
     clamp = clamp_of(device)
-    sure = ~reference_rasterizer.draw(params, view, background, alpha_max=clamp).doubtful
-    v_image = rng.normal(0, 1, (view.height, view.width, 3)) * sure[:, :, None]
-    v_alpha = rng.normal(0, 1, (view.height, view.width)) * sure
+    certain = ~reference_rasterizer.draw(params, view, background, alpha_max=clamp).doubtful
+    v_image = rng.normal(0, 1, (view.height, view.width, 3)) * certain[:, :, None]
+    v_alpha = rng.normal(0, 1, (view.height, view.width)) * certain
     expected = reference_rasterizer.gradient_by_differences(params, view, background, v_image, v_alpha, alpha_max=clamp)
     images, alphas, tensors = render_tensors(splats, [view], device, [background])
     loss = (images[0].cpu() * torch.from_numpy(v_image)).sum() + (alphas[0].cpu() * torch.from_numpy(v_alpha)).sum()
     loss.backward()
     for name in ATTRIBUTES:
         found = tensors[name].grad.cpu().numpy().reshape(len(splats), -1)
-        wanted = expected[name].reshape(len(splats), -1)
-        if wanted.size:
-            size = np.abs(wanted).max(axis=1, keepdims=True)
-            error = np.abs(found - wanted) / (tolerance * size + 2e-6 * (1 + np.abs(wanted).max()))
+        reference = expected[name].reshape(len(splats), -1)
+        if reference.size:
+            size = np.abs(reference).max(axis=1, keepdims=True)
+            error = np.abs(found - reference) / (tolerance * size + 2e-6 * (1 + np.abs(reference).max()))
             assert error.max() <= 1, f"{name}: {error.max():.2f} times what is allowed"
 
 
 @devices
-def test_several_cameras_give_the_sum_of_their_gradients(device):
+def test_gradients_of_several_cameras_are_added(device):
     splats, views = blobs(20, 2), [camera(seed=1), camera(seed=2)]
     backgrounds = [[0.1, 0.2, 0.3], [1.0, 0.0, 0.5]]
     images, alphas, tensors = render_tensors(splats, views, device, backgrounds)
@@ -161,7 +168,7 @@ def test_several_cameras_give_the_sum_of_their_gradients(device):
         torch.testing.assert_close(tensor.grad, total[name], atol=1e-5, rtol=1e-4)
 
 
-def test_pictures_and_gradients_are_the_same_for_any_number_of_threads():
+def test_images_and_gradients_do_not_depend_on_threads():
     splats, view = blobs(300, 3, spread=1.5), camera(130, 70)
     results = []
     for threads in (1, 2, 3, 7):
@@ -173,7 +180,7 @@ def test_pictures_and_gradients_are_the_same_for_any_number_of_threads():
             assert torch.equal(one_thread, several)
 
 
-def test_render_is_the_same_without_torch():
+def test_render_and_rasterize_agree_exactly():
     splats, view = blobs(50, 3), camera()
     image, alpha = render(splats, view, background=(1.0, 1.0, 1.0))
     images, alphas, _ = render_tensors(splats, [view], backgrounds=[(1.0, 1.0, 1.0)])
@@ -181,20 +188,20 @@ def test_render_is_the_same_without_torch():
     assert np.array_equal(alpha, alphas[0].detach().numpy())
 
 
-def test_a_selection_with_steps_is_drawn_like_its_copy():
+def test_arrays_of_a_scene_need_not_be_contiguous():
     splats, view = blobs(40, 2), camera()
     every_other = splats.select(slice(None, None, 2))
     image, _ = render(every_other, view)
     assert np.array_equal(image, render(splats.select(np.arange(0, 40, 2)), view)[0])
 
 
-def test_the_input_is_not_changed_and_shared():
+def test_tensors_share_the_memory_of_the_scene():
     splats = blobs(5)
     tensors = tensors_of(splats)
     assert tensors["means"].data_ptr() == splats.means.ctypes.data
 
 
-def test_a_parameter_changed_before_the_way_back_is_noticed():
+def test_a_parameter_changed_before_the_backward_pass_is_an_error():
     images, _, tensors = render_tensors(blobs(5), [camera()])
     with torch.no_grad():
         tensors["means"].add_(1)
@@ -212,7 +219,7 @@ def test_tensors_need_not_be_contiguous():
 
 
 @pytest.mark.parametrize(
-    ("change", "kind", "sentence"),
+    ("change", "error", "message"),
     [
         ({"means": torch.zeros(5, 3, dtype=torch.float64)}, UnsupportedError, "float32"),
         ({"quats": torch.zeros(4, 4)}, InvalidSceneError, "quats"),
@@ -230,25 +237,25 @@ def test_tensors_need_not_be_contiguous():
         ({"viewmats": torch.zeros(0, 4, 4), "Ks": torch.zeros(0, 3, 3)}, InvalidViewsError, "no camera"),
     ],
 )
-def test_wrong_arguments_are_refused_in_one_sentence(change, kind, sentence):
+def test_invalid_arguments_are_refused(change, error, message):
     arguments = {**tensors_of(blobs(5)), "viewmats": torch.eye(4)[None], "Ks": torch.eye(3)[None], "width": 8}
-    with pytest.raises(kind, match=sentence):
+    with pytest.raises(error, match=message):
         rasterize(**{**arguments, **change}, height=8)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device here")
-def test_no_cuda_is_said_in_one_sentence():
+def test_rendering_on_cuda_without_a_device_is_refused():
     with pytest.raises(UnsupportedError, match="no CUDA device"):
         render(blobs(1), camera(), device="cuda")
 
 
-def test_loading_the_kernels_is_announced():
-    told = []
-    load_kernels(lambda stage, fraction: told.append((stage, fraction)))
-    assert told == [("kernels", 0.0), ("kernels", 1.0)]
+def test_loading_the_kernels_reports_progress():
+    events = []
+    load_kernels(lambda stage, fraction: events.append((stage, fraction)))
+    assert events == [("kernels", 0.0), ("kernels", 1.0)]
 
 
-def test_cameras_of_any_type_and_layout():
+def test_cameras_may_have_any_dtype_and_layout():
     splats, view = blobs(20), camera()
     expected, _, _ = render_tensors(splats, [view, view])
     viewmats = torch.linalg.inv(torch.linalg.inv(torch.from_numpy(view.viewmat)))[None].expand(2, 4, 4)
@@ -262,12 +269,12 @@ def test_cameras_of_any_type_and_layout():
 
 
 @pytest.mark.parametrize("background", [(1.0,), (1.0, 0.5), (0.0, 0.0, 0.0, 1.0), (0.0, float("nan"), 0.0)])
-def test_a_background_is_three_finite_numbers(background):
+def test_a_background_must_be_three_finite_numbers(background):
     with pytest.raises(InvalidViewsError, match="three finite numbers"):
         render(blobs(3), camera(), background=background)
 
 
-def test_read_only_scenes_are_drawn():
+def test_read_only_scenes_are_rendered():
     splats = blobs(10, 2)
     expected, _ = render(splats, camera())
     for name in ATTRIBUTES:
@@ -275,28 +282,28 @@ def test_read_only_scenes_are_drawn():
     assert np.array_equal(render(splats, camera())[0], expected)
 
 
-def test_too_many_in_one_tile_are_refused(monkeypatch):
+def test_too_many_gaussians_in_one_tile_are_refused(monkeypatch):
     from kissgs.rendering.cpu import lists
 
     monkeypatch.setattr(lists, "MAX_MEMBERS", 10)
-    with pytest.raises(UnsupportedError, match="meet in 16x16 pixels"):
+    with pytest.raises(UnsupportedError, match="touch the same 16x16 pixels"):
         render(blobs(50), camera())
 
 
-def test_a_picture_beyond_memory_is_refused(monkeypatch):
+def test_an_image_that_does_not_fit_into_memory_is_refused(monkeypatch):
     from kissgs.rendering.cpu import frame
 
     def no_memory(*arguments):
         raise MemoryError
 
     monkeypatch.setattr(frame, "sort_into_tiles", no_memory)
-    with pytest.raises(UnsupportedError, match="not enough memory for a picture of 37x29"):
+    with pytest.raises(UnsupportedError, match="not enough memory for an image of 37x29"):
         render(blobs(3), camera())
 
 
-def test_too_many_tiles_are_refused(monkeypatch):
+def test_too_many_pairs_of_gaussians_and_tiles_are_refused(monkeypatch):
     from kissgs.rendering.cpu import lists
 
     monkeypatch.setattr(lists, "MAX_PAIRS", 10)
-    with pytest.raises(KissgsError, match="Render it smaller"):
+    with pytest.raises(KissgsError, match="render a smaller image"):
         render(blobs(50), camera(200, 200))

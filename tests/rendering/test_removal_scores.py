@@ -1,4 +1,4 @@
-"""Oracle: the Gaussian is taken out and the scene drawn again, by reference_rasterizer and by the renderer."""
+"""Reference: the scene is rendered without the Gaussian, by reference_rasterizer and by the renderer."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from kissgs.rendering.rasterizer import removal_scores, render
 
 
 def brute_force(splats, view, background):
-    """Pictures where a decision is close are compared where it is not."""
+    """Return the scores by removal of each Gaussian, and the rendering of the whole scene."""
     params = in_float64(splats)
     whole = reference_rasterizer.draw(params, view, np.array(background))
     without = [
@@ -24,7 +24,7 @@ def brute_force(splats, view, background):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_scores_are_those_of_removal(seed):
+def test_scores_agree_with_removal(seed):
     splats, view = blobs(25, seed % 4, seed=seed, log_scale=-2), camera(seed=seed)
     expected, whole = brute_force(splats, view, (0.3, 0.6, 0.1))
     assert (whole.alpha < 0.9999).all(), "no pixel may end early here"
@@ -32,8 +32,8 @@ def test_scores_are_those_of_removal(seed):
     np.testing.assert_allclose(scores, expected, rtol=1e-5, atol=2e-6 * expected.max())
 
 
-def one_sweep(whole, count, background):
-    """The formula in float64, from the back: dC = alpha T (c - B), and B <- B + alpha (c - B)."""
+def backward_scores(whole, count, background):
+    """Return the scores by the formula, back to front in float64: dC = alpha T (c - B), and B <- B + alpha (c - B)."""
     scores, behind = np.zeros(count), np.ones((*whole.alpha.shape, 3)) * background
     for n, alpha, T, colour in reversed(whole.layers):
         change = alpha[:, :, None] * (colour - behind)
@@ -43,15 +43,15 @@ def one_sweep(whole, count, background):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_the_formula_is_that_of_removal(seed):
-    """To 6 digits and more in float64; what kernels of float32 keep of these is tested above."""
+def test_the_formula_agrees_with_removal(seed):
+    """The formula is accurate to 6 digits in float64; the float32 kernels are tested above."""
     splats, view = blobs(25, seed % 4, seed=seed, log_scale=-2), camera(seed=seed)
     expected, whole = brute_force(splats, view, (0.3, 0.6, 0.1))
-    np.testing.assert_allclose(one_sweep(whole, 25, np.array([0.3, 0.6, 0.1])), expected, rtol=1e-6, atol=1e-15)
+    np.testing.assert_allclose(backward_scores(whole, 25, np.array([0.3, 0.6, 0.1])), expected, rtol=1e-6, atol=1e-15)
 
 
-def test_on_a_real_scene_they_rank_as_removals_do(shared_data):
-    """150 Gaussians of fox, each taken out, and two of the capture's pictures drawn again without it."""
+def test_scores_of_a_real_scene_have_the_ranks_of_removals(shared_data):
+    """Each of 150 Gaussians of fox is removed, and two views of the capture are rendered without it."""
     scene = kissgs.load(shared_data / "fox" / "point_cloud.ply")
     views = [view.camera.at_most(240) for view in kissgs.load_views(shared_data / "fox").train[::20]]
     scores = removal_scores(scene, views)
@@ -67,25 +67,25 @@ def test_on_a_real_scene_they_rank_as_removals_do(shared_data):
     assert spearmanr(scores[chosen], expected).statistic > 0.999
 
 
-def test_scores_add_up_over_cameras():
+def test_scores_are_sums_over_cameras():
     splats, views = blobs(30, 2), [camera(seed=1), camera(20, 40, seed=2), camera(seed=3)]
     total = sum(removal_scores(splats, [view]) for view in views)
     np.testing.assert_allclose(removal_scores(splats, views), total, rtol=1e-12)
 
 
-def test_what_is_not_seen_scores_nothing():
+def test_the_score_of_an_invisible_gaussian_is_0():
     behind, faint, shown = one(mean=(0, 0, -50)), one(opacity=-7.0), one()
     scores = removal_scores(together(behind, faint, shown), [camera()])
     assert scores[0] == scores[1] == 0
     assert scores[2] > 0
 
 
-def test_a_gaussian_of_the_backgrounds_colour_scores_nothing():
+def test_the_score_of_a_gaussian_of_the_background_colour_is_0():
     scores = removal_scores(one(sh0=(0.5 / 0.28209479,) * 3), [camera()], background=(1.0, 1.0, 1.0))
     assert scores[0] < 1e-10
 
 
-def test_behind_an_opaque_pile_nothing_counts():
+def test_scores_behind_opaque_gaussians_are_0():
     pile = together(*(one(mean=(0, 0, 0.2 * i), scale=(2, 2, 2), opacity=9.0) for i in range(6)))
     scores = removal_scores(pile, [camera()])
     nearest = int(np.argmax(scores))
@@ -94,12 +94,12 @@ def test_behind_an_opaque_pile_nothing_counts():
 
 
 def test_the_change_is_alpha_times_the_derivative_by_alpha():
-    """With one footprint that no clamp touches: dC = alpha dC/dalpha, and dC/dlogit = alpha (1 - o) dC/dalpha."""
+    """One unclamped footprint: dC = alpha dC/dalpha, and dC/dlogit = alpha (1 - o) dC/dalpha."""
     splats, view = one(opacity=1.0, scale=(-0.5, -0.5, -0.5)), camera()
     background = (0.2, 0.9, 0.4)
     with Workers(1) as pool:
         frame = draw(splats, view, np.array(background, np.float32), pool)
-        change = frame.image - frame.background  # what its removal takes away
+        change = frame.image - frame.background  # the change by its removal, negated
         v_alpha = np.zeros(frame.transmittance.shape, np.float32)
         gradients = differentiate(frame, change, v_alpha, pool)
     opacity = 1 / (1 + np.exp(-1.0))
@@ -114,13 +114,13 @@ def test_scores_do_not_depend_on_threads():
         assert np.array_equal(first, removal_scores(splats, views, threads=threads))
 
 
-def test_progress_is_told_and_can_stop_the_work():
-    told = []
-    removal_scores(blobs(3), [camera()] * 4, progress=lambda stage, fraction: told.append((stage, fraction)))
-    assert told == [("score", fraction) for fraction in (0, 0.25, 0.5, 0.75, 1.0)]
+def test_progress_is_reported_and_may_cancel():
+    events = []
+    removal_scores(blobs(3), [camera()] * 4, progress=lambda stage, fraction: events.append((stage, fraction)))
+    assert events == [("score", fraction) for fraction in (0, 0.25, 0.5, 0.75, 1.0)]
 
     def stop(stage, fraction):
-        raise Cancelled("enough")
+        raise Cancelled("cancelled")
 
     with pytest.raises(Cancelled):
         removal_scores(blobs(3), [camera()], progress=stop)

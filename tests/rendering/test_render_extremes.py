@@ -1,4 +1,4 @@
-"""Oracle: no picture, gradient or score of finite Gaussians is NaN or infinite, whatever they are."""
+"""Images, gradients and scores of any finite Gaussians are finite."""
 
 import os
 import subprocess
@@ -35,7 +35,7 @@ sizes = st.sampled_from([(1, 1), (1, 4096), (4096, 1), (16, 16), (17, 15)])
 
 @settings(max_examples=150, deadline=None)
 @given(gaussians=st.lists(gaussian, min_size=1, max_size=9), size=sizes, seed=st.integers(0, 99))
-def test_nothing_becomes_nan_or_infinite(gaussians, size, seed):
+def test_images_gradients_and_scores_are_finite(gaussians, size, seed):
     all_is_finite(together(*gaussians), camera(*size, seed=seed))
 
 
@@ -43,25 +43,25 @@ def test_nothing_becomes_nan_or_infinite(gaussians, size, seed):
 @given(depth=st.sampled_from([0.0, 1e-9, -1e-9, 0.0099, 0.01, 0.0101, 1.0]), scale=log_scale, side=anywhere)
 def test_gaussians_on_and_behind_the_camera_plane(depth, scale, side):
     view = camera(33, 17)
-    place = view.position + view.viewmat[2, :3] * depth + view.viewmat[0, :3] * side
-    all_is_finite(one(mean=tuple(place), scale=(scale, -3, scale), quat=(1, 1, 0, 0)), view)
+    position = view.position + view.viewmat[2, :3] * depth + view.viewmat[0, :3] * side
+    all_is_finite(one(mean=tuple(position), scale=(scale, -3, scale), quat=(1, 1, 0, 0)), view)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 4096), (4096, 1)])
-def test_pictures_of_one_pixel_and_of_one_line(size):
+def test_images_of_one_pixel_and_of_one_line_are_finite(size):
     all_is_finite(blobs(200, 3, spread=2.0), camera(*size))
 
 
-def test_a_gaussian_as_large_as_the_world_is_fog_of_its_colour():
-    fog = one(scale=(30, 30, 30), opacity=0.0, sh0=(0, 1, 2))
-    images, alphas, _ = render_tensors(fog, [camera()])
+def test_a_gaussian_larger_than_the_scene_is_a_uniform_colour():
+    splats = one(scale=(30, 30, 30), opacity=0.0, sh0=(0, 1, 2))
+    images, alphas, _ = render_tensors(splats, [camera()])
     torch.testing.assert_close(alphas, torch.full_like(alphas, 0.5), atol=1e-6, rtol=0)
     expected = 0.5 * (0.5 + 0.28209479177387814 * torch.tensor([0.0, 1.0, 2.0]))
     torch.testing.assert_close(images[0], expected.expand_as(images[0]), atol=1e-6, rtol=0)
 
 
-def test_nan_in_a_parameter_that_places_a_gaussian_hides_it():
-    """Not promised (kissgs.clean removes them), but no crash either: kernels check no bounds."""
+def test_nan_in_a_parameter_does_not_crash_the_rasteriser():
+    """kissgs.clean removes NaN; kernels do not check bounds, so an invalid index would crash them."""
     good = one()
     for name in ("means", "quats", "scales", "opacities"):
         for value in (np.nan, np.inf, -np.inf):
@@ -86,13 +86,13 @@ for degree, size in enumerate(((1, 1), (33, 50), (1, 4096), (300, 7))):
     K[:2, 2] = 1e4, -1e5
     all_is_finite(blobs(40, degree, spread=9.0, log_scale=3), Camera(away.viewmat, K, *size))
     all_is_finite(together(one(scale=(30, 30, -30)), one(mean=(1e6, 0, 0), scale=(30, 2, 2))), camera(*size))
-    picture = torch.rand(size[1], size[0], 3, requires_grad=True)
-    photometric_loss(picture, torch.rand(size[1], size[0], 3)).backward()
+    image = torch.rand(size[1], size[0], 3, requires_grad=True)
+    photometric_loss(image, torch.rand(size[1], size[0], 3)).backward()
 """
 
 
 def test_kernels_stay_within_their_arrays(tmp_path):
-    """With numba's bounds checks on, in a process and with a cache of its own."""
+    """Bounds checks of numba are enabled in a separate process with a separate cache."""
     environment = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path)}
     command = [sys.executable, "-c", BOUNDS, str(Path(__file__).parents[1])]
     done = subprocess.run(command, check=False, env=environment, capture_output=True, text=True, timeout=300)

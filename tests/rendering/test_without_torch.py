@@ -1,4 +1,4 @@
-"""Oracle: a Python in which torch cannot be imported. Pictures need none; what needs it names the extra."""
+"""Rendering works without torch; functions that need it name the extra. Torch cannot be imported in the subprocess."""
 
 import subprocess
 import sys
@@ -23,6 +23,6 @@ with pytest.raises(UnsupportedError, match="cuda"):
 """
 
 
-def test_pictures_need_no_torch():
+def test_rendering_does_not_need_torch():
     done = subprocess.run([sys.executable, "-c", CODE], check=False, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr[-2000:]

@@ -190,7 +190,7 @@ def test_focus_goes_everywhere_and_is_seen(preview, service):
             break
         assert re.fullmatch(r"[2-9]px", outline), name
         seen.append(name)
-    wanted = {"open", "picture", "handle", "compare", "reset", "background", "fullscreen", "panels", "help", "thumb"}
+    wanted = {"open", "viewport", "handle", "compare", "reset", "background", "fullscreen", "panels", "help", "thumb"}
     assert wanted <= set(seen)
     assert seen.count("thumb") == 9
     assert "file" not in seen
@@ -294,7 +294,7 @@ def test_a_lost_picture_is_told(preview, service):
     tab.shown(COUNT)
     assert not tab.page.locator("#trouble").is_visible()
     tab.page.evaluate(
-        "document.querySelector('#picture').getContext('webgl2').getExtension('WEBGL_lose_context').loseContext()"
+        "document.querySelector('#viewport').getContext('webgl2').getExtension('WEBGL_lose_context').loseContext()"
     )
     tab.health_problem("graphics driver has reset", "reload the page")
     tab.drop(("b.zip", OTHER))
@@ -391,6 +391,6 @@ def test_no_scene_is_shown_under_the_name_of_another(preview, service):
     tab.choose(("second.zip", damaged.getvalue()))
     tab.health_problem("means_bytes_1.webp")
     tab.page.locator("#empty").wait_for()
-    assert not tab.page.locator("#picture").is_visible()
+    assert not tab.page.locator("#viewport").is_visible()
     tab.choose(("third.zip", ZIP))
     assert colours(tab.shown(COUNT)) > 3000

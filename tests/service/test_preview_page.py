@@ -43,7 +43,7 @@ def test_from_the_upload_to_the_picture(preview, service):
     page.get_by_label("Fast").check()
     page.get_by_role("button", name="Compress").click()
     page.get_by_role("link", name="Preview").click()
-    page.locator("#picture").wait_for()
+    page.locator("#viewport").wait_for()
     job = service.http.get("/v1/jobs", params={"limit": 1}).json()["jobs"][0]
     count = len(kissgs.decompress(service.http.get(job["links"]["result"]).content))
     picture = tab.shown(count)
@@ -72,7 +72,7 @@ def test_keys_and_mouse_move_the_camera(preview, service, job, decoded):
     tab = preview().open(service, job["id"])
     page, press = tab.page, tab.page.keyboard.press
     home = tab.shown(len(decoded))
-    page.locator("#picture").focus()
+    page.locator("#viewport").focus()
     still = tab.still_image()
     frames = page.evaluate("books().frames")
     page.wait_for_timeout(700)
@@ -90,7 +90,7 @@ def test_keys_and_mouse_move_the_camera(preview, service, job, decoded):
         assert least < red(tab.still_image()) / red(still) < most, key
         press("r")
     assert looks_like(tab.still_image(), still) > 60
-    middle = page.locator("#picture").bounding_box()
+    middle = page.locator("#viewport").bounding_box()
     at = (middle["x"] + middle["width"] / 2, middle["y"] + middle["height"] / 2)
     page.mouse.move(*at)
     page.mouse.wheel(0, -300)
@@ -112,7 +112,7 @@ def test_panels_can_be_hidden_and_keys_are_listed(preview, service, job, decoded
     tab = preview().open(service, job["id"])
     page = tab.page
     narrow = tab.shown(len(decoded))
-    page.locator("#picture").focus()
+    page.locator("#viewport").focus()
     page.keyboard.press("h")
     assert not page.locator("#panel").is_visible()
     assert page.locator("#panels").get_attribute("aria-pressed") == "true"
@@ -121,7 +121,7 @@ def test_panels_can_be_hidden_and_keys_are_listed(preview, service, job, decoded
     assert colours(wide) > 5000
     page.locator("#panels").click()
     assert page.locator("#panel").is_visible()
-    page.locator("#picture").focus()
+    page.locator("#viewport").focus()
     page.keyboard.press("?")
     assert page.get_by_role("dialog").get_by_text("Reset the view").is_visible()
     page.keyboard.press("Escape")
@@ -171,7 +171,7 @@ def test_comparing_with_the_original(preview, service, job, decoded):
     left, right = np.s_[60:-80, 20 : int(0.25 * width) - 30], np.s_[60:-80, int(0.25 * width) + 30 : -20]
     assert looks_like(both[left], original[left]) > 60
     assert looks_like(both[right], compressed[right]) > 60
-    page.locator("#picture").focus()
+    page.locator("#viewport").focus()
     page.keyboard.press("ArrowLeft")  # both turn
     turned = tab.still_image()
     assert looks_like(turned[left], both[left]) < 45
@@ -279,7 +279,7 @@ def test_a_damaged_file_is_named(preview, service, job, file, damage):
     tab.open(service, job["id"])
     tab.health_problem(file, *(() if damage else ("404",)))
     tab.page.locator("#loading").wait_for(state="hidden")
-    assert tab.page.locator("#picture:visible, #empty:visible").count() == 1
+    assert tab.page.locator("#viewport:visible, #empty:visible").count() == 1
     if damage is None:
         tab.forgive("^404 ", "Failed to load resource.*404")
     tab.page.get_by_role("button", name="Dismiss").click()
@@ -333,7 +333,7 @@ def test_without_places_there_is_no_picture(preview, service, job, file):
     tab.health_problem(file)
     tab.page.locator("#empty").wait_for()
     tab.page.wait_for_timeout(300)
-    assert not tab.page.locator("#picture").is_visible()
+    assert not tab.page.locator("#viewport").is_visible()
     assert tab.page.locator("#planes .thumb").count() == (0 if file.startswith("active") else 8)
 
 
@@ -382,7 +382,7 @@ def test_one_finger_orbits(preview, service, job, decoded):
     tab = preview(viewport={"width": 390, "height": 780}, has_touch=True, is_mobile=True).open(service, job["id"])
     before = tab.shown(len(decoded))
     assert tab.page.evaluate("document.documentElement.scrollWidth") <= 390
-    box = tab.page.locator("#picture").bounding_box()
+    box = tab.page.locator("#viewport").bounding_box()
     x, y = box["x"] + 150, box["y"] + box["height"] / 2
     finger = tab.context.new_cdp_session(tab.page)
     for kind, points in (

@@ -93,7 +93,7 @@ def test_what_goes_wrong_here_is_told(service, scene, tmp_path):
 def test_a_service_that_is_not_there(scene, tmp_path, monkeypatch):
     from kissgs.client import remote
 
-    monkeypatch.setattr(remote, "PATIENCE_SECONDS", 1.0)
+    monkeypatch.setattr(remote, "RETRY_SECONDS", 1.0)
     with socket.socket() as nobody:
         nobody.bind(("127.0.0.1", 0))
         url = f"http://127.0.0.1:{nobody.getsockname()[1]}"

@@ -1,4 +1,4 @@
-/** Does the jobs on standard input, one after the other; writes a line of JSON for each. */
+/** Performs the jobs on standard input, one after the other; writes a line of JSON for each. */
 
 import { readFileSync } from "node:fs";
 import { perform } from "./scene_jobs.mjs";

@@ -1,4 +1,4 @@
-/** Decodes many WebP files that lie in one, as a job on standard input says; writes a line of JSON for each. */
+/** Decodes WebP files that are concatenated in one file, by a job on standard input; writes a line of JSON for each. */
 
 import { createHash } from "node:crypto";
 import { readFileSync } from "node:fs";
@@ -9,17 +9,17 @@ const blob = readFileSync(process.argv[2]);
 const lines = [];
 let at = 0;
 for (const size of sizes) {
-  const begun = performance.now();
+  const start = performance.now();
   let line;
   try {
     const { width, height, rgba } = decodeWebP(blob.subarray(at, at + size), { maxPixels });
-    const ms = performance.now() - begun;
+    const ms = performance.now() - start;
     if (!(rgba instanceof Uint8Array) || rgba.length !== 4 * width * height) throw new Error("pixels of another size");
     line = { width, height, sha256: createHash("sha256").update(rgba).digest("hex"), ms };
     if (pixels) line.rgba = Buffer.from(rgba).toString("base64");
   } catch (error) {
     line = { name: error instanceof WebPError ? error.name : `not a WebPError: ${error.stack}`, error: error.message };
-    line.ms = performance.now() - begun;
+    line.ms = performance.now() - start;
   }
   lines.push(JSON.stringify(line));
   at += size;

@@ -1,4 +1,4 @@
-/** CRC-32, zips and WebP at many places of larger buffers, as a job on standard input says. */
+/** Computes CRC-32 and reads zips and WebP files at several offsets of larger buffers, by a job on standard input. */
 
 import { createHash } from "node:crypto";
 import { readFileSync } from "node:fs";
@@ -27,7 +27,6 @@ console.log(
     crcs: views.map(([at, length]) => crc32(bytes.subarray(at, at + length))),
     buffers: views.map(([at, length]) => crc32(Buffer.from(bytes.buffer, at, length))),
     files,
-    pictures:
-      webp && Array.from({ length: 9 }, (_, by) => sha(decodeWebP(moved(Buffer.from(webp, "base64"), by)).rgba)),
+    images: webp && Array.from({ length: 9 }, (_, by) => sha(decodeWebP(moved(Buffer.from(webp, "base64"), by)).rgba)),
   }),
 );

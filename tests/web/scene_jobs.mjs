@@ -1,4 +1,4 @@
-/** Decodes containers as jobs say, and tells all that happened as JSON; the same in Node, in pages and in workers. */
+/** Decodes containers by jobs, and reports results and events as JSON; used in Node.js, in pages and in workers. */
 
 import { decode, expandSH } from "../../web_decoder/sogxt.js";
 
@@ -11,7 +11,7 @@ const toBase64 = (array) => {
   return btoa(text);
 };
 
-/** What `decode` may be given: an address, or bytes in several shapes. */
+/** Return a source for `decode`: an address, or bytes in one of several types. */
 function sourceOf({ url, base64, as = "bytes" }) {
   if (url) return as === "URL" ? new URL(url) : url;
   const bytes = Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
@@ -20,43 +20,43 @@ function sourceOf({ url, base64, as = "bytes" }) {
   return { bytes, buffer: bytes.buffer, blob: new Blob([bytes]), within: shifted.subarray(3, 3 + bytes.length) }[as];
 }
 
-/** One decode; never rejects. */
+/** Perform one job; never rejects. */
 export async function perform({ source, options = {}, abort, snapshots, throwAt }) {
-  const said = { progress: [], order: [], snapshots: {} };
+  const report = { progress: [], order: [], snapshots: {} };
   const stop = new AbortController();
   if (abort === "before") stop.abort();
-  if (abort === "reason") stop.abort(new RangeError("enough"));
+  if (abort === "reason") stop.abort(new RangeError("a reason"));
   if (abort?.after) setTimeout(() => stop.abort(), abort.after);
-  const begun = performance.now();
+  const start = performance.now();
   try {
     const scene = await decode(sourceOf(source), {
       ...options,
       ...(abort && { signal: stop.signal }),
-      onProgress: (progress) => said.progress.push(progress),
+      onProgress: (progress) => report.progress.push(progress),
       onPlane: (file, partial) => {
-        said.order.push(file);
+        report.order.push(file);
         if (snapshots?.includes(file)) {
-          said.snapshots[file] = Object.fromEntries(FIELDS.map((field) => [field, toBase64(partial[field])]));
+          report.snapshots[file] = Object.fromEntries(FIELDS.map((field) => [field, toBase64(partial[field])]));
         }
         if (abort?.at === file) stop.abort();
         if (throwAt === file) throw new Error("thrown by the caller");
       },
     });
     const { count, degree, gridSide, codebookSide, sizes, meta } = scene;
-    Object.assign(said, { count, degree, gridSide, codebookSide, sizes, meta });
-    said.types = Object.fromEntries(FIELDS.map((field) => [field, scene[field].constructor.name]));
-    said.arrays = Object.fromEntries(
+    Object.assign(report, { count, degree, gridSide, codebookSide, sizes, meta });
+    report.types = Object.fromEntries(FIELDS.map((field) => [field, scene[field].constructor.name]));
+    report.arrays = Object.fromEntries(
       [...FIELDS.map((f) => [f, scene[f]]), ["shN", expandSH(scene)]].map(([f, a]) => [f, toBase64(a)]),
     );
-    said.planes = Object.fromEntries(
+    report.planes = Object.fromEntries(
       Object.entries(scene.planes).map(([file, { width, height, rgba }]) => [file, [width, height, toBase64(rgba)]]),
     );
   } catch (error) {
-    said.error = { name: error.name, message: error.message, stack: String(error.stack), cause: String(error.cause) };
+    report.error = { name: error.name, message: error.message, stack: String(error.stack), cause: String(error.cause) };
   }
-  said.ms = performance.now() - begun;
-  said.ended = said.order.length;
+  report.ms = performance.now() - start;
+  report.ended = report.order.length;
   await new Promise((resolve) => setTimeout(resolve, abort ? 50 : 0));
-  said.later = said.order.length - said.ended;
-  return said;
+  report.later = report.order.length - report.ended;
+  return report;
 }

@@ -1,4 +1,4 @@
-/** Does a job inside a worker of a page. */
+/** Performs a job in a worker of a page. */
 
 import { perform } from "./scene_jobs.mjs";
 

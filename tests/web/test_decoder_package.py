@@ -1,4 +1,4 @@
-"""The npm package of the decoder: types, size, contents; oracles: TypeScript's compiler, gzip, npm."""
+"""The npm package of the decoder: types, size, contents; reference: TypeScript's compiler, gzip, npm."""
 
 import gzip
 import json
@@ -12,7 +12,7 @@ from helpers.web_tools import DECODER, node, run_node
 import kissgs
 
 PARTS = ("webp.js", "sogxt.js", "zip.js")
-MOST_BYTES = 12_000
+MAX_BYTES = 12_000
 
 AGREE = """
 import * as main from "./web_decoder/sogxt.js";
@@ -20,7 +20,7 @@ import * as webp from "./web_decoder/webp.js";
 import type * as mainTypes from "./declared/types.js";
 import type * as webpTypes from "./declared/webp.js";
 
-// What is declared is what there is, and the other way round.
+// Declarations and code agree in both directions.
 const decode: typeof mainTypes.decode = main.decode;
 const declaredDecode: typeof main.decode = null! as typeof mainTypes.decode;
 const expandSH: typeof mainTypes.expandSH = main.expandSH;
@@ -30,11 +30,11 @@ const decodeWebP: typeof webpTypes.decodeWebP = webp.decodeWebP;
 const declaredDecodeWebP: typeof webp.decodeWebP = null! as typeof webpTypes.decodeWebP;
 const WebPError: typeof webpTypes.WebPError = webp.WebPError;
 const error: Error = new SogxtError("x");
-const notMore: never[] = [] as Exclude<keyof typeof main, keyof typeof mainTypes>[];
-const notLess: never[] = [] as Exclude<keyof typeof mainTypes, keyof typeof main>[];
-const notMoreWebP: never[] = [] as Exclude<keyof typeof webp, keyof typeof webpTypes>[];
+const undeclared: never[] = [] as Exclude<keyof typeof main, keyof typeof mainTypes>[];
+const missing: never[] = [] as Exclude<keyof typeof mainTypes, keyof typeof main>[];
+const undeclaredWebP: never[] = [] as Exclude<keyof typeof webp, keyof typeof webpTypes>[];
 
-// As users write it.
+// Typical use.
 const scene = await decode(new URL("https://localhost/scene/"), {
   signal: AbortSignal.timeout(1),
   request: { headers: { Authorization: "x" } },
@@ -67,7 +67,7 @@ def test_types_of_the_code():
 
 
 def test_declarations_agree_with_the_code(tmp_path):
-    """Declarations lie apart from the code here, so that neither hides the other."""
+    """Declarations and code are in different folders here, so that neither hides the other."""
     (tmp_path / "web_decoder").mkdir()
     (tmp_path / "declared").mkdir()
     for path in DECODER.glob("*.js"):
@@ -81,26 +81,29 @@ def test_declarations_agree_with_the_code(tmp_path):
     compile_types("--project", str(tmp_path))
 
 
-def test_what_is_exported():
+def test_exports():
     program = "import * as m from '%s'; console.log(JSON.stringify(Object.keys(m)))"
-    for name, wanted in (("sogxt.js", ["SogxtError", "decode", "expandSH"]), ("webp.js", ["WebPError", "decodeWebP"])):
-        said = subprocess.run(
+    for name, expected in (
+        ("sogxt.js", ["SogxtError", "decode", "expandSH"]),
+        ("webp.js", ["WebPError", "decodeWebP"]),
+    ):
+        output = subprocess.run(
             [node(), "--input-type=module", "-e", program % (DECODER / name).as_uri()],
             capture_output=True,
             text=True,
             check=True,
             timeout=60,
         ).stdout
-        assert json.loads(said) == wanted
+        assert json.loads(output) == expected
 
 
 def test_size():
-    """Compressed as servers do, before any minifier."""
-    assert sum(len(gzip.compress((DECODER / name).read_bytes(), 9)) for name in PARTS) < MOST_BYTES
+    """Files are compressed by gzip and not minified."""
+    assert sum(len(gzip.compress((DECODER / name).read_bytes(), 9)) for name in PARTS) < MAX_BYTES
 
 
 def test_package():
-    """All that the code imports, and nothing else; the paths that are promised exist."""
+    """The package has all files that the code imports and no others; all exported paths exist."""
     npm = shutil.which("npm")
     if npm is None:
         pytest.skip("no npm on the PATH")
@@ -127,8 +130,8 @@ def test_package():
     assert not package.get("dependencies")
 
 
-def test_the_package_by_its_names(tmp_path):
-    """As installed: ``kissgs`` and ``kissgs/webp``; inner files are not to be had."""
+def test_imports_of_the_installed_package(tmp_path):
+    """The installed package exports ``kissgs`` and ``kissgs/webp``; internal files cannot be imported."""
     package = tmp_path / "node_modules" / "kissgs"
     package.mkdir(parents=True)
     for name in [*json.loads((DECODER / "package.json").read_text())["files"], "package.json"]:

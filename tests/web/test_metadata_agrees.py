@@ -1,4 +1,4 @@
-"""``meta.json``, damaged or odd: JavaScript and Python refuse the same, and read the rest alike."""
+"""Damaged or odd ``meta.json``: JavaScript and Python refuse the same texts, and read the others alike."""
 
 import copy
 import json
@@ -16,7 +16,7 @@ IMAGES = {name: data for name, data in FILES.items() if name.endswith(".webp")}
 
 
 def in_python(text):
-    """The sentence of the refusal, or None."""
+    """Return the error message of Python's decoder, or None."""
     try:
         decompress({**IMAGES, "meta.json": text})
     except KissgsError as error:
@@ -24,16 +24,16 @@ def in_python(text):
     return None
 
 
-def agree(texts):
-    """What each decoder says of each text; asserts that they agree. Returns Python's sentences."""
+def check_agreement(texts):
+    """Check that both decoders accept and refuse the same texts; return Python's error messages."""
     found = in_node(*(job({**IMAGES, "meta.json": text}) for text in texts))
-    sentences = [in_python(text) for text in texts]
-    for text, said, sentence in zip(texts, found, sentences, strict=True):
-        assert said.get("error", {"name": "SogxtError"})["name"] == "SogxtError"
-        assert ("error" in said) == (sentence is not None), (text[:300], said.get("error"), sentence)
-        if sentence is None:
-            assert assert_scene(said, {**IMAGES, "meta.json": text}) <= 1
-    return sentences
+    messages = [in_python(text) for text in texts]
+    for text, report, message in zip(texts, found, messages, strict=True):
+        assert report.get("error", {"name": "SogxtError"})["name"] == "SogxtError"
+        assert ("error" in report) == (message is not None), (text[:300], report.get("error"), message)
+        if message is None:
+            assert assert_scene(report, {**IMAGES, "meta.json": text}) <= 1
+    return messages
 
 
 def odd(change):
@@ -46,19 +46,19 @@ def odd(change):
 @pytest.mark.parametrize("accepted", [True, False])
 def test_odd_metadata(accepted):
     rows = [row for row in ODD if row.accepted == accepted]
-    sentences = agree([odd(row.change) for row in rows])
-    for row, sentence in zip(rows, sentences, strict=True):
-        assert (sentence is None) == accepted, (row.name, sentence)
+    messages = check_agreement([odd(row.change) for row in rows])
+    for row, message in zip(rows, messages, strict=True):
+        assert (message is None) == accepted, (row.name, message)
 
 
 def test_odd_spellings():
     meta = json.loads(FILES["meta.json"])
-    sentences = agree([spell(copy.deepcopy(meta)) for spell, _ in SPELLINGS])
-    assert [sentence is None for sentence in sentences] == [accepted for _, accepted in SPELLINGS]
+    messages = check_agreement([spell(copy.deepcopy(meta)) for spell, _ in SPELLINGS])
+    assert [message is None for message in messages] == [accepted for _, accepted in SPELLINGS]
 
 
-def test_no_changed_byte_makes_another_scene():
-    """Every bit of every byte, and some bytes instead."""
+def test_no_changed_byte_changes_the_scene():
+    """Each bit of each byte is flipped, and each byte is replaced by some others."""
     text = FILES["meta.json"].decode("ascii")
     found = json.loads(run_node("damage_metadata.mjs", text))
     assert found["other"] == []

@@ -1,4 +1,4 @@
-"""Containers decoded by JavaScript in Node; oracles: Pillow for levels, kissgs' Python decoder for values."""
+"""Containers in Node.js; reference: Pillow for levels, kissgs' Python decoder for values."""
 
 import json
 import zipfile
@@ -25,8 +25,8 @@ import kissgs
 
 PRESETS = ("fast", "balanced", "small", "paper")
 COUNTS = (0, 1, 7, 8, 9, 63, 64, 65, 1000)
-WORST = 1
-"""Ulps between values of JavaScript and of Python: both compute in float64, and round once."""
+MAX_ULPS = 1
+"""Largest difference of values of JavaScript and Python, ulps: both compute in float64 and round once."""
 
 
 @pytest.fixture(scope="module")
@@ -41,10 +41,10 @@ def site():
 def test_every_preset_degree_and_count(preset, degree):
     files = [container(preset, degree, count) for count in COUNTS]
     found = in_node(*(job(some, options={"keepPlanes": True}) for some in files))
-    for said, some in zip(found, files, strict=True):
-        assert sorted(said["planes"]) == sorted(IMAGES)
-        assert assert_scene(said, some) <= WORST
-        assert_progress(said)
+    for report, some in zip(found, files, strict=True):
+        assert sorted(report["planes"]) == sorted(IMAGES)
+        assert assert_scene(report, some) <= MAX_ULPS
+        assert_progress(report)
 
 
 def extremes():
@@ -74,7 +74,7 @@ def test_extreme_values(preset):
         dict(kissgs.compress(scene, settings=kissgs.Settings(preset=preset)).files) for scene in extremes().values()
     ]
     found = in_node(*(job(some) for some in files))
-    assert max(assert_scene(said, some) for said, some in zip(found, files, strict=True)) <= WORST
+    assert max(assert_scene(report, some) for report, some in zip(found, files, strict=True)) <= MAX_ULPS
 
 
 def test_every_kind_of_source(site):
@@ -96,9 +96,9 @@ def test_every_kind_of_source(site):
         job(f"{site.url}/x/scene.zip?a/"),
         {"source": {"url": address, "as": "URL"}},
     )
-    for said in found:
-        assert assert_scene(said, files) <= WORST
-        assert_progress(said)
+    for report in found:
+        assert assert_scene(report, files) <= MAX_ULPS
+        assert_progress(report)
     assert found[9]["progress"][-1]["received"] == sum(len(files[name]) for name in (*IMAGES, "meta.json"))
     assert found[12]["progress"][-1]["received"] == len(zipped(files))
 
@@ -106,40 +106,40 @@ def test_every_kind_of_source(site):
 def test_requests_are_made_as_asked(site):
     address = site.put("private", container())
     site.received.clear()
-    (said,) = in_node(job(address, options={"request": {"headers": {"Authorization": "Bearer x"}}}))
-    assert assert_scene(said, container()) <= WORST
+    (report,) = in_node(job(address, options={"request": {"headers": {"Authorization": "Bearer x"}}}))
+    assert assert_scene(report, container()) <= MAX_ULPS
     assert len(site.received) == 10
     assert {key for _, key in site.received} == {"Bearer x"}
 
 
-def test_without_checksums_and_names_of_kind():
-    """As other encoders leave it: no word of ours, no version, no format."""
+def test_containers_of_other_encoders():
+    """They have no block "kissgs", no version and no format."""
     files = without_checksums(container())
     bare = with_meta(files, lambda meta: [meta.pop(key) for key in ("format", "version", "profile")])
-    for said, some in zip(in_node(job(files), job(bare)), (files, bare), strict=True):
-        assert assert_scene(said, some) <= WORST
+    for report, some in zip(in_node(job(files), job(bare)), (files, bare), strict=True):
+        assert assert_scene(report, some) <= MAX_ULPS
 
 
-def test_images_in_the_worst_order(site):
-    """The mask last, low bytes first; the order in which they are told is right all the same."""
+def test_images_that_arrive_in_the_worst_order(site):
+    """The mask arrives last, low bytes first; ``onPlane`` is called in the documented order nevertheless."""
     files = container(count=1000)
     address = site.put("late", files)
     for i, name in enumerate(("means_bytes_0", "f_rest_labels", "means_bytes_1", "active_mask")):
         site.late[f"/late/{name}.webp"] = 0.05 * (i + 1)
-    (said,) = in_node(job(address))
-    assert assert_scene(said, files) <= WORST
-    assert_progress(said)
+    (report,) = in_node(job(address))
+    assert assert_scene(report, files) <= MAX_ULPS
+    assert_progress(report)
 
 
-def test_what_is_known_until_now_is_in_the_scene(site):
-    """After the mask: neutral. After the high bytes: positions from their levels, 128 for the low ones."""
+def test_the_scene_has_the_values_of_decoded_images(site):
+    """After the mask, values are neutral; after the high bytes, positions have low bytes of 128."""
     files = container(count=1000, degree=1)
     address = site.put("coarse", files)
     site.late["/coarse/means_bytes_0.webp"] = 0.3
-    (said,) = in_node(job(address, snapshots=["active_mask.webp", "means_bytes_1.webp"]))
-    assert_progress(said)
-    assert assert_scene(said, files) <= WORST
-    neutral = {name: array_of(text, name) for name, text in said["snapshots"]["active_mask.webp"].items()}
+    (report,) = in_node(job(address, snapshots=["active_mask.webp", "means_bytes_1.webp"]))
+    assert_progress(report)
+    assert assert_scene(report, files) <= MAX_ULPS
+    neutral = {name: array_of(text, name) for name, text in report["snapshots"]["active_mask.webp"].items()}
     assert (neutral["quats"].reshape(-1, 4) == [1, 0, 0, 0]).all()
     assert {name: len(array) for name, array in neutral.items() if name != "centroids"} == {
         **dict.fromkeys(("means", "scales", "sh0"), 3000),
@@ -151,14 +151,14 @@ def test_what_is_known_until_now_is_in_the_scene(site):
     low, high = float(np.float32(meta["mins"])), float(np.float32(meta["maxs"]))
     levels = pillow(files["means_bytes_1.webp"])[:, :, :3].reshape(-1, 3).astype(np.int64) * 256 + 128
     logs = low + (levels - levels.min()) / (levels.max() - levels.min()) * (high - low)
-    wanted = (np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32)[neutral["cells"]]
-    coarse = array_of(said["snapshots"]["means_bytes_1.webp"]["means"], "means")
-    assert ulps(coarse, wanted.ravel()) <= WORST
-    assert (coarse != array_of(said["arrays"]["means"], "means")).any()
+    expected = (np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32)[neutral["cells"]]
+    coarse = array_of(report["snapshots"]["means_bytes_1.webp"]["means"], "means")
+    assert ulps(coarse, expected.ravel()) <= MAX_ULPS
+    assert (coarse != array_of(report["arrays"]["means"], "means")).any()
 
 
-def test_stopping(site):
-    """Before, amid, for a reason, while waiting; the signal's reason is thrown, and no more is told."""
+def test_aborting(site):
+    """Aborted before, during and while waiting: the signal's reason is thrown, and no callback follows."""
     files = container()
     address = site.put("slow", files)
     site.late["/slow/f_dc.webp"] = 1.0
@@ -170,35 +170,35 @@ def test_stopping(site):
         job(files, abort={"at": "f_dc.webp"}),
         job(address, abort={"at": "active_mask.webp"}),
     )
-    names = [said["error"]["name"] for said in found]
+    names = [report["error"]["name"] for report in found]
     assert names == ["AbortError", "AbortError", "RangeError", "AbortError", "AbortError", "AbortError"]
-    assert all(said["later"] == 0 for said in found)
-    assert all(said["ms"] < 900 for said in found)
-    assert [said["order"] for said in found[:3]] == [[], [], []]
+    assert all(report["later"] == 0 for report in found)
+    assert all(report["ms"] < 900 for report in found)
+    assert [report["order"] for report in found[:3]] == [[], [], []]
 
 
-def test_what_the_caller_throws_ends_the_work():
-    (said,) = in_node(job(container(), throwAt="f_dc.webp"))
-    assert (said["error"]["name"], said["error"]["message"]) == ("Error", "thrown by the caller")
-    assert said["later"] == 0
+def test_an_error_of_a_callback_ends_decoding():
+    (report,) = in_node(job(container(), throwAt="f_dc.webp"))
+    assert (report["error"]["name"], report["error"]["message"]) == ("Error", "thrown by the caller")
+    assert report["later"] == 0
 
 
-def test_without_workers_others_have_their_turn():
-    """A timer fires between images, so that work can be ended and a page can show how far it is."""
+def test_without_workers_the_event_loop_runs_between_images():
+    """A timer fires between images, so that decoding can be aborted and a page can show progress."""
     data = container(count=20_000)
     (whole,) = in_node(job(data))
-    (said,) = in_node(job(data, abort={"after": 1}))
+    (report,) = in_node(job(data, abort={"after": 1}))
     assert whole["ended"] == len(IMAGES)
-    assert said["error"]["name"] == "AbortError"
-    assert said["ended"] < len(IMAGES)
+    assert report["error"]["name"] == "AbortError"
+    assert report["ended"] < len(IMAGES)
 
 
-def test_what_is_whole_is_shown_beside_what_is_damaged():
+def test_intact_images_are_decoded_beside_damaged_ones():
     files = container()
     damaged = {**files, "f_dc.webp": files["f_dc.webp"][:-20], "scales.webp": b"RIFF"}
-    (said,) = in_node(job(damaged))
-    assert said["error"]["message"].startswith("f_dc.webp: cut off")
-    assert set(said["order"]) == set(IMAGES) - {"f_dc.webp", "scales.webp"}
+    (report,) = in_node(job(damaged))
+    assert report["error"]["message"].startswith("f_dc.webp: cut off")
+    assert set(report["order"]) == set(IMAGES) - {"f_dc.webp", "scales.webp"}
 
 
 @pytest.mark.parametrize("preset", ["balanced"])
@@ -206,6 +206,6 @@ def test_a_real_scene(shared_data, preset):
     files = dict(
         kissgs.compress(next((shared_data / "fox").glob("*.ply")), settings=kissgs.Settings(preset=preset)).files
     )
-    (said,) = in_node(job(files, options={"keepPlanes": True}))
-    assert assert_scene(said, files) <= WORST
-    assert_progress(said)
+    (report,) = in_node(job(files, options={"keepPlanes": True}))
+    assert assert_scene(report, files) <= MAX_ULPS
+    assert_progress(report)

@@ -1,4 +1,4 @@
-"""Containers that are damaged, impossible or too large; oracle: what was done to them, which the error must name."""
+"""Containers that are damaged, invalid or too large; the error must name what was done to them."""
 
 import io
 import json
@@ -23,11 +23,11 @@ def site():
 
 def refusals(*jobs):
     found = in_node(*jobs)
-    for said in found:
-        assert said.get("error", {}).get("name") == "SogxtError", said.get("error", "was decoded")
-        assert "\n" not in said["error"]["message"]
-        assert said["later"] == 0
-    return [said["error"]["message"] for said in found]
+    for report in found:
+        assert report.get("error", {}).get("name") == "SogxtError", report.get("error", "was decoded")
+        assert "\n" not in report["error"]["message"]
+        assert report["later"] == 0
+    return [report["error"]["message"] for report in found]
 
 
 def without(name):
@@ -36,17 +36,17 @@ def without(name):
 
 @pytest.mark.parametrize("name", ["meta.json", "active_mask.webp", "f_rest_centroids.webp", "means_bytes_0.webp"])
 def test_a_missing_file(name, site):
-    zip_says, folder_says = refusals(
+    from_zip, from_folder = refusals(
         job(without(name)), job(site.put(f"without {name}".replace(" ", "-"), without(name)))
     )
-    assert zip_says == f"this is no SOG-XT container: it has no {name}"
-    assert folder_says == f"{name} cannot be fetched: the server answers 404"
+    assert from_zip == f"this is no SOG-XT container: it has no {name}"
+    assert from_folder == f"{name} cannot be fetched: the server answers with status 404"
 
 
 def test_no_server_and_no_address():
-    nowhere, nothing = refusals(job("http://127.0.0.1:1/scene/"), job("no address"))
-    assert nowhere.startswith("meta.json cannot be fetched")
-    assert nothing
+    no_server, no_address = refusals(job("http://127.0.0.1:1/scene/"), job("no address"))
+    assert no_server.startswith("meta.json cannot be fetched")
+    assert no_address
 
 
 def flipped(data, bit):
@@ -57,26 +57,26 @@ def flipped(data, bit):
 
 @pytest.mark.parametrize("name", [name for name in FILES if name.endswith(".webp")])
 def test_a_damaged_image_is_named(name):
-    """Any bit of the stream: it cannot be decoded, or the checksum of the pixels tells."""
+    """Any flipped bit of the stream makes it undecodable, or changes the checksum of the pixels."""
     data = FILES[name]
     bits = np.random.default_rng(0).integers(25 * 8, (len(data) - 2) * 8, 12)
     damaged = [{**FILES, name: flipped(data, int(bit))} for bit in bits]
     same = [(pixels := pillow(some[name])) is not None and (pixels == pillow(data)).all() for some in damaged]
     found = in_node(*map(job, damaged))
-    for said, harmless in zip(found, same, strict=True):
+    for report, harmless in zip(found, same, strict=True):
         if not harmless:
-            assert said["error"]["name"] == "SogxtError"
-            assert said["error"]["message"].startswith(f"{name}: ")
+            assert report["error"]["name"] == "SogxtError"
+            assert report["error"]["message"].startswith(f"{name}: ")
 
 
-def test_other_pixels_are_noticed_by_the_checksum_alone():
+def test_changed_pixels_are_detected_by_the_checksum():
     pixels = pillow(FILES["f_dc.webp"]).copy()
     pixels[0, 0, 0] ^= 1
     files = {**FILES, "f_dc.webp": webp(pixels[:, :, :3])}
     (error,) = refusals(job(files))
-    assert error == "f_dc.webp: damaged: other pixels than were stored"
-    (said,) = in_node(job(without_checksums(files)))
-    assert "error" not in said
+    assert error == "f_dc.webp: damaged: its pixels do not match their checksum"
+    (report,) = in_node(job(without_checksums(files)))
+    assert "error" not in report
 
 
 def test_images_of_another_size_or_kind():
@@ -93,13 +93,13 @@ def test_images_of_another_size_or_kind():
     )
     for error, why in zip(
         found,
-        ("8 x 8 pixels, not 16 x 16", "16000000 pixels|4000 x 4000", "lossy", "no WebP", "cut off", "1000000"),
+        ("8 x 8 pixels, not 16 x 16", "16000000 pixels|4000 x 4000", "lossy", "not a WebP", "cut off", "1000000"),
         strict=True,
     ):
         assert any(part in error for part in why.split("|")), error
 
 
-def test_a_mask_that_marks_others():
+def test_a_mask_with_another_count():
     mask = pillow(FILES["active_mask.webp"])[:, :, 0]
     cell = np.argwhere(mask)[0]
     mask = mask.copy()
@@ -109,19 +109,19 @@ def test_a_mask_that_marks_others():
 
 
 def test_labels_outside_the_codebook():
-    """The last entry is well, the one behind it is not, however it is written."""
+    """The last entry is valid; the next one is not, by column or by row."""
     side = json.loads(FILES["meta.json"])["shN"]["centroidSide"]
     jobs = []
-    for place in ((side - 1, side - 1), (0, side), (side, side - 1), (255, 255)):
+    for position in ((side - 1, side - 1), (0, side), (side, side - 1), (255, 255)):
         labels = pillow(FILES["f_rest_labels.webp"])[:, :, :3].copy()
-        labels[2, 3, :2] = place
+        labels[2, 3, :2] = position
         jobs.append(job(without_checksums({**FILES, "f_rest_labels.webp": webp(labels)})))
     assert "error" not in in_node(jobs[0])[0]
     assert set(refusals(*jobs[1:])) == {"f_rest_labels.webp points outside the codebook"}
 
 
 def put(path, value):
-    """A change of the metadata at a dotted path; ``del`` leaves it out."""
+    """Return a change of the metadata at a dotted path; the value ``del`` deletes it."""
 
     def change(meta):
         *parents, last = path.split(".")
@@ -141,10 +141,10 @@ IMPOSSIBLE = [
     *(("shN.centroidSide", value, "impossible") for value in (0, 257, "8", None, "del", 8.5)),
     *(("shN", value, "impossible") for value in ("del", None, 5, "text", [])),
     *(("kissgs.sh_degree", value, "impossible") for value in (4, -1, "3", 1.5)),
-    *(("version", value, "of a kind that is not read") for value in (2, 4, "3.0", None)),
-    *(("format", value, "of a kind that is not read") for value in ("sog", None, 7)),
-    *(("quats.encoding", value, "of a kind that is not read") for value in ("smallest-three", 7)),
-    *(("shN.layout", value, "of a kind that is not read") for value in ("palette", 7)),
+    *(("version", value, "unsupported variant") for value in (2, 4, "3.0", None)),
+    *(("format", value, "unsupported variant") for value in ("sog", None, 7)),
+    *(("quats.encoding", value, "unsupported variant") for value in ("smallest-three", 7)),
+    *(("shN.layout", value, "unsupported variant") for value in ("palette", 7)),
     *(("means.mins", value, "not 1 finite numbers") for value in ("del", "x", {}, [], [{}], 1e39)),
     *((f"{key}.maxs", value, "numbers") for key in ("scales", "quats", "sh0") for value in ("del", "x", [], ["x"] * 4)),
     *((key, "del", "numbers") for key in ("means", "scales", "quats", "sh0", "opacities")),
@@ -155,14 +155,14 @@ IMPOSSIBLE = [
 ]
 
 
-def test_metadata_that_is_impossible():
+def test_invalid_metadata():
     found = refusals(*(job(with_meta(FILES, put(path, value))) for path, value, _ in IMPOSSIBLE))
     for error, (path, value, why) in zip(found, IMPOSSIBLE, strict=True):
         assert error.startswith("meta.json: "), (path, value, error)
         assert why in error, (path, value, error)
 
 
-def test_metadata_that_is_no_json():
+def test_metadata_that_is_not_json():
     texts = [b"", b"{", b"null", b"\xff\xfe{}", FILES["meta.json"][:-1], b"NaN", b"meta: {}", b"\0" * 99]
     assert set(refusals(*(job({**FILES, "meta.json": text}) for text in texts))) == {"meta.json is not readable JSON"}
     for error in refusals(*(job({**FILES, "meta.json": text}) for text in (b"[]", b"5", b'"text"', b"{}", b"true"))):
@@ -172,24 +172,24 @@ def test_metadata_that_is_no_json():
 
 
 def test_more_gaussians_than_allowed():
-    """Also where the metadata declares few on a large grid; at the limit all is well."""
+    """The limit applies to the size of the grid too, and is inclusive."""
     large = with_meta(FILES, put("gridSide", 13376))
     found = refusals(
         job(large), job(large, options={"maxGaussians": 80_000_000}), job(FILES, options={"maxGaussians": 64})
     )
-    assert all("Gaussians need that are allowed" in error for error in found)
-    (said,) = in_node(job(FILES, options={"maxGaussians": 96}))
-    assert assert_scene(said, FILES) <= 1
+    assert all("Gaussians need, the most allowed" in error for error in found)
+    (report,) = in_node(job(FILES, options={"maxGaussians": 96}))
+    assert assert_scene(report, FILES) <= 1
 
 
-def test_checksums_that_are_none():
-    """What stands there is no number: refused. Where nothing stands, nothing is compared."""
+def test_invalid_and_missing_checksums():
+    """Values that are not numbers are refused; missing ones are not compared."""
     numbers = ("123", [], {}, None, -1, 1.5, True)
     jobs = [job(with_meta(FILES, put("kissgs.crc32", dict.fromkeys(FILES, value)))) for value in numbers]
     jobs += [job(with_meta(FILES, put("kissgs.crc32", value))) for value in ("text", 5, None, [])]
     assert all(" is impossible: " in error for error in refusals(*jobs))
     found = in_node(*(job(with_meta(FILES, put("kissgs.crc32", value))) for value in ("del", {})))
-    assert all("error" not in said for said in found)
+    assert all("error" not in report for report in found)
 
 
 # --- Zips -----------------------------------------------------------------------------------------
@@ -199,7 +199,7 @@ DEFLATED = zipped(FILES, zipfile.ZIP_DEFLATED)
 
 
 def record(data, name, signature, at_name):
-    """Where the record of a file begins; the last of them for the table."""
+    """Return the offset of the record of a file with this signature."""
     at = data.find(name.encode())
     while at >= 0:
         if data[at - at_name : at - at_name + 4] == signature:
@@ -230,9 +230,9 @@ def patched(data, at, form, value):
         (ZIP[:-1], "not a zip"),
         (ZIP[: len(ZIP) // 2], "not a zip"),
         (zipped({}), "has no meta.json"),
-        (patched(ZIP, central(ZIP) + 16, "<I", 1), "f_dc.webp is damaged: its checksum is another"),
+        (patched(ZIP, central(ZIP) + 16, "<I", 1), "f_dc.webp is damaged: it does not match its checksum"),
         (patched(ZIP, central(ZIP) + 8, "<H", 1), "f_dc.webp is encrypted"),
-        (patched(ZIP, central(ZIP) + 10, "<H", 12), "(12)"),
+        (patched(ZIP, central(ZIP) + 10, "<H", 12), "compression method 12"),
         (patched(ZIP, central(ZIP) + 24, "<I", 99), "damaged"),
         (patched(ZIP, central(ZIP) + 24, "<I", 2**32 - 1), "more than the"),
         (patched(ZIP, central(ZIP) + 20, "<I", 2**32 - 1), "cut off"),
@@ -240,7 +240,7 @@ def patched(data, at, form, value):
         (patched(ZIP, central(ZIP) + 42, "<I", 7), "not where the zip says"),
         (patched(ZIP, central(ZIP), "<I", 7), "table of files is damaged"),
         (patched(ZIP, central(ZIP) + 28, "<H", 65535), "table of files is damaged"),
-        (patched(ZIP, len(ZIP) - 6, "<I", 2**32 - 1), "64-bit kind"),
+        (patched(ZIP, len(ZIP) - 6, "<I", 2**32 - 1), "a 64-bit zip"),
         (patched(ZIP, len(ZIP) - 12, "<H", 13), "table of files is damaged"),
         (patched(DEFLATED, central(DEFLATED) + 24, "<I", 99), "damaged"),
         (patched(DEFLATED, central(DEFLATED) + 24, "<I", len(FILES["f_dc.webp"]) + 1), "damaged"),
@@ -252,63 +252,61 @@ def patched(data, at, form, value):
         (zipped({f"{i}.txt": b"" for i in range(1001)}), "a zip of more than 1000 files"),
     ],
 )
-def test_zips_that_are_refused(data, why):
+def test_invalid_zips_are_refused(data, why):
     (error,) = refusals(job(data))
     assert why in error
 
 
-def test_a_bomb_is_not_unpacked():
-    """A gigabyte of zeros in a megabyte, declared as what an image can need, or as it is."""
+def test_a_zip_bomb_is_not_unpacked():
+    """The file has 256 MiB of zeros and declares them, or declares 5000 bytes."""
     bomb = zipped({**FILES, "f_dc.webp": bytes(1 << 28)}, zipfile.ZIP_DEFLATED)
     at = central(bomb)
     found = in_node(job(bomb), job(patched(bomb, at + 24, "<I", 5000)), flags=("--max-old-space-size=300",))
     assert "more than the" in found[0]["error"]["message"]
     assert "damaged" in found[1]["error"]["message"]
-    assert all(said["ms"] < 500 for said in found)
+    assert all(report["ms"] < 500 for report in found)
 
 
-def test_as_many_entries_as_allowed():
-    """A thousand, comments of every length that a zip can have, signatures within a comment that are none."""
+def test_the_most_entries_and_the_longest_comment():
     more = {f"{i}.txt": b"" for i in range(1000 - len(FILES))}
     zips = [zipped({**FILES, **more}), zipped(FILES, comment=b"x" * 65535), zipped(FILES, comment=b"")]
-    for said in in_node(*map(job, zips)):
-        assert assert_scene(said, FILES) <= 1
+    for report in in_node(*map(job, zips)):
+        assert assert_scene(report, FILES) <= 1
 
 
 def test_damage_anywhere_in_a_zip():
-    """The right scene or a sentence, whichever byte is changed."""
+    """Any changed byte gives the same scene or an error of one sentence."""
     rng = np.random.default_rng(0)
     zips = [flipped(data, int(bit)) for data in (ZIP, DEFLATED) for bit in rng.integers(0, 8 * len(data), 150)]
     zips += [data[: int(at)] for data in (ZIP, DEFLATED) for at in rng.integers(0, len(data), 30)]
     table = ZIP.find(b"PK\1\2")
     zips += [flipped(ZIP, int(bit)) for bit in rng.integers(8 * table, 8 * len(ZIP), 300)]
-    right, *found = in_node(job(ZIP), *map(job, zips))
-    assert assert_scene(right, FILES) <= 1
-    for said in found:
-        if "error" in said:
-            assert said["error"]["name"] == "SogxtError"
-            assert said["ms"] < 1000
+    expected, *found = in_node(job(ZIP), *map(job, zips))
+    assert assert_scene(expected, FILES) <= 1
+    for report in found:
+        if "error" in report:
+            assert report["error"]["name"] == "SogxtError"
+            assert report["ms"] < 1000
         else:
-            assert said["arrays"] == right["arrays"]
+            assert report["arrays"] == expected["arrays"]
 
 
 def test_damage_anywhere_in_the_metadata():
-    """Bits of ``meta.json`` changed: the right scene or a sentence, in no time."""
+    """Any flipped bit of ``meta.json`` gives the same scene or an error of one sentence, within a second."""
     rng = np.random.default_rng(1)
     text = FILES["meta.json"]
     jobs = [job({**FILES, "meta.json": flipped(text, int(bit))}) for bit in rng.integers(0, 8 * len(text), 400)]
-    right, *found = in_node(job(FILES), *jobs)
-    for said in found:
-        assert said["ms"] < 1000
-        if "error" in said:
-            assert said["error"]["name"] == "SogxtError", said["error"]
+    expected, *found = in_node(job(FILES), *jobs)
+    for report in found:
+        assert report["ms"] < 1000
+        if "error" in report:
+            assert report["error"]["name"] == "SogxtError", report["error"]
         else:
-            assert said["arrays"] == right["arrays"]
+            assert report["arrays"] == expected["arrays"]
 
 
-def test_metadata_is_read_as_python_reads_it():
-    """Numbers alone or in lists stand for the same."""
+def test_a_number_and_a_list_of_one_number_are_equivalent():
     files = with_meta(FILES, lambda meta: meta["means"].update(mins=[meta["means"]["mins"]]))
-    (said,) = in_node(job(files))
-    assert assert_scene(said, files) <= 1
-    assert json.loads(files["meta.json"]) == said["meta"]
+    (report,) = in_node(job(files))
+    assert assert_scene(report, files) <= 1
+    assert json.loads(files["meta.json"]) == report["meta"]

@@ -1,6 +1,6 @@
-"""Spark's picture of a scene; oracle: ``kissgs.render``, and for colours the spherical harmonics of the textbooks.
+"""Rendering by Spark; reference: ``kissgs.render``, and textbook spherical harmonics for colours.
 
-``pytest --log-cli-level INFO`` tells how close they are.
+``pytest --log-cli-level INFO`` shows how close they are.
 """
 
 import base64
@@ -48,31 +48,31 @@ const textOf = (bytes) => {
   for (let at = 0; at < bytes.length; at += 32768) text += String.fromCharCode(...bytes.subarray(at, at + 32768));
   return btoa(text);
 };
-const viewer = () => new Viewer(document.body.appendChild(document.createElement("canvas")));
-const [one, other] = [viewer(), viewer()];
+const newViewer = () => new Viewer(document.body.appendChild(document.createElement("canvas")));
+const [one, other] = [newViewer(), newViewer()];
 
 function sceneOf({ count, degree, labels, ...fields }) {
   const arrays = Object.fromEntries(Object.entries(fields).map(([name, text]) => [name, floats(text)]));
   return { count, degree, labels: new Uint16Array(bytesOf(labels).buffer), ...arrays };
 }
 
-async function pictures(of, cameras) {
-  const taken = [];
+async function imagesOf(viewer, cameras) {
+  const images = [];
   for (const camera of cameras) {
-    of.setCamera(camera);
-    await of.render();
-    taken.push(textOf(of.readPixels().data));
+    viewer.setCamera(camera);
+    await viewer.render();
+    images.push(textOf(viewer.readPixels().data));
   }
-  return taken;
+  return images;
 }
 
 window.draw = async ({ scene, cameras, background = "#000000", ply = null }) => {
   one.setScene(sceneOf(scene));
   one.setBackground(background);
-  const found = { drawn: await pictures(one, cameras) };
+  const found = { drawn: await imagesOf(one, cameras) };
   if (ply !== null) {
     found.read = await other.setPly(bytesOf(ply), one);
-    found.beside = await pictures(other, cameras);
+    found.beside = await imagesOf(other, cameras);
   }
   return found;
 };
@@ -81,20 +81,20 @@ window.draw = async ({ scene, cameras, background = "#000000", ply = null }) => 
 
 @pytest.fixture(scope="module")
 def page():
-    wrong = []
+    errors = []
     site = Site()
     site.files |= {"/": PAGE.encode(), "/page.js": PROGRAM.encode()}
     site.headers["/"] = {"Content-Type": "text/html"}
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
         page = browser.new_page()
-        page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on("console", lambda said: wrong.append(said.text) if said.type == "error" else None)
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
         page.goto(f"{site.url}/")
         yield page
         browser.close()
     site.close()
-    assert wrong == []
+    assert errors == []
 
 
 def encoded(array):
@@ -102,7 +102,7 @@ def encoded(array):
 
 
 def scene_of(splats):
-    """As the decoder gives it; entries of the codebook stand in an order of their own."""
+    """Return the scene in the form of the decoder, with codebook entries in random order."""
     rng = np.random.default_rng(0)
     order = rng.permutation(len(splats)).astype(np.uint16)
     return {
@@ -115,7 +115,7 @@ def scene_of(splats):
 
 
 def draw(page, splats, cameras, **options):
-    """Pictures as the page draws them, from 0 to 1; with ``ply``, also what its viewer of originals draws."""
+    """Return images by the page, 0 to 1; with ``ply``, also those of its viewer of originals and the count."""
     pinholes = [
         {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist(), "width": camera.width, "height": camera.height}
         for camera in cameras
@@ -145,7 +145,7 @@ def seen_from(position, target=(0, -0.8, 0), size=(300, 200), fov=0.9):
 
 
 def skewed(camera):
-    """The same pose behind another lens: its middle elsewhere, its pixels not square."""
+    """Return the camera with another principal point and pixels that are not square."""
     K = camera.K.copy()
     K[0, 0] *= 1.25
     K[:2, 2] += (0.17 * camera.width, -0.12 * camera.height)
@@ -157,16 +157,16 @@ SIDE = skewed(seen_from((-4.5, -2.6, 2.0)))
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_pictures_are_those_of_the_rasteriser(page, degree):
+def test_images_agree_with_the_rasteriser(page, degree):
     splats = kissgs.sample_scene(5000, sh_degree=degree)
     for camera, drawn in zip((FRONT, SIDE), draw(page, splats, [FRONT, SIDE]), strict=True):
-        wanted = expected(splats, camera)
-        reached = psnr(drawn, wanted)
+        reference = expected(splats, camera)
+        reached = psnr(drawn, reference)
         log.info("degree %d: %.1f dB", degree, reached)
         assert reached > 40
-        assert np.abs((drawn - wanted).mean(axis=(0, 1))).max() < 2 / 255
+        assert np.abs((drawn - reference).mean(axis=(0, 1))).max() < 2 / 255
         for mirrored in (drawn[:, ::-1], drawn[::-1], drawn[..., ::-1]):
-            assert psnr(mirrored, wanted) < reached - 15
+            assert psnr(mirrored, reference) < reached - 15
 
 
 def test_a_white_background(page):
@@ -180,7 +180,7 @@ def test_a_white_background(page):
 
 
 def test_far_from_the_origin(page):
-    """Spark has 11 bits for a position."""
+    """Spark stores positions as half floats."""
     splats = kissgs.sample_scene(5000, sh_degree=1)
     far = replace(splats, means=splats.means + np.float32(1000))
     camera = seen_from(np.array((1.2, -2.2, -5.2)) + 1000, np.array((0, -0.8, 0)) + 1000)
@@ -190,22 +190,21 @@ def test_far_from_the_origin(page):
     assert reached > 40
 
 
-def test_an_original_beside_what_became_of_it(page):
-    """A .ply that Spark reads itself, against the same Gaussians given to it by us."""
+def test_a_ply_read_by_spark_and_a_decoded_scene_agree(page):
     splats = kissgs.sample_scene(5000, sh_degree=3)
     file = io.BytesIO()
     write_ply(file, splats)
     drawn, beside, count = draw(page, splats, [FRONT, SIDE], ply=base64.b64encode(file.getvalue()).decode())
     assert count == len(splats)
     for camera, one, other in zip((FRONT, SIDE), drawn, beside, strict=True):
-        alike, true = psnr(one, other), psnr(other, expected(splats, camera))
-        log.info("read from a .ply: %.1f dB, and %.1f dB to what we give Spark", true, alike)
-        assert alike > 45
-        assert true > 40
+        to_decoded, to_reference = psnr(one, other), psnr(other, expected(splats, camera))
+        log.info("read from a .ply: %.1f dB, and %.1f dB to the decoded scene", to_reference, to_decoded)
+        assert to_decoded > 45
+        assert to_reference > 40
 
 
 def spherical_harmonic(degree, order, direction):
-    """As textbooks have it, with the Condon-Shortley phase."""
+    """Return the real spherical harmonic with the Condon-Shortley phase, by associated Legendre functions."""
     x, y, z = direction
     size = abs(order)
     scale = np.sqrt((2 * degree + 1) / (4 * np.pi) * factorial(degree - size) / factorial(degree + size))
@@ -231,18 +230,18 @@ def test_colours_of_one_gaussian_from_all_sides(page, degree):
     sides /= np.linalg.norm(sides, axis=1)[:, None]
     cameras = [seen_from(one.means[0] - 4 * side, one.means[0], (41, 41), 0.3) for side in sides]
     worst = 0
-    for side, picture in zip(sides, draw(page, one, cameras), strict=True):
+    for side, image in zip(sides, draw(page, one, cameras), strict=True):
         basis = np.array([spherical_harmonic(band, order, side) for band, order in bands])
-        wanted = 0.5 + SH_C0 * one.sh0[0] + basis @ one.shN[0]
-        worst = max(worst, np.abs(picture[20, 20] - wanted.clip(0, 1)).max())
-        assert np.ptp(wanted) > 0.05
+        colour = 0.5 + SH_C0 * one.sh0[0] + basis @ one.shN[0]
+        worst = max(worst, np.abs(image[20, 20] - colour.clip(0, 1)).max())
+        assert np.ptp(colour) > 0.05
     log.info("degree %d: colours within %.1f of 255", degree, 255 * worst)
     assert worst < 3 / 255
 
 
 @pytest.mark.parametrize("count", [0, 1])
 @pytest.mark.parametrize("degree", [0, 3])
-def test_hardly_any_gaussians(page, count, degree):
+def test_scenes_of_no_and_one_gaussian(page, count, degree):
     splats = kissgs.sample_scene(count, sh_degree=degree)
     middle = splats.means.mean(axis=0) if count else np.zeros(3)
     camera = seen_from(middle + np.array([0, 0, -4.0]), middle, (40, 30))

@@ -1,4 +1,4 @@
-"""Streams that no encoder writes, made bit by bit; oracle: what Pillow (libwebp) makes of the same bytes."""
+"""Streams that no encoder writes, made bit by bit; reference: Pillow (libwebp) on the same bytes."""
 
 import base64
 import hashlib
@@ -25,8 +25,8 @@ def argb(count, seed=0):
     return np.random.default_rng(seed).integers(0, 1 << 32, count).tolist()
 
 
-def assert_like_pillow(folder, *writers, channels=4):
-    """Same pixels, or both refuse."""
+def check_like_pillow(folder, *writers, channels=4):
+    """Check that both decoders return the same pixels or refuse the file."""
     files = [writer.file() for writer in writers]
     for data, got in zip(files, decode_all(folder, files, pixels=True), strict=True):
         wanted = pillow(data)
@@ -40,11 +40,11 @@ def assert_like_pillow(folder, *writers, channels=4):
 
 def accepted(folder, *writers, channels=4):
     assert all(pillow(writer.file()) is not None for writer in writers)
-    assert_like_pillow(folder, *writers, channels=channels)
+    check_like_pillow(folder, *writers, channels=channels)
 
 
 def refused(folder, *writers, why=""):
-    """By both."""
+    """Check that both decoders refuse the files."""
     files = [writer.file() for writer in writers]
     assert [pillow(data) for data in files] == [None] * len(files)
     for got in decode_all(folder, files):
@@ -60,7 +60,7 @@ def plain(width, height, seed=0):
 
 
 def with_tiles(kind, bits, width, height, pixel):
-    """One transform with a pixel for each tile; the picture is noise."""
+    """Return an image of noise with one transform, with a pixel for each tile."""
     writer = Writer(width, height)
     writer.transform(kind, bits)
     writer.image([pixel(i) for i in range(tiles(width, bits) * tiles(height, bits))])
@@ -75,7 +75,7 @@ def test_plain_noise(tmp_path):
 
 @pytest.mark.parametrize("mode", range(16))
 def test_every_predictor_of_noise(mode, tmp_path):
-    """Also 14 and 15, which mean black; other bits of the tiles mean nothing. Narrow ones have none to the right."""
+    """Modes 14 and 15 mean black; other bits of the tiles are ignored; narrow images have no pixel to the right."""
     tile = 0xFF0000FF | mode << 8
     accepted(
         tmp_path,
@@ -96,7 +96,7 @@ def test_every_size_of_tiles(bits, tmp_path):
 
 
 def test_every_factor_of_cross_colour(tmp_path):
-    """Signed bytes from -128 to 127, two tiles of each."""
+    """Factors are signed bytes from -128 to 127, two tiles of each."""
     accepted(
         tmp_path,
         *(with_tiles(CROSS_COLOUR, 2, 64, 64, lambda i, at=at: (i % 256) << at) for at in (0, 8, 16)),
@@ -118,8 +118,8 @@ def test_transforms_in_any_order(order, tmp_path):
 @pytest.mark.parametrize("others", [(), (SUBTRACT_GREEN,), (PREDICTOR,), (CROSS_COLOUR, PREDICTOR)])
 @pytest.mark.parametrize("before", [True, False])
 @pytest.mark.parametrize("size", [1, 2, 3, 4, 5, 15, 16, 17, 200, 256])
-def test_palettes_with_indices_beyond_them(size, before, others, tmp_path):
-    """And palettes amid other transforms: those after it see packed pixels."""
+def test_palettes_with_indices_beyond_their_end(size, before, others, tmp_path):
+    """Transforms after a palette apply to packed pixels."""
     width, height = 29, 11
     writer = Writer(width, height)
 
@@ -144,7 +144,7 @@ def test_palettes_with_indices_beyond_them(size, before, others, tmp_path):
 
 
 def test_codes_of_one_and_two_symbols(tmp_path):
-    """Simple or not; of one symbol of any length; two equal symbols; a first symbol of one bit."""
+    """Codes are simple or not, of one symbol of any length, of two equal symbols, or of a one-bit first symbol."""
 
     def green_of(write):
         writer = Writer(16, 16)
@@ -173,7 +173,7 @@ def test_codes_of_one_and_two_symbols(tmp_path):
 
 @pytest.mark.parametrize("longest", range(1, 16))
 def test_codes_up_to_15_bits(longest, tmp_path):
-    """One symbol of each length: the longest possible codes, through one or two tables."""
+    """One symbol of each length gives the longest possible codes, with one or two tables."""
     lengths = [*range(1, longest + 1), longest]
     writer = Writer(32, 32)
     writer.put(0, 3)
@@ -186,8 +186,8 @@ def test_codes_up_to_15_bits(longest, tmp_path):
     accepted(tmp_path, writer)
 
 
-def test_code_lengths_in_all_spellings(tmp_path):
-    """Repeats 16, 17 and 18, at the beginning too (16 then repeats 8), and a count of lengths."""
+def test_code_lengths_in_all_encodings(tmp_path):
+    """Repeats 16, 17 and 18, also at the beginning (16 repeats 8 there), and a number of lengths."""
     writer = Writer(16, 16)
     writer.put(0, 3)
     writer.put(0, 1)
@@ -222,7 +222,7 @@ def test_code_lengths_in_all_spellings(tmp_path):
 
 @pytest.mark.parametrize("bits", range(1, 12))
 def test_colour_caches(bits, tmp_path):
-    """Of all sizes, with places that nothing has been put into (transparent black) and pixels that come thence."""
+    """Caches of all sizes, with pixels from filled and from empty slots, which are transparent black."""
     writer = Writer(40, 30)
     writer.put(0, 1)
     writer.put(1, 1)
@@ -246,8 +246,8 @@ def test_colour_caches(bits, tmp_path):
         accepted(tmp_path, writer)
 
 
-def test_a_colour_from_an_empty_place_is_put_into_the_cache(tmp_path):
-    """A colour from an empty place is 0, which then takes place 0 from what had it."""
+def test_a_colour_from_an_empty_slot_is_put_into_the_cache(tmp_path):
+    """The colour of an empty slot is 0, which then replaces the colour in slot 0."""
     bits = 1
     kept = next(value for value in range(0xFF000001, 0xFFFFFFFF) if (0x1E35A7BD * value & 0xFFFFFFFF) >> 31 == 0)
     writer = Writer(3, 1)
@@ -264,7 +264,7 @@ def test_a_colour_from_an_empty_place_is_put_into_the_cache(tmp_path):
 
 @pytest.mark.parametrize("width", [1, 2, 5, 9, 40])
 def test_every_distance_and_length(width, tmp_path):
-    """The 120 near ones of each width; those that point ahead mean the pixel before."""
+    """Includes the 120 near distances; those that are not positive mean the previous pixel."""
     height = 400 // width + 30
     near = [*range(1, 121), 121, 125, 200, 300]
     writer = Writer(width, height)
@@ -274,7 +274,7 @@ def test_every_distance_and_length(width, tmp_path):
     first = min(max(first, 8 * 8), count - 1)
 
     def prefix(value):
-        """Symbol, extra bits and their number."""
+        """Return the symbol, the extra bits and their number."""
         value -= 1
         if value < 4:
             return value, 0, 0
@@ -305,7 +305,7 @@ def test_every_distance_and_length(width, tmp_path):
 
 @pytest.mark.parametrize("bits", range(2, 10))
 def test_groups_of_codes(bits, tmp_path):
-    """A group for each tile, by both bytes of its number; one of them is never used."""
+    """Each tile has a group, whose number takes both bytes; some groups are never used."""
     width, height = (70, 9) if bits < 7 else (2 * (1 << bits) + 3, 2)
     writer = Writer(width, height)
     writer.put(0, 2)
@@ -322,8 +322,8 @@ def test_groups_of_codes(bits, tmp_path):
     accepted(tmp_path, writer)
 
 
-def test_a_choice_of_codes_that_does_not_begin_with_zero(tmp_path):
-    """Number 300 for all: 301 groups are written, one is used."""
+def test_groups_of_codes_that_are_not_used(tmp_path):
+    """All tiles use group 300, so that 301 groups are written and one is used."""
     writer = Writer(9, 9)
     writer.put(0, 2)
     writer.put(1, 1)
@@ -336,19 +336,19 @@ def test_a_choice_of_codes_that_does_not_begin_with_zero(tmp_path):
 
 
 @pytest.mark.parametrize("hint", [0, 1])
-def test_alpha_is_what_is_stored_whatever_the_hint_says(hint, tmp_path):
-    """Pillow looks at the hint and gives no alpha then, so that alpha's oracle is what was written."""
+def test_alpha_does_not_depend_on_the_hint(hint, tmp_path):
+    """Pillow ignores alpha if the hint says so; then the reference is what was written."""
     writer = Writer(6, 4, alpha=hint)
     writer.put(0, 1)
     pixels = argb(24)
     writer.image(pixels, main=True)
-    assert_like_pillow(tmp_path, writer, channels=3 + hint)
+    check_like_pillow(tmp_path, writer, channels=3 + hint)
     wanted = np.array(pixels, dtype=np.uint32).view(np.uint8).reshape(-1, 4)[:, [2, 1, 0, 3]]
     (got,) = decode_all(tmp_path, [writer.file()])
     assert got["sha256"] == hashlib.sha256(np.ascontiguousarray(wanted)).hexdigest()
 
 
-# --- What is refused, by both ---------------------------------------------------------------------
+# --- Files that both decoders refuse ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", range(4))
@@ -362,7 +362,7 @@ def test_a_transform_twice(kind, tmp_path):
             writer.image([0xFF000000] * (200 if kind == INDEXING else 1))
     writer.put(0, 1)
     writer.image(argb(16), main=True)
-    refused(tmp_path, writer, why="the same transform twice")
+    refused(tmp_path, writer, why="a transform that occurs twice")
 
 
 @pytest.mark.parametrize("version", range(1, 8))
@@ -374,7 +374,7 @@ def test_other_versions(version, tmp_path):
 
 
 @pytest.mark.parametrize("bits", [0, 12, 13, 14, 15])
-def test_caches_of_impossible_size(bits, tmp_path):
+def test_caches_of_invalid_size(bits, tmp_path):
     writer = Writer(4, 4)
     writer.put(0, 1)
     writer.put(1, 1)
@@ -390,7 +390,7 @@ def test_caches_of_impossible_size(bits, tmp_path):
     "lengths", [[], [2], [1, 2], [1, 1, 1], [1, 2, 2, 2], [3] * 7, [3] * 9, [15] * 2, [1, *[15] * 200]]
 )
 @pytest.mark.parametrize("which", range(5))
-def test_codes_that_do_not_add_up(lengths, which, tmp_path):
+def test_incomplete_and_oversubscribed_codes(lengths, which, tmp_path):
     writer = Writer(4, 4)
     writer.put(0, 3)
     for i, size in enumerate((280, 256, 256, 256, 40)):
@@ -399,11 +399,11 @@ def test_codes_that_do_not_add_up(lengths, which, tmp_path):
     if lengths == [2]:
         accepted(tmp_path, writer)
     else:
-        refused(tmp_path, writer, why="add up")
+        refused(tmp_path, writer, why="prefix code")
 
 
 @pytest.mark.parametrize("at", [0, 1, 5])
-def test_copies_from_before_the_beginning_or_beyond_the_end(at, tmp_path):
+def test_copies_from_outside_the_image(at, tmp_path):
     for length, distance in ((0, 5 - 1), (3, 1)):
         writer = Writer(3, 2 if at < 5 else 3)
         writer.put(0, 3)
@@ -413,11 +413,11 @@ def test_copies_from_before_the_beginning_or_beyond_the_end(at, tmp_path):
         writer.symbol(codes[0], 256 + length)
         writer.symbol(codes[4], distance)
         writer.put(0, 200)
-        assert_like_pillow(tmp_path, writer)
+        check_like_pillow(tmp_path, writer)
 
 
 def test_more_code_lengths_than_symbols(tmp_path):
-    """By a count, and by a repeat that runs over the end."""
+    """The number of code lengths exceeds the alphabet."""
     counted = Writer(4, 4)
     counted.put(0, 3)
     counted.put(0, 1)
@@ -432,15 +432,15 @@ def test_more_code_lengths_than_symbols(tmp_path):
 
 
 def test_a_symbol_outside_its_alphabet(tmp_path):
-    """Distances have 40 symbols."""
+    """The alphabet of distances has 40 symbols."""
     writer = Writer(2, 2)
     writer.put(0, 3)
     for symbol in (1, 2, 3, 4, 200):
         writer.simple(symbol)
-    refused(tmp_path, writer, why="add up")
+    refused(tmp_path, writer, why="prefix code")
 
 
-def test_two_symbols_of_which_one_is_outside_the_alphabet(tmp_path):
+def test_one_of_two_symbols_outside_its_alphabet(tmp_path):
     writer = Writer(2, 2)
     writer.put(0, 3)
     for symbols in ((1,), (2,), (3,), (4,), (3, 200)):

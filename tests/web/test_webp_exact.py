@@ -1,4 +1,4 @@
-"""Pictures that libwebp wrote, decoded by JavaScript; oracle: the pixels that were written, and Pillow's decoder."""
+"""Images that libwebp wrote, decoded by JavaScript; reference: the original pixels, and Pillow's decoder."""
 
 import hashlib
 import itertools
@@ -31,7 +31,7 @@ def gradient(w, h, rng):
 
 
 def photograph(w, h, rng):
-    """Sums of waves, some sensor noise, channels that go together."""
+    """Return sums of waves with sensor noise and correlated channels."""
     y, x = grid(w, h)
     light = sum(np.sin(x / rng.uniform(2, 40) + rng.uniform(0, 6)) * np.cos(y / rng.uniform(2, 40)) for _ in range(5))
     image = 128 + light[:, :, None] * np.array([25, 22, 15]) + rng.normal(0, 2, (h, w, 3)) + np.array([20, 0, -20])
@@ -39,7 +39,7 @@ def photograph(w, h, rng):
 
 
 def tinted(w, h, rng):
-    """Red and blue that follow green by factors: what the cross-colour transform is for."""
+    """Return red and blue proportional to green, for the cross-colour transform."""
     green = rng.integers(0, 256, (h, w))
     return np.stack([green * 0.7 + rng.integers(0, 3, (h, w)), green, 255 - green * 0.4], axis=2)
 
@@ -49,7 +49,7 @@ def grey(w, h, rng):
 
 
 def single(w, h, rng):
-    """A picture of one channel."""
+    """Return an image of one channel."""
     return rng.integers(0, 40, (h, w, 1))
 
 
@@ -59,19 +59,19 @@ def checker(w, h, rng):
 
 
 def pattern(w, h, rng):
-    """A small piece of noise over and over, moved a little: copies."""
+    """Return a repeated piece of noise with small shifts, for copies."""
     piece = rng.integers(0, 256, (11, 23, 3))
     y, x = grid(w, h)
     return piece[(y + x // 50) % 11, x % 23]
 
 
 def few_colours(w, h, rng):
-    """More than a palette holds, again and again: the colour cache."""
+    """Return repeated colours, more than a palette holds, for the colour cache."""
     return rng.integers(0, 256, (700, 3))[np.minimum(rng.geometric(0.01, (h, w)), 699)]
 
 
 def transparent(w, h, rng):
-    """Colour under transparency, to be kept where ``exact``."""
+    """Return colours of transparent pixels, which are kept if ``exact``."""
     image = rng.integers(0, 256, (h, w, 4))
     image[:, :, 3] = np.where(rng.random((h, w)) < 0.5, 0, 255)
     return image
@@ -88,17 +88,17 @@ def alpha_noise(w, h, rng):
 
 
 def rotations(w, h, rng):
-    """Like a plane of quaternions: four correlated channels, a few levels."""
+    """Return four correlated channels of few levels, like a plane of quaternions."""
     return np.clip(rng.normal(40, 12, (h, w, 4)) + 8 * np.sin(np.add(*grid(w, h)) / 9)[:, :, None], 0, 255)
 
 
 def labels(w, h, rng):
-    """Like a plane of codebook entries."""
+    """Return two channels of few levels, like a plane of codebook labels."""
     return np.concatenate([rng.integers(0, 40, (h, w, 2)), np.zeros((h, w, 1))], axis=2)
 
 
 def quarters(w, h, rng):
-    """A different statistic in each part: several groups of codes."""
+    """Return parts of different statistics, for several groups of codes."""
     image = noise(w, h, rng)
     image[: h // 2, : w // 2] = gradient(w, h, rng)[: h // 2, : w // 2]
     image[h // 2 :, w // 2 :] = rng.integers(0, 3, (h, w, 3))[h // 2 :, w // 2 :] * 70
@@ -106,7 +106,7 @@ def quarters(w, h, rng):
 
 
 def steep(w, h, rng):
-    """Levels of very different frequency: long codes."""
+    """Return levels of very different frequency, for long codes."""
     return np.minimum(rng.geometric(0.5, (h, w, 3)) ** 2, 255)
 
 
@@ -126,7 +126,7 @@ def palette_alpha(w, h, rng):
 
 
 def predicted(mode):
-    """Made by a predictor of the format, plus little: the encoder will mostly choose that one."""
+    """Return a function that makes images by a predictor plus small changes, so that encoders mostly choose it."""
 
     def predict(image, y, x):
         left, top, corner = image[y, x - 1], image[y - 1, x], image[y - 1, x - 1]
@@ -181,19 +181,19 @@ def sha(rgba):
 
 
 def assert_exact(folder, cases):
-    """``cases``: (what it is, bytes, the pixels or None where Pillow must say)."""
+    """Check cases (name, file, pixels); the reference is Pillow if pixels are None."""
     found = decode_all(folder, [data for _, data, _ in cases])
-    wrong = []
+    failures = []
     for (name, data, wanted), got in zip(cases, found, strict=True):
         rgba = pillow(data) if wanted is None else as_rgba(wanted)
         if (got.get("height"), got.get("width"), got.get("sha256")) != (*rgba.shape[:2], sha(rgba)):
-            wrong.append((name, got))
-    assert wrong == []
+            failures.append((name, got))
+    assert failures == []
 
 
 @pytest.mark.parametrize("content", CONTENTS, ids=lambda content: content.__name__)
 def test_every_effort_and_size(content, tmp_path):
-    """All methods and qualities at one size, all sizes at one effort; ``exact`` or not."""
+    """All methods and qualities at one size, all sizes with one method, ``exact`` or not."""
     cases = []
     image = image_of(content, 65, 49)
     for method, quality in itertools.product(range(7), (0, 25, 50, 75, 100)):
@@ -222,7 +222,7 @@ def test_large(tmp_path):
     assert_exact(tmp_path, [("4096 x 4096", webp(image, method=0, quality=0), image)])
 
 
-def test_groups_of_codes_and_copies_in_a_picture_of_many_tiles(tmp_path):
+def test_groups_of_codes_and_copies_in_an_image_of_many_tiles(tmp_path):
     image = np.concatenate([image_of(content, 400, 150)[:, :, :3] for content in (quarters, pattern, photograph)])
     cases = [(f"method {method}", webp(image, method=method, quality=90), image) for method in range(7)]
     assert_exact(tmp_path, cases)
@@ -231,8 +231,8 @@ def test_groups_of_codes_and_copies_in_a_picture_of_many_tiles(tmp_path):
     assert len({bits for fact in facts for bits in fact.tile_bits}) > 1
 
 
-def test_the_corpus_has_all_that_the_format_has():
-    """Read bit by bit; what no encoder writes is in test_webp_by_hand.py."""
+def test_the_images_use_all_features_of_the_format():
+    """Features that no encoder uses are tested in test_webp_by_hand.py."""
     facts = [
         Reader(webp(image_of(content, 65, 49), method=method, quality=100)).facts
         for content in CONTENTS
@@ -247,13 +247,13 @@ def test_the_corpus_has_all_that_the_format_has():
     assert max(sizes) == 256
     assert any(cache for fact in facts for cache in fact.caches)
     assert any(fact.groups > 1 for fact in facts)
-    assert max(fact.longest for fact in facts) > 9  # a second look into the table
+    assert max(fact.longest for fact in facts) > 9  # needs a second lookup
     assert all(sum(getattr(fact, what) for fact in facts) > 99 for what in ("literals", "cached", "near", "single"))
     assert any(fact.far for fact in facts)
 
 
 def test_near_lossless(tmp_path):
-    """What cwebp has changed a little is a lossless stream like others."""
+    """The option of cwebp changes pixels slightly and writes a lossless stream."""
     if shutil.which("cwebp") is None:
         pytest.skip("no cwebp is installed")
     cases = []
@@ -266,12 +266,12 @@ def test_near_lossless(tmp_path):
     assert_exact(tmp_path, cases)
 
 
-# --- What is around a stream --------------------------------------------------------------------
+# --- Data around a stream --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("content", [photograph, alpha_noise, palette(4)], ids=lambda content: content.__name__)
 def test_metadata_and_odd_sizes(content, tmp_path):
-    """Profiles, EXIF and XMP before and after the picture, parts of odd length, bytes behind the end."""
+    """Profiles, EXIF and XMP before and after the image, chunks of odd length, bytes after the end."""
     image = image_of(content, 21, 10)
     cases = []
     for more in (
@@ -280,11 +280,11 @@ def test_metadata_and_odd_sizes(content, tmp_path):
     ):
         data = webp(image, **more)
         assert b"VP8X" in data[:20]
-        cases += [(str(more), data, image), (f"{more} and bytes", data + b"behind", image)]
+        cases += [(str(more), data, image), (f"{more} and bytes", data + b"after", image)]
     plain = webp(image)
     stream = stream_of(plain)
     for end in (b"", b"\0", b"\xff", b"rest"):
-        cases += [("bytes behind", plain + end, image)]
-        cases += [("bytes in the part", riff(chunk(b"VP8L", stream + end)), image)]
-        cases += [("an unknown part", riff(chunk(b"VP8L", stream), chunk(b"abcd", end)), image)]
+        cases += [("bytes after", plain + end, image)]
+        cases += [("bytes in the chunk", riff(chunk(b"VP8L", stream + end)), image)]
+        cases += [("an unknown chunk", riff(chunk(b"VP8L", stream), chunk(b"abcd", end)), image)]
     assert_exact(tmp_path, cases)

@@ -1,4 +1,4 @@
-"""What is no lossless WebP, or a damaged one; oracles: the format, and Pillow (libwebp) wherever bytes were changed."""
+"""Files that are not lossless WebP or are damaged; reference: the format, and Pillow (libwebp) for changed bytes."""
 
 import base64
 import io
@@ -18,10 +18,10 @@ NOISE = webp(RNG.integers(0, 256, (9, 11, 4)).astype(np.uint8))
 SMALL = webp((np.mgrid[:5, :7].sum(axis=0)[:, :, None] * [1, 9, 20]).astype(np.uint8))
 
 
-def saved(picture=None, **options):
+def saved(image=None, **options):
     buffer = io.BytesIO()
-    picture = picture or Image.fromarray(RNG.integers(0, 256, (16, 16, 3)).astype(np.uint8))
-    picture.save(buffer, "WEBP", **options)
+    image = image or Image.fromarray(RNG.integers(0, 256, (16, 16, 3)).astype(np.uint8))
+    image.save(buffer, "WEBP", **options)
     return buffer.getvalue()
 
 
@@ -30,7 +30,7 @@ def frames():
 
 
 def declared(width, height):
-    """A file of some 60 bytes that says it is large, and could be: codes of no bits at all."""
+    """Return a valid file of some 60 bytes that declares a large image, with codes of zero bits."""
     writer = Writer(width, height)
     writer.put(0, 3)
     for symbol in (1, 2, 3, 255, 0):
@@ -53,17 +53,17 @@ def extended(canvas, *chunks, flags=0):
 @pytest.mark.parametrize(
     ("data", "why"),
     [
-        (b"", "no WebP"),
-        (b"RIFF", "no WebP"),
-        (b"\x89PNG\r\n\x1a\n" + bytes(60), "no WebP"),
-        (b"RIFX" + NOISE[4:], "no WebP"),
-        (NOISE[:8] + b"WAVE" + NOISE[12:], "no WebP"),
+        (b"", "not a WebP"),
+        (b"RIFF", "not a WebP"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(60), "not a WebP"),
+        (b"RIFX" + NOISE[4:], "not a WebP"),
+        (NOISE[:8] + b"WAVE" + NOISE[12:], "not a WebP"),
         (saved(lossless=False), "lossy"),
         (saved(Image.fromarray(RNG.integers(0, 256, (16, 16, 4)).astype(np.uint8)), lossless=False), "lossy"),
         (saved(frames()[0], save_all=True, append_images=frames(), lossless=True), "animation"),
         (saved(frames()[0], save_all=True, append_images=frames()), "animation"),
-        (riff(chunk(b"abcd", bytes(30))), "without a picture"),
-        (extended((11, 9)), "without a picture"),
+        (riff(chunk(b"abcd", bytes(30))), "without an image"),
+        (extended((11, 9)), "without an image"),
         (extended((11, 8), chunk(b"VP8L", stream_of(NOISE))), "canvas"),
         (extended((12, 9), chunk(b"VP8L", stream_of(NOISE))), "canvas"),
         (NOISE[:4] + struct.pack("<I", len(NOISE) - 7) + NOISE[8:], "cut off"),
@@ -77,7 +77,7 @@ def extended(canvas, *chunks, flags=0):
         (wrapped(stream_of(NOISE)[:-8]), "ends too soon"),
     ],
 )
-def test_what_is_refused_and_why(data, why, tmp_path):
+def test_errors_name_the_reason(data, why, tmp_path):
     (error,) = refusals(tmp_path, [data])
     assert why in error
 
@@ -88,18 +88,18 @@ def test_a_canvas_of_the_same_size_is_right(tmp_path):
 
 
 def test_cut_off_anywhere(tmp_path):
-    """The file; and its stream, in a file that knows that it is shorter."""
+    """Both the file and its stream, in a file that declares the shorter length, are cut off."""
     large = webp(RNG.integers(0, 256, (120, 90, 3)).astype(np.uint8))
     for data, places in ((SMALL, range(len(SMALL))), (NOISE, range(len(NOISE))), (large, range(0, len(large), 149))):
         refusals(tmp_path, [data[:length] for length in places])
         stream = stream_of(data).rstrip(b"\0")
         cut = [wrapped(stream[:length]) for length in places if length < len(stream)]
         refusals(tmp_path, cut)
-        # libwebp reads on into the byte that fills up a part of odd length.
+        # libwebp reads the padding byte of a chunk of odd length.
         assert all(pillow(shorter) is None for shorter in cut[:-4:2])
 
 
-def test_too_many_pixels_are_refused_before_memory_is_taken(tmp_path):
+def test_too_many_pixels_are_refused_before_memory_is_allocated(tmp_path):
     files = [declared(16384, 16384), declared(16383, 16384), declared(8192, 8193)]
     assert max(map(len, files)) < 70
     for error in refusals(tmp_path, files):
@@ -119,7 +119,7 @@ LIMIT = 1 << 20
 
 
 def planes():
-    """Small images of containers of several presets, and others."""
+    """Return small images of containers of several presets, and others."""
     rng = np.random.default_rng(5)
     found = [SMALL, NOISE, saved(lossless=True, exif=b"Exif\0\0abc")]
     scene = kissgs.Splats(
@@ -137,13 +137,13 @@ def planes():
 
 
 def changed(data, rng):
-    """Bytes or bits changed, put in or left out, blocks exchanged; sizes in the headers put right, mostly.
+    """Return the file with bytes or bits changed, inserted or deleted, or blocks exchanged; sizes are mostly corrected.
 
-    Then to an even length: libwebp reads on beyond the end of a part, into the byte that fills it up.
+    The length is even then, because libwebp reads the padding byte of a chunk.
     """
     new = bytearray(data)
     for _ in range(rng.integers(1, 4)):
-        at, other = (int(place) for place in rng.integers(12 if rng.random() < 0.1 else 20, len(new), 2))
+        at, other = (int(offset) for offset in rng.integers(12 if rng.random() < 0.1 else 20, len(new), 2))
         kind = rng.integers(6)
         if kind == 0:
             new[at] ^= 1 << int(rng.integers(8))
@@ -164,7 +164,7 @@ def changed(data, rng):
 
 
 def size_of(data):
-    """As the stream's head declares it; None where there is none to be found."""
+    """Return the size that the stream's header declares, or None."""
     at = data.find(b"VP8L")
     if at < 0 or len(data) < at + 13:
         return None
@@ -179,7 +179,7 @@ def corpus():
 
 @pytest.mark.parametrize("part", range(PARTS))
 def test_changed_bytes(part, corpus, tmp_path):
-    """Never anything but a sentence or a picture; and where libwebp reads the same bytes, the same picture."""
+    """Any change gives an error of one sentence or an image, the same as libwebp's if that decodes the file."""
     rng = np.random.default_rng(part)
     files = [changed(corpus[int(rng.integers(len(corpus)))], rng) for _ in range(CHANGES // PARTS)]
     found = decode_all(tmp_path, files, maxPixels=LIMIT, pixels=True)
@@ -193,43 +193,43 @@ def test_changed_bytes(part, corpus, tmp_path):
             continue
         wanted, begin = pillow(data), data.find(b"VP8L")
         if wanted is None:
-            # Pillow reads what stands behind the picture, too; who wants only the picture need not.
+            # Pillow also reads chunks after the image, which are not needed.
             assert "error" in got or data[12:16] == b"VP8X"
         elif "error" in got:
-            # libwebp may have taken the byte that fills the part up.
+            # libwebp may have read the padding byte.
             assert struct.unpack_from("<I", data, begin + 4)[0] & 1, got
         else:
             rgba = np.frombuffer(base64.b64decode(got["rgba"]), np.uint8).reshape(wanted.shape)
-            channels = 3 + (data[begin + 12] >> 4 & 1)  # Pillow has no alpha where the hint says so
+            channels = 3 + (data[begin + 12] >> 4 & 1)  # Pillow ignores alpha if the hint says so
             assert (rgba[:, :, :channels] == wanted[:, :, :channels]).all()
             both += 1
     assert both > 50
 
 
 def with_large_codes(choice):
-    """A picture whose every 4 x 4 pixels name one of as many groups of codes, each of 2,644 entries."""
+    """Return an image whose 4 x 4 tiles use these groups of codes, each with 2,644 entries."""
     side, groups = choice.shape[0], int(choice.max()) + 1
-    picture = Writer(4 * side, 4 * side)
-    picture.put(0, 1)
-    picture.put(1, 1)
-    picture.put(11, 4)  # a colour cache, for an alphabet of 280 + 2048
-    picture.put(1, 1)
-    picture.put(0, 3)
-    picture.image([0xFF000000 | int(group) << 8 for group in choice.reshape(-1)])
+    image = Writer(4 * side, 4 * side)
+    image.put(0, 1)
+    image.put(1, 1)
+    image.put(11, 4)  # a colour cache, for an alphabet of 280 + 2048
+    image.put(1, 1)
+    image.put(0, 3)
+    image.image([0xFF000000 | int(group) << 8 for group in choice.reshape(-1)])
     one = Writer(1, 1)
     begin = len(one.bits)
     one.code([9] * 212 + [length for length in range(10, 15) for _ in range(300)] + [15] * 600, 280 + 2048)
     for symbol in (1, 2, 255, 0):
         one.simple(symbol)
-    bits = np.concatenate([picture.bits, np.tile(one.bits[begin:], groups), np.zeros(9 * 16 * side * side, np.uint8)])
+    bits = np.concatenate([image.bits, np.tile(one.bits[begin:], groups), np.zeros(9 * 16 * side * side, np.uint8)])
     return wrapped(np.packbits(bits.astype(np.uint8), bitorder="little").tobytes())
 
 
 def test_tables_for_codes_are_bounded(tmp_path):
-    """A file could ask for gigabytes of them; those that no pixel uses are not even made."""
-    everyone = with_large_codes(np.arange(6561).reshape(81, 81))
-    (why,) = refusals(tmp_path, [everyone])
-    assert "codes without end" in why
-    last = with_large_codes(np.full((3, 3), 6999))
-    (found,) = decode_all(tmp_path, [last])
-    assert found["sha256"] == sha_of(pillow(last))
+    """A file could declare gigabytes of them; tables of unused groups are not built."""
+    all_used = with_large_codes(np.arange(6561).reshape(81, 81))
+    (why,) = refusals(tmp_path, [all_used])
+    assert "too many prefix codes" in why
+    one_used = with_large_codes(np.full((3, 3), 6999))
+    (found,) = decode_all(tmp_path, [one_used])
+    assert found["sha256"] == sha_of(pillow(one_used))

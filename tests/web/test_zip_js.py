@@ -1,4 +1,4 @@
-"""CRC-32 and zips by JavaScript in Node; oracles: zlib and zipfile."""
+"""CRC-32 and zips in Node.js; reference: zlib and zipfile."""
 
 import base64
 import io
@@ -12,8 +12,8 @@ from helpers.web_tools import run_node, sha_of, webp
 PROGRAM = "read_zips.mjs"
 
 
-def test_crc32_of_every_length_and_place():
-    """At all places of a larger buffer, also odd ones, in plain views and Node's own."""
+def test_crc32_of_any_length_and_offset():
+    """Offsets in a larger buffer may be odd; arrays are Uint8Array or Buffer."""
     rng = np.random.default_rng(0)
     blob = rng.bytes(5000)
     views = [(at, length) for length in range(71) for at in range(9)] + [(3, 4990), (0, 5000), (1, 4999)]
@@ -35,7 +35,7 @@ def test_files_of_zips_in_any_view():
     streamed = io.BytesIO()
 
     class Unseekable(io.RawIOBase):
-        """Makes zipfile write sizes behind the data."""
+        """A stream for which zipfile writes sizes after the data."""
 
         def writable(self):
             return True
@@ -55,4 +55,4 @@ def test_files_of_zips_in_any_view():
 def test_webp_in_any_view():
     image = np.random.default_rng(2).integers(0, 256, (13, 9, 4)).astype(np.uint8)
     job = {"webp": base64.b64encode(webp(image)).decode()}
-    assert json.loads(run_node(PROGRAM, json.dumps(job)))["pictures"] == [sha_of(image)] * 9
+    assert json.loads(run_node(PROGRAM, json.dumps(job)))["images"] == [sha_of(image)] * 9

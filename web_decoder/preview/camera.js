@@ -1,19 +1,19 @@
-/** Where to look from. Scenes are in COLMAP's frame: y down, z ahead; three.js has y up, z behind. */
+/** Camera poses. Scenes are in COLMAP's frame, with y down and z forward; three.js has y up and z backward. */
 
 import { Matrix4, Vector3 } from "three";
 
 /**
- * @typedef {{viewmat: number[][], K: number[][], width: number, height: number}} Pinhole `viewmat` world to camera, as
- *   OpenCV has it; pixels of `K` from the upper left corner of the picture
+ * @typedef {{viewmat: number[][], K: number[][], width: number, height: number}} Pinhole `viewmat`: world to camera, as
+ *   in OpenCV; `K`: pixels, from the upper left corner of the image
  */
 
 /** From COLMAP's frame to that of three.js, and back. */
 const FLIP = new Matrix4().makeScale(1, -1, -1);
 
 /**
- * Put a camera where the whole extent is in the picture, seen from the front and a little from above.
+ * Move a camera so that the whole extent is visible, from the front and slightly from above.
  * @param {import("three").PerspectiveCamera} camera
- * @param {number} radius of what is around the origin
+ * @param {number} radius of the scene around the origin
  */
 export function lookAtAll(camera, radius) {
   const half = Math.atan(Math.min(1, camera.aspect) * Math.tan((camera.fov * Math.PI) / 360)); // the narrower angle
@@ -27,10 +27,10 @@ export function lookAtAll(camera, radius) {
 }
 
 /**
- * Make a camera an exact pinhole, its centre of projection anywhere.
+ * Set the exact pose and intrinsics of a camera.
  * @param {import("three").PerspectiveCamera} camera
  * @param {Pinhole} pinhole
- * @param {number[]} centre of the scene, which is the origin here
+ * @param {number[]} centre of the scene, which is the origin of the viewer
  */
 export function setPinhole(camera, { viewmat, K, width, height }, [x, y, z]) {
   const [near, far] = [0.01, 1e5];

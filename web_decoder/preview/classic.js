@@ -1,7 +1,7 @@
-/** How Spark has to be set to draw as the original rasteriser does. */
+/** Settings with which Spark renders like the original 3DGS rasteriser. */
 
-/** Base colours of trained scenes leave 0 to 1; Spark would clip them. Three times its range is three times its steps. */
-export const WIDE = {
+/** Ranges for unknown scenes: base colours of trained scenes exceed 0 to 1, and Spark would clip them. */
+export const WIDE_RANGES = {
   rgbMin: -1,
   rgbMax: 2,
   lnScaleMin: -12,
@@ -13,8 +13,8 @@ export const WIDE = {
 };
 
 /**
- * As the original rasteriser draws: Gaussians are widened by 0.3 square pixels and keep their opacity (`blurAmount`
- * would thin them out in return), are sorted by depth and followed until they are fainter than 1/255.
+ * Options of the original rasteriser: Gaussians are dilated by 0.3 square pixels and keep their opacity (`blurAmount`
+ * would reduce it), are sorted by depth, and are drawn down to an alpha of 1/255.
  */
 export const CLASSIC = {
   preBlurAmount: 0.3,
@@ -23,15 +23,14 @@ export const CLASSIC = {
   minAlpha: 1 / 255,
   maxStdDev: Math.sqrt(2 * Math.log(255)),
   maxPixelRadius: 4096,
-  accumExtSplats: true, // a second rounding to 8 bits would be seen
+  accumExtSplats: true, // a second rounding to 8 bits would be visible
   enableLod: false,
 };
 
 /**
- * Let Gaussians be drawn that lie far beside the picture, when they are large enough to reach into it, as skies are.
- * Spark leaves them out, because it takes the derivative of the projection where they are, and footprints grow without
- * end there; the original rasteriser takes it no further outside than 0.3 of half the picture. A Spark whose shader has
- * no such line is left as it is.
+ * Draw Gaussians with centres far outside the image that extend into it, such as those of a sky. Spark omits them, because
+ * it takes the derivative of the projection at the centre, where footprints grow without bound; the original rasteriser
+ * clamps that point to 0.3 of half the image outside. A version of Spark without this line of shader is not changed.
  * @param {import("@sparkjsdev/spark").SparkRenderer} spark before it has drawn
  */
 export function drawFromOutside(spark) {

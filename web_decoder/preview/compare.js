@@ -1,10 +1,10 @@
-/** Two pictures of one view, divided by a handle: the original to its left, what has been compressed to its right. */
+/** Two renderings of one view with a handle between them: the original to its left, the compressed scene to its right. */
 
 import { el } from "./dom.js";
 import { Viewer } from "./viewer.js";
 
-const STEP = 2; // per cent, of an arrow key
-const LEAP = 10;
+const STEP = 2; // of an arrow key, per cent
+const LARGE_STEP = 10; // of a page key, per cent
 
 /**
  * @param {HTMLElement} stage
@@ -82,7 +82,14 @@ export async function comparison(stage, compressed, bytes) {
  */
 function moveOf(key, share) {
   /** @type {Record<string, number>} */
-  const steps = { ArrowLeft: -STEP, ArrowDown: -STEP, ArrowRight: STEP, ArrowUp: STEP, PageDown: -LEAP, PageUp: LEAP };
+  const steps = {
+    ArrowLeft: -STEP,
+    ArrowDown: -STEP,
+    ArrowRight: STEP,
+    ArrowUp: STEP,
+    PageDown: -LARGE_STEP,
+    PageUp: LARGE_STEP,
+  };
   if (key in steps) return share + steps[key];
   return { Home: 0, End: 100 }[key] ?? null;
 }

@@ -1,9 +1,9 @@
-/** Making and finding elements. Data only ever becomes text: nothing here parses HTML. */
+/** Creating and finding elements. Data becomes text only; nothing here parses HTML. */
 
 /**
- * The element with an id, which is on the page or the page is broken.
+ * Return the element with an id; throw if the page has none.
  * @param {string} id
- * @returns {any} any, because every caller knows which kind it is
+ * @returns {any} any, because each caller knows its type
  */
 export function byId(id) {
   const found = document.getElementById(id);
@@ -12,9 +12,9 @@ export function byId(id) {
 }
 
 /**
- * A new element.
+ * Return a new element.
  * @param {string} name
- * @param {Record<string, any>} [attributes] functions listen (`onclick`), booleans switch, null and undefined are left out
+ * @param {Record<string, any>} [attributes] functions become listeners (`onclick`), booleans toggle, null and undefined are omitted
  * @param {...(Node | string | null | undefined)} children strings become text
  * @returns {any}
  */
@@ -30,7 +30,7 @@ export function el(name, attributes = {}, ...children) {
 }
 
 /**
- * Tell people who listen instead of look.
+ * Announce a text to screen readers.
  * @param {string} text
  */
 export function announce(text) {
@@ -38,24 +38,24 @@ export function announce(text) {
 }
 
 /**
- * Files dropped anywhere on the page, with a veil over it while one is above.
+ * Accept files that are dropped anywhere on the page, with an overlay while they are dragged over it.
  * @param {(files: File[]) => void} take
  */
 export function dropAnywhere(take) {
-  const veil = (/** @type {boolean} */ down) => document.body.classList.toggle("dragging", down);
+  const showOverlay = (/** @type {boolean} */ down) => document.body.classList.toggle("dragging", down);
   const carriesFiles = (/** @type {DragEvent} */ event) => event.dataTransfer?.types.includes("Files");
   window.addEventListener("dragover", (event) => {
     if (!carriesFiles(event)) return;
     event.preventDefault(); // the browser would leave the page and show the file
-    veil(true);
+    showOverlay(true);
   });
   window.addEventListener("dragleave", (event) => {
-    if (!event.relatedTarget) veil(false); // it has left the window, not just an element
+    if (!event.relatedTarget) showOverlay(false); // it has left the window, not just an element
   });
   window.addEventListener("drop", (event) => {
     if (!carriesFiles(event)) return;
     event.preventDefault();
-    veil(false);
+    showOverlay(false);
     take([...(event.dataTransfer?.files ?? [])]);
   });
 }

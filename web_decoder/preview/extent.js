@@ -1,16 +1,16 @@
-/** Where a scene is and how far it reaches. */
+/** The position and size of a scene. */
 
 import { sigmoid } from "./scene.js";
 
 const SAMPLES = 20_000;
-const DISTANT = 0.85; // of the opacity lies nearer to the centre; the rest may be sky and stray Gaussians
+const DISTANT = 0.85; // share of the opacity within the radius; the rest may be sky and outliers
 
 /** @typedef {{centre: number[], radius: number}} Extent */
 
 /**
- * Where a scene is: its opacity-weighted median, and how far most of it reaches from there. Outliers do not count.
+ * Return the opacity-weighted median of a scene, and the radius that contains most of it, without outliers.
  * @param {number} count
- * @param {(index: number) => ArrayLike<number>} mean three numbers
+ * @param {(index: number) => ArrayLike<number>} mean position of a Gaussian
  * @param {(index: number) => number} weight
  * @returns {Extent}
  */

@@ -1,4 +1,4 @@
-/** Numbers, sizes and times for people. The page is written in English; its numbers follow the text, not the browser. */
+/** Formatting of numbers, sizes and times, in English like the page, whatever the browser's language. */
 
 /** @param {Intl.NumberFormatOptions} options */
 const formatter = (options) => new Intl.NumberFormat("en", options);
@@ -18,18 +18,18 @@ const sizes = SIZES.map((unit) =>
 /** @param {number} value */
 export const count = (value) => whole.format(value);
 
-/** @param {number} value three digits */
+/** @param {number} value formatted with three digits */
 export const short = (value) => (value !== 0 && Math.abs(value) < 0.001 ? tiny : brief).format(value).replace("-", "−");
 
 /** @param {number} value from 0 to 1 */
 export const share = (value) => (value > 0 && value < 0.0005 ? "< 0.1%" : shares.format(value));
 
 /**
- * Bytes, in the unit that keeps the number short.
+ * Format bytes with three digits and a unit.
  * @param {number} value
  */
 export function bytes(value) {
-  // 999,600 rounded to three digits would read "1,000 kB": it belongs to the next unit already.
+  // 999,600 rounded to three digits would read "1,000 kB": it belongs to the next unit.
   const step = Math.min(SIZES.length - 1, Math.max(0, Math.floor(Math.log10(Math.max(value, 1) * 1.0005) / 3)));
   return sizes[step].format(value / 1000 ** step);
 }

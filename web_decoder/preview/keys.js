@@ -1,4 +1,4 @@
-/** What keys do, and the buttons that do the same. */
+/** Actions of keys, and of the buttons that do the same. */
 
 import { byId } from "./dom.js";
 import { Trouble, trouble } from "./trouble.js";
@@ -17,15 +17,15 @@ export function switchFullScreen() {
 }
 
 /**
- * Keys count while the picture has the focus, or nothing has: elsewhere they are somebody else's.
- * @param {{picture: HTMLElement, home: () => void, move: (event: KeyboardEvent) => boolean}} view
+ * Handle keys while the viewport or nothing has the focus; elsewhere they belong to other elements.
+ * @param {{viewport: HTMLElement, home: () => void, move: (event: KeyboardEvent) => boolean}} view
  */
-export function listen({ picture, home, move }) {
+export function listen({ viewport, home, move }) {
   /** @type {Record<string, () => void>} */
   const actions = { r: home, home, f: switchFullScreen, h: switchPanels, "?": help };
   window.addEventListener("keydown", (event) => {
-    const ours = event.target === document.body || event.target === picture;
-    if (!ours || event.ctrlKey || event.metaKey || event.altKey || picture.hidden) return;
+    const ours = event.target === document.body || event.target === viewport;
+    if (!ours || event.ctrlKey || event.metaKey || event.altKey || viewport.hidden) return;
     const action = actions[event.key.toLowerCase()];
     if (!action && !move(event)) return;
     event.preventDefault();

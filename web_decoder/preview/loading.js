@@ -1,10 +1,10 @@
-/** The card that shows how far loading is, and cancels it. */
+/** The card that shows the progress of loading, with a button to cancel it. */
 
 import { byId } from "./dom.js";
 import { bytes } from "./format.js";
 
 /**
- * One thing is loaded at a time: whatever begins ends what went on before.
+ * Return a loader of one thing at a time: a new load cancels the former one.
  * @returns {{begin: (what: string) => Load, cancel: () => void}}
  */
 export function loader() {
@@ -18,7 +18,7 @@ export function loader() {
   function begin(what) {
     cancel();
     const own = (current = new AbortController());
-    let most = 0; // a share that goes back is believed by nobody
+    let largest = 0; // the bar never goes back
     byId("loading-what").textContent = what;
     amount.textContent = "";
     bar.removeAttribute("value");
@@ -30,7 +30,7 @@ export function loader() {
         if (current !== own) return;
         const [ofAll, ofImages] = [received / total, planes ? decoded / planes : 0];
         const share = total && planes ? (ofAll + ofImages) / 2 : total ? ofAll : ofImages;
-        if (share) bar.value = most = Math.max(most, Math.min(1, share));
+        if (share) bar.value = largest = Math.max(largest, Math.min(1, share));
         const ofBytes = received < total ? `${bytes(received)} of ${bytes(total)}` : received ? bytes(received) : null;
         const ofPlanes = planes ? `${decoded} of ${planes} planes` : null;
         amount.textContent = [ofBytes, ofPlanes].filter((text) => text !== null).join(" · ");

@@ -1,4 +1,4 @@
-/** The marker of one Gaussian: the wires of its ellipsoid at three sigma, and a ring where that is too small to see. */
+/** The marker of one Gaussian: a wireframe of its ellipsoid at three sigma, and a ring in case that is too small. */
 
 import {
   CanvasTexture,
@@ -11,19 +11,19 @@ import {
   WireframeGeometry,
 } from "three";
 
-const COLOUR = "#ffb020"; // seen on black as on white, and rare in scenes
+const COLOUR = "#ffb020"; // visible on black and white, and rare in scenes
 const SIGMAS = 3;
-const RING = 0.06; // of the height of the picture, more or less
+const RING = 0.06; // share of the height of the image, about
 
-/** Drawn last and whatever is in front of it. */
-const ABOVE = { depthTest: false, depthWrite: false, transparent: true };
+/** Drawn last, in front of everything. */
+const ON_TOP = { depthTest: false, depthWrite: false, transparent: true };
 
 export function marker() {
   const wires = new LineSegments(
     new WireframeGeometry(new SphereGeometry(1, 16, 10)),
-    new LineBasicMaterial({ color: COLOUR, opacity: 0.85, ...ABOVE }),
+    new LineBasicMaterial({ color: COLOUR, opacity: 0.85, ...ON_TOP }),
   );
-  const ring = new Sprite(new SpriteMaterial({ map: ringTexture(), sizeAttenuation: false, ...ABOVE }));
+  const ring = new Sprite(new SpriteMaterial({ map: ringTexture(), sizeAttenuation: false, ...ON_TOP }));
   ring.scale.setScalar(RING);
   const object = new Group();
   object.visible = false;

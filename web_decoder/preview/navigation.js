@@ -1,14 +1,14 @@
-/** Moving the camera: mouse and touch by three's OrbitControls, keys here. */
+/** Camera movement: mouse and touch by OrbitControls of three.js, keys here. */
 
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { Spherical, Vector3 } from "three";
 
-const TURN = 1.4; // radians per second
-const FLY = 0.7; // of the scene's radius per second
-const ZOOM = 2.2; // times nearer per second
-const FIRST_STEP = 1 / 20; // seconds: what a tap on a key is worth
+const TURN_SPEED = 1.4; // radians per second
+const FLY_SPEED = 0.7; // scene radii per second
+const ZOOM_SPEED = 2.2; // factor of distance per second
+const FIRST_STEP = 1 / 20; // seconds of movement by a tap on a key
 
-/** Directions of the camera's own frame. @type {Record<string, [number, number, number]>} */
+/** Directions in the camera's frame. @type {Record<string, [number, number, number]>} */
 const FLIGHTS = { w: [0, 0, -1], s: [0, 0, 1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, -1, 0], e: [0, 1, 0] };
 /** Angles around and over the scene. @type {Record<string, [number, number]>} */
 const TURNS = { arrowleft: [-1, 0], arrowright: [1, 0], arrowup: [0, -1], arrowdown: [0, 1] };
@@ -30,27 +30,27 @@ export function navigation(viewer) {
   function step(seconds) {
     const radius = viewer.extent.radius;
     for (const key of held) {
-      if (key in FLIGHTS) fly(new Vector3(...FLIGHTS[key]).multiplyScalar(FLY * radius * seconds));
-      else if (key in TURNS) turn(TURNS[key].map((direction) => direction * TURN * seconds));
-      else zoom(ZOOM ** (-ZOOMS[key] * seconds));
+      if (key in FLIGHTS) fly(new Vector3(...FLIGHTS[key]).multiplyScalar(FLY_SPEED * radius * seconds));
+      else if (key in TURNS) turn(TURNS[key].map((direction) => direction * TURN_SPEED * seconds));
+      else zoom(ZOOM_SPEED ** (-ZOOMS[key] * seconds));
     }
     controls.update();
     viewer.invalidate();
   }
 
-  /** @param {Vector3} way */
-  function fly(way) {
-    way.applyQuaternion(camera.quaternion);
-    camera.position.add(way);
-    controls.target.add(way);
+  /** @param {Vector3} offset */
+  function fly(offset) {
+    offset.applyQuaternion(camera.quaternion);
+    camera.position.add(offset);
+    controls.target.add(offset);
   }
 
   /** @param {number[]} angles */
   function turn([around, over]) {
-    const place = new Spherical().setFromVector3(camera.position.clone().sub(controls.target));
-    place.theta += around;
-    place.phi += over;
-    camera.position.setFromSpherical(place.makeSafe()).add(controls.target);
+    const position = new Spherical().setFromVector3(camera.position.clone().sub(controls.target));
+    position.theta += around;
+    position.phi += over;
+    camera.position.setFromSpherical(position.makeSafe()).add(controls.target);
   }
 
   /** @param {number} factor */
@@ -72,7 +72,7 @@ export function navigation(viewer) {
   window.addEventListener("keyup", (event) => held.delete(event.key.toLowerCase()));
 
   return {
-    /** Whether somebody has moved the camera since it was put where it sees everything. */
+    /** Whether the user has moved the camera since the last home(). */
     get moved() {
       return moved;
     },

@@ -1,4 +1,4 @@
-/** A decoded scene in Spark's own form: 16 bytes per Gaussian, and up to 40 more for spherical harmonics. */
+/** Conversion of a decoded scene to Spark's format: 16 bytes per Gaussian, and up to 40 more for spherical harmonics. */
 
 import { PackedSplats, utils } from "@sparkjsdev/spark";
 import { baseColour, sigmoid } from "./scene.js";
@@ -12,20 +12,20 @@ const BANDS = [
   { name: "sh3", words: 4, from: 8, to: 15, encode: utils.encodeSh3Rgb },
 ];
 
-/** Spark discards sizes below e^-30 and cannot tell finer ones apart: one outlier must not coarsen all steps. */
+/** Lower limit of log-scales, so that a single outlier does not coarsen the quantisation of all. */
 const SMALLEST_LOG_SCALE = -14;
 
 /**
  * @param {Scene} scene
- * @param {number[]} centre subtracted from all positions, which are halves: exact only near zero
+ * @param {number[]} centre subtracted from all positions, which are half floats, accurate only near zero
  * @param {object} how
- * @param {number | null} how.size standard deviation to draw all with, while their own are not there
- * @param {boolean} how.spherical whether the spherical harmonics are there
+ * @param {number | null} how.size standard deviation of all Gaussians until scales have arrived; null afterwards
+ * @param {boolean} how.spherical whether the spherical harmonics have arrived
  */
 export function pack(scene, centre, { size, spherical }) {
   const { count, means, quats } = scene;
   const encoding = encodingOf(scene, size);
-  // Spark shows only whole rows of its texture: arrays must be as long as it wants them, or Gaussians get lost.
+  // Spark shows whole rows of its texture only: shorter arrays would lose Gaussians.
   const room = utils.computeMaxSplats(count);
   const packed = new Uint32Array(4 * room);
   for (let i = 0, a = 0, q = 0; i < count; i++, a += 3, q += 4) {
@@ -58,7 +58,7 @@ export function pack(scene, centre, { size, spherical }) {
 }
 
 /**
- * The ranges that Spark's few bits are spread over: no wider than the scene needs.
+ * Return the ranges of Spark's quantisation, no wider than the scene needs.
  * @param {Scene} scene
  * @param {number | null} size
  */
@@ -74,7 +74,7 @@ function encodingOf(scene, size) {
     sh1Max: 1,
     sh2Max: 1,
     sh3Max: 1,
-    lodOpacity: false, // Spark's reader of .ply files insists on it
+    lodOpacity: false, // required by Spark's reader of .ply files
   };
   const names = /** @type {const} */ (["sh1Max", "sh2Max", "sh3Max"]);
   names.forEach((name, at) => (encoding[name] = largestOf(scene, BANDS[at].from, BANDS[at].to) || 1));
@@ -109,7 +109,7 @@ function largestOf({ centroids, degree }, from, to) {
 }
 
 /**
- * Every codebook entry is encoded once; Gaussians get copies of the words, which is many times quicker.
+ * Encode each codebook entry once, and copy the words to Gaussians, which is many times faster.
  * @param {Scene} scene
  * @param {ReturnType<typeof encodingOf>} encoding
  * @param {number} room

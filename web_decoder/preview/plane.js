@@ -1,4 +1,4 @@
-/** One plane of a container, large enough to point at its pixels. */
+/** View of one plane of a container, large enough to point at its pixels. */
 
 import { el } from "./dom.js";
 import { bytes } from "./format.js";
@@ -6,7 +6,7 @@ import { readout } from "./readout.js";
 import { planeName } from "./words.js";
 
 /** @type {Record<string, [number, number]>} */
-const WAYS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+const STEPS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 
 /**
  * @param {import("./scene.js").Scene} scene
@@ -44,7 +44,7 @@ export function planeView(scene, file, indexOfCell, mark) {
 }
 
 /**
- * Which pixel is meant, by pointer or keys.
+ * Report the pixel that is selected by pointer or keys.
  * @param {HTMLCanvasElement} canvas
  * @param {{width: number, height: number}} plane
  * @param {{at: (pixel: {x: number, y: number}) => void, away: () => void}} then
@@ -68,19 +68,19 @@ function pointing(canvas, plane, then) {
   canvas.addEventListener("pointerdown", point);
   canvas.addEventListener("pointermove", point);
   canvas.addEventListener("pointerleave", ({ pointerType }) => {
-    if (pointerType !== "touch" && document.activeElement !== canvas) then.away(); // a finger leaves with every tap
+    if (pointerType !== "touch" && document.activeElement !== canvas) then.away(); // a finger leaves after each tap
   });
   canvas.addEventListener("focus", () => canvas.matches(":focus-visible") && then.at(pixel));
   canvas.addEventListener("blur", then.away);
   canvas.addEventListener("keydown", (event) => {
-    const way = WAYS[event.key];
-    if (!way) return;
+    const step = STEPS[event.key];
+    if (!step) return;
     event.preventDefault();
-    pointAt(pixel.x + way[0], pixel.y + way[1]);
+    pointAt(pixel.x + step[0], pixel.y + step[1]);
   });
 }
 
-/** The button that gives planes most of the window, and takes it back. */
+/** Return the button that enlarges and shrinks the planes. */
 function enlarger() {
   const button = el("button", { type: "button", class: "quiet small", onclick: press });
   const label = (/** @type {boolean} */ wide) => (button.textContent = wide ? "Shrink" : "Enlarge");
@@ -92,7 +92,7 @@ function enlarger() {
 }
 
 /**
- * A canvas for a plane, still blank.
+ * Return a blank canvas for a plane.
  * @param {import("./scene.js").Plane} plane
  * @param {Record<string, any>} attributes
  * @returns {HTMLCanvasElement}
@@ -100,8 +100,8 @@ function enlarger() {
 export const canvasOf = ({ width, height }, attributes) => el("canvas", { width, height, ...attributes });
 
 /**
- * Levels are stretched to all of black to white, or a mask of ones would be as black as one of zeros. Alpha is left out: of
- * rotations it is data, not transparency.
+ * Paint a plane with levels stretched from black to white, so that a mask of ones is visible. Alpha is ignored: in rotations
+ * it is data, not transparency.
  * @param {HTMLCanvasElement} canvas
  * @param {import("./scene.js").Plane} plane
  */

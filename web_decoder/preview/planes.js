@@ -1,18 +1,18 @@
-/** The planes of a container as images. Pointing at a pixel marks its Gaussian in the scene. */
+/** View of all planes of a container; the selected pixel's Gaussian is marked in the scene. */
 
 import { el } from "./dom.js";
 import { canvasOf, paint, planeView } from "./plane.js";
 import { inOrder, planeName } from "./words.js";
 
-/** Longest wait for a browser that is never idle, in milliseconds. */
-const PATIENCE = 200;
+/** Longest wait for the browser to be idle, milliseconds. */
+const MAX_WAIT = 200;
 
 /** @param {() => void} work */
 const whenIdle = (work) =>
-  "requestIdleCallback" in window ? requestIdleCallback(work, { timeout: PATIENCE }) : setTimeout(work);
+  "requestIdleCallback" in window ? requestIdleCallback(work, { timeout: MAX_WAIT }) : setTimeout(work);
 
 /**
- * Paint what is on the page, one plane at a time; a newer scene has taken the rest off it.
+ * Paint one plane after the other, until they are removed from the page for a newer scene.
  * @param {[HTMLCanvasElement, import("./scene.js").Plane][]} waiting
  */
 function paintInTurn([next, ...others]) {

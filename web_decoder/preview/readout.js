@@ -1,4 +1,4 @@
-/** What a pixel of a plane says, in natural units. */
+/** Description of a pixel of a plane, in natural units. */
 
 import { el } from "./dom.js";
 import { count, share, short } from "./format.js";

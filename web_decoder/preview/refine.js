@@ -1,11 +1,11 @@
-/** From a coarse picture to the whole one, as planes arrive. */
+/** Refinement of a rendering as images arrive. */
 
 import { STAGES } from "./scene.js";
 
 /** @typedef {import("./scene.js").Scene} Scene */
 
 /**
- * Shows a scene whenever there is more of it, and as much as there is by then: planes may come faster than pictures.
+ * Return a function that shows the latest stage of a scene; stages that arrive while one waits to be drawn are merged.
  * @param {{ready: Promise<void>, show: (scene: Scene, state: number, fresh: boolean) => void}} view
  * @param {(scene: Scene) => boolean} current whether the scene is still wanted
  */
@@ -27,6 +27,6 @@ export function refiner(view, current) {
     if (state <= wanted) return;
     const waiting = wanted > done;
     wanted = state;
-    if (!waiting) view.ready.then(() => setTimeout(show, 0, scene)); // else the picture to come will have it
+    if (!waiting) view.ready.then(() => setTimeout(show, 0, scene)); // otherwise the waiting rendering will include it
   };
 }

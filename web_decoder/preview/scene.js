@@ -1,4 +1,4 @@
-/** What a decoded scene is, and what one of its Gaussians is in natural units. */
+/** Decoding stages of a scene, and the values of one Gaussian in natural units. */
 
 /** @typedef {import("../types.js").Scene} Scene */
 /** @typedef {import("../types.js").Plane} Plane */
@@ -11,11 +11,11 @@ export const sigmoid = (logit) => 1 / (1 + Math.exp(-logit));
 /** @param {number} sh0 */
 export const baseColour = (sh0) => 0.5 + SH_CONSTANT * sh0;
 
-/** How much of a scene is there: each is worth a new picture. */
+/** Stages of decoding, each of which is worth a new rendering. */
 export const STAGES = /** @type {const} */ ({ nothing: 0, coarse: 1, base: 2, whole: 3 });
 
-const PLACES = ["active_mask.webp", "means_bytes_1.webp"];
-const COARSE = [...PLACES, "f_dc.webp"];
+const POSITIONS = ["active_mask.webp", "means_bytes_1.webp"];
+const COARSE = [...POSITIONS, "f_dc.webp"];
 const BASE = [...COARSE, "opacities.webp", "scales.webp", "quaternions.webp", "means_bytes_0.webp"];
 const SPHERICAL = ["f_rest_labels.webp", "f_rest_centroids.webp"];
 
@@ -30,19 +30,19 @@ export function stageOf(arrived, degree) {
 }
 
 /**
- * What can be drawn of a scene of which no more will come.
+ * Return the stage to draw after an error, when no more images will arrive.
  * @param {Set<string>} arrived
  */
-export const lastStageOf = (arrived) => (PLACES.every((file) => arrived.has(file)) ? STAGES.whole : STAGES.nothing);
+export const lastStageOf = (arrived) => (POSITIONS.every((file) => arrived.has(file)) ? STAGES.whole : STAGES.nothing);
 
 /**
- * What of a picture is as it will stay: where Gaussians are, their own sizes, their spherical harmonics.
+ * Return which parts of a rendering are final: positions with opacities, sizes, spherical harmonics.
  * @param {Set<string>} arrived
  * @param {number} stage
  * @returns {Parts}
  */
 export const partsOf = (arrived, stage) => ({
-  placed: arrived.has("means_bytes_0.webp") && arrived.has("opacities.webp"), // which weigh in a scene's extent
+  placed: arrived.has("means_bytes_0.webp") && arrived.has("opacities.webp"), // the extent depends on both
   sized: stage >= STAGES.base && arrived.has("scales.webp"),
   spherical: SPHERICAL.every((file) => arrived.has(file)),
 });
@@ -50,7 +50,7 @@ export const partsOf = (arrived, stage) => ({
 /** @typedef {{placed: boolean, sized: boolean, spherical: boolean}} Parts */
 
 /**
- * One Gaussian as people and the marker in the picture want it.
+ * Return the values of a Gaussian in natural units.
  * @param {Scene} scene
  * @param {number} index
  */

@@ -1,4 +1,4 @@
-/** Where a scene comes from: the page's own address, or a file. */
+/** Sources of scenes: the page's address, or a file. */
 
 import { Trouble } from "./trouble.js";
 
@@ -6,21 +6,21 @@ import { Trouble } from "./trouble.js";
  * @typedef {object} Source
  * @property {string} name
  * @property {string | Blob} container
- * @property {number} [bytes] of the container
- * @property {boolean} [zipped] whether it is a zip at an address, which says itself how long it is
+ * @property {number} [bytes] size of the container
+ * @property {boolean} [zipped] whether it is a zip at an address, whose response tells its size
  * @property {RequestInit} [request]
- * @property {{url: string, bytes: number} | null} [original] where the .ply can be had
+ * @property {{url: string, bytes: number} | null} [original] address and size of the original .ply
  * @property {number} [originalBytes]
  */
 
-/** What the service's page has been told, for this tab. */
+/** Return the key that the user entered on the service's page, stored for this tab. */
 const key = () => sessionStorage.getItem("kissgs-key") ?? "";
 
 /** @returns {RequestInit} */
 const withKey = () => (key() ? { headers: { Authorization: `Bearer ${key()}` } } : {});
 
 /**
- * What the address names.
+ * Return the source that the page's address names.
  * @param {Location} location
  * @param {AbortSignal} signal
  * @returns {Promise<Source>}
@@ -78,26 +78,26 @@ async function ofJob(id, signal) {
  * @param {RequestInit} init
  */
 async function get(url, init) {
-  const answer = await fetch(url, init).catch((error) => {
+  const response = await fetch(url, init).catch((error) => {
     throw init.signal?.aborted ? error : new Trouble("The server cannot be reached: check your network, then reload.");
   });
-  if (answer.status === 401)
+  if (response.status === 401)
     throw new Trouble("This service wants a key: enter it on its page, then open the preview from there.");
-  if (answer.status === 404 || answer.status === 410) throw new Trouble("The server does not have this any more.");
-  if (!answer.ok) throw new Trouble(`The server answered with status ${answer.status}.`);
-  return answer;
+  if (response.status === 404 || response.status === 410) throw new Trouble("The server does not have this any more.");
+  if (!response.ok) throw new Trouble(`The server answered with status ${response.status}.`);
+  return response;
 }
 
 /**
- * All bytes behind an address of the service, with progress.
+ * Download the original .ply from the service, with progress.
  * @param {{url: string, bytes: number}} original
  * @param {import("./loading.js").Load} load
  */
 export async function download({ url, bytes: total }, load) {
-  const answer = await get(url, { ...withKey(), signal: load.signal });
+  const response = await get(url, { ...withKey(), signal: load.signal });
   const parts = [];
   let received = 0;
-  const reader = /** @type {ReadableStream<Uint8Array<ArrayBuffer>>} */ (answer.body).getReader();
+  const reader = /** @type {ReadableStream<Uint8Array<ArrayBuffer>>} */ (response.body).getReader();
   for (let part = await reader.read(); !part.done; part = await reader.read()) {
     parts.push(part.value);
     load.progress({ received: (received += part.value.length), total: Math.max(total, received) });

@@ -1,4 +1,4 @@
-/** The place where the scene is seen: viewer, camera and comparison, as far as this browser can draw at all. */
+/** The stage: viewer, camera and comparison, if this browser can draw them. */
 
 import { byId } from "./dom.js";
 import { Trouble } from "./trouble.js";
@@ -6,9 +6,9 @@ import { Trouble } from "./trouble.js";
 /** @typedef {import("./scene.js").Scene} Scene */
 
 const BACKGROUNDS = { dark: "#0b0a10", white: "#ffffff" };
-const MOST_PIXELS_PER_PIXEL = 2; // more costs much and shows little
+const MAX_PIXEL_RATIO = 2; // a higher one costs much and is hardly visible
 
-const LOST = "The graphics driver has reset, so the picture is gone; reload the page to draw it again.";
+const LOST = "The graphics driver has reset, so the rendering is gone; reload the page to draw it again.";
 
 /** The modules that need Spark, which may not be installed. */
 async function modules() {
@@ -23,9 +23,9 @@ async function modules() {
   }
 }
 
-/** @param {(error: unknown) => void} failed what to do if nothing can be drawn */
+/** @param {(error: unknown) => void} failed called if nothing can be drawn */
 export function stage(failed) {
-  const [place, canvas] = [byId("stage"), byId("picture")];
+  const [container, canvas] = [byId("stage"), byId("viewport")];
   /** @type {{viewer: import("./viewer.js").Viewer, camera: ReturnType<typeof import("./navigation.js").navigation>} | null} */
   let live = null;
   /** @type {Awaited<ReturnType<typeof import("./compare.js").comparison>> | null} */
@@ -35,7 +35,7 @@ export function stage(failed) {
   const ready = modules().then(([{ Viewer }, { navigation }, { comparison }]) => {
     const viewer = new Viewer(canvas, { lost: () => fail(new Trouble(LOST)) });
     live = { viewer, camera: navigation(viewer) };
-    new ResizeObserver(fit).observe(place);
+    new ResizeObserver(fit).observe(container);
     paint();
     return { ...live, comparison };
   });
@@ -47,16 +47,16 @@ export function stage(failed) {
   const viewers = () => [live?.viewer, beside?.original].filter((viewer) => viewer !== undefined);
 
   function fit() {
-    const { clientWidth: width, clientHeight: height } = place;
+    const { clientWidth: width, clientHeight: height } = container;
     if (!width || !height || canvas.hidden) return;
-    for (const viewer of viewers()) viewer.resize(width, height, Math.min(MOST_PIXELS_PER_PIXEL, devicePixelRatio));
+    for (const viewer of viewers()) viewer.resize(width, height, Math.min(MAX_PIXEL_RATIO, devicePixelRatio));
     if (!live?.camera.moved) live?.camera.home();
   }
 
   function paint() {
     const colour = white ? BACKGROUNDS.white : BACKGROUNDS.dark;
     for (const viewer of viewers()) viewer.setBackground(colour);
-    place.style.backgroundColor = colour;
+    container.style.backgroundColor = colour;
   }
 
   /** @param {boolean} fresh whether this is another scene than before */
@@ -75,7 +75,7 @@ export function stage(failed) {
   }
 
   return {
-    /** Resolves when a scene can be shown; never where none can. @type {Promise<void>} */
+    /** Resolves when a scene can be shown; never if that is impossible. @type {Promise<void>} */
     ready: new Promise((resolve) =>
       ready.then(
         () => resolve(),
@@ -84,13 +84,13 @@ export function stage(failed) {
     ),
     /** Resolves when it is known whether a scene can be shown. @type {Promise<unknown>} */
     settled: ready.catch(() => {}),
-    /** Why no scene can be shown, or null. */
+    /** The error why no scene can be shown, or null. */
     get failure() {
       return failure;
     },
     /**
      * @param {Scene} scene
-     * @param {import("./scene.js").Parts} parts of it that are there
+     * @param {import("./scene.js").Parts} parts that have arrived
      * @param {boolean} fresh
      */
     show(scene, parts, fresh) {
@@ -110,12 +110,12 @@ export function stage(failed) {
     async compare(bytes) {
       const { viewer, comparison } = await ready;
       endComparison();
-      beside = await comparison(place, viewer, bytes);
+      beside = await comparison(container, viewer, bytes);
       fit();
       paint();
     },
     endComparison,
-    /** Show no picture, until there is one of another scene. */
+    /** Show nothing until the next scene. */
     conceal() {
       endComparison();
       canvas.hidden = true;

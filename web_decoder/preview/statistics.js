@@ -1,4 +1,4 @@
-/** The figures of a container. */
+/** Statistics of a container. */
 
 import { el } from "./dom.js";
 import { bytes, count, duration, share, short } from "./format.js";
@@ -7,9 +7,9 @@ import { attributes } from "./words.js";
 /**
  * @typedef {object} Facts
  * @property {import("./scene.js").Scene} scene
- * @property {number} [bytes] of the container, if it is known better than by the sum of its files
+ * @property {number} [bytes] size of the container, if known; else the sum of its files is used
  * @property {number} [originalBytes]
- * @property {number | null} seconds to load and decode; null if that was cut short
+ * @property {number | null} seconds to load and decode; null if that failed
  */
 
 /** @param {Facts} facts */
@@ -42,7 +42,7 @@ export function statisticsView({ scene, bytes: known, originalBytes, seconds }) 
 const perGaussian = (size, gaussians) => (gaussians ? `${short((8 * size) / gaussians)} bits` : "none");
 
 /**
- * Of a .ply that is shown by itself.
+ * Return the statistics of a .ply that is shown without a container.
  * @param {number} gaussians
  * @param {number} size
  */

@@ -1,12 +1,12 @@
-/** Showing what has gone wrong: one sentence, and the rest of the page goes on. */
+/** Display of error messages of one sentence; the rest of the page goes on. */
 
 import { SogxtError } from "../sogxt.js";
 import { byId, el } from "./dom.js";
 
-/** Something that this page can name; its message is the sentence. */
+/** An error with a message for users, a sentence. */
 export class Trouble extends Error {}
 
-/** @param {unknown} error null when it is over */
+/** @param {unknown} error null to hide the message */
 export function trouble(error) {
   const place = byId("trouble");
   place.hidden = error === null;
@@ -27,12 +27,12 @@ function sentenceOf(error) {
 }
 
 /**
- * The decoder's messages begin small, as they may be part of a longer line; here they stand alone.
+ * Make a sentence of a message of the decoder, which begins with a small letter and has no full stop.
  * @param {string} text
  */
 function sentence(text) {
-  const begun = /^[a-z]+\b(?![._])/.test(text) ? text.charAt(0).toUpperCase() + text.slice(1) : text; // not names of files
-  return /[.!?…]$/.test(begun) ? begun : `${begun}.`;
+  const capitalised = /^[a-z]+\b(?![._])/.test(text) ? text.charAt(0).toUpperCase() + text.slice(1) : text; // except file names
+  return /[.!?…]$/.test(capitalised) ? capitalised : `${capitalised}.`;
 }
 
 /** @param {unknown} error */

@@ -1,9 +1,9 @@
-/** The picture of a scene on a canvas, drawn by Spark. Draws only when something has changed. */
+/** Rendering of a scene on a canvas by Spark, only when something has changed. */
 
 import * as THREE from "three";
 import { SparkRenderer, SplatFileType, SplatMesh } from "@sparkjsdev/spark";
 import { lookAtAll, setPinhole } from "./camera.js";
-import { CLASSIC, WIDE, drawFromOutside } from "./classic.js";
+import { CLASSIC, WIDE_RANGES, drawFromOutside } from "./classic.js";
 import { extentOfMesh, extentOfScene } from "./extent.js";
 import { marker } from "./marker.js";
 import { pack } from "./pack.js";
@@ -23,18 +23,18 @@ export class Viewer {
   #mesh = null;
   /** @type {Scene | null} */
   #shown = null;
-  /** Whether the extent is final, as nothing more comes that it depends on. */
+  /** Whether the extent is final, because all images that it depends on have arrived. */
   #placed = false;
   /** @type {Extent} */
   #extent = { centre: [0, 0, 0], radius: 1 };
   /** @type {import("./pack.js").Encoding} */
-  #encoding = WIDE;
+  #encoding = WIDE_RANGES;
   #requested = 0;
   #disposed = false;
 
   /**
    * @param {HTMLCanvasElement} canvas
-   * @param {{afterFrame?: () => void, lost?: () => void}} [options] `lost` if the graphics driver takes the picture away
+   * @param {{afterFrame?: () => void, lost?: () => void}} [options] `lost`: called if the graphics driver resets
    */
   constructor(canvas, { afterFrame = () => {}, lost = () => {} } = {}) {
     this.canvas = canvas;
@@ -53,21 +53,21 @@ export class Viewer {
     });
   }
 
-  /** Where the scene is; its centre is the origin of the viewer's own frame. */
+  /** The extent of the scene, whose centre is the origin of the viewer's frame. */
   get extent() {
     return this.#extent;
   }
 
-  /** The ranges of Spark's steps, so that another viewer can round as this one does. */
+  /** The ranges of Spark's quantisation, so that another viewer can use the same. */
   get encoding() {
     return this.#encoding;
   }
 
   /**
-   * Show a decoded scene, or what has changed of it: call it again as more of its planes arrive.
+   * Show a decoded scene, or update it when more of its images have arrived.
    * @param {Scene} scene
-   * @param {Partial<import("./scene.js").Parts>} [parts] what has come of it; all, unless said
-   * @param {boolean} [held] whether somebody has moved the camera: it would jump if the frame followed the scene
+   * @param {Partial<import("./scene.js").Parts>} [parts] which parts have arrived; default: all
+   * @param {boolean} [held] whether the user has moved the camera, so that the origin must not change
    */
   setScene(scene, { placed = true, sized = true, spherical = true } = {}, held = false) {
     if (scene !== this.#shown || !this.#placed) {
@@ -82,13 +82,13 @@ export class Viewer {
   }
 
   /**
-   * Show a .ply, as Spark reads it.
+   * Show a .ply, read by Spark.
    * @param {Uint8Array} bytes
-   * @param {Viewer} [beside] share the frame of this viewer
+   * @param {Viewer} [beside] viewer whose frame is used
    * @returns {Promise<number>} the number of Gaussians
    */
   async setPly(bytes, beside) {
-    const splatEncoding = beside?.encoding ?? WIDE;
+    const splatEncoding = beside?.encoding ?? WIDE_RANGES;
     const mesh = new SplatMesh({ fileBytes: bytes, fileType: SplatFileType.PLY, splatEncoding });
     await mesh.initialized;
     this.#shown = null;
@@ -111,7 +111,7 @@ export class Viewer {
     this.invalidate();
   }
 
-  /** Put the camera where it sees the whole scene. */
+  /** Move the camera so that the whole scene is visible. */
   lookAtAll() {
     lookAtAll(this.camera, this.#extent.radius);
     this.invalidate();
@@ -150,7 +150,7 @@ export class Viewer {
   }
 
   /**
-   * Mark a Gaussian, through all that is in front of it.
+   * Mark a Gaussian, visible through all that is in front of it; null removes the mark.
    * @param {import("./scene.js").Gaussian | null} gaussian
    */
   mark(gaussian) {
@@ -158,7 +158,7 @@ export class Viewer {
     this.invalidate();
   }
 
-  /** Draw before long, once for all that changes until then. */
+  /** Draw in the next animation frame, once for all changes until then. */
   invalidate() {
     if (!this.#requested && !this.#disposed) this.#requested = requestAnimationFrame(() => this.#draw());
   }
@@ -170,11 +170,11 @@ export class Viewer {
     this.afterFrame();
   }
 
-  /** The final picture: with all Gaussians in their order for this camera. */
+  /** Draw with all Gaussians sorted for this camera. */
   async render() {
     this.#scene.updateMatrixWorld();
     this.camera.updateMatrixWorld();
-    await this.#sorted(); // for an earlier camera
+    await this.#sorted(); // of an earlier camera
     await this.#spark.update({ scene: this.#scene, camera: this.camera });
     await this.#sorted();
     this.#draw();
@@ -185,7 +185,7 @@ export class Viewer {
       await new Promise((resolve) => setTimeout(resolve, 4));
   }
 
-  /** The picture on the canvas: RGBA, top row first. */
+  /** Return the pixels of the canvas: RGBA, top row first. */
   readPixels() {
     this.#renderer.setRenderTarget(null);
     const gl = this.#renderer.getContext();
@@ -198,7 +198,7 @@ export class Viewer {
     return { width, height, data };
   }
 
-  /** Spark ends first what it is sorting: it would fail in the middle of it, where nobody can catch the error. */
+  /** Free all resources, after Spark has finished sorting, which would otherwise fail with an error that cannot be caught. */
   async dispose() {
     this.#disposed = true;
     cancelAnimationFrame(this.#requested);

@@ -1,4 +1,4 @@
-/** What the files of a container are called here. */
+/** Names of the files of a container on this page. */
 
 /** @type {[RegExp, string][]} */
 const NAMES = [
@@ -18,16 +18,16 @@ const NAMES = [
 export const planeName = (file) => NAMES.find(([pattern]) => pattern.test(file))?.[1] ?? file;
 
 /**
- * Files in the order of the list above.
+ * Return files in the order of the list above.
  * @param {string[]} files
  */
 export function inOrder(files) {
-  const place = (/** @type {string} */ file) => NAMES.findIndex(([pattern]) => pattern.test(file));
-  return [...files].sort((a, b) => place(a) - place(b));
+  const rank = (/** @type {string} */ file) => NAMES.findIndex(([pattern]) => pattern.test(file));
+  return [...files].sort((a, b) => rank(a) - rank(b));
 }
 
 /**
- * Bytes of each attribute, largest first; files of one meaning are added up.
+ * Return the bytes of each attribute, largest first; files of one attribute are added.
  * @param {Record<string, number>} sizes
  * @returns {[string, number][]}
  */

@@ -1,1 +1,1 @@
-"""The rasteriser for processors: compiled kernels, in the order in which a picture passes through them."""
+"""The CPU rasteriser: numba kernels for projection, shading, tiles, blending and sensitivity."""

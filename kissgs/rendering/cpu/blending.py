@@ -1,14 +1,14 @@
-"""Kernels: Gaussians over pixels, tile by tile. The picture, its derivative, and what a removal would change.
+"""Numba kernels of alpha blending, tile by tile: the image, its derivative, and the error of removals.
 
 A footprint's exponent is u² + v² with u = l0 dx + l1 dy, v = l2 dy (the Cholesky factor of half the inverse
-covariance): a sum of squares cannot go negative, and a needle costs no digits.
+covariance): a sum of squares is never negative, and needles lose no digits.
 
-The lists of tiles are read forward for the picture and backward for everything else. From the back, the colour B behind
-a Gaussian is known without subtracting: B <- B + alpha (colour - B), beginning with the background; and T before it is
-T after it / (1 - alpha). The pixel changes with the Gaussian's alpha by T (colour - B), and by alpha T (colour - B) if
-the Gaussian is removed.
+The lists of tiles are read forward for the image and backward for everything else. Backward, the colour B behind a
+Gaussian needs no subtraction: B <- B + alpha (colour - B), starting with the background; and T in front of it is T
+behind it / (1 - alpha). The derivative of the pixel by the Gaussian's alpha is T (colour - B), and its removal changes
+the pixel by alpha T (colour - B).
 
-Inner loops run over whole rows of a tile, without branches, on one array, so that they become vector instructions.
+Inner loops process whole rows of a tile without branches on one array, so that they are vectorised.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from numba import njit
 
 from kissgs.core.numba_kernels import compiled
 
-# Sums may be reordered, so that they can be vectorised: always in the same way.
+# Sums may be reordered for vectorisation, at compile time, so that results stay reproducible.
 _FAST = {"contract", "reassoc", "nsz"}
 
 
 @njit(nogil=True, error_model="numpy", fastmath=_FAST, inline="always")
 def _exp_minus(s: np.float32) -> np.float32:
-    """exp(-s) for s from 0 to 6, relative error 1e-6; beyond 6, exp(-6), which is less than any alpha that shows."""
+    """Return exp(-s) for s from 0 to 6, relative error 1e-6; beyond 6, exp(-6), which is below ALPHA_MIN."""
     t = min(s, np.float32(6.0)) * np.float32(0.125)
     e = np.float32(-0.00569869049)
     e = e * t + np.float32(0.0395219925)
@@ -39,23 +39,23 @@ def _exp_minus(s: np.float32) -> np.float32:
 
 @njit(nogil=True, error_model="numpy")
 def _pixel_centres(s: np.ndarray) -> None:
-    """x and y of a tile's pixels, into the first and the second 256 of ``s``."""
+    """Write x and y of a tile's pixel centres into the first and the second 256 values of ``s``."""
     for p in range(256):
         s[p], s[256 + p] = np.float32(p & 15) + np.float32(0.5), np.float32(p >> 4) + np.float32(0.5)
 
 
 @njit(nogil=True, error_model="numpy")
-def _footprint(splats: np.ndarray, n: int, x0: int, y0: int) -> tuple[tuple[np.float32, ...], tuple[np.float32, ...]]:
-    """Centre, in the tile that begins at (x0, y0), and l0, l1, l2; opacity, red, green, blue."""
+def _footprint(records: np.ndarray, n: int, x0: int, y0: int) -> tuple[tuple[np.float32, ...], tuple[np.float32, ...]]:
+    """Return the centre relative to (x0, y0), l0, l1, l2; and opacity, red, green, blue."""
     return (
         (
-            splats[n, 0] - np.float32(x0),
-            splats[n, 1] - np.float32(y0),
-            splats[n, 2],
-            splats[n, 3],
-            splats[n, 4],
+            records[n, 0] - np.float32(x0),
+            records[n, 1] - np.float32(y0),
+            records[n, 2],
+            records[n, 3],
+            records[n, 4],
         ),
-        (splats[n, 5], splats[n, 6], splats[n, 7], splats[n, 8]),
+        (records[n, 5], records[n, 6], records[n, 7], records[n, 8]),
     )
 
 
@@ -65,7 +65,7 @@ def _footprint(splats: np.ndarray, n: int, x0: int, y0: int) -> tuple[tuple[np.f
     fastmath=_FAST,
 )
 def blend(
-    splats: np.ndarray,
+    records: np.ndarray,
     members: np.ndarray,
     spans: np.ndarray,
     starts: np.ndarray,
@@ -80,27 +80,27 @@ def blend(
     transmittance: np.ndarray,
     stops: np.ndarray,
 ) -> None:
-    """Draw tiles ``first`` to ``last`` (exclusive).
+    """Render tiles ``first`` to ``last`` (exclusive).
 
     Args:
-        splats: ``(M, 11)`` records of :func:`kissgs.rendering.cpu.projection.project`.
-        members: for each tile, front to back, the rows of ``splats`` that touch it.
-        spans: the rows of pixels that each of these touches, see :func:`kissgs.rendering.cpu.tiles.fill_tiles`.
-        starts: where each tile's members begin; one more than there are tiles.
-        first: tile.
-        last: tile.
-        width: pixels.
-        height: pixels.
-        columns: tiles per row.
+        records: ``(M, 11)`` records of :func:`kissgs.rendering.cpu.projection.project`.
+        members: rows of ``records`` that touch each tile, tile after tile, front to back.
+        spans: rows of pixels that each member touches, see :func:`kissgs.rendering.cpu.tiles.fill_tiles`.
+        starts: ``(tiles + 1,)`` index of the first member of each tile.
+        first: first tile.
+        last: end of the tiles, exclusive.
+        width: of the image, pixels.
+        height: of the image, pixels.
+        columns: number of tiles in a row of tiles.
         limits: ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN.
         background: RGB.
-        image: ``(H, W, 3)``, written.
-        transmittance: ``(H, W)`` left at the end, written.
-        stops: ``(tiles, 256)``, written: members from this one on were not drawn at the pixel.
+        image: out, ``(H, W, 3)``.
+        transmittance: out, ``(H, W)``, behind all Gaussians.
+        stops: out, ``(tiles, 256)``: index of the first member that is not drawn at the pixel.
     """
     alpha_min, alpha_max, t_min = limits[0], limits[1], limits[2]
     zero, one = np.float32(0), np.float32(1)
-    # One array for all that a pixel has, or the compiler would have to fear that the arrays overlap.
+    # One array for all values of a pixel (x, y, stop, T, R, G, B): the compiler must assume that several ones overlap.
     s = np.empty(7 * 256, np.float32)
     _pixel_centres(s)
     for tile in range(first, last):
@@ -112,29 +112,29 @@ def blend(
             s[768 + p] = one
             s[1024 + p] = s[1280 + p] = s[1536 + p] = zero
         for i in range(begin, end):
-            (mx, my, l0, l1, l2), (opacity, red, green, blue) = _footprint(splats, members[i], x0, y0)
+            (mx, my, l0, l1, l2), (opacity, red, green, blue) = _footprint(records, members[i], x0, y0)
             top, bottom = np.uint64(spans[i] >> 5), np.uint64(spans[i] & 31)
-            place = np.float32(i - begin)
+            index = np.float32(i - begin)
             for p in range(top * np.uint64(16), bottom * np.uint64(16)):
                 dx, dy = s[p] - mx, s[p + np.uint64(256)] - my
                 u, v = l0 * dx + l1 * dy, l2 * dy
                 alpha = min(opacity * _exp_minus(u * u + v * v), alpha_max)
                 alpha = alpha if alpha >= alpha_min else zero
-                alpha = alpha if place < s[p + np.uint64(512)] else zero
+                alpha = alpha if index < s[p + np.uint64(512)] else zero
                 t = s[p + np.uint64(768)]
                 after = t * (one - alpha)
                 ends = after <= t_min
                 weight = zero if ends else alpha * t
-                s[p + np.uint64(512)] = place if ends else s[p + np.uint64(512)]
+                s[p + np.uint64(512)] = index if ends else s[p + np.uint64(512)]
                 s[p + np.uint64(768)] = t if ends else after
                 s[p + np.uint64(1024)] += weight * red
                 s[p + np.uint64(1280)] += weight * green
                 s[p + np.uint64(1536)] += weight * blue
             if (i & 7) == 7:
-                furthest = zero
+                last_stop = zero
                 for p in range(512, 768):
-                    furthest = max(furthest, s[p])
-                if furthest <= place:
+                    last_stop = max(last_stop, s[p])
+                if last_stop <= index:
                     break
         for p in range(256):
             x, y = x0 + (p & 15), y0 + (p >> 4)
@@ -153,7 +153,7 @@ def blend(
     fastmath=_FAST,
 )
 def blend_backward(
-    splats: np.ndarray,
+    records: np.ndarray,
     members: np.ndarray,
     spans: np.ndarray,
     slots: np.ndarray,
@@ -169,29 +169,30 @@ def blend_backward(
     v_alpha: np.ndarray,
     v_slots: np.ndarray,
 ) -> None:
-    """Gradients of tiles ``first`` to ``last`` (exclusive), as :func:`kissgs.rendering.cpu.blending.blend` drew them.
+    """Compute gradients of tiles ``first`` to ``last`` (exclusive), which :func:`blend` rendered.
 
     Args:
-        splats, members, spans, starts, first, last, columns, limits, background, transmittance, stops: as there.
-        slots: where each member's gradient goes.
-        v_image: ``(H, W, 3)`` gradient of the loss by the picture.
+        records, members, spans, starts, first, last, columns, limits, background, transmittance, stops: as for
+            :func:`blend`.
+        slots: row of ``v_slots`` of each member.
+        v_image: ``(H, W, 3)`` gradient of the loss by the image.
         v_alpha: ``(H, W)`` gradient of the loss by 1 - transmittance.
-        v_slots: ``(slots, 9)``, written: sums over the tile's pixels of the gradient by the exponent times 1, u, v, u²,
+        v_slots: out, ``(slots, 9)``: sums over the tile's pixels of the gradient by the exponent times 1, u, v, u²,
             uv, v²; and the gradient by the colour's R, G, B.
     """
     alpha_min, alpha_max = limits[0], limits[1]
     zero, one = np.float32(0), np.float32(1)
     height, width = transmittance.shape
-    # Per pixel: x, y, stop, T, gradient by R, G, B and alpha, and what is behind, weighed by them.
+    # Per pixel: x, y, stop, T; gradient by R, G, B and alpha; product of the colour behind and its gradient.
     s = np.empty(9 * 256, np.float32)
     _pixel_centres(s)
     for tile in range(first, last):
         x0, y0 = (tile % columns) * 16, (tile // columns) * 16
         begin = starts[tile]
-        furthest = 0
+        last_stop = 0
         for p in range(256):
             x, y = x0 + (p & 15), y0 + (p >> 4)
-            furthest = max(furthest, stops[tile, p])
+            last_stop = max(last_stop, stops[tile, p])
             s[512 + p] = np.float32(stops[tile, p])
             inside = x < width and y < height
             x, y = min(x, width - 1), min(y, height - 1)
@@ -201,12 +202,12 @@ def blend_backward(
             s[1536 + p] = v_image[y, x, 2] if inside else zero
             s[1792 + p] = v_alpha[y, x] if inside else zero
             s[2048 + p] = background[0] * s[1024 + p] + background[1] * s[1280 + p] + background[2] * s[1536 + p]
-        for i in range(begin + furthest, starts[tile + 1]):
+        for i in range(begin + last_stop, starts[tile + 1]):
             v_slots[slots[i], :] = zero
-        for i in range(begin + furthest - 1, begin - 1, -1):
-            (mx, my, l0, l1, l2), (opacity, red, green, blue) = _footprint(splats, members[i], x0, y0)
+        for i in range(begin + last_stop - 1, begin - 1, -1):
+            (mx, my, l0, l1, l2), (opacity, red, green, blue) = _footprint(records, members[i], x0, y0)
             top, bottom = np.uint64(spans[i] >> 5), np.uint64(spans[i] & 31)
-            place = np.float32(i - begin)
+            index = np.float32(i - begin)
             m, mu, mv, muu, muv, mvv, vr, vg, vb = zero, zero, zero, zero, zero, zero, zero, zero, zero
             for p in range(top * np.uint64(16), bottom * np.uint64(16)):
                 dx, dy = s[p] - mx, s[p + np.uint64(256)] - my
@@ -214,7 +215,7 @@ def blend_backward(
                 full = opacity * _exp_minus(u * u + v * v)
                 alpha = min(full, alpha_max)
                 alpha = alpha if alpha >= alpha_min else zero
-                alpha = alpha if place < s[p + np.uint64(512)] else zero
+                alpha = alpha if index < s[p + np.uint64(512)] else zero
                 t = s[p + np.uint64(768)] / (one - alpha)
                 s[p + np.uint64(768)] = t
                 gr, gg, gb = s[p + np.uint64(1024)], s[p + np.uint64(1280)], s[p + np.uint64(1536)]
@@ -250,7 +251,7 @@ def blend_backward(
     fastmath=_FAST,
 )
 def removal_errors(
-    splats: np.ndarray,
+    records: np.ndarray,
     members: np.ndarray,
     spans: np.ndarray,
     slots: np.ndarray,
@@ -264,38 +265,39 @@ def removal_errors(
     stops: np.ndarray,
     errors: np.ndarray,
 ) -> None:
-    """Squared change of the picture in tiles ``first`` to ``last`` (exclusive) when a member is removed, per slot.
+    """Compute the squared change of tiles ``first`` to ``last`` (exclusive) by the removal of each member.
 
-    The arguments are those of :func:`blend_backward`; ``errors`` is written, the sum over the tile's pixels and RGB.
+    The arguments are those of :func:`blend_backward`. ``errors``: out, ``(slots,)``, sums over the tile's pixels and
+    RGB.
     """
     alpha_min, alpha_max = limits[0], limits[1]
     zero, one = np.float32(0), np.float32(1)
     height, width = transmittance.shape
-    # Per pixel: x, y, stop, T, and R, G, B of what is behind.
+    # Per pixel: x, y, stop, T, and R, G, B behind the Gaussian.
     s = np.empty(7 * 256, np.float32)
     _pixel_centres(s)
     for tile in range(first, last):
         x0, y0 = (tile % columns) * 16, (tile // columns) * 16
         begin = starts[tile]
-        furthest = 0
+        last_stop = 0
         for p in range(256):
-            furthest = max(furthest, stops[tile, p])
+            last_stop = max(last_stop, stops[tile, p])
             s[512 + p] = np.float32(stops[tile, p])
             s[768 + p] = transmittance[min(y0 + (p >> 4), height - 1), min(x0 + (p & 15), width - 1)]
             s[1024 + p], s[1280 + p], s[1536 + p] = background[0], background[1], background[2]
-        for i in range(begin + furthest, starts[tile + 1]):
+        for i in range(begin + last_stop, starts[tile + 1]):
             errors[slots[i]] = zero
-        for i in range(begin + furthest - 1, begin - 1, -1):
-            (mx, my, l0, l1, l2), (opacity, red, green, blue) = _footprint(splats, members[i], x0, y0)
+        for i in range(begin + last_stop - 1, begin - 1, -1):
+            (mx, my, l0, l1, l2), (opacity, red, green, blue) = _footprint(records, members[i], x0, y0)
             top, bottom = np.uint64(spans[i] >> 5), np.uint64(spans[i] & 31)
-            place = np.float32(i - begin)
+            index = np.float32(i - begin)
             total = zero
             for p in range(top * np.uint64(16), bottom * np.uint64(16)):
                 dx, dy = s[p] - mx, s[p + np.uint64(256)] - my
                 u, v = l0 * dx + l1 * dy, l2 * dy
                 alpha = min(opacity * _exp_minus(u * u + v * v), alpha_max)
                 alpha = alpha if alpha >= alpha_min else zero
-                alpha = alpha if place < s[p + np.uint64(512)] else zero
+                alpha = alpha if index < s[p + np.uint64(512)] else zero
                 t = s[p + np.uint64(768)] / (one - alpha)
                 s[p + np.uint64(768)] = t
                 dr = alpha * (red - s[p + np.uint64(1024)])
@@ -318,7 +320,7 @@ def sum_errors(
     last: int,
     scores: np.ndarray,
 ) -> None:
-    """Add up each footprint's slots into ``scores[visible]``, for footprints ``first`` to ``last`` (exclusive)."""
+    """Write the sum of each footprint's slots to ``scores[visible]``, footprints ``first`` to ``last`` (exclusive)."""
     for n in range(first, last):
         total = 0.0
         for slot in range(slots_from[n], slots_from[n] + slot_counts[n]):

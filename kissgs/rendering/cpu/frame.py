@@ -1,7 +1,7 @@
-"""One picture on the processor: the kernels in their order, split over threads so that no result depends on how many.
+"""One image on the CPU: rendering, gradients, removal scores and sensitivity, independent of the number of threads.
 
-Every sum that crosses tiles goes through slots: one per pair of footprint and tile, numbered footprint by footprint.
-A tile writes its own slots, a footprint adds up its own in their order.
+Sums over several tiles go through slots: one per pair of footprint and tile, numbered footprint by footprint. A tile
+writes its own slots, and the slots of a footprint are added in order.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from kissgs.core.errors import InvalidViewsError, UnsupportedError
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.core.threads import Workers
-from kissgs.rendering import constants as semantics
+from kissgs.rendering import constants
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu import blending, projection, sensitivity, shading
 from kissgs.rendering.cpu.lists import (
-    RULES,
+    PROJECTION_CONSTANTS,
     Footprints,
     TileLists,
     each_part,
@@ -29,24 +29,25 @@ from kissgs.rendering.cpu.lists import (
     sort_into_tiles,
 )
 
-LIMITS = np.array([semantics.ALPHA_MIN, semantics.ALPHA_MAX, semantics.TRANSMITTANCE_MIN], np.float32)
+LIMITS = np.array([constants.ALPHA_MIN, constants.ALPHA_MAX, constants.TRANSMITTANCE_MIN], np.float32)
+"""Constants of blending, as kernels take them."""
 
-PIXELS_PER_TILE = semantics.TILE**2
+PIXELS_PER_TILE = constants.TILE**2
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A picture, and what its derivative and the scores need.
+    """A rendered image, with the intermediate results that its derivatives and scores need.
 
     Attributes:
         splats: the scene.
-        image: ``(H, W, 3)`` linear in the Gaussians' colours, 0 and up, not clamped to 1.
-        transmittance: ``(H, W)`` share of the background that is seen; 1 - alpha.
-        camera: that took it.
-        background: ``(3,)``.
-        footprints: front to back.
-        lists: of the tiles.
-        stops: ``(tiles, 256)`` members from this one on were not drawn at the pixel.
+        image: ``(H, W, 3)`` RGB, 0 and up, not clamped to 1.
+        transmittance: ``(H, W)`` share of the background that is visible, 1 - alpha.
+        camera: the camera.
+        background: ``(3,)`` RGB.
+        footprints: Gaussians that touch the image, front to back.
+        lists: lists of the footprints that touch each tile.
+        stops: ``(tiles, 256)`` index of the first member of the tile that is not drawn at the pixel.
     """
 
     splats: Splats
@@ -61,7 +62,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Gradients:
-    """Gradients of a loss by the stored parameters; of the shapes of those of :class:`kissgs.Splats`."""
+    """Gradients of a loss by the stored parameters, with the shapes of :class:`kissgs.Splats`."""
 
     means: Float32[np.ndarray, "N 3"]
     quats: Float32[np.ndarray, "N 4"]
@@ -72,17 +73,17 @@ class Gradients:
 
 
 def draw(splats: Splats, camera: Camera, background: Shaped[np.ndarray, "..."], pool: Workers) -> Frame:
-    """Take a picture of finite Gaussians (:func:`kissgs.clean`), as :mod:`kissgs.rendering.constants` says.
+    """Render an image of a finite scene (:func:`kissgs.clean`) by the image model of :mod:`kissgs.rendering.constants`.
 
     Raises:
         InvalidViewsError: the background is not three finite numbers.
-        UnsupportedError: too many footprints for the lists of the tiles, or too little memory for the picture.
+        UnsupportedError: too many footprints for the lists of tiles, or too little memory for the image.
     """
     try:
-        return _draw(_readable(splats), camera, _colour(background), pool)
+        return _draw(_for_kernels(splats), camera, _colour(background), pool)
     except MemoryError as error:
         size = f"{camera.width}x{camera.height}"
-        raise UnsupportedError(f"there is not enough memory for a picture of {size}: render it smaller") from error
+        raise UnsupportedError(f"there is not enough memory for an image of {size}; render a smaller one") from error
 
 
 def _draw(splats: Splats, camera: Camera, background: Float32[np.ndarray, "3"], pool: Workers) -> Frame:
@@ -94,8 +95,20 @@ def _draw(splats: Splats, camera: Camera, background: Float32[np.ndarray, "3"], 
 
     def blend(first: int, last: int) -> None:
         blending.blend(
-            *(footprints.records, lists.members, lists.spans, lists.starts, first, last, camera.width, camera.height),
-            *(lists.columns, LIMITS, background, image, transmittance, stops),
+            footprints.records,
+            lists.members,
+            lists.spans,
+            lists.starts,
+            first,
+            last,
+            camera.width,
+            camera.height,
+            lists.columns,
+            LIMITS,
+            background,
+            image,
+            transmittance,
+            stops,
         )
 
     each_part(blend, even_tiles(lists, pool), pool)
@@ -108,10 +121,16 @@ def differentiate(
     v_alpha: Float32[np.ndarray, "H W"],
     pool: Workers,
 ) -> Gradients:
-    """Gradients of a loss, given those by the picture and by its alpha.
+    """Return the gradients of a loss by the stored parameters.
+
+    Args:
+        frame: a rendered image.
+        v_image: ``(H, W, 3)`` gradient of the loss by the image.
+        v_alpha: ``(H, W)`` gradient of the loss by alpha.
+        pool: threads; the result does not depend on their number.
 
     Raises:
-        MemoryError: there is not enough for them.
+        MemoryError: there is not enough memory.
     """
     splats = frame.splats
     camera, lists, visible, rows = frame.camera, frame.lists, frame.footprints.visible, frame.footprints.rows
@@ -120,8 +139,21 @@ def differentiate(
 
     def blend(first: int, last: int) -> None:
         blending.blend_backward(
-            *(records, lists.members, lists.spans, lists.slots, lists.starts, first, last, lists.columns, LIMITS),
-            *(frame.background, frame.transmittance, frame.stops, v_image, v_alpha, v_slots),
+            records,
+            lists.members,
+            lists.spans,
+            lists.slots,
+            lists.starts,
+            first,
+            last,
+            lists.columns,
+            LIMITS,
+            frame.background,
+            frame.transmittance,
+            frame.stops,
+            v_image,
+            v_alpha,
+            v_slots,
         )
 
     each_part(blend, even_tiles(lists, pool), pool)
@@ -130,15 +162,41 @@ def differentiate(
 
     def project(first: int, last: int) -> None:
         projection.project_backward(
-            *(splats.means, splats.quats, splats.scales, splats.opacities),
-            *(visible, rows, lists.slots_from, lists.slot_counts, v_slots),
-            *(first, last, camera.viewmat, camera.K),
-            *(camera.width, camera.height, RULES),
-            *(found.means, found.quats, found.scales, found.opacities, v_colors),
+            splats.means,
+            splats.quats,
+            splats.scales,
+            splats.opacities,
+            visible,
+            rows,
+            lists.slots_from,
+            lists.slot_counts,
+            v_slots,
+            first,
+            last,
+            camera.viewmat,
+            camera.K,
+            camera.width,
+            camera.height,
+            PROJECTION_CONSTANTS,
+            found.means,
+            found.quats,
+            found.scales,
+            found.opacities,
+            v_colors,
         )
         shading.shade_backward(
-            *(splats.means, splats.shN, camera.position, visible, rows, first, last, records),
-            *(v_colors, found.means, found.sh0, found.shN),
+            splats.means,
+            splats.shN,
+            camera.position,
+            visible,
+            rows,
+            first,
+            last,
+            records,
+            v_colors,
+            found.means,
+            found.sh0,
+            found.shN,
         )
 
     each_part(project, even(len(visible), pool), pool)
@@ -146,18 +204,29 @@ def differentiate(
 
 
 def removal_scores(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
-    """For each of the scene's Gaussians, by how much its removal alone would change the picture.
+    """Return, for each Gaussian of the scene, the squared change of the image by its removal alone, ``(N,)``.
 
-    The squared change, summed over pixels and RGB (GaussianPOP); exact but for what was hidden behind the end of a
-    pixel's list, which a removal may reveal. Gaussians not in the picture score 0.
+    A sum over pixels and RGB (GaussianPOP, section 3), exact except for Gaussians behind the end of a pixel's list,
+    which a removal may reveal; 0 for Gaussians outside the image.
     """
     lists, (visible, records) = frame.lists, (frame.footprints.visible, frame.footprints.records)
     errors = np.empty(len(lists.members), np.float32)
 
     def blend(first: int, last: int) -> None:
         blending.removal_errors(
-            *(records, lists.members, lists.spans, lists.slots, lists.starts, first, last, lists.columns, LIMITS),
-            *(frame.background, frame.transmittance, frame.stops, errors),
+            records,
+            lists.members,
+            lists.spans,
+            lists.slots,
+            lists.starts,
+            first,
+            last,
+            lists.columns,
+            LIMITS,
+            frame.background,
+            frame.transmittance,
+            frame.stops,
+            errors,
         )
 
     each_part(blend, even_tiles(lists, pool), pool)
@@ -167,10 +236,15 @@ def removal_scores(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
 
 
 def add_sensitivities(frame: Frame, weight: float, spread: float, into: Sensitivity, pool: Workers) -> None:
-    """Add to ``into`` what small changes of each Gaussian cost in this picture, times ``weight``.
+    """Add the sensitivity in this image, times ``weight``, to ``into``.
 
-    ``spread`` is the standard deviation of each channel of the background. In ``directions``, sums of (alpha T)² times
-    the harmonics, to be divided by ``colors`` in the end.
+    Args:
+        frame: a rendered image.
+        weight: weight of the squared error of a single value of the image.
+        spread: standard deviation of each channel of the background.
+        into: sums over images; ``mean_sh_basis`` receives sums of (alpha T)² times the spherical harmonics, to be
+            divided by ``color_weight`` in the end.
+        pool: threads; the result does not depend on their number.
     """
     splats, camera, lists = frame.splats, frame.camera, frame.lists
     visible, rows, records = frame.footprints.visible, frame.footprints.rows, frame.footprints.records
@@ -178,24 +252,48 @@ def add_sensitivities(frame: Frame, weight: float, spread: float, into: Sensitiv
 
     def blend(first: int, last: int) -> None:
         sensitivity.moments(
-            *(records, lists.members, lists.spans, lists.slots, lists.starts, first, last, lists.columns, LIMITS),
-            *(frame.background, spread, frame.transmittance, frame.stops, slots),
+            records,
+            lists.members,
+            lists.spans,
+            lists.slots,
+            lists.starts,
+            first,
+            last,
+            lists.columns,
+            LIMITS,
+            frame.background,
+            spread,
+            frame.transmittance,
+            frame.stops,
+            slots,
         )
 
     each_part(blend, even_tiles(lists, pool), pool)
 
     def project(first: int, last: int) -> None:
         sensitivity.add_to_parameters(
-            *(splats.means, splats.quats, splats.scales, splats.opacities),
-            *(visible, rows, lists.slots_from, lists.slot_counts, slots),
+            splats.means,
+            splats.quats,
+            splats.scales,
+            splats.opacities,
+            visible,
+            rows,
+            lists.slots_from,
+            lists.slot_counts,
+            slots,
             first,
             last,
-            *(camera.viewmat, camera.position, camera.K),
+            camera.viewmat,
+            camera.position,
+            camera.K,
             camera.width,
             camera.height,
-            RULES,
+            PROJECTION_CONSTANTS,
             weight,
-            *(into.position_hessian, into.shape_hessian, into.color_weight, into.mean_sh_basis),
+            into.position_hessian,
+            into.shape_hessian,
+            into.color_weight,
+            into.mean_sh_basis,
         )
 
     each_part(project, even(len(visible), pool), pool)
@@ -204,11 +302,11 @@ def add_sensitivities(frame: Frame, weight: float, spread: float, into: Sensitiv
 def _colour(background: Shaped[np.ndarray, "..."]) -> Float32[np.ndarray, "3"]:
     colour = np.array(background, np.float32, order="C")
     if colour.shape != (3,) or not np.isfinite(colour).all():
-        raise InvalidViewsError("a background is three finite numbers: red, green and blue, from 0 to 1")
+        raise InvalidViewsError("a background must be three finite numbers: red, green and blue, from 0 to 1")
     return colour
 
 
-def _readable(splats: Splats) -> Splats:
-    """The same if its arrays are such as kernels read, which are contiguous and writeable; else copies."""
+def _for_kernels(splats: Splats) -> Splats:
+    """Return the scene with contiguous, writeable arrays, as kernels need them; copied only where necessary."""
     arrays = {name: np.require(getattr(splats, name), requirements=("C", "W")) for name in ATTRIBUTES}
     return splats if all(array is getattr(splats, name) for name, array in arrays.items()) else Splats(**arrays)

@@ -1,6 +1,6 @@
-"""Which Gaussians touch a picture, and which of its tiles: lists, made in parts that threads share.
+"""Lists of the Gaussians that touch an image and each of its tiles, built in parts by threads.
 
-No result depends on how many parts there are.
+The result does not depend on the number of parts.
 """
 
 from __future__ import annotations
@@ -16,31 +16,33 @@ from kissgs.core.array_types import Float32, Int32, Int64, UInt16
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.splats import Splats
 from kissgs.core.threads import Workers
-from kissgs.rendering import constants as semantics
+from kissgs.rendering import constants
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu import projection, shading, tiles
 
-RULES = np.array(
-    [semantics.NEAR, semantics.FAR, semantics.DILATION, semantics.FRUSTUM_MARGIN, semantics.ALPHA_MIN], np.float64
+PROJECTION_CONSTANTS = np.array(
+    [constants.NEAR, constants.FAR, constants.DILATION, constants.FRUSTUM_MARGIN, constants.ALPHA_MIN], np.float64
 )
+"""Constants of projection, as kernels take them."""
+
 R = TypeVar("R")
 
 MAX_PAIRS = 2**31 - 1
-"""Footprints times the tiles they touch: more would not fit the int32 lists."""
+"""Largest number of pairs of a footprint and a tile that it touches: the lists are int32."""
 
 MAX_MEMBERS = 2**24 - 1
-"""Footprints in one tile: their places there are float32, so that they fit into vectors with the rest."""
+"""Largest number of footprints in one tile: kernels store their indices as float32."""
 
 PARTS_PER_THREAD = 4
-"""Parts of the work differ in cost; finer ones even it out."""
+"""Number of parts per thread; parts differ in cost, and smaller ones balance the load."""
 
 
 @dataclass(frozen=True, slots=True)
 class Footprints:
-    """The M Gaussians that touch a picture, front to back.
+    """The M Gaussians that touch an image, front to back.
 
     Attributes:
-        visible: ``(M,)`` which Gaussians they are.
+        visible: ``(M,)`` indices of the Gaussians.
         rows: ``(M,)`` footprints in the order of their Gaussians.
         records: ``(M, 11)``, see :func:`kissgs.rendering.cpu.projection.project`.
     """
@@ -52,16 +54,16 @@ class Footprints:
 
 @dataclass(frozen=True, slots=True)
 class TileLists:
-    """Which footprints touch which tile.
+    """Lists of the footprints that touch each tile.
 
     Attributes:
-        columns: tiles per row of tiles.
-        starts: ``(tiles + 1,)`` where each tile's list begins.
+        columns: number of tiles in a row of tiles.
+        starts: ``(tiles + 1,)`` index of the first member of each tile.
         members: ``(P,)`` footprints, tile after tile, front to back.
-        spans: ``(P,)`` the rows of pixels that each touches there, see :func:`kissgs.rendering.cpu.tiles.fill_tiles`.
-        slots: ``(P,)`` the slot of each of these pairs.
-        slots_from: ``(M,)`` the first slot of each footprint; they are numbered in the order of the Gaussians.
-        slot_counts: ``(M,)`` how many it has, one per tile that it touches.
+        spans: ``(P,)`` rows of pixels that each member touches, see :func:`kissgs.rendering.cpu.tiles.fill_tiles`.
+        slots: ``(P,)`` slot of each member.
+        slots_from: ``(M,)`` first slot of each footprint; slots are numbered in the order of the Gaussians.
+        slot_counts: ``(M,)`` number of slots of each footprint, one per tile that it touches.
     """
 
     columns: int
@@ -74,15 +76,27 @@ class TileLists:
 
 
 def find_footprints(splats: Splats, camera: Camera, pool: Workers) -> Footprints:
-    """Project and shade all Gaussians; those that touch the picture, nearest first."""
+    """Project and shade all Gaussians; return those that touch the image, nearest first."""
     count = len(splats)
     visible, depths = np.empty(count, np.int32), np.empty(count, np.float32)
     records = np.empty((count, 11), np.float32)
 
     def part(first: int, last: int) -> slice:
         found = projection.project(
-            *(splats.means, splats.quats, splats.scales, splats.opacities, first, last, camera.viewmat, camera.K),
-            *(camera.width, camera.height, RULES, visible, depths, records),
+            splats.means,
+            splats.quats,
+            splats.scales,
+            splats.opacities,
+            first,
+            last,
+            camera.viewmat,
+            camera.K,
+            camera.width,
+            camera.height,
+            PROJECTION_CONSTANTS,
+            visible,
+            depths,
+            records,
         )
         shading.shade(splats.means, splats.sh0, splats.shN, camera.position, visible, first, first + found, records)
         return slice(first, first + found)
@@ -98,12 +112,12 @@ def find_footprints(splats: Splats, camera: Camera, pool: Workers) -> Footprints
 
 
 def sort_into_tiles(footprints: Footprints, camera: Camera, pool: Workers) -> TileLists:
-    """List for every tile the footprints that touch it, nearest first.
+    """Return lists of the footprints that touch each tile, nearest first.
 
     Raises:
-        UnsupportedError: too many for the lists.
+        UnsupportedError: there are more than :data:`MAX_PAIRS`, or more than :data:`MAX_MEMBERS` in one tile.
     """
-    columns, rows = -(-camera.width // semantics.TILE), -(-camera.height // semantics.TILE)
+    columns, rows = -(-camera.width // constants.TILE), -(-camera.height // constants.TILE)
     records = footprints.records
     parts = even(len(records), pool)
     slot_counts = np.empty(len(records), np.int64)
@@ -131,14 +145,14 @@ def sort_into_tiles(footprints: Footprints, camera: Camera, pool: Workers) -> Ti
 def _check_lists(starts: Int64[np.ndarray, " tiles_1"]) -> None:
     if starts[-1] > MAX_PAIRS:
         raise UnsupportedError(
-            f"this view has {starts[-1]:,} pairs of a Gaussian and a tile of the picture; at most {MAX_PAIRS:,} fit. "
-            "Render it smaller"
+            f"this view has {starts[-1]:,} pairs of a Gaussian and a tile of the image, more than {MAX_PAIRS:,}; "
+            "render a smaller image"
         )
     longest = int(np.diff(starts).max())
     if longest > MAX_MEMBERS:
         raise UnsupportedError(
-            f"{longest:,} Gaussians meet in 16x16 pixels of this view; at most {MAX_MEMBERS:,} can be drawn. "
-            "Go nearer, or render it larger"
+            f"{longest:,} Gaussians touch the same 16x16 pixels of this view, more than {MAX_MEMBERS:,}; move the "
+            "camera nearer, or render a larger image"
         )
 
 
@@ -149,13 +163,13 @@ def _running_sum(counts: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n_1"]:
 
 
 def even(count: int, pool: Workers) -> Int64[np.ndarray, " edges"]:
-    """Edges of parts of about the same number of items; at least one part, none empty unless all are."""
+    """Return the edges of at least one part of about equal numbers of items; no part is empty if there are items."""
     parts = max(1, min(pool.threads * PARTS_PER_THREAD, count))
     return np.linspace(0, count, parts + 1).astype(np.int64)
 
 
 def even_tiles(lists: TileLists, pool: Workers) -> Int64[np.ndarray, " edges"]:
-    """Edges of parts of about the same number of members, plus something for each tile."""
+    """Return the edges of parts of tiles of about equal cost: the number of members plus a constant per tile."""
     tiles_count = len(lists.starts) - 1
     work = lists.starts + 8 * np.arange(tiles_count + 1)
     edges = np.searchsorted(work, np.linspace(0, work[-1], pool.threads * PARTS_PER_THREAD + 1))
@@ -164,5 +178,5 @@ def even_tiles(lists: TileLists, pool: Workers) -> Int64[np.ndarray, " edges"]:
 
 
 def each_part(work: Callable[[int, int], R], edges: Int64[np.ndarray, " edges"], pool: Workers) -> list[R]:
-    """Work from each edge to the next, results in their order."""
+    """Call ``work`` with the edges (first, last) of each part in threads; return the results in order."""
     return pool.map(lambda pair: work(int(pair[0]), int(pair[1])), list(itertools.pairwise(edges)))

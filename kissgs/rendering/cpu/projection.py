@@ -1,10 +1,11 @@
-"""Kernels: Gaussians in the world -> footprints in the picture, and the way back.
+"""Numba kernels of projection: from Gaussians to footprints in the image, and gradients back.
 
 The 2x2 covariance is W Wᵀ + dilation, where W = J Rc R diag(s) is 2x3: J the derivative of the projection, Rc and R the
-rotations of camera and Gaussian. Its determinant is taken from W as a sum of positive terms (Cauchy-Binet): a needle
-1e13 long loses no digits. In float64: beside the memory traffic that costs nothing, and nothing overflows.
+rotations of camera and Gaussian. Its determinant is computed from W as a sum of positive terms (Cauchy-Binet), so that
+a needle of length 1e13 loses no digits. Arithmetic is float64, which avoids overflow; memory bandwidth is the limit
+anyway.
 
-Vectors are tuples here, matrices tuples of their rows: they live in registers.
+Vectors are tuples and matrices tuples of rows, so that they stay in registers.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def _scaled(a: Vector, s: Vector) -> Vector:
 
 @_helper
 def _times(a: Vector, m: Matrix) -> Vector:
-    """Row vector times matrix."""
+    """Return row vector times matrix."""
     return (
         a[0] * m[0][0] + a[1] * m[1][0] + a[2] * m[2][0],
         a[0] * m[0][1] + a[1] * m[1][1] + a[2] * m[2][1],
@@ -58,7 +59,7 @@ def _times(a: Vector, m: Matrix) -> Vector:
 
 @_helper
 def _applied(m: Matrix, a: Vector) -> Vector:
-    """Matrix times column vector."""
+    """Return matrix times column vector."""
     return _dot(m[0], a), _dot(m[1], a), _dot(m[2], a)
 
 
@@ -72,19 +73,19 @@ def _pose(viewmat: np.ndarray) -> tuple[Matrix, Vector]:
 
 @_helper
 def _frustum(K: np.ndarray, width: int, height: int, margin: float) -> tuple[float, float, float, float]:
-    """Bounds of x/z and y/z, beyond which the derivative of the projection is that at the bound."""
-    wide, tall = margin * 0.5 * width / K[0, 0], margin * 0.5 * height / K[1, 1]
+    """Return the left, right, top and bottom bound of x/z and y/z, to which the projection's derivative is clamped."""
+    margin_x, margin_y = margin * 0.5 * width / K[0, 0], margin * 0.5 * height / K[1, 1]
     return (
-        -K[0, 2] / K[0, 0] - wide,
-        (width - K[0, 2]) / K[0, 0] + wide,
-        -K[1, 2] / K[1, 1] - tall,
-        (height - K[1, 2]) / K[1, 1] + tall,
+        -K[0, 2] / K[0, 0] - margin_x,
+        (width - K[0, 2]) / K[0, 0] + margin_x,
+        -K[1, 2] / K[1, 1] - margin_y,
+        (height - K[1, 2]) / K[1, 1] + margin_y,
     )
 
 
 @_helper
 def _unit_quat(quats: np.ndarray, n: int) -> tuple[float, float, float, float, float]:
-    """w, x, y, z, and 1 / the length it had; no rotation, and 0, for one of no length."""
+    """Return the normalised w, x, y, z and 1 / length; the identity and 0 for a length below 1e-12."""
     w, x, y, z = np.float64(quats[n, 0]), np.float64(quats[n, 1]), np.float64(quats[n, 2]), np.float64(quats[n, 3])
     norm2 = w * w + x * x + y * y + z * z
     if norm2 < 1e-24:
@@ -104,7 +105,7 @@ def _rotation(w: float, x: float, y: float, z: float) -> Matrix:
 
 @_helper
 def _by_quat(q: Quat, e: Matrix) -> Quat:
-    """Gradient by a unit quaternion of what has the gradient ``e`` by its rotation; none along its own direction."""
+    """Return the gradient by a unit quaternion, given that by its rotation matrix, ``e``; tangential to the sphere."""
     w, x, y, z = q
     curl = (e[2][1] - e[1][2], e[0][2] - e[2][0], e[1][0] - e[0][1])
     both = (e[1][2] + e[2][1], e[0][2] + e[2][0], e[0][1] + e[1][0])
@@ -124,7 +125,7 @@ def _deviations(scales: np.ndarray, n: int) -> Vector:
 
 @_helper
 def _cholesky(w: Vector, v: Vector, dilation: float) -> tuple[float, float, float]:
-    """l0, l1, l2 with (l0 dx + l1 dy)² + (l2 dy)² half the squared Mahalanobis distance; w, v the rows of W."""
+    """Return l0, l1, l2: (l0 dx + l1 dy)² + (l2 dy)² is half the squared Mahalanobis distance; w, v: rows of W."""
     c, ww, vv = _cross(w, v), _dot(w, w), _dot(v, v)
     det = _dot(c, c) + dilation * (ww + vv + dilation)
     l0 = np.sqrt((vv + dilation) / (2 * det))
@@ -133,9 +134,9 @@ def _cholesky(w: Vector, v: Vector, dilation: float) -> tuple[float, float, floa
 
 @_helper
 def _whitened(w: Vector, v: Vector, dilation: float) -> tuple[Vector, Vector]:
-    """The rows of L W, which has no entry above 1/√2: l0 w + l1 v, and l2 v.
+    """Return the rows of L W, whose entries are at most 1/√2: l0 w + l1 v, and l2 v.
 
-    Of a needle, the terms of that sum are as large as it is long and cancel: w (v v) - v (w v) is v × (w × v).
+    The terms of l0 w + l1 v are as large as a needle is long and cancel; w (v v) - v (w v) = v × (w × v) avoids that.
     """
     l0, _, l2 = _cholesky(w, v, dilation)
     scale = l0 / (_dot(v, v) + dilation)
@@ -158,47 +159,48 @@ def project(
     K: np.ndarray,
     width: int,
     height: int,
-    rules: np.ndarray,
+    constants: np.ndarray,
     visible: np.ndarray,
     depths: np.ndarray,
-    splats: np.ndarray,
+    records: np.ndarray,
 ) -> int:
-    """Footprints of the Gaussians ``first`` to ``last`` (exclusive) that touch the picture.
+    """Compute the footprints of the Gaussians ``first`` to ``last`` (exclusive) that touch the image.
 
     Args:
-        means: ``(N, 3)``, and so on: stored parameters, see :class:`kissgs.Splats`.
-        first: Gaussian.
-        last: Gaussian.
+        means, quats, scales, opacities: stored parameters, see :class:`kissgs.Splats`.
+        first: first Gaussian.
+        last: end of the Gaussians, exclusive.
         viewmat: ``(4, 4)`` world to camera.
-        K: ``(3, 3)``.
-        width: pixels.
-        height: pixels.
-        rules: NEAR, FAR, DILATION, FRUSTUM_MARGIN, ALPHA_MIN.
-        visible: out, from row ``first``: which Gaussians they are.
-        depths: out, likewise.
-        splats: out, likewise, ``(N, 11)``: centre x, y; l0, l1, l2 of :mod:`kissgs.rendering.cpu.blending`; opacity;
-            R, G, B (not written here); the largest exponent that shows; half height in pixels.
+        K: ``(3, 3)`` intrinsics.
+        width: of the image, pixels.
+        height: of the image, pixels.
+        constants: NEAR, FAR, DILATION, FRUSTUM_MARGIN, ALPHA_MIN.
+        visible: out, from row ``first``, ``(N,)``: the Gaussian of each footprint.
+        depths: out, from row ``first``, ``(N,)``: z in the camera.
+        records: out, from row ``first``, ``(N, 11)``: centre x, y; l0, l1, l2 of :mod:`kissgs.rendering.cpu.blending`;
+            opacity; R, G, B (written by :func:`kissgs.rendering.cpu.shading.shade`); the largest exponent whose alpha
+            reaches ALPHA_MIN; half height in pixels.
 
     Returns:
-        How many.
+        Number of footprints.
     """
-    near, far, dilation, alpha_min = rules[0], rules[1], rules[2], rules[4]
+    near, far, dilation, alpha_min = constants[0], constants[1], constants[2], constants[4]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    turn, shift = _pose(viewmat)
-    left, right, high, low = _frustum(K, width, height, rules[3])
+    rotation, translation = _pose(viewmat)
+    left, right, top, bottom = _frustum(K, width, height, constants[3])
     found = 0
     for n in range(first, last):
         mean = _load(means, n)
-        z = _dot(turn[2], mean) + shift[2]
+        z = _dot(rotation[2], mean) + translation[2]
         if not (z >= near and z <= far):
             continue
         opacity = 1.0 / (1.0 + np.exp(-np.float64(opacities[n])))
         if not opacity >= alpha_min:
             continue
-        x, y = (_dot(turn[0], mean) + shift[0]) / z, (_dot(turn[1], mean) + shift[1]) / z
+        x, y = (_dot(rotation[0], mean) + translation[0]) / z, (_dot(rotation[1], mean) + translation[1]) / z
         centre_x, centre_y = fx * x + cx, fy * y + cy
-        p = _mix(fx / z, turn[0], -fx / z * min(right, max(left, x)), turn[2])
-        q = _mix(fy / z, turn[1], -fy / z * min(low, max(high, y)), turn[2])
+        p = _mix(fx / z, rotation[0], -fx / z * min(right, max(left, x)), rotation[2])
+        q = _mix(fy / z, rotation[1], -fy / z * min(bottom, max(top, y)), rotation[2])
         qw, qx, qy, qz, _ = _unit_quat(quats, n)
         R, s = _rotation(qw, qx, qy, qz), _deviations(scales, n)
         w, v = _scaled(_times(p, R), s), _scaled(_times(q, R), s)
@@ -211,12 +213,12 @@ def project(
         found += 1
         visible[row] = n
         depths[row] = z
-        splats[row, 0] = centre_x
-        splats[row, 1] = centre_y
-        splats[row, 2], splats[row, 3], splats[row, 4] = _cholesky(w, v, dilation)
-        splats[row, 5] = opacity
-        splats[row, 9] = tau
-        splats[row, 10] = half_height
+        records[row, 0] = centre_x
+        records[row, 1] = centre_y
+        records[row, 2], records[row, 3], records[row, 4] = _cholesky(w, v, dilation)
+        records[row, 5] = opacity
+        records[row, 9] = tau
+        records[row, 10] = half_height
     return found
 
 
@@ -242,31 +244,31 @@ def project_backward(
     K: np.ndarray,
     width: int,
     height: int,
-    rules: np.ndarray,
+    constants: np.ndarray,
     v_means: np.ndarray,
     v_quats: np.ndarray,
     v_scales: np.ndarray,
     v_opacities: np.ndarray,
     v_colors: np.ndarray,
 ) -> None:
-    """Gradients of the footprints in ``rows[first:last]``, written to the rows of their Gaussians.
+    """Compute gradients by the parameters of the Gaussians whose footprints are ``rows[first:last]``.
 
     Args:
-        means, quats, scales, opacities, viewmat, K, width, height, rules: as for :func:`project`.
-        visible: the Gaussian of each footprint.
-        rows: footprints in the order of their Gaussians: so memory is read and written in order.
-        slots_from: the first slot of each footprint.
-        slot_counts: how many it has.
-        v_slots: of :func:`kissgs.rendering.cpu.blending.blend_backward`.
-        first: of ``rows``.
-        last: of ``rows``.
-        v_means: out; and so on, gradients of the shapes of the parameters.
-        v_colors: out, ``(M, 3)``, gradients by the footprints' colours.
+        means, quats, scales, opacities, viewmat, K, width, height, constants: as for :func:`project`.
+        visible: ``(M,)`` the Gaussian of each footprint.
+        rows: ``(M,)`` footprints in the order of their Gaussians, so that memory is accessed in order.
+        slots_from: ``(M,)`` first slot of each footprint.
+        slot_counts: ``(M,)`` number of its slots.
+        v_slots: output of :func:`kissgs.rendering.cpu.blending.blend_backward`.
+        first: first index into ``rows``.
+        last: end of the indices, exclusive.
+        v_means, v_quats, v_scales, v_opacities: out, gradients, of the shapes of the parameters.
+        v_colors: out, ``(M, 3)``, gradients by the colours of footprints.
     """
-    dilation = rules[2]
+    dilation = constants[2]
     fx, fy = K[0, 0], K[1, 1]
-    turn, shift = _pose(viewmat)
-    left, right, high, low = _frustum(K, width, height, rules[3])
+    rotation, translation = _pose(viewmat)
+    left, right, top, bottom = _frustum(K, width, height, constants[3])
     sums = np.empty(9, np.float64)
     for i in range(first, last):
         row = rows[i]
@@ -280,18 +282,18 @@ def project_backward(
 
         # As in project.
         mean = _load(means, n)
-        z = _dot(turn[2], mean) + shift[2]
-        x, y = (_dot(turn[0], mean) + shift[0]) / z, (_dot(turn[1], mean) + shift[1]) / z
+        z = _dot(rotation[2], mean) + translation[2]
+        x, y = (_dot(rotation[0], mean) + translation[0]) / z, (_dot(rotation[1], mean) + translation[1]) / z
         jx, jxz = fx / z, -fx / z * min(right, max(left, x))
-        jy, jyz = fy / z, -fy / z * min(low, max(high, y))
-        p, q = _mix(jx, turn[0], jxz, turn[2]), _mix(jy, turn[1], jyz, turn[2])
+        jy, jyz = fy / z, -fy / z * min(bottom, max(top, y))
+        p, q = _mix(jx, rotation[0], jxz, rotation[2]), _mix(jy, rotation[1], jyz, rotation[2])
         qw, qx, qy, qz, shrink = _unit_quat(quats, n)
         R, s = _rotation(qw, qx, qy, qz), _deviations(scales, n)
         w, v = _scaled(_times(p, R), s), _scaled(_times(q, R), s)
         l0, l1, l2 = _cholesky(w, v, dilation)
 
-        # By the centre: -2 Lᵀ (Σ u, Σ v). By W: -4 Lᵀ S L W, S = (Σ uu, Σ uv; Σ uv, Σ vv); then by p and q (a scale is
-        # its own derivative by its logarithm).
+        # By the centre: -2 Lᵀ (Σ u, Σ v). By W: -4 Lᵀ S L W, S = (Σ uu, Σ uv; Σ uv, Σ vv); then by p and q (the
+        # derivative of a scale by its logarithm is the scale).
         by_x, by_y = -2 * l0 * sums[1], -2 * (l1 * sums[1] + l2 * sums[2])
         u_rows, v_rows = _whitened(w, v, dilation)
         spread_u, spread_v = _mix(sums[3], u_rows, sums[4], v_rows), _mix(sums[4], u_rows, sums[5], v_rows)
@@ -301,17 +303,17 @@ def project_backward(
         by_w, by_v = _scaled(by_w, s), _scaled(by_v, s)
         by_p, by_q = _applied(R, by_w), _applied(R, by_v)
 
-        # By R, rows e0, e1, e2; then by the quaternion as it was before it became one of length 1.
+        # By R, with rows e0, e1, e2; then by the quaternion before normalisation.
         e0, e1, e2 = _mix(p[0], by_w, q[0], by_v), _mix(p[1], by_w, q[1], by_v), _mix(p[2], by_w, q[2], by_v)
         by_quat = _by_quat((qw, qx, qy, qz), (e0, e1, e2))
         for c in range(4):
             v_quats[n, c] = by_quat[c] * shrink
 
-        # By the position before the camera: through the centre; through J; through J's x/z and y/z if not clamped.
-        by_jx, by_jxz = _dot(by_p, turn[0]), _dot(by_p, turn[2])
-        by_jy, by_jyz = _dot(by_q, turn[1]), _dot(by_q, turn[2])
+        # By the position in the camera: through the centre, through J, and through the x/z and y/z of J if not clamped.
+        by_jx, by_jxz = _dot(by_p, rotation[0]), _dot(by_p, rotation[2])
+        by_jy, by_jyz = _dot(by_q, rotation[1]), _dot(by_q, rotation[2])
         by_ratio_x = by_x * fx - (by_jxz * jx if left < x < right else 0.0)
-        by_ratio_y = by_y * fy - (by_jyz * jy if high < y < low else 0.0)
+        by_ratio_y = by_y * fy - (by_jyz * jy if top < y < bottom else 0.0)
         by_z = -(by_jx * jx + by_jxz * jxz + by_jy * jy + by_jyz * jyz + by_ratio_x * x + by_ratio_y * y) / z
-        moved = _times((by_ratio_x / z, by_ratio_y / z, by_z), turn)
-        v_means[n, 0], v_means[n, 1], v_means[n, 2] = moved
+        v_mean = _times((by_ratio_x / z, by_ratio_y / z, by_z), rotation)
+        v_means[n, 0], v_means[n, 1], v_means[n, 2] = v_mean

@@ -1,12 +1,12 @@
-"""Kernels: what a small change of each stored parameter costs in the picture, exactly, from one pass from the back.
+"""Numba kernels of sensitivity: Hessians of the squared image error by stored parameters, from one backward pass.
 
-A pixel changes with the logarithm of a footprint's alpha by w = alpha T (colour - B), B being what is behind it; and
-that logarithm is, to first order, a polynomial of degree 2 in the footprint's own coordinates u, v: the opacity moves
-its constant, the centre its linear, the covariance its quadratic terms. The squared change of the picture is then a
-quadratic form in these six numbers whose entries are moments, sums of |w|² uⁱ vʲ over the pixels with i + j up to 4.
-The chain rule carries it to the stored parameters: J ᵀ J of the picture, without a random probe.
+The derivative of a pixel by the logarithm of a footprint's alpha is w = alpha T (colour - B), B being the colour behind
+it. To first order, the change of that logarithm is a polynomial of degree 2 in the footprint's own coordinates u, v:
+the opacity changes its constant term, the centre its linear terms, the covariance its quadratic terms. The squared
+change of the image is then a quadratic form in these six coefficients, whose entries are moments, sums of |w|² uⁱ vʲ
+over pixels with i + j up to 4. The chain rule gives J ᵀ J of the image by the stored parameters, without random probes.
 
-Nobody knows before which background a scene will be shown, so that is random: |w|² is the mean over it.
+The background that a scene will be shown with is unknown, so it is random: |w|² is the mean over backgrounds.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from kissgs.rendering.cpu.shading import _harmonics
     fastmath=_FAST,
 )
 def moments(
-    splats: np.ndarray,
+    records: np.ndarray,
     members: np.ndarray,
     spans: np.ndarray,
     slots: np.ndarray,
@@ -54,48 +54,48 @@ def moments(
     stops: np.ndarray,
     sums: np.ndarray,
 ) -> None:
-    """Moments of the members of tiles ``first`` to ``last`` (exclusive).
+    """Compute moments of the members of tiles ``first`` to ``last`` (exclusive).
 
-    The arguments are those of :func:`kissgs.rendering.cpu.blending.removal_errors`, and the standard deviation of each
-    channel of the background; ``sums``, ``(slots, 16)``, is written: over the tile's pixels, of |w|² times 1, u, v, u²,
-    uv, v², u³, u²v, uv², v³, u⁴, u³v, u²v², uv³, v⁴; and of (alpha T)². Where alpha is at its largest, it does not
-    change: these pixels count in the first alone, which is thereby what it costs to remove a Gaussian.
+    The arguments are those of :func:`kissgs.rendering.cpu.blending.removal_errors`, and ``spread``, the standard
+    deviation of each channel of the background. ``sums``: out, ``(slots, 16)``, sums over the tile's pixels of |w|²
+    times 1, u, v, u², uv, v², u³, u²v, uv², v³, u⁴, u³v, u²v², uv³, v⁴; and of (alpha T)². Pixels at which alpha is
+    clamped to ALPHA_MAX count in the first sum only, which is therefore the error of removing the Gaussian.
     """
     alpha_min, alpha_max = limits[0], limits[1]
     zero, one = np.float32(0), np.float32(1)
-    brightest = np.float32(2)  # a display shows no more than 1, and hardly less with a factor of two of it in front
+    max_color = np.float32(2)  # a display shows at most 1; brighter colours are limited to twice that
     height, width = transmittance.shape
     variance = np.float32(3 * spread * spread)
-    # Per pixel: x, y, stop, T; R, G, B of what is behind, and how much of the background shines through that.
+    # Per pixel: x, y, stop, T; R, G, B behind the Gaussian, and transmittance to the background behind it.
     s = np.empty(8 * 256, np.float32)
     _pixel_centres(s)
     for tile in range(first, last):
         x0, y0 = (tile % columns) * 16, (tile // columns) * 16
         begin = starts[tile]
-        furthest = 0
+        last_stop = 0
         for p in range(256):
-            furthest = max(furthest, stops[tile, p])
+            last_stop = max(last_stop, stops[tile, p])
             s[512 + p] = np.float32(stops[tile, p])
             s[768 + p] = transmittance[min(y0 + (p >> 4), height - 1), min(x0 + (p & 15), width - 1)]
             s[1024 + p], s[1280 + p], s[1536 + p] = background[0], background[1], background[2]
             s[1792 + p] = one
-        for i in range(begin + furthest, starts[tile + 1]):
+        for i in range(begin + last_stop, starts[tile + 1]):
             sums[slots[i], :] = zero
-        for i in range(begin + furthest - 1, begin - 1, -1):
-            (mx, my, l0, l1, l2), (opacity, red, green, blue) = _footprint(splats, members[i], x0, y0)
-            red, green, blue = min(red, brightest), min(green, brightest), min(blue, brightest)
+        for i in range(begin + last_stop - 1, begin - 1, -1):
+            (mx, my, l0, l1, l2), (opacity, red, green, blue) = _footprint(records, members[i], x0, y0)
+            red, green, blue = min(red, max_color), min(green, max_color), min(blue, max_color)
             top, bottom = np.uint64(spans[i] >> 5), np.uint64(spans[i] & 31)
-            place = np.float32(i - begin)
+            index = np.float32(i - begin)
             m0, mu, mv, muu, muv, mvv = zero, zero, zero, zero, zero, zero
             m30, m21, m12, m03 = zero, zero, zero, zero
-            m40, m31, m22, m13, m04, seen = zero, zero, zero, zero, zero, zero
+            m40, m31, m22, m13, m04, squared_weight = zero, zero, zero, zero, zero, zero
             for p in range(top * np.uint64(16), bottom * np.uint64(16)):
                 dx, dy = s[p] - mx, s[p + np.uint64(256)] - my
                 u, v = l0 * dx + l1 * dy, l2 * dy
                 full = opacity * _exp_minus(u * u + v * v)
                 alpha = min(full, alpha_max)
                 alpha = alpha if alpha >= alpha_min else zero
-                alpha = alpha if place < s[p + np.uint64(512)] else zero
+                alpha = alpha if index < s[p + np.uint64(512)] else zero
                 t = s[p + np.uint64(768)] / (one - alpha)
                 s[p + np.uint64(768)] = t
                 dr = alpha * (red - s[p + np.uint64(1024)])
@@ -105,10 +105,10 @@ def moments(
                 s[p + np.uint64(1280)] += dg
                 s[p + np.uint64(1536)] += db
                 weight = alpha * t
-                seen += weight * weight
-                shine = alpha * s[p + np.uint64(1792)]
-                s[p + np.uint64(1792)] -= shine
-                g = t * t * (dr * dr + dg * dg + db * db + variance * (shine * shine))
+                squared_weight += weight * weight
+                background_change = alpha * s[p + np.uint64(1792)]
+                s[p + np.uint64(1792)] -= background_change
+                g = t * t * (dr * dr + dg * dg + db * db + variance * (background_change * background_change))
                 m0 += g
                 g = g if full <= alpha_max else zero
                 uu, uv, vv = u * u, u * v, v * v
@@ -143,13 +143,13 @@ def moments(
             sums[slot, 12] = m22
             sums[slot, 13] = m13
             sums[slot, 14] = m04
-            sums[slot, 15] = seen
+            sums[slot, 15] = squared_weight
 
 
 @njit(nogil=True, error_model="numpy")
 def _form(m: np.ndarray, form: np.ndarray) -> None:
-    """The 6x6 matrix of moments, for polynomials in 1, u, v, u², uv, v²."""
-    place = np.array(
+    """Write the 6x6 matrix of moments of polynomials in 1, u, v, u², uv, v² into ``form``."""
+    moment_index = np.array(
         [
             [0, 1, 2, 3, 4, 5],
             [1, 3, 4, 6, 7, 8],
@@ -161,7 +161,7 @@ def _form(m: np.ndarray, form: np.ndarray) -> None:
     )
     for i in range(6):
         for j in range(6):
-            form[i, j] = m[place[i, j]]
+            form[i, j] = m[moment_index[i, j]]
 
 
 @compiled(
@@ -187,34 +187,34 @@ def add_to_parameters(
     K: np.ndarray,
     width: int,
     height: int,
-    rules: np.ndarray,
+    constants: np.ndarray,
     weight: float,
-    places: np.ndarray,
-    shapes: np.ndarray,
-    colors: np.ndarray,
-    directions: np.ndarray,
+    position_hessian: np.ndarray,
+    shape_hessian: np.ndarray,
+    color_weight: np.ndarray,
+    sh_basis_sum: np.ndarray,
 ) -> None:
-    """Add a view's quadratic forms to those of the Gaussians whose footprints are in ``rows[first:last]``.
+    """Add the Hessians of one image to those of the Gaussians whose footprints are ``rows[first:last]``.
 
     Args:
         means, quats, scales, opacities, visible, rows, slots_from, slot_counts, first, last, viewmat, K, width, height,
-            rules: as for :func:`kissgs.rendering.cpu.projection.project_backward`.
-        slots: of :func:`moments`.
-        eye: where the camera stands.
-        weight: of this view.
-        places: ``(N, 6)``, upper triangle of the form of the position: xx, xy, xz, yy, yz, zz.
-        shapes: ``(N, 28)``, upper triangle, row by row, of the form of opacity logit, three log-scales, and a rotation
-            vector in the Gaussian's own frame.
-        colors: ``(N,)``, sum of (alpha T)².
-        directions: ``(N, K)``, the same times the spherical harmonics without the constant one.
+            constants: as for :func:`kissgs.rendering.cpu.projection.project_backward`.
+        slots: output of :func:`moments`.
+        eye: ``(3,)`` position of the camera, world units.
+        weight: weight of the image.
+        position_hessian: ``(N, 6)`` upper triangle of the Hessian by position: xx, xy, xz, yy, yz, zz.
+        shape_hessian: ``(N, 28)`` upper triangle, row by row, of the Hessian by opacity logit, three log-scales, and a
+            rotation vector in the Gaussian's own frame.
+        color_weight: ``(N,)`` sum of (alpha T)².
+        sh_basis_sum: ``(N, K)`` sum of (alpha T)² times the spherical harmonics without the constant one.
     """
-    dilation = rules[2]
+    dilation = constants[2]
     fx, fy = K[0, 0], K[1, 1]
-    turn, shift = _pose(viewmat)
-    left, right, high, low = _frustum(K, width, height, rules[3])
+    rotation, translation = _pose(viewmat)
+    left, right, top, bottom = _frustum(K, width, height, constants[3])
     m, form = np.empty(16, np.float64), np.empty((6, 6), np.float64)
-    by_shape, half = np.zeros((7, 6), np.float64), np.zeros((7, 6), np.float64)
-    by_place = np.zeros((3, 2), np.float64)
+    by_shape, product = np.zeros((7, 6), np.float64), np.zeros((7, 6), np.float64)
+    by_position = np.zeros((3, 2), np.float64)
     basis = np.zeros(15, np.float64)
     for i in range(first, last):
         row = rows[i]
@@ -230,58 +230,61 @@ def add_to_parameters(
 
         # As in project.
         mean = _load(means, n)
-        z = _dot(turn[2], mean) + shift[2]
-        x, y = (_dot(turn[0], mean) + shift[0]) / z, (_dot(turn[1], mean) + shift[1]) / z
-        p = _mix(fx / z, turn[0], -fx / z * min(right, max(left, x)), turn[2])
-        q = _mix(fy / z, turn[1], -fy / z * min(low, max(high, y)), turn[2])
+        z = _dot(rotation[2], mean) + translation[2]
+        x, y = (_dot(rotation[0], mean) + translation[0]) / z, (_dot(rotation[1], mean) + translation[1]) / z
+        p = _mix(fx / z, rotation[0], -fx / z * min(right, max(left, x)), rotation[2])
+        q = _mix(fy / z, rotation[1], -fy / z * min(bottom, max(top, y)), rotation[2])
         qw, qx, qy, qz, _ = _unit_quat(quats, n)
         R, s = _rotation(qw, qx, qy, qz), _deviations(scales, n)
         w, v = _scaled(_times(p, R), s), _scaled(_times(q, R), s)
         l0, l1, l2 = _cholesky(w, v, dilation)
         u_rows, v_rows = _whitened(w, v, dilation)
 
-        # ln alpha by the position: 2 (u, v) L dc, c being the centre.
-        across, down = _mix(fx / z, turn[0], -fx / z * x, turn[2]), _mix(fy / z, turn[1], -fy / z * y, turn[2])
+        # Derivative of ln alpha by position: 2 (u, v) L dc, c being the centre.
+        across = _mix(fx / z, rotation[0], -fx / z * x, rotation[2])
+        down = _mix(fy / z, rotation[1], -fy / z * y, rotation[2])
         for c in range(3):
-            by_place[c, 0] = 2 * (l0 * across[c] + l1 * down[c])
-            by_place[c, 1] = 2 * l2 * down[c]
+            by_position[c, 0] = 2 * (l0 * across[c] + l1 * down[c])
+            by_position[c, 1] = 2 * l2 * down[c]
         k = 0
         for c in range(3):
             for d in range(c, 3):
-                places[n, k] += by_place[c, 0] * (form[1, 1] * by_place[d, 0] + form[1, 2] * by_place[d, 1]) + by_place[
-                    c, 1
-                ] * (form[2, 1] * by_place[d, 0] + form[2, 2] * by_place[d, 1])
+                position_hessian[n, k] += by_position[c, 0] * (
+                    form[1, 1] * by_position[d, 0] + form[1, 2] * by_position[d, 1]
+                ) + by_position[c, 1] * (form[2, 1] * by_position[d, 0] + form[2, 2] * by_position[d, 1])
                 k += 1
 
-        # By opacity; by the covariance, 2 (u, v) L dS Lᵀ (u, v)ᵀ; S by log-scales and by turns about the own axes.
+        # By opacity; by the covariance S, 2 (u, v) L dS Lᵀ (u, v)ᵀ, and S by log-scales and by rotations about the
+        # axes.
         by_shape[0, 0] = 1.0 / (1.0 + np.exp(np.float64(opacities[n])))
         for c in range(6):
             if c < 3:
                 d, e, size = c, c, 2.0
             else:
-                d, e = (c - 2) % 3, (c - 1) % 3  # the two axes that turn about axis c - 3
+                d, e = (c - 2) % 3, (c - 1) % 3  # the two axes that rotate about axis c - 3
                 size = 2 * (s[d] / s[e] - s[e] / s[d])
             by_shape[1 + c, 3] = 2 * size * u_rows[d] * u_rows[e]
             by_shape[1 + c, 4] = 2 * size * (u_rows[d] * v_rows[e] + v_rows[d] * u_rows[e])
             by_shape[1 + c, 5] = 2 * size * v_rows[d] * v_rows[e]
         for c in range(7):
             for d in range(6):
-                half[c, d] = by_shape[c, 0] * form[0, d]
+                product[c, d] = by_shape[c, 0] * form[0, d]
                 for e in range(3, 6):
-                    half[c, d] += by_shape[c, e] * form[e, d]
+                    product[c, d] += by_shape[c, e] * form[e, d]
         k = 0
         for c in range(7):
             for d in range(c, 7):
-                total = half[c, 0] * by_shape[d, 0]
+                total = product[c, 0] * by_shape[d, 0]
                 for e in range(3, 6):
-                    total += half[c, e] * by_shape[d, e]
-                shapes[n, k] += total
+                    total += product[c, e] * by_shape[d, e]
+                shape_hessian[n, k] += total
                 k += 1
 
-        colors[n] += m[15]
-        if directions.shape[1] > 0:
-            gaze = (mean[0] - eye[0], mean[1] - eye[1], mean[2] - eye[2])
-            inverse = 1.0 / np.sqrt(_dot(gaze, gaze))
-            _harmonics(gaze[0] * inverse, gaze[1] * inverse, gaze[2] * inverse, directions.shape[1], basis)
-            for c in range(directions.shape[1]):
-                directions[n, c] += m[15] * basis[c]
+        color_weight[n] += m[15]
+        if sh_basis_sum.shape[1] > 0:
+            direction = (mean[0] - eye[0], mean[1] - eye[1], mean[2] - eye[2])
+            inverse = 1.0 / np.sqrt(_dot(direction, direction))
+            dx, dy, dz = direction[0] * inverse, direction[1] * inverse, direction[2] * inverse
+            _harmonics(dx, dy, dz, sh_basis_sum.shape[1], basis)
+            for c in range(sh_basis_sum.shape[1]):
+                sh_basis_sum[n, c] += m[15] * basis[c]

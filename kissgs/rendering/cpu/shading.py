@@ -1,4 +1,4 @@
-"""Kernels: spherical harmonics -> the colours that a camera sees, and the way back."""
+"""Numba kernels of shading: from spherical harmonics to colours in a camera, and gradients back."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from kissgs.core.numba_kernels import compiled
 
 @njit(nogil=True, error_model="numpy")
 def _harmonics(x: float, y: float, z: float, count: int, basis: np.ndarray) -> None:
-    """Values of the real spherical harmonics 1 to ``count`` (without the constant one) at a unit vector."""
+    """Write the real spherical harmonics 1 to ``count``, without the constant one, at a unit vector into ``basis``."""
     if count >= 3:
         basis[0] = -0.4886025119029199 * y
         basis[1] = 0.4886025119029199 * z
@@ -33,7 +33,7 @@ def _harmonics(x: float, y: float, z: float, count: int, basis: np.ndarray) -> N
 
 @njit(nogil=True, error_model="numpy")
 def _harmonics_gradient(x: float, y: float, z: float, count: int, v: np.ndarray) -> tuple[float, float, float]:
-    """Sum over the harmonics 1 to ``count`` of ``v`` times their gradient by the direction, not yet on the sphere."""
+    """Return the sum over harmonics of ``v`` times their gradients by x, y, z, not projected on the sphere."""
     gx = gy = gz = 0.0
     if count >= 3:
         gy -= 0.4886025119029199 * v[0]
@@ -68,17 +68,17 @@ def shade(
     visible: np.ndarray,
     first: int,
     last: int,
-    splats: np.ndarray,
+    records: np.ndarray,
 ) -> None:
-    """Write the colours, at least 0, of footprints ``first`` to ``last`` (exclusive).
+    """Write the colours of footprints ``first`` to ``last`` (exclusive), clamped to at least 0.
 
     Args:
-        means: ``(N, 3)``, and so on: stored parameters, see :class:`kissgs.Splats`.
-        eye: where the camera stands.
+        means, sh0, shN: stored parameters, see :class:`kissgs.Splats`.
+        eye: ``(3,)`` position of the camera, world units.
         visible: the Gaussian of each footprint.
-        first: footprint.
-        last: footprint.
-        splats: ``(M, 11)`` records of :func:`kissgs.rendering.cpu.projection.project`; columns 6 to 8 are written.
+        first: first footprint.
+        last: end of the footprints, exclusive.
+        records: ``(M, 11)`` records of :func:`kissgs.rendering.cpu.projection.project`; columns 6 to 8 are written.
     """
     rest = shN.shape[1]
     basis = np.empty(15, np.float64)
@@ -94,9 +94,9 @@ def shade(
             red += basis[k] * shN[n, k, 0]
             green += basis[k] * shN[n, k, 1]
             blue += basis[k] * shN[n, k, 2]
-        splats[row, 6] = max(red, 0.0)
-        splats[row, 7] = max(green, 0.0)
-        splats[row, 8] = max(blue, 0.0)
+        records[row, 6] = max(red, 0.0)
+        records[row, 7] = max(green, 0.0)
+        records[row, 8] = max(blue, 0.0)
 
 
 @compiled(
@@ -111,21 +111,21 @@ def shade_backward(
     rows: np.ndarray,
     first: int,
     last: int,
-    splats: np.ndarray,
+    records: np.ndarray,
     v_colors: np.ndarray,
     v_means: np.ndarray,
     v_sh0: np.ndarray,
     v_shN: np.ndarray,
 ) -> None:
-    """Gradients by position and harmonics, of the footprints in ``rows[first:last]``.
+    """Compute gradients by means and SH coefficients, of the footprints ``rows[first:last]``.
 
     Args:
-        means, shN, eye, visible, splats: as for :func:`shade`.
+        means, shN, eye, visible, records: as for :func:`shade`.
         rows, first, last: as for :func:`kissgs.rendering.cpu.projection.project_backward`.
-        v_colors: ``(M, 3)`` gradient by the colours.
-        v_means: ``(N, 3)``, added to.
-        v_sh0: ``(N, 3)``, written.
-        v_shN: ``(N, K, 3)``, written.
+        v_colors: ``(M, 3)`` gradients by the colours.
+        v_means: ``(N, 3)``; gradients are added.
+        v_sh0: out, ``(N, 3)``.
+        v_shN: out, ``(N, K, 3)``.
     """
     rest = shN.shape[1]
     basis, v_basis = np.empty(15, np.float64), np.empty(15, np.float64)
@@ -136,9 +136,9 @@ def shade_backward(
         inverse = 1.0 / np.sqrt(x * x + y * y + z * z)
         x, y, z = x * inverse, y * inverse, z * inverse
         _harmonics(x, y, z, rest, basis)
-        red = v_colors[row, 0] if splats[row, 6] > 0 else 0.0
-        green = v_colors[row, 1] if splats[row, 7] > 0 else 0.0
-        blue = v_colors[row, 2] if splats[row, 8] > 0 else 0.0
+        red = v_colors[row, 0] if records[row, 6] > 0 else 0.0
+        green = v_colors[row, 1] if records[row, 7] > 0 else 0.0
+        blue = v_colors[row, 2] if records[row, 8] > 0 else 0.0
         v_sh0[n, 0] = 0.28209479177387814 * red
         v_sh0[n, 1] = 0.28209479177387814 * green
         v_sh0[n, 2] = 0.28209479177387814 * blue
@@ -148,7 +148,7 @@ def shade_backward(
             v_shN[n, k, 2] = basis[k] * blue
             v_basis[k] = shN[n, k, 0] * red + shN[n, k, 1] * green + shN[n, k, 2] * blue
         gx, gy, gz = _harmonics_gradient(x, y, z, rest, v_basis)
-        along = gx * x + gy * y + gz * z  # a direction has no length to change
+        along = gx * x + gy * y + gz * z  # the component along the direction changes only its length
         v_means[n, 0] += (gx - along * x) * inverse
         v_means[n, 1] += (gy - along * y) * inverse
         v_means[n, 2] += (gz - along * z) * inverse
