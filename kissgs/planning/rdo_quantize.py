@@ -18,7 +18,7 @@ from kissgs.planning.rd_model import Costs, step
 from kissgs.planning.rotation_forms import PERMUTATIONS, ROTATIONS
 
 UNSEEN = {"opacities": 0.15, "scales": 0.11, "growth": 0.11, "quaternions": 0.023, "f_dc": 0.055}
-VIRTUAL = {"opacities": 0.4, "scales": 0.13, "growth": 0.12, "quaternions": 0.08, "f_dc": 0.2}
+VIRTUAL = {"opacities": 0.4, "scales": 0.13, "growth": 0.12, "quaternions": 0.04, "f_dc": 0.2}
 CAPTURED = {"opacities": 2.0, "scales": 0.6, "growth": 0.3, "quaternions": 0.25, "f_dc": 0.5}
 """Largest step of each attribute and largest change by rounding, at any lambda.
 
