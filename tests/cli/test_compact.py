@@ -120,7 +120,10 @@ def test_ctrl_c_leaves_a_checkpoint_to_resume_from(folder: Path, tmp_path: Path)
     [
         (["-o", "b.ply"], "missing the number of Gaussians to keep: give -n 200k, --ratio 0.2 or --max-psnr-drop 0.2"),
         (["-n", "9"], "missing -o: by default the output would overwrite the input"),
-        (["-n", "many", "-o", "b.ply"], "'many' is no number of Gaussians; give 200000, 200k or 1.5M, or a share with --ratio 0.2"),
+        (
+            ["-n", "many", "-o", "b.ply"],
+            "'many' is no number of Gaussians; give 200000, 200k or 1.5M, or a share with --ratio 0.2",
+        ),
         (["-n", "0", "-o", "b.ply"], "setting count: input should be greater than or equal to 1, not 0"),
         (["--ratio", "20", "-o", "b.ply"], "setting ratio: input should be less than or equal to 1, not 20.0"),
         (["-n", "9", "--ratio", "0.2", "-o", "b.ply"], "count and ratio cannot both be met; give one"),
