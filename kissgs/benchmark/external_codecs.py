@@ -18,8 +18,8 @@ from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.splats import Splats, clean
 from kissgs.evaluation.attributes import AttributeErrors, attribute_errors, sigmoid
 from kissgs.evaluation.cameras import evaluation_views
-from kissgs.evaluation.evaluate import compare_pictures
-from kissgs.evaluation.matching import pair
+from kissgs.evaluation.evaluate import compare_images
+from kissgs.evaluation.matching import match_gaussians
 from kissgs.evaluation.results import Evaluation
 from kissgs.io.atomic import reason_of
 from kissgs.io.ply import read_ply
@@ -82,7 +82,7 @@ def measure_peer(
         format: ``"sog"`` or ``"spz"``.
         command: How to start splat-transform.
         sh_iterations: k-means iterations over the SH of ``.sog``; None leaves the tool's default.
-        pictures: compare pictures too (:func:`kissgs.evaluation.evaluate.compare_pictures`).
+        pictures: compare pictures too (:func:`kissgs.evaluation.evaluate.compare_images`).
         views: from where; by default cameras drawn over the whole scene.
 
     Raises:
@@ -112,7 +112,7 @@ def measure_peer(
         decode_cpu_seconds=decoding.cpu,
         peak_memory=max(encoding.memory, decoding.memory),
         errors=_errors_of_visible(reference, candidate),
-        pictures=compare_pictures(reference, candidate, views or evaluation_views(reference)) if pictures else None,
+        pictures=compare_images(reference, candidate, views or evaluation_views(reference)) if pictures else None,
     )
 
 
@@ -132,7 +132,7 @@ def check_peer(format: str, command: Sequence[str]) -> None:
 
 
 def _errors_of_visible(reference: Splats, candidate: Splats) -> AttributeErrors:
-    paired = reference.select(pair(reference, candidate))
+    paired = reference.select(match_gaussians(reference, candidate))
     visible = sigmoid(paired.opacities) * 255 > 1.001
     return attribute_errors(paired.select(visible), candidate.select(visible))
 

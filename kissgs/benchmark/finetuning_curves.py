@@ -13,7 +13,7 @@ from kissgs.core.errors import UnsupportedError
 from kissgs.core.progress import Progress, as_stage, silent
 from kissgs.core.splats import Splats
 from kissgs.evaluation.cameras import evaluation_views
-from kissgs.evaluation.evaluate import compare_pictures
+from kissgs.evaluation.evaluate import compare_images
 from kissgs.pipeline.pipeline import compact, compress, decompress
 from kissgs.settings import Settings
 
@@ -119,7 +119,7 @@ def _point(
     result = compress(scene, settings=settings, views=taught, threads=threads, progress=progress)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     decoded = decompress(result.files, threads=threads)
-    mean = compare_pictures(original, decoded, judges, threads=threads, progress=as_stage("judge", progress)).mean
+    mean = compare_images(original, decoded, judges, threads=threads, progress=as_stage("judge", progress)).mean
     return RatePoint(
         way=way,
         count=len(scene),

@@ -17,7 +17,7 @@ from kissgs.core.splats import Splats, clean
 from kissgs.core.timing import peak_memory
 from kissgs.evaluation.attributes import AttributeErrors, attribute_errors
 from kissgs.evaluation.cameras import evaluation_views
-from kissgs.evaluation.evaluate import compare_pictures
+from kissgs.evaluation.evaluate import compare_images
 from kissgs.evaluation.results import Evaluation
 from kissgs.pipeline.pipeline import compress, decompress
 from kissgs.pipeline.report import Report
@@ -66,7 +66,7 @@ def roundtrip(
     Args:
         source: a scene, or the path of a ``.ply``.
         settings: of the compression.
-        pictures: compare pictures too (:func:`kissgs.evaluation.evaluate.compare_pictures`); no part of the times.
+        pictures: compare pictures too (:func:`kissgs.evaluation.evaluate.compare_images`); no part of the times.
         views: a capture of the scene: weighs the bits, and its held-out views are compared; by default cameras drawn
             over the whole scene are.
         threads: 0 means one per processor.
@@ -91,7 +91,7 @@ def roundtrip(
 
 def _compared(scene: Splats, decoded: Splats, views: Views | None, threads: int, progress: Progress) -> Evaluation:
     judges = views or evaluation_views(scene, threads=threads, progress=progress)
-    return compare_pictures(scene, decoded, judges, threads=threads, progress=progress)
+    return compare_images(scene, decoded, judges, threads=threads, progress=progress)
 
 
 def isolated_roundtrip(
