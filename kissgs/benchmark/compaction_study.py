@@ -18,7 +18,7 @@ from kissgs.core.errors import InvalidSceneError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
 from kissgs.settings import CompactSettings
-from kissgs.training.supervision import SCORED, SupervisionViews, supervision_views
+from kissgs.training.supervision import SCORING_STRIDE, SupervisionViews, supervision_views
 
 RATIOS = (0.7, 0.5, 0.3, 0.2, 0.1, 0.05)
 
@@ -173,6 +173,6 @@ def study(
 def _taught(
     splats: Splats, settings: CompactSettings, views: Views | None, learn_from: Source, threads: int, progress: Progress
 ) -> SupervisionViews:
-    scored = SCORED if settings.trains else 1
+    scored = SCORING_STRIDE if settings.trains else 1
     learned = None if views is None else views.to_learn(learn_from)
-    return supervision_views(splats, learned, settings, scored=scored, threads=threads, progress=progress)
+    return supervision_views(splats, learned, settings, scoring_stride=scored, threads=threads, progress=progress)

@@ -23,7 +23,7 @@ from kissgs.evaluation.psnr_loss import ESTIMATED_DROP, SEARCH_SEED, drop_of
 from kissgs.rendering.gsplat_backend import need_cuda
 from kissgs.rendering.rasterizer import Device
 from kissgs.settings import CompactSettings
-from kissgs.training.supervision import SCORED, SupervisionViews, supervision_views
+from kissgs.training.supervision import SCORING_STRIDE, SupervisionViews, supervision_views
 
 if TYPE_CHECKING:
     from kissgs.evaluation.results import Evaluation
@@ -140,8 +140,8 @@ class Compactor:
             )
         if settings.trains and device == "cuda":
             need_cuda()
-        scored = SCORED if settings.trains else 1
-        taught = supervision_views(splats, views, settings, scored=scored, threads=threads, progress=progress)
+        scored = SCORING_STRIDE if settings.trains else 1
+        taught = supervision_views(splats, views, settings, scoring_stride=scored, threads=threads, progress=progress)
         return cls(splats, settings, taught, threads, device, progress, None if views is None else taught.eval_views)
 
     def __call__(self, count: int, *, judges: bool = False, checkpoint: Path | None = None) -> Compacted:
