@@ -20,7 +20,7 @@ from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import clean
 from kissgs.evaluation.cameras import evaluation_views
-from kissgs.evaluation.evaluate import compare_pictures
+from kissgs.evaluation.evaluate import compare_images
 from kissgs.evaluation.results import Comparison
 from kissgs.pipeline.scene_files import load
 from kissgs.settings import EncodeSettings, Preset, Settings
@@ -218,7 +218,7 @@ class _Ablation:
         views = self.views or evaluation_views(splats, threads=self.threads, progress=self.progress)
 
         def row(name: str, parts: paper_ablation.EncodedParts, **published: float | None) -> AblationRow:
-            mean = compare_pictures(splats, parts.decoded, views, threads=self.threads).mean
+            mean = compare_images(splats, parts.decoded, views, threads=self.threads).mean
             return _row("KISS-GS", name, parts.size(settings.encode, self.threads), mean, base, **published)
 
         self.progress("measure", 0.0, "KISS-GS")

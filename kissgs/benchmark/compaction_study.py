@@ -19,7 +19,7 @@ from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
 from kissgs.evaluation.results import ImageMetrics
 from kissgs.settings import CompactSettings
-from kissgs.training.supervision import SCORED, SupervisionViews, supervision_views
+from kissgs.training.supervision import SCORING_STRIDE, SupervisionViews, supervision_views
 
 RATIOS = (0.7, 0.5, 0.3, 0.2, 0.1, 0.05)
 """Shares of the Gaussians that are kept, by default."""
@@ -190,6 +190,6 @@ def _supervision(
     threads: int,
     progress: Progress,
 ) -> SupervisionViews:
-    scored = SCORED if settings.trains else 1
+    stride = SCORING_STRIDE if settings.trains else 1
     used = None if views is None else views.to_learn(supervision)
-    return supervision_views(splats, used, settings, scored=scored, threads=threads, progress=progress)
+    return supervision_views(splats, used, settings, scoring_stride=stride, threads=threads, progress=progress)

@@ -18,8 +18,8 @@ from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.splats import Splats, clean
 from kissgs.evaluation.attributes import AttributeErrors, attribute_errors, sigmoid
 from kissgs.evaluation.cameras import evaluation_views
-from kissgs.evaluation.evaluate import compare_pictures
-from kissgs.evaluation.matching import pair
+from kissgs.evaluation.evaluate import compare_images
+from kissgs.evaluation.matching import match_gaussians
 from kissgs.evaluation.results import Evaluation
 from kissgs.io.atomic import reason_of
 from kissgs.io.ply import read_ply
@@ -92,7 +92,7 @@ def measure_external(
         format: one of :data:`EXTERNAL_FORMATS`.
         command: command that starts splat-transform.
         sh_iterations: k-means iterations over the SH of ``.sog``; None for the tool's default.
-        evaluate: whether to compare rendered images too (:func:`kissgs.evaluation.evaluate.compare_pictures`).
+        evaluate: whether to compare rendered images too (:func:`kissgs.evaluation.evaluate.compare_images`).
         views: views of that comparison; None for cameras drawn over the whole scene.
 
     Raises:
@@ -122,7 +122,7 @@ def measure_external(
         decode_cpu_seconds=decoding.cpu,
         peak_memory=max(encoding.memory, decoding.memory),
         errors=_errors_of_visible(reference, candidate),
-        evaluation=compare_pictures(reference, candidate, views or evaluation_views(reference)) if evaluate else None,
+        evaluation=compare_images(reference, candidate, views or evaluation_views(reference)) if evaluate else None,
     )
 
 
@@ -142,7 +142,7 @@ def check_external(format: str, command: Sequence[str]) -> None:
 
 
 def _errors_of_visible(reference: Splats, candidate: Splats) -> AttributeErrors:
-    paired = reference.select(pair(reference, candidate))
+    paired = reference.select(match_gaussians(reference, candidate))
     visible = sigmoid(paired.opacities) * 255 > 1.001
     return attribute_errors(paired.select(visible), candidate.select(visible))
 

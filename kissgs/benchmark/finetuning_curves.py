@@ -13,7 +13,7 @@ from kissgs.core.errors import UnsupportedError
 from kissgs.core.progress import Progress, as_stage, silent
 from kissgs.core.splats import Splats
 from kissgs.evaluation.cameras import evaluation_views
-from kissgs.evaluation.evaluate import compare_pictures
+from kissgs.evaluation.evaluate import compare_images
 from kissgs.pipeline.pipeline import compact, compress, decompress
 from kissgs.settings import Settings
 
@@ -121,7 +121,7 @@ def _point(
     result = compress(scene, settings=settings, views=training, threads=threads, progress=progress)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     decoded = decompress(result.files, threads=threads)
-    mean = compare_pictures(original, decoded, evaluated, threads=threads, progress=as_stage("evaluate", progress)).mean
+    mean = compare_images(original, decoded, evaluated, threads=threads, progress=as_stage("evaluate", progress)).mean
     return RatePoint(
         variant=variant,
         count=len(scene),

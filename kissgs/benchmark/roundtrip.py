@@ -17,7 +17,7 @@ from kissgs.core.splats import Splats, clean
 from kissgs.core.timing import peak_memory
 from kissgs.evaluation.attributes import AttributeErrors, attribute_errors
 from kissgs.evaluation.cameras import evaluation_views
-from kissgs.evaluation.evaluate import compare_pictures
+from kissgs.evaluation.evaluate import compare_images
 from kissgs.evaluation.results import Evaluation
 from kissgs.pipeline.pipeline import compress, decompress
 from kissgs.pipeline.report import Report
@@ -67,7 +67,7 @@ def roundtrip(
     Args:
         source: a scene, or the path of a ``.ply`` file.
         settings: settings of the compression.
-        evaluate: whether to compare rendered images too (:func:`kissgs.evaluation.evaluate.compare_pictures`); the
+        evaluate: whether to compare rendered images too (:func:`kissgs.evaluation.evaluate.compare_images`); the
             times do not include this.
         views: capture for rate-distortion planning and, by its held-out views, for the evaluation; None to evaluate
             with cameras drawn over the whole scene.
@@ -93,7 +93,7 @@ def roundtrip(
 
 def _evaluation(scene: Splats, decoded: Splats, views: Views | None, threads: int, progress: Progress) -> Evaluation:
     views = views or evaluation_views(scene, threads=threads, progress=progress)
-    return compare_pictures(scene, decoded, views, threads=threads, progress=progress)
+    return compare_images(scene, decoded, views, threads=threads, progress=progress)
 
 
 def isolated_roundtrip(

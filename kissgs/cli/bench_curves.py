@@ -12,7 +12,7 @@ from rich.text import Text
 from kissgs.cli.bench_scenes import BenchOptions, BenchOutput, each_scene
 from kissgs.cli.options import choice, chosen
 from kissgs.core.errors import UnsupportedError
-from kissgs.evaluation.results import spell
+from kissgs.evaluation.results import format_metric
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -76,7 +76,7 @@ def compaction_table(rows: list[tuple[str, CompactionPoint]]) -> Table:
     names = ("Gaussians", "PSNR", "SSIM", "bytes", "seconds", "CPU s")
     table = Table("scene", "strategy", *(Column(name, justify="right") for name in names), box=None, pad_edge=False)
     for scene, point in rows:
-        metrics = f"{point.count:,}", spell(point.psnr, 2), spell(point.ssim, 4), f"{point.bytes:,}"
+        metrics = f"{point.count:,}", format_metric(point.psnr, 2), format_metric(point.ssim, 4), f"{point.bytes:,}"
         table.add_row(scene, point.strategy, *metrics, f"{point.seconds:.1f}", f"{point.cpu_seconds:.1f}")
     return table
 
@@ -121,7 +121,7 @@ def finetuning_table(rows: list[tuple[str, RatePoint]]) -> RenderableType:
     for scene in dict.fromkeys(name for name, _ in rows):
         points = [point for name, point in rows if name == scene]
         for point in points:
-            quality = spell(point.psnr, 2), spell(point.ssim, 4), spell(point.psnr_to_scene, 2)
+            quality = format_metric(point.psnr, 2), format_metric(point.ssim, 4), format_metric(point.psnr_to_scene, 2)
             resources = f"{point.seconds:.1f}", f"{point.cpu_seconds:.1f}", f"{point.peak_memory / 1e6:.0f}"
             table.add_row(
                 scene,

@@ -10,7 +10,7 @@ from rich.text import Text
 
 from kissgs.benchmark.ablation import AblationRow
 from kissgs.benchmark.results import EqualPsnr, Measurement, PsnrTarget
-from kissgs.evaluation.results import Evaluation, spell
+from kissgs.evaluation.results import Evaluation, format_metric
 
 TARGETS: dict[PsnrTarget, str] = {"original": "to the original", "photographs": "to photographs"}
 
@@ -62,7 +62,7 @@ def ablation_table(rows: Sequence[tuple[str, AblationRow]]) -> RenderableType:
                 f"{row.bytes:,}",
                 _share(row.bytes_change),
                 *((_share(row.equal_psnr_change),) if equal else ()),
-                _signed(row.psnr_change) if row.name != "nothing" else spell(row.psnr, 2),
+                _signed(row.psnr_change) if row.name != "nothing" else format_metric(row.psnr, 2),
                 *((_photo(row),) if photographed else ()),
                 *last,
             )
@@ -73,7 +73,7 @@ def ablation_table(rows: Sequence[tuple[str, AblationRow]]) -> RenderableType:
 def _photo(row: AblationRow) -> str:
     if row.photo_psnr is None:
         return ""
-    return spell(row.photo_psnr, 2) if row.name == "nothing" else _signed(row.photo_psnr_change)
+    return format_metric(row.photo_psnr, 2) if row.name == "nothing" else _signed(row.photo_psnr_change)
 
 
 def _share(change: float | None) -> str:
@@ -81,7 +81,7 @@ def _share(change: float | None) -> str:
 
 
 def _signed(change: float | None) -> str:
-    return "" if change is None else spell(change, 2, signed=True)
+    return "" if change is None else format_metric(change, 2, signed=True)
 
 
 def _counts(rows: Sequence[Measurement]) -> str:
@@ -120,12 +120,15 @@ def _evaluation_cells(evaluation: Evaluation | None, photographed: bool) -> list
     if evaluation is None:
         return []
     mean = evaluation.mean
-    change = "" if mean.change is None else spell(mean.change, 2, signed=True)
-    to_photo = [spell(mean.candidate.psnr, 2), change, spell(mean.candidate.ssim, 4)]
-    to_original = [spell(mean.candidate_vs_reference.psnr, 2), spell(mean.candidate_vs_reference.ssim, 4)]
+    change = "" if mean.change is None else format_metric(mean.change, 2, signed=True)
+    to_photo = [format_metric(mean.candidate.psnr, 2), change, format_metric(mean.candidate.ssim, 4)]
+    to_original = [
+        format_metric(mean.candidate_vs_reference.psnr, 2),
+        format_metric(mean.candidate_vs_reference.ssim, 4),
+    ]
     if photographed:
         return [*to_photo, *to_original]
-    return [*to_original, spell(evaluation.worst.comparison.candidate_vs_reference.psnr, 2)]
+    return [*to_original, format_metric(evaluation.worst.comparison.candidate_vs_reference.psnr, 2)]
 
 
 def _columns(title: str, names: Sequence[str], parts: Sequence[Mapping[str, float]], form: str) -> Table:

@@ -82,7 +82,7 @@ def compact(
     from kissgs.cli.signals import stoppable
     from kissgs.io.ply import write_ply
     from kissgs.pipeline.pipeline import compact as run
-    from kissgs.training.checkpoint import forget
+    from kissgs.training.checkpoint import delete_checkpoints
 
     settings = chosen(
         preset,
@@ -121,7 +121,7 @@ def compact(
 
             with stdout():
                 write_ply(sys.stdout.buffer, result.splats)
-            forget(result.checkpoint)
+            delete_checkpoints(result.checkpoint)
         elif not (quiet or as_json):
             from kissgs.cli.tables import compaction_table
 

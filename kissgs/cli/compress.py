@@ -100,7 +100,7 @@ def compress(
 ) -> None:
     """Compress each scene into a SOG-XT container."""
     from kissgs.pipeline.pipeline import compress as run
-    from kissgs.training.checkpoint import forget
+    from kissgs.training.checkpoint import delete_checkpoints
 
     budget = None if compact is None else budget_of(compact)
     settings = chosen(
@@ -142,7 +142,7 @@ def compress(
             )
         if piped:
             write_stdout(result.to_zip())
-            forget(*result.checkpoints)
+            delete_checkpoints(*result.checkpoints)
         elif not (quiet or as_json):
             from kissgs.cli.tables import report_table
 

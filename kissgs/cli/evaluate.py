@@ -47,7 +47,7 @@ def evaluate(
     """Compare the renderings of a scene with those of its original, and with photographs: PSNR and SSIM."""
     from kissgs.cli.console import progress_bar
     from kissgs.evaluation.evaluate import evaluate as measure
-    from kissgs.evaluation.html import Side, html_report
+    from kissgs.evaluation.html import ReportScene, html_report
     from kissgs.evaluation.results import Split
     from kissgs.io.atomic import atomic_file, refuse_existing
     from kissgs.pipeline.scene_files import load, stored_bytes
@@ -59,7 +59,7 @@ def evaluate(
     capture = open_views(views, scale=scale, images=images, resolution=resolution)
     with progress_bar(quiet or as_json) as progress:
         sides = [
-            Side(name=path.name, splats=load(path, threads=threads, progress=progress), bytes=stored_bytes(path))
+            ReportScene(name=path.name, splats=load(path, threads=threads, progress=progress), bytes=stored_bytes(path))
             for path in (reference, candidate)
         ]
         scenes = sides[0].splats, sides[1].splats

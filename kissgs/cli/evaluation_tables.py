@@ -10,11 +10,13 @@ from rich.text import Text
 
 from kissgs.benchmark.render_speed import RenderingCost
 from kissgs.cli.tables import size, surroundings_summary
-from kissgs.evaluation.html import Side
+from kissgs.evaluation.html import ReportScene
 from kissgs.evaluation.results import Evaluation
 
 
-def evaluation_table(evaluation: Evaluation, reference: Side, candidate: Side, *, asked: str) -> RenderableType:
+def evaluation_table(
+    evaluation: Evaluation, reference: ReportScene, candidate: ReportScene, *, asked: str
+) -> RenderableType:
     """Format the output of ``kissgs evaluate``; ``asked`` is the value of ``--split``."""
     what = Text(f"{evaluation.views_used}, {evaluation.size}: {evaluation.source}")
     notes = [Text(evaluation.note, "yellow")] if evaluation.note else []
@@ -30,7 +32,7 @@ def _sentence(text: str) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
 
-def _sizes(evaluation: Evaluation, reference: Side, candidate: Side) -> Text:
+def _sizes(evaluation: Evaluation, reference: ReportScene, candidate: ReportScene) -> Text:
     head = Text.assemble((candidate.name, "bold"), " compared with ", (reference.name, "bold"))
     if reference.bytes is not None and candidate.bytes:
         ratio = reference.bytes / candidate.bytes
@@ -53,8 +55,8 @@ def _views(evaluation: Evaluation) -> Table:
         pad_edge=False,
     )
     for compared in evaluation.views:
-        table.add_row(Text(compared.view.name), *compared.comparison.spelled())
-    table.add_row("mean", *mean.spelled(), style="bold")
+        table.add_row(Text(compared.view.name), *compared.comparison.cells())
+    table.add_row("mean", *mean.cells(), style="bold")
     return table
 
 

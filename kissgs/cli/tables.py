@@ -9,7 +9,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from kissgs.compaction.result import CompactionReport
-from kissgs.evaluation.results import Evaluation, spell
+from kissgs.evaluation.results import Evaluation, format_metric
 from kissgs.finetuning.result import FinetuneReport
 from kissgs.pipeline.inspect import Info
 from kissgs.pipeline.report import Report
@@ -96,7 +96,7 @@ def _compaction(report: CompactionReport) -> list[RenderableType]:
     for step in report.steps:
         cells = [f"{step.count:,}", f"{step.seconds:.1f}"]
         if step.psnr is not None and step.ssim is not None and step.bytes is not None:
-            cells += [spell(step.psnr, 2), spell(step.ssim, 4), f"{step.bytes:,}"]
+            cells += [format_metric(step.psnr, 2), format_metric(step.ssim, 4), f"{step.bytes:,}"]
         table.add_row(step.name, *cells)
     return [*lines, table]
 
@@ -106,7 +106,7 @@ def _finetuning(report: FinetuneReport) -> list[Text]:
     targets = "photographs" if report.target_source == "photos" else "renderings of the scene"
     line = (
         f"fine-tuned on {targets}: {size(report.bytes_before)} -> {size(report.bytes_after)}, held-out PSNR "
-        f"{spell(report.psnr_before, 2)} -> {spell(report.psnr_after, 2)} dB, {report.seconds:.0f} s"
+        f"{format_metric(report.psnr_before, 2)} -> {format_metric(report.psnr_after, 2)} dB, {report.seconds:.0f} s"
     )
     return [Text(line), *([Text(report.note, style="yellow")] if report.note else [])]
 
@@ -123,11 +123,11 @@ def _trials(trials: Sequence[Trial]) -> str:
 
 def _evaluation(evaluation: Evaluation) -> Text:
     mean = evaluation.mean
-    metrics = f"PSNR {spell(mean.candidate.psnr, 2)} dB, SSIM {spell(mean.candidate.ssim, 4)}"
+    metrics = f"PSNR {format_metric(mean.candidate.psnr, 2)} dB, SSIM {format_metric(mean.candidate.ssim, 4)}"
     if mean.reference is None:
         against = f"to the scene's own renderings from {evaluation.views_used}"
     else:
-        own = f"{spell(mean.reference.psnr, 2)} dB, {spell(mean.reference.ssim, 4)}"
+        own = f"{format_metric(mean.reference.psnr, 2)} dB, {format_metric(mean.reference.ssim, 4)}"
         against = f"to {evaluation.views_used}; the scene itself {own}"
     surroundings = evaluation.surroundings
     rest = "" if surroundings is None else f"\nbeyond the capture: {surroundings_summary(surroundings)}"
@@ -137,7 +137,7 @@ def _evaluation(evaluation: Evaluation) -> Text:
 
 def surroundings_summary(surroundings: Evaluation) -> str:
     """Format the evaluation from virtual cameras over the whole scene, beyond the views of a capture."""
-    mean = f"PSNR {spell(surroundings.mean.candidate_vs_reference.psnr, 2)} dB to the scene's own renderings"
+    mean = f"PSNR {format_metric(surroundings.mean.candidate_vs_reference.psnr, 2)} dB to the scene's own renderings"
     return f"{mean} from {surroundings.views_used}; {surroundings.extremes}"
 
 

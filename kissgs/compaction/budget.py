@@ -18,12 +18,12 @@ from kissgs.core.progress import Progress, as_stage, silent
 from kissgs.core.root_finding import find_root
 from kissgs.core.splats import Splats
 from kissgs.evaluation.cameras import evaluation_views
-from kissgs.evaluation.evaluate import Picture, compare_pictures
-from kissgs.evaluation.psnr_loss import MODELLED, SEARCH_SEED, drop_of
+from kissgs.evaluation.evaluate import Rendering, compare_images
+from kissgs.evaluation.psnr_loss import ESTIMATED_DROP, SEARCH_SEED, drop_of
 from kissgs.rendering.gsplat_backend import need_cuda
 from kissgs.rendering.rasterizer import Device
 from kissgs.settings import CompactSettings
-from kissgs.training.supervision import SCORED, SupervisionViews, supervision_views
+from kissgs.training.supervision import SCORING_STRIDE, SupervisionViews, supervision_views
 
 if TYPE_CHECKING:
     from kissgs.evaluation.results import Evaluation
@@ -118,7 +118,7 @@ class Compactor:
     device: Device
     progress: Progress
     judges: Views | None = None
-    _taken: dict[str, Picture] | None = None
+    _taken: dict[str, Rendering] | None = None
     _targets: TrainingTargets | None = None
 
     @classmethod
@@ -140,8 +140,8 @@ class Compactor:
             )
         if settings.trains and device == "cuda":
             need_cuda()
-        scored = SCORED if settings.trains else 1
-        taught = supervision_views(splats, views, settings, scored=scored, threads=threads, progress=progress)
+        scored = SCORING_STRIDE if settings.trains else 1
+        taught = supervision_views(splats, views, settings, scoring_stride=scored, threads=threads, progress=progress)
         return cls(splats, settings, taught, threads, device, progress, None if views is None else taught.eval_views)
 
     def __call__(self, count: int, *, judges: bool = False, checkpoint: Path | None = None) -> Compacted:
@@ -171,14 +171,19 @@ class Compactor:
         if self.judges is None:
             drawn = evaluation_views(self.splats, seed=SEARCH_SEED, threads=self.threads, progress=progress)
             self.judges, self._taken = drawn, {}
-        return compare_pictures(
-            self.splats, found.splats, self.judges, threads=self.threads, taken=self._taken, progress=progress
+        return compare_images(
+            self.splats,
+            found.splats,
+            self.judges,
+            threads=self.threads,
+            reference_images=self._taken,
+            progress=progress,
         )
 
     @property
     def note(self) -> str:
         """How a drop is told, where that needs to be said."""
-        return "" if any(view.photo for view in self.supervision.test) else MODELLED
+        return "" if any(view.photo for view in self.supervision.test) else ESTIMATED_DROP
 
 
 class _Search:

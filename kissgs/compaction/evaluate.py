@@ -6,7 +6,7 @@ from kissgs.cameras.views import Views
 from kissgs.core.progress import Progress, as_stage, silent
 from kissgs.core.splats import Splats
 from kissgs.evaluation.cameras import evaluation_views
-from kissgs.evaluation.evaluate import compare_pictures
+from kissgs.evaluation.evaluate import compare_images
 from kissgs.evaluation.results import ImageMetrics
 from kissgs.settings import Preset, Settings
 from kissgs.sogxt.container import zip_bytes
@@ -30,6 +30,6 @@ def evaluate_scene(
     """
     receive = as_stage("judge", progress)
     views = exam(reference, supervision, threads, receive)
-    compared = compare_pictures(reference, scene, views, threads=threads, progress=receive)
+    compared = compare_images(reference, scene, views, threads=threads, progress=receive)
     encoded = encode(scene, Settings(preset=Preset.FAST).encode, threads=threads, progress=receive)
     return compared.mean.candidate, len(zip_bytes(encoded.files))

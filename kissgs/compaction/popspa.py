@@ -29,7 +29,7 @@ from kissgs.training.checkpoint import Checkpoint
 from kissgs.training.supervision import SupervisionViews
 
 if TYPE_CHECKING:
-    from kissgs.training.loop import Rates
+    from kissgs.training.loop import LrSchedule
     from kissgs.training.model import GaussianModel
     from kissgs.training.targets import TrainingTargets
 
@@ -232,7 +232,7 @@ class _Recipe:
         """One phase from a step of it on, and the pruning after it."""
         from kissgs.compaction.regularizers import Shape
         from kissgs.compaction.sparsify import Sparsity
-        from kissgs.training.loop import Plan, Regularizer, train
+        from kissgs.training.loop import Regularizer, TrainingPlan, train
 
         phase, chosen, wishes = phases[number], self.settings, list[Regularizer]()
         progress = self._within(phases, number)
@@ -249,7 +249,7 @@ class _Recipe:
             if self.checkpoint.due:
                 self._save(number, step, {} if sparsity is None else sparsity.state())
 
-        plan = Plan(
+        plan = TrainingPlan(
             stage=phase.name,
             steps=phase.steps,
             rates=self._rates(phase, targets),
@@ -271,7 +271,7 @@ class _Recipe:
 
     def _reach(self, targets: TrainingTargets) -> Float32[np.ndarray, " M"]:
         """How far apart the cameras about each Gaussian that is left stand, by where the scene has it."""
-        return targets.reach(self.splats.means[self.index], self._extent(targets))
+        return targets.local_extents(self.splats.means[self.index], self._extent(targets))
 
     def _within(self, phases: list[_Phase], number: int) -> Progress:
         """Tells of all phases of one name as of one stage, with the prunings between them."""
@@ -285,7 +285,7 @@ class _Recipe:
 
         return receive
 
-    def _rates(self, phase: _Phase, targets: TrainingTargets) -> Rates:
+    def _rates(self, phase: _Phase, targets: TrainingTargets) -> LrSchedule:
         """Rates stay while Gaussians go, and fall exponentially, as 3DGS has it for the means, in the refinement."""
         from kissgs.training.loop import exponential_lr
 

@@ -47,5 +47,5 @@ class Shape:
         loss = self._needle_weight * needle_loss(scales).mean()
         return loss + self._flat_weight * scales.amin(dim=1).exp().mean()
 
-    def update(self, step: int, learner: TrainableScene) -> None:
+    def update(self, step: int, scene: TrainableScene) -> None:
         """Nothing is remembered."""

@@ -35,12 +35,12 @@ class Sparsity:
             return None
         return 0.5 * self._rho * (_sigmoid(parameters["opacities"]) - self.z + self.u).square().sum()
 
-    def update(self, step: int, learner: TrainableScene) -> None:
+    def update(self, step: int, scene: TrainableScene) -> None:
         """Sparsify, and move the dual."""
         if (step + 1) % self._interval:
             return
         with torch.no_grad():
-            activated = _sigmoid(learner.gaussians()["opacities"])
+            activated = _sigmoid(scene.gaussians()["opacities"])
             self.z = sparsest(activated + self.u, self._count)
             self.u += activated - self.z
 

@@ -1,1 +1,5 @@
-"""What a compressed scene lost: errors of its stored values, and the same for other tools."""
+"""Evaluation: two scenes, and optionally views with photographs -> PSNR, SSIM, LPIPS and errors of stored values.
+
+Evaluation cameras are drawn at random and share nothing with the encoder's cameras. Results can be written as JSON or
+as one HTML page.
+"""

@@ -1,4 +1,4 @@
-"""Errors of a scene's stored values, attribute by attribute."""
+"""Errors of a scene's stored values, per attribute."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from kissgs.core.errors import InvalidSceneError
 from kissgs.core.splats import SH_C0, SH_REST_COUNTS, Splats
 
 CHUNK = 65_536
-"""Rows at a time: float64 temporaries of some tens of MB, whatever the size of the scene."""
+"""Gaussians per chunk: bounds the float64 temporaries to some tens of MB for any scene."""
 
-SIGNED_AXES = np.array(
+AXIS_ROTATIONS = np.array(
     [
         axes
         for order in permutations(range(3))
@@ -24,15 +24,15 @@ SIGNED_AXES = np.array(
         if np.linalg.det(axes := np.eye(3)[:, order] * signs) > 0
     ]
 )
-"""The 24 rotations that only rename the axes of a frame or reverse them in pairs."""
+"""``(24, 3, 3)`` the rotations that map the coordinate axes to each other (octahedral group)."""
 
-RENAMING = np.abs(SIGNED_AXES).argmax(axis=1)
-"""``(24, 3)``: which old axis each new one is. R diag(s²) Rᵀ stays the same under R → R M, s → s[renaming]."""
+AXIS_PERMUTATIONS = np.abs(AXIS_ROTATIONS).argmax(axis=1)
+"""``(24, 3)`` the old axis that each new one is. R diag(s²) Rᵀ is invariant under R → R M, s → s[permutation]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Spread:
-    """Size of an error over all values: each component of each Gaussian counts once. 0 for an empty scene."""
+class ErrorStats:
+    """Root mean square and maximum of an error over all components of all Gaussians; 0 for an empty scene."""
 
     rmse: float
     max: float
@@ -40,69 +40,71 @@ class Spread:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ShErrors:
-    """Errors of SH coefficients beyond the constant one."""
+    """Errors of the SH coefficients of one or more bands, without band 0."""
 
     rmse: float
     signal: float
-    """root mean square of the reference"""
+    """root mean square of the reference's coefficients"""
     energy_kept: float | None
-    """1 - (rmse / signal)²: 1 is lossless, 0 no better than zeros. None where the reference itself is all zeros"""
+    """1 - (rmse / signal)²: 1 is lossless, 0 no better than zeros; None if the reference is all zeros"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AttributeErrors:
-    """What the stored values of a scene lost; see :func:`attribute_errors`."""
+    """Errors of a candidate's stored values; see :func:`attribute_errors`."""
 
     gaussians: int
-    means: Spread
+    means: ErrorStats
     """world units, per coordinate"""
-    means_relative: Spread
-    """|x' - x| / (1 + |x|), per coordinate: the error that a logarithmic encoding spreads evenly"""
-    rotation_degrees: Spread
-    """angle between the frames"""
-    scales: Spread
+    means_relative: ErrorStats
+    """|x' - x| / (1 + |x|), per coordinate: uniform for an encoding of logarithms"""
+    rotation_degrees: ErrorStats
+    """angle between the rotations"""
+    scales: ErrorStats
     """natural logarithm, per axis: 0.01 is 1 % of the size"""
     covariance_relative_median: float
     covariance_relative_max: float
-    """‖Σ' - Σ‖ / ‖Σ‖, Frobenius norms: what the errors of rotation and scales do to the shape"""
-    opacity_logits: Spread
-    opacities: Spread
-    """0 to 1"""
-    sh0: Spread
+    """‖Σ' - Σ‖ / ‖Σ‖, Frobenius norms: joint effect of the rotation and scale errors"""
+    opacity_logits: ErrorStats
+    opacities: ErrorStats
+    """activated, 0 to 1"""
+    sh0: ErrorStats
     """coefficients"""
-    sh0_levels: Spread
-    """the same in levels of an 8-bit colour, not clipped to 0..255"""
+    sh0_levels: ErrorStats
+    """levels of an 8-bit colour, not clipped to 0..255"""
     shN: ShErrors
     bands: tuple[ShErrors, ...]
-    """band 1, 2, …, as far as the reference goes"""
+    """one entry for each band of the reference, from band 1"""
 
     def as_dict(self) -> dict[str, Any]:
-        """All numbers by name, nested as the fields are."""
+        """Return all values by name, nested like the fields, for JSON."""
         return asdict(self)
 
 
 def attribute_errors(reference: Splats, candidate: Splats) -> AttributeErrors:
-    """Compare two scenes row by row.
+    """Compare the stored values of two scenes, Gaussian by Gaussian.
 
-    The rotation and scales of a Gaussian have 48 equivalent forms, among which codecs choose as they like. So each
-    candidate is first brought into the form nearest to its reference: the least sum of the squared angle (radians)
-    and the squared differences of the log-scales. Where two axes are about equally long, the angle around the third
-    means little; the covariance error tells what remains.
+    The rotation and scales of a Gaussian have 48 equivalent forms, and codecs may choose any of them. So each candidate
+    is first brought into the form nearest to its reference: the smallest sum of the squared angle (radians) and the
+    squared differences of the log-scales. If two axes are about equally long, the angle around the third has little
+    effect; see the covariance error.
 
     Args:
         reference: N Gaussians, cleaned.
-        candidate: N Gaussians, cleaned, in the same order. SH bands that it lacks count as zeros.
+        candidate: N Gaussians, cleaned, in the order of ``reference``. Missing SH bands count as zeros.
 
     Raises:
         InvalidSceneError: the scenes differ in length, or the candidate has the higher SH degree.
     """
     if len(reference) != len(candidate):
         raise InvalidSceneError(
-            f"the scenes have {len(reference)} and {len(candidate)} Gaussians; pair() tells which belong together"
+            f"the scenes have {len(reference)} and {len(candidate)} Gaussians and cannot be compared row by row; "
+            "find corresponding Gaussians with match_gaussians() first"
         )
     if candidate.sh_degree > reference.sh_degree:
         raise InvalidSceneError(
-            f"the candidate's SH degree, {candidate.sh_degree}, is above the reference's, {reference.sh_degree}"
+            f"the candidate's SH degree, {candidate.sh_degree}, is above the reference's, {reference.sh_degree}; "
+            "swap the scenes or drop the candidate's upper bands"
         )
     angles, log_scales, covariances = _shape_errors(reference, candidate)
     bands = [_sh_sums(reference, candidate, degree) for degree in range(1, reference.sh_degree + 1)]
@@ -111,16 +113,16 @@ def attribute_errors(reference: Splats, candidate: Splats) -> AttributeErrors:
     sh0 = (reference.sh0, candidate.sh0)
     return AttributeErrors(
         gaussians=len(reference),
-        means=_spread(y - x for x, y in _chunks(*means)),
-        means_relative=_spread((y - x) / (1 + np.abs(x)) for x, y in _chunks(*means)),
-        rotation_degrees=_spread([np.degrees(angles)]),
-        scales=_spread([log_scales]),
+        means=_error_stats(y - x for x, y in _chunks(*means)),
+        means_relative=_error_stats((y - x) / (1 + np.abs(x)) for x, y in _chunks(*means)),
+        rotation_degrees=_error_stats([np.degrees(angles)]),
+        scales=_error_stats([log_scales]),
         covariance_relative_median=float(np.median(covariances)) if len(covariances) else 0.0,
         covariance_relative_max=float(covariances.max(initial=0)),
-        opacity_logits=_spread(y - x for x, y in _chunks(*opacities)),
-        opacities=_spread(sigmoid(y) - sigmoid(x) for x, y in _chunks(*opacities)),
-        sh0=_spread(y - x for x, y in _chunks(*sh0)),
-        sh0_levels=_spread(255 * SH_C0 * (y - x) for x, y in _chunks(*sh0)),
+        opacity_logits=_error_stats(y - x for x, y in _chunks(*opacities)),
+        opacities=_error_stats(sigmoid(y) - sigmoid(x) for x, y in _chunks(*opacities)),
+        sh0=_error_stats(y - x for x, y in _chunks(*sh0)),
+        sh0_levels=_error_stats(255 * SH_C0 * (y - x) for x, y in _chunks(*sh0)),
         shN=_sh_errors(bands),
         bands=tuple(_sh_errors([band]) for band in bands),
     )
@@ -137,13 +139,13 @@ def _chunks(
         yield reference[rows].astype(np.float64), candidate[rows].astype(np.float64)
 
 
-def _spread(errors: Iterable[Float64[np.ndarray, "..."]]) -> Spread:
+def _error_stats(errors: Iterable[Float64[np.ndarray, "..."]]) -> ErrorStats:
     count, total, largest = 0, 0.0, 0.0
     for error in errors:
         count += error.size
         total += float(np.vdot(error, error))
         largest = max(largest, float(np.abs(error).max(initial=0)))
-    return Spread(rmse=_root(total, count), max=largest)
+    return ErrorStats(rmse=_root(total, count), max=largest)
 
 
 def _root(total: float, count: int) -> float:
@@ -151,7 +153,7 @@ def _root(total: float, count: int) -> float:
 
 
 def sigmoid(logits: Float[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:
-    """Opacities, 0 to 1, in float64."""
+    """Return the opacities, 0 to 1, of logits, in float64."""
     return np.asarray(1 / (1 + np.exp(-logits.astype(np.float64))))
 
 
@@ -161,7 +163,7 @@ def sigmoid(logits: Float[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:
 def _shape_errors(
     reference: Splats, candidate: Splats
 ) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, "N 3"], Float64[np.ndarray, " N"]]:
-    """Angle (radians) and differences of the log-scales in the nearest form; relative error of the covariance."""
+    """Return angles (radians) and log-scale differences in the nearest form, and relative covariance errors."""
     n = len(reference)
     angles, log_scales, covariances = np.empty(n), np.empty((n, 3)), np.empty(n)
     for rows in _rows(n):
@@ -180,18 +182,18 @@ def _nearest_form(
     other_frames: Float64[np.ndarray, "C 3 3"],
     other_scales: Float64[np.ndarray, "C 3"],
 ) -> tuple[Float64[np.ndarray, " C"], Float64[np.ndarray, "C 3"]]:
-    """Angle to, and differences of log-scales from, the first under the best of the other's 24 forms."""
-    between = other_frames.transpose(0, 2, 1) @ frames
-    traces = between.reshape(-1, 9) @ SIGNED_AXES.reshape(-1, 9).T  # of Mᵀ R'ᵀ R, for each renaming M
+    """Return angles and log-scale differences between the first Gaussians and the nearest forms of the others."""
+    relative = other_frames.transpose(0, 2, 1) @ frames
+    traces = relative.reshape(-1, 9) @ AXIS_ROTATIONS.reshape(-1, 9).T  # trace(Mᵀ R'ᵀ R) for each M
     angles = np.arccos(np.clip((traces - 1) / 2, -1, 1))
-    differences = other_scales[:, RENAMING] - scales[:, None]
+    differences = other_scales[:, AXIS_PERMUTATIONS] - scales[:, None]
     best = (angles**2 + (differences**2).sum(axis=2)).argmin(axis=1)
     row = np.arange(len(best))
     return angles[row, best], differences[row, best]
 
 
 def _rotations(quats: Float32[np.ndarray, "C 4"]) -> Float64[np.ndarray, "C 3 3"]:
-    # float32 unit quaternions are off unit length by 1e-7, which an arc cosine would turn into 0.03 degrees.
+    # Normalised in float64: the length error of float32 unit quaternions, 1e-7, would become 0.03 degrees.
     wide = quats.astype(np.float64)
     w, x, y, z = (wide / np.linalg.norm(wide, axis=1, keepdims=True)).T
     rows = [
@@ -220,7 +222,7 @@ class _ShSums:
 
 
 def _sh_sums(reference: Splats, candidate: Splats, degree: int) -> _ShSums:
-    """Sums of squares over one band."""
+    """Return the sums of squares over one band."""
     band = slice(SH_REST_COUNTS[degree - 1], SH_REST_COUNTS[degree])
     error = signal = 0.0
     for x, y in _chunks(reference.shN[:, band], candidate.shN[:, band]):

@@ -1,4 +1,4 @@
-"""What all cameras that judge have in common: lenses, backgrounds, and how near they come."""
+"""Settings and helpers of all evaluation cameras: fields of view, backgrounds, smallest distance."""
 
 from __future__ import annotations
 
@@ -9,36 +9,48 @@ from kissgs.rendering.camera import Camera, look_at
 from kissgs.rendering.constants import NEAR
 
 BACKGROUNDS = (0.0, 0.5, 1.0)
-"""Black, grey and white, in turn: what is lost of a dark scene does not show on black."""
+"""Grey levels of the views' backgrounds, in turn: on black, missing parts of a dark scene would not show."""
 
 FIELDS_OF_VIEW = np.radians((50.0, 90.0))
-"""Angles along the longer side."""
+"""Smallest and largest field of view along the longer side of the image, radians."""
 
-NEAREST = 5 * NEAR
-"""World units: cameras do not go nearer, for what is nearer than NEAR is not drawn; they take a longer lens instead."""
+MIN_DISTANCE = 5 * NEAR
+"""Smallest distance of a camera to its target, world units. Gaussians nearer than ``NEAR`` are not drawn; a camera that
+would be closer gets a narrower field of view instead."""
 
-PATIENCE = 12
-"""Cameras that are drawn for a view, at most."""
+MAX_DRAWS = 12
+"""Largest number of cameras drawn for one view until one is accepted."""
 
 THUMBNAIL = 64
-"""Pixels of the longer side of the pictures that tell whether there is anything to see."""
+"""Longer side of the thumbnails that decide whether a camera is accepted, pixels."""
 
 UP = np.array([0.0, -1.0, 0.0])
+"""Up vector of all evaluation cameras."""
 
 Point = Float64[np.ndarray, "3"]
 
 
-def direction(rng: np.random.Generator) -> Point:
-    """A direction, any as likely as any other."""
+def random_direction(rng: np.random.Generator) -> Point:
+    """Return a unit vector, uniformly distributed over the sphere."""
     vector = rng.standard_normal(3)
     return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-9))
 
 
-def aim(place: Point, target: Point, fov: float, size: tuple[int, int]) -> Camera:
-    """A camera there, or no nearer than :data:`NEAREST` with as much in its picture; ``fov`` in radians."""
-    distance = float(np.linalg.norm(place - target))
-    if distance < NEAREST:
-        away = (place - target) / distance if distance > 0 else -UP
-        place = target + NEAREST * away
-        fov = max(2 * float(np.arctan(np.tan(fov / 2) * distance / NEAREST)), 1e-9)
-    return look_at(place, target, UP, fov=fov, width=size[0], height=size[1])
+def camera_at(position: Point, target: Point, fov: float, size: tuple[int, int]) -> Camera:
+    """Return a camera at ``position`` that looks at ``target``.
+
+    If that is nearer than :data:`MIN_DISTANCE`, the camera moves back and its field of view shrinks, so that the image
+    shows the same section.
+
+    Args:
+        position: of the camera, world units.
+        target: point in the middle of the image, world units.
+        fov: field of view along the longer side, radians.
+        size: width and height of the image, pixels.
+    """
+    distance = float(np.linalg.norm(position - target))
+    if distance < MIN_DISTANCE:
+        away = (position - target) / distance if distance > 0 else -UP
+        position = target + MIN_DISTANCE * away
+        fov = max(2 * float(np.arctan(np.tan(fov / 2) * distance / MIN_DISTANCE)), 1e-9)
+    return look_at(position, target, UP, fov=fov, width=size[0], height=size[1])

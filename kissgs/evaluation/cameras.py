@@ -1,8 +1,8 @@
 """Evaluation cameras: drawn at random over a whole scene, at all scales, from a seed.
 
-The encoder has cameras of its own (:mod:`kissgs.cameras.virtual`) and stores coarsely what these do not see. The same
-cameras would not notice what was lost. So nothing here is shared with them: cameras are drawn, not chosen, and every
-Gaussian that can be visible may be looked at.
+The encoder has cameras of its own (:mod:`kissgs.cameras.virtual`) and stores coarsely what these do not see; evaluated
+with the same cameras, these errors would not show. So evaluation shares nothing with them: cameras are drawn at random
+instead of optimised, and every Gaussian that can be visible may become a target.
 """
 
 from __future__ import annotations
@@ -18,37 +18,49 @@ from kissgs.core.errors import InvalidViewsError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
 from kissgs.core.threads import Workers
-from kissgs.evaluation.camera_sampling import BACKGROUNDS, FIELDS_OF_VIEW, PATIENCE, THUMBNAIL, Point, aim, direction
-from kissgs.evaluation.overlooked import MOST_ADDED, Parts
-from kissgs.evaluation.prominence import GaussianSampler, distances, opacity, prominence
-from kissgs.evaluation.visibility import weights_of, without_gloss
+from kissgs.evaluation.camera_sampling import (
+    BACKGROUNDS,
+    FIELDS_OF_VIEW,
+    MAX_DRAWS,
+    THUMBNAIL,
+    Point,
+    camera_at,
+    random_direction,
+)
+from kissgs.evaluation.overlooked import MAX_ADDED, Parts
+from kissgs.evaluation.prominence import GaussianSampler, drawn_opacities, mahalanobis_distances, prominence
+from kissgs.evaluation.visibility import base_colors_only, blending_weights
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu.frame import draw
 
 COUNT = 24
+"""Default number of evaluation views, without those added for overlooked parts."""
+
 WIDTH, HEIGHT = 320, 240
+"""Default image size, pixels."""
 
 Kind = Literal["far", "around", "close-up", "across"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
-"""From outside of all there is; around a part of any size; close to a surface; from one place to another."""
+"""Kinds of poses, in turn: outside of the scene; around a part of random size; close to a surface; from one part of the
+scene towards another."""
 
-EXTENTS = (1.0, 0.98, 0.9, 0.5)
-"""Shares of the Gaussians, along each axis, that views from far have in their picture: a few may be far away."""
+EXTENT_SHARES = (1.0, 0.98, 0.9, 0.5)
+"""Shares of the Gaussians, along each axis, that a "far" view frames: below 1 because a few may lie far away."""
 
-CLOSE = (100, 1000)
-"""How many Gaussians are nearer than a close-up's camera to what it looks at."""
+CLOSE_UP_RANKS = (100, 1000)
+"""Smallest and largest number of Gaussians that are nearer to the target of a close-up than its camera is."""
 
-BESIDE = 5.0
-"""Standard deviations: no camera is nearer than that to the Gaussian that it looks at."""
+MIN_SIGMAS = 5.0
+"""Smallest distance of a camera to its target Gaussian, in the Gaussian's standard deviations."""
 
-EMPTY = 0.02
-"""A picture with less than this mean alpha shows nothing."""
+MIN_MEAN_ALPHA = 0.02
+"""An image with a smaller mean alpha counts as empty."""
 
-WITHIN = 3.0
-"""Standard deviations: a camera that is nearer to a Gaussian's middle stands inside it."""
+INSIDE_SIGMAS = 3.0
+"""A camera within this Mahalanobis distance of a Gaussian's mean counts as inside it."""
 
-INSIDE, ALONE = 0.5, 0.3
-"""Shares of a picture that may show Gaussians inside of which the camera stands, and a single Gaussian."""
+MAX_INSIDE_SHARE, MAX_SINGLE_SHARE = 0.5, 0.3
+"""Largest shares of an image that Gaussians around the camera, and that a single Gaussian, may cover."""
 
 
 def evaluation_views(
@@ -61,49 +73,37 @@ def evaluation_views(
     threads: int = 0,
     progress: Progress = silent,
 ) -> Views:
-    """Cameras all over a scene, none of which the encoder uses; all are for testing.
+    """Draw evaluation cameras over a whole scene; all of them are test views.
 
-    Four kinds take turns, see :data:`KINDS`. A camera is drawn anew only if it shows nothing at all, or little but the
-    inside of Gaussians or a single one. For parts of the scene that stand apart, and whose loss would hardly change any
-    of these pictures, cameras are added (:mod:`kissgs.evaluation.overlooked`). The same scene and seed give the same
-    cameras, whatever the number of threads.
+    Four kinds alternate, see :data:`KINDS`. A camera is drawn again only if its image is empty, or mostly covered by
+    Gaussians that contain the camera or by a single one. Cameras are added for separate parts of the scene whose loss
+    would hardly change any of these images (:mod:`kissgs.evaluation.overlooked`). The cameras depend on the scene and
+    the seed only, not on the number of threads.
 
     Args:
-        splats: cleaned (:func:`kissgs.clean`).
-        count: how many views, but for those that are added.
-        width: of the pictures, pixels.
-        height: of the pictures, pixels.
-        seed: another one, other cameras.
-        threads: 0 means one per processor.
+        splats: the scene, cleaned (:func:`kissgs.clean`).
+        count: number of views, without the added ones.
+        width: width of the images, pixels.
+        height: height of the images, pixels.
+        seed: seed of the random numbers, 0 or more.
+        threads: number of threads; 0 means one per processor.
         progress: receives the stage ``"cameras"``.
 
     Raises:
-        InvalidViewsError: less than one view, or pictures of less than one pixel, are asked for; the seed is negative.
+        InvalidViewsError: ``count``, ``width`` or ``height`` is below 1, or the seed is negative.
     """
     if min(width, height, count) < 1:
-        raise InvalidViewsError(f"at least 1 view of 1x1 pixels can be had, not {count} of {width}x{height}")
+        raise InvalidViewsError(f"cannot draw {count} views of {width}x{height} pixels; ask for at least 1 view of 1x1")
     if seed < 0:
-        raise InvalidViewsError(f"a seed is a whole number from 0, not {seed}")
+        raise InvalidViewsError(f"the seed of evaluation cameras is {seed}; give a whole number from 0")
     rng, counts = np.random.Generator(np.random.PCG64(seed)), prominence(splats)
     sampler = _PoseSampler.of(splats, counts, (width, height))
-    subjects = _subjects(count, rng)
-    poses: list[_Pose] = [sampler.pose(n, 0, float(subjects[n]), rng) for n in range(count)]
-    parts = Parts.of(without_gloss(splats), counts)
-    shares = np.zeros((count, len(parts.parts)))
-    again = list(range(count)) if sampler.seen else []
+    parts = Parts.of(base_colors_only(splats), counts)
     with Workers(threads) as pool:
-        for attempt in range(1, PATIENCE):
-            progress("cameras", (count - len(again)) / count)
-            if not again:
-                break
-            shown = pool.map(lambda n: _shows(parts, poses[n].camera.at_most(THUMBNAIL)), again)
-            shares[again] = [taken if good else 0 * taken for good, taken in shown]
-            again = [n for n, (good, _) in zip(again, shown, strict=True) if not good]
-            for n in again:
-                poses[n] = sampler.pose(n, attempt, float(subjects[n]), rng)
+        poses, shares = _draw_poses(sampler, parts, count, rng, pool, progress)
         drawn = [(pose.camera, BACKGROUNDS[n % len(BACKGROUNDS)]) for n, pose in enumerate(poses)]
-        few = parts.overlooked(shares, drawn, pool)[:MOST_ADDED]
-        added = parts.cameras_for(few, (width, height), rng, pool)
+        overlooked = parts.overlooked(shares, drawn, pool)[:MAX_ADDED]
+        added = parts.cameras_for(overlooked, (width, height), rng, pool)
     progress("cameras", 1.0)
     digits = len(str(count + len(added) - 1))
     views = [
@@ -117,13 +117,33 @@ def evaluation_views(
     return Views((), tuple(views), _grey(0.5), f"drawn over the whole scene, seed {seed}")
 
 
-def _subjects(count: int, rng: np.random.Generator) -> Float64[np.ndarray, " count"]:
-    """Numbers from 0 to 1, one for each view: evenly spread over views of what is near, and over the others."""
+def _draw_poses(
+    sampler: _PoseSampler, parts: Parts, count: int, rng: np.random.Generator, pool: Workers, progress: Progress
+) -> tuple[list[_Pose], Float64[np.ndarray, "V P"]]:
+    """Draw each view until it is accepted; return the poses and the share of each image that each part covers."""
+    quantiles = _target_quantiles(count, rng)
+    poses: list[_Pose] = [sampler.pose(n, 0, float(quantiles[n]), rng) for n in range(count)]
+    shares = np.zeros((count, len(parts.parts)))
+    rejected = list(range(count)) if sampler.any_visible else []
+    for attempt in range(1, MAX_DRAWS):
+        progress("cameras", (count - len(rejected)) / count)
+        if not rejected:
+            break
+        checked = pool.map(lambda n: _check_camera(parts, poses[n].camera.at_most(THUMBNAIL)), rejected)
+        shares[rejected] = [share if accepted else 0 * share for accepted, share in checked]
+        rejected = [n for n, (accepted, _) in zip(rejected, checked, strict=True) if not accepted]
+        for n in rejected:
+            poses[n] = sampler.pose(n, attempt, float(quantiles[n]), rng)
+    return poses, shares
+
+
+def _target_quantiles(count: int, rng: np.random.Generator) -> Float64[np.ndarray, " count"]:
+    """Return one number from 0 to 1 per view, stratified over the near kinds and over the other kinds."""
     near = np.array([KINDS[n % len(KINDS)] in ("around", "close-up") for n in range(count)])
     numbers = np.empty(count)
-    for of in (near, ~near):
-        many = int(of.sum())
-        numbers[of] = rng.permutation((np.arange(many) + rng.random(many)) / max(many, 1))
+    for group in (near, ~near):
+        size = int(group.sum())
+        numbers[group] = rng.permutation((np.arange(size) + rng.random(size)) / max(size, 1))
     return numbers
 
 
@@ -140,17 +160,17 @@ class _Pose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _PoseSampler:
-    """Where the visible Gaussians are.
+    """Draws poses relative to the visible Gaussians of a scene.
 
     Attributes:
-        seen: whether there is one; else something stands for them, so that there are cameras.
-        columns: ``(3, n)`` positions, as they are stored.
+        any_visible: whether there are any; if not, one at the origin stands in, so that there are cameras.
+        columns: ``(3, n)`` positions, as stored.
         sizes: ``(n,)`` standard deviations along the middle axis.
-        gaussians: what to look at.
-        size: of pictures, pixels.
+        gaussians: draws the target Gaussians.
+        size: width and height of the images, pixels.
     """
 
-    seen: bool
+    any_visible: bool
     columns: Float32[np.ndarray, "3 n"]
     sizes: Float64[np.ndarray, " n"]
     gaussians: GaussianSampler
@@ -158,71 +178,75 @@ class _PoseSampler:
 
     @classmethod
     def of(cls, splats: Splats, counts: Float64[np.ndarray, " N"], size: tuple[int, int]) -> _PoseSampler:
-        visible = np.flatnonzero(opacity(splats) > 0)
+        visible = np.flatnonzero(drawn_opacities(splats) > 0)
         if not len(visible):
-            alone = GaussianSampler(np.zeros(1, np.int64), np.ones(1))
-            return cls(False, np.zeros((3, 1), np.float32), np.ones(1), alone, size)
+            single = GaussianSampler(np.zeros(1, np.int64), np.ones(1))
+            return cls(False, np.zeros((3, 1), np.float32), np.ones(1), single, size)
         means = splats.means[visible].astype(np.float64)
         sizes = np.exp(np.median(splats.scales[visible].astype(np.float64), axis=1))
         gaussians = GaussianSampler.of(means, counts[visible])
         return cls(True, np.ascontiguousarray(splats.means[visible].T), sizes, gaussians, size)
 
-    def pose(self, number: int, attempt: int, subject: float, rng: np.random.Generator) -> _Pose:
-        """The ``attempt``-th camera for a view; ``subject``, from 0 to 1, tells what is looked at, at first."""
-        kind = KINDS[number % len(KINDS)] if 2 * attempt < PATIENCE else "around"  # there is always something near
-        chosen = self.gaussians.at(subject if 2 * attempt < PATIENCE else rng.random())
-        other = self.gaussians.at(rng.random())
-        fov, towards = float(rng.uniform(*FIELDS_OF_VIEW)), direction(rng)
-        nearer = 2 * attempt * (attempt % 2)  # every other one, in case that a lone cluster has fewer Gaussians
-        few, many = (max(1, min(limit, self.columns.shape[1]) >> nearer) for limit in CLOSE)
-        close = _between(few, many, rng)
+    def pose(self, number: int, attempt: int, quantile: float, rng: np.random.Generator) -> _Pose:
+        """Return the ``attempt``-th camera for a view; ``quantile``, 0 to 1, selects the target of the first ones."""
+        kind = KINDS[number % len(KINDS)] if 2 * attempt < MAX_DRAWS else "around"  # the kind that fails least
+        target_index = self.gaussians.at(quantile if 2 * attempt < MAX_DRAWS else rng.random())
+        origin_index = self.gaussians.at(rng.random())
+        fov, direction = float(rng.uniform(*FIELDS_OF_VIEW)), random_direction(rng)
+        halvings = 2 * attempt * (attempt % 2)  # every other attempt: an isolated cluster may have fewer Gaussians
+        fewest, most = (max(1, min(limit, self.columns.shape[1]) >> halvings) for limit in CLOSE_UP_RANKS)
+        close_rank = _log_uniform(fewest, most, rng)
         if kind == "far":
-            target, radius = self._extent(EXTENTS[(number // len(KINDS) + attempt) % len(EXTENTS)])
+            target, radius = self._bounding_sphere(EXTENT_SHARES[(number // len(KINDS) + attempt) % len(EXTENT_SHARES)])
             narrow = np.tan(fov / 2) * min(self.size) / max(self.size)
-            return self._take(kind, target + towards * radius / np.sin(np.arctan(narrow)), target, fov)
-        target = self._at(chosen)
+            return self._looking(kind, target + direction * radius / np.sin(np.arctan(narrow)), target, fov)
+        target = self._position(target_index)
         if kind == "across":
-            place = self._at(other) + towards * self._reach(other, close)
-            return self._take(kind, place, target, fov)
-        around = close if kind == "close-up" else _between(few, max(few, self.columns.shape[1] >> nearer), rng)
-        return self._take(kind, target + towards * self._reach(chosen, around), target, fov)
+            position = self._position(origin_index) + direction * self._distance(origin_index, close_rank)
+            return self._looking(kind, position, target, fov)
+        rank = (
+            close_rank
+            if kind == "close-up"
+            else _log_uniform(fewest, max(fewest, self.columns.shape[1] >> halvings), rng)
+        )
+        return self._looking(kind, target + direction * self._distance(target_index, rank), target, fov)
 
-    def _take(self, kind: Kind, place: Point, target: Point, fov: float) -> _Pose:
-        return _Pose(kind, aim(place, target, fov, self.size), target)
+    def _looking(self, kind: Kind, position: Point, target: Point, fov: float) -> _Pose:
+        return _Pose(kind, camera_at(position, target, fov, self.size), target)
 
-    def _at(self, index: int) -> Point:
+    def _position(self, index: int) -> Point:
         return self.columns[:, index].astype(np.float64)
 
-    def _reach(self, index: int, count: int) -> float:
-        """How far ``count`` Gaussians, itself included, lie from this one at most; and that it is before a camera."""
+    def _distance(self, index: int, count: int) -> float:
+        """Return the radius around a Gaussian that holds ``count`` of them, itself included; at least MIN_SIGMAS."""
         x, y, z = self.columns
         squares = np.square(x - x[index])
         squares += np.square(y - y[index])
         squares += np.square(z - z[index])
-        reach = float(np.sqrt(np.partition(squares, count - 1)[count - 1], dtype=np.float64))
-        return max(reach, BESIDE * float(self.sizes[index]))
+        radius = float(np.sqrt(np.partition(squares, count - 1)[count - 1], dtype=np.float64))
+        return max(radius, MIN_SIGMAS * float(self.sizes[index]))
 
-    def _extent(self, share: float) -> tuple[Point, float]:
-        """Centre and radius of a sphere around the box that holds this share of all along each axis."""
+    def _bounding_sphere(self, share: float) -> tuple[Point, float]:
+        """Return centre and radius of the sphere around the box that holds this share of Gaussians along each axis."""
         low, high = np.quantile(self.columns.astype(np.float64), [(1 - share) / 2, (1 + share) / 2], axis=1)
         radius = 0.5 * float(np.linalg.norm(high - low))
-        return 0.5 * (low + high), max(radius, BESIDE * float(np.median(self.sizes)))
+        return 0.5 * (low + high), max(radius, MIN_SIGMAS * float(np.median(self.sizes)))
 
 
-def _between(low: int, high: int, rng: np.random.Generator) -> int:
-    """A whole number of any order of magnitude."""
+def _log_uniform(low: int, high: int, rng: np.random.Generator) -> int:
+    """Return a whole number from ``low`` to ``high``, its logarithm uniformly distributed."""
     return int(np.clip(np.rint(np.exp(rng.uniform(np.log(low), np.log(high)))), low, high))
 
 
-def _shows(parts: Parts, camera: Camera) -> tuple[bool, Float64[np.ndarray, " P"]]:
-    """Whether there is something to see, and more than the inside of Gaussians, or one of them; the parts' shares."""
-    with Workers(1) as alone:
-        frame = draw(parts.splats, camera, _grey(0.0), alone)
-        if 1 - float(frame.transmittance.mean(dtype=np.float64)) < EMPTY:
+def _check_camera(parts: Parts, camera: Camera) -> tuple[bool, Float64[np.ndarray, " P"]]:
+    """Return whether the image is neither empty nor covered by Gaussians too near, and each part's share of it."""
+    with Workers(1) as single:
+        frame = draw(parts.splats, camera, _grey(0.0), single)
+        if 1 - float(frame.transmittance.mean(dtype=np.float64)) < MIN_MEAN_ALPHA:
             return False, np.zeros(len(parts.parts))
-        weights = weights_of(frame, alone)
+        weights = blending_weights(frame, single)
     pixels = frame.transmittance.size
-    around = np.flatnonzero(weights > 0)
-    inside = distances(parts.splats.select(around), camera.position) < WITHIN
-    good = weights.max() < ALONE * pixels and weights[around[inside]].sum() < INSIDE * pixels
-    return bool(good), parts.shares(weights, pixels)
+    shown = np.flatnonzero(weights > 0)
+    inside = mahalanobis_distances(parts.splats.select(shown), camera.position) < INSIDE_SIGMAS
+    accepted = weights.max() < MAX_SINGLE_SHARE * pixels and weights[shown[inside]].sum() < MAX_INSIDE_SHARE * pixels
+    return bool(accepted), parts.shares(weights, pixels)

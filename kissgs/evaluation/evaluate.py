@@ -1,7 +1,7 @@
-"""What a compressed scene looks like beside the original: PSNR, SSIM and LPIPS of pictures taken from the same places.
+"""PSNR, SSIM and LPIPS of a candidate scene's renderings against photographs and the reference's renderings.
 
-Pictures are clamped to [0, 1], as a screen clamps them, but not rounded to 8 bits: rounding would put a floor of some
-59 dB under every error. (Published figures often come from 8-bit files; near 30 dB that is less than 0.01 dB.)
+Renderings are clamped to [0, 1], as a screen does, but not rounded to 8 bits: rounding would limit every PSNR to about
+59 dB. (Published values often come from 8-bit files; near 30 dB the difference is below 0.01 dB.)
 """
 
 from __future__ import annotations
@@ -25,13 +25,14 @@ from kissgs.rendering.lpips import Lpips
 from kissgs.rendering.metrics import psnr, ssim
 from kissgs.rendering.rasterizer import Device, load_kernels, render
 
-NOTHING_SEEN = (
-    "no picture shows anything of the reference, so these figures say nothing; choose other cameras (--views)"
+NOTHING_VISIBLE = (
+    "no rendering shows any of the reference, so these values mean nothing; choose other cameras (--views)"
 )
+"""Note of an evaluation whose views all miss the reference."""
 
-
-Picture = Float32[np.ndarray, "H W 3"]
+Rendering = Float32[np.ndarray, "H W 3"]
 Measure = Callable[[np.ndarray, np.ndarray], ImageMetrics]
+"""Measures an image against a target, both from 0 to 1."""
 
 
 def evaluate(
@@ -46,141 +47,154 @@ def evaluate(
     threads: int = 0,
     progress: Progress = silent,
 ) -> Evaluation:
-    """Take the same pictures of two scenes, and compare them with the photographs, if there are any, and each other.
+    """Render two scenes from the same views, and compare the images with photographs, if any, and with each other.
 
-    Cameras drawn over the whole scene (:func:`kissgs.evaluation.cameras.evaluation_views`) judge where no views are
-    given. Where some are, the drawn ones judge beside them: they are the ``surroundings`` of the result.
+    Without ``views``, cameras are drawn over the whole scene (:func:`kissgs.evaluation.cameras.evaluation_views`). With
+    ``views``, the results of the drawn cameras are the ``surroundings`` of the evaluation.
 
-    The pictures of one view are in memory at a time. They are clamped to [0, 1] and not rounded to 8 bits.
+    The images of one view at a time are in memory. They are clamped to [0, 1] and not rounded to 8 bits.
 
     Args:
-        reference: the scene as it was; cleaned first, as is the candidate.
-        candidate: what became of it. Gaussians need not be as many, nor in the same order.
-        views: from where. Without photographs, the candidate is compared with the reference's renderings alone.
-        split: the part of these views to use. Where "test" has none, it is "train", which the result says.
-        seed: of the drawn cameras; another one, other cameras.
-        lpips: compute LPIPS too, which needs the extra ``kissgs[lpips]``.
+        reference: the original scene; cleaned first, like the candidate.
+        candidate: the scene to evaluate, with any number of Gaussians in any order.
+        views: views of a capture. Without photographs, the candidate is compared only with renderings of the reference.
+        split: which of the views to use. If "test" is empty, "train" is used; see :attr:`Evaluation.split`.
+        seed: seed of the drawn cameras.
+        lpips: compute LPIPS too; needs the extra ``kissgs[lpips]``.
         device: ``"cuda"`` needs the extra ``kissgs[cuda]``.
-        threads: of the processor; 0 means one each. The figures do not depend on it.
-        progress: receives the stages ``"kernels"``, ``"cameras"`` (of those that are drawn) and ``"evaluate"``.
+        threads: number of threads; 0 means one per processor. The results do not depend on it.
+        progress: receives the stages ``"kernels"``, ``"cameras"`` (drawing them) and ``"evaluate"``.
 
     Raises:
-        InvalidViewsError: there is no view to use; some of them have photographs and some have not; a photograph
-            cannot be read.
-        UnsupportedError: a picture would take too much memory; no CUDA or no LPIPS here; no such split.
+        InvalidViewsError: the split is empty, only some of its views have a photograph, or one cannot be read.
+        UnsupportedError: an image would take too much memory, CUDA or LPIPS is missing, or the split is unknown.
     """
     reference, candidate = clean(reference)[0], clean(candidate)[0]
     measure = _measure(lpips, device)
-    given = [] if views is None else [_chosen(views, split)]
+    given = [] if views is None else [_select_split(views, split)]
     load_kernels(progress)
     drawn = evaluation_views(reference, seed=seed, threads=threads, progress=progress)
-    parts = [*given, _chosen(drawn, "all")]
-    total, done, found = sum(len(part.views) for part in parts), 0, list[Evaluation]()
-    for part in parts:
-        begin, share = done / total, len(part.views) / total
-        told = _compare_all(
+    groups = [*given, _select_split(drawn, "all")]
+    total, done, evaluations = sum(len(group.views) for group in groups), 0, list[Evaluation]()
+    for group in groups:
+        begin, share = done / total, len(group.views) / total
+        evaluation = _compare_views(
             reference,
             candidate,
-            part,
+            group,
             measure,
             device,
             threads,
             progress=lambda stage, fraction, begin=begin, share=share: progress(stage, begin + share * fraction),
         )
-        shown = share_shown(reference, [view.camera for view in part.views], threads=threads)
-        found.append(replace(told, shown=shown))
-        done += len(part.views)
+        shown = share_shown(reference, [view.camera for view in group.views], threads=threads)
+        evaluations.append(replace(evaluation, shown=shown))
+        done += len(group.views)
     progress("evaluate", 1.0)
-    return found[0] if len(found) == 1 else replace(found[0], surroundings=found[1])
+    return evaluations[0] if len(evaluations) == 1 else replace(evaluations[0], surroundings=evaluations[1])
 
 
-def compare_pictures(
+def compare_images(
     reference: Splats,
     candidate: Splats,
     views: Views,
     *,
     device: Device = "cpu",
     threads: int = 0,
-    taken: dict[str, Picture] | None = None,
+    reference_images: dict[str, Rendering] | None = None,
     progress: Progress = silent,
 ) -> Evaluation:
-    """As :func:`evaluate` from these views alone: held-out ones, or where none is held out, those for training.
+    """Compare two scenes from these views alone: the test views, or the training views if there are none.
 
     Args:
-        reference: the scene as it was.
-        candidate: what became of it.
-        views: from where.
-        device: as for :func:`evaluate`, as are the following and the errors.
-        threads: of the processor.
-        taken: pictures of the reference by the names of the views, for those who compare many candidates with it:
-            they are taken from there, or put there.
+        reference: the original scene.
+        candidate: the scene to evaluate.
+        views: the views.
+        device: see :func:`evaluate`.
+        threads: see :func:`evaluate`.
+        reference_images: cache of the reference's renderings by view name, read and filled; for comparisons of many
+            candidates with one reference.
         progress: receives the stages ``"kernels"`` and ``"evaluate"``.
+
+    Raises:
+        InvalidViewsError: see :func:`evaluate`.
+        UnsupportedError: see :func:`evaluate`.
     """
     reference, candidate = clean(reference)[0], clean(candidate)[0]
-    part = _chosen(views, "test")
+    group = _select_split(views, "test")
     if device == "cpu":
         load_kernels(progress)
     measure = _measure(False, device)
-    found = _compare_all(reference, candidate, part, measure, device, threads, taken, progress=progress)
+    evaluation = _compare_views(
+        reference, candidate, group, measure, device, threads, reference_images, progress=progress
+    )
     progress("evaluate", 1.0)
-    return found
+    return evaluation
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Part:
-    """Views to compare from: those of one split."""
+class _SplitViews:
+    """The views of one split.
 
-    of: Views
+    Attributes:
+        all_views: all views, with their source, background and note.
+        split: the split that is used.
+        views: its views, one or more.
+        photographed: whether they have photographs: all or none of them do.
+    """
+
+    all_views: Views
     split: Split
     views: tuple[View, ...]
     photographed: bool
 
 
-def _compare_all(
+def _compare_views(
     reference: Splats,
     candidate: Splats,
-    part: _Part,
+    group: _SplitViews,
     measure: Measure,
     device: Device,
     threads: int,
-    taken: dict[str, Picture] | None = None,
+    reference_images: dict[str, Rendering] | None = None,
     *,
     progress: Progress,
 ) -> Evaluation:
-    """View by view; both scenes are clean."""
+    """Compare two clean scenes view by view."""
     compared, blank = [], len(reference) > 0
-    for done, view in enumerate(part.views):
-        progress("evaluate", done / len(part.views))
-        background = over(view, part.of.background)
-        known = None if taken is None else taken.get(view.name)
-        picture = take_picture(reference, view.camera, background, device, threads) if known is None else known
-        if taken is not None:
-            taken[view.name] = picture
-        other = take_picture(candidate, view.camera, background, device, threads)
-        blank = blank and bool((picture == np.clip(background, 0, 1)).all())
-        photo = view.load_photo() if part.photographed else None
-        compared.append(ViewComparison(view=view, comparison=_compare(picture, other, photo, measure)))
+    for done, view in enumerate(group.views):
+        progress("evaluate", done / len(group.views))
+        background = background_of(view, group.all_views.background)
+        image = None if reference_images is None else reference_images.get(view.name)
+        if image is None:
+            image = render_clamped(reference, view.camera, background, device, threads)
+        if reference_images is not None:
+            reference_images[view.name] = image
+        other = render_clamped(candidate, view.camera, background, device, threads)
+        blank = blank and bool((image == np.clip(background, 0, 1)).all())
+        photo = view.load_photo() if group.photographed else None
+        compared.append(ViewComparison(view=view, comparison=_compare(image, other, photo, measure)))
     return Evaluation(
-        against="photos" if part.photographed else "renderings",
-        split=part.split,
-        source=part.of.source,
-        background=part.of.background,
+        against="photos" if group.photographed else "renderings",
+        split=group.split,
+        source=group.all_views.source,
+        background=group.all_views.background,
         reference_count=len(reference),
         candidate_count=len(candidate),
         views=tuple(compared),
-        note="; ".join(filter(None, [part.of.note, NOTHING_SEEN if blank else ""])),
+        note="; ".join(filter(None, [group.all_views.note, NOTHING_VISIBLE if blank else ""])),
     )
 
 
-def over(view: View, otherwise: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, "3"]:
-    """The background over which to render for a view: its own, or where it has none, that of all views."""
-    return otherwise if view.background is None else view.background
+def background_of(view: View, default: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, "3"]:
+    """Return the view's own background, or ``default`` if it has none; ``(3,)`` RGB."""
+    return default if view.background is None else view.background
 
 
-def take_picture(
+def render_clamped(
     splats: Splats, camera: Camera, background: Float32[np.ndarray, "3"], device: Device, threads: int
-) -> Picture:
-    """What a screen would show: clamped to [0, 1]."""
+) -> Rendering:
+    """Return a rendering with its values clamped to [0, 1]."""
     image, _ = render(splats, camera, background=background.tolist(), threads=threads, device=device)
     return np.clip(image, 0, 1)
 
@@ -195,19 +209,21 @@ def _measure(lpips: bool, device: Device) -> Measure:
     return measure
 
 
-def _chosen(views: Views, split: str) -> _Part:
-    """The views of a split, and which that is: where "test" is empty, "train"."""
-    parts = {
+def _select_split(views: Views, split: str) -> _SplitViews:
+    """Return the views of a split; if "test" is empty, those of "train"."""
+    splits = {
         "test": views.test,
         "train": views.train,
         "all": views.all,
     }
     used = "train" if split == "test" and not views.test else split
-    if used not in parts:
+    if used not in splits:
         raise UnsupportedError(f"there is no split {split!r}; choose test, train or all")
-    if not parts[used]:
-        raise InvalidViewsError(f"there is no view to evaluate from: the split {used!r} of {views.source} is empty")
-    return _Part(views, cast(Split, used), parts[used], _have_photos(parts[used]))
+    if not splits[used]:
+        raise InvalidViewsError(
+            f"there is no view to evaluate from: the split {used!r} of {views.source} is empty; choose another split"
+        )
+    return _SplitViews(views, cast(Split, used), splits[used], _have_photos(splits[used]))
 
 
 def _compare(
@@ -216,19 +232,24 @@ def _compare(
     photo: Shaped[np.ndarray, "H W 3"] | None,
     measure: Measure,
 ) -> Comparison:
-    between = measure(candidate, reference)
+    candidate_vs_reference = measure(candidate, reference)
     if photo is None:
-        return Comparison(reference=None, candidate=between, candidate_vs_reference=between)
+        return Comparison(
+            reference=None, candidate=candidate_vs_reference, candidate_vs_reference=candidate_vs_reference
+        )
     return Comparison(
-        reference=measure(reference, photo), candidate=measure(candidate, photo), candidate_vs_reference=between
+        reference=measure(reference, photo),
+        candidate=measure(candidate, photo),
+        candidate_vs_reference=candidate_vs_reference,
     )
 
 
 def _have_photos(views: Sequence[View]) -> bool:
+    """Return whether all of these views have photographs; raise InvalidViewsError if only some have."""
     without = [view.name for view in views if view.photo is None]
     if without and len(without) < len(views):
         raise InvalidViewsError(
-            f"{len(without)} of {len(views)} views have no photograph, the first is {without[0]!r}; give all of them "
-            "one, or none"
+            f"{len(without)} of {len(views)} views have no photograph, the first is {without[0]!r}; give all views a "
+            "photograph, or none"
         )
     return not without

@@ -1,4 +1,4 @@
-"""An evaluation as one HTML file to look at: figures, pictures side by side, and where they differ."""
+"""HTML report of an evaluation, one file: metrics, images side by side, error maps."""
 
 from __future__ import annotations
 
@@ -15,39 +15,45 @@ from PIL import Image
 from kissgs.core.array_types import Float32, UInt8
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
-from kissgs.evaluation.error_maps import STOPS, difference, full_scale, heat_map, worst_place
-from kissgs.evaluation.evaluate import over, take_picture
+from kissgs.evaluation.error_maps import INFERNO, full_scale, heat_map, rms_difference, worst_crop
+from kissgs.evaluation.evaluate import background_of, render_clamped
 from kissgs.evaluation.html_tables import (
-    change_of,
-    extremes_lines,
-    figure_cards,
-    in_words,
+    metric_cards,
+    other_metrics,
+    psnr_change,
     summary_line,
     views_table,
+    worst_views_text,
 )
-from kissgs.evaluation.results import Comparison, Evaluation, ViewComparison, spell
+from kissgs.evaluation.results import Comparison, Evaluation, ViewComparison, format_metric
 from kissgs.rendering.images import to_bytes
 from kissgs.rendering.rasterizer import Device
 
-MOST_VIEWS = 12
-"""Shown with pictures: some 10 MB of them."""
+MAX_VIEWS = 12
+"""Largest number of views shown with images, about 10 MB in all."""
 
-MOST_ELSEWHERE = 4
-"""Views of the surroundings that are shown with pictures."""
+MAX_SURROUNDINGS = 4
+"""Largest number of views of the surroundings shown with images."""
 
-LARGEST = 1280
-"""Pixels a side of the large pictures; what is larger is reduced."""
+MAX_SIDE = 1280
+"""Longer side of the large images, pixels; larger ones are reduced."""
 
 QUALITY = 90
-"""Of the large pictures' WebP; lossless, they would take five times as much."""
+"""WebP quality of the large images; lossless, they would be five times as large."""
 
-CROP, SMALLEST_CROP = 160, 64
-"""Pixels a side of what is shown enlarged: half of a picture's shorter side, within these."""
+MAX_CROP, MIN_CROP = 160, 64
+"""Limits of the side of an enlarged crop, pixels; within them it is half of the image's shorter side."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Side:
-    """One of the two scenes: its name for people, its Gaussians, and the bytes of its file if it has one."""
+class ReportScene:
+    """One of the two scenes of a report.
+
+    Attributes:
+        name: name to display.
+        splats: the scene, clean.
+        bytes: size of its file; None if it has none.
+    """
 
     name: str
     splats: Splats
@@ -56,67 +62,70 @@ class Side:
 
 def html_report(
     evaluation: Evaluation,
-    reference: Side,
-    candidate: Side,
+    reference: ReportScene,
+    candidate: ReportScene,
     *,
     device: Device = "cpu",
     threads: int = 0,
     progress: Progress = silent,
 ) -> str:
-    """Write an evaluation as a page that needs nothing beside itself: styles, script and pictures are in it.
+    """Return an evaluation as a self-contained HTML page, with styles, script and images embedded.
 
-    Up to :data:`MOST_VIEWS` views are shown with pictures, evenly chosen, the worst first. Of the ``surroundings``, the
-    worst :data:`MOST_ELSEWHERE` follow.
+    Up to :data:`MAX_VIEWS` views are shown with images, evenly selected, the worst first. The worst
+    :data:`MAX_SURROUNDINGS` views of the ``surroundings`` follow.
 
     Args:
-        evaluation: of these two scenes.
-        reference: the scene as it was, clean.
-        candidate: what became of it, clean.
-        device: as for the evaluation.
-        threads: of the processor; 0 means one each.
+        evaluation: evaluation of the two scenes.
+        reference: the original scene.
+        candidate: the evaluated scene.
+        device: see :func:`kissgs.evaluate`.
+        threads: number of threads; 0 means one per processor.
         progress: receives the stage ``"html"``.
 
     Raises:
         InvalidViewsError: a photograph cannot be read.
-        UnsupportedError: a picture would take too much memory; no CUDA here.
+        UnsupportedError: an image would take too much memory, or CUDA is missing.
     """
-    shown, around = chosen_views(evaluation), evaluation.surroundings
-    parts = [(f"view-{i}", evaluation, evaluation.views[i]) for i in shown]
-    if around is not None:
-        elsewhere = sorted(range(len(around.views)), key=lambda i: around.views[i].badness)[:MOST_ELSEWHERE]
-        parts += [(f"elsewhere-{i}", around, around.views[i]) for i in elsewhere]
-    worst = min((compared for _, _, compared in parts), key=lambda compared: compared.badness)
+    shown, surroundings = select_views(evaluation), evaluation.surroundings
+    entries = [(f"view-{i}", evaluation, evaluation.views[i]) for i in shown]
+    if surroundings is not None:
+        worst_first = sorted(range(len(surroundings.views)), key=lambda i: surroundings.views[i].ranking_psnr)
+        entries += [(f"surroundings-{i}", surroundings, surroundings.views[i]) for i in worst_first[:MAX_SURROUNDINGS]]
+    worst = min((compared for _, _, compared in entries), key=lambda compared: compared.ranking_psnr)
     full, sections = full_scale(worst.comparison.candidate_vs_reference.psnr), []
-    for done, (anchor, of, compared) in enumerate(parts):
-        progress("html", done / len(parts))
-        view, scenes = compared.view, (reference.splats, candidate.splats)
-        background = over(view, of.background)
-        pictures = [take_picture(scene, view.camera, background, device, threads) for scene in scenes]
-        photo = view.load_photo() if of.against == "photos" else None
-        sections.append(_section(anchor, compared, _Pictures(pictures[0], pictures[1], photo), full))
+    for done, (anchor, group, compared) in enumerate(entries):
+        progress("html", done / len(entries))
+        view = compared.view
+        background = background_of(view, group.background)
+        images = _ViewImages(
+            reference=render_clamped(reference.splats, view.camera, background, device, threads),
+            candidate=render_clamped(candidate.splats, view.camera, background, device, threads),
+            photo=view.load_photo() if group.against == "photos" else None,
+        )
+        sections.append(_section(anchor, compared, images, full))
     progress("html", 1.0)
     return Template(files("kissgs.evaluation").joinpath("report.html").read_text(encoding="utf-8")).substitute(
         title=escape(f"{candidate.name} compared with {reference.name}"),
         reference=escape(reference.name),
         candidate=escape(candidate.name),
         summary=escape(summary_line(evaluation, len(shown)) + _sentence(evaluation.note)),
-        figures="\n".join(figure_cards(evaluation, reference.bytes, candidate.bytes)),
+        cards="\n".join(metric_cards(evaluation, reference.bytes, candidate.bytes)),
         table=views_table(evaluation, shown),
-        extremes=escape(extremes_lines(evaluation)),
+        worst_views=escape(worst_views_text(evaluation)),
         sections="\n".join(sections),
-        colours=", ".join("#" + bytes(stop).hex() for stop in STOPS),
+        colours=", ".join("#" + bytes(color).hex() for color in INFERNO),
         quality=QUALITY,
-        largest=LARGEST,
+        max_side=MAX_SIDE,
     )
 
 
-def chosen_views(evaluation: Evaluation) -> list[int]:
-    """Which views to show: first that where the scenes' renderings are least alike, then others, evenly spread."""
+def select_views(evaluation: Evaluation) -> list[int]:
+    """Return the indices of the views to show: the one with the lowest PSNR first, then others, evenly spread."""
     count = len(evaluation.views)
-    worst = min(range(count), key=lambda i: evaluation.views[i].badness)
-    chosen = np.unique(np.rint(np.linspace(0, count - 1, min(count, MOST_VIEWS))).astype(int)).tolist()
-    chosen.remove(min(chosen, key=lambda i: abs(i - worst)))
-    return [worst, *chosen]
+    worst = min(range(count), key=lambda i: evaluation.views[i].ranking_psnr)
+    selected = np.unique(np.rint(np.linspace(0, count - 1, min(count, MAX_VIEWS))).astype(int)).tolist()
+    selected.remove(min(selected, key=lambda i: abs(i - worst)))
+    return [worst, *selected]
 
 
 def _sentence(note: str) -> str:
@@ -124,48 +133,48 @@ def _sentence(note: str) -> str:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Pictures:
+class _ViewImages:
     reference: Float32[np.ndarray, "H W 3"]
     candidate: Float32[np.ndarray, "H W 3"]
     photo: UInt8[np.ndarray, "H W 3"] | None
 
 
-def _section(anchor: str, compared: ViewComparison, pictures: _Pictures, full: int) -> str:
+def _section(anchor: str, compared: ViewComparison, images: _ViewImages, full: int) -> str:
     name = escape(compared.view.name)
-    levels = difference(pictures.candidate, pictures.reference)
-    place = worst_place(levels, max(SMALLEST_CROP, min(CROP, min(levels.shape) // 2)))
+    levels = rms_difference(images.candidate, images.reference)
+    crop = worst_crop(levels, max(MIN_CROP, min(MAX_CROP, min(levels.shape) // 2)))
     layers = {
-        "reference": to_bytes(pictures.reference),
-        "candidate": to_bytes(pictures.candidate),
-        **({} if pictures.photo is None else {"photograph": pictures.photo}),
+        "reference": to_bytes(images.reference),
+        "candidate": to_bytes(images.candidate),
+        **({} if images.photo is None else {"photograph": images.photo}),
         "difference": heat_map(levels, full),
     }
-    mark, images = _mark(place, levels.shape), {layer: _large(image) for layer, image in layers.items()}
-    figures = [_slider(name, images["reference"], images["candidate"], mark)]
-    if pictures.photo is not None:
-        figures.append(_picture(images["photograph"], f"photograph {name}", "the photograph"))
+    mark, sources = _mark(crop, levels.shape), {layer: _large(pixels) for layer, pixels in layers.items()}
+    figures = [_slider(name, sources["reference"], sources["candidate"], mark)]
+    if images.photo is not None:
+        figures.append(_figure(sources["photograph"], f"photograph {name}", "the photograph"))
     caption = (
-        f'<span class="legend">0 <i></i> {full} levels of 255 or more</span>the difference of the two '
-        "renderings, root mean square over red, green and blue"
+        f'<span class="legend">0 <i></i> {full} levels of 255 or more</span>difference of the two '
+        "renderings, root mean square over RGB"
     )
-    figures.append(_picture(images["difference"], f"difference in {name}", caption, mark))
-    crops = [_picture(_lossless(image[place]), f"{layer}, enlarged", layer) for layer, image in layers.items()]
-    shape = "tall" if levels.shape[0] > levels.shape[1] else "wide" if pictures.photo is None else "wide photographed"
+    figures.append(_figure(sources["difference"], f"difference in {name}", caption, mark))
+    crops = [_figure(_lossless(pixels[crop]), f"{layer}, enlarged", layer) for layer, pixels in layers.items()]
+    shape = "tall" if levels.shape[0] > levels.shape[1] else "wide" if images.photo is None else "wide photographed"
     return (
         f'<section class="card" id="{anchor}"><h2>{name}</h2><p class="numbers">{_numbers(compared.comparison)} · '
-        f"{compared.place}</p>"
-        f'<div class="pictures {shape}">{"".join(figures)}</div>'
+        f"{compared.pose}</p>"
+        f'<div class="images {shape}">{"".join(figures)}</div>'
         f'<div class="crops">{"".join(crops)}</div></section>'
     )
 
 
 def _numbers(comparison: Comparison) -> str:
-    found = comparison.candidate_vs_reference
-    between = f"candidate to reference {spell(found.psnr, 2)} dB, {in_words(found)}"
+    metrics = comparison.candidate_vs_reference
+    to_reference = f"candidate to reference {format_metric(metrics.psnr, 2)} dB, {other_metrics(metrics)}"
     if comparison.reference is None:
-        return between
-    candidate = f"candidate to photograph {spell(comparison.candidate.psnr, 2)} dB ({change_of(comparison)})"
-    return f"{candidate}, {in_words(comparison.candidate)} · {between}"
+        return to_reference
+    psnr = f"candidate to photograph {format_metric(comparison.candidate.psnr, 2)} dB ({psnr_change(comparison)})"
+    return f"{psnr}, {other_metrics(comparison.candidate)} · {to_reference}"
 
 
 def _slider(name: str, reference: str, candidate: str, mark: str) -> str:
@@ -178,15 +187,15 @@ def _slider(name: str, reference: str, candidate: str, mark: str) -> str:
     )
 
 
-def _picture(source: str, alternative: str, caption: str, mark: str = "") -> str:
+def _figure(source: str, alternative: str, caption: str, mark: str = "") -> str:
     return (
         f'<figure><div class="stage"><img src="{source}" alt="{alternative}">{mark}</div>'
         f"<figcaption>{caption}</figcaption></figure>"
     )
 
 
-def _mark(place: tuple[slice, slice], shape: tuple[int, ...]) -> str:
-    rows, columns = place
+def _mark(crop: tuple[slice, slice], shape: tuple[int, ...]) -> str:
+    rows, columns = crop
     edges = {"top": rows.start / shape[0], "left": columns.start / shape[1]}
     edges |= {"height": (rows.stop - rows.start) / shape[0], "width": (columns.stop - columns.start) / shape[1]}
     return f'<span class="mark" style="{"; ".join(f"{edge}: {100 * at:.2f}%" for edge, at in edges.items())}"></span>'
@@ -194,7 +203,7 @@ def _mark(place: tuple[slice, slice], shape: tuple[int, ...]) -> str:
 
 def _large(pixels: UInt8[np.ndarray, "H W 3"]) -> str:
     image = Image.fromarray(pixels)
-    image.thumbnail((LARGEST, LARGEST), Image.Resampling.BOX)
+    image.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.BOX)
     return _data_uri(image, quality=QUALITY)
 
 

@@ -1,32 +1,34 @@
-"""The figures of an evaluation's page: in words, on cards and in a table."""
+"""Values of an evaluation's HTML page: summary, cards and table."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, spell
+from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, format_metric
 
 
 def summary_line(evaluation: Evaluation, shown: int) -> str:
-    """What was compared, where from; ``shown`` views have pictures. Plain text, to be escaped."""
-    rest = " Their pictures are below" if shown == len(evaluation.views) else f" Pictures of {shown} of them are below"
+    """Return what was compared, as plain text to be escaped; ``shown`` is the number of views with images."""
+    rest = " Their images are below" if shown == len(evaluation.views) else f" Images of {shown} of them are below"
     rest += ", the worst first."
     return f"{evaluation.views_used}, {evaluation.size.replace('x', '×')}: {evaluation.source}.{rest}"
 
 
-def figure_cards(evaluation: Evaluation, before: int | None, after: int | None) -> Iterable[str]:
-    """The means, and the bytes of both files where they are known."""
+def metric_cards(evaluation: Evaluation, before: int | None, after: int | None) -> Iterable[str]:
+    """Yield cards with the means, and the bytes of both files if known."""
     mean = evaluation.mean
     if mean.reference is not None:
-        change = f"{change_of(mean)} dB: the reference has {spell(mean.reference.psnr, 2)} dB"
-        yield _card("PSNR, candidate to photographs", f"{spell(mean.candidate.psnr, 2)} dB", change)
-        ssim = f"the reference has {spell(mean.reference.ssim, 4)}"
-        yield _card("SSIM, candidate to photographs", spell(mean.candidate.ssim, 4), ssim)
-    between = f"of their renderings; {in_words(mean.candidate_vs_reference)}"
-    yield _card("PSNR, candidate to reference", f"{spell(mean.candidate_vs_reference.psnr, 2)} dB", between)
-    fifth = f"{spell(evaluation.fifth_percentile, 2)} dB is the 5th percentile"
-    yield _card("PSNR, worst view", f"{spell(evaluation.worst.comparison.candidate_vs_reference.psnr, 2)} dB", fifth)
+        change = f"{psnr_change(mean)} dB: the reference has {format_metric(mean.reference.psnr, 2)} dB"
+        yield _card("PSNR, candidate to photographs", f"{format_metric(mean.candidate.psnr, 2)} dB", change)
+        ssim = f"the reference has {format_metric(mean.reference.ssim, 4)}"
+        yield _card("SSIM, candidate to photographs", format_metric(mean.candidate.ssim, 4), ssim)
+    remark = f"of their renderings; {other_metrics(mean.candidate_vs_reference)}"
+    yield _card("PSNR, candidate to reference", f"{format_metric(mean.candidate_vs_reference.psnr, 2)} dB", remark)
+    fifth = f"{format_metric(evaluation.fifth_percentile, 2)} dB is the 5th percentile"
+    yield _card(
+        "PSNR, worst view", f"{format_metric(evaluation.worst.comparison.candidate_vs_reference.psnr, 2)} dB", fifth
+    )
     counts = f"{evaluation.candidate_count:,} of {evaluation.reference_count:,} Gaussians"
     if before and after:
         change = f"{before / after:.1f}× smaller" if before >= after else f"{after / before:.1f}× larger"
@@ -35,41 +37,41 @@ def figure_cards(evaluation: Evaluation, before: int | None, after: int | None) 
         yield _card("Gaussians", f"{evaluation.candidate_count:,}", counts)
 
 
-def extremes_lines(evaluation: Evaluation) -> str:
-    """Where the worst views are, of the scene beside those of a capture too. Plain text, to be escaped."""
-    told, around = f"Candidate to reference: {evaluation.extremes}.", evaluation.surroundings
-    if around is None:
-        return told
-    found = around.mean.candidate_vs_reference
-    mean = f"PSNR {spell(found.psnr, 2)} dB, SSIM {spell(found.ssim, 4)}"
-    return f"{told} Elsewhere, {around.views_used} ({around.source}): {mean}; {around.extremes}."
+def worst_views_text(evaluation: Evaluation) -> str:
+    """Return the worst views, those of the surroundings included, as plain text to be escaped."""
+    text, surroundings = f"Candidate to reference: {evaluation.extremes}.", evaluation.surroundings
+    if surroundings is None:
+        return text
+    metrics = surroundings.mean.candidate_vs_reference
+    mean = f"PSNR {format_metric(metrics.psnr, 2)} dB, SSIM {format_metric(metrics.ssim, 4)}"
+    return f"{text} Surroundings, {surroundings.views_used} ({surroundings.source}): {mean}; {surroundings.extremes}."
 
 
 def _card(name: str, value: str, remark: str) -> str:
     return f'<div class="card"><dt>{name}</dt><dd>{value}</dd><dd class="remark">{remark}</dd></div>'
 
 
-def in_words(likeness: ImageMetrics) -> str:
-    """All but the PSNR."""
-    lpips = "" if likeness.lpips is None else f", LPIPS {spell(likeness.lpips, 4)}"
-    return f"SSIM {spell(likeness.ssim, 4)}{lpips}"
+def other_metrics(metrics: ImageMetrics) -> str:
+    """Return all metrics but the PSNR, as text."""
+    lpips = "" if metrics.lpips is None else f", LPIPS {format_metric(metrics.lpips, 4)}"
+    return f"SSIM {format_metric(metrics.ssim, 4)}{lpips}"
 
 
-def change_of(comparison: Comparison) -> str:
-    """Of the PSNR to the photograph, a loss in red."""
-    text = "" if comparison.change is None else spell(comparison.change, 2, signed=True)
+def psnr_change(comparison: Comparison) -> str:
+    """Return the change of the PSNR to the photograph as HTML, a loss in red."""
+    text = "" if comparison.change is None else format_metric(comparison.change, 2, signed=True)
     return f'<span class="worse">−{text[1:]}</span>' if text.startswith("-") else text
 
 
 def views_table(evaluation: Evaluation, shown: Sequence[int]) -> str:
-    """A row for each view, linked to its pictures if it is among ``shown``, and their mean."""
+    """Return a table with a row for each view, linked to its images if it is among ``shown``, and the means."""
     mean = evaluation.mean
-    parts = ["PSNR", "SSIM", "LPIPS"][: len(mean.candidate_vs_reference.spelled())]
-    between = [("candidate to reference", parts)]
-    photographed = [("reference to photograph", parts), ("candidate to photograph", parts), ("change", ["dB"])]
-    groups = between if mean.reference is None else photographed + between
-    upper = "".join(f'<th colspan="{len(below)}">{title}</th>' for title, below in groups)
-    lower = "".join(f"<th>{part}</th>" for _, below in groups for part in below)
+    metrics = ["PSNR", "SSIM", "LPIPS"][: len(mean.candidate_vs_reference.cells())]
+    renderings = [("candidate to reference", metrics)]
+    photographs = [("reference to photograph", metrics), ("candidate to photograph", metrics), ("change", ["dB"])]
+    groups = renderings if mean.reference is None else photographs + renderings
+    upper = "".join(f'<th colspan="{len(columns)}">{title}</th>' for title, columns in groups)
+    lower = "".join(f"<th>{column}</th>" for _, columns in groups for column in columns)
     rows = []
     for i, compared in enumerate(evaluation.views):
         name = escape(compared.view.name)
@@ -84,5 +86,5 @@ def views_table(evaluation: Evaluation, shown: Sequence[int]) -> str:
 def _cells(comparison: Comparison) -> str:
     return "".join(
         f'<td class="worse">−{cell[1:]}</td>' if cell.startswith("-") else f"<td>{cell}</td>"
-        for cell in comparison.spelled()
+        for cell in comparison.cells()
     )

@@ -1,4 +1,4 @@
-"""Cameras for parts of a scene that drawn cameras overlook: whose loss would hardly change any of their pictures."""
+"""Cameras for overlooked parts of a scene: parts whose loss would hardly change any image of the drawn cameras."""
 
 from __future__ import annotations
 
@@ -10,30 +10,40 @@ import numpy as np
 from kissgs.core.array_types import Float32, Float64, Int
 from kissgs.core.splats import Splats
 from kissgs.core.threads import Workers
-from kissgs.evaluation.camera_sampling import BACKGROUNDS, FIELDS_OF_VIEW, PATIENCE, THUMBNAIL, Point, aim, direction
+from kissgs.evaluation.camera_sampling import (
+    BACKGROUNDS,
+    FIELDS_OF_VIEW,
+    MAX_DRAWS,
+    THUMBNAIL,
+    Point,
+    camera_at,
+    random_direction,
+)
 from kissgs.evaluation.parts import Part, find_parts
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu.frame import draw
 
-MOST_ADDED = 72
-"""Cameras that are added, at most."""
+MAX_ADDED = 72
+"""Largest number of added cameras."""
 
-NOTICED = 18.0
-"""Decibels between thumbnails with and without a part: where there are no more, full pictures have at most about 20."""
+VISIBLE_PSNR = 18.0
+"""Largest PSNR, decibels, between thumbnails with and without a part at which its loss counts as visible; between full
+images it is then at most about 20."""
 
-FILLING = (0.6, 1.6)
-"""Distances from which to look at a part, in those from which the sphere around it just fits the picture."""
+DISTANCES = (0.6, 1.6)
+"""Smallest and largest distance of a camera to its part, in units of the distance at which the part's sphere just fits
+into the image."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Added:
-    """A camera that looks at a part.
+class AddedCamera:
+    """A camera that was added for a part.
 
     Attributes:
-        camera: for a full picture.
-        target: the middle of the part.
-        background: grey level, the one of :data:`BACKGROUNDS` over which its loss shows best.
-        psnr: of thumbnails with and without the part, decibels.
+        camera: the camera, at full image size.
+        target: centre of the part.
+        background: grey level of :data:`BACKGROUNDS` over which the loss of the part is most visible.
+        psnr: PSNR between thumbnails with and without the part, decibels.
     """
 
     camera: Camera
@@ -44,12 +54,12 @@ class Added:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parts:
-    """What stands apart in a scene, and how much of it the pictures so far show.
+    """Separate parts of a scene.
 
     Attributes:
-        splats: finite.
+        splats: the scene, finite.
         parts: see :func:`kissgs.evaluation.parts.find_parts`.
-        part_of: ``(N,)`` the part of each Gaussian, -1 for none.
+        part_of: ``(N,)`` index of each Gaussian's part, -1 for none.
     """
 
     splats: Splats
@@ -58,22 +68,22 @@ class Parts:
 
     @classmethod
     def of(cls, splats: Splats, counts: Float64[np.ndarray, " N"]) -> Parts:
-        """See :func:`kissgs.evaluation.parts.find_parts`."""
+        """Find the parts of a scene, see :func:`kissgs.evaluation.parts.find_parts`."""
         return cls(splats, *find_parts(splats, counts))
 
     def shares(self, weights: Float64[np.ndarray, " N"], pixels: int) -> Float64[np.ndarray, " P"]:
-        """The share of a picture that each part takes up, given the Gaussians' weights in it."""
+        """Return the share of an image that each part covers, given the blending weights of all Gaussians in it."""
         return np.bincount(self.part_of + 1, weights, minlength=len(self.parts) + 1)[1:] / pixels
 
     def overlooked(
         self, shares: Float64[np.ndarray, "V P"], views: Sequence[tuple[Camera, float]], pool: Workers
     ) -> list[int]:
-        """Parts that could be lost with hardly a change of the view that shows most of them; the least shown first.
+        """Return the parts whose loss hardly changes the view that shows them best, least visible parts first.
 
         Args:
-            shares: see :meth:`shares`, for each of the views.
-            views: cameras, and the grey level of their backgrounds.
-            pool: of threads.
+            shares: share of each image that each part covers, see :meth:`shares`.
+            views: cameras and the grey levels of their backgrounds.
+            pool: threads.
         """
 
         def psnr(part: int) -> float:
@@ -81,48 +91,52 @@ class Parts:
             return self._psnrs_without(part, camera, (background,))[0]
 
         order = [int(part) for part in np.argsort(shares.max(axis=0), kind="stable")]
-        return [part for part, found in zip(order, pool.map(psnr, order), strict=True) if found > NOTICED]
+        return [part for part, without in zip(order, pool.map(psnr, order), strict=True) if without > VISIBLE_PSNR]
 
     def cameras_for(
         self, parts: Sequence[int], size: tuple[int, int], rng: np.random.Generator, pool: Workers
-    ) -> list[Added]:
-        """A camera for each, drawn anew until the loss of the part shows; the best one where that never is the case.
+    ) -> list[AddedCamera]:
+        """Draw a camera for each part until its loss is visible; after the last attempt, return the best one.
 
         Args:
-            parts: their numbers.
-            size: of pictures, pixels.
+            parts: indices of the parts.
+            size: width and height of the images, pixels.
             rng: draws cameras, part after part.
-            pool: of threads.
+            pool: threads.
         """
-        best: dict[int, Added] = {}
-        left = list(parts)
-        for _ in range(PATIENCE):
-            drawn = [(part, self._look_at(self.parts[part], size, rng)) for part in left]
-            for part, found in zip(left, pool.map(lambda each: self._added(*each), drawn), strict=True):
-                if part not in best or found.psnr < best[part].psnr:
-                    best[part] = found
-            left = [part for part in left if best[part].psnr > NOTICED]
+        best: dict[int, AddedCamera] = {}
+        remaining = list(parts)
+        for _ in range(MAX_DRAWS):
+            drawn = [(part, self._draw_camera(self.parts[part], size, rng)) for part in remaining]
+            for part, added in zip(remaining, pool.map(lambda each: self._added(*each), drawn), strict=True):
+                if part not in best or added.psnr < best[part].psnr:
+                    best[part] = added
+            remaining = [part for part in remaining if best[part].psnr > VISIBLE_PSNR]
         return [best[part] for part in parts]
 
-    def _look_at(self, part: Part, size: tuple[int, int], rng: np.random.Generator) -> Camera:
+    def _draw_camera(self, part: Part, size: tuple[int, int], rng: np.random.Generator) -> Camera:
         fov = float(rng.uniform(*FIELDS_OF_VIEW))
         narrow = np.arctan(np.tan(fov / 2) * min(size) / max(size))
-        distance = part.radius / np.sin(narrow) * np.exp(rng.uniform(*np.log(FILLING)))
-        return aim(part.middle + distance * direction(rng), part.middle, fov, size)
+        distance = part.radius / np.sin(narrow) * np.exp(rng.uniform(*np.log(DISTANCES)))
+        return camera_at(part.center + distance * random_direction(rng), part.center, fov, size)
 
-    def _added(self, part: int, camera: Camera) -> Added:
+    def _added(self, part: int, camera: Camera) -> AddedCamera:
         psnrs = self._psnrs_without(part, camera, BACKGROUNDS)
         least = int(np.argmin(psnrs))
-        return Added(camera, self.parts[part].middle, BACKGROUNDS[least], psnrs[least])
+        return AddedCamera(camera, self.parts[part].center, BACKGROUNDS[least], psnrs[least])
 
     def _psnrs_without(self, part: int, camera: Camera, backgrounds: Sequence[float]) -> list[float]:
-        """Of thumbnails with and without a part, over each of these backgrounds."""
-        others, pictures = self.splats.select(np.flatnonzero(self.part_of != part)), []
-        with Workers(1) as alone:
+        """Return the PSNR between thumbnails with and without a part, over each of these grey backgrounds."""
+        others, thumbnails = self.splats.select(np.flatnonzero(self.part_of != part)), []
+        with Workers(1) as single:
             for scene in (self.splats, others):
-                frame = draw(scene, camera.at_most(THUMBNAIL), np.zeros(3, np.float32), alone)
-                pictures.append((frame.image, frame.transmittance[:, :, None]))
-        return [_psnr(*(np.clip(image + grey * through, 0, 1) for image, through in pictures)) for grey in backgrounds]
+                frame = draw(scene, camera.at_most(THUMBNAIL), np.zeros(3, np.float32), single)
+                thumbnails.append((frame.image, frame.transmittance[:, :, None]))
+        (image, transmittance), (other_image, other_transmittance) = thumbnails
+        return [
+            _psnr(np.clip(image + grey * transmittance, 0, 1), np.clip(other_image + grey * other_transmittance, 0, 1))
+            for grey in backgrounds
+        ]
 
 
 def _psnr(one: Float32[np.ndarray, "H W 3"], other: Float32[np.ndarray, "H W 3"]) -> float:

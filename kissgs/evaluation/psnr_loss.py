@@ -1,4 +1,4 @@
-"""How good a scene's pictures are, in the figures that goals ask for."""
+"""PSNR and PSNR loss of an evaluation, as goals of rate control and compaction define them."""
 
 from __future__ import annotations
 
@@ -7,74 +7,83 @@ from collections.abc import Sequence
 
 from kissgs.evaluation.results import Evaluation
 
-USUAL = 30.0
-"""Decibels between a scene's pictures and photographs, where there are none to ask: about that of good captures."""
+ASSUMED_PSNR = 30.0
+"""PSNR, decibels, that renderings are assumed to have to photographs if there are none: about that of good captures."""
 
-MODELLED = f"without photographs, the drop is that of a scene {USUAL:g} dB from them to which the new errors are added"
+ESTIMATED_DROP = f"without photographs, the drop of PSNR is estimated for a scene that has {ASSUMED_PSNR:g} dB to them"
+"""Note for a drop that was not measured with photographs."""
 
 SEARCH_SEED = 20_011
-"""Of the cameras that judge attempts at a goal. Those of ``evaluate`` have seed 0: what is chosen because certain
-cameras find it good is better from these than from others."""
+"""Seed of the cameras that evaluate the trials of a search. ``evaluate`` has seed 0: a result selected with some
+cameras is better from these than from others."""
 
 WORST_SHARE = 0.05
-"""Share of the views, the worst ones, that a goal looks at by themselves."""
+"""Share of the views, the worst ones, that a goal limits separately."""
 
-UNEVEN = 20.0
-"""How many times the squared error that a goal stands for these may have: a mean alone forgives the loss of a part that
-few views show. That costs them hundreds of times as much; what is only harder than the rest, a few times."""
+MAX_ERROR_RATIO = 20.0
+"""Largest ratio of the worst views' squared error to that of the goal. The mean alone would accept the loss of a part
+that few views show: there the ratio is in the hundreds, in views that are merely difficult below ten."""
 
 
 def psnr_of(evaluation: Evaluation) -> float:
-    """PSNR of a scene's pictures to its reference's, as goals count it, decibels; NaN where a picture failed.
+    """Return the PSNR of the candidate to the reference as goals define it, decibels; NaN if a rendering failed.
 
-    The mean over views, but at most that of pictures with a :data:`UNEVEN`-th of the squared error of the worst views.
+    It is the mean over views, limited by the worst views: at most the PSNR of their mean squared error divided by
+    :data:`MAX_ERROR_RATIO`.
     """
     mean = evaluation.mean.candidate_vs_reference.psnr
-    worst = _worst([_squared(view.comparison.candidate_vs_reference.psnr) for view in evaluation.views]) / UNEVEN
+    worst = (
+        _mean_of_worst([_squared_error(view.comparison.candidate_vs_reference.psnr) for view in evaluation.views])
+        / MAX_ERROR_RATIO
+    )
     return mean if math.isnan(mean) or worst <= 0 else min(mean, -10 * math.log10(worst))
 
 
 def drop_of(evaluation: Evaluation) -> float:
-    """By how many decibels a scene's pictures have become worse, as goals count it; NaN where a picture failed.
+    """Return the drop of PSNR from reference to candidate as goals define it, decibels; NaN if a rendering failed.
 
-    Where there are no photographs to ask, as if the scene had been :data:`USUAL` decibels from them and the new errors
-    were independent of those: squared errors then add up. (Of fox it predicts 0.40 dB where 0.38 are measured.)
+    With photographs it is the drop of the mean PSNR to them. Without, the reference is assumed to have
+    :data:`ASSUMED_PSNR` to photographs, with errors independent of the new ones, so that squared errors add up. (For
+    fox this predicts 0.40 dB; measured are 0.38 dB.)
 
-    That is the drop of the mean over views, but at least what a :data:`UNEVEN`-th of the squared error that has come to
-    the worst views would be in all of them.
+    The worst views limit it: it is at least the drop that their additional squared error, divided by
+    :data:`MAX_ERROR_RATIO`, would cause in all views.
     """
     mean = evaluation.mean
     if mean.change is None:
-        drop = _added(_squared(mean.candidate_vs_reference.psnr) / _squared(USUAL))
-        each = [_squared(view.comparison.candidate_vs_reference.psnr) / _squared(USUAL) for view in evaluation.views]
+        drop = _drop_by(_squared_error(mean.candidate_vs_reference.psnr) / _squared_error(ASSUMED_PSNR))
+        errors = [
+            _squared_error(view.comparison.candidate_vs_reference.psnr) / _squared_error(ASSUMED_PSNR)
+            for view in evaluation.views
+        ]
     else:
-        drop, each = -mean.change, _errors_added(evaluation)
-    worst = _worst(each) / UNEVEN
-    return drop if math.isnan(drop) or worst <= 0 else max(drop, _added(worst))
+        drop, errors = -mean.change, _errors_added(evaluation)
+    worst = _mean_of_worst(errors) / MAX_ERROR_RATIO
+    return drop if math.isnan(drop) or worst <= 0 else max(drop, _drop_by(worst))
 
 
 def _errors_added(evaluation: Evaluation) -> list[float]:
-    """For each view, by how much its squared error to the photograph has grown, in units of the reference's mean."""
+    """Return the growth of each view's squared error to its photograph, in units of the reference's mean error."""
     pairs = [
-        (_squared(view.comparison.candidate.psnr), _squared(view.comparison.reference.psnr))
+        (_squared_error(view.comparison.candidate.psnr), _squared_error(view.comparison.reference.psnr))
         for view in evaluation.views
         if view.comparison.reference is not None
     ]
-    usual = sum(reference for _, reference in pairs) / len(pairs)
-    return [(candidate - reference) / max(usual, 1e-30) for candidate, reference in pairs]
+    mean_error = sum(reference for _, reference in pairs) / len(pairs)
+    return [(candidate - reference) / max(mean_error, 1e-30) for candidate, reference in pairs]
 
 
-def _worst(errors: Sequence[float]) -> float:
-    """The mean over the largest :data:`WORST_SHARE` of these, one at least."""
+def _mean_of_worst(errors: Sequence[float]) -> float:
+    """Return the mean of the largest errors: :data:`WORST_SHARE` of them, at least one."""
     count = math.ceil(WORST_SHARE * len(errors))
     return sum(sorted(errors)[-count:]) / count
 
 
-def _squared(psnr: float) -> float:
-    """The mean squared error; 0 for an infinite PSNR."""
+def _squared_error(psnr: float) -> float:
+    """Return the mean squared error of a PSNR in decibels; 0 if that is infinite."""
     return float(10 ** (-psnr / 10))
 
 
-def _added(errors: float) -> float:
-    """What squared errors, in units of those that were there, take of the PSNR, decibels."""
+def _drop_by(errors: float) -> float:
+    """Return the drop of PSNR, decibels, caused by additional squared error in units of the former error."""
     return 10 * math.log10(1 + max(errors, 0.0))

@@ -1,4 +1,4 @@
-"""What comparing pictures gives: how alike they are, view by view and on average, for people and for machines."""
+"""Results of an evaluation: metrics per view and their means, as text and as JSON."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from kissgs.core.array_types import Float32, Float64
 
 Split = Literal["test", "train", "all"]
 
-MOST = 60.0
-"""Decibels that a view counts for at most in a mean: beyond about 59 no display of 8 bits shows a difference, and one
-view of an unchanged part, at 120 dB or infinite, would make up for others that are spoilt."""
+MAX_VIEW_PSNR = 60.0
+"""Largest PSNR, decibels, with which a view enters a mean. No 8-bit display shows a difference above about 59 dB, and a
+single unchanged view, at 120 dB or infinite, would hide damage in others."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImageMetrics:
-    """How alike two pictures are, or many pairs of them on average.
+    """Metrics of an image against a target, or their means over views.
+
+    NaN in an image gives NaN in the metrics and their means, so that no mean hides a failed rendering.
 
     Attributes:
-        psnr: decibels; infinite for equal pictures. On average, views count for at most :data:`MOST`, and it is
-            infinite only where all pictures are equal.
-        ssim: -1 to 1; 1 for equal pictures.
-        lpips: from 0 for equal pictures up to about 1; None where it was not asked for.
-
-    NaN, should a picture have it, is kept: no average hides a failed rendering.
+        psnr: decibels; infinite for equal images. In a mean, each view counts for at most :data:`MAX_VIEW_PSNR`; it is
+            infinite only if all images are equal.
+        ssim: -1 to 1; 1 for equal images.
+        lpips: 0 for equal images, up to about 1; None if not requested.
     """
 
     psnr: float
@@ -37,25 +37,24 @@ class ImageMetrics:
     lpips: float | None = None
 
     def as_dict(self) -> dict[str, float | str | None]:
-        """For JSON, which has no infinity and no NaN: an infinite value is None (null), NaN the string ``"NaN"``."""
+        """Return the metrics for JSON: an infinite value is None (null), NaN the string ``"NaN"``."""
         values = {"psnr": as_json(self.psnr), "ssim": as_json(self.ssim)}
         return values if self.lpips is None else {**values, "lpips": as_json(self.lpips)}
 
-    def spelled(self) -> list[str]:
-        """For people."""
-        values = [spell(self.psnr, 2), spell(self.ssim, 4)]
-        return values if self.lpips is None else [*values, spell(self.lpips, 4)]
+    def cells(self) -> list[str]:
+        """Return the metrics as cells of a table."""
+        values = [format_metric(self.psnr, 2), format_metric(self.ssim, 4)]
+        return values if self.lpips is None else [*values, format_metric(self.lpips, 4)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Comparison:
-    """The three likenesses that matter, of one view or on average over all.
+    """Metrics of one view, or their means over all views.
 
     Attributes:
-        reference: of the reference's rendering to the photograph; None where there are no photographs.
-        candidate: of the candidate's rendering to the photograph; equal to ``candidate_vs_reference`` where
-            there are none.
-        candidate_vs_reference: of the candidate's rendering to the reference's.
+        reference: the reference's rendering against the photograph; None without photographs.
+        candidate: the candidate's rendering against the photograph; without photographs, ``candidate_vs_reference``.
+        candidate_vs_reference: the candidate's rendering against the reference's.
     """
 
     reference: ImageMetrics | None
@@ -64,7 +63,7 @@ class Comparison:
 
     @property
     def change(self) -> float | None:
-        """Of the PSNR to the photograph, decibels: below 0 the candidate lost. None where there are no photographs."""
+        """Change of the PSNR to photographs, decibels, negative for a loss; None without photographs."""
         if self.reference is None:
             return None
         if self.reference.psnr == self.candidate.psnr:  # both may be infinite
@@ -72,7 +71,7 @@ class Comparison:
         return self.candidate.psnr - self.reference.psnr
 
     def as_dict(self) -> dict[str, Any]:
-        """By name."""
+        """Return the metrics by name, for JSON."""
         reference = None if self.reference is None else self.reference.as_dict()
         return {
             "reference": reference,
@@ -80,40 +79,39 @@ class Comparison:
             "candidate_vs_reference": self.candidate_vs_reference.as_dict(),
         }
 
-    def spelled(self) -> list[str]:
-        """For people, a row of a table: reference, candidate, change, between; without photographs only the last."""
+    def cells(self) -> list[str]:
+        """Return a table row: reference, candidate, change, candidate to reference; without photographs the last."""
         if self.reference is None or self.change is None:
-            return self.candidate_vs_reference.spelled()
-        change = spell(self.change, 2, signed=True)
-        return [*self.reference.spelled(), *self.candidate.spelled(), change, *self.candidate_vs_reference.spelled()]
+            return self.candidate_vs_reference.cells()
+        change = format_metric(self.change, 2, signed=True)
+        return [*self.reference.cells(), *self.candidate.cells(), change, *self.candidate_vs_reference.cells()]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ViewComparison:
-    """One view, and how alike the pictures from it are."""
+    """A view and the metrics of its images."""
 
     view: View
     comparison: Comparison
 
     @property
-    def badness(self) -> float:
-        """PSNR of the candidate to the reference; NaN, a failed picture, is the worst there is."""
+    def ranking_psnr(self) -> float:
+        """PSNR of the candidate to the reference, decibels; -inf for NaN, so that a failed rendering ranks worst."""
         psnr = self.comparison.candidate_vs_reference.psnr
         return -math.inf if math.isnan(psnr) else psnr
 
     @property
-    def place(self) -> str:
-        """Where the camera stands and looks, in the scene's coordinates, for people."""
+    def pose(self) -> str:
+        """Position of the camera, and its target or direction, in the scene's coordinates, as text."""
         camera = self.view.camera
         if self.view.target is not None:
             return f"at {_point(camera.position)} looking at {_point(self.view.target)}"
         return f"at {_point(camera.position)} looking along {_point(camera.viewmat[2, :3])}"
 
-    def where(self) -> dict[str, Any]:
-        """For JSON: the name, the PSNR of the candidate to the reference, and where the camera stands and looks.
+    def pose_as_dict(self) -> dict[str, Any]:
+        """Return the view's name, its PSNR of the candidate to the reference, and the camera's pose, for JSON.
 
-        ``position``, ``target`` (null where none is known) and the unit vector ``direction`` are in the scene's
-        coordinates.
+        ``position``, ``target`` (None if unknown) and the unit vector ``direction`` are in the scene's coordinates.
         """
         camera, target = self.view.camera, self.view.target
         return {
@@ -125,30 +123,29 @@ class ViewComparison:
         }
 
     def as_dict(self) -> dict[str, Any]:
-        """Name, size in pixels, and the likenesses."""
+        """Return name, size in pixels and metrics, for JSON."""
         camera = self.view.camera
         return {"name": self.view.name, "width": camera.width, "height": camera.height, **self.comparison.as_dict()}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Evaluation:
-    """A candidate scene's pictures beside those of its reference; see :func:`evaluate`.
+    """Evaluation of a candidate scene against its reference; see :func:`evaluate`.
 
     Attributes:
         against: what ``candidate`` was compared with: "photos", or the reference's "renderings".
-        split: the views that were used: "test", "train" or "all". Where "test" was asked for and no view is held out,
-            this is "train".
-        source: of the views, for people.
-        background: ``(3,)`` red, green, blue from 0 to 1, over which views without a background of their own were
-            rendered.
-        reference_count: Gaussians of the reference.
-        candidate_count: Gaussians of the candidate.
-        views: in their order, one or more.
-        note: of the views, for people; see :class:`kissgs.cameras.views.Views`.
-        shown: share of the scene that the views show, from 0 to 1; see
-            :func:`kissgs.evaluation.visibility.share_shown`. None where it was not computed.
-        surroundings: the same from cameras drawn over the whole scene; None where those are the ``views``, or were not
-            asked for.
+        split: the views that were used: "test", "train" or "all". "train" if "test" was requested and no view is held
+            out.
+        source: description of the views.
+        background: ``(3,)`` RGB from 0 to 1, behind views without a background of their own.
+        reference_count: number of Gaussians of the reference.
+        candidate_count: number of Gaussians of the candidate.
+        views: metrics of each view, one or more.
+        note: note about the views (:class:`kissgs.cameras.views.Views`) and the renderings; may be empty.
+        shown: share of the scene that the views show, 0 to 1 (:func:`kissgs.evaluation.visibility.share_shown`); None
+            if not computed.
+        surroundings: evaluation from cameras drawn over the whole scene; None if those are the ``views`` or were not
+            requested.
     """
 
     against: Literal["photos", "renderings"]
@@ -164,27 +161,27 @@ class Evaluation:
 
     @property
     def views_used(self) -> str:
-        """For people: "7 held-out photographs", "1 training camera"."""
+        """Number and kind of the views: "7 held-out photographs", "1 training camera"."""
         kind = {"test": "held-out ", "train": "training ", "all": ""}[self.split]
         noun = "photograph" if self.against == "photos" else "camera"
         return f"{len(self.views)} {kind}{noun}{'' if len(self.views) == 1 else 's'}"
 
     @property
     def size(self) -> str:
-        """For people, in pixels: "540x960", or "3 sizes"."""
-        sizes = {f"{each.view.camera.width}x{each.view.camera.height}" for each in self.views}
+        """Image size in pixels: "540x960", or "3 sizes"."""
+        sizes = {f"{view.view.camera.width}x{view.view.camera.height}" for view in self.views}
         return sizes.pop() if len(sizes) == 1 else f"{len(sizes)} sizes"
 
     @property
     def added(self) -> int:
-        """How many of the views were put beside the drawn ones for parts of the scene that those overlook."""
+        """Number of views that were added for overlooked parts of the scene."""
         return sum(view.view.added for view in self.views)
 
     @property
     def mean(self) -> Comparison:
-        """Mean over views of each figure; of the PSNR a mean of decibels, of at most :data:`MOST` for each view.
+        """Mean of each metric over all views, added ones included; of PSNR, the mean of decibels.
 
-        Added views count as all others do: without them, the mean would say nothing of the parts they were added for.
+        Each view counts for at most :data:`MAX_VIEW_PSNR`.
         """
         all_views = [view.comparison for view in self.views]
         references = [view.reference for view in all_views if view.reference is not None]
@@ -196,38 +193,38 @@ class Evaluation:
 
     @property
     def worst(self) -> ViewComparison:
-        """The view from which the candidate is least like the reference; the first of several."""
-        return min(self.views, key=lambda view: view.badness)
+        """View with the lowest PSNR of the candidate to the reference; the first of several."""
+        return min(self.views, key=lambda view: view.ranking_psnr)
 
     @property
     def fifth_percentile(self) -> float:
-        """PSNR of the candidate to the reference that one view in twenty falls short of, between views linearly.
+        """5th percentile over views of the PSNR of the candidate to the reference, interpolated linearly, decibels.
 
-        NaN where a picture failed; between a number and infinity, the number.
+        NaN if a rendering failed; between a number and infinity, the number.
         """
         values = sorted(view.comparison.candidate_vs_reference.psnr for view in self.views)
         if any(math.isnan(value) for value in values):
             return math.nan
-        place = 0.05 * (len(values) - 1)
-        lower, upper = values[math.floor(place)], values[math.ceil(place)]
-        return lower if math.isinf(upper) else lower + (place - math.floor(place)) * (upper - lower)
+        rank = 0.05 * (len(values) - 1)
+        lower, upper = values[math.floor(rank)], values[math.ceil(rank)]
+        return lower if math.isinf(upper) else lower + (rank - math.floor(rank)) * (upper - lower)
 
     @property
     def extremes(self) -> str:
-        """For people: the worst view and where it is, the fifth percentile, and how much of the scene is shown."""
+        """Worst view and its pose, fifth percentile, and share of the scene that is shown, as text."""
         worst = self.worst
         lowest = worst.comparison.candidate_vs_reference.psnr
-        told = (
-            f"worst view {spell(lowest, 1)} dB ({worst.view.name}, {worst.place}), "
-            f"5th percentile {spell(self.fifth_percentile, 1)} dB"
+        text = (
+            f"worst view {format_metric(lowest, 1)} dB ({worst.view.name}, {worst.pose}), "
+            f"5th percentile {format_metric(self.fifth_percentile, 1)} dB"
         )
         if self.shown is not None:
-            told += f"; the views show {math.floor(100 * self.shown)} % of the scene"
+            text += f"; the views show {math.floor(100 * self.shown)} % of the scene"
         added = f"{self.added} of the views {'was' if self.added == 1 else 'were'} added"
-        return told if not self.added else f"{told}; {added} for parts that the others overlook"
+        return text if not self.added else f"{text}; {added} for parts that the others overlook"
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON; see :meth:`ImageMetrics.as_dict` for infinity and NaN."""
+        """Return the evaluation for JSON; see :meth:`ImageMetrics.as_dict` for infinity and NaN."""
         return {
             "against": self.against,
             "split": self.split,
@@ -237,20 +234,20 @@ class Evaluation:
             "views": [view.as_dict() for view in self.views],
             "added": self.added,
             "mean": self.mean.as_dict(),
-            "worst": self.worst.where(),
+            "worst": self.worst.pose_as_dict(),
             "fifth_percentile": as_json(self.fifth_percentile),
             "shown": self.shown,
             "surroundings": None if self.surroundings is None else self.surroundings.as_dict(),
         }
 
 
-def spell(value: float, digits: int, *, signed: bool = False) -> str:
-    """A figure for people: ∞ where two pictures are equal, NaN where one of them failed."""
+def format_metric(value: float, digits: int, *, signed: bool = False) -> str:
+    """Return a value as text with this number of digits: ∞ for equal images, NaN for a failed rendering."""
     if math.isinf(value):
         return "∞" if value > 0 else "-∞"
     if math.isnan(value):
         return "NaN"
-    return f"{round(value, digits) + 0.0:{'+' if signed else ''}.{digits}f}"  # which makes -0.0 a +0.0
+    return f"{round(value, digits) + 0.0:{'+' if signed else ''}.{digits}f}"  # -0.0 + 0.0 is 0.0
 
 
 def _mean(values: Sequence[ImageMetrics]) -> ImageMetrics:
@@ -265,7 +262,7 @@ def _mean(values: Sequence[ImageMetrics]) -> ImageMetrics:
 def _mean_decibels(values: Sequence[float]) -> float:
     if all(value == math.inf for value in values):
         return math.inf
-    return sum(value if math.isnan(value) else min(value, MOST) for value in values) / len(values)
+    return sum(value if math.isnan(value) else min(value, MAX_VIEW_PSNR) for value in values) / len(values)
 
 
 def _point(point: Float64[np.ndarray, "3"]) -> str:
@@ -273,7 +270,7 @@ def _point(point: Float64[np.ndarray, "3"]) -> str:
 
 
 def as_json(value: float) -> float | str | None:
-    """For JSON, which has no infinity and no NaN: None and ``"NaN"``."""
+    """Return a value for JSON, which has neither infinity nor NaN: None for infinity, ``"NaN"`` for NaN."""
     if math.isinf(value):
         return None
     return "NaN" if math.isnan(value) else value

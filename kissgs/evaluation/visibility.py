@@ -1,4 +1,4 @@
-"""How much of a scene some views show: what every Gaussian adds to their pictures."""
+"""Share of a scene that some views show, from the blending weights of its Gaussians."""
 
 from __future__ import annotations
 
@@ -15,58 +15,80 @@ from kissgs.rendering.cpu import blending
 from kissgs.rendering.cpu.frame import LIMITS, Frame, draw
 from kissgs.rendering.cpu.lists import each_part, even_tiles
 
-LITTLE = 1e-6
-"""Share of a picture: a Gaussian that takes up no more of it is not shown by it."""
+SHOWN_SHARE = 1e-6
+"""Share of an image that a Gaussian must exceed to count as shown by it."""
 
-SIDE = 160
-"""Pixels of the longer side of the pictures that tell, at most."""
+MAX_SIDE = 160
+"""Longer side of the images, pixels; larger ones are rendered at this size."""
 
 
-def weights_of(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
-    """For each of the scene's Gaussians, the sum over all pixels of its weight in their colours.
+def blending_weights(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
+    """Return the blending weight of each Gaussian, ``(N,)``, summed over all pixels.
 
-    That is alpha times the transmittance before it; together with that of the background, the sum is the number of
-    pixels.
+    The weight in a pixel is alpha times the transmittance in front of the Gaussian; with the background's weights, the
+    total is the number of pixels.
+
+    Args:
+        frame: a rendering, with the lists of Gaussians per tile.
+        pool: threads.
     """
     lists, footprints = frame.lists, frame.footprints
     height, width = frame.transmittance.shape
     ones, zeros = np.zeros((height, width, 3), np.float32), np.zeros((height, width), np.float32)
-    ones[:, :, 0] = 1  # the gradient by a colour's red is then the sum of weights
+    ones[:, :, 0] = 1  # so the gradient with respect to a red value is the sum of weights
     slots = np.empty((len(lists.members), 9), np.float32)
 
     def blend(first: int, last: int) -> None:
         blending.blend_backward(
-            *(footprints.records, lists.members, lists.spans, lists.slots, lists.starts, first, last, lists.columns),
-            *(LIMITS, frame.background, frame.transmittance, frame.stops, ones, zeros, slots),
+            footprints.records,
+            lists.members,
+            lists.spans,
+            lists.slots,
+            lists.starts,
+            first,
+            last,
+            lists.columns,
+            LIMITS,
+            frame.background,
+            frame.transmittance,
+            frame.stops,
+            ones,
+            zeros,
+            slots,
         )
 
     each_part(blend, even_tiles(lists, pool), pool)
     weights = np.zeros(len(frame.splats), np.float64)
-    of_slot, visible = np.ascontiguousarray(slots[:, 6]), footprints.visible
-    blending.sum_errors(of_slot, lists.slots_from, lists.slot_counts, visible, 0, len(visible), weights)
+    slot_weights, visible = np.ascontiguousarray(slots[:, 6]), footprints.visible
+    blending.sum_errors(slot_weights, lists.slots_from, lists.slot_counts, visible, 0, len(visible), weights)
     return weights
 
 
 def share_shown(splats: Splats, cameras: Sequence[Camera], *, threads: int = 0) -> float:
-    """The share of a scene that some cameras show, from 0 to 1; that of a scene of which nothing can be seen is 1.
+    """Return the share of a scene, 0 to 1, that some cameras show; 1 for a scene without visible Gaussians.
 
-    A Gaussian is shown if it takes up more than :data:`LITTLE` of one of the pictures, and counts by what it can show
-    (:func:`kissgs.evaluation.prominence.prominence`). What lies hidden behind others from all sides is not shown.
+    A Gaussian is shown if it covers more than :data:`SHOWN_SHARE` of an image, and counts by its prominence
+    (:func:`kissgs.evaluation.prominence.prominence`). Gaussians hidden behind others in all images are not shown.
+
+    Args:
+        splats: the scene, finite.
+        cameras: any number of cameras; large ones are reduced to :data:`MAX_SIDE` pixels.
+        threads: number of threads; 0 means one per processor.
     """
-    counts, bare = prominence(splats), without_gloss(splats)
+    counts, plain = prominence(splats), base_colors_only(splats)
     if not counts.any():
         return 1.0
     shown = np.zeros(len(splats), bool)
     with Workers(threads) as pool:
         for camera in cameras:
-            small = camera.at_most(SIDE)
-            frame = draw(bare, small, np.zeros(3, np.float32), pool)
-            shown |= weights_of(frame, pool) > LITTLE * small.width * small.height
+            small = camera.at_most(MAX_SIDE)
+            frame = draw(plain, small, np.zeros(3, np.float32), pool)
+            shown |= blending_weights(frame, pool) > SHOWN_SHARE * small.width * small.height
     return float(counts[shown].sum() / counts.sum())
 
 
-def without_gloss(splats: Splats) -> Splats:
-    """The same in base colours alone, for those who do not look at colours: they cost as much as all else."""
+def base_colors_only(splats: Splats) -> Splats:
+    """Return the scene without shN, for renderings whose colours do not matter: shN costs as much as all else."""
     return Splats(
         means=splats.means,
         quats=splats.quats,

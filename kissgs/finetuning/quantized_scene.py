@@ -1,15 +1,15 @@
-"""The codec as a differentiable function: levels that gradients can move, and what a decoder makes of them.
+"""``QuantizedScene``: the differentiable decoder of fine-tuning, from latents to levels to a scene.
 
-Every level is ``spacing * round(symbol + latent)``, the symbol being the multiple that was chosen. Latents are what is
-learned, in units of the step that the row's class of Gaussians has. Rounding passes gradients straight through (Bengio
-et al. 2013): what the loss says of a decoded value is said of its latent. Order, forms, labels and ranges stay as they
-were chosen; the images that are written hold these very levels.
+Every level is ``stride * round(multiple + latent)``, with the multiple of the encoding plan. The latents are trained;
+their unit is the step size of the row's sensitivity class. Rounding passes gradients straight through (Bengio et al.
+2013): the gradient of a decoded value becomes that of its latent. Order, rotation forms, labels and ranges are those of
+the plan; the images that are written contain exactly the rounded levels.
 
-Straight-through training alone does not settle: where the best value lies between two levels, its latent crosses to
-and fro, and ends at the worse one as often as at the better. So each latent hangs on a spring at its level, as stiff as
-the loss bends there. It comes to rest where one Newton step from the level would lead, ``level - slope / bend``: that
-is one place, whichever of the two levels is taken, and it is rounded to the nearer one. How fast the loss bends is
-known from what errors cost in pictures (:class:`kissgs.planning.rd_model.Costs`).
+Straight-through training alone does not converge: if the best value is between two levels, its latent oscillates across
+the boundary and may end at the worse level. So a quadratic term attracts each latent to its current level, with the
+curvature that the loss has there. The latent converges to the result of one Newton step from the level,
+``level - gradient / curvature``, which is the same point from both levels, and is rounded to the nearer one. The
+curvature follows from the costs of errors (:class:`kissgs.planning.rd_model.Costs`).
 """
 
 from __future__ import annotations
@@ -33,31 +33,32 @@ from kissgs.planning.sh_codebook import COEFFICIENTS
 from kissgs.rendering.rasterizer import Device
 from kissgs.training.optimizer import PrunableAdam
 
-ATTRIBUTE = {"quats": "quaternions", "scales": "scales", "sh0": "f_dc"}
-"""Attributes whose values are those of a field as they are, by field."""
+ATTRIBUTE_FIELDS = {"quats": "quaternions", "scales": "scales", "sh0": "f_dc"}
+"""Fields that hold an attribute without transformation, by attribute."""
 
 FIELDS = ("means", "opacities", "scales", "quaternions", "f_dc", "f_rest_centroids")
+"""Trained fields of the metadata."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plane:
-    """One field: from latents to levels to values.
+    """One field: maps latents to levels to values.
 
     Attributes:
-        field: levels as they were, ``(R, C)``; a row for each Gaussian, or for each entry of the codebook.
-        base_multiples: ``(R, C)`` float64, which multiple of its spacing each level was.
-        spacing: ``(R, 1)`` float64.
-        shift: ``(R, C)`` float64, from multiples to levels: ``-field.level_offset``, but for those that must not move.
-        min_latent: ``(R, C)`` float32: lowest and highest latents whose levels the image can hold; 0 for those that
-            must not move.
-        max_latent: see ``min_latent``.
-        low: ``(C,)`` float64: value of level 0.
-        step: ``(C,)`` float64: distance of the values of two levels.
+        field: levels of the plan, ``(R, C)``; one row per Gaussian, or per entry of the codebook.
+        base_multiples: ``(R, C)`` float64, each level of the plan as a multiple of its stride.
+        stride: ``(R, 1)`` float64, distance between the levels that a row uses.
+        shift: ``(R, C)`` float64, added to multiples times stride to give levels: ``-field.level_offset``, except for
+            frozen levels.
+        min_latent: ``(R, C)`` float32, smallest latent whose level the image can hold; 0 for frozen levels.
+        max_latent: ``(R, C)`` float32, largest such latent; 0 for frozen levels.
+        low: ``(C,)`` float64, value of level 0.
+        step: ``(C,)`` float64, difference of the values of consecutive levels.
     """
 
     field: Quantized
     base_multiples: Float64[Tensor, "R C"]
-    spacing: Float64[Tensor, "R 1"]
+    stride: Float64[Tensor, "R 1"]
     shift: Float64[Tensor, "R C"]
     min_latent: Float32[Tensor, "R C"]
     max_latent: Float32[Tensor, "R C"]
@@ -65,146 +66,153 @@ class Plane:
     step: Float64[Tensor, " C"]
 
     @classmethod
-    def of(cls, field: Quantized, device: Device, *, pinned: bool = False) -> Plane:
-        """A level that is no multiple of its spacing begins at the nearest; ``pinned``: the top level stays."""
+    def of(cls, field: Quantized, device: Device, *, freeze_top: bool = False) -> Plane:
+        """Return the plane of a field; a level that is no multiple of its stride starts at the nearest multiple.
+
+        Args:
+            field: levels of the plan.
+            device: device of the tensors.
+            freeze_top: whether levels equal to ``field.top`` are not trained.
+        """
         levels = field.levels.astype(np.float64)
-        spacing = np.broadcast_to(np.reshape(field.level_stride, (-1, 1)), (len(levels), 1)).astype(np.float64)
+        stride = np.broadcast_to(np.reshape(field.level_stride, (-1, 1)), (len(levels), 1)).astype(np.float64)
         low = field.low.astype(np.float64)
         step = (field.high.astype(np.float64) - low) / field.top
-        first, last = np.ceil(field.level_offset / spacing), np.floor((field.top + field.level_offset) / spacing)
-        fixed = (first > last) | (step == 0) | (pinned & (levels == field.top))
-        symbols = np.rint((levels + field.level_offset) / spacing)
-        symbols = np.where(fixed, symbols, np.clip(symbols, first, last))
-        shift = np.where(fixed, levels - symbols * spacing, -field.level_offset)
-        bounds = (np.where(fixed, 0, bound - symbols).astype(np.float32) for bound in (first, last))
-        arrays = (symbols, spacing, shift, *bounds, low, step)
+        first, last = np.ceil(field.level_offset / stride), np.floor((field.top + field.level_offset) / stride)
+        frozen = (first > last) | (step == 0) | (freeze_top & (levels == field.top))
+        multiples = np.rint((levels + field.level_offset) / stride)
+        multiples = np.where(frozen, multiples, np.clip(multiples, first, last))
+        shift = np.where(frozen, levels - multiples * stride, -field.level_offset)
+        bounds = (np.where(frozen, 0, bound - multiples).astype(np.float32) for bound in (first, last))
+        arrays = (multiples, stride, shift, *bounds, low, step)
         return cls(field, *(torch.from_numpy(np.ascontiguousarray(array)).to(device) for array in arrays))
 
     def levels(self, latents: Float32[Tensor, "R C"]) -> Float64[Tensor, "R C"]:
-        """Whole numbers from 0 to the field's top, with the gradient of the latents as they are, without rounding."""
-        whole = torch.round(self.base_multiples + latents.detach())
-        return (whole + (latents - latents.detach())) * self.spacing + self.shift
+        """Return levels, whole numbers from 0 to the field's top; their gradient ignores the rounding."""
+        multiples = torch.round(self.base_multiples + latents.detach())
+        return (multiples + (latents - latents.detach())) * self.stride + self.shift
 
     def values(self, latents: Float32[Tensor, "R C"]) -> Float64[Tensor, "R C"]:
-        """What a decoder makes of the levels, with the same gradient."""
+        """Return the decoded values of the levels, differentiable like :meth:`levels`."""
         return self.low + self.step * self.levels(latents)
 
     def quantized(self, latents: Float32[Tensor, "R C"]) -> Quantized:
-        """The field with these levels."""
+        """Return the field with the levels of these latents."""
         levels = self.levels(latents.detach()).cpu().numpy()
         return replace(self.field, levels=levels.astype(self.field.levels.dtype))
 
 
 class QuantizedScene:
-    """A choice that is being improved: what :func:`kissgs.training.loop.train` fits.
+    """An encoding plan whose levels :func:`kissgs.training.loop.train` can fit.
 
     Attributes:
-        planes: by field of the metadata.
-        classes: ``(M,)`` kind of each Gaussian.
-        grid: which Gaussian sits where.
+        planes: planes by field of the metadata.
+        classes: ``(M,)`` sensitivity class of each Gaussian.
+        grid: cell of each Gaussian.
     """
 
-    def __init__(self, choice: EncodingPlan, sh_degree: int, device: Device = "cpu") -> None:
-        self._choice, self._sh_degree = choice, sh_degree
-        shown, count = np.flatnonzero(choice.grid.mask), int(choice.grid.mask.sum())
+    def __init__(self, plan: EncodingPlan, sh_degree: int, device: Device = "cpu") -> None:
+        """Start from a plan; ``sh_degree`` is that of the decoded scene."""
+        self._plan, self._sh_degree = plan, sh_degree
+        filled, count = np.flatnonzero(plan.grid.mask), int(plan.grid.mask.sum())
         self.planes = {
             name: Plane.of(
-                field if name == "f_rest_centroids" else field.take(shown),
+                field if name == "f_rest_centroids" else field.take(filled),
                 device,
-                pinned=name == "means" and field.top == MEANS_TOP,
+                freeze_top=name == "means" and field.top == MEANS_TOP,
             )
-            for name, field in choice.fields.items()
+            for name, field in plan.fields.items()
         }
-        self.classes, self.grid = choice.classes, choice.grid
-        self._labels = _Labels(choice.codebook.labels[:count], choice.codebook.side**2, device)
-        self._leaves = PrunableAdam({name: torch.zeros_like(plane.min_latent) for name, plane in self.planes.items()})
-        self._bend = {name: torch.zeros_like(plane.min_latent) for name, plane in self.planes.items()}
+        self.classes, self.grid = plan.classes, plan.grid
+        self._labels = _Labels(plan.codebook.labels[:count], plan.codebook.side**2, device)
+        self._adam = PrunableAdam({name: torch.zeros_like(plane.min_latent) for name, plane in self.planes.items()})
+        self._curvature = {name: torch.zeros_like(plane.min_latent) for name, plane in self.planes.items()}
 
     @property
     def latents(self) -> dict[str, Tensor]:
-        """What is learned, by field."""
-        return self._leaves.by_name
+        """Trained latents by field, ``(R, C)`` float32 each."""
+        return self._adam.parameters
 
-    def hang(self, costs: Costs, steepness: float) -> None:
-        """Make the springs as stiff as the loss bends: by what errors cost in pictures. Before, there are none.
+    def set_curvature(self, costs: Costs, loss_per_error: float) -> None:
+        """Set the curvature of the quadratic attraction, 0 before, to that of the loss.
 
         Args:
-            costs: mean squared error of pictures by an error of one unit, ``(M,)`` for each attribute.
-            steepness: how much the loss grows with that error.
+            costs: mean squared image error per squared unit of each attribute, ``(M,)`` each.
+            loss_per_error: derivative of the loss with respect to the mean squared image error.
         """
         labels = self._labels
-        # An error of a coefficient of gloss costs what one of the base colour does: all are of one norm.
+        # All SH basis functions have one norm, so a coefficient of shN costs as much as one of the base colour.
         entries = np.bincount(labels.index.cpu().numpy(), costs.color, labels.entries)
-        of = {
+        by_field = {
             "means": costs.position,
             "opacities": costs.opacity,
             "scales": costs.scale,
-            "quaternions": 3 * costs.rotation,  # a quaternion's change of 1 turns by 2
+            "quaternions": 3 * costs.rotation,  # a change of a quaternion by 1 is a rotation by 2 radians
             "f_dc": costs.color,
             "f_rest_centroids": entries,
         }
         for name, plane in self.planes.items():
-            cost = torch.from_numpy(np.ascontiguousarray(of[name])).to(plane.step.device)[:, None]
-            self._bend[name] = (2 * steepness * cost * (plane.step * plane.spacing) ** 2).float()
+            cost = torch.from_numpy(np.ascontiguousarray(by_field[name])).to(plane.step.device)[:, None]
+            self._curvature[name] = (2 * loss_per_error * cost * (plane.step * plane.stride) ** 2).float()
 
     def __len__(self) -> int:
         return len(self.latents["means"])
 
     def gaussians(self) -> dict[str, Tensor]:
-        """What a decoder makes of the levels, by the names in :class:`kissgs.core.splats.Splats`."""
+        """Return the decoded scene by the names in :class:`kissgs.core.splats.Splats`, differentiable."""
         values = {name: self.planes[name].values(latents) for name, latents in self.latents.items()}
-        shown = {name: values[field].float() for name, field in ATTRIBUTE.items()}
-        kinds = SH_REST_COUNTS[self._sh_degree]
-        entries = values["f_rest_centroids"].float().reshape(-1, 3, COEFFICIENTS)[:, :, :kinds]
-        shown["shN"] = _Entries.apply(entries.transpose(1, 2).contiguous(), self._labels)  # type: ignore[no-untyped-call]
-        shown["means"] = _SignedExp.apply(values["means"])  # type: ignore[no-untyped-call]
-        shown["opacities"] = values["opacities"][:, 0].float()
-        return shown
+        decoded = {name: values[field].float() for name, field in ATTRIBUTE_FIELDS.items()}
+        coefficients = SH_REST_COUNTS[self._sh_degree]
+        entries = values["f_rest_centroids"].float().reshape(-1, 3, COEFFICIENTS)[:, :, :coefficients]
+        decoded["shN"] = _LookUp.apply(entries.transpose(1, 2).contiguous(), self._labels)  # type: ignore[no-untyped-call]
+        decoded["means"] = _SignedExp.apply(values["means"])  # type: ignore[no-untyped-call]
+        decoded["opacities"] = values["opacities"][:, 0].float()
+        return decoded
 
     def step(self, rates: Mapping[str, float]) -> None:
-        """Move the latents against their gradients and springs, as far as the images can hold their levels.
+        """Make an Adam step of the latents, with quadratic attraction, within the levels that the images can hold.
 
         Args:
-            rates: learning rates by field; and ``"spring"``, the share of the springs' strength.
+            rates: learning rates by field, and ``"attraction"``: factor of the quadratic attraction, 0 to 1.
         """
         with torch.no_grad():
             for name, latents in self.latents.items():
                 if latents.grad is not None:
                     plane = self.planes[name]
                     level = (torch.round(plane.base_multiples + latents) - plane.base_multiples).float()
-                    latents.grad += rates["spring"] * self._bend[name] * (latents - level)
-        self._leaves.step(rates)
+                    latents.grad += rates["attraction"] * self._curvature[name] * (latents - level)
+        self._adam.step(rates)
         with torch.no_grad():
             for name, latents in self.latents.items():
                 latents.clamp_(self.planes[name].min_latent, self.planes[name].max_latent)
 
-    def choice(self) -> EncodingPlan:
-        """The choice with the levels as they are now."""
-        grid, before = self._choice.grid, self._choice.fields
-        fields, errors = {}, dict(self._choice.errors)
+    def plan(self) -> EncodingPlan:
+        """Return the plan with the current levels."""
+        grid, former = self._plan.grid, self._plan.fields
+        fields, errors = {}, dict(self._plan.errors)
         for name, latents in self.latents.items():
             field = self.planes[name].quantized(latents)
             moved = np.abs(field.values() - self.planes[name].field.values()).max(axis=0, initial=0.0)
             errors[name] = (np.array(errors[name]) + moved[: len(errors[name])]).tolist()
             fields[name] = field if name == "f_rest_centroids" else field.take(grid.cell_to_gaussian)
         return replace(
-            self._choice,
-            fields={name: fields[name] for name in before},
-            codebook=replace(self._choice.codebook, centroids=fields["f_rest_centroids"]),
+            self._plan,
+            fields={name: fields[name] for name in former},
+            codebook=replace(self._plan.codebook, centroids=fields["f_rest_centroids"]),
             errors=errors,
         )
 
     def state(self) -> dict[str, np.ndarray]:
-        """Everything, to go on from later."""
-        return self._leaves.state()
+        """Return the state of the training, see :meth:`restore`."""
+        return self._adam.state()
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Go on from there."""
-        self._leaves.restore(state)
+        """Continue from a :meth:`state` of a scene with an equal plan."""
+        self._adam.restore(state)
 
 
 class _SignedExp(torch.autograd.Function):
-    """sign(y) (e^|y| - 1), by the very function that the decoder uses; in float64, rounded to float32."""
+    """sign(y) (e^|y| - 1) by the decoder's own function: computed in float64, rounded to float32."""
 
     @staticmethod
     def forward(ctx: Any, y: Float64[Tensor, "..."]) -> Float32[Tensor, "..."]:  # noqa: ANN401
@@ -220,7 +228,15 @@ class _SignedExp(torch.autograd.Function):
 
 
 class _Labels:
-    """Which Gaussians share an entry, sorted once."""
+    """Codebook entry of each Gaussian.
+
+    Attributes:
+        entries: number of entries.
+        index: ``(M,)`` entry of each Gaussian.
+        order: ``(M,)`` Gaussians sorted by entry.
+        used: entries that occur, ascending.
+        starts: start of each of these in ``order``.
+    """
 
     def __init__(self, labels: Int[np.ndarray, " M"], entries: int, device: Device) -> None:
         self.entries = entries
@@ -229,8 +245,8 @@ class _Labels:
         self.used, self.starts = np.unique(labels[self.order], return_index=True)
 
 
-class _Entries(torch.autograd.Function):
-    """Its entry for each Gaussian. On the processor gradients are summed in a fixed order, unlike torch's own."""
+class _LookUp(torch.autograd.Function):
+    """Codebook look-up. On the CPU, gradients are summed in a fixed order, unlike those of torch's indexing."""
 
     @staticmethod
     def forward(ctx: Any, entries: Float32[Tensor, "E K 3"], labels: _Labels) -> Float32[Tensor, "M K 3"]:  # noqa: ANN401

@@ -1,4 +1,4 @@
-"""``FinetuneReport``: what fine-tuning took and gave."""
+"""``FinetuneReport``: effort and results of fine-tuning."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FinetuneReport:
-    """What fine-tuning took and gave.
+    """Effort and results of fine-tuning.
 
     Attributes:
-        steps: of training.
-        target_source: what the levels were fitted to: "photos", or "renderings" of the scene as it was.
-        source: of the views, for people.
-        psnr_before: decibels, mean over held-out views (over those that were learned from, if none are), to their
-            photographs or, where there are none, to renderings: of the container as it was chosen.
-        psnr_after: the same after fine-tuning.
-        bytes_before: of the container as it was chosen.
-        bytes_after: the same after fine-tuning.
-        kept: whether the fine-tuned container is the better one, and is what was written: less squared error than the
-            other, once bytes are paid for at the price at which levels were chosen.
-        seconds: wall time, judging included; without that of taking the pictures to learn from.
-        note: a sentence for people about what they may not have expected, without a capital and a full stop; or none.
+        steps: number of training steps.
+        target_source: training targets: "photos", or "renderings" of the original scene.
+        source: description of the training views.
+        psnr_before: PSNR of the container before fine-tuning, decibels: mean over the evaluation views, to photographs
+            or, without them, to renderings of the original scene. Evaluation views are held-out views, or training
+            views if there are none.
+        psnr_after: PSNR after fine-tuning, decibels.
+        bytes_before: size of the container before fine-tuning, as a zip.
+        bytes_after: size after fine-tuning, as a zip.
+        kept: whether the fine-tuned container was kept: it has less squared error plus lambda times bits.
+        seconds: wall time, evaluation included, preparation of the targets excluded.
+        note: note for the user, a sentence without capital and full stop; may be empty.
     """
 
     steps: int
@@ -37,8 +37,8 @@ class FinetuneReport:
     note: str = ""
 
     def as_dict(self) -> dict[str, Any]:
-        """For machines; what is infinite is null."""
-        told = asdict(self)
+        """Return the report for JSON; an infinite PSNR is None (null)."""
+        values = asdict(self)
         for name in ("psnr_before", "psnr_after"):
-            told[name] = None if told[name] == float("inf") else told[name]
-        return told
+            values[name] = None if values[name] == float("inf") else values[name]
+        return values

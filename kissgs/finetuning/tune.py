@@ -1,4 +1,4 @@
-"""Fine-tuning: from a container as it was chosen to a better one of the same layout (KISS-GS, appendix)."""
+"""``Tuner``: fine-tune the levels of an encoding plan, and keep the better container (KISS-GS, appendix)."""
 
 from __future__ import annotations
 
@@ -18,13 +18,12 @@ from kissgs.core.errors import OutputError
 from kissgs.core.progress import Progress, as_stage, silent
 from kissgs.core.splats import ATTRIBUTES, Splats, clean
 from kissgs.evaluation.evaluate import evaluate
-from kissgs.finetuning.losses import CodeLength, Smoothness
+from kissgs.evaluation.results import Evaluation
+from kissgs.finetuning.losses import RateLoss, TotalVariationLoss
 from kissgs.finetuning.quantized_scene import FIELDS, QuantizedScene
 from kissgs.finetuning.result import FinetuneReport
 from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.rd_model import Costs, implied_lambda
-from kissgs.rendering.differentiable import rasterize
-from kissgs.rendering.losses import photometric_loss
 from kissgs.rendering.rasterizer import Device
 from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
 from kissgs.settings import FinetuneSettings
@@ -32,40 +31,40 @@ from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.decode import MAX_GAUSSIANS, decode
 from kissgs.sogxt.encode import Encoded
 from kissgs.training.checkpoint import Checkpoint
-from kissgs.training.loop import Plan, Rates, exponential_lr, threads_of_torch, train
+from kissgs.training.loop import LrSchedule, TrainingPlan, exponential_lr, image_loss, torch_threads, train
 from kissgs.training.supervision import SupervisionViews, supervision_views
 from kissgs.training.targets import TrainingTargets, training_targets
 
-WATCHED = 64
-"""TrainingTargets from which costs of errors are told, about."""
+SENSITIVITY_VIEWS = 64
+"""Approximate number of training cameras from which costs are measured, if the plan has none."""
 
-HEDGE = 0.1
-"""How little they say of other places, see :class:`kissgs.Sensitivity`."""
+VIEW_UNCERTAINTY = 0.1
+"""View uncertainty of these costs, see :class:`kissgs.Sensitivity`."""
 
-LOOKS = 16
-"""TrainingTargets from which the loss at the beginning is told."""
+LOSS_VIEWS = 16
+"""Largest number of targets from which the loss before training is estimated."""
 
-SETTLE = 0.5
-"""Share of the steps after which levels begin to settle."""
+ATTRACTION_START = 0.5
+"""Fraction of the steps after which quadratic attraction starts; it grows linearly to 1 at the last step."""
 
-NO_HELP = "fine-tuning did not help; the container is as it was without it"
+NOT_KEPT = "fine-tuning did not help; the container is as it was without it"
 
 Write = Callable[[EncodingPlan, int, Progress], Encoded]
-"""The files that show a choice, which became better in so many steps; and who is told of it."""
+"""Writes a plan that was fine-tuned in a number of steps; the third argument receives progress."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tuner:
-    """Improves choices for one scene.
+    """Fine-tunes encoding plans of one scene.
 
     Attributes:
-        original: the scene as it was, clean: the teacher where there are no photographs.
-        settings: how.
-        supervision: views to learn from, and to judge by.
-        targets: what they should show.
-        device: where it is trained.
-        threads: 0 means one per processor; the result does not depend on it.
-        progress: receives "finetune", and then what writing tells.
+        original: the original scene, clean; its renderings are the targets if there are no photographs.
+        settings: settings of the training.
+        supervision: training and evaluation views.
+        targets: target images of the training views.
+        device: device that trains.
+        threads: number of threads; 0 means one per processor. The result does not depend on it.
+        progress: receives the stage "finetune", and then those of writing.
     """
 
     original: Splats
@@ -87,46 +86,46 @@ class Tuner:
         threads: int = 0,
         progress: Progress = silent,
     ) -> Tuner:
-        """With the photographs of ``views``, or with pictures of the original from virtual cameras.
+        """Prepare the targets: photographs of ``views``, or renderings of the original from virtual cameras.
 
         Raises:
             InvalidViewsError: a photograph cannot be read.
-            UnsupportedError: a picture would take too much memory.
+            UnsupportedError: an image would take too much memory.
         """
-        found = supervision_views(original, views, settings, scored=0, threads=threads, progress=progress)
-        taught = training_targets(
-            *(original, found.train, found.background), threads=threads, device=device, progress=progress
+        supervision = supervision_views(original, views, settings, scoring_stride=0, threads=threads, progress=progress)
+        targets = training_targets(
+            original, supervision.train, supervision.background, threads=threads, device=device, progress=progress
         )
-        return cls(original, settings, found, taught, device, threads, progress)
+        return cls(original, settings, supervision, targets, device, threads, progress)
 
     def __call__(
-        self, choice: EncodingPlan, start: EncodingPlan, scene: Splats, write: Write, checkpoint: Path | None = None
+        self, plan: EncodingPlan, start: EncodingPlan, scene: Splats, write: Write, checkpoint: Path | None = None
     ) -> tuple[Encoded, FinetuneReport]:
-        """Fine-tune, and keep what is better: the container as it was chosen, or the new one.
+        """Fine-tune, and return the better container with a report: the tuned one, or that of ``plan``.
 
         Args:
-            choice: of at least one Gaussian.
-            start: what is trained: the same, or one of fewer Gaussians, of at least one.
-            scene: for which they were made.
-            write: makes the files, and tells of it.
-            checkpoint: file to keep the state in, every half minute. If there is one of this very work, it is taken up
-                where it was left.
+            plan: plan of the container without fine-tuning, with at least one Gaussian.
+            start: plan from which training starts: ``plan``, or one with fewer Gaussians, at least one.
+            scene: the scene of both plans.
+            write: writes the files of a plan.
+            checkpoint: file for the state of the training, saved every half minute. If it exists and belongs to this
+                work, training continues from it.
 
         Raises:
             InvalidViewsError: a photograph cannot be read.
-            OutputError: ``checkpoint`` is of other work.
+            OutputError: ``checkpoint`` belongs to other work.
         """
-        begun = time.perf_counter()
-        at_first = as_stage("finetune", self.progress)
-        before = write(choice, 0, at_first)
-        first = self._judge(before, at_first)
-        rd_lambda = choice.rd_lambda or implied_lambda(
-            self._rounding(before, scene, at_first), int(choice.grid.mask.sum())
+        started = time.perf_counter()
+        as_finetune = as_stage("finetune", self.progress)
+        before = write(plan, 0, as_finetune)
+        first = self._evaluate(before, as_finetune)
+        rd_lambda = plan.rd_lambda or implied_lambda(
+            self._coding_error(before, scene, as_finetune), int(plan.grid.mask.sum())
         )
-        better, trouble = self._train(start, scene.sh_degree, start.rd_lambda or rd_lambda, checkpoint)
-        after = write(better, self.settings.steps, self.progress)
-        second = self._judge(after, self._at_last)
-        cost, new_cost = (told.error + 8 * told.bytes * rd_lambda for told in (first, second))
+        tuned, checkpoint_note = self._train(start, scene.sh_degree, start.rd_lambda or rd_lambda, checkpoint)
+        after = write(tuned, self.settings.steps, self.progress)
+        second = self._evaluate(after, self._report_images_done)
+        cost, new_cost = (result.error + 8 * result.bytes * rd_lambda for result in (first, second))
         kept = new_cost < cost
         report = FinetuneReport(
             steps=self.settings.steps,
@@ -137,153 +136,146 @@ class Tuner:
             bytes_before=first.bytes,
             bytes_after=second.bytes,
             kept=kept,
-            seconds=time.perf_counter() - begun,
-            note="; ".join(filter(None, [self.supervision.note, "" if kept else NO_HELP, trouble])),
+            seconds=time.perf_counter() - started,
+            note="; ".join(filter(None, [self.supervision.note, "" if kept else NOT_KEPT, checkpoint_note])),
         )
         return (after if kept else before), report
 
-    def _at_last(self, stage: str, fraction: float, note: str = "") -> None:
+    def _report_images_done(self, stage: str, fraction: float, note: str = "") -> None:
         self.progress("images", 1.0)
 
-    def _judge(self, encoded: Encoded, progress: Progress) -> _Mark:
-        decoded = decode(encoded.files, max_gaussians=max(len(self.original), MAX_GAUSSIANS), threads=self.threads)
-        compared = evaluate(
-            *(self.original, decoded, self.supervision.eval_views),
+    def _evaluate(self, encoded: Encoded, progress: Progress) -> _Result:
+        evaluation = self._compare(self.original, encoded, progress)
+        return _Result(
+            bytes=len(zip_bytes(encoded.files)),
+            psnr=evaluation.mean.candidate.psnr,
+            error=float(np.mean([_squared_error(view.comparison.candidate.psnr) for view in evaluation.views])),
+        )
+
+    def _coding_error(self, encoded: Encoded, scene: Splats, progress: Progress) -> float:
+        """Return the mean squared error of a container's renderings relative to those of the encoded scene."""
+        views = self._compare(scene, encoded, progress).views
+        return float(np.mean([_squared_error(view.comparison.candidate_vs_reference.psnr) for view in views]))
+
+    def _compare(self, reference: Splats, encoded: Encoded, progress: Progress) -> Evaluation:
+        decoded = decode(encoded.files, max_gaussians=max(len(reference), MAX_GAUSSIANS), threads=self.threads)
+        return evaluate(
+            reference,
+            decoded,
+            self.supervision.eval_views,
             device=self.device,
             threads=self.threads,
             progress=progress,
         )
-        return _Mark(
-            bytes=len(zip_bytes(encoded.files)),
-            psnr=compared.mean.candidate.psnr,
-            error=float(np.mean([_squared(view.comparison.candidate.psnr) for view in compared.views])),
-        )
-
-    def _rounding(self, encoded: Encoded, scene: Splats, progress: Progress) -> float:
-        """Squared error by which pictures of a container differ from those of the scene that it was made of."""
-        decoded = decode(encoded.files, max_gaussians=max(len(scene), MAX_GAUSSIANS), threads=self.threads)
-        compared = evaluate(
-            *(scene, decoded, self.supervision.eval_views), device=self.device, threads=self.threads, progress=progress
-        )
-        return float(np.mean([_squared(view.comparison.candidate_vs_reference.psnr) for view in compared.views]))
 
     def _train(
-        self, choice: EncodingPlan, sh_degree: int, rd_lambda: float, path: Path | None
+        self, plan: EncodingPlan, sh_degree: int, rd_lambda: float, path: Path | None
     ) -> tuple[EncodingPlan, str]:
-        """A better choice, and what went wrong with the checkpoint on the way to it."""
-        chosen, work = self.settings, QuantizedScene(choice, sh_degree, self.device)
-        kept, done, trouble = Checkpoint(path, "" if path is None else self._key(choice, sh_degree)), 0, ""
-        steepness = self._steepness(work)
-        work.hang(choice.costs or self._costs(work), steepness)
-        lengths = CodeLength(work, chosen.rate_weight * rd_lambda * steepness)
-        state = kept.load()
+        """Return the fine-tuned plan, and a note if the checkpoint could not be saved."""
+        settings, scene = self.settings, QuantizedScene(plan, sh_degree, self.device)
+        checkpoint = Checkpoint(path, "" if path is None else self._key(plan, sh_degree))
+        done, checkpoint_note = 0, ""
+        loss_per_error = self._loss_per_error(scene)
+        scene.set_curvature(plan.costs or self._measure_costs(scene), loss_per_error)
+        rate_loss = RateLoss(scene, settings.rate_weight * rd_lambda * loss_per_error)
+        state = checkpoint.load()
         if state is not None:
             done = int(state["done"])
-            work.restore(state)
-            lengths.restore(state)
+            scene.restore(state)
+            rate_loss.restore(state)
 
         def after(step: int) -> None:
-            nonlocal trouble
-            if kept.due or (path is not None and step == chosen.steps):
+            nonlocal checkpoint_note
+            if checkpoint.due or (path is not None and step == settings.steps):
                 try:
-                    kept.save(_state(work, lengths, step))
+                    checkpoint.save({**scene.state(), **rate_loss.state(), "done": np.asarray(step)})
                 except OutputError as error:
-                    trouble = f"the work went on without a checkpoint: {error}"
+                    checkpoint_note = f"the work went on without a checkpoint: {error}"
 
-        plan = Plan(
+        training = TrainingPlan(
             stage="finetune",
-            steps=chosen.steps,
-            rates=_rates(chosen, self.targets),
-            ssim_weight=chosen.ssim_weight,
-            seed=(chosen.seed,),
-            regularizers=(lengths, Smoothness(work, chosen.tv_weight, chosen.steps)),
-            batch=chosen.batch,
+            steps=settings.steps,
+            rates=_lr_schedule(settings, self.targets),
+            ssim_weight=settings.ssim_weight,
+            seed=(settings.seed,),
+            regularizers=(rate_loss, TotalVariationLoss(scene, settings.tv_weight, settings.steps)),
+            batch=settings.batch,
         )
-        train(work, self.targets, plan, first=done, after=after, threads=self.threads, progress=self.progress)
-        return work.choice(), trouble
+        train(scene, self.targets, training, first=done, after=after, threads=self.threads, progress=self.progress)
+        return scene.plan(), checkpoint_note
 
-    def _steepness(self, work: QuantizedScene) -> float:
-        """How much the loss grows with the mean squared error of pictures.
+    def _loss_per_error(self, scene: QuantizedScene) -> float:
+        """Estimate the derivative of the loss with respect to the mean squared image error.
 
-        As if it were proportional to its root, which holds for errors that come on top of those of photographs.
+        The loss is taken as proportional to the root of the error, as for errors on top of those to photographs.
         """
         losses, errors = [], []
-        with torch.no_grad(), threads_of_torch(1):  # its sums depend on them
-            shown = work.gaussians()
-            for n in islice(self.targets.order((self.settings.seed,)), min(LOOKS, len(self.targets))):
+        with torch.no_grad(), torch_threads(1):  # the sums depend on the number of threads
+            parameters = scene.gaussians()
+            for n in islice(self.targets.order((self.settings.seed,)), min(LOSS_VIEWS, len(self.targets))):
                 self.progress("finetune", 0.0)
-                camera = self.targets.cameras[n]
-                target = torch.from_numpy(self.targets.picture(n))[None].to(shown["means"].device)
-                image, _ = rasterize(
-                    **shown,
-                    viewmats=torch.from_numpy(camera.viewmat)[None],
-                    Ks=torch.from_numpy(camera.K)[None],
-                    width=camera.width,
-                    height=camera.height,
-                    backgrounds=torch.from_numpy(self.targets.background)[None],
-                    threads=self.threads,
+                loss, error = image_loss(
+                    parameters, self.targets, n, ssim_weight=self.settings.ssim_weight, threads=self.threads
                 )
-                loss = photometric_loss(image, target, ssim_weight=self.settings.ssim_weight, threads=self.threads)
                 losses.append(float(loss))
-                errors.append(float((image - target).square().mean()))
+                errors.append(error)
         return float(np.mean(losses)) / (2 * max(float(np.mean(errors)), 1e-10))
 
-    def _costs(self, work: QuantizedScene) -> Costs:
-        """What errors of the Gaussians cost in the pictures that are learned from, where nobody has looked before."""
+    def _measure_costs(self, scene: QuantizedScene) -> Costs:
+        """Measure the costs of errors in the training views, for a plan without costs."""
         with torch.no_grad():
-            scene = clean(Splats(**{name: value.cpu().numpy() for name, value in work.gaussians().items()}))[0]
-        cameras = self.targets.cameras[:: max(1, len(self.targets) // WATCHED)]
-        watch = WeightedCameras(cameras, [1.0] * len(cameras), self.targets.background)
-        progress = as_stage("finetune", self.progress)
-        return Costs.of(
-            measure_sensitivity(scene, watch, view_uncertainty=HEDGE, threads=self.threads, progress=progress), scene
+            splats = clean(Splats(**{name: value.cpu().numpy() for name, value in scene.gaussians().items()}))[0]
+        cameras = self.targets.cameras[:: max(1, len(self.targets) // SENSITIVITY_VIEWS)]
+        sensitivity = measure_sensitivity(
+            splats,
+            WeightedCameras(cameras, [1.0] * len(cameras), self.targets.background),
+            view_uncertainty=VIEW_UNCERTAINTY,
+            threads=self.threads,
+            progress=as_stage("finetune", self.progress),
         )
+        return Costs.of(sensitivity, splats)
 
-    def _key(self, choice: EncodingPlan, sh_degree: int) -> str:
-        """Of the work: equal only where the result is equal."""
-        taught = self.targets
-        told = f"{__version__} {self.device} {sh_degree} {self.settings.model_dump_json()} {choice.rd_lambda} "
-        key = hashlib.sha256(f"{told}{taught.background}".encode())
-        for name, field in choice.fields.items():
+    def _key(self, plan: EncodingPlan, sh_degree: int) -> str:
+        """Return the key of the work's checkpoint: equal only for equal results."""
+        targets = self.targets
+        settings = f"{__version__} {self.device} {sh_degree} {self.settings.model_dump_json()} {plan.rd_lambda} "
+        key = hashlib.sha256(f"{settings}{targets.background}".encode())
+        for name, field in plan.fields.items():
             key.update(f"{name} {field.top} {field.level_offset} {field.levels.shape}".encode())
             for array in (field.levels, field.low, field.high, np.asarray(field.level_stride)):
                 key.update(array.tobytes())
-        for array in (choice.codebook.labels, choice.classes, choice.grid.mask):
+        for array in (plan.codebook.labels, plan.classes, plan.grid.mask):
             key.update(array.tobytes())
-        for name in Costs.__slots__ if choice.costs is not None else ():
-            key.update(getattr(choice.costs, name).tobytes())
-        for camera, picture in zip(taught.cameras, taught.pictures, strict=True):
-            key.update(f"{picture.shape} {picture.dtype}".encode())
-            key.update(camera.viewmat.tobytes() + camera.K.tobytes() + picture.tobytes())
+        for name in Costs.__slots__ if plan.costs is not None else ():
+            key.update(getattr(plan.costs, name).tobytes())
+        for camera, image in zip(targets.cameras, targets.images, strict=True):
+            key.update(f"{image.shape} {image.dtype}".encode())
+            key.update(camera.viewmat.tobytes() + camera.K.tobytes() + image.tobytes())
         for name in ATTRIBUTES:
             key.update(getattr(self.original, name).tobytes())
         return key.hexdigest()
 
 
-def _rates(chosen: FinetuneSettings, targets: TrainingTargets) -> Rates:
-    """Learning rates that fall exponentially, and springs that grow from nothing once most is learned."""
-    share = 1.0 if targets.target_source == "photos" else chosen.synthetic_lr_scale
-    base = {name: share * (chosen.codebook_lr if name == "f_rest_centroids" else chosen.lr) for name in FIELDS}
-    learning = exponential_lr(base, dict.fromkeys(FIELDS, 1.0), dict.fromkeys(FIELDS, chosen.final_lr_scale))
+def _lr_schedule(settings: FinetuneSettings, targets: TrainingTargets) -> LrSchedule:
+    """Return exponentially falling learning rates, and quadratic attraction that grows in the second half."""
+    scale = 1.0 if targets.target_source == "photos" else settings.synthetic_lr_scale
+    base = {name: scale * (settings.codebook_lr if name == "f_rest_centroids" else settings.lr) for name in FIELDS}
+    learning_rates = exponential_lr(base, dict.fromkeys(FIELDS, 1.0), dict.fromkeys(FIELDS, settings.final_lr_scale))
 
     def rates(done: float) -> dict[str, float]:
-        return {**learning(done), "spring": max(done - SETTLE, 0.0) / (1 - SETTLE)}
+        return {**learning_rates(done), "attraction": max(done - ATTRACTION_START, 0.0) / (1 - ATTRACTION_START)}
 
     return rates
 
 
-def _state(work: QuantizedScene, lengths: CodeLength, done: int) -> dict[str, np.ndarray]:
-    return {**work.state(), **lengths.state(), "done": np.asarray(done)}
-
-
 @dataclass(frozen=True, slots=True)
-class _Mark:
-    """Of one container: bytes of its zip; PSNR and squared error of its pictures."""
+class _Result:
+    """Bytes of a container as a zip, and PSNR (decibels) and mean squared error of its renderings."""
 
     bytes: int
     psnr: float
     error: float
 
 
-def _squared(psnr: float) -> float:
+def _squared_error(psnr: float) -> float:
     return float(10 ** (-psnr / 10))

@@ -23,7 +23,7 @@ from kissgs.settings import EncodeSettings, Settings
 from kissgs.settings.encode import GOALS
 from kissgs.sogxt.container import check_destination, is_packed, stored_sizes, write_container, zip_bytes
 from kissgs.sogxt.decode import MAX_GAUSSIANS, decode
-from kissgs.training.checkpoint import beside, forget
+from kissgs.training.checkpoint import delete_checkpoints, finetune_checkpoint_path
 
 if TYPE_CHECKING:
     from kissgs.cameras.views import Views
@@ -120,7 +120,7 @@ def compact(
             overwrite=overwrite,
             progress=ignore_stop_search(clock) if settings.searches else clock,
         )
-        forget(result.checkpoint)
+        delete_checkpoints(result.checkpoint)
     clock.stop()
     report = replace(result.report, cleaned=cleaned, cpu_seconds=clock.cpu_seconds, peak_memory=peak_memory())
     return replace(result, report=report)
@@ -181,7 +181,7 @@ def compress(
     if settings.finetune.enabled:
         check_finetuning(settings, views, device)
         if checkpoint is not None and not settings.encode.has_goal:
-            finetune_checkpoint = beside(Path(checkpoint))
+            finetune_checkpoint = finetune_checkpoint_path(Path(checkpoint))
     clock = StageTimer(progress)
     original, cleaned, source_bytes = open_scene(source, threads, clock)
     encoding = Encoding(
@@ -212,7 +212,7 @@ def compress(
     if target is not None:
         after_search("write", 0.0)
         write_container(encoded.files, target, overwrite=overwrite)
-        forget(*checkpoints)
+        delete_checkpoints(*checkpoints)
     clock.stop()
     report = Report(
         source_count=len(original) + cleaned.removed,

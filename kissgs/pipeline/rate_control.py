@@ -13,7 +13,7 @@ from kissgs.core.progress import SearchNote
 from kissgs.core.root_finding import find_root
 from kissgs.core.splats import Splats
 from kissgs.evaluation.psnr_loss import SEARCH_SEED
-from kissgs.evaluation.results import MOST
+from kissgs.evaluation.results import MAX_VIEW_PSNR
 from kissgs.finetuning.result import FinetuneReport
 from kissgs.pipeline.trial import Trial
 from kissgs.planning.sh_codebook import COEFFICIENTS, codebook_side
@@ -24,7 +24,7 @@ from kissgs.sogxt.decode import MAX_GAUSSIANS, decode
 from kissgs.sogxt.encode import Encoded
 
 if TYPE_CHECKING:
-    from kissgs.evaluation.evaluate import Picture
+    from kissgs.evaluation.evaluate import Rendering
     from kissgs.evaluation.results import Evaluation
 
 LOG2_LAMBDA_RANGE = (-70.0, -6.0)
@@ -129,7 +129,7 @@ class Goal:
             return (
                 f"psnr {self.settings.psnr:g} dB cannot be met: the finest container found has {highest:.2f} dB; "
                 "ask for at most that"
-                + (f"; each view counts for at most {MOST:g} dB" if self.settings.psnr > MOST else "")
+                + (f"; each view counts for at most {MAX_VIEW_PSNR:g} dB" if self.settings.psnr > MAX_VIEW_PSNR else "")
             )
         smallest_drop = 1.005 * min(math.inf if trial.drop is None else trial.drop for trial in trials)
         return (
@@ -192,7 +192,7 @@ class RateControl:
         self._jump: tuple[float, int] | None = None
         self._psnr: float | None = None
         self._finetuning: FinetuneReport | None = None
-        self._rendered: dict[str, Picture] | None = None
+        self._rendered: dict[str, Rendering] | None = None
 
     def search_all(self, encoder: Encoder) -> None:
         """Search with up to ``max_encodes`` containers; change the codebook size if lambda alone cannot meet the goal.
@@ -391,14 +391,14 @@ class RateControl:
     def evaluate(self, encoded: Encoded) -> Evaluation:
         """Compare the renderings of a container with those of the original, or both with the photographs."""
         from kissgs.evaluation.cameras import evaluation_views
-        from kissgs.evaluation.evaluate import compare_pictures
+        from kissgs.evaluation.evaluate import compare_images
 
         self.progress("evaluate", 0.0)
         if self.views is None:
             self.views = evaluation_views(self.original, seed=SEARCH_SEED, threads=self.threads)
             self._rendered = {}
         decoded = decode(encoded.files, max_gaussians=max(len(self.original), MAX_GAUSSIANS), threads=self.threads)
-        return compare_pictures(self.original, decoded, self.views, threads=self.threads, taken=self._rendered)
+        return compare_images(self.original, decoded, self.views, threads=self.threads, reference_images=self._rendered)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Work that takes minutes, kept in a file now and then, so that it can be taken up where it was left."""
+"""``Checkpoint``: the state of long work in a file, saved regularly, to resume the work after an interruption."""
 
 from __future__ import annotations
 
@@ -14,87 +14,89 @@ import numpy as np
 from kissgs.core.errors import OutputError
 from kissgs.io.atomic import atomic_file, reason_of, refuse_existing
 
-SECONDS = 30.0
-"""Between two savings: what is lost at most."""
+SAVE_INTERVAL = 30.0
+"""Shortest time between two saves, seconds."""
 
 
 class Checkpoint:
-    """A file ``.npz`` that holds the state of one piece of work; without a path, nothing is kept.
+    """An ``.npz`` file with the state of one piece of work.
 
     Args:
-        path: of the file.
-        key: of the work: its input, settings and version. What was kept under another is not taken up.
+        path: the file; None: nothing is saved.
+        key: identifies the work by its input, settings and version; a state is loaded only under the same key.
 
     Raises:
-        OutputError: the file is of other work, or no such file, and must not be written over; or it could not be
-            written.
+        OutputError: the file is a checkpoint of other work or no checkpoint at all, so that it must not be overwritten,
+            or it cannot be read or written.
     """
 
     def __init__(self, path: Path | None, key: str) -> None:
         self._path, self._key = path, key
-        self._saved, self._took = time.monotonic(), 0.0
+        self._saved_at, self._save_seconds = time.monotonic(), 0.0
         if path is not None:
             refuse_existing(path, overwrite=True)
             if path.exists() and self._read(path) is None:
                 raise OutputError(
-                    f"{path} is the checkpoint of other work: another scene, other views or settings, or another "
-                    "version of kissgs; delete it to begin anew"
+                    f"{path} is a checkpoint of other work: another scene, other views or settings, or another version "
+                    "of kissgs; delete it to start again"
                 )
 
     def load(self) -> dict[str, np.ndarray] | None:
-        """What was kept; None if nothing was."""
+        """Return the saved state; None if there is none."""
         return self._read(self._path) if self._path is not None and self._path.exists() else None
 
     def _read(self, path: Path) -> dict[str, np.ndarray] | None:
         try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as kept:
-                if str(kept["key"]) != self._key:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as saved:
+                if str(saved["key"]) != self._key:
                     return None
-                return {name: kept[name] for name in kept.files if name != "key"}
+                return {name: saved[name] for name in saved.files if name != "key"}
         except OSError as error:
             raise OutputError(f"cannot read {path}: {reason_of(error)}") from error
         except (ValueError, KeyError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile) as error:
-            raise OutputError(f"{path} is no checkpoint of kissgs; move it away or delete it") from error
+            raise OutputError(f"{path} is no checkpoint of kissgs; move or delete it, or name another file") from error
 
     @property
     def due(self) -> bool:
-        """Whether it is time to save again: half a minute has gone, and saving takes no more than a twentieth of it."""
-        return self._path is not None and time.monotonic() - self._saved >= max(SECONDS, 20 * self._took)
+        """Whether to save again: :data:`SAVE_INTERVAL` has passed, and saving takes at most 5 % of the time."""
+        return self._path is not None and time.monotonic() - self._saved_at >= max(
+            SAVE_INTERVAL, 20 * self._save_seconds
+        )
 
     def save(self, state: Mapping[str, np.ndarray]) -> None:
-        """Keep it, whole or not at all, in place of what was kept before.
+        """Save a state in place of the former one, completely or not at all.
 
         Raises:
-            OutputError: the file system refuses.
+            OutputError: the file cannot be written.
         """
         if self._path is None:
             return
-        begun = time.monotonic()
+        started = time.monotonic()
         arrays: dict[str, Any] = {"key": np.asarray(self._key), **state}
         with atomic_file(self._path, overwrite=True) as file:
             np.savez(file, **arrays)
-        self._saved = time.monotonic()
-        self._took = self._saved - begun
+        self._saved_at = time.monotonic()
+        self._save_seconds = self._saved_at - started
 
     def remove(self) -> None:
-        """What it led to is kept elsewhere."""
+        """Delete the file, once the result is saved."""
         if self._path is not None:
             self._path.unlink(missing_ok=True)
 
 
-def forget(*checkpoints: Path | None) -> None:
-    """Delete them, now that what they led to is kept elsewhere."""
+def delete_checkpoints(*checkpoints: Path | None) -> None:
+    """Delete checkpoints whose results are saved; files that cannot be deleted stay."""
     for path in checkpoints:
         if path is not None:
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)
 
 
-def beside(checkpoint: Path) -> Path:
-    """Where fine-tuning keeps its state if compaction keeps its own in this file.
+def finetune_checkpoint_path(checkpoint: Path) -> Path:
+    """Return the path of fine-tuning's checkpoint, given that of compaction.
 
     Raises:
-        OutputError: it is a folder.
+        OutputError: ``checkpoint`` is a folder.
     """
     refuse_existing(checkpoint, overwrite=True)
     return checkpoint.with_name(f"{checkpoint.stem}-finetune{checkpoint.suffix}")

@@ -1,4 +1,4 @@
-"""The loop: take a picture, compare it with what it should be, move every Gaussian a little."""
+"""``train``: fit a scene to target images by gradient descent."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import Protocol
-
-import numpy as np
 
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.progress import Progress, silent
@@ -21,56 +19,58 @@ try:
     import torch
     from torch import Tensor
 except ModuleNotFoundError as error:
-    raise UnsupportedError("training is torch's, which is missing: pip install 'kissgs[train]'") from error
+    raise UnsupportedError("training needs torch, which is missing: pip install 'kissgs[train]'") from error
 
-SMOOTH = 0.98
-"""Of what is told of loss and PSNR: how much of the last figure stays in the next."""
+SMOOTHING = 0.98
+"""Weight of the former value in the running means of loss and squared error."""
 
 Parameters = Mapping[str, Tensor]
-Rates = Callable[[float], Mapping[str, float]]
-"""Learning rates by parameter, given the share of the steps that are done."""
+"""Stored parameters of a scene, by the names in :class:`kissgs.core.splats.Splats`."""
+
+LrSchedule = Callable[[float], Mapping[str, float]]
+"""Function from the fraction of steps done, 0 to 1, to the learning rates by parameter."""
 
 
 class TrainableScene(Protocol):
-    """What is fitted to pictures."""
+    """A scene that can be fitted to images."""
 
     def gaussians(self) -> dict[str, Tensor]:
-        """Current parameters, by the names in :class:`kissgs.core.splats.Splats`; gradients flow back from there."""
+        """Return the current :data:`Parameters`, differentiable."""
 
     def step(self, rates: Mapping[str, float]) -> None:
-        """Move against the gradients that have come, at these learning rates, and forget them."""
+        """Make an optimiser step with the accumulated gradients at these learning rates, and clear the gradients."""
 
     def __len__(self) -> int:
         """Number of Gaussians."""
 
 
 class Regularizer(Protocol):
-    """What is wanted of the Gaussians beside the pictures."""
+    """A loss term beside the photometric loss."""
 
     def penalty(self, step: int, parameters: Parameters) -> Tensor | None:
-        """To be added to the loss of ``step``; None for nothing."""
+        """Return the term to add to the loss of ``step``, a scalar; None for nothing."""
 
-    def update(self, step: int, learner: TrainableScene) -> None:
-        """What is to be done after ``step``."""
+    def update(self, step: int, scene: TrainableScene) -> None:
+        """Update the state after ``step``."""
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
-    """How to train.
+class TrainingPlan:
+    """Settings of a training.
 
     Attributes:
-        stage: its name, for progress.
-        steps: how many.
+        stage: name of the stage in progress events.
+        steps: number of steps.
         rates: learning rates.
-        ssim_weight: of 1 - SSIM in the loss, from 0 to 1; the rest is for the mean absolute difference.
-        seed: of the order of the pictures, one number or several.
-        regularizers: beside the pictures.
-        batch: pictures in each step.
+        ssim_weight: weight of 1 - SSIM in the loss, 0 to 1; the mean absolute difference has the rest.
+        seed: seed of the order of the images, one number or several.
+        regularizers: further loss terms.
+        batch: number of images in each step.
     """
 
     stage: str
     steps: int
-    rates: Rates
+    rates: LrSchedule
     ssim_weight: float
     seed: Sequence[int]
     regularizers: tuple[Regularizer, ...] = ()
@@ -78,93 +78,96 @@ class Plan:
 
 
 def train(
-    learner: TrainableScene,
+    scene: TrainableScene,
     targets: TrainingTargets,
-    plan: Plan,
+    plan: TrainingPlan,
     *,
     first: int = 0,
     after: Callable[[int], None] = lambda done: None,
     threads: int = 0,
     progress: Progress = silent,
 ) -> None:
-    """Fit a scene to pictures, from the step ``first`` on.
+    """Fit a scene to target images, from step ``first`` on.
 
-    The loss is that of Kerbl et al. 2023, equation 7, and what the plan adds to it. The same seed gives the same scene,
-    whatever the number of threads; not on a GPU.
+    The loss is that of 3DGS (Kerbl et al. 2023, equation 7) plus the plan's regularizers. On the CPU, the result
+    depends on the seed but not on the number of threads; on a GPU it is not reproducible.
 
     Args:
-        learner: changed in place.
-        targets: pictures.
-        plan: what to do.
-        first: steps that were done before.
-        after: told the number of steps done, after each.
-        threads: 0 means one per processor.
-        progress: receives the plan's stage, with loss, PSNR to the lessons and count; what it raises leaves the
-            learner as it was after a whole number of steps.
+        scene: the scene to train; changed in place.
+        targets: cameras and target images.
+        plan: settings of the training.
+        first: number of steps already done.
+        after: called after each step with the number of steps done.
+        threads: number of threads; 0 means one per processor.
+        progress: receives the plan's stage, with count, loss and PSNR to the targets as its note. If it raises, the
+            scene is in the state after the last completed step.
     """
-    cameras = [_as_tensors(camera.viewmat, camera.K, targets.background) for camera in targets.cameras]
-    order, told = targets.order(plan.seed, first * plan.batch), Told()
-    with threads_of_torch(threads):
+    order, running = targets.order(plan.seed, first * plan.batch), RunningMeans()
+    with torch_threads(threads):
         for step in range(first, plan.steps):
-            progress(plan.stage, step / plan.steps, told.in_words(len(learner)))
-            shown = learner.gaussians()
+            progress(plan.stage, step / plan.steps, running.text(len(scene)))
+            parameters = scene.gaussians()
             losses, errors = [], []
             for n in islice(order, plan.batch):
-                camera, (viewmat, K, background) = targets.cameras[n], cameras[n]
-                target = torch.from_numpy(targets.picture(n))[None].to(shown["means"].device)
-                image, _ = rasterize(
-                    **shown,
-                    viewmats=viewmat,
-                    Ks=K,
-                    width=camera.width,
-                    height=camera.height,
-                    backgrounds=background,
-                    threads=threads,
-                )
-                losses.append(photometric_loss(image, target, ssim_weight=plan.ssim_weight, threads=threads))
-                errors.append(float((image.detach() - target).square().mean()))
+                loss, error = image_loss(parameters, targets, n, ssim_weight=plan.ssim_weight, threads=threads)
+                losses.append(loss)
+                errors.append(error)
             loss = torch.stack(losses).mean()
-            told.hear(float(loss.detach()), sum(errors) / plan.batch)
+            running.add(float(loss.detach()), sum(errors) / plan.batch)
             for regularizer in plan.regularizers:
-                penalty = regularizer.penalty(step, shown)
+                penalty = regularizer.penalty(step, parameters)
                 loss = loss if penalty is None else loss + penalty
             loss.backward()  # type: ignore[no-untyped-call]
-            learner.step(plan.rates(step / plan.steps))
+            scene.step(plan.rates(step / plan.steps))
             for regularizer in plan.regularizers:
-                regularizer.update(step, learner)
+                regularizer.update(step, scene)
             after(step + 1)
-    progress(plan.stage, 1.0, told.in_words(len(learner)))
+    progress(plan.stage, 1.0, running.text(len(scene)))
+
+
+def image_loss(
+    parameters: Parameters, targets: TrainingTargets, n: int, *, ssim_weight: float, threads: int
+) -> tuple[Tensor, float]:
+    """Render target ``n``; return the photometric loss, differentiable, and the mean squared error."""
+    camera = targets.cameras[n]
+    target = torch.from_numpy(targets.image(n))[None].to(parameters["means"].device)
+    image, _ = rasterize(
+        **parameters,
+        viewmats=torch.from_numpy(camera.viewmat)[None],  # float64: poses far from the origin need it
+        Ks=torch.from_numpy(camera.K)[None],
+        width=camera.width,
+        height=camera.height,
+        backgrounds=torch.from_numpy(targets.background)[None],
+        threads=threads,
+    )
+    loss = photometric_loss(image, target, ssim_weight=ssim_weight, threads=threads)
+    return loss, float((image.detach() - target).square().mean())
 
 
 @dataclass(slots=True)
-class Told:
-    """Loss and squared error of the last steps, on average."""
+class RunningMeans:
+    """Exponentially weighted means of loss and squared error; NaN before the first step."""
 
     loss: float = math.nan
     error: float = math.nan
 
-    def hear(self, loss: float, error: float) -> None:
-        """Of one more step."""
+    def add(self, loss: float, error: float) -> None:
+        """Add the values of a step."""
         first = math.isnan(self.loss)
-        self.loss = loss if first else SMOOTH * self.loss + (1 - SMOOTH) * loss
-        self.error = error if first else SMOOTH * self.error + (1 - SMOOTH) * error
+        self.loss = loss if first else SMOOTHING * self.loss + (1 - SMOOTHING) * loss
+        self.error = error if first else SMOOTHING * self.error + (1 - SMOOTHING) * error
 
-    def in_words(self, count: int) -> str:
-        """For people."""
+    def text(self, count: int) -> str:
+        """Return number of Gaussians, loss and PSNR as text."""
         if math.isnan(self.loss):
             return f"{count:,} Gaussians"
         psnr = math.inf if self.error == 0 else -10 * math.log10(self.error)
         return f"{count:,} Gaussians, loss {self.loss:.4f}, PSNR {psnr:.2f}"
 
 
-def _as_tensors(*arrays: np.ndarray) -> tuple[Tensor, ...]:
-    """Of the type they have: the pose of a camera far from the origin is more than float32 can say."""
-    return tuple(torch.as_tensor(array)[None] for array in arrays)
-
-
 @contextlib.contextmanager
-def threads_of_torch(threads: int) -> Iterator[None]:
-    """For its own loops, the number that the rasteriser has."""
+def torch_threads(threads: int) -> Iterator[None]:
+    """Set the number of threads of torch to that of the rasteriser for a ``with`` block; 0 changes nothing."""
     before = torch.get_num_threads()
     if threads > 0:
         torch.set_num_threads(threads)
@@ -174,13 +177,13 @@ def threads_of_torch(threads: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def exponential_lr(base: Mapping[str, float], begin: Mapping[str, float], end: Mapping[str, float]) -> Rates:
-    """Rates that go from one share of ``base`` to another, exponentially, as those of the means do in 3DGS.
+def exponential_lr(base: Mapping[str, float], begin: Mapping[str, float], end: Mapping[str, float]) -> LrSchedule:
+    """Return learning rates that change exponentially from ``base · begin`` to ``base · end``, as in 3DGS for means.
 
     Args:
         base: learning rates by parameter.
-        begin: what each is multiplied with at the beginning, above 0.
-        end: the same at the end.
+        begin: factor of each at the first step, above 0.
+        end: factor of each after the last step, above 0.
     """
 
     def rates(done: float) -> dict[str, float]:

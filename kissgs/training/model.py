@@ -1,4 +1,4 @@
-"""``GaussianModel``: a scene whose parameters are being fitted."""
+"""``GaussianModel``: a scene with trainable parameters."""
 
 from __future__ import annotations
 
@@ -30,64 +30,70 @@ BOUNDS = {
     "sh0": (-SH_LIMIT, SH_LIMIT),
     "shN": (-SH_LIMIT, SH_LIMIT),
 }
-"""What :func:`kissgs.core.splats.clean` would change or remove."""
+"""Smallest and largest values that :func:`kissgs.core.splats.clean` leaves unchanged."""
 
 
 class GaussianModel:
-    """The stored parameters of a scene as leaves of torch, and the Adam that moves them."""
+    """The stored parameters of a scene as torch tensors, optimised by Adam."""
 
-    def __init__(self, splats: Splats, device: Device = "cpu", reach: Float32[np.ndarray, " N"] | None = None) -> None:
-        """``splats`` is copied; it must be clean.
+    def __init__(
+        self, splats: Splats, device: Device = "cpu", extents: Float32[np.ndarray, " N"] | None = None
+    ) -> None:
+        """Copy a scene.
 
-        ``reach`` is ``(N,)``, the length in which the learning rate of each Gaussian's position is given; by default 1.
+        Args:
+            splats: the scene, clean.
+            device: device of the tensors.
+            extents: ``(N,)`` unit of length, world units, of the learning rate of each position; 1 by default.
         """
-        self._leaves = PrunableAdam(tensors_of(splats, device))
-        self._reach = torch.from_numpy(np.ones(len(splats), np.float32) if reach is None else reach)[:, None].to(device)
+        self._adam = PrunableAdam(tensors_of(splats, device))
+        extents = np.ones(len(splats), np.float32) if extents is None else extents
+        self._extents = torch.from_numpy(extents)[:, None].to(device)
 
     @property
     def parameters(self) -> dict[str, Tensor]:
-        """By their names in :class:`kissgs.core.splats.Splats`, float32, with gradients; :meth:`keep` replaces them."""
-        return self._leaves.by_name
+        """Float32 parameters by their names in :class:`kissgs.core.splats.Splats`; :meth:`keep` replaces them."""
+        return self._adam.parameters
 
     def gaussians(self) -> dict[str, Tensor]:
-        """The parameters themselves."""
+        """Return the parameters themselves."""
         return self.parameters
 
     def __len__(self) -> int:
         return len(self.parameters["means"])
 
     def step(self, rates: Mapping[str, float]) -> None:
-        """Move all parameters against their gradients, at these learning rates, and forget the gradients.
+        """Make an Adam step at these learning rates, and clear the gradients.
 
-        Values stay within the bounds of :func:`kissgs.core.splats.clean`; a gradient that is no number counts as none.
+        Values are clamped to :data:`BOUNDS`; NaN and infinite gradients count as 0.
         """
         before = self.parameters["means"].detach().clone()
-        longest = float(self._reach.max()) if len(self) else 1.0
-        self._leaves.step({**rates, "means": rates["means"] * longest})
+        largest = float(self._extents.max()) if len(self) else 1.0
+        self._adam.step({**rates, "means": rates["means"] * largest})
         with torch.no_grad():
-            self.parameters["means"].sub_(before).mul_(self._reach / longest).add_(before)
-            for name, (least, most) in BOUNDS.items():
-                self.parameters[name].clamp_(least, most)
+            self.parameters["means"].sub_(before).mul_(self._extents / largest).add_(before)
+            for name, (smallest, greatest) in BOUNDS.items():
+                self.parameters[name].clamp_(smallest, greatest)
 
     def keep(self, index: Int[np.ndarray, " M"]) -> None:
-        """Leave all but the Gaussians at ``index`` out; what Adam remembers of these stays with them."""
-        self._leaves.keep(index)
-        self._reach = self._reach[torch.from_numpy(index).to(self._reach.device)]
+        """Keep only the Gaussians at ``index``, with their Adam moments."""
+        self._adam.keep(index)
+        self._extents = self._extents[torch.from_numpy(index).to(self._extents.device)]
 
     def splats(self) -> Splats:
-        """A clean copy of the scene as it is now."""
+        """Return a clean copy of the current scene."""
         arrays = {name: tensor.detach().cpu().numpy().copy() for name, tensor in self.parameters.items()}
         return clean(Splats(**arrays))[0]
 
     def state(self) -> dict[str, np.ndarray]:
-        """Everything, to go on from later: see :meth:`restored`."""
-        return self._leaves.state()
+        """Return the full state as arrays, see :meth:`restored`."""
+        return self._adam.state()
 
     @classmethod
     def restored(
-        cls, state: Mapping[str, np.ndarray], device: Device = "cpu", reach: Float32[np.ndarray, " N"] | None = None
+        cls, state: Mapping[str, np.ndarray], device: Device = "cpu", extents: Float32[np.ndarray, " N"] | None = None
     ) -> GaussianModel:
-        """One that goes on exactly as the one whose :meth:`state` this was, if its ``reach`` was the same."""
-        model = cls(Splats(**{name: state[name] for name in ATTRIBUTES}), device, reach)
-        model._leaves.restore(state)
+        """Return a model that continues exactly from a :meth:`state`; ``extents`` must be those of its model."""
+        model = cls(Splats(**{name: state[name] for name in ATTRIBUTES}), device, extents)
+        model._adam.restore(state)
         return model

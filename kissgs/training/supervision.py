@@ -1,4 +1,4 @@
-"""From where a scene is scored, fitted and judged while it is compacted or fine-tuned."""
+"""Supervision views: the views that train, score and evaluate a scene during compaction or fine-tuning."""
 
 from __future__ import annotations
 
@@ -17,31 +17,32 @@ from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
 from kissgs.settings.training import TrainingViewSettings
 
-SCORED = 4
-"""Of virtual cameras to learn from, one in so many scores."""
+SCORING_STRIDE = 4
+"""Every so many-th virtual training camera scores Gaussians."""
 
-CLOSE, CLOSE_SHRINK = 4, 4
-"""Close-ups that score beside each virtual camera that does, and how much shorter their sides are."""
+CLOSE_UPS, CLOSE_UP_SHRINK = 4, 4
+"""Number of close-ups per virtual scoring camera, and the factor by which their sides are shorter."""
 
-BACKDROPS = (0.0, 0.5, 1.0)
-"""Grey levels behind what virtual cameras score."""
+BACKGROUNDS = (0.0, 0.5, 1.0)
+"""Grey levels of the backgrounds of virtual scoring cameras, in turn."""
 
 MAX_EVAL_VIEWS = 16
-"""Held-out views that are looked at, at most."""
+"""Largest number of evaluation views."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SupervisionViews:
-    """Views, all at the size at which to learn.
+    """Views by their role, all at the training resolution.
 
     Attributes:
-        train: to learn from; one or more.
-        score: to score by: those of a capture; or some virtual ones and close-ups, each before a background of its own.
-        test: to judge by: held out, or where no view is, some of those to learn from. All have photographs, or none.
-        background: ``(3,)`` RGB over which to render.
-        source: for people.
-        captured: whether the views to learn from are those of a capture.
-        note: a sentence for people about what they may not have expected, without a capital and a full stop; or none.
+        train: training views, one or more.
+        score: views that score Gaussians: the training views of a capture, or some virtual cameras and close-ups, each
+            with a background of its own.
+        test: evaluation views: held-out views, or some training views if there are none. All have photographs or none.
+        background: ``(3,)`` RGB from 0 to 1.
+        source: description of the training views.
+        captured: whether the training views are those of a capture.
+        note: note for the user, a sentence without capital and full stop; may be empty.
     """
 
     train: tuple[View, ...]
@@ -54,7 +55,7 @@ class SupervisionViews:
 
     @property
     def eval_views(self) -> Views:
-        """The views to judge by, for :func:`kissgs.evaluate`."""
+        """Evaluation views, for :func:`kissgs.evaluate`."""
         return Views((), self.test, self.background, self.source)
 
 
@@ -63,96 +64,99 @@ def supervision_views(
     views: Views | None,
     settings: TrainingViewSettings,
     *,
-    scored: int = SCORED,
+    scoring_stride: int = SCORING_STRIDE,
     threads: int = 0,
     progress: Progress = silent,
 ) -> SupervisionViews:
-    """A capture's views for training and a few virtual ones all around, or virtual ones alone if there is none.
+    """Return a capture's training views with a few virtual ones around them, or virtual views alone.
 
     Args:
-        splats: finite.
-        views: of a capture. Where none is for training, virtual ones teach and these judge.
-        settings: how many virtual views, and the size of pictures; smaller ones stay as they are.
-        scored: one in so many virtual views scores; 1 where they are for nothing else, and :data:`SCORED` times fewer
-            will do; 0 if none has to.
-        threads: 0 means one per processor.
+        splats: the scene, finite.
+        views: views of a capture. Without training views, virtual ones train and the test views evaluate.
+        settings: number of virtual views, and largest image size; smaller images stay as they are.
+        scoring_stride: every so many-th virtual view scores. 1: no view trains, so that :data:`SCORING_STRIDE` times
+            fewer are drawn; 0: none scores.
+        threads: number of threads; 0 means one per processor.
         progress: receives the stage ``"cameras"``.
     """
     if views is None or not views.train:
-        alone = _virtual(splats, settings, scored, threads, progress)
+        virtual = _virtual_views(splats, settings, scoring_stride, threads, progress)
         if views is None or not views.test:
-            return alone
-        return replace(alone, test=_held_out(views, settings.view_size), background=views.background)
+            return virtual
+        return replace(virtual, test=_evaluation_views(views, settings.view_size), background=views.background)
     size, train, source = settings.view_size, views.train, views.source
     if settings.synthetic_view_share > 0:
         camera = views.train[0].camera.at_most(size)
         side = round(math.sqrt(camera.width * camera.height))
         count = max(1, round(len(views.train) * settings.synthetic_view_share / (1 - settings.synthetic_view_share)))
-        around = scene_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
-        train, source = (*train, *around.all), f"{source}, and {around.source}"
-    sized = _sized(train, size)
-    unheld = "" if views.test else "no view is held out: the figures are those of views that were learned from"
+        synthetic = scene_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
+        train, source = (*train, *synthetic.all), f"{source}, and {synthetic.source}"
+    resized = _resized(train, size)
+    note = "" if views.test else "no view is held out: training views are used for evaluation too"
     return SupervisionViews(
-        train=sized,
-        score=sized,
-        test=_held_out(views, size),
+        train=resized,
+        score=resized,
+        test=_evaluation_views(views, size),
         background=views.background,
         source=source,
         captured=True,
-        note="; ".join(filter(None, [views.note, unheld])),
+        note="; ".join(filter(None, [views.note, note])),
     )
 
 
-def _held_out(views: Views, size: int) -> tuple[View, ...]:
-    """Those of a capture to judge by, at most so large: all with photographs, or none."""
-    return _sized(_some(_alike(views.test or views.train)), size)
+def _evaluation_views(views: Views, size: int) -> tuple[View, ...]:
+    """Return the evaluation views of a capture, at most ``size`` pixels on a side: all with photographs, or none."""
+    return _resized(_evenly_selected(_photographed(views.test or views.train)), size)
 
 
-def _alike(views: Sequence[View]) -> Sequence[View]:
-    """Those with a photograph, if any has one."""
+def _photographed(views: Sequence[View]) -> Sequence[View]:
+    """Return the views with a photograph, or all if none has one."""
     return [view for view in views if view.photo is not None] or views
 
 
-def _virtual(
+def _virtual_views(
     splats: Splats, settings: TrainingViewSettings, stride: int, threads: int, progress: Progress
 ) -> SupervisionViews:
-    """Where the scene is its own teacher, pictures of it cost nothing but time."""
+    """Return virtual views only; their targets are renderings of the scene."""
     side = settings.view_size * 3 // 5
-    found = random_poses(
+    drawn = random_poses(
         splats,
         side=side,
-        count=max(1, settings.views * (stride or SCORED) // SCORED),
+        count=max(1, settings.views * (stride or SCORING_STRIDE) // SCORING_STRIDE),
         seed=settings.seed,
         threads=threads,
         progress=progress,
     )
-    scoring = _to_score_by(splats, found.train[::stride], side, settings.seed) if stride else ()
-    close = len(scoring) - len(found.train[::stride]) if stride else 0
+    scoring = _scoring_views(splats, drawn.train[::stride], side, settings.seed) if stride else ()
+    close_up_count = len(scoring) - len(drawn.train[::stride]) if stride else 0
     return SupervisionViews(
-        train=found.train,
+        train=drawn.train,
         score=scoring,
-        test=tuple(_some(found.test or found.train)),
-        background=found.background,
-        source=f"{len(found.train)} virtual camera{'' if len(found.train) == 1 else 's'}"
-        + (f", and {close} close-ups that score" if close else ""),
+        test=tuple(_evenly_selected(drawn.test or drawn.train)),
+        background=drawn.background,
+        source=f"{len(drawn.train)} virtual camera{'' if len(drawn.train) == 1 else 's'}"
+        + (f", and {close_up_count} close-ups that score" if close_up_count else ""),
     )
 
 
-def _to_score_by(splats: Splats, views: Sequence[View], side: int, seed: int) -> tuple[View, ...]:
-    """Those and close-ups beside them, before black, grey and white in turn: what is dark does not show on black."""
-    close = close_ups(splats, side=max(1, side // CLOSE_SHRINK), count=CLOSE * len(views), seed=seed)
-    added = [View(f"close-up {n}", camera) for n, camera in enumerate(close)]
+def _scoring_views(splats: Splats, views: Sequence[View], side: int, seed: int) -> tuple[View, ...]:
+    """Return ``views`` and close-ups with black, grey and white backgrounds in turn: on black, dark parts do not show.
+
+    ``side`` is that of the views, pixels.
+    """
+    cameras = close_ups(splats, side=max(1, side // CLOSE_UP_SHRINK), count=CLOSE_UPS * len(views), seed=seed)
+    added = [View(f"close-up {n}", camera) for n, camera in enumerate(cameras)]
     return tuple(
-        replace(view, background=np.full(3, BACKDROPS[n % len(BACKDROPS)], np.float32))
-        for part in (views, added)
-        for n, view in enumerate(part)
+        replace(view, background=np.full(3, BACKGROUNDS[n % len(BACKGROUNDS)], np.float32))
+        for group in (views, added)
+        for n, view in enumerate(group)
     )
 
 
-def _sized(views: Iterable[View], size: int) -> tuple[View, ...]:
+def _resized(views: Iterable[View], size: int) -> tuple[View, ...]:
     return tuple(view.at_most(size) for view in views)
 
 
-def _some(views: Sequence[View]) -> list[View]:
-    chosen = np.unique(np.linspace(0, len(views) - 1, MAX_EVAL_VIEWS).astype(int))
-    return [views[n] for n in chosen]
+def _evenly_selected(views: Sequence[View]) -> list[View]:
+    selected = np.unique(np.linspace(0, len(views) - 1, MAX_EVAL_VIEWS).astype(int))
+    return [views[n] for n in selected]

@@ -96,7 +96,7 @@ def test_ctrl_c_leaves_a_checkpoint_to_resume_from(folder: Path, tmp_path: Path)
     kissgs.save(SCENE, scene)
     longer = ["--set", "sparsify_steps=300", "--set", "refine_steps=300", "--set", "views=24", "--set", "view_size=48"]
     words = ["compact", scene, "-n", "300", "-o", target, "--checkpoint", "--quiet", *longer]
-    program = "import kissgs.training.checkpoint as c; c.SECONDS = 0; from kissgs.cli.main import main; main()"
+    program = "import kissgs.training.checkpoint as c; c.SAVE_INTERVAL = 0; from kissgs.cli.main import main; main()"
     process = subprocess.Popen([KISSGS.with_name("python"), "-c", program, *map(str, words)], stderr=subprocess.PIPE)
     kept = tmp_path / "a.checkpoint.npz"
     deadline = time.monotonic() + 90

@@ -44,8 +44,8 @@ def test_the_table_says_what_was_compared(folder: Path) -> None:
     assert "1.0x smaller" in text
     assert "1,500 of 1,500 Gaussians" in text
     rows = {row.split()[0]: row.split()[1:] for row in text.splitlines() if row.startswith(("images/", "mean"))}
-    assert rows["images/a.png"] == found.views[0].comparison.spelled()
-    assert rows["mean"] == found.mean.spelled()
+    assert rows["images/a.png"] == found.views[0].comparison.cells()
+    assert rows["mean"] == found.mean.cells()
 
 
 def test_without_views_it_draws_cameras_and_folders_are_scenes_too(folder: Path, tmp_path: Path) -> None:
@@ -148,7 +148,7 @@ def test_compressing_can_evaluate(folder: Path, tmp_path: Path) -> None:
     assert report == json.loads(json.dumps(found.as_dict()))
     assert (tmp_path / "a.zip").read_bytes() == kissgs.compress(folder / "a.ply", views=views).to_zip()
     text = run(*words, "--force").stdout.decode()
-    psnr, ssim = found.mean.candidate.spelled()
+    psnr, ssim = found.mean.candidate.cells()
     assert f"PSNR {psnr} dB, SSIM {ssim} to 1 held-out photograph; the scene itself" in text
     run(*[word for word in words if word != "--evaluate"], "--force")
     assert (tmp_path / "a.zip").read_bytes() == kissgs.compress(folder / "a.ply", views=views).to_zip()

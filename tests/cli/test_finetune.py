@@ -65,7 +65,7 @@ def test_ctrl_c_leaves_a_checkpoint_to_resume_from(tmp_path: Path) -> None:
     scene, target = tmp_path / "a.ply", tmp_path / "b.zip"
     kissgs.save(SCENE, scene)
     words = ["compress", scene, "-o", target, "--finetune", "300", "--checkpoint", "--quiet", *OPTIONS]
-    program = "import kissgs.training.checkpoint as c; c.SECONDS = 0; from kissgs.cli.main import main; main()"
+    program = "import kissgs.training.checkpoint as c; c.SAVE_INTERVAL = 0; from kissgs.cli.main import main; main()"
     process = subprocess.Popen([KISSGS.with_name("python"), "-c", program, *map(str, words)], stderr=subprocess.PIPE)
     kept = tmp_path / "a.checkpoint-finetune.npz"
     deadline = time.monotonic() + 90

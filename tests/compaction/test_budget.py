@@ -12,7 +12,7 @@ from kissgs import CompactSettings, UnsupportedError
 from kissgs.cameras.views import View, Views, black
 from kissgs.compaction.budget import compact_scene
 from kissgs.evaluation.evaluate import evaluate
-from kissgs.evaluation.psnr_loss import USUAL, drop_of
+from kissgs.evaluation.psnr_loss import ASSUMED_PSNR, drop_of
 from kissgs.rendering.rasterizer import render
 
 ONLY_PRUNE = {"sparsify_steps": 0, "refine_steps": 0, "min_keep_per_scoring": 0.6}
@@ -109,8 +109,8 @@ def test_without_photographs_errors_add_up_to_those_of_a_usual_capture():
     """Independent noise: of 30 dB in the scene, and as much again, is 3 dB."""
     rng = np.random.default_rng(0)
     truth = np.full((64, 64, 3), 0.5)
-    scene, worse = truth + rng.normal(0, 10 ** (-USUAL / 20), truth.shape), None
-    for error in (USUAL, 40.0, 50.0):
+    scene, worse = truth + rng.normal(0, 10 ** (-ASSUMED_PSNR / 20), truth.shape), None
+    for error in (ASSUMED_PSNR, 40.0, 50.0):
         worse = scene + rng.normal(0, 10 ** (-error / 20), truth.shape)
         psnr = [-10 * math.log10(np.mean((a - b) ** 2)) for a, b in ((scene, truth), (worse, truth), (worse, scene))]
         told = evaluation_of(psnr[2])

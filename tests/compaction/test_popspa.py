@@ -277,9 +277,9 @@ def test_virtual_views_teach_where_there_is_no_capture():
     assert [view.background for view in found.train] == [None] * len(found.train)
     assert len(found.test) == min(-(-len(found.train) // 7), 16)
     assert all(max(view.camera.width, view.camera.height) <= 50 for view in found.train)
-    pruned = supervision_views(scene, None, settings(views=64, view_size=50), scored=1)
+    pruned = supervision_views(scene, None, settings(views=64, view_size=50), scoring_stride=1)
     assert len(pruned.score) == len(found.score)
-    assert supervision_views(scene, None, settings(views=64, view_size=50), scored=0).score == ()
+    assert supervision_views(scene, None, settings(views=64, view_size=50), scoring_stride=0).score == ()
     result = popspa(scene, 100, settings(), found)
     assert result.report.target_source == "renderings"
     assert result.report.source.startswith(f"{len(found.train)} virtual cameras, and ")

@@ -1,4 +1,4 @@
-"""Cameras to judge by. Oracles: the places of clusters that were put there, and distances computed one by one."""
+"""Evaluation cameras. Oracles: known positions of clusters, and distances computed one by one."""
 
 import subprocess
 import sys
@@ -11,8 +11,8 @@ import pytest
 import kissgs
 from kissgs.core.errors import InvalidViewsError
 from kissgs.core.splats import ATTRIBUTES, Splats
-from kissgs.evaluation.camera_sampling import BACKGROUNDS, NEAREST
-from kissgs.evaluation.cameras import EMPTY, HEIGHT, KINDS, WIDTH, evaluation_views
+from kissgs.evaluation.camera_sampling import BACKGROUNDS, MIN_DISTANCE
+from kissgs.evaluation.cameras import HEIGHT, KINDS, MIN_MEAN_ALPHA, WIDTH, evaluation_views
 from kissgs.rendering.rasterizer import render
 
 ROOT = Path(__file__).parents[2]
@@ -39,7 +39,7 @@ def alpha(scene, view):
     return float(render(scene, view.camera)[1].mean())
 
 
-def test_the_same_seed_draws_the_same_and_another_one_others():
+def test_cameras_depend_on_the_seed_but_not_on_threads():
     first = cameras_of(evaluation_views(SCENE, threads=1))
     assert first == cameras_of(evaluation_views(SCENE, threads=3))
     other = cameras_of(evaluation_views(SCENE, seed=1))
@@ -47,7 +47,7 @@ def test_the_same_seed_draws_the_same_and_another_one_others():
     assert not set(first) & set(cameras_of(kissgs.virtual_views(SCENE, width=WIDTH, height=HEIGHT)))
 
 
-def test_kinds_take_turns_and_so_do_backgrounds():
+def test_kinds_and_backgrounds_alternate():
     views = evaluation_views(SCENE, count=24)
     assert views.train == ()
     assert [view.name for view in views.test] == sorted(view.name for view in views.test)
@@ -65,39 +65,39 @@ def test_kinds_take_turns_and_so_do_backgrounds():
 
 
 def test_every_view_shows_something():
-    assert min(alpha(SCENE, view) for view in evaluation_views(SCENE, seed=2).test) > EMPTY / 2
+    assert min(alpha(SCENE, view) for view in evaluation_views(SCENE, seed=2).test) > MIN_MEAN_ALPHA / 2
 
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize(("by", "scale"), [(10_000.0, 1.0), (10_000.0, 0.02), (40.0, 0.02)])
 def test_every_cluster_gets_cameras(seed, by, scale):
-    """Two objects far apart, or one of them tiny: both are looked at from about their own size."""
+    """Two objects far apart, or one of them tiny: both get cameras at a distance of about their own size."""
     second = moved(by=(by, 0, 0), scale=scale)
     targets = [
         (view.target, np.linalg.norm(view.camera.position - view.target))
         for view in evaluation_views(joined(SCENE, second), seed=seed).test
     ]
-    extent = 50 * SIZE  # the sample scene stands under a sky
-    near = [away for target, away in targets if np.linalg.norm(target) < extent and away < extent]
-    there = [
-        away
-        for target, away in targets
-        if np.linalg.norm(target - [by, 0, 0]) < extent * scale and away < extent * scale
+    extent = 50 * SIZE  # the sample scene has a sky
+    first = [distance for target, distance in targets if np.linalg.norm(target) < extent and distance < extent]
+    other = [
+        distance
+        for target, distance in targets
+        if np.linalg.norm(target - [by, 0, 0]) < extent * scale and distance < extent * scale
     ]
-    assert len(near) >= 3
-    assert len(there) >= 3
+    assert len(first) >= 3
+    assert len(other) >= 3
 
 
-def test_a_small_cluster_beside_a_hundred_times_as_many_gets_its_turn():
+def test_a_cluster_of_a_hundredth_of_the_gaussians_gets_cameras():
     rng = np.random.default_rng(1)
     few = moved(SCENE.select(rng.choice(1500, 15, replace=False)), by=(3000, 0, 0))
     found = [
         view.target[0] > 2000 for seed in range(6) for view in evaluation_views(joined(SCENE, few), seed=seed).test
     ]
-    assert sum(found) >= 6  # a hundredth of 108 cameras that look at what is near would be one
+    assert sum(found) >= 6  # a hundredth of the 108 cameras with near targets would be one
 
 
-def test_one_outlier_does_not_take_the_cameras_away():
+def test_one_outlier_does_not_attract_the_cameras():
     far = moved(SCENE.select(slice(0, 1)), by=(1e6, 0, 0))
     for seed in range(3):
         views = evaluation_views(joined(SCENE, far), seed=seed).test
@@ -105,8 +105,8 @@ def test_one_outlier_does_not_take_the_cameras_away():
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7])
-def test_few_gaussians(count):
-    """The first of the sample scene, all in sight: they fill part of every picture."""
+def test_scenes_of_few_gaussians_get_cameras(count):
+    """The first Gaussians of the sample scene are all visible: they fill part of every image."""
     scene = SCENE.select(slice(0, count))
     views = evaluation_views(scene)
     assert len(views.test) == 24
@@ -114,7 +114,7 @@ def test_few_gaussians(count):
         assert np.mean([alpha(scene, view) for view in views.test]) > 0.03
 
 
-def test_nothing_visible_and_all_in_one_place():
+def test_scenes_without_visible_gaussians_or_at_one_point_get_cameras():
     hidden = Splats(**{**{name: getattr(SCENE, name) for name in ATTRIBUTES}, "opacities": SCENE.opacities - 99})
     assert len(evaluation_views(hidden).test) == 24
     together = moved(scale=1.0)
@@ -123,35 +123,35 @@ def test_nothing_visible_and_all_in_one_place():
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e6])
-def test_scenes_of_any_size_are_looked_at_alike(scale):
+def test_scenes_of_any_scale_fill_the_images(scale):
     scene = moved(scale=scale, by=(3 * scale, 0, 0))
     views = evaluation_views(scene).test
     assert np.mean([alpha(scene, view) for view in views]) > 0.3
-    assert min(np.linalg.norm(view.camera.position - view.target) for view in views) > 0.99 * NEAREST
+    assert min(np.linalg.norm(view.camera.position - view.target) for view in views) > 0.99 * MIN_DISTANCE
 
 
-def test_close_ups_stand_among_the_nearest():
-    """No nearer than the hundredth, no farther than the thousandth Gaussian, unless the Gaussian itself is large."""
+def test_close_ups_are_among_the_nearest_gaussians():
+    """Between the 100th and the 1000th nearest Gaussian, unless the Gaussian itself is large."""
     for view in evaluation_views(SCENE, seed=1).test:
         if "close-up" in view.name:
-            away = np.linalg.norm(view.camera.position - view.target)
+            distance = np.linalg.norm(view.camera.position - view.target)
             distances = np.linalg.norm(SCENE.means - view.target, axis=1)
             subject = int(distances.argmin())
             own = 5 * float(np.exp(np.sort(SCENE.scales[subject])[1]))
-            nearer = int((distances < away).sum())
-            assert 95 <= nearer <= 1005 or away == pytest.approx(own, rel=1e-3)
+            nearer = int((distances < distance).sum())
+            assert 95 <= nearer <= 1005 or distance == pytest.approx(own, rel=1e-3)
 
 
-def test_impossible_requests_are_refused():
-    for wrong in ({"count": 0}, {"width": 0}, {"height": -1}):
-        with pytest.raises(InvalidViewsError, match="at least 1 view of 1x1 pixels"):
-            evaluation_views(SCENE, **wrong)
-    with pytest.raises(InvalidViewsError, match="a seed is a whole number from 0, not -1"):
+def test_invalid_arguments_are_rejected():
+    for arguments in ({"count": 0}, {"width": 0}, {"height": -1}):
+        with pytest.raises(InvalidViewsError, match="at least 1 view of 1x1"):
+            evaluation_views(SCENE, **arguments)
+    with pytest.raises(InvalidViewsError, match="cameras is -1; give a whole number from 0"):
         evaluation_views(SCENE, seed=-1)
 
 
-def test_nothing_is_shared_with_the_cameras_of_the_encoder():
-    """They, and what they are found by, are not even imported; and the contract of imports names them all."""
+def test_evaluation_does_not_import_the_encoders_cameras():
+    """Neither these nor the modules behind them are imported, and the import contract names them all."""
     code = (
         "import sys, kissgs.evaluation.evaluate, kissgs.evaluation.html, kissgs.evaluation.psnr_loss\n"
         "print(' '.join(name for name in sys.modules if name.startswith('kissgs.')))"

@@ -1,4 +1,4 @@
-"""Oracle: renderings taken and photographs read here, compared by the textbook formulas; fox's README."""
+"""Evaluation of scenes. Oracle: renderings and photographs compared here by the textbook formulas; fox's README."""
 
 import json
 import math
@@ -16,10 +16,10 @@ from kissgs.cameras.captures.load import load_views
 from kissgs.cameras.views import View, Views
 from kissgs.core.errors import Cancelled, InvalidViewsError, UnsupportedError
 from kissgs.core.splats import ATTRIBUTES, Splats
-from kissgs.evaluation import evaluate as pictures
+from kissgs.evaluation import evaluate as evaluation_module
 from kissgs.evaluation.cameras import evaluation_views
-from kissgs.evaluation.evaluate import compare_pictures, evaluate
-from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, ViewComparison, spell
+from kissgs.evaluation.evaluate import compare_images, evaluate
+from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, ViewComparison, format_metric
 from kissgs.evaluation.visibility import share_shown
 from kissgs.rendering.camera import look_at
 from kissgs.rendering.metrics import ssim
@@ -37,7 +37,7 @@ def photo_of(view):
         return np.asarray(image.convert("RGB")).astype(np.float32) / 255
 
 
-def assert_likeness(found, image, target):
+def assert_metrics(found, image, target):
     assert found.psnr == pytest.approx(decibels(image, target), abs=1e-5)
     assert found.ssim == pytest.approx(ssim(image, target), abs=1e-7)
     assert found.lpips is None
@@ -48,28 +48,28 @@ def capture(tmp_path_factory):
     return load_views(write_capture(tmp_path_factory.mktemp("photos") / "capture"))
 
 
-def test_renderings_are_compared_where_there_are_no_photographs():
+def test_without_photographs_renderings_are_compared():
     views = cameras(background=(0.2, 0.5, 1))
     found = evaluate(SCENE, WORSE, views)
     assert (found.against, found.split, found.source) == ("renderings", "test", "cameras by hand")
     assert [each.view for each in found.views] == list(views.test)
     for each in found.views:
         pair = [rendered_view(scene, each.view, (0.2, 0.5, 1)) for scene in (WORSE, SCENE)]
-        assert_likeness(each.comparison.candidate_vs_reference, *pair)
+        assert_metrics(each.comparison.candidate_vs_reference, *pair)
         assert each.comparison.candidate == each.comparison.candidate_vs_reference
         assert each.comparison.reference is None
         assert each.comparison.change is None
 
 
-def test_photographs_are_what_counts_where_there_are_any(capture):
+def test_photographs_are_the_targets_if_there_are_any(capture):
     found = evaluate(SCENE, WORSE, capture, split="all")
     assert (found.against, found.split) == ("photos", "all")
     assert [each.view.name for each in found.views] == ["images/a.png", "images/b.png", "images/c.png"]
     for each in found.views:
         before, after, photo = rendered_view(SCENE, each.view), rendered_view(WORSE, each.view), photo_of(each.view)
-        assert_likeness(each.comparison.reference, before, photo)
-        assert_likeness(each.comparison.candidate, after, photo)
-        assert_likeness(each.comparison.candidate_vs_reference, after, before)
+        assert_metrics(each.comparison.reference, before, photo)
+        assert_metrics(each.comparison.candidate, after, photo)
+        assert_metrics(each.comparison.candidate_vs_reference, after, before)
         assert each.comparison.change == pytest.approx(decibels(after, photo) - decibels(before, photo), abs=1e-5)
         assert each.comparison.change < 0
 
@@ -83,33 +83,33 @@ def test_means_are_means_of_decibels(capture):
         assert mean.lpips is None
 
 
-def test_equal_scenes_are_infinitely_alike(capture):
+def test_equal_scenes_have_infinite_psnr(capture):
     found = evaluate(SCENE, SCENE, capture, split="train")
     assert found.mean.candidate_vs_reference == ImageMetrics(psnr=math.inf, ssim=1.0)
     assert found.mean.change == 0
-    told = json.loads(json.dumps(found.as_dict(), allow_nan=False))
-    assert told["mean"]["candidate_vs_reference"] == {"psnr": None, "ssim": 1.0}
-    assert told["mean"]["reference"] == told["mean"]["candidate"]
+    report = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    assert report["mean"]["candidate_vs_reference"] == {"psnr": None, "ssim": 1.0}
+    assert report["mean"]["reference"] == report["mean"]["candidate"]
 
 
-def test_the_json_has_the_layout_it_is_known_for(capture):
+def test_the_json_has_the_documented_layout(capture):
     found = evaluate(SCENE, WORSE.select(slice(0, 900)), capture)
-    told = json.loads(json.dumps(found.as_dict(), allow_nan=False))
-    assert told["against"] == "photos"
-    assert told["split"] == "test"
-    assert told["source"] == capture.source
-    assert told["count"] == {"reference": 1500, "candidate": 900}
-    (view,) = told["views"]
+    report = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    assert report["against"] == "photos"
+    assert report["split"] == "test"
+    assert report["source"] == capture.source
+    assert report["count"] == {"reference": 1500, "candidate": 900}
+    (view,) = report["views"]
     assert (view["name"], view["width"], view["height"]) == ("images/a.png", 60, 40)
-    assert told["mean"] == {side: view[side] for side in ("reference", "candidate", "candidate_vs_reference")}
+    assert report["mean"] == {side: view[side] for side in ("reference", "candidate", "candidate_vs_reference")}
     assert set(view["reference"]) == {"psnr", "ssim"}
     without = evaluate(SCENE, WORSE, cameras()).as_dict()
     assert without["mean"]["reference"] is None
     assert without["mean"]["candidate"] == without["mean"]["candidate_vs_reference"]
 
 
-def test_scenes_need_not_be_alike_nor_clean():
-    """A NaN Gaussian cannot be drawn; it is removed rather than spread over the picture."""
+def test_scenes_may_differ_in_length_and_need_cleaning():
+    """A Gaussian with NaN is removed instead of spoiling the image."""
     arrays = {name: getattr(SCENE, name).copy() for name in ATTRIBUTES}
     arrays["means"][3] = np.nan
     arrays["quats"][5] *= 4
@@ -118,7 +118,7 @@ def test_scenes_need_not_be_alike_nor_clean():
     assert 0 < found.mean.candidate_vs_reference.psnr < 40
 
 
-def test_threads_do_not_change_the_figures():
+def test_results_do_not_depend_on_threads():
     results = [evaluate(SCENE, WORSE, cameras(), threads=threads).as_dict() for threads in (1, 3)]
     assert results[0] == results[1]
 
@@ -127,41 +127,43 @@ def test_drawn_cameras_are_the_default():
     found, views = evaluate(SCENE, WORSE, seed=3), evaluation_views(SCENE, seed=3)
     assert (found.against, found.split, found.source) == ("renderings", "all", "drawn over the whole scene, seed 3")
     assert found.surroundings is None
-    compared = compare_pictures(SCENE, WORSE, views)
+    compared = compare_images(SCENE, WORSE, views)
     assert [each.comparison for each in found.views] == [each.comparison for each in compared.views]
     assert found.shown == share_shown(SCENE, [view.camera for view in views.test])
 
 
-def test_drawn_cameras_judge_beside_those_of_a_capture(capture):
+def test_drawn_cameras_evaluate_the_surroundings_of_a_capture(capture):
     found, alone = evaluate(SCENE, WORSE, capture), evaluate(SCENE, WORSE)
     assert found.against == "photos"
     assert found.surroundings.as_dict() == alone.as_dict()
     assert [each.comparison for each in found.views] == [
-        each.comparison for each in compare_pictures(SCENE, WORSE, capture).views
+        each.comparison for each in compare_images(SCENE, WORSE, capture).views
     ]
 
 
-def test_each_view_has_a_background_of_its_own_or_that_of_all():
+def test_views_use_their_own_background_or_the_common_one():
     views = cameras(test=2, background=(1, 0, 0))
     white = replace(views.test[1], background=np.ones(3, np.float32))
-    found = compare_pictures(SCENE, WORSE, replace(views, test=(views.test[0], white)))
+    found = compare_images(SCENE, WORSE, replace(views, test=(views.test[0], white)))
     for each, background in zip(found.views, ((1, 0, 0), (1, 1, 1)), strict=True):
         pair = [rendered_view(scene, each.view, background) for scene in (WORSE, SCENE)]
-        assert_likeness(each.comparison.candidate_vs_reference, *pair)
+        assert_metrics(each.comparison.candidate_vs_reference, *pair)
 
 
-def test_pictures_of_the_reference_are_taken_once(monkeypatch):
-    taken, drawn = {}, []
-    first = compare_pictures(SCENE, WORSE, cameras(), taken=taken)
-    monkeypatch.setattr(pictures, "render", lambda *args, **options: drawn.append(args[0]) or render(*args, **options))
-    again = compare_pictures(SCENE, WORSE, cameras(), taken=taken)
+def test_the_reference_is_rendered_once(monkeypatch):
+    reference_images, rendered = {}, []
+    first = compare_images(SCENE, WORSE, cameras(), reference_images=reference_images)
+    monkeypatch.setattr(
+        evaluation_module, "render", lambda *args, **options: rendered.append(args[0]) or render(*args, **options)
+    )
+    again = compare_images(SCENE, WORSE, cameras(), reference_images=reference_images)
     assert first.as_dict() == again.as_dict()
-    assert len(drawn) == len(taken) == 3
-    assert all((scene.sh0 == WORSE.sh0).all() for scene in drawn)
+    assert len(rendered) == len(reference_images) == 3
+    assert all((scene.sh0 == WORSE.sh0).all() for scene in rendered)
 
 
-def test_a_removed_object_is_found():
-    """The judge of an encoder that looks at the first object alone: the second is a thousand units away."""
+def test_the_loss_of_an_object_is_detected():
+    """The lost object is a thousand units away from the other."""
     away = Splats(**{name: getattr(SCENE, name) + np.float32(1000 * (name == "means")) for name in ATTRIBUTES})
     both = Splats(**{name: np.concatenate([getattr(SCENE, name), getattr(away, name)]) for name in ATTRIBUTES})
     found = evaluate(both, SCENE)
@@ -171,7 +173,7 @@ def test_a_removed_object_is_found():
     assert found.shown > 0.7
 
 
-def test_fox_is_as_good_as_its_readme_says(shared_data):
+def test_fox_has_the_metrics_of_its_readme(shared_data):
     scene = kissgs.load(shared_data / "fox" / "point_cloud.ply")
     found = evaluate(scene, scene, load_views(shared_data / "fox", scale=4))
     assert len(found.views) == 7
@@ -185,31 +187,31 @@ def test_fox_is_as_good_as_its_readme_says(shared_data):
 # --- Splits ---------------------------------------------------------------------------------------
 
 
-def test_splits():
+def test_each_split_evaluates_its_views():
     views = cameras(test=2, train=3)
     for split, wanted in (("test", views.test), ("train", views.train), ("all", views.test + views.train)):
         found = evaluate(SCENE, SCENE, views, split=split)
         assert (found.split, [each.view for each in found.views]) == (split, list(wanted))
 
 
-def test_training_views_stand_in_for_missing_test_views_and_the_result_says_so():
+def test_training_views_replace_missing_test_views():
     found = evaluate(SCENE, SCENE, cameras(test=0, train=2))
     assert (found.split, len(found.views)) == ("train", 2)
     assert found.views_used == "2 training cameras"
 
 
-def test_empty_splits_are_refused():
+def test_empty_splits_are_rejected():
     with pytest.raises(InvalidViewsError, match="the split 'train' of cameras by hand is empty"):
         evaluate(SCENE, SCENE, cameras(test=2, train=0), split="train")
     for split in ("test", "all"):
         with pytest.raises(InvalidViewsError, match="there is no view to evaluate from"):
             evaluate(SCENE, SCENE, cameras(test=0, train=0), split=split)
     with pytest.raises(UnsupportedError, match="there is no split 'val'; choose test, train or all"):
-        pictures._chosen(cameras(), "val")
+        evaluation_module._select_split(cameras(), "val")
 
 
-def test_photographs_of_some_views_are_refused(capture):
-    """Figures of a part would pass for those of the whole."""
+def test_photographs_of_only_some_views_are_rejected(capture):
+    """Otherwise the results of a part would look like those of the whole."""
     mixed = Views(capture.train, cameras(test=1).test, capture.background, "a mixture")
     with pytest.raises(InvalidViewsError, match="1 of 3 views have no photograph, the first is 'view_00'; give all"):
         evaluate(SCENE, SCENE, mixed, split="all")
@@ -225,15 +227,15 @@ def test_missing_photographs_are_an_error(tmp_path):
 # --- Progress, LPIPS, CUDA ------------------------------------------------------------------------
 
 
-def test_progress_and_cancelling():
+def test_progress_is_reported_and_can_cancel():
     events = []
-    compare_pictures(SCENE, SCENE, cameras(test=4), progress=lambda stage, fraction: events.append((stage, fraction)))
+    compare_images(SCENE, SCENE, cameras(test=4), progress=lambda stage, fraction: events.append((stage, fraction)))
     assert [fraction for stage, fraction in events if stage == "evaluate"] == [0, 0.25, 0.5, 0.75, 1]
     assert {stage for stage, _ in events} == {"kernels", "evaluate"}
     events.clear()
     evaluate(SCENE, SCENE, cameras(test=4), progress=lambda stage, fraction: events.append((stage, fraction)))
-    told = [fraction for stage, fraction in events if stage == "evaluate"]
-    np.testing.assert_allclose(told, np.arange(29) / 28)
+    fractions = [fraction for stage, fraction in events if stage == "evaluate"]
+    np.testing.assert_allclose(fractions, np.arange(29) / 28)
     assert list(dict.fromkeys(stage for stage, _ in events)) == ["kernels", "cameras", "evaluate"]
 
     def stop(stage, fraction):
@@ -244,15 +246,17 @@ def test_progress_and_cancelling():
         evaluate(SCENE, SCENE, cameras(test=4), progress=stop)
 
 
-def test_lpips_is_measured_if_asked_for(monkeypatch, capture):
-    monkeypatch.setattr(pictures, "Lpips", lambda device: lambda image, target: float(np.abs(image - target).max()))
+def test_lpips_is_measured_on_request(monkeypatch, capture):
+    monkeypatch.setattr(
+        evaluation_module, "Lpips", lambda device: lambda image, target: float(np.abs(image - target).max())
+    )
     found = evaluate(SCENE, WORSE, cameras(), lpips=True)
     each = [np.abs(rendered_view(WORSE, view) - rendered_view(SCENE, view)).max() for view in cameras().test]
     assert found.mean.candidate_vs_reference.lpips == pytest.approx(np.mean(each))
     assert set(found.as_dict()["mean"]["candidate_vs_reference"]) == {"psnr", "ssim", "lpips"}
 
 
-def test_no_cuda_is_one_sentence():
+def test_missing_cuda_is_an_error():
     import torch
 
     if torch.cuda.is_available():
@@ -261,7 +265,7 @@ def test_no_cuda_is_one_sentence():
         evaluate(SCENE, SCENE, cameras(), device="cuda")
 
 
-# --- Figures --------------------------------------------------------------------------------------
+# --- Metrics --------------------------------------------------------------------------------------
 
 
 def test_a_failed_rendering_is_not_hidden(monkeypatch):
@@ -272,20 +276,20 @@ def test_a_failed_rendering_is_not_hidden(monkeypatch):
         return image, image[..., 0]
 
     views = cameras()
-    monkeypatch.setattr(pictures, "render", fail_once)
+    monkeypatch.setattr(evaluation_module, "render", fail_once)
     found = evaluate(SCENE, SCENE.select(slice(0, 900)), views)
-    told = json.loads(json.dumps(found.as_dict(), allow_nan=False))
-    assert [view["candidate_vs_reference"]["psnr"] for view in told["views"]] == [None, "NaN", None]
-    assert told["mean"]["candidate_vs_reference"] == {"psnr": "NaN", "ssim": "NaN"}
+    report = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    assert [view["candidate_vs_reference"]["psnr"] for view in report["views"]] == [None, "NaN", None]
+    assert report["mean"]["candidate_vs_reference"] == {"psnr": "NaN", "ssim": "NaN"}
 
 
-FIGURES = st.floats(0, 100) | st.sampled_from([math.inf, math.nan])
+PSNRS = st.floats(0, 100) | st.sampled_from([math.inf, math.nan])
 
 
-@given(st.lists(st.tuples(FIGURES, FIGURES, FIGURES), min_size=1, max_size=5))
-def test_any_figures_survive_means_and_json(figures):
+@given(st.lists(st.tuples(PSNRS, PSNRS, PSNRS), min_size=1, max_size=5))
+def test_any_metrics_are_averaged_and_valid_json(psnrs):
     view = View("a", cameras(test=1).test[0].camera)
-    rows = [[ImageMetrics(psnr=value, ssim=0.5) for value in row] for row in figures]
+    rows = [[ImageMetrics(psnr=value, ssim=0.5) for value in row] for row in psnrs]
     compared = tuple(
         ViewComparison(view=view, comparison=Comparison(reference=a, candidate=b, candidate_vs_reference=c))
         for a, b, c in rows
@@ -299,25 +303,25 @@ def test_any_figures_survive_means_and_json(figures):
         candidate_count=1,
         views=compared,
     )
-    told = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    report = json.loads(json.dumps(found.as_dict(), allow_nan=False))
     for i, side in enumerate(("reference", "candidate", "candidate_vs_reference")):
-        column = [row[i] for row in figures]
+        column = [row[i] for row in psnrs]
         mean = None if set(column) == {math.inf} else pytest.approx(np.mean(np.minimum(column, 60)))
-        assert told["mean"][side]["psnr"] == ("NaN" if any(map(math.isnan, column)) else mean)
-    assert all(len(each.comparison.spelled()) == 7 for each in compared)
-    same = [a == b for a, b, _ in figures]
+        assert report["mean"][side]["psnr"] == ("NaN" if any(map(math.isnan, column)) else mean)
+    assert all(len(each.comparison.cells()) == 7 for each in compared)
+    same = [a == b for a, b, _ in psnrs]
     assert all(each.comparison.change == 0 for each, equal in zip(compared, same, strict=True) if equal)
 
 
-def evaluation_of(figures):
-    """Views from one place that have these PSNRs, named by their numbers."""
-    place = cameras(test=1).test[0].camera
+def evaluation_of(psnrs):
+    """Return an evaluation with these PSNRs of views with one camera, named by their indices."""
+    camera = cameras(test=1).test[0].camera
     compared = [
         ViewComparison(
-            view=View(f"{number}", place),
-            comparison=Comparison(reference=None, candidate=told, candidate_vs_reference=told),
+            view=View(f"{number}", camera),
+            comparison=Comparison(reference=None, candidate=metrics, candidate_vs_reference=metrics),
         )
-        for number, told in enumerate(ImageMetrics(psnr=value, ssim=0.5) for value in figures)
+        for number, metrics in enumerate(ImageMetrics(psnr=psnr, ssim=0.5) for psnr in psnrs)
     ]
     return Evaluation(
         against="renderings",
@@ -331,34 +335,34 @@ def evaluation_of(figures):
 
 
 @pytest.mark.parametrize(
-    ("figures", "mean"),
+    ("psnrs", "mean"),
     [((10, math.inf), 35), ((10, 120), 35), ((70, 120), 60), ((20, 40), 30), ((math.inf,) * 2, math.inf)],
 )
-def test_a_view_that_has_lost_nothing_does_not_hide_the_others(figures, mean):
-    """One of 120 dB beside one of 10 once told of 65 on average, and an infinite one of infinitely many."""
-    found = evaluation_of(figures)
+def test_an_unchanged_view_does_not_hide_the_others(psnrs, mean):
+    """Without a limit, 120 dB and 10 dB would have a mean of 65, and an infinite PSNR an infinite one."""
+    found = evaluation_of(psnrs)
     assert found.mean.candidate_vs_reference.psnr == mean
-    assert found.worst.comparison.candidate_vs_reference.psnr == min(figures)
-    assert [each.comparison.candidate_vs_reference.psnr for each in found.views] == list(figures)
+    assert found.worst.comparison.candidate_vs_reference.psnr == min(psnrs)
+    assert [each.comparison.candidate_vs_reference.psnr for each in found.views] == list(psnrs)
 
 
-@given(st.lists(FIGURES, min_size=1, max_size=45))
-def test_the_worst_view_and_the_fifth_percentile(figures):
+@given(st.lists(PSNRS, min_size=1, max_size=45))
+def test_the_worst_view_and_the_fifth_percentile(psnrs):
     """Oracle: sorting, and NumPy's percentile where all is finite."""
-    found = evaluation_of(figures)
-    place = found.views[0].view.camera
-    failed = [number for number, value in enumerate(figures) if math.isnan(value)]
-    assert int(found.worst.view.name) == (failed[0] if failed else figures.index(min(figures)))
-    told = json.loads(json.dumps(found.as_dict(), allow_nan=False))
-    assert told["worst"]["name"] == found.worst.view.name
-    assert told["worst"]["position"] == place.position.tolist()
-    assert told["worst"]["target"] is None
+    found = evaluation_of(psnrs)
+    camera = found.views[0].view.camera
+    failed = [number for number, value in enumerate(psnrs) if math.isnan(value)]
+    assert int(found.worst.view.name) == (failed[0] if failed else psnrs.index(min(psnrs)))
+    report = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    assert report["worst"]["name"] == found.worst.view.name
+    assert report["worst"]["position"] == camera.position.tolist()
+    assert report["worst"]["target"] is None
     if failed:
         assert math.isnan(found.fifth_percentile)
-    elif all(map(math.isfinite, figures)):
-        assert found.fifth_percentile == pytest.approx(np.percentile(figures, 5))
+    elif all(map(math.isfinite, psnrs)):
+        assert found.fifth_percentile == pytest.approx(np.percentile(psnrs, 5))
     else:
-        assert min(figures) <= found.fifth_percentile
+        assert min(psnrs) <= found.fifth_percentile
     assert "worst view" in found.extremes
 
 
@@ -372,15 +376,15 @@ def test_the_worst_view_and_the_fifth_percentile(figures):
         (math.nan, 0, "NaN"),
     ],
 )
-def test_spelling(value, signed, text):
-    assert spell(value, 2, signed=bool(signed)) == text
+def test_values_are_formatted(value, signed, text):
+    assert format_metric(value, 2, signed=bool(signed)) == text
 
 
-def test_pictures_of_nothing_are_told_apart_from_perfect_ones() -> None:
-    """Equal because both are black: 1e12 world units away, beyond what renderers draw."""
+def test_empty_images_are_noted() -> None:
+    """Both images are black: the scene is 1e12 world units away, beyond what renderers draw."""
     scene = kissgs.sample_scene(50, sh_degree=0)
     away = Splats(**{name: getattr(scene, name) + (1e12 if name == "means" else 0) for name in ATTRIBUTES})
-    assert "say nothing" in evaluate(away, scene, looking_away()).note
+    assert "mean nothing" in evaluate(away, scene, looking_away()).note
     assert evaluate(scene.select(slice(0)), scene, looking_away()).note == ""
     assert evaluate(scene, scene).note == ""
 

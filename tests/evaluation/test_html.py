@@ -1,4 +1,4 @@
-"""The page as a strict reader sees it. Oracles: html.parser, Pillow, and places and colours found the slow way."""
+"""HTML reports, read by a strict parser. Oracles: html.parser, Pillow, and errors searched window by window."""
 
 import base64
 import io
@@ -15,17 +15,17 @@ from kissgs.cameras.captures.load import load_views
 from kissgs.cameras.views import View, Views
 from kissgs.core.errors import Cancelled
 from kissgs.core.splats import ATTRIBUTES, Splats
-from kissgs.evaluation.error_maps import SCALES, STOPS, WINDOW, difference, full_scale, heat_map, worst_place
-from kissgs.evaluation.evaluate import compare_pictures, evaluate
-from kissgs.evaluation.html import MOST_ELSEWHERE, MOST_VIEWS, Side, chosen_views, html_report
+from kissgs.evaluation.error_maps import FULL_SCALES, INFERNO, WINDOW, full_scale, heat_map, rms_difference, worst_crop
+from kissgs.evaluation.evaluate import compare_images, evaluate
+from kissgs.evaluation.html import MAX_SURROUNDINGS, MAX_VIEWS, ReportScene, html_report, select_views
 
 WORSE = damaged()
 VOID = {"meta", "link", "img", "input", "br"}
-NASTY = "<script>alert(\"1\")</script> & 'two' $table"
+MARKUP = "<script>alert(\"1\")</script> & 'two' $table"
 
 
 class Page(HTMLParser):
-    """Elements, text and attributes; every element must be closed."""
+    """Collects elements, text and images; every element must be closed."""
 
     def __init__(self, text):
         super().__init__(convert_charrefs=True)
@@ -59,15 +59,15 @@ class Page(HTMLParser):
 
 
 def report(views, *, candidate=WORSE, names=("a.ply", "b.zip"), sizes=(20_000, 4_000), found=None):
-    found = found or compare_pictures(SCENE, candidate, views)
+    found = found or compare_images(SCENE, candidate, views)
     sides = [
-        Side(name=name, splats=scene, bytes=size)
+        ReportScene(name=name, splats=scene, bytes=size)
         for name, scene, size in zip(names, (SCENE, candidate), sizes, strict=True)
     ]
     return html_report(found, *sides), found
 
 
-def test_the_page_needs_nothing_beside_itself():
+def test_the_page_is_self_contained():
     text, _ = report(cameras())
     page = Page(text)
     for tag, attributes in page.elements:
@@ -80,7 +80,7 @@ def test_the_page_needs_nothing_beside_itself():
     assert "default-src 'none'" in text
 
 
-def test_pictures_of_every_view_without_photographs():
+def test_every_view_has_images_without_photographs():
     text, found = report(cameras(test=3))
     page = Page(text)
     worst = min(range(3), key=lambda i: found.views[i].comparison.candidate_vs_reference.psnr)
@@ -90,74 +90,74 @@ def test_pictures_of_every_view_without_photographs():
     first = page.images[:6]
     assert all(image.shape == (40, 60, 3) for image in first)
     view, wanted = found.views[worst].view, {}
-    for at, scene in (("candidate", WORSE), ("reference", SCENE)):
-        wanted[at] = np.rint(255 * rendered_view(scene, view)).astype(np.uint8)
+    for side, scene in (("candidate", WORSE), ("reference", SCENE)):
+        wanted[side] = np.rint(255 * rendered_view(scene, view)).astype(np.uint8)
     assert np.abs(first[0].astype(int) - wanted["candidate"]).mean() < 6  # lossy
     np.testing.assert_array_equal(first[3], wanted["reference"])  # crops are lossless
     np.testing.assert_array_equal(first[4], wanted["candidate"])
 
 
-def test_photographs_are_shown_where_there_are_any(tmp_path):
+def test_photographs_are_shown_if_there_are_any(tmp_path):
     views = load_views(write_capture(tmp_path / "capture"))
     text, found = report(views, found=evaluate(SCENE, WORSE, views, split="all"))
     page = Page(text)
-    assert len(page.images) == 3 * (4 + 4) + MOST_ELSEWHERE * (3 + 3)
+    assert len(page.images) == 3 * (4 + 4) + MAX_SURROUNDINGS * (3 + 3)
     np.testing.assert_array_equal(page.images[6], found.worst.view.load_photo())
-    for told in (found, found.surroundings):
-        assert told.worst.view.name in page.text
-        assert told.worst.place in page.text
-        assert told.extremes in page.text
+    for evaluation in (found, found.surroundings):
+        assert evaluation.worst.view.name in page.text
+        assert evaluation.worst.pose in page.text
+        assert evaluation.extremes in page.text
     for compared in found.views:
-        for cell in compared.comparison.spelled():
+        for cell in compared.comparison.cells():
             assert cell.replace("-", "−") in page.text
     assert "5.0× smaller" in page.text
     assert "0.02 → 0.00 MB" in page.text
 
 
 def test_names_are_escaped(tmp_path):
-    view = View(NASTY, camera(0))
-    text, _ = report(Views((), (view,), np.zeros(3, np.float32), NASTY), names=(NASTY, NASTY))
+    view = View(MARKUP, camera(0))
+    text, _ = report(Views((), (view,), np.zeros(3, np.float32), MARKUP), names=(MARKUP, MARKUP))
     page = Page(text)
     assert len(page.of("script")) == 1
     assert "<script>alert" not in text
-    assert page.text.count(NASTY) >= 5
-    assert any(image["alt"].endswith(NASTY) for image in page.of("img"))
+    assert page.text.count(MARKUP) >= 5
+    assert any(image["alt"].endswith(MARKUP) for image in page.of("img"))
 
 
-def test_a_scene_beside_itself():
+def test_equal_scenes_have_a_report():
     text, _ = report(cameras(test=1), candidate=SCENE, sizes=(10, 40))
     page = Page(text)
     assert "∞ dB" in page.text
     assert "1 levels of 255" in page.text
     assert "4.0× larger" in page.text
-    assert (page.images[2] == STOPS[0]).mean() > 0.9
+    assert (page.images[2] == INFERNO[0]).mean() > 0.9
     text, _ = report(cameras(test=1), candidate=SCENE, sizes=(None, None))
     assert "1,500 of 1,500 Gaussians" in text
 
 
-def test_large_pictures_are_reduced_and_crops_are_not():
+def test_large_images_are_reduced_but_crops_are_not():
     page = Page(report(cameras(test=1, size=(1500, 300)))[0])
     assert [image.shape for image in page.images] == [(256, 1280, 3)] * 3 + [(150, 150, 3)] * 3
 
 
-def test_twelve_of_many_views_and_the_worst_among_them():
+def test_twelve_of_many_views_are_shown_the_worst_first():
     one = SCENE.select(slice(0, 300))
     views = cameras(test=30, train=0, size=(8, 6))
-    found = compare_pictures(one, damaged(one), views)
-    shown = chosen_views(found)
+    found = compare_images(one, damaged(one), views)
+    shown = select_views(found)
     worst = int(np.argmin([each.comparison.candidate_vs_reference.psnr for each in found.views]))
-    assert len(shown) == len(set(shown)) == MOST_VIEWS
+    assert len(shown) == len(set(shown)) == MAX_VIEWS
     assert shown[0] == worst
     assert shown[1:] == sorted(shown[1:])
     assert np.diff(sorted(shown)).max() <= 6
-    text = html_report(found, Side(name="a", splats=one), Side(name="b", splats=damaged(one)))
+    text = html_report(found, ReportScene(name="a", splats=one), ReportScene(name="b", splats=damaged(one)))
     page = Page(text)
     assert [section["id"] for section in page.of("section") if "id" in section] == [f"view-{i}" for i in shown]
     assert {link["href"] for link in page.of("a")} == {f"#view-{i}" for i in shown}
 
 
-def test_cancelling():
-    found = compare_pictures(SCENE, SCENE, cameras())
+def test_progress_can_cancel():
+    found = compare_images(SCENE, SCENE, cameras())
     events = []
 
     def stop(stage, fraction):
@@ -166,35 +166,35 @@ def test_cancelling():
             raise Cancelled("enough")
 
     with pytest.raises(Cancelled):
-        html_report(found, Side(name="a", splats=SCENE), Side(name="b", splats=SCENE), progress=stop)
+        html_report(found, ReportScene(name="a", splats=SCENE), ReportScene(name="b", splats=SCENE), progress=stop)
     assert events == [("html", 0), ("html", 1 / 3)]
 
 
-# --- Differences ----------------------------------------------------------------------------------
+# --- Error maps ----------------------------------------------------------------------------------
 
 
-def test_a_difference_is_in_levels():
+def test_differences_are_in_levels():
     black, image = np.zeros((2, 3, 3), np.float32), np.zeros((2, 3, 3), np.float32)
     image[0, 1] = 1
     image[1, 2] = (0, 10 / 255, 0)
     wanted = [[0, 255, 0], [0, 0, 10 / np.sqrt(3)]]
-    np.testing.assert_allclose(difference(image, black), wanted, rtol=1e-6)
+    np.testing.assert_allclose(rms_difference(image, black), wanted, rtol=1e-6)
 
 
-def test_colours_grow_lighter_evenly():
+def test_the_lightness_of_colours_grows_evenly():
     ramp = heat_map(np.linspace(0, 20, 256, dtype=np.float32)[None], 20)[0]
     lightness = ramp @ [0.299, 0.587, 0.114]
-    assert tuple(ramp[0]) == STOPS[0]
-    assert tuple(ramp[-1]) == STOPS[-1]
+    assert tuple(ramp[0]) == INFERNO[0]
+    assert tuple(ramp[-1]) == INFERNO[-1]
     assert np.diff(lightness).min() > -0.5  # they are rounded
     assert np.abs(lightness - np.linspace(0, 245, 256)).max() < 45
-    assert heat_map(np.array([[np.nan, 99]], np.float32), 20).tolist() == [[list(STOPS[-1])] * 2]
+    assert heat_map(np.array([[np.nan, 99]], np.float32), 20).tolist() == [[list(INFERNO[-1])] * 2]
 
 
 @given(st.floats(-10, 150) | st.sampled_from([np.inf, np.nan]))
-def test_full_colour_is_a_round_number_that_fits(psnr):
+def test_the_full_scale_is_a_round_number_near_four_times_the_error(psnr):
     full = full_scale(psnr)
-    assert full in SCALES
+    assert full in FULL_SCALES
     if psnr < 100:
         mean_error = 255 * 10 ** (-psnr / 20)
         assert full == 255 or full >= 4 * mean_error
@@ -203,11 +203,11 @@ def test_full_colour_is_a_round_number_that_fits(psnr):
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(1, 90), st.integers(1, 90), st.integers(1, 60), st.integers(0, 2**32 - 1))
-def test_the_worst_place_is_found(height, width, side, seed):
+def test_the_worst_crop_is_centred_on_the_largest_error(height, width, side, seed):
     rng = np.random.default_rng(seed)
     levels = rng.random((height, width)).astype(np.float32)
     levels[rng.integers(height), rng.integers(width)] = 200
-    rows, columns = worst_place(levels, side)
+    rows, columns = worst_crop(levels, side)
     assert (rows.stop - rows.start, columns.stop - columns.start) == (min(side, height), min(side, width))
     assert rows.start >= 0
     assert rows.stop <= height
@@ -222,12 +222,12 @@ def test_the_worst_place_is_found(height, width, side, seed):
     assert columns.start == np.clip(middle[1] - side // 2, 0, width - min(side, width))
 
 
-def test_where_nothing_differs_it_is_the_middle():
-    assert worst_place(np.zeros((200, 301), np.float32), 160) == (slice(20, 180), slice(70, 230))
+def test_without_errors_the_crop_is_the_middle():
+    assert worst_crop(np.zeros((200, 301), np.float32), 160) == (slice(20, 180), slice(70, 230))
 
 
-def test_a_damaged_spot_is_what_is_enlarged():
-    """Where the scene itself is spoilt, there the crop is."""
+def test_damaged_gaussians_are_in_the_crop():
+    """The Gaussians around one pixel are damaged."""
     views = cameras(test=1, size=(400, 300))
     view = views.test[0]
     homogeneous = np.append(SCENE.means, np.ones((len(SCENE), 1)), axis=1) @ view.camera.viewmat.T
@@ -237,8 +237,8 @@ def test_a_damaged_spot_is_what_is_enlarged():
     assert near.any()
     arrays = {name: getattr(SCENE, name).copy() for name in ATTRIBUTES}
     arrays["sh0"][near] += 3
-    spoilt = Splats(**arrays)
-    levels = difference(rendered_view(spoilt, view), rendered_view(SCENE, view))
-    rows, columns = worst_place(levels, 160)
+    damaged_scene = Splats(**arrays)
+    levels = rms_difference(rendered_view(damaged_scene, view), rendered_view(SCENE, view))
+    rows, columns = worst_crop(levels, 160)
     assert rows.start < 200 < rows.stop
     assert columns.start < 300 < columns.stop

@@ -1,4 +1,4 @@
-"""Oracle: permutations that the test itself applied."""
+"""Correspondence of Gaussians. Oracle: permutations that the test applied."""
 
 import sys
 from dataclasses import replace
@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
-from kissgs.evaluation.matching import pair
+from kissgs.evaluation.matching import match_gaussians
 from kissgs.synthetic.scene import sample_scene
 
 
 def disturbed(splats, rng, size=1.0):
-    """With errors as large as coarse codecs make them, times ``size``."""
+    """Return the scene with errors of the magnitude of coarse codecs', times ``size``."""
 
     def noisy(array, error):
         return (array + size * error * rng.standard_normal(array.shape)).astype(np.float32)
@@ -28,11 +28,11 @@ def disturbed(splats, rng, size=1.0):
     )
 
 
-def test_a_shuffled_and_disturbed_scene_is_recognised():
+def test_shuffled_and_disturbed_gaussians_are_matched():
     rng = np.random.default_rng(0)
     scene = sample_scene(10_000)
     order = rng.permutation(len(scene))
-    found = pair(scene, disturbed(scene.select(order), rng))
+    found = match_gaussians(scene, disturbed(scene.select(order), rng))
     assert found.dtype == np.int64
     assert (found == order).mean() > 0.999
     assert len(np.unique(found)) > 0.999 * len(scene)
@@ -42,45 +42,45 @@ def test_dropped_gaussians_leave_their_rows_unused():
     rng = np.random.default_rng(0)
     scene = sample_scene(5000)
     order = rng.permutation(len(scene))[:2000]
-    assert (pair(scene, disturbed(scene.select(order), rng)) == order).mean() > 0.999
+    assert (match_gaussians(scene, disturbed(scene.select(order), rng)) == order).mean() > 0.999
 
 
-def test_other_equivalent_forms_are_recognised():
+def test_equivalent_forms_are_matched():
     scene = sample_scene(2000)
-    renamed = replace(scene, scales=scene.scales[:, [1, 2, 0]])
-    assert (pair(scene, renamed) == np.arange(2000)).all()
+    permuted = replace(scene, scales=scene.scales[:, [1, 2, 0]])
+    assert (match_gaussians(scene, permuted) == np.arange(2000)).all()
 
 
-def test_scrambled_colours_of_invisible_gaussians_do_not_mislead():
+def test_colours_of_invisible_gaussians_are_ignored():
     """splat-transform's WebP images keep no colour under zero alpha."""
     scene = sample_scene(2000)
     opacities, sh0 = scene.opacities.copy(), scene.sh0.copy()
     opacities[::2], sh0[::2] = -13, 2
     candidate = replace(scene, opacities=opacities, sh0=sh0)
-    assert (pair(replace(scene, opacities=opacities), candidate) == np.arange(2000)).mean() > 0.999
+    assert (match_gaussians(replace(scene, opacities=opacities), candidate) == np.arange(2000)).mean() > 0.999
 
 
 @settings(deadline=None, max_examples=50)
 @given(references=st.integers(1, 8), candidates=st.integers(0, 8), seed=st.integers(0, 2**32))
-def test_few_gaussians_are_paired_one_to_one(references, candidates, seed):
-    found = pair(sample_scene(references, seed=seed), sample_scene(candidates, seed=seed + 1))
+def test_few_gaussians_are_matched_one_to_one(references, candidates, seed):
+    found = match_gaussians(sample_scene(references, seed=seed), sample_scene(candidates, seed=seed + 1))
     assert found.shape == (candidates,)
     assert len(np.unique(found)) == min(references, candidates)
     assert ((found >= 0) & (found < references)).all()
 
 
-def test_gaussians_all_alike_are_still_paired():
+def test_equal_gaussians_are_matched_one_to_one():
     scene = sample_scene(1).select(np.zeros(8, np.int64))
-    assert sorted(pair(scene, scene)) == list(range(8))
+    assert sorted(match_gaussians(scene, scene)) == list(range(8))
 
 
-def test_nothing_pairs_with_nothing():
-    assert pair(sample_scene(0), sample_scene(0)).shape == (0,)
-    with pytest.raises(InvalidSceneError, match="empty reference"):
-        pair(sample_scene(0), sample_scene(1))
+def test_empty_scenes():
+    assert match_gaussians(sample_scene(0), sample_scene(0)).shape == (0,)
+    with pytest.raises(InvalidSceneError, match="cannot be matched with an empty reference"):
+        match_gaussians(sample_scene(0), sample_scene(1))
 
 
-def test_the_missing_extra_is_named(monkeypatch):
+def test_a_missing_extra_is_an_error(monkeypatch):
     monkeypatch.setitem(sys.modules, "scipy.spatial", None)
     with pytest.raises(UnsupportedError, match=r"kissgs\[bench\]"):
-        pair(sample_scene(2), sample_scene(2))
+        match_gaussians(sample_scene(2), sample_scene(2))

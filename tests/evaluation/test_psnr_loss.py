@@ -1,4 +1,4 @@
-"""Figures that goals ask for. Oracle: squared errors, added and averaged one by one."""
+"""PSNR and its drop as goals define them. Oracle: squared errors, added and averaged one by one."""
 
 import math
 
@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kissgs.cameras.views import View
-from kissgs.evaluation.psnr_loss import UNEVEN, USUAL, drop_of, psnr_of
+from kissgs.evaluation.psnr_loss import ASSUMED_PSNR, MAX_ERROR_RATIO, drop_of, psnr_of
 from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, ViewComparison
 from kissgs.rendering.camera import look_at
 
@@ -17,22 +17,22 @@ VIEW = View(
 )
 
 
-def likeness(psnr):
+def metrics(psnr):
     return ImageMetrics(psnr=psnr, ssim=0.5)
 
 
-def evaluation_of(between, photos=None):
-    """Views with these PSNRs, and, if given, pairs of the reference's and the candidate's PSNR to photographs."""
+def evaluation_of(psnrs, photo_psnrs=None):
+    """Return an evaluation; ``photo_psnrs``: PSNRs of reference and candidate to the photograph of each view."""
     compared = [
-        Comparison(reference=None, candidate=likeness(psnr), candidate_vs_reference=likeness(psnr)) for psnr in between
+        Comparison(reference=None, candidate=metrics(psnr), candidate_vs_reference=metrics(psnr)) for psnr in psnrs
     ]
-    if photos is not None:
+    if photo_psnrs is not None:
         compared = [
-            Comparison(reference=likeness(one), candidate=likeness(other), candidate_vs_reference=likeness(psnr))
-            for (one, other), psnr in zip(photos, between, strict=True)
+            Comparison(reference=metrics(one), candidate=metrics(other), candidate_vs_reference=metrics(psnr))
+            for (one, other), psnr in zip(photo_psnrs, psnrs, strict=True)
         ]
     return Evaluation(
-        against="renderings" if photos is None else "photos",
+        against="renderings" if photo_psnrs is None else "photos",
         split="all",
         source="",
         background=np.zeros(3, np.float32),
@@ -46,52 +46,54 @@ def squared(psnr):
     return 10 ** (-np.asarray(psnr) / 10)
 
 
-def test_a_mean_does_not_make_up_for_a_part_that_is_lost():
-    """23 views at 44 dB and one at 9 are 42.5 on average; a goal of 42 was met."""
+def test_the_mean_does_not_hide_a_lost_part():
+    """The mean of 23 views at 44 dB and one at 9 dB is 42.5 dB, which would meet a goal of 42 dB."""
     found = evaluation_of([44.0] * 23 + [9.0])
     assert found.mean.candidate_vs_reference.psnr > 42
-    assert psnr_of(found) == pytest.approx(-10 * math.log10((squared(9) + squared(44)) / 2 / UNEVEN))
+    assert psnr_of(found) == pytest.approx(-10 * math.log10((squared(9) + squared(44)) / 2 / MAX_ERROR_RATIO))
     assert psnr_of(found) < 26
-    even = evaluation_of([USUAL + 16.4] * 24)
+    even = evaluation_of([ASSUMED_PSNR + 16.4] * 24)
     assert drop_of(even) == pytest.approx(0.1, abs=0.002)
     assert drop_of(found) > 1
 
 
-def test_views_that_are_only_harder_change_nothing():
+def test_difficult_views_do_not_limit_the_psnr():
     found = evaluation_of([46.0] * 20 + [37.0] * 4)
     assert psnr_of(found) == found.mean.candidate_vs_reference.psnr
     assert drop_of(found) == pytest.approx(
-        10 * math.log10(1 + squared(found.mean.candidate_vs_reference.psnr) / squared(USUAL))
+        10 * math.log10(1 + squared(found.mean.candidate_vs_reference.psnr) / squared(ASSUMED_PSNR))
     )
 
 
 @pytest.mark.parametrize(("count", "worst"), [(1, 1), (20, 1), (21, 2), (96, 5)])
-def test_a_twentieth_of_the_views_is_one_at_least(count, worst):
-    figures = [5.0] + [50.0] * (count - 1)
-    error = np.mean(sorted(squared(figures))[-worst:])
-    assert psnr_of(evaluation_of(figures)) == pytest.approx(min(np.mean(figures), -10 * math.log10(error / UNEVEN)))
+def test_the_worst_five_percent_are_at_least_one_view(count, worst):
+    psnrs = [5.0] + [50.0] * (count - 1)
+    error = np.mean(sorted(squared(psnrs))[-worst:])
+    assert psnr_of(evaluation_of(psnrs)) == pytest.approx(
+        min(np.mean(psnrs), -10 * math.log10(error / MAX_ERROR_RATIO))
+    )
 
 
-def test_photographs_count_by_what_came_on_top():
-    """A view that was bad before is no loss; one that became bad is."""
+def test_with_photographs_only_additional_error_counts():
+    """A view with a low PSNR in the reference is no loss; one whose PSNR drops is."""
     before = [32.0] * 24
     bad = evaluation_of([45.0] * 24, [(30.0, 29.9), (9.0, 9.0), *[(psnr, psnr) for psnr in before[2:]]])
     assert drop_of(bad) == pytest.approx(0.1 / 24, abs=1e-6)
     lost = evaluation_of([45.0] * 24, [(psnr, psnr + 0.5) for psnr in before[1:]] + [(32.0, 20.5)])
     assert lost.mean.change == pytest.approx(0.0, abs=1e-9)
-    top = (squared(20.5) - squared(32.0) + squared(32.5) - squared(32.0)) / 2
-    assert drop_of(lost) == pytest.approx(10 * math.log10(1 + top / squared(32.0) / UNEVEN))
+    added = (squared(20.5) - squared(32.0) + squared(32.5) - squared(32.0)) / 2
+    assert drop_of(lost) == pytest.approx(10 * math.log10(1 + added / squared(32.0) / MAX_ERROR_RATIO))
     better = evaluation_of([45.0] * 24, [(psnr, psnr + 0.5) for psnr in before])
     assert drop_of(better) == pytest.approx(-0.5)
 
 
 @given(st.lists(st.floats(0, 100) | st.sampled_from([math.inf, math.nan]), min_size=1, max_size=45))
-def test_any_figures(figures):
-    found = evaluation_of(figures)
-    if any(map(math.isnan, figures)):
+def test_psnr_and_drop_of_any_values(psnrs):
+    found = evaluation_of(psnrs)
+    if any(map(math.isnan, psnrs)):
         assert math.isnan(psnr_of(found))
         assert math.isnan(drop_of(found))
     else:
         assert psnr_of(found) <= found.mean.candidate_vs_reference.psnr
         assert drop_of(found) >= 0
-        assert (psnr_of(found) == math.inf) == (min(figures) == math.inf)
+        assert (psnr_of(found) == math.inf) == (min(psnrs) == math.inf)

@@ -72,7 +72,7 @@ def test_costs_are_cut_off():
 
 def test_gradients_above_1e15_count_as_that():
     leaves = PrunableAdam({"a": torch.zeros(4, 1)})
-    leaves.by_name["a"].grad = torch.tensor([[1e30], [1e15], [-np.inf], [-3e38]])
+    leaves.parameters["a"].grad = torch.tensor([[1e30], [1e15], [-np.inf], [-3e38]])
     leaves.step({"a": 1.0})
     assert leaves.state()["a.exp_avg"].ravel() / 1e14 == pytest.approx([1, 1, 0, -1])
 

@@ -1,4 +1,4 @@
-"""Oracle: the container that is written, and decoders of it; finite differences; NumPy in float64."""
+"""The differentiable decoder. Oracle: written containers and their decoders; finite differences; float64 NumPy."""
 
 import numpy as np
 import pytest
@@ -17,24 +17,24 @@ from kissgs.sogxt.encode import write_files
 IMAGES = {"opacities": 3, "scales": 3, "quaternions": 4, "f_dc": 3}
 
 
-def container(choice, scene):
-    return write_files(choice, scene, Settings().encode, threads=1).files
+def container(plan, scene):
+    return write_files(plan, scene, Settings().encode, threads=1).files
 
 
-def shown(work):
+def decoded_by(work):
     return Splats(**{name: tensor.detach().numpy() for name, tensor in work.gaussians().items()})
 
 
 @pytest.mark.parametrize("number", range(len(choices())))
 @pytest.mark.parametrize("moved", [False, True])
-def test_levels_in_the_images_are_those_of_training_and_decode_to_what_was_rendered(number, moved):
+def test_written_levels_and_decoded_values_equal_those_of_training(number, moved):
     scene, preset = choices()[number]
-    choice = chosen(scene, preset)
-    work = QuantizedScene(choice, scene.sh_degree)
+    plan = chosen(scene, preset)
+    work = QuantizedScene(plan, scene.sh_degree)
     if moved:
         shuffled(work)
-    files = container(work.choice(), scene)
-    mask = choice.grid.mask
+    files = container(work.plan(), scene)
+    mask = plan.grid.mask
     for name in FIELDS:
         levels = work.planes[name].levels(work.latents[name]).detach().numpy()
         assert (levels == np.rint(levels)).all()
@@ -45,34 +45,34 @@ def test_levels_in_the_images_are_those_of_training_and_decode_to_what_was_rende
     assert (256 * high + low == work.planes["means"].levels(work.latents["means"]).detach().numpy()).all()
     decoded, reference = decompress(files), reference_decoder.decode(files)
     for name in ATTRIBUTES:
-        found, wanted = getattr(shown(work), name), getattr(decoded, name)
+        found, wanted = getattr(decoded_by(work), name), getattr(decoded, name)
         scale = np.abs(wanted).max(initial=1e-9)
         np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=3e-6 * scale, err_msg=name)
     reference_decoder.assert_equal_scenes(decoded, reference, files)
 
 
 @pytest.mark.parametrize("preset", ["fast", "balanced", "paper"])
-def test_a_choice_that_nobody_moved_stays_as_it_was(preset):
-    """But for levels that are no multiples of their spacing; they are few, and move less than one step."""
+def test_an_untrained_plan_is_unchanged(preset):
+    """Except for a few levels that are no multiples of their stride; these move by less than one step."""
     scene = cloud(400, 2)
-    choice = chosen(scene, preset)
-    found = QuantizedScene(choice, 2).choice()
-    for name, field in choice.fields.items():
-        off = found.fields[name].levels.astype(int) - field.levels
-        spacing = 1
+    plan = chosen(scene, preset)
+    found = QuantizedScene(plan, 2).plan()
+    for name, field in plan.fields.items():
+        change = found.fields[name].levels.astype(int) - field.levels
+        stride = 1
         if name != "f_rest_centroids":  # padding may repeat another form of a Gaussian
-            off, spacing = off[choice.grid.mask], np.reshape(field.take(choice.grid.mask).level_stride, (-1, 1))
-        assert (off != 0).mean() < 0.15
-        assert (np.abs(off) <= spacing / 2).all()
+            change, stride = change[plan.grid.mask], np.reshape(field.take(plan.grid.mask).level_stride, (-1, 1))
+        assert (change != 0).mean() < 0.15
+        assert (np.abs(change) <= stride / 2).all()
         if name == "means":
-            assert not off.any()
+            assert not change.any()
 
 
-def test_levels_are_those_that_the_encoders_own_rounding_finds():
-    """One rule: a value half-way between two levels goes to the same one here and there."""
+def test_rounding_equals_that_of_the_encoder():
+    """A value half-way between two levels goes to the same one in both."""
     scene = cloud(300, 1)
-    choice = chosen(scene, "fast")
-    work = QuantizedScene(choice, 1)
+    plan = chosen(scene, "fast")
+    work = QuantizedScene(plan, 1)
     rng = np.random.default_rng(3)
     for name, plane in work.planes.items():
         latents = work.latents[name]
@@ -82,30 +82,30 @@ def test_levels_are_those_that_the_encoders_own_rounding_finds():
         )
         latents.data.clamp_(plane.min_latent, plane.max_latent)
         assert not plane.field.level_offset
-        field, spacing = plane.field, plane.spacing.numpy()
-        place = (plane.base_multiples.numpy() + latents.detach().numpy().astype(np.float64)) * spacing
+        field, stride = plane.field, plane.stride.numpy()
+        position = (plane.base_multiples.numpy() + latents.detach().numpy().astype(np.float64)) * stride
         # Dyadic ranges: values are exact, so that halves stay halves.
         found = _levels(
-            place / 1024,
-            np.zeros(place.shape[1], np.float32),
-            np.full(place.shape[1], field.top / 1024, np.float32),
+            position / 1024,
+            np.zeros(position.shape[1], np.float32),
+            np.full(position.shape[1], field.top / 1024, np.float32),
             field.top,
-            spacing,
+            stride,
         )
         free = (plane.min_latent < plane.max_latent).numpy()
         assert (found[free] == plane.levels(latents).detach().numpy()[free]).all()
 
 
-def smooth(work, latents):
-    """The round trip without rounding, in float64 NumPy."""
+def unrounded(work, latents):
+    """Decode unrounded levels, in float64 NumPy."""
     values = {}
     for name, plane in work.planes.items():
         field = plane.field
         low, high = field.low.astype(float), field.high.astype(float)
-        levels = (plane.base_multiples.numpy() + latents[name]) * plane.spacing.numpy() - field.level_offset
+        levels = (plane.base_multiples.numpy() + latents[name]) * plane.stride.numpy() - field.level_offset
         values[name] = low + levels * (high - low) / field.top
-    kinds = work.gaussians()["shN"].shape[1]
-    entries = values["f_rest_centroids"].reshape(-1, 3, 15)[:, :, :kinds].transpose(0, 2, 1)
+    coefficients = work.gaussians()["shN"].shape[1]
+    entries = values["f_rest_centroids"].reshape(-1, 3, 15)[:, :, :coefficients].transpose(0, 2, 1)
     return {
         "means": np.sign(values["means"]) * np.expm1(np.abs(values["means"])),
         "quats": values["quaternions"],
@@ -117,7 +117,7 @@ def smooth(work, latents):
 
 
 @pytest.mark.parametrize(("preset", "degree"), [("balanced", 3), ("fast", 1), ("paper", 2), ("balanced", 0)])
-def test_gradients_are_those_of_the_round_trip_without_rounding(preset, degree):
+def test_gradients_are_those_of_decoding_without_rounding(preset, degree):
     scene = cloud(120, degree)
     work = QuantizedScene(chosen(scene, preset), degree)
     rng = np.random.default_rng(1)
@@ -127,7 +127,7 @@ def test_gradients_are_those_of_the_round_trip_without_rounding(preset, degree):
     here = {name: latents.detach().numpy().astype(np.float64) for name, latents in work.latents.items()}
 
     def loss(latents):
-        return sum((weights[name] * value).sum() for name, value in smooth(work, latents).items())
+        return sum((weights[name] * value).sum() for name, value in unrounded(work, latents).items())
 
     for name, latents in work.latents.items():
         gradient = latents.grad.numpy()
@@ -142,65 +142,65 @@ def test_gradients_are_those_of_the_round_trip_without_rounding(preset, degree):
             assert gradient[row, column] == pytest.approx((sides[0] - sides[1]) / 2e-4, rel=2e-4, abs=1e-6), name
 
 
-def test_what_must_stay_stays_and_no_level_leaves_its_image():
-    """The outermost position is 65535, which some readers count on; a constant channel has no other level."""
+def test_frozen_levels_stay_and_no_level_leaves_its_range():
+    """Some readers rely on the largest position being 65535; a constant channel has no other level."""
     scene = cloud(200, 1)
     scene.scales[:, 1] = -2
-    choice = chosen(scene)
-    work = QuantizedScene(choice, 1)
-    pinned = choice.fields["means"].levels[choice.grid.mask] == 65535
-    assert pinned.any()
+    plan = chosen(scene)
+    work = QuantizedScene(plan, 1)
+    frozen = plan.fields["means"].levels[plan.grid.mask] == 65535
+    assert frozen.any()
     for sign in (1, -1):
         for _ in range(5):
             for latents in work.latents.values():
                 latents.grad = torch.full_like(latents, 1e9 * sign)
-            work.step({**dict.fromkeys(FIELDS, 1e5), "spring": 0.0})
-        found = work.choice()
-        assert (found.fields["means"].levels[choice.grid.mask][pinned] == 65535).all()
+            work.step({**dict.fromkeys(FIELDS, 1e5), "attraction": 0.0})
+        found = work.plan()
+        assert (found.fields["means"].levels[plan.grid.mask][frozen] == 65535).all()
         for name, field in found.fields.items():
             assert field.levels.max() <= field.top, name
             plane, levels = work.planes[name], work.planes[name].levels(work.latents[name]).detach().numpy()
             free = (plane.min_latent < plane.max_latent).numpy()
-            multiples = (levels + plane.field.level_offset) / plane.spacing.numpy()
+            multiples = (levels + plane.field.level_offset) / plane.stride.numpy()
             assert (multiples[free] == np.rint(multiples[free])).all(), name
             if sign > 0:
                 assert (work.latents[name] == plane.min_latent).all(), name
 
 
-def test_latents_settle_at_the_level_nearest_to_the_best_value_and_stay_there():
-    """Of a bowl around a value between two levels; the gradient is known at the levels alone."""
+def test_latents_converge_to_the_level_nearest_to_the_best_value():
+    """The loss is quadratic around a value between two levels; the gradient is evaluated at the levels only."""
     work = QuantizedScene(chosen(cloud(300, 1), "fast"), 1)
     count, rng = len(work), np.random.default_rng(5)
     costs = Costs(**{name: rng.uniform(0.5, 2, count) for name in Costs.__slots__})
-    work.hang(costs, 0.5)
+    work.set_curvature(costs, 0.5)
     plane, name = work.planes["scales"], "scales"
-    unit = (plane.step * plane.spacing).numpy()
+    unit = (plane.step * plane.stride).numpy()
     best = np.clip(rng.uniform(-3, 3, (count, 3)), plane.min_latent.numpy(), plane.max_latent.numpy())
-    bend = costs.scale[:, None] * unit**2
-    gone = []
+    curvature = costs.scale[:, None] * unit**2
+    levels = []
     for step in range(1200):
         level = np.rint(work.latents[name].detach().numpy().astype(np.float64))
-        work.latents[name].grad = torch.from_numpy((bend * (level - best)).astype(np.float32))
-        work.step({**dict.fromkeys(FIELDS, 0.1 * 0.02 ** (step / 1200)), "spring": 1.0})
-        gone.append(level)
-    clear = np.abs(best - np.rint(best)) < 0.45
-    assert (gone[-1] == np.rint(best))[clear].all()
-    assert (gone[-1] == gone[-200])[clear].all()
+        work.latents[name].grad = torch.from_numpy((curvature * (level - best)).astype(np.float32))
+        work.step({**dict.fromkeys(FIELDS, 0.1 * 0.02 ** (step / 1200)), "attraction": 1.0})
+        levels.append(level)
+    unambiguous = np.abs(best - np.rint(best)) < 0.45
+    assert (levels[-1] == np.rint(best))[unambiguous].all()
+    assert (levels[-1] == levels[-200])[unambiguous].all()
     np.testing.assert_allclose(work.latents[name].detach().numpy(), best, atol=0.05)
 
 
-def test_gradients_that_are_no_numbers_move_nothing():
+def test_non_finite_gradients_have_no_effect():
     work = QuantizedScene(chosen(cloud(30), "fast"), 1)
-    work.hang(Costs(**{name: np.zeros(len(work)) for name in Costs.__slots__}), 1.0)
+    work.set_curvature(Costs(**{name: np.zeros(len(work)) for name in Costs.__slots__}), 1.0)
     for bad in (np.nan, 0.0, np.inf):
         for latents in work.latents.values():
             latents.grad = torch.full_like(latents, bad)
-        work.step({**dict.fromkeys(FIELDS, 0.1), "spring": 1.0})
+        work.step({**dict.fromkeys(FIELDS, 0.1), "attraction": 1.0})
         assert all(torch.isfinite(latents).all() for latents in work.latents.values())
         assert all((latents == 0).all() for latents in work.latents.values())
 
 
-def test_no_bit_depends_on_torchs_threads():
+def test_the_result_does_not_depend_on_torch_threads():
     scene, found, before = cloud(2000, 2), [], torch.get_num_threads()
     for threads in (1, 2, 3):
         torch.set_num_threads(threads)
@@ -211,8 +211,8 @@ def test_no_bit_depends_on_torchs_threads():
                 (torch.from_numpy(weights.normal(size=value.shape).astype(np.float32)) * value).sum()
                 for value in work.gaussians().values()
             ).backward()
-            work.step({**dict.fromkeys(FIELDS, 0.3), "spring": 1.0})
-        found.append(shown(work))
+            work.step({**dict.fromkeys(FIELDS, 0.3), "attraction": 1.0})
+        found.append(decoded_by(work))
     torch.set_num_threads(before)
     assert same(found[0], found[1])
     assert same(found[0], found[2])

@@ -1,4 +1,4 @@
-"""Oracle: the same work without interruption, the pictures before, and the container as it was chosen."""
+"""Fine-tuning. Oracle: uninterrupted work, and the container and its renderings before fine-tuning."""
 
 import itertools
 from dataclasses import replace
@@ -14,7 +14,7 @@ import kissgs
 from kissgs import FinetuneSettings, OutputError, Settings, UnsupportedError, decompress
 from kissgs.cameras.views import Views, black
 from kissgs.core.progress import silent
-from kissgs.finetuning.tune import Tuner, _Mark
+from kissgs.finetuning.tune import Tuner, _Result
 from kissgs.pipeline.inspect import describe
 from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.encode import write_files
@@ -33,8 +33,8 @@ def tuner(scene, size=40, **changes):
 
 
 def written(scene, settings):
-    def files(choice, steps, progress):
-        return write_files(choice, scene, settings, finetune_steps=steps, threads=1)
+    def files(plan, steps, progress):
+        return write_files(plan, scene, settings, finetune_steps=steps, threads=1)
 
     return files
 
@@ -44,12 +44,12 @@ def tuned(scene, *, checkpoint=None, progress=None, preset="fast", encode=COARSE
     if progress is not None:
         work = replace(work, progress=progress)
     settings = Settings.from_preset(preset, **encode).encode
-    choice = chosen(scene, preset, **encode)
-    return work(choice, choice, scene, written(scene, settings), checkpoint)
+    plan = chosen(scene, preset, **encode)
+    return work(plan, plan, scene, written(scene, settings), checkpoint)
 
 
 @pytest.mark.parametrize("degree", [0, 2])
-def test_pictures_come_nearer_to_those_of_the_scene_as_it_was(degree):
+def test_fine_tuning_raises_the_psnr_to_the_original_scene(degree):
     scene = cloud(150, degree)
     encoded, report = tuned(scene, steps=150)
     assert report.kept
@@ -59,14 +59,14 @@ def test_pictures_come_nearer_to_those_of_the_scene_as_it_was(degree):
     assert len(decompress(encoded.files)) == 150
 
 
-def test_bytes_become_fewer_where_they_weigh_more():
+def test_a_larger_rate_weight_gives_fewer_bytes():
     scene = cloud(400, 1)
     found = [tuned(scene, rate_weight=weight, steps=60)[1] for weight in (0.0, 3.0, 30.0)]
     assert found[2].bytes_after < found[1].bytes_after < found[0].bytes_after
     assert found[2].psnr_after < found[0].psnr_after
 
 
-def test_what_does_not_help_is_not_kept():
+def test_a_worse_container_is_not_kept():
     scene = cloud(80)
     encoded, report = tuned(scene, lr=5.0, codebook_lr=5.0, final_lr_scale=1.0)
     assert not report.kept
@@ -77,7 +77,7 @@ def test_what_does_not_help_is_not_kept():
 
 
 @pytest.mark.parametrize("batch", [1, 3])
-def test_threads_change_no_bit_and_the_seed_does(batch):
+def test_the_result_depends_on_the_seed_but_not_on_threads(batch):
     scene = cloud(200, 1)
     found = []
     before = torch.get_num_threads()
@@ -85,8 +85,8 @@ def test_threads_change_no_bit_and_the_seed_does(batch):
         torch.set_num_threads(threads)
         work = replace(tuner(scene, batch=batch, size=140, view_size=160, **GENTLE), threads=threads)
         settings = Settings.from_preset("fast", **COARSE).encode
-        choice = chosen(scene, "fast", **COARSE)
-        found.append(work(choice, choice, scene, written(scene, settings))[0].files)
+        plan = chosen(scene, "fast", **COARSE)
+        found.append(work(plan, plan, scene, written(scene, settings))[0].files)
     torch.set_num_threads(before)
     assert found[0] == found[1] == found[2]
     assert found[0] != tuned(scene, batch=batch, size=140, view_size=160, seed=1, **GENTLE)[0].files
@@ -97,17 +97,17 @@ class Interrupted(Exception):
 
 
 def stopping_after(steps):
-    left = itertools.count(steps - 1, -1)
+    remaining = itertools.count(steps - 1, -1)
 
     def progress(stage, fraction, note=""):
-        if stage == "finetune" and note and next(left) < 0:
+        if stage == "finetune" and note and next(remaining) < 0:
             raise Interrupted
 
     return progress
 
 
 @pytest.mark.parametrize("steps", [0, 1, 5, 11, 12])
-def test_what_was_interrupted_ends_as_if_it_had_not_been(tmp_path, monkeypatch, steps):
+def test_interrupted_work_resumes_to_the_same_bytes(tmp_path, monkeypatch, steps):
     monkeypatch.setattr(Checkpoint, "due", True)
     scene, path = cloud(150, 1), tmp_path / "c.npz"
     whole = tuned(scene)[0]
@@ -120,7 +120,7 @@ def test_what_was_interrupted_ends_as_if_it_had_not_been(tmp_path, monkeypatch, 
     assert done.count(True) == 12 - steps + 1
 
 
-def test_a_checkpoint_of_other_work_is_not_taken_up(tmp_path, monkeypatch):
+def test_a_checkpoint_of_other_work_is_rejected(tmp_path, monkeypatch):
     monkeypatch.setattr(Checkpoint, "due", True)
     path = tmp_path / "c.npz"
     with pytest.raises(Interrupted):
@@ -134,7 +134,7 @@ def test_a_checkpoint_of_other_work_is_not_taken_up(tmp_path, monkeypatch):
             other(checkpoint=path)
 
 
-def test_a_disk_that_fills_later_does_not_end_the_work(tmp_path, monkeypatch):
+def test_training_continues_if_a_checkpoint_cannot_be_saved(tmp_path, monkeypatch):
     monkeypatch.setattr(Checkpoint, "due", True)
     saves, whole, expected = [], Checkpoint.save, tuned(cloud(60))[0].files
 
@@ -150,7 +150,7 @@ def test_a_disk_that_fills_later_does_not_end_the_work(tmp_path, monkeypatch):
     assert found.files == expected
 
 
-def test_compress_does_it_and_says_so(tmp_path):
+def test_compress_fine_tunes_and_reports_it(tmp_path):
     settings = Settings.from_preset("fast", finetune=SHORT)
     result = kissgs.compress(cloud(200), tmp_path / "a.zip", settings=settings, checkpoint=tmp_path / "c.npz")
     report = result.report
@@ -161,37 +161,37 @@ def test_compress_does_it_and_says_so(tmp_path):
     again = kissgs.compress(cloud(200), settings=settings, checkpoint=tmp_path / "c.npz")
     assert again.to_zip() == result.to_zip()
     assert [path.name for path in again.checkpoints] == ["c-finetune.npz"]
-    told = describe(tmp_path / "a.zip").details["settings"]
-    assert told.get("finetune_steps", 0) == (12 if report.finetuning.kept else 0)
+    written_settings = describe(tmp_path / "a.zip").details["settings"]
+    assert written_settings.get("finetune_steps", 0) == (12 if report.finetuning.kept else 0)
 
 
 @pytest.mark.parametrize(
     ("encode", "finetune", "fewer"), [(10, 80, True), (10, 10, False), (90, 80, False), (0, 80, False)]
 )
-def test_more_gaussians_go_before_training_than_without_it(monkeypatch, encode, finetune, fewer):
-    """As many as without training at that threshold; and none where all shall stay."""
+def test_more_gaussians_are_pruned_before_fine_tuning(monkeypatch, encode, finetune, fewer):
+    """The number is that of the threshold without fine-tuning, and 0 if pruning is off."""
     scene = cloud(600, 1)
-    chosen = {"quality_offset_db": -12, "sensitivity_views": 4, "sensitivity_view_size": 60}
+    common = {"quality_offset_db": -12, "sensitivity_views": 4, "sensitivity_view_size": 60}
 
     def better_after_training(self, encoded, progress):
-        return _Mark(len(zip_bytes(encoded.files)), psnr=30.0, error=1.0 - (b"finetune" in encoded.files[YAML_NAME]))
+        return _Result(len(zip_bytes(encoded.files)), psnr=30.0, error=1.0 - (b"finetune" in encoded.files[YAML_NAME]))
 
-    monkeypatch.setattr(Tuner, "_judge", better_after_training)
+    monkeypatch.setattr(Tuner, "_evaluate", better_after_training)
 
-    def made(drop, tuning=None):
+    def compressed(threshold, tuning=None):
         return kissgs.compress(
-            scene, settings=Settings.from_preset("balanced", **chosen, prune_threshold_bits=drop, finetune=tuning)
+            scene, settings=Settings.from_preset("balanced", **common, prune_threshold_bits=threshold, finetune=tuning)
         )
 
-    found = made(encode, SHORT | {"prune_threshold_bits": finetune})
-    assert found.report.pruned_by_rd == made(max(encode, finetune) if encode else 0).report.pruned_by_rd
-    assert found.report.finetuning.bytes_before == made(encode).report.container_bytes
-    assert (found.report.pruned_by_rd > made(encode).report.pruned_by_rd) == fewer
-    drop = float(max(encode, finetune) if encode else 0)
-    assert f"prune_threshold_bits: {drop}\n".encode() in found.files[YAML_NAME]
+    found = compressed(encode, SHORT | {"prune_threshold_bits": finetune})
+    assert found.report.pruned_by_rd == compressed(max(encode, finetune) if encode else 0).report.pruned_by_rd
+    assert found.report.finetuning.bytes_before == compressed(encode).report.container_bytes
+    assert (found.report.pruned_by_rd > compressed(encode).report.pruned_by_rd) == fewer
+    threshold = float(max(encode, finetune) if encode else 0)
+    assert f"prune_threshold_bits: {threshold}\n".encode() in found.files[YAML_NAME]
 
 
-def test_a_size_is_met_by_the_fine_tuned_container():
+def test_the_fine_tuned_container_meets_a_target_size():
     scene = cloud(600, 1)
     plain = kissgs.compress(scene, settings=Settings(encode={"sensitivity_views": 4, "sensitivity_view_size": 60}))
     size = int(0.8 * plain.report.container_bytes)
@@ -204,22 +204,22 @@ def test_a_size_is_met_by_the_fine_tuned_container():
     assert len(found.report.trials) >= 2
 
 
-def test_a_size_that_is_met_without_fine_tuning_is_met_with_it(monkeypatch):
-    """Even where fine-tuned containers are all too large."""
+def test_a_target_size_is_met_if_fine_tuned_containers_are_too_large(monkeypatch):
+    """The container without fine-tuning is kept."""
 
     def sizes(files, *, packed):
         return 900 + 900 * (b"finetune" in files[YAML_NAME]), {}
 
     monkeypatch.setattr("kissgs.pipeline.rate_control.stored_sizes", sizes)
-    chosen = {"target_size": 1000, "sensitivity_views": 4, "sensitivity_view_size": 60}
-    gentle = Settings.from_preset("balanced", finetune={**SHORT, **GENTLE}, **chosen)
+    common = {"target_size": 1000, "sensitivity_views": 4, "sensitivity_view_size": 60}
+    gentle = Settings.from_preset("balanced", finetune={**SHORT, **GENTLE}, **common)
     found = kissgs.compress(cloud(60), settings=gentle)
     assert b"finetune" not in found.files[YAML_NAME]
     assert not found.report.finetuning.kept
     assert "as it was without" in found.report.finetuning.note
 
 
-def test_a_search_leaves_other_files_alone(tmp_path):
+def test_a_search_does_not_change_existing_checkpoints(tmp_path):
     (tmp_path / "c-finetune.npz").write_bytes(b"mine")
     settings = Settings.from_preset(
         "balanced", finetune=SHORT, target_size=50_000, sensitivity_views=4, sensitivity_view_size=60
@@ -229,17 +229,17 @@ def test_a_search_leaves_other_files_alone(tmp_path):
     assert found.checkpoints == ()
 
 
-def test_bits_cost_the_same_whatever_compaction_lost():
+def test_the_coding_error_does_not_depend_on_compaction():
     scene = cloud(300, 1)
     smaller, found = scene.select(np.arange(100)), []
     for work in (tuner(scene), replace(tuner(scene), original=smaller)):
         settings = Settings.from_preset("fast").encode
         encoded = written(smaller, settings)(chosen(smaller, "fast"), 0, silent)
-        found.append(work._rounding(encoded, smaller, silent))
+        found.append(work._coding_error(encoded, smaller, silent))
     assert found[0] == found[1]
 
 
-def test_a_psnr_to_the_scene_is_not_sought_where_photographs_teach(tmp_path):
+def test_a_psnr_goal_is_rejected_if_photographs_are_the_targets(tmp_path):
     from PIL import Image
 
     views = []
@@ -254,7 +254,7 @@ def test_a_psnr_to_the_scene_is_not_sought_where_photographs_teach(tmp_path):
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_nothing_and_nearly_nothing_to_tune(count):
+def test_scenes_of_no_or_one_gaussian(count):
     scene = cloud(9).select(np.arange(count))
     for preset in ("fast", "balanced"):
         result = kissgs.compress(scene, settings=Settings.from_preset(preset, finetune=SHORT))

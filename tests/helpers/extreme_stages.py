@@ -16,7 +16,7 @@ from kissgs.compaction.regularizers import needle_loss
 from kissgs.rendering.differentiable import rasterize
 from kissgs.rendering.rasterizer import removal_scores, render
 from kissgs.rendering.tensors import tensors_of
-from kissgs.training.loop import threads_of_torch
+from kissgs.training.loop import torch_threads
 
 
 def clean(name):
@@ -138,5 +138,5 @@ STAGES = {
 @functools.cache
 def measured(name, stage):
     """The error of a stage at an extreme."""
-    with threads_of_torch(1):  # several are slower where tests run side by side
+    with torch_threads(1):  # several are slower where tests run side by side
         return STAGES[stage](name)

@@ -10,7 +10,7 @@ import torch
 from helpers import reference_float64
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.rendering.losses import plain_photometric_loss
-from kissgs.training.loop import Plan, train
+from kissgs.training.loop import TrainingPlan, train
 from kissgs.training.model import BOUNDS, GaussianModel
 from kissgs.training.targets import TrainingTargets
 
@@ -35,7 +35,7 @@ def trained(splats, camera):
     away = np.linalg.norm(splats.means.astype(np.float64) - camera.position, axis=1)
     targets, rates = stripes(camera), RATES | {"means": RATES["means"] * (np.median(away) if len(away) else 1.0)}
     model = GaussianModel(splats)
-    train(model, targets, Plan("step", STEPS, lambda done: rates, 0.2, [0]), threads=1)
+    train(model, targets, TrainingPlan("step", STEPS, lambda done: rates, 0.2, [0]), threads=1)
     wanted, clear = oracle(splats, targets, rates)
     worst = 0.0
     for name in ATTRIBUTES:
@@ -53,7 +53,7 @@ def oracle(splats, targets, rates):
     leaves = reference_float64.tensors(splats)
     moments = {name: (torch.zeros_like(leaf), torch.zeros_like(leaf)) for name, leaf in leaves.items()}
     clear = {name: np.ones(leaf.shape, bool) for name, leaf in leaves.items()}
-    target = torch.from_numpy(targets.picture(0)).double()
+    target = torch.from_numpy(targets.image(0)).double()
     for step in range(1, STEPS + 1):
         params = {name: leaf.clone().requires_grad_() for name, leaf in leaves.items()}
         loss = plain_photometric_loss(

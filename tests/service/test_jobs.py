@@ -479,7 +479,7 @@ def test_evaluating(service):
     evaluation = service.ended(job, seconds=120)["evaluation"]
     expected = kissgs.compress(SMALL, settings=kissgs.Settings(preset="fast"), evaluate=True).report.evaluation
     assert evaluation["psnr"] == pytest.approx(expected.mean.candidate_vs_reference.psnr, abs=1e-6)
-    assert evaluation["worst"] == json.loads(json.dumps(expected.worst.where()))
+    assert evaluation["worst"] == json.loads(json.dumps(expected.worst.pose_as_dict()))
     assert evaluation["fifth_percentile"] == pytest.approx(expected.fifth_percentile, abs=1e-6)
     assert evaluation["shown"] == pytest.approx(expected.shown)
 

@@ -38,7 +38,9 @@ def expected():
 @pytest.fixture
 def start_saving(start, tmp_path):
     """Starts a service whose jobs save their state all the time, not every half minute."""
-    (tmp_path / "sitecustomize.py").write_text("from kissgs.training import checkpoint\ncheckpoint.SECONDS = 0.05\n")
+    (tmp_path / "sitecustomize.py").write_text(
+        "from kissgs.training import checkpoint\ncheckpoint.SAVE_INTERVAL = 0.05\n"
+    )
     return lambda **settings: start(PYTHONPATH=f"{ROOT}{os.pathsep}{tmp_path}", **settings)
 
 
@@ -135,7 +137,7 @@ def test_a_disk_without_room_for_checkpoints_is_no_obstacle(tmp_path, monkeypatc
         raise OutputError(f"cannot write {path}: no space left on device")
 
     monkeypatch.setattr(checkpoint, "atomic_file", full)
-    monkeypatch.setattr(checkpoint, "SECONDS", 0.0)
+    monkeypatch.setattr(checkpoint, "SAVE_INTERVAL", 0.0)
     work = tmp_path / "work"
     work.mkdir()
     (tmp_path / "scene.ply").write_bytes(SMALL)

@@ -1,4 +1,4 @@
-"""Oracle: the scene that the pictures were taken of; for regularisers, what they were told."""
+"""The training loop. Oracle: the scene that was rendered; for regularizers, the calls they received."""
 
 import numpy as np
 import pytest
@@ -8,21 +8,21 @@ from helpers.training_scenes import around, cloud, same, targets_of
 import kissgs
 from kissgs.rendering.losses import plain_photometric_loss
 from kissgs.rendering.rasterizer import render
-from kissgs.training.loop import Plan, exponential_lr, train
+from kissgs.training.loop import TrainingPlan, exponential_lr, train
 from kissgs.training.model import GaussianModel
 
 RATES = {"means": 2e-3, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 1e-2, "shN": 1e-3}
 
 
 def plan(steps=30, **changes):
-    return Plan(
+    return TrainingPlan(
         **{"stage": "learn", "steps": steps, "rates": lambda done: RATES, "ssim_weight": 0.2, "seed": (0,), **changes}
     )
 
 
 def error(scene, targets):
-    pictures = [render(scene, camera)[0] for camera in targets.cameras]
-    return np.mean([(image - targets.picture(n)) ** 2 for n, image in enumerate(pictures)])
+    images = [render(scene, camera)[0] for camera in targets.cameras]
+    return np.mean([(image - targets.image(n)) ** 2 for n, image in enumerate(images)])
 
 
 def dimmed(scene):
@@ -32,27 +32,27 @@ def dimmed(scene):
     )
 
 
-def test_it_finds_the_way_back_to_the_pictures():
+def test_a_changed_scene_converges_to_the_targets():
     scene = cloud(40)
-    targets, begun = targets_of(scene), dimmed(scene)
-    model = GaussianModel(begun)
+    targets, start = targets_of(scene), dimmed(scene)
+    model = GaussianModel(start)
     train(model, targets, plan(200))
-    assert error(model.splats(), targets) < 0.03 * error(begun, targets)
+    assert error(model.splats(), targets) < 0.03 * error(start, targets)
 
 
-def test_nothing_moves_where_nothing_is_to_be_learned():
-    """The scene's own pictures, but for their rounding to float16."""
+def test_a_scene_stays_if_its_renderings_are_the_targets():
+    """The renderings are equal except for the rounding of targets to float16."""
     scene = cloud(40)
     targets, model = targets_of(scene), GaussianModel(scene)
     train(model, targets, plan(4, rates=lambda done: dict.fromkeys(RATES, 1e-9)))
     np.testing.assert_allclose(model.splats().means, scene.means, atol=1e-7)
 
 
-def test_it_stops_and_goes_on_as_if_nothing_had_been():
+def test_an_interrupted_training_resumes_exactly():
     scene = cloud(40)
     targets, whole = targets_of(scene), GaussianModel(dimmed(scene))
     train(whole, targets, plan(23))
-    kept = []
+    steps = []
 
     def stop(stage, fraction, note=""):
         if fraction >= 9 / 23:
@@ -60,15 +60,15 @@ def test_it_stops_and_goes_on_as_if_nothing_had_been():
 
     first = GaussianModel(dimmed(scene))
     with pytest.raises(kissgs.Cancelled):
-        train(first, targets, plan(23), after=kept.append, progress=stop)
-    assert kept == list(range(1, 10))
+        train(first, targets, plan(23), after=steps.append, progress=stop)
+    assert steps == list(range(1, 10))
     second = GaussianModel.restored(first.state())
     train(second, targets, plan(23), first=9)
     assert same(whole.splats(), second.splats())
 
 
 @pytest.mark.parametrize("threads", [2, 3])
-def test_no_bit_depends_on_threads(threads):
+def test_the_result_does_not_depend_on_threads(threads):
     scene = cloud(300, 3)
     targets, found = targets_of(scene), []
     for number in (1, threads):
@@ -79,7 +79,7 @@ def test_no_bit_depends_on_threads(threads):
     assert same(*found)
 
 
-def test_another_seed_is_another_order():
+def test_the_result_depends_on_the_seed():
     scene, found = cloud(40), []
     for seed in (0, 1):
         model = GaussianModel(dimmed(scene))
@@ -88,55 +88,55 @@ def test_another_seed_is_another_order():
     assert not same(*found)
 
 
-class Pull:
-    """Towards the origin."""
+class PullToOrigin:
+    """Regularizer of the squared positions."""
 
     def __init__(self):
-        self.asked, self.updated = [], []
+        self.penalized, self.updated = [], []
 
     def penalty(self, step, parameters):
-        self.asked.append(step)
+        self.penalized.append(step)
         return parameters["means"].square().sum() if step % 2 else None
 
-    def update(self, step, learner):
-        self.updated.append((step, float(learner.gaussians()["means"].detach().square().sum())))
+    def update(self, step, scene):
+        self.updated.append((step, float(scene.gaussians()["means"].detach().square().sum())))
 
 
-def test_regularizers_have_their_say():
-    scene, pull = cloud(40), Pull()
+def test_regularizers_are_called_in_every_step():
+    scene, pull = cloud(40), PullToOrigin()
     model = GaussianModel(scene)
     train(model, targets_of(scene), plan(40, regularizers=(pull,)), first=3)
-    assert pull.asked == [step for step, _ in pull.updated] == list(range(3, 40))
+    assert pull.penalized == [step for step, _ in pull.updated] == list(range(3, 40))
     assert pull.updated[-1][1] < 0.9 * float((scene.means**2).sum())
 
 
-def test_what_is_told_is_the_loss():
+def test_notes_report_running_means_of_loss_and_psnr():
     scene, notes = cloud(40), []
     targets = targets_of(scene)
-    begun = dimmed(scene)
+    start = dimmed(scene)
     frozen = plan(3, rates=lambda done: dict.fromkeys(RATES, 0.0))
-    train(GaussianModel(begun), targets, frozen, progress=lambda stage, fraction, note="": notes.append(note))
+    train(GaussianModel(start), targets, frozen, progress=lambda stage, fraction, note="": notes.append(note))
     order = [n for n, _ in zip(targets.order((0,)), range(3), strict=False)]
     losses, errors = [], []
     for n in order:
-        image = torch.from_numpy(render(begun, targets.cameras[n])[0])
-        losses.append(float(plain_photometric_loss(image, torch.from_numpy(targets.picture(n)), 0.2)))
-        errors.append(float((image - torch.from_numpy(targets.picture(n))).square().mean()))
+        image = torch.from_numpy(render(start, targets.cameras[n])[0])
+        losses.append(float(plain_photometric_loss(image, torch.from_numpy(targets.image(n)), 0.2)))
+        errors.append(float((image - torch.from_numpy(targets.image(n))).square().mean()))
     assert notes[0] == "40 Gaussians"
     assert notes[1] == f"40 Gaussians, loss {losses[0]:.4f}, PSNR {-10 * np.log10(errors[0]):.2f}"
     smooth = 0.98 * (0.98 * losses[0] + 0.02 * losses[1]) + 0.02 * losses[2]
     assert notes[3].startswith(f"40 Gaussians, loss {smooth:.4f}, PSNR")
 
 
-def test_rates_fall_as_in_3dgs():
-    """Exponentially: half-way, the geometric mean."""
+def test_learning_rates_fall_exponentially():
+    """Half-way they are the geometric mean, as in 3DGS."""
     rates = exponential_lr({"means": 2.0, "sh0": 3.0}, {"means": 1.0, "sh0": 1.0}, {"means": 0.01, "sh0": 1.0})
     assert rates(0.0) == {"means": 2.0, "sh0": 3.0}
     assert rates(0.5) == pytest.approx({"means": 0.2, "sh0": 3.0})
     assert rates(1.0) == pytest.approx({"means": 0.02, "sh0": 3.0})
 
 
-def test_pictures_of_several_sizes_and_one_gaussian():
+def test_targets_of_several_sizes_and_one_gaussian():
     scene = cloud(1, 0)
     model = GaussianModel(scene)
     train(model, targets_of(scene, (*around(2, 40), *around(3, 24))), plan(6))

@@ -1,4 +1,4 @@
-"""Oracle: Adam as its paper writes it, in float64 NumPy, on Gaussians that come and go."""
+"""Trainable scenes. Oracle: Adam as in its paper, in float64 NumPy, with removal of rows."""
 
 import numpy as np
 import pytest
@@ -30,14 +30,14 @@ class NaiveAdam:
 
 def push(model, rng):
     gradients = {}
-    for name, leaf in model.parameters.items():
-        gradients[name] = rng.normal(size=leaf.shape)
-        leaf.grad = torch.from_numpy(gradients[name].astype(np.float32))
+    for name, parameter in model.parameters.items():
+        gradients[name] = rng.normal(size=parameter.shape)
+        parameter.grad = torch.from_numpy(gradients[name].astype(np.float32))
     model.step(RATES)
     return gradients
 
 
-def test_it_is_adam_and_survivors_remember():
+def test_steps_are_those_of_adam_and_moments_survive_pruning():
     scene, rng = cloud(50, 2), np.random.default_rng(1)
     model = GaussianModel(scene)
     oracle = {name: NaiveAdam(getattr(scene, name)) for name in ATTRIBUTES}
@@ -51,12 +51,12 @@ def test_it_is_adam_and_survivors_remember():
             for adam in oracle.values():
                 adam.keep(index)
     assert len(model) == 20
-    for name, leaf in model.parameters.items():
-        np.testing.assert_allclose(leaf.detach().numpy(), oracle[name].value, rtol=2e-5, atol=2e-5)
+    for name, parameter in model.parameters.items():
+        np.testing.assert_allclose(parameter.detach().numpy(), oracle[name].value, rtol=2e-5, atol=2e-5)
 
 
 @pytest.mark.parametrize("steps", [0, 1, 5])
-def test_a_restored_one_goes_on_exactly_as_the_first_would(steps):
+def test_a_restored_model_continues_exactly(steps):
     one, rng = GaussianModel(cloud(30)), np.random.default_rng(2)
     for _ in range(steps):
         push(one, rng)
@@ -67,21 +67,21 @@ def test_a_restored_one_goes_on_exactly_as_the_first_would(steps):
     assert same(one.splats(), other.splats())
 
 
-def test_positions_move_in_units_of_their_reach():
+def test_positions_move_in_units_of_their_extents():
     scene, rng = cloud(50, 2), np.random.default_rng(1)
-    reach = np.exp(rng.normal(0, 4, 50)).astype(np.float32)
-    model, oracle = GaussianModel(scene, reach=reach), NaiveAdam(scene.means)
+    extents = np.exp(rng.normal(0, 4, 50)).astype(np.float32)
+    model, oracle = GaussianModel(scene, extents=extents), NaiveAdam(scene.means)
     for step in range(9):
-        oracle.step(push(model, rng)["means"], RATES["means"] * reach[:, None])
+        oracle.step(push(model, rng)["means"], RATES["means"] * extents[:, None])
         if step in (3, 6):
             index = np.sort(rng.permutation(len(model))[:20])
             model.keep(index)
             oracle.keep(index)
-            reach = reach[index]
+            extents = extents[index]
     np.testing.assert_allclose(model.parameters["means"].detach().numpy(), oracle.value, rtol=2e-5, atol=2e-5)
 
 
-def test_the_scene_it_came_from_is_not_changed():
+def test_the_original_scene_is_not_changed():
     scene = cloud(12)
     before = scene.means.copy()
     model = GaussianModel(scene)
@@ -90,33 +90,33 @@ def test_the_scene_it_came_from_is_not_changed():
     assert (model.splats().means != before).all()
 
 
-def test_gradients_that_are_no_numbers_move_nothing_for_long():
-    """One NaN would otherwise stay in Adam's moments, and its Gaussian be lost for good."""
+def test_non_finite_gradients_have_no_lasting_effect():
+    """Otherwise a NaN would stay in Adam's moments, and its Gaussian would be lost."""
     model = GaussianModel(cloud(4, 0))
     for bad in (np.nan, np.inf, -np.inf, 3e38):
-        for leaf in model.parameters.values():
-            leaf.grad = torch.full_like(leaf, bad)
+        for parameter in model.parameters.values():
+            parameter.grad = torch.full_like(parameter, bad)
         model.step(RATES)
         push(model, np.random.default_rng(0))
-    assert all(torch.isfinite(leaf).all() for leaf in model.parameters.values())
+    assert all(torch.isfinite(parameter).all() for parameter in model.parameters.values())
     assert all(np.isfinite(value).all() for value in model.state().values())
 
 
-def test_opacities_and_scales_stay_in_what_a_scene_can_hold():
+def test_opacities_and_scales_stay_within_their_bounds():
     model = GaussianModel(cloud(10))
     for sign in (1, -1):
-        for _ in range(30):  # momentum has to turn first
+        for _ in range(30):  # the momentum must change its sign first
             for name in ("opacities", "scales"):
-                leaf = model.parameters[name]
-                leaf.grad = torch.full_like(leaf, -sign)
+                parameter = model.parameters[name]
+                parameter.grad = torch.full_like(parameter, -sign)
             model.step(dict.fromkeys(ATTRIBUTES, 100.0))
         scene = model.splats()
         assert (scene.scales == 30.0 * sign).all()
         assert (scene.opacities == np.float32(OPACITY_LOGIT_MAX if sign > 0 else OPACITY_LOGIT_MIN)).all()
 
 
-def test_no_bit_depends_on_torchs_threads():
-    """Adam is elementwise, but vectorised in parts: it must not matter where these begin."""
+def test_the_result_does_not_depend_on_torch_threads():
+    """Adam is elementwise but vectorised in parts, whose boundaries must have no effect."""
     found, before = [], torch.get_num_threads()
     for threads in (1, 2, 3):
         torch.set_num_threads(threads)
@@ -129,7 +129,7 @@ def test_no_bit_depends_on_torchs_threads():
     assert same(found[0], found[2])
 
 
-def test_nobody_is_left():
+def test_all_gaussians_can_be_removed():
     model = GaussianModel(cloud(3))
     push(model, np.random.default_rng(0))
     model.keep(np.empty(0, np.int64))
