@@ -31,7 +31,7 @@ lint: setup-dev
 bench: setup
 	@mkdir -p demo-out
 	@test -n "$(SCENE)" || $(KISSGS) sample demo-out/sample.ply --force
-	@$(KISSGS) bench --evaluate "$(if $(SCENE),$(SCENE),demo-out/sample.ply)"
+	@$(KISSGS) bench codecs --evaluate "$(if $(SCENE),$(SCENE),demo-out/sample.ply)"
 
 docs: setup-dev
 	@.venv/bin/python docs/generate.py

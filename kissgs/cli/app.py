@@ -11,7 +11,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from kissgs._version import __version__
-from kissgs.cli.bench import bench
+from kissgs.cli.bench import app as bench
 from kissgs.cli.compact import compact
 from kissgs.cli.compress import compress
 from kissgs.cli.decompress import decompress
@@ -53,8 +53,9 @@ def _run() -> None:
         _fail(UnsupportedError(f"cannot use {error.filename!s:.100}: {(error.strerror or str(error)).lower()}"))
 
 
-for command in (compress, decompress, compact, render, evaluate, info, sample, bench, warmup):
+for command in (compress, decompress, compact, render, evaluate, info, sample, warmup):
     app.command()(command)
+app.add_typer(bench)
 app.add_typer(remote)
 
 

@@ -1,4 +1,4 @@
-"""``kissgs bench`` of presets and external codecs, ``--ablate`` and ``--rendering``."""
+"""``kissgs bench codecs``, ``scaling``, ``ablation`` and ``rendering``."""
 
 from __future__ import annotations
 
@@ -50,8 +50,6 @@ def _plan(options: BenchOptions) -> BenchmarkPlan:
     from kissgs.benchmark.comparison import BenchmarkPlan
     from kissgs.settings import Preset
 
-    if options.gaussians and (options.external_codecs or options.quality_offsets):
-        raise UnsupportedError("--gaussians measures presets only; leave out --external and --quality-offset")
     presets = [chosen(name, options.changes) for name in options.presets or list(Preset)]
     curve_presets = [settings for settings in presets if settings.encode.rate_distortion]
     if not options.presets:

@@ -1,4 +1,4 @@
-"""``kissgs bench --compaction`` and ``--finetuning``."""
+"""``kissgs bench compaction`` and ``finetuning``."""
 
 from __future__ import annotations
 

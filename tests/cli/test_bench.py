@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
 from pathlib import Path
 
 import pytest
 from helpers.command_line import failure, run
+from typer.core import TyperGroup
+from typer.main import get_command
 
 import kissgs
+from kissgs.cli.bench import app as bench
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +24,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_each_preset_is_measured(scene: Path) -> None:
-    rows = json.loads(run("bench", scene, "-p", "fast", "-p", "paper", "--repeats", 2, "--json").stdout)
+    rows = json.loads(run("bench", "codecs", scene, "-p", "fast", "-p", "paper", "--repeats", 2, "--json").stdout)
     assert [(row["codec"], len(row["runs"])) for row in rows] == [("fast", 2), ("paper", 2)]
     for row in rows:
         result = kissgs.compress(scene, settings=kissgs.Settings(preset=row["codec"]))
@@ -33,7 +38,7 @@ def test_each_preset_is_measured(scene: Path) -> None:
 def test_a_curve_is_plotted_and_images_are_compared(scene: Path, tmp_path: Path) -> None:
     quick = ["--set", "sensitivity_views=4", "--set", "sensitivity_view_size=60"]
     options = ["-p", "balanced", "--quality-offset", -3, *quick, "--plot", tmp_path / "p.svg"]
-    done = run("bench", scene, *options)
+    done = run("bench", "codecs", scene, *options)
     assert done.returncode == 0, done.stderr
     assert "balanced at -3" in done.stdout.decode()
     assert "f_rest_centroids.webp" in done.stdout.decode()
@@ -42,49 +47,60 @@ def test_a_curve_is_plotted_and_images_are_compared(scene: Path, tmp_path: Path)
 
 def test_other_sizes_are_measured_and_plotted(scene: Path, tmp_path: Path) -> None:
     options = ["-p", "fast", "--gaussians", 200, "--gaussians", 900, "--json", "--plot", tmp_path / "p.png"]
-    done = run("bench", scene, *options)
+    done = run("bench", "scaling", scene, *options)
     assert done.returncode == 0, done.stderr
     assert [row["gaussians"] for row in json.loads(done.stdout)] == [200, 900]
     assert (tmp_path / "p.png").stat().st_size > 10_000
 
 
 def test_images_are_compared_and_the_rasteriser_is_measured(scene: Path) -> None:
-    rows = json.loads(run("bench", scene, "-p", "fast", "--evaluate", "--json").stdout)
+    rows = json.loads(run("bench", "codecs", scene, "-p", "fast", "--evaluate", "--json").stdout)
     assert rows[0]["evaluation"]["mean"]["candidate_vs_reference"]["psnr"] > 20
-    rows = json.loads(run("bench", scene, "--rendering", "--gaussians", 100, "--json").stdout)
+    rows = json.loads(run("bench", "rendering", scene, "--gaussians", 100, "--json").stdout)
     assert [row["gaussians"] for row in rows] == [100]
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("command", "options", "message"),
     [
-        ("--rendering -p fast", "leave out --preset and --external"),
-        ("--rendering --ablate", "--ablate and --rendering cannot be combined"),
-        ("--rendering --repeats 2", "--repeats does not apply to --rendering"),
-        ("--gaussians 5 --external spz", "leave out --external and --quality-offset"),
-        ("--gaussians 5 --compaction", "--gaussians does not apply to --compaction"),
-        ("--quality-offset 1 -p fast", "--quality-offset needs a preset with rate-distortion planning"),
-        ("--quality-offset 1 --ablate", "--quality-offset does not apply to --ablate"),
-        ("--ablate -p fast", "balanced or small, not fast"),
-        ("--ratio 0.5", "--ratio needs --compaction"),
-        ("--supervision scene", "--supervision needs --compaction or --finetuning"),
-        ("--compaction -p fast -p paper", "--compaction measures one preset"),
-        ("--plot curve.jpg", "ends in .svg, .png or .pdf"),
-        ("--scale 4", "--views"),
-        ("--external rar -p fast", "unknown external codec 'rar'; choose sog or spz"),
+        ("codecs", "--quality-offset 1 -p fast", "--quality-offset needs a preset with rate-distortion planning"),
+        ("codecs", "--plot curve.jpg", "ends in .svg, .png or .pdf"),
+        ("codecs", "--scale 4", "--views"),
+        ("codecs", "--external rar -p fast", "unknown external codec 'rar'; choose sog or spz"),
+        ("ablation", "-p fast", "balanced or small, not fast"),
+        ("compaction", "--ratio 0", "--ratio 0 keeps no Gaussian"),
+        ("compaction", "--strategy none", "unknown strategy; choose one of"),
+        ("finetuning", "--supervision cameras", "needs a capture; give one with --views"),
     ],
 )
-def test_options_that_exclude_each_other_are_refused(scene: Path, options: str, message: str) -> None:
-    assert message in failure("bench", scene, *options.split())
+def test_impossible_requests_are_refused(scene: Path, command: str, options: str, message: str) -> None:
+    assert message in failure("bench", command, scene, *options.split())
+
+
+def test_every_documented_command_is_accepted() -> None:
+    """All options of the command lines in the documentation exist, with values of the right kind."""
+    group = get_command(bench)
+    assert isinstance(group, TyperGroup)
+    root = Path(__file__).parents[2]
+    lines = [
+        shlex.split(line.replace("\n", " "), comments=True)
+        for page in [root / "README.md", *sorted((root / "docs").rglob("*.md"))]
+        for line in re.findall(
+            r"kissgs bench ([a-z]+ [^`#]*?)(?:`|#|  |\n\n|\n\$|\n```)", page.read_text(encoding="utf-8")
+        )
+    ]
+    assert len(lines) > 15
+    for name, *words in lines:
+        group.commands[name].make_context(name, ["x.ply" if word == "SCENE.ply" else word for word in words])
 
 
 def test_a_plot_of_two_scenes_is_refused(scene: Path, tmp_path: Path) -> None:
-    assert "--plot takes one scene" in failure("bench", scene, "other.ply", "--plot", tmp_path / "p.svg")
+    assert "--plot takes one scene" in failure("bench", "codecs", scene, "other.ply", "--plot", tmp_path / "p.svg")
 
 
-@pytest.mark.parametrize("measurement", [["--ablate", "-p", "paper"], ["--rendering"], ["-p", "fast"]])
+@pytest.mark.parametrize("measurement", [["ablation", "-p", "paper"], ["rendering"], ["codecs", "-p", "fast"]])
 def test_the_results_of_other_scenes_are_printed_if_one_fails(scene: Path, measurement: list[str]) -> None:
-    done = run("bench", scene, scene.with_name("none.ply"), *measurement, "--json")
+    done = run("bench", *measurement, scene, scene.with_name("none.ply"), "--json")
     assert done.returncode == 2
     assert b"none.ply: there is no such file" in done.stderr
     assert {row["scene"] for row in json.loads(done.stdout)} == {"scene.ply"}
@@ -95,18 +111,18 @@ def test_scenes_of_equal_file_names_have_different_names(scene: Path, tmp_path: 
     other = tmp_path / "other" / scene.name
     other.parent.mkdir()
     kissgs.save(kissgs.sample_scene(50, sh_degree=0), other)
-    rows = json.loads(run("bench", scene, other, scene, "-p", "fast", "--json").stdout)
+    rows = json.loads(run("bench", "codecs", scene, other, scene, "-p", "fast", "--json").stdout)
     names = [f"{path.parent.name}/{path.name}" for path in (scene, other)]
     assert [(row["scene"], row["gaussians"]) for row in rows] == [(names[0], 600), (names[1], 50)]
 
 
 def test_an_empty_scene_is_not_resampled(tmp_path: Path) -> None:
     kissgs.save(kissgs.sample_scene(0), tmp_path / "none.ply")
-    rows = json.loads(run("bench", tmp_path / "none.ply", "-p", "fast", "--gaussians", 5, "--json").stdout)
+    rows = json.loads(run("bench", "scaling", tmp_path / "none.ply", "-p", "fast", "--gaussians", 5, "--json").stdout)
     assert [row["gaussians"] for row in rows] == [0]
 
 
 def test_there_is_no_table_if_all_scenes_fail() -> None:
-    done = run("bench", "none.ply", "nothing.ply", "-p", "fast")
+    done = run("bench", "codecs", "none.ply", "nothing.ply", "-p", "fast")
     assert (done.returncode, done.stdout) == (2, b"")
     assert done.stderr.count(b"there is no such file") == 2

@@ -261,7 +261,7 @@ def test_missing_cuda_is_an_error():
 
     if torch.cuda.is_available():
         pytest.skip("this machine has CUDA")
-    with pytest.raises(UnsupportedError, match="torch finds no CUDA device here"):
+    with pytest.raises(UnsupportedError, match="torch finds no CUDA device"):
         evaluate(SCENE, SCENE, cameras(), device="cuda")
 
 
