@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from kissgs.cameras.views import Source, Views
+from kissgs.cameras.views import TargetSource, Views
 from kissgs.compaction.evaluate import evaluate_scene
 from kissgs.compaction.popspa import popspa
 from kissgs.compaction.scoring import highest
@@ -112,7 +112,7 @@ def study(
     *,
     ratios: Sequence[float] = RATIOS,
     ways: Sequence[Way] = WAYS,
-    learn_from: Source = "photos",
+    learn_from: TargetSource = "photos",
     threads: int = 0,
     progress: Progress = silent,
 ) -> list[Point]:
@@ -171,8 +171,13 @@ def study(
 
 
 def _taught(
-    splats: Splats, settings: CompactSettings, views: Views | None, learn_from: Source, threads: int, progress: Progress
+    splats: Splats,
+    settings: CompactSettings,
+    views: Views | None,
+    learn_from: TargetSource,
+    threads: int,
+    progress: Progress,
 ) -> SupervisionViews:
     scored = SCORED if settings.trains else 1
-    learned = None if views is None else views.to_learn(learn_from)
+    learned = None if views is None else views.for_training(learn_from)
     return supervision_views(splats, learned, settings, scored=scored, threads=threads, progress=progress)

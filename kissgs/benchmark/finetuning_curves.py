@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from kissgs.benchmark.bd_rate import RateCurve, at_fidelity
-from kissgs.cameras.views import Source, Views
+from kissgs.cameras.views import TargetSource, Views
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.progress import Progress, as_stage, silent
 from kissgs.core.splats import Splats
@@ -61,7 +61,7 @@ def rate_curves(
     *,
     fidelities: Sequence[float] | None = None,
     ratios: Sequence[float] = (),
-    learn_from: Source = "photos",
+    learn_from: TargetSource = "photos",
     threads: int = 0,
     progress: Progress = silent,
 ) -> list[RatePoint]:
@@ -88,7 +88,7 @@ def rate_curves(
             "fine-tuning is measured on a scene as it is; compact it first: kissgs compact, or ratios"
         )
     judges = views or evaluation_views(splats, threads=threads, progress=progress)
-    taught = None if views is None or learn_from == "scene" else views.to_learn(learn_from)
+    taught = None if views is None or learn_from == "scene" else views.for_training(learn_from)
     points = []
     shares: list[float | None] = [*ratios] or [None]
     for ratio in shares:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from kissgs.benchmark.compaction_study import Point
     from kissgs.benchmark.finetuning_curves import RatePoint
-    from kissgs.cameras.views import Source
+    from kissgs.cameras.views import TargetSource
     from kissgs.core.progress import Progress
 
 
@@ -57,13 +57,13 @@ def compaction(asked: Asked) -> Outcome:
     )
 
 
-def _teacher(asked: Asked) -> Source:
+def _teacher(asked: Asked) -> TargetSource:
     """What to learn from, once it is known that it can be, and that something will be left to teach."""
-    from kissgs.cameras.views import Source
+    from kissgs.cameras.views import TargetSource
 
     if 0 in asked.ratios:
         raise UnsupportedError("--ratio 0 keeps nothing; give a share above 0")
-    source = cast(Source, choice("--learn-from", asked.learn_from, Source))
+    source = cast(TargetSource, choice("--learn-from", asked.learn_from, TargetSource))
     if asked.views is None and source == "cameras":
         raise UnsupportedError("--learn-from cameras: say whose with --views")
     return source
