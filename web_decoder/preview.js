@@ -41,7 +41,7 @@ async function during(what, work) {
     if (!aborted(error)) trouble(error);
   }
   load.done();
-  byId("empty").hidden = !byId("picture").hidden || !byId("loading").hidden;
+  byId("empty").hidden = !byId("viewport").hidden || !byId("loading").hidden;
 }
 
 /**
@@ -197,7 +197,7 @@ byId("file").addEventListener("change", () => {
   byId("file").value = ""; // so that the same file can be chosen again
 });
 dropAnywhere(take);
-listen({ picture: byId("picture"), home: view.home, move: view.press });
+listen({ picture: byId("viewport"), home: view.home, move: view.press });
 
 const job = jobIn(location);
 if (job) byId("home").href = `../#${job}`;

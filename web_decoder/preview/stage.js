@@ -25,7 +25,7 @@ async function modules() {
 
 /** @param {(error: unknown) => void} failed what to do if nothing can be drawn */
 export function stage(failed) {
-  const [place, canvas] = [byId("stage"), byId("picture")];
+  const [place, canvas] = [byId("stage"), byId("viewport")];
   /** @type {{viewer: import("./viewer.js").Viewer, camera: ReturnType<typeof import("./navigation.js").navigation>} | null} */
   let live = null;
   /** @type {Awaited<ReturnType<typeof import("./compare.js").comparison>> | null} */
