@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from kissgs.cameras.views import Source, Views
+from kissgs.cameras.views import TargetSource, Views
 from kissgs.compaction.evaluate import evaluate_scene
 from kissgs.compaction.popspa import popspa
 from kissgs.compaction.scoring import highest
@@ -116,7 +116,7 @@ def compare_strategies(
     *,
     ratios: Sequence[float] = RATIOS,
     strategies: Sequence[Strategy] = STRATEGIES,
-    supervision: Source = "photos",
+    supervision: TargetSource = "photos",
     threads: int = 0,
     progress: Progress = silent,
 ) -> list[CompactionPoint]:
@@ -186,10 +186,10 @@ def _supervision(
     splats: Splats,
     settings: CompactSettings,
     views: Views | None,
-    supervision: Source,
+    supervision: TargetSource,
     threads: int,
     progress: Progress,
 ) -> SupervisionViews:
     stride = SCORING_STRIDE if settings.trains else 1
-    used = None if views is None else views.to_learn(supervision)
+    used = None if views is None else views.for_training(supervision)
     return supervision_views(splats, used, settings, scoring_stride=stride, threads=threads, progress=progress)

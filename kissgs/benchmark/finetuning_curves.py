@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from kissgs.benchmark.bd_rate import RateCurve, at_quality_offset
-from kissgs.cameras.views import Source, Views
+from kissgs.cameras.views import TargetSource, Views
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.progress import Progress, as_stage, silent
 from kissgs.core.splats import Splats
@@ -63,7 +63,7 @@ def rate_curves(
     *,
     quality_offsets: Sequence[float] | None = None,
     ratios: Sequence[float] = (),
-    supervision: Source = "photos",
+    supervision: TargetSource = "photos",
     threads: int = 0,
     progress: Progress = silent,
 ) -> list[RatePoint]:
@@ -92,7 +92,7 @@ def rate_curves(
             "--ratio"
         )
     evaluated = views or evaluation_views(splats, threads=threads, progress=progress)
-    training = None if views is None or supervision == "scene" else views.to_learn(supervision)
+    training = None if views is None or supervision == "scene" else views.for_training(supervision)
     points = []
     shares: list[float | None] = [*ratios] or [None]
     for ratio in shares:

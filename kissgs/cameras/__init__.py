@@ -1,1 +1,1 @@
-"""From where a scene is looked at: posed photographs, and virtual cameras for a scene that has none."""
+"""Cameras: posed photographs of a capture, and virtual cameras for a scene without one."""

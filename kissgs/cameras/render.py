@@ -1,4 +1,4 @@
-"""What ``kissgs render`` does once it knows what is wanted: a picture, a way around the scene, or all its views."""
+"""``RenderJob``: the work of ``kissgs render``, an image, an orbit around the scene, or a sheet of all views."""
 
 from __future__ import annotations
 
@@ -20,38 +20,40 @@ from kissgs.rendering.contact_sheet import Label, contact_sheet
 from kissgs.rendering.images import reframed, render_all
 from kissgs.rendering.rasterizer import BLACK, Colour, Device, load_kernels
 
-PICTURE, FRAME, CELL = (1280, 960), (640, 480), (320, 240)
-"""Width and height if none is asked for: of a picture, of a film's frames, and of the pictures on a sheet."""
+IMAGE_SIZE, FRAME_SIZE, CELL_SIZE = (1280, 960), (640, 480), (320, 240)
+"""Default (width, height), pixels: of a single image, of an animation's frames, of the images on a contact sheet."""
 
-FILM_FRAMES, SHEET_FRAMES = 48, 24
+ANIMATION_FRAMES, SHEET_FRAMES = 48, 24
+"""Default number of images of an orbit, in an animation and on a contact sheet."""
+
 HELD_OUT = " · held out"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RenderedImages:
-    """Pictures that were taken.
+    """Result of a render job.
 
     Attributes:
-        pictures: to write: one, or the frames of a film.
-        views: from where; on a sheet, one for each of its pictures.
-        what: in words.
+        images: uint8 ``(height, width, 3)`` each: one image or contact sheet, or the frames of an animation.
+        views: the views that were rendered; for a contact sheet, those of all its cells.
+        description: description of the views, for people.
     """
 
-    pictures: Sequence[UInt8[np.ndarray, "H W 3"]]
+    images: Sequence[UInt8[np.ndarray, "H W 3"]]
     views: Sequence[View]
-    what: str
+    description: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RenderJob:
-    """Takes pictures of a scene; all its methods raise what their parts do.
+    """Renderer of a scene with the choices of ``kissgs render``.
 
     Attributes:
-        splats: finite (:func:`kissgs.clean`).
-        size: (width, height) of each picture; None for the camera's own, or what is usual.
-        background: RGB from 0 to 1; None for that of the capture, else black.
+        splats: scene to render, without non-finite values (:func:`kissgs.clean`).
+        size: (width, height) of each image, pixels; None for the camera's size, else for the default.
+        background: RGB, 0 to 1; None for that of the capture, else black.
         device: as for :func:`kissgs.render`.
-        threads: of the processor; 0 means one each.
+        threads: number of threads; 0 means one per processor.
         progress: receives the stages ``"kernels"``, ``"cameras"`` and ``"render"``.
     """
 
@@ -63,10 +65,15 @@ class RenderJob:
     progress: Progress = silent
 
     def single(self, capture: Views | None, which: str | None) -> RenderedImages:
-        """One picture, of a camera in its own shape and size if it has any.
+        """Render a single image, by default at the camera's size.
 
-        ``which`` is a file of cameras, or a number or a name in the capture, else among virtual views. By default it is
-        the capture's first view or the best virtual one.
+        Args:
+            capture: views that ``which`` selects from; None for virtual views.
+            which: number or name of a view, or a camera file; None for the first view of the capture, or the best
+                virtual view.
+
+        Raises:
+            InvalidViewsError: no view or camera file matches ``which``.
         """
         load_kernels(self.progress)
         if which is not None and is_camera_file(which):
@@ -74,50 +81,52 @@ class RenderJob:
         elif capture is not None:
             view, source = pick_view(capture.all, which or "0", capture.source), capture.source
         elif which is None:
-            width, height = self.size or PICTURE
+            width, height = self.size or IMAGE_SIZE
             view = best_view(self.splats, width=width, height=height, threads=self.threads, progress=self.progress)
             source = "best of the virtual cameras"
         else:
-            virtual = self._virtual(self.size or PICTURE)
+            virtual = self._virtual(self.size or IMAGE_SIZE)
             view, source = pick_view(virtual.all, which, virtual.source), virtual.source
         if self.size is not None:
             view = View(view.name, reframed(view.camera, *self.size))
-        return RenderedImages(self._take([view.camera], capture), [view], f"{view.name} ({source})")
+        return RenderedImages(self._render([view.camera], capture), [view], f"{view.name} ({source})")
 
-    def film(self, frames: int | None = None) -> RenderedImages:
-        """The way around the scene, as frames that can be repeated."""
+    def animation(self, frames: int | None = None) -> RenderedImages:
+        """Render an orbit around the scene, as the frames of an animation that loops."""
         load_kernels(self.progress)
-        width, height = self.size or FRAME
+        width, height = self.size or FRAME_SIZE
         orbit = find_orbit(self.splats, width=width, height=height, threads=self.threads, progress=self.progress)
-        cameras = orbit.loop(frames or FILM_FRAMES, width, height)
-        return RenderedImages(self._take(cameras, None), _numbered(cameras), f"{len(cameras)} frames, {orbit.in_words}")
+        cameras = orbit.loop(frames or ANIMATION_FRAMES, width, height)
+        return RenderedImages(
+            self._render(cameras, None), _numbered(cameras), f"{len(cameras)} frames, {orbit.in_words}"
+        )
 
-    def strip(self, frames: int | None = None) -> RenderedImages:
-        """The way around the scene, as one sheet of pictures."""
+    def orbit_sheet(self, frames: int | None = None) -> RenderedImages:
+        """Render an orbit around the scene, as one contact sheet."""
         load_kernels(self.progress)
-        width, height = self.size or CELL
+        width, height = self.size or CELL_SIZE
         orbit = find_orbit(self.splats, width=width, height=height, threads=self.threads, progress=self.progress)
         cameras = orbit.stops(frames or SHEET_FRAMES, width, height)
-        sheet = contact_sheet(self._take(cameras, None))
-        return RenderedImages([sheet], _numbered(cameras), f"{len(cameras)} pictures, {orbit.in_words}")
+        sheet = contact_sheet(self._render(cameras, None))
+        return RenderedImages([sheet], _numbered(cameras), f"{len(cameras)} images, {orbit.in_words}")
 
-    def sheet(self, capture: Views | None) -> RenderedImages:
-        """All views of the capture, else the virtual ones, with their names; held-out ones are marked."""
+    def view_sheet(self, capture: Views | None) -> RenderedImages:
+        """Render a contact sheet of the capture's views, else of the virtual views, with names and held-out marks."""
         load_kernels(self.progress)
-        width, height = self.size or CELL
+        width, height = self.size or CELL_SIZE
         views = self._virtual((width, height)) if capture is None else capture
         if not views.all:
-            raise InvalidViewsError(f"{views.source} has no view to show")
+            raise InvalidViewsError(f"{views.source} has no view; name a capture with views")
         shown = [View(view.name, _within(view.camera, width, height)) for view in views.all]
         held_out = {view.name for view in views.test}
         labels = [Label(f"{view.name}{HELD_OUT * (view.name in held_out)}", view.name in held_out) for view in shown]
-        sheet = contact_sheet(self._take([view.camera for view in shown], capture), labels)
+        sheet = contact_sheet(self._render([view.camera for view in shown], capture), labels)
         return RenderedImages([sheet], shown, f"{len(shown)} views, {len(views.test)} held out ({views.source})")
 
     def _virtual(self, size: tuple[int, int]) -> Views:
         return virtual_views(self.splats, width=size[0], height=size[1], threads=self.threads, progress=self.progress)
 
-    def _take(self, cameras: Sequence[Camera], capture: Views | None) -> list[UInt8[np.ndarray, "H W 3"]]:
+    def _render(self, cameras: Sequence[Camera], capture: Views | None) -> list[UInt8[np.ndarray, "H W 3"]]:
         background = self.background
         if background is None:
             background = BLACK if capture is None else capture.background.tolist()
@@ -137,6 +146,6 @@ def _numbered(cameras: Sequence[Camera]) -> list[View]:
 
 
 def _within(camera: Camera, width: int, height: int) -> Camera:
-    """The same picture, as large as fits."""
+    """Return the camera resized to the largest image that fits into ``width`` x ``height``."""
     scale = min(width / camera.width, height / camera.height)
     return camera.resized(max(1, round(scale * camera.width)), max(1, round(scale * camera.height)))

@@ -1,7 +1,7 @@
-"""Photographs of a distorting lens made into those of a pinhole.
+"""Undistortion: conversion of photographs of a distorting lens to those of a pinhole camera.
 
-The model is Brown's in OpenCV's spelling, which COLMAP's SIMPLE_RADIAL, RADIAL, OPENCV and FULL_OPENCV and nerfstudio
-share. Fisheye lenses follow others and are refused where cameras are read.
+The distortion model is Brown's with OpenCV's coefficients, which COLMAP's SIMPLE_RADIAL, RADIAL, OPENCV and FULL_OPENCV
+and nerfstudio share. Fisheye lenses have other models, which the readers of camera files reject.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from kissgs.core.array_types import Bool, Float32, Float64, UInt8
 from kissgs.core.errors import InvalidViewsError
 
 MIN_AREA = 0.1
-"""Share of the photograph that must remain. Real lenses leave more than half; less means wrong coefficients."""
+"""Minimum share of the photograph's area that must remain; real lenses keep more than half."""
 
 _BLOCK_PIXELS = 1 << 14
-"""Undistorted at a time: the temporaries, some 2 MB, stay in the processor's cache."""
+"""Number of pixels undistorted at a time, so that temporaries of about 2 MB stay in the processor's cache."""
 
 _GRID = 33
-"""Points per side at which the inside of a window is checked; its border is checked at every pixel."""
+"""Points per side at which the interior of a window is checked; its border is checked at every pixel."""
 
 
 @dataclass(frozen=True, slots=True)
 class Distortion:
-    """Coefficients of a lens: radial k1 to k6 (k4 to k6 in the denominator) and tangential p1, p2."""
+    """Distortion coefficients: radial k1 to k6 (k4 to k6 in the denominator) and tangential p1, p2."""
 
     k1: float = 0.0
     k2: float = 0.0
@@ -44,7 +44,7 @@ class Distortion:
     def apply(
         self, x: Float64[np.ndarray, "*shape"], y: Float64[np.ndarray, "*shape"]
     ) -> tuple[Float64[np.ndarray, "*shape"], Float64[np.ndarray, "*shape"]]:
-        """Where the lens images the ray (x, y, 1): the same plane, in units of the focal length."""
+        """Return the distorted image point of the ray (x, y, 1), in units of the focal length."""
         r2 = x * x + y * y
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
         if self.k4 or self.k5 or self.k6:
@@ -62,7 +62,7 @@ NO_DISTORTION = Distortion()
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """Intrinsics of a photograph of ``width`` x ``height`` pixels, all lengths in these pixels."""
+    """Intrinsics and distortion of a photograph of ``width`` x ``height`` pixels; all lengths in pixels."""
 
     fx: float
     fy: float
@@ -74,18 +74,18 @@ class Lens:
 
     @property
     def K(self) -> Float64[np.ndarray, "3 3"]:
-        """Of the pinhole in it."""
+        """``(3, 3)`` float64 intrinsics of the pinhole without distortion."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def resized(self, width: int, height: int) -> Lens:
-        """Of the same photograph on another grid of pixels; distortion is in units of the focal length."""
+        """Return the lens for the photograph resized to this size; the distortion has no unit, so it stays."""
         x, y = width / self.width, height / self.height
         return Lens(self.fx * x, self.fy * y, self.cx * x, self.cy * y, width, height, self.distortion)
 
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """The part of the pinhole's picture that is kept: on the photograph's grid of pixels, from ``left``, ``top`` on."""
+    """Part of the undistorted image that is kept, in pixels of the photograph; ``left``, ``top`` is its first pixel."""
 
     left: int
     top: int
@@ -93,19 +93,19 @@ class Window:
     height: int
 
     def K(self, lens: Lens) -> Float64[np.ndarray, "3 3"]:
-        """Intrinsics of the pinhole whose picture it is: only the principal point moves."""
+        """Return the ``(3, 3)`` pinhole intrinsics of the cropped image: only the principal point moves."""
         return lens.K - [[0, 0, self.left], [0, 0, self.top], [0, 0, 0]]
 
 
-@lru_cache(maxsize=256)  # most captures have one lens and hundreds of photographs
+@lru_cache(maxsize=256)  # most captures have hundreds of photographs of one lens
 def full_window(lens: Lens) -> Window:
-    """The largest window whose every pixel the photograph shows, so that no border is black.
+    """Return the largest window that the photograph covers completely, so that no border is black.
 
-    It is the photograph's own rectangle shrunk towards the principal point, so a lens that bends outwards (barrel)
-    loses nothing, and the shape stays.
+    The window is the photograph's rectangle shrunk towards the principal point, so its aspect ratio stays, and barrel
+    distortion loses nothing.
 
     Raises:
-        InvalidViewsError: the principal point is not in the photograph, or less than a tenth of its area would remain.
+        InvalidViewsError: the principal point is outside the photograph, or less than :data:`MIN_AREA` would remain.
     """
     if not (0 < lens.cx < lens.width and 0 < lens.cy < lens.height):
         raise InvalidViewsError(
@@ -113,11 +113,11 @@ def full_window(lens: Lens) -> Window:
             f"{lens.width}x{lens.height} photograph; calibrate again"
         )
     low, high = 0.0, 1.0
-    if _is_shown(lens, _shrunk(lens, 1.0)):
+    if _is_covered(lens, _shrunk(lens, 1.0)):
         return _shrunk(lens, 1.0)
-    while high - low > 1e-5:  # windows are nested, so what holds for one holds for all smaller ones
+    while high - low > 1e-5:  # windows are nested: if one is covered, all smaller ones are
         middle = (low + high) / 2
-        low, high = (middle, high) if _is_shown(lens, _shrunk(lens, middle)) else (low, middle)
+        low, high = (middle, high) if _is_covered(lens, _shrunk(lens, middle)) else (low, middle)
     window = _shrunk(lens, low)
     if window.width * window.height < MIN_AREA * lens.width * lens.height:
         raise InvalidViewsError(
@@ -128,9 +128,9 @@ def full_window(lens: Lens) -> Window:
 
 
 def undistort(photo: UInt8[np.ndarray, "H W 3"], lens: Lens, window: Window) -> UInt8[np.ndarray, "h w 3"]:
-    """What a pinhole with the lens' focal lengths and principal point would have shown within ``window``.
+    """Return the image that a pinhole with the focal lengths and principal point of ``lens`` would take of ``window``.
 
-    Every pixel's ray is sent through the lens, and the photograph sampled there, bicubically (Catmull-Rom).
+    Each pixel's ray is projected through the lens, and the photograph is sampled there, bicubically (Catmull-Rom).
     """
     planes = np.ascontiguousarray(photo.transpose(2, 0, 1))
     result = np.empty((window.height, window.width, 3), dtype=np.uint8)
@@ -149,8 +149,8 @@ def _shrunk(lens: Lens, share: float) -> Window:
     return Window(int(left), int(top), max(0, int(right - left)), max(0, int(bottom - top)))
 
 
-def _is_shown(lens: Lens, window: Window) -> bool:
-    """Whether every pixel's ray meets the photograph, without the lens folding the picture over itself."""
+def _is_covered(lens: Lens, window: Window) -> bool:
+    """Whether the rays of all pixels hit the photograph, in the range in which the distortion is invertible."""
     if window.width == 0 or window.height == 0:
         return True
     first_x, first_y = window.left + 0.5, window.top + 0.5
@@ -159,17 +159,17 @@ def _is_shown(lens: Lens, window: Window) -> bool:
     inside = np.meshgrid(np.linspace(first_x, last_x, _GRID), np.linspace(first_y, last_y, _GRID))
     u = np.concatenate([xs, xs, np.full_like(ys, first_x), np.full_like(ys, last_x), inside[0].ravel()])
     v = np.concatenate([np.full_like(xs, first_y), np.full_like(xs, last_y), ys, ys, inside[1].ravel()])
-    return bool(_is_seen(lens, (u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy).all())
+    return bool(_is_imaged(lens, (u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy).all())
 
 
-def _is_seen(lens: Lens, x: Float64[np.ndarray, " n"], y: Float64[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+def _is_imaged(lens: Lens, x: Float64[np.ndarray, " n"], y: Float64[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
     h = 1e-5
-    with np.errstate(all="ignore"):  # coefficients may be anything; what overflows is not seen
+    with np.errstate(all="ignore"):  # coefficients may be arbitrary; rays that overflow miss the photograph
         u, v = _project(lens, x, y)
         (ux1, vx1), (ux0, vx0) = lens.distortion.apply(x + h, y), lens.distortion.apply(x - h, y)
         (uy1, vy1), (uy0, vy0) = lens.distortion.apply(x, y + h), lens.distortion.apply(x, y - h)
-        unfolded = (ux1 - ux0) * (vy1 - vy0) - (uy1 - uy0) * (vx1 - vx0) > 0  # the mapping's Jacobian determinant
-        return np.asarray(unfolded & (u >= 0) & (u <= lens.width) & (v >= 0) & (v <= lens.height))
+        invertible = (ux1 - ux0) * (vy1 - vy0) - (uy1 - uy0) * (vx1 - vx0) > 0  # the mapping's Jacobian determinant
+        return np.asarray(invertible & (u >= 0) & (u <= lens.width) & (v >= 0) & (v <= lens.height))
 
 
 def _project(
@@ -182,9 +182,9 @@ def _project(
 def _sample(
     planes: UInt8[np.ndarray, "3 H W"], u: Float64[np.ndarray, "h w"], v: Float64[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """A photograph between its pixels; (0, 0) is the centre of the first. Beyond the last, the last goes on.
+    """Sample a photograph bicubically; (0, 0) is the centre of the first pixel, and border pixels are repeated.
 
-    One plane per colour, because numpy gathers single bytes several times faster than triples.
+    The planes are separate, because numpy gathers single bytes several times faster than triples.
     """
     height, width = planes.shape[1:]
     flat = planes.reshape(3, height * width)
@@ -195,14 +195,14 @@ def _sample(
     for j in range(4):
         start = np.clip(row + j - 1, 0, height - 1) * width
         for i in range(4):
-            place, weight = start + columns[i], down[j] * across[i]
-            for colour in range(3):
-                total[colour] += flat[colour].take(place) * weight
+            index, weight = start + columns[i], down[j] * across[i]
+            for channel in range(3):
+                total[channel] += flat[channel].take(index) * weight
     return np.clip(np.rint(total), 0, 255).astype(np.uint8).transpose(1, 2, 0)
 
 
 def _weights(t: Float32[np.ndarray, "h w"]) -> list[Float32[np.ndarray, "h w"]]:
-    """Of the four pixels around a place that is ``t`` after the second."""
+    """Return the Catmull-Rom weights of four pixels, for a position ``t`` (0 to 1) after the second."""
     half = np.float32(0.5)
     return [
         ((-half * t + 1) * t - half) * t,

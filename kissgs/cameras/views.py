@@ -1,4 +1,4 @@
-"""``View`` and ``Views``: from where a scene was looked at, and what was seen."""
+"""``View`` and ``Views``: cameras with their photographs, for training and for evaluation."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from kissgs.rendering.camera import Camera
 
 
 def black() -> Float32[np.ndarray, "3"]:
-    """The background of photographs, which have none."""
+    """Return black, the default background, as ``(3,)`` float32."""
     return np.zeros(3, dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True)
 class UndistortionSpec:
-    """How a photograph becomes its view's picture: reduced to the lens' size, undistorted, cropped to the window."""
+    """Steps from a photograph to the image of a view: resize to the lens' size, undistort, crop to the window."""
 
     lens: Lens
     window: Window
@@ -30,71 +30,74 @@ class UndistortionSpec:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """A camera, at the resolution to render, and the photograph taken with it.
+    """A camera with a name and perhaps a photograph.
 
     Attributes:
-        name: of the view.
-        camera: an undistorted pinhole of the photograph's size after all reduction and cropping.
-        photo: the photograph's file; None where there are only cameras.
-        background: ``(3,)`` red, green, blue from 0 to 1: what transparent pixels of the photograph show, and over
-            which to render when scenes are compared; None: black, and that of all views.
-        bend: how to undistort the photograph; None if it is a pinhole's.
-        target: ``(3,)`` the point in the middle of the picture that the camera looks at; None where none is known.
-        added: whether it was put beside drawn ones for a part of the scene that those overlook.
+        name: name of the view.
+        camera: pinhole camera at the resolution to render, that of the photograph after undistortion and reduction.
+        photo: file of the photograph; None if there is only a camera.
+        background: ``(3,)`` float32 RGB, 0 to 1, behind transparent pixels of the photograph and behind renderings in
+            comparisons; None: black for the photograph, that of ``Views`` for renderings.
+        undistortion: how to undistort the photograph; None if its lens does not distort.
+        target: ``(3,)`` float64 point, world units, that the camera looks at in the centre of its image; None if
+            unknown.
+        added: whether an evaluation added it for an overlooked part of the scene.
     """
 
     name: str
     camera: Camera
     photo: Path | None = None
     background: Float32[np.ndarray, "3"] | None = None
-    bend: UndistortionSpec | None = None
+    undistortion: UndistortionSpec | None = None
     target: Float64[np.ndarray, "3"] | None = None
     added: bool = False
 
     def at_most(self, size: int) -> View:
-        """The same with at most so many pixels on the longer side; the photograph is reduced when it is loaded."""
+        """Return the view with at most ``size`` pixels on the longer side; its photograph is reduced on loading."""
         camera = self.camera.at_most(size)
-        if self.bend is None or camera is self.camera:
+        if self.undistortion is None or camera is self.camera:
             return replace(self, camera=camera)
-        lens, shrink = self.bend.lens, size / max(self.camera.width, self.camera.height)
+        lens, shrink = self.undistortion.lens, size / max(self.camera.width, self.camera.height)
         small = lens.resized(max(1, int(lens.width * shrink)), max(1, int(lens.height * shrink)))
         window = full_window(small)
         camera = Camera(self.camera.viewmat, window.K(small), window.width, window.height)
-        return replace(self, camera=camera, bend=UndistortionSpec(small, window))
+        return replace(self, camera=camera, undistortion=UndistortionSpec(small, window))
 
     def load_photo(self) -> UInt8[np.ndarray, "H W 3"]:
-        """The photograph at exactly the camera's size; read anew at every call.
+        """Read the photograph from its file and return it at the camera's size, uint8 ``(height, width, 3)``.
 
-        It is reduced first and then undistorted, which is several times cheaper than the other way round.
+        It is reduced before it is undistorted, which is several times cheaper than the other way round.
 
         Raises:
             InvalidViewsError: there is none, or it cannot be read.
-            UnsupportedError: its pixels are numbers of 32 bits.
+            UnsupportedError: it has 32 bits per channel.
         """
         if self.photo is None:
-            raise InvalidViewsError(f"view {self.name} has no photograph, only a camera")
+            raise InvalidViewsError(
+                f"view {self.name} has no photograph, only a camera; add the photographs of the capture"
+            )
         background = black() if self.background is None else self.background
-        if self.bend is None:
+        if self.undistortion is None:
             return read_photo(self.photo, self.camera.width, self.camera.height, background)
-        lens = self.bend.lens
-        return undistort(read_photo(self.photo, lens.width, lens.height, background), lens, self.bend.window)
+        lens = self.undistortion.lens
+        return undistort(read_photo(self.photo, lens.width, lens.height, background), lens, self.undistortion.window)
 
 
-Source = Literal["photos", "cameras", "scene"]
-"""What to learn from: a capture's photographs; its cameras alone, with pictures of the scene as it was; or the scene
-alone, from virtual cameras."""
+TargetSource = Literal["photos", "cameras", "scene"]
+"""Source of training targets: a capture's photographs; renderings of the original scene from the capture's cameras; or
+renderings from virtual cameras."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Views:
-    """The views of a capture, each part sorted by name.
+    """Views for training and evaluation, each sorted by name.
 
     Attributes:
-        train: to learn from.
-        test: held out, to judge by; may be empty.
-        background: ``(3,)`` red, green, blue from 0 to 1, over which to render.
-        source: what was read, for people.
-        note: a sentence for people about what they may not have expected, without a capital and a full stop; or none.
+        train: training views.
+        test: held-out views, for evaluation only; may be empty.
+        background: ``(3,)`` float32 RGB, 0 to 1, behind renderings.
+        source: description of the files that were read, for messages.
+        note: clause about an unexpected property of the capture, for messages; empty if there is none.
     """
 
     train: tuple[View, ...]
@@ -105,11 +108,11 @@ class Views:
 
     @property
     def all(self) -> tuple[View, ...]:
-        """Both parts, sorted by name."""
+        """Training and held-out views, sorted by name."""
         return tuple(sorted(self.train + self.test, key=lambda view: view.name))
 
-    def to_learn(self, source: Source) -> Views:
-        """With so much of the capture to learn from; what is held out, or all where nothing is, still judges."""
+    def for_training(self, source: TargetSource) -> Views:
+        """Return views whose training part suits ``source``; evaluation uses the held-out views, or all if none is."""
         if source == "photos":
             return self
         bare = tuple(replace(view, photo=None) for view in self.train) if source == "cameras" else ()

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from kissgs.benchmark.compaction_study import CompactionPoint
     from kissgs.benchmark.finetuning_curves import RatePoint
-    from kissgs.cameras.views import Source
+    from kissgs.cameras.views import TargetSource
     from kissgs.core.progress import Progress
 
 
@@ -59,13 +59,13 @@ def compaction(options: BenchOptions) -> BenchOutput:
     )
 
 
-def _supervision(options: BenchOptions) -> Source:
+def _supervision(options: BenchOptions) -> TargetSource:
     """Return the value of ``--supervision``, after a check of the options of training."""
-    from kissgs.cameras.views import Source
+    from kissgs.cameras.views import TargetSource
 
     if 0 in options.ratios:
         raise UnsupportedError("--ratio 0 keeps no Gaussian; give a share above 0")
-    supervision = cast(Source, choice("--supervision", options.supervision, Source))
+    supervision = cast(TargetSource, choice("--supervision", options.supervision, TargetSource))
     if options.views is None and supervision == "cameras":
         raise UnsupportedError("--supervision cameras needs a capture; give one with --views")
     return supervision

@@ -151,9 +151,9 @@ def render(
                 progress=progress,
             )
             if orbit:
-                rendered = job.film(frames) if animated else job.strip(frames)
+                rendered = job.animation(frames) if animated else job.orbit_sheet(frames)
             else:
-                rendered = job.sheet(capture) if sheet else job.single(capture, view)
+                rendered = job.view_sheet(capture) if sheet else job.single(capture, view)
             progress("write", 0.0)
             data = _encoded(rendered, suffix, FPS if fps is None else fps, QUALITY if quality is None else quality)
             progress("write", 1.0)
@@ -163,7 +163,7 @@ def render(
         report = _report(rendered, len(data))
         if not (quiet or as_json or piped):
             saved = "" if save_camera is None else f"; {save_camera}"
-            show(f"{target}  {report['width']}x{report['height']}, {rendered.what}{saved}")
+            show(f"{target}  {report['width']}x{report['height']}, {rendered.description}{saved}")
         return report
 
     for_each_input([file], output, suffix, as_json, work)
@@ -219,12 +219,12 @@ def _colour(text: str | None) -> tuple[float, float, float] | None:
 def _encoded(rendered: RenderedImages, suffix: str, fps: int, quality: int) -> bytes:
     from kissgs.rendering.images import animated_webp, png
 
-    return png(rendered.pictures[0]) if suffix == ".png" else animated_webp(rendered.pictures, fps=fps, quality=quality)
+    return png(rendered.images[0]) if suffix == ".png" else animated_webp(rendered.images, fps=fps, quality=quality)
 
 
 def _report(rendered: RenderedImages, size: int) -> dict[str, Any]:
     from kissgs.cameras.captures.camera_json import camera_as_dict
 
-    height, width = rendered.pictures[0].shape[:2]
+    height, width = rendered.images[0].shape[:2]
     cameras = [{"name": view.name, **camera_as_dict(view.camera)} for view in rendered.views]
-    return {"width": width, "height": height, "frames": len(rendered.pictures), "bytes": size, "cameras": cameras}
+    return {"width": width, "height": height, "frames": len(rendered.images), "bytes": size, "cameras": cameras}

@@ -61,7 +61,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     app.state.context = context
     for router in ROUTERS:
         app.include_router(router)
-    app.mount("/static", page.Fresh(directory=page.STATIC), name="static")
+    app.mount("/static", page.RevalidatedFiles(directory=page.STATIC), name="static")
     describe(app, keys_required=bool(settings.keys))
     app.openapi()  # generated at the start, not during a request
     _answer_errors(app)

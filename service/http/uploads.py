@@ -62,7 +62,7 @@ class Spool:
     async def __aenter__(self) -> Self:
         if self._at_most is not None:
             self._refuse_size(self._at_most)
-            await run_sync(self._admission.require, self._at_most)
+            await run_sync(self._admission.check_space, self._at_most)
         return self
 
     async def __aexit__(self, *error: object) -> None:

@@ -1,4 +1,4 @@
-"""What is let in: the queue's length, uploads at the same time, room on the disk."""
+"""Admission: checks on the queue, on simultaneous uploads and on disk space."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from service.storage.job_storage import JobStorage
 from service.storage.job_store import LimitExceeded, Store
 
 BUSY_SECONDS = 5.0
-"""When to try again what is refused for a crowd that will pass soon."""
+"""``Retry-After`` of refusals because of simultaneous uploads, seconds."""
 
 FULL_SECONDS = 600.0
-"""When to try again what is refused for want of room."""
+"""``Retry-After`` of refusals because of a full disk, seconds."""
 
 
 @dataclass
 class Admission:
-    """Counts what is on its way in, and refuses what there is no room for. Its methods may block on the database."""
+    """Counts of uploads and reserved disk space, and refusals beyond the limits; methods may block on the database."""
 
     settings: ServiceSettings
     store: Store
@@ -34,7 +34,7 @@ class Admission:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def check(self, owner: str) -> None:
-        """Refuse, before a body is read, what :meth:`add` would refuse after it.
+        """Refuse a request before its body is read, if :meth:`add` would refuse it afterwards.
 
         Raises:
             ProblemError: ``queue-full`` or ``too-many-jobs``.
@@ -49,10 +49,10 @@ class Admission:
 
         Raises:
             ProblemError: ``queue-full`` or ``too-many-jobs``.
-            LimitExceeded: its idempotency key is taken.
+            LimitExceeded: its idempotency key is in use.
         """
         try:
-            with self._lock:  # counted and added in one step, on every kind of database
+            with self._lock:  # counting and adding is one step with every database
                 return self.store.add(job, max_queue=self.settings.max_queue, max_owner=self.settings.max_jobs_per_key)
         except LimitExceeded as refused:
             if refused.limit == "key":
@@ -61,7 +61,7 @@ class Admission:
 
     @contextlib.contextmanager
     def slot(self) -> Iterator[None]:
-        """Count an upload for as long as it arrives.
+        """Count an upload while it is received.
 
         Raises:
             ProblemError: ``too-many-uploads``.
@@ -69,7 +69,7 @@ class Admission:
         if self.uploads >= self.settings.max_uploads:
             raise ProblemError(
                 "too-many-uploads",
-                f"{self.uploads} uploads are arriving, which is the limit; try again in a few seconds",
+                f"{self.uploads} uploads are in progress, which is the limit; try again in a few seconds",
                 retry_after=BUSY_SECONDS,
             )
         self.uploads += 1
@@ -78,8 +78,8 @@ class Admission:
         finally:
             self.uploads -= 1
 
-    def require(self, size: int) -> None:
-        """Refuse what cannot fit even if ended jobs gave up all they can. Nothing is set aside or removed.
+    def check_space(self, size: int) -> None:
+        """Refuse ``size`` bytes that would not fit even without the reclaimable files of ended jobs; reserve nothing.
 
         Raises:
             ProblemError: ``disk-full``.
@@ -89,7 +89,7 @@ class Admission:
                 raise self._full(size)
 
     def reserve(self, size: int) -> None:
-        """Set bytes of the disk aside; where there is no room, ended jobs give up what they can.
+        """Reserve disk space in bytes; if there is not enough, remove reclaimable files of ended jobs.
 
         Raises:
             ProblemError: ``disk-full``.
@@ -98,41 +98,41 @@ class Admission:
             if not self._fits(size) and not self._fits(size, self.store.reclaimable_bytes()):
                 raise self._full(size)
             while not self._fits(size):
-                spare = self.store.reclaimable()
-                if not spare:
+                reclaimable = self.store.reclaimable()
+                if not reclaimable:
                     raise self._full(size)
-                for number, job_id in spare:
-                    self._give_up(number, job_id)
+                for number, job_id in reclaimable:
+                    self._reclaim(number, job_id)
                     if self._fits(size):
                         break
             self._reserved += size
 
     def wrote(self, size: int) -> None:
-        """Bytes that were set aside have become a file, and the disk has that much less already."""
+        """Record that ``size`` reserved bytes have been written, so they are no longer free on the disk."""
         with self._lock:
             self._written += size
 
     def release(self, size: int, written: int) -> None:
-        """Give back what :meth:`reserve` has set aside: it is a job's now, or nobody's."""
+        """Release a reservation of ``size`` bytes, of which ``written`` were written and now count as the job's."""
         with self._lock:
             self._reserved -= size
             self._written -= written
 
-    def _give_up(self, number: int, job_id: str) -> None:
-        """Remove the upload of an ended job, and its decoded scene, which can be made anew."""
-        self.store.require()
+    def _reclaim(self, number: int, job_id: str) -> None:
+        """Remove the upload of an ended job, and its decoded scene, which can be decoded again."""
+        self.store.check()
         for path in self.storage.reclaimable_files(job_id):
             self.storage.discard(path)
         self.store.update(number, upload_kept=False, reclaimable_bytes=0, disk_bytes=self.storage.job_bytes(job_id))
 
-    def _fits(self, size: int, spare: int = 0) -> bool:
-        taken = self.store.disk_bytes() + self._reserved - spare
-        free = self.storage.free_bytes() - (self._reserved - self._written) + spare
+    def _fits(self, size: int, reclaimable: int = 0) -> bool:
+        taken = self.store.disk_bytes() + self._reserved - reclaimable
+        free = self.storage.free_bytes() - (self._reserved - self._written) + reclaimable
         return taken + size <= self.settings.max_disk_bytes and free - size >= self.settings.min_free_bytes
 
     def _full(self, size: int) -> ProblemError:
         text = (
-            f"there is no room for {size:,} more bytes on the server; try again later, "
+            f"the server has no disk space for {size:,} more bytes; try again later, "
             "or delete jobs that you no longer need"
         )
         return ProblemError("disk-full", text, retry_after=FULL_SECONDS)

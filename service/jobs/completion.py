@@ -1,4 +1,4 @@
-"""How jobs end: their files, their row, what is counted and logged of it."""
+"""``JobCompletion``: the end of jobs in files, database, metrics and log."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ log = logging.getLogger("kissgs.service")
 
 @dataclass(frozen=True, slots=True)
 class JobCompletion:
-    """Brings jobs to an end. Its methods block on the disk and the database."""
+    """Recorder of the end of jobs; methods block on the disk and the database."""
 
     settings: ServiceSettings
     store: Store
@@ -28,7 +28,7 @@ class JobCompletion:
     clock: Clock
 
     def succeed(self, job: Job, summary: dict[str, Any]) -> None:
-        """The job's result is in its place."""
+        """Record success of a job whose result is in its final folder."""
         upload = self.storage.upload(job.id)
         self.storage.discard_checkpoints(job.id)
         if not self.settings.keep_uploads:
@@ -44,17 +44,17 @@ class JobCompletion:
             self.storage.discard(self.storage.result(job.id))
 
     def fail(self, job: Job, code: str, detail: str) -> None:
-        """The job has no result, and its files are of no more use."""
+        """Record failure of a job and remove its files."""
         if self._failed(job, code, detail):
             self.storage.remove_job(job.id)
 
     def lose(self, job: Job) -> None:
-        """The job's upload has vanished. What there is of its files stays."""
+        """Record failure of a job whose upload is missing; other files move to the orphaned folder."""
         if self._failed(job, "internal", "the upload is no longer on the server's disk; submit the scene again"):
-            self.storage.keep_aside(job.id, "has lost its upload")
+            self.storage.move_to_orphaned_unless_empty(job.id, "has lost its upload")
 
     def end(self, job: Job, state: State, **values: Any) -> bool:  # noqa: ANN401
-        """Set a job's last state, and ``values`` with it; False if it has ended before."""
+        """Set a job's final state and the columns ``values``; return False if it has already ended."""
         moved = self.store.move(job.number, state, expires_at=self.clock() + self.settings.keep_seconds, **values)
         current = self.store.get(job.id)
         if moved and current is not None:

@@ -1,4 +1,4 @@
-"""The parts of one running service, and how a request gets at them."""
+"""Parts of a running service, and the dependencies through which requests access them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from service.storage.job_store import Store
 
 @dataclass(frozen=True, slots=True)
 class ServiceContainer:
-    """What a service is made of."""
+    """All parts of a running service."""
 
     settings: ServiceSettings
     store: Store
@@ -46,25 +46,25 @@ def _context(request: Request) -> ServiceContainer:
 
 Service = Annotated[ServiceContainer, Depends(_context)]
 
-_bearer = HTTPBearer(auto_error=False, description="A key, where the service asks for one (see /v1/limits).")
+_bearer = HTTPBearer(auto_error=False, description="A key, if the service requires one (see /v1/limits).")
 
 
 def _owner(context: Service, given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]) -> str:
-    """Whose request this is; everybody's where no keys are configured."""
+    """Return the owner of the request's key; empty if no keys are configured."""
     keys = context.settings.keys
     if not keys:
         return ""
     digest = hashlib.sha256((given.credentials if given else "").encode()).hexdigest()
     found = ""
-    for key in keys:  # all of them, whichever fits: the time tells nothing
+    for key in keys:  # compare with all keys, so that the time reveals nothing
         if hmac.compare_digest(key.sha256, digest):
             found = key.owner
     if not found:
         raise ProblemError(
             "unauthorized",
-            "this key is not known here; check it, or ask for a new one"
+            "this key is unknown; check it, or ask the operator for a new one"
             if given
-            else "this service needs a key; send it as 'Authorization: Bearer KEY'",
+            else "this service requires a key; send it as 'Authorization: Bearer KEY'",
             headers={"WWW-Authenticate": 'Bearer realm="kissgs"'},
         )
     return found

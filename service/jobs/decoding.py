@@ -1,4 +1,4 @@
-"""The decoded scene of a job: made when first asked for, in a process of its own, once."""
+"""Decoding of a job's container to a ``.ply``, on the first request, in a job process."""
 
 from __future__ import annotations
 
@@ -22,32 +22,32 @@ from service.storage.job_store import Store
 
 @dataclass(frozen=True)
 class Decoder:
-    """Decodes one container at a time: it is quick, and memory is set aside for jobs."""
+    """Decoder that handles one container at a time: decoding is quick, and memory is meant for jobs."""
 
     settings: ServiceSettings
     store: Store
     storage: JobStorage
     admission: Admission
-    _turn: asyncio.Lock = field(default_factory=asyncio.Lock)
+    _lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     _processes: dict[str, JobProcess] = field(default_factory=dict)
 
     async def scene(self, job: Job) -> tuple[Path, dict[str, Any]]:
-        """The decoded ``.ply`` of a job that has succeeded, and its size and SHA-256.
+        """Return the decoded ``.ply`` of a succeeded job, and its size and SHA-256 by name.
 
         Raises:
-            ProblemError: there is no room for it, its process failed, or the job went away meanwhile.
+            ProblemError: the disk is full, the decoding failed, or the job was deleted or has expired meanwhile.
         """
-        path, note = self.storage.decoded(job.id), self.storage.decoded(job.id).with_suffix(".json")
+        path, metadata = self.storage.decoded(job.id), self.storage.decoded(job.id).with_suffix(".json")
         if not path.exists():
-            async with self._turn:
+            async with self._lock:
                 if not path.exists():
-                    await self._make(job)
+                    await self._decode(job)
         try:
-            return path, json.loads(await run_sync(note.read_text))
+            return path, json.loads(await run_sync(metadata.read_text))
         except OSError as error:
             raise _gone() from error
 
-    async def _make(self, job: Job) -> None:
+    async def _decode(self, job: Job) -> None:
         size = 2000 + BYTES_PER_GAUSSIAN[job.sh_degree] * job.gaussians
         await run_sync(self.admission.reserve, size)
         work = None
@@ -55,7 +55,7 @@ class Decoder:
             work = await run_sync(self.storage.new_work, job.id)
             await self._run(job, work)
             await run_sync(self.storage.keep_decoded, work, job.id)
-            await run_sync(self._account, job)
+            await run_sync(self._update_sizes, job)
         except (ProblemError, OSError) as error:
             current = await run_sync(self.store.get, job.id)
             if current is None or current.state != State.SUCCEEDED:
@@ -66,12 +66,12 @@ class Decoder:
                 await run_sync(self.storage.discard, work)
             await run_sync(self.admission.release, size, 0)
 
-    def _account(self, job: Job) -> None:
-        spare = sum(path.stat().st_size for path in self.storage.reclaimable_files(job.id))
-        self.store.update(job.number, disk_bytes=self.storage.job_bytes(job.id), reclaimable_bytes=spare)
+    def _update_sizes(self, job: Job) -> None:
+        reclaimable = sum(path.stat().st_size for path in self.storage.reclaimable_files(job.id))
+        self.store.update(job.number, disk_bytes=self.storage.job_bytes(job.id), reclaimable_bytes=reclaimable)
 
     def stop(self, job_id: str) -> None:
-        """End the decoding of a job, if it is going on."""
+        """Kill the decoding of a job, if it is running."""
         process = self._processes.get(job_id)
         if process is not None:
             process.kill()

@@ -1,4 +1,4 @@
-"""A job's events as a stream that can be taken up again where it broke off."""
+"""Server-sent events of a job, as a stream that clients can resume after a lost connection."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from service.core.notifier import JobNotifier, wait
 from service.jobs.status import QueueEstimator, job_status
 from service.storage.job_store import Store
 
-SILENCE_SECONDS = 15.0
-"""After which a comment is sent, so that nobody takes the connection for dead."""
+KEEPALIVE_SECONDS = 15.0
+"""Seconds without an event after which a comment is sent, so that the connection is not taken for dead."""
 
 RETRY_MILLISECONDS = 1000
-"""When a browser connects again after a broken connection."""
+"""Delay after which a browser reconnects, milliseconds."""
 
 
 class _Feed:
-    """The events of one job, read once for all who follow it."""
+    """Events of one job, read from the database once for all its clients."""
 
     def __init__(self) -> None:
         self.events: list[Event] = []
         self.job: Job | None = None
-        self.turn = asyncio.Lock()
-        self.subscribe = asyncio.Event()
-        self.subscribe.set()  # nothing has been read
+        self.lock = asyncio.Lock()
+        self.changed = asyncio.Event()
+        self.changed.set()  # nothing has been read
 
 
 @dataclass(frozen=True)
 class EventStream:
-    """Streams events of jobs to any number of clients."""
+    """Streams of job events to any number of clients."""
 
     store: Store
     notifier: JobNotifier
@@ -43,7 +43,7 @@ class EventStream:
     _feeds: WeakValueDictionary[str, _Feed] = field(default_factory=WeakValueDictionary)
 
     async def stream(self, job: Job, after: int) -> AsyncIterator[str]:
-        """Events from ``after`` on, until the job has ended, is gone, or the service stops."""
+        """Yield the events with a ``seq`` above ``after``, until the job ends or is deleted, or the service stops."""
         yield f"retry: {RETRY_MILLISECONDS}\n\n"
         feed = self._feeds.get(job.id)
         if feed is None:
@@ -53,34 +53,34 @@ class EventStream:
             current = feed.job
             for event in feed.events[after:]:  # ids count from 1 without gaps
                 after = event.seq
-                yield await self._spelled(event, current)
+                yield await self._format(event, current)
             if (
                 current is None
                 or (after >= current.last_event and current.state not in ACTIVE)
                 or self.notifier.closing
             ):
                 return
-            if not await wait(feed.subscribe, SILENCE_SECONDS):
-                yield ": still here\n\n"
+            if not await wait(feed.changed, KEEPALIVE_SECONDS):
+                yield ": keep-alive\n\n"
 
     async def _refresh(self, feed: _Feed, job: Job) -> None:
-        """Read what is new, unless another listener has just done so."""
-        async with feed.turn:
-            if feed.subscribe.is_set():
-                subscribe = self.notifier.subscribe(
-                    job.id
-                )  # before reading: what happens meanwhile is read the next time
-                feed.job, new = await run_sync(self._look, job, len(feed.events))
+        """Read new events, unless another client's request has just done so."""
+        async with feed.lock:
+            if feed.changed.is_set():
+                changed = self.notifier.subscribe(job.id)  # before reading, so that no later event is missed
+                feed.job, new = await run_sync(self._read, job, len(feed.events))
                 feed.events += new
-                feed.subscribe = subscribe
+                feed.changed = changed
 
-    def _look(self, job: Job, after: int) -> tuple[Job | None, list[Event]]:
+    def _read(self, job: Job, after: int) -> tuple[Job | None, list[Event]]:
         current = self.store.get(job.id)
         return current, self.store.events(job.number, after)
 
-    async def _spelled(self, event: Event, current: Job | None) -> str:
+    async def _format(self, event: Event, current: Job | None) -> str:
         data = event.data
-        if event.kind == "state" and current is not None and event.seq == current.last_event:  # the whole story, once
+        if (
+            event.kind == "state" and current is not None and event.seq == current.last_event
+        ):  # the full status is sent with the latest event only
             status = await run_sync(job_status, current, QueueEstimator(self.store, self.workers))
             data = {**data, "job": status.model_dump(mode="json", exclude_none=True)}
         return f"id: {event.seq}\nevent: {event.kind}\ndata: {json.dumps(data)}\n\n"

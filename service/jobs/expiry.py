@@ -1,4 +1,4 @@
-"""Housekeeping: what has expired is removed, and the time is written down."""
+"""Expiry: removal of ended jobs after their time, and the heartbeat of the database lease."""
 
 from __future__ import annotations
 
@@ -19,17 +19,23 @@ log = logging.getLogger("kissgs.service")
 
 
 GRACE_SECONDS = 3600.0
+"""Seconds after the start in which nothing expires, in case the machine's clock was wrong at the start."""
 
 
 @dataclass(frozen=True, slots=True)
 class ExpiryTask:
-    """Sweeps every ``settings.sweep_seconds``."""
+    """Background task that removes expired jobs every ``settings.sweep_seconds``.
+
+    Attributes:
+        context: the parts of the service.
+        began: time of the service's start, seconds since 1970.
+    """
 
     context: ServiceContainer
     began: float
 
     async def run(self) -> None:
-        """For ever; a failed sweep is logged and tried again."""
+        """Sweep periodically until cancelled; failures are logged and retried."""
         while True:
             await asyncio.sleep(self.context.settings.sweep_seconds)
             try:
@@ -37,19 +43,17 @@ class ExpiryTask:
                     self.context.notifier.notify(job_id)
                     self.context.notifier.notify(ended(job_id))
             except Exception:
-                log.exception("what has expired could not be removed; trying again")
+                log.exception("expired jobs could not be removed; trying again")
 
     async def heartbeat(self) -> None:
-        """For ever: what keeps other services from using the same database."""
+        """Renew the database lease periodically until cancelled."""
         while True:
             await asyncio.sleep(HEARTBEAT_SECONDS)
-            with contextlib.suppress(SQLAlchemyError):  # /readyz and the worker tell
+            with contextlib.suppress(SQLAlchemyError):  # /readyz and the worker report it
                 await run_sync(self.context.store.heartbeat)
 
     def sweep(self) -> list[str]:
-        """Remove the files of ended jobs whose time is over; forget them altogether after as long again.
-
-        Nothing expires in the first hour of a service, should its machine have started with a wrong clock.
+        """Expire ended jobs and remove their files after ``keep_seconds``; delete their rows after as long again.
 
         Returns:
             Ids of the jobs that have expired.

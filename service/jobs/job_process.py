@@ -1,7 +1,7 @@
-"""The heavy part of a job, in a process of its own: ``python -m service.jobs.job_process``.
+"""Job process, ``python -m service.jobs.job_process``: compression or decoding outside the service's process.
 
-One JSON object comes in on standard input, a line of JSON goes out on standard output for every event. The process
-ends itself when its standard input closes, that is, when the service dies: no orphan outlives it.
+It reads its task, a JSON object, from the first line of standard input, and writes one line of JSON to standard output
+per event. When standard input closes, because the service has ended, the process exits.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ if TYPE_CHECKING:
     import kissgs
 
 EVENT_SECONDS = 0.25
-"""Between progress events of one stage."""
+"""Minimum seconds between progress events of a stage."""
 
-MEMORY_DETAIL = "the scene needs more memory than a job may have; choose one with fewer Gaussians"
+MEMORY_DETAIL = "the job exceeded its memory limit; submit a scene with fewer Gaussians"
 
 Send = Callable[[dict[str, Any]], None]
 
 
 def main() -> None:
-    """Read what to do, do it, and say what came of it."""
+    """Read the task, run it, and send its result or its error."""
     task = json.loads(_first_line())
-    for number in (signal.SIGINT, signal.SIGTERM):  # meant for the service, which decides what becomes of us
+    for number in (signal.SIGINT, signal.SIGTERM):  # sent to the service, which ends this process if needed
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_exit_with_service, daemon=True).start()
     send = _sender()
@@ -48,29 +48,30 @@ def main() -> None:
         send({"error": {"code": error.code, "detail": detail.replace(" /", " ")}})
     except MemoryError:
         send({"error": {"code": "memory-limit", "detail": MEMORY_DETAIL}})
-    except Exception:  # noqa: BLE001  a fault of ours, said on standard error and by the exit status
+    except Exception:  # noqa: BLE001  a bug, reported by standard error and the exit status
         traceback.print_exc()
         os._exit(1)
-    os._exit(0)  # nothing is left to do, and no thread of a library needs waiting for
+    os._exit(0)  # without waiting for threads of libraries
 
 
 def _compress(task: dict[str, Any], send: Send) -> dict[str, Any]:
-    result = _compressed(task, send)
+    result = _run_compression(task, send)
     folder = Path(task["work"]) / "result"
     folder.mkdir()
     result.save(folder / "scene.zip")
     result.save(folder / "files")
-    for made in (folder / "files", folder):
-        _sync(made)
+    for path in (folder / "files", folder):
+        _sync(path)
     report = result.report.as_dict()
     _write(folder / "report.json", json.dumps(report, indent=2).encode())
     stored = result.report.file_bytes
     files = {
-        path.name: {**_described(path), "stored": stored[path.name]} for path in sorted((folder / "files").iterdir())
+        path.name: {**_size_and_hash(path), "stored": stored[path.name]}
+        for path in sorted((folder / "files").iterdir())
     }
     summary = {
-        "container": _described(folder / "scene.zip"),
-        "report": _described(folder / "report.json"),
+        "container": _size_and_hash(folder / "scene.zip"),
+        "report": _size_and_hash(folder / "report.json"),
         "files": files,
         "count": report["count"],
         "compacted": result.report.compacted,
@@ -82,25 +83,25 @@ def _compress(task: dict[str, Any], send: Send) -> dict[str, Any]:
         "peak_memory": report["peak_memory"],
     }
     if report["evaluation"] is not None:
-        told = report["evaluation"]
+        evaluation = report["evaluation"]
         summary["evaluation"] = {
-            **told["mean"]["candidate_vs_reference"],
-            **{name: told[name] for name in ("worst", "fifth_percentile", "shown")},
+            **evaluation["mean"]["candidate_vs_reference"],
+            **{name: evaluation[name] for name in ("worst", "fifth_percentile", "shown")},
         }
     _write(folder / "summary.json", json.dumps(summary).encode())
     return summary
 
 
-def _compressed(task: dict[str, Any], send: Send) -> kissgs.Compressed:
-    """The work itself, from its checkpoint on if there is one.
+def _run_compression(task: dict[str, Any], send: Send) -> kissgs.Compressed:
+    """Compress the scene, continuing from its checkpoint if there is one.
 
-    A checkpoint is a help, no condition: one of no use (damaged, or of another version of kissgs) is replaced, and
-    where none can be written (a full disk), the work is done without.
+    Checkpoints are optional: an unusable one (damaged, or of another version of kissgs) is replaced, and if none can be
+    written, because the disk is full, the job runs without.
     """
     import kissgs
 
     checkpoint = None
-    if task["checkpoint"] is not None:  # as seen from here: the report may name it, and is the client's to read
+    if task["checkpoint"] is not None:  # relative, because the report may name it to the client
         checkpoint = Path(os.path.relpath(task["checkpoint"], task["work"]))
     while True:
         kept = [] if checkpoint is None else sorted(checkpoint.parent.glob(f"{checkpoint.stem}*{checkpoint.suffix}"))
@@ -113,10 +114,10 @@ def _compressed(task: dict[str, Any], send: Send) -> kissgs.Compressed:
                 threads=task["threads"],
                 progress=_Throttle(send),
             )
-        except kissgs.OutputError:  # the checkpoint's: nothing else is written yet
+        except kissgs.OutputError:  # of the checkpoint: nothing else has been written so far
             if checkpoint is None:
                 raise
-            if kept:  # the latest work's first: what led to it may be sound
+            if kept:  # the latest first: earlier ones may be usable
                 kept[0].unlink(missing_ok=True)
             else:
                 checkpoint = None
@@ -127,12 +128,12 @@ def _decode(task: dict[str, Any], send: Send) -> dict[str, Any]:
 
     target = Path(task["work"]) / "decoded.ply"
     kissgs.decompress(Path(task["source"]), target, threads=task["threads"], progress=_Throttle(send))
-    described = _described(target)
+    described = _size_and_hash(target)
     _write(target.with_suffix(".json"), json.dumps(described).encode())
     return described
 
 
-def _described(path: Path) -> dict[str, Any]:
+def _size_and_hash(path: Path) -> dict[str, Any]:
     with path.open("rb") as file:
         return {"bytes": path.stat().st_size, "sha256": hashlib.file_digest(file, "sha256").hexdigest()}
 
@@ -151,7 +152,7 @@ def _sync(folder: Path) -> None:
 
 
 class _Throttle:
-    """Passes on the beginning and the end of every stage, and in between what a person can follow."""
+    """Progress callback that sends the start and end of each stage, and between them one event per interval."""
 
     def __init__(self, send: Send) -> None:
         self._send = send
@@ -167,7 +168,7 @@ class _Throttle:
 
 
 def _sender() -> Send:
-    """Events leave by a descriptor of their own: what a library prints goes to the log instead."""
+    """Return a function that sends events on standard output, and redirect output of libraries to standard error."""
     out = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     lock = threading.Lock()
@@ -181,7 +182,7 @@ def _sender() -> Send:
 
 
 def _limit_resources(memory: int) -> None:
-    """Take what the service leaves of the processor, no more memory than agreed, and be the first to be ended."""
+    """Lower the priority, limit memory to ``memory`` bytes, and become the first victim of the out-of-memory killer."""
     os.nice(10)
     if sys.platform == "linux":
         import resource
@@ -195,7 +196,7 @@ def _limit_resources(memory: int) -> None:
 def _first_line() -> bytes:
     line = b""
     while not line.endswith(b"\n"):
-        block = os.read(0, 65536)  # nothing is sent after the line, so none of it is lost
+        block = os.read(0, 65536)  # nothing follows the line, so no data is lost
         if not block:
             os._exit(1)
         line += block
@@ -203,7 +204,7 @@ def _first_line() -> bytes:
 
 
 def _exit_with_service() -> None:
-    while os.read(0, 4096):  # not by sys.stdin, whose lock the interpreter wants when it ends
+    while os.read(0, 4096):  # sys.stdin has a lock that the interpreter needs at exit
         pass
     os._exit(1)
 

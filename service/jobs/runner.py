@@ -1,4 +1,4 @@
-"""Running the heavy part of a job in a process process: its events, its limits, its end."""
+"""``JobProcess``: start of a job process, its progress events, its limits and its outcome."""
 
 from __future__ import annotations
 
@@ -20,31 +20,31 @@ from service.jobs.job_process import MEMORY_DETAIL
 log = logging.getLogger("kissgs.service")
 
 OnProgress = Callable[[str, float, str], Awaitable[None]]
-"""Told a stage, the fraction of it, and a note, which may be empty."""
+"""Callback with a stage, its completed fraction (0 to 1), and a note, which may be empty."""
 
 OUT_OF_MEMORY = re.compile(
     "MemoryError|bad_alloc|out of memory|memory allocation|cannot allocate memory", re.IGNORECASE
 )
-"""Last words of Python, C++, LLVM, OpenBLAS and the C library: which of them meets the limit is chance."""
+"""Messages of Python, C++, LLVM, OpenBLAS and the C library when an allocation fails; any of them may be the first."""
 
 NEAR_LIMIT = 0.8
-"""The share of its memory from which on a process that dies without a known word is taken to have died of the limit."""
+"""Share of the memory limit above which a crash without such a message is attributed to the limit."""
 
 SAMPLE_SECONDS = 0.1
-"""Between two looks at a process's memory."""
+"""Seconds between samples of a process's memory."""
 
 MAX_LINE_BYTES = 1 << 20
-"""Of one event; the largest is the summary of a result."""
+"""Maximum bytes of an event; the largest is the summary of a result."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How a process process ended.
+    """How a job process ended.
 
     Attributes:
-        kind: "done" with what it found in ``data``; "error" with a problem's ``code`` and ``detail`` in ``data``;
-            "crashed" if something else ended it, "stopped" if :meth:`Child.kill` did, "postponed" if it could not be
-            started for now.
+        kind: "done" after success; "error" after an expected error; "crashed" if the process ended otherwise;
+            "stopped" after :meth:`JobProcess.kill`; "postponed" if the job cannot run at the moment.
+        data: the result for "done"; ``code`` and ``detail`` of the problem for "error"; ``detail`` for "crashed".
     """
 
     kind: Literal["done", "error", "crashed", "stopped", "postponed"]
@@ -52,7 +52,11 @@ class Outcome:
 
 
 class JobProcess:
-    """One process process, from its start to its end. Use :meth:`run` once."""
+    """One job process; call :meth:`run` once.
+
+    Args:
+        seconds: time limit.
+    """
 
     def __init__(self, *, seconds: float) -> None:
         self._seconds = seconds
@@ -62,19 +66,19 @@ class JobProcess:
         self.ended = asyncio.Event()
 
     def kill(self) -> None:
-        """End it, now; before it has started, as soon as it does."""
+        """Kill the process now, or as soon as it has started."""
         self._killed = True
-        self._kill_if_asked()
+        self._kill_if_requested()
 
-    def _kill_if_asked(self) -> None:
+    def _kill_if_requested(self) -> None:
         if self._killed and self._process is not None and self._process.returncode is None:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self._process.pid, signal.SIGKILL)
 
     async def run(self, task: dict[str, Any], on_progress: OnProgress) -> Outcome:
-        """Start it with an ``order`` (see :mod:`service.jobs.job_process`), follow it, and say how it ended.
+        """Run a task (see :mod:`service.jobs.job_process`) and return its outcome.
 
-        A cancelled caller takes it along.
+        If the caller is cancelled, the process is killed.
         """
         try:
             return await self._run(task, on_progress)
@@ -87,10 +91,13 @@ class JobProcess:
     async def _run(self, task: dict[str, Any], on_progress: OnProgress) -> Outcome:
         if self._killed:
             return Outcome("stopped")
-        trace = Path(task["work"]) / "stderr.txt"
-        with trace.open("wb") as errors:
+        stderr_file = Path(task["work"]) / "stderr.txt"
+        with stderr_file.open("wb") as errors:
             self._process = await asyncio.create_subprocess_exec(
-                *(sys.executable, "-P", "-m", "service.jobs.job_process"),
+                sys.executable,
+                "-P",
+                "-m",
+                "service.jobs.job_process",
                 stdin=asyncio.subprocess.PIPE,
                 stdout=asyncio.subprocess.PIPE,
                 stderr=errors,
@@ -99,7 +106,7 @@ class JobProcess:
                 start_new_session=True,
                 limit=MAX_LINE_BYTES,
             )
-        self._kill_if_asked()  # while it was starting
+        self._kill_if_requested()  # in case of a kill during the start
         sampling = asyncio.create_task(self._sample_memory(self._process.pid))
         try:
             async with asyncio.timeout(self._seconds):
@@ -114,21 +121,21 @@ class JobProcess:
             return Outcome("done", final["done"])
         if final is not None:
             return Outcome("error", final["error"])
-        return self._explain(status, trace, task["memory"])
+        return self._explain(status, stderr_file, task["memory"])
 
     async def _sample_memory(self, pid: int) -> None:
-        """Note the most memory that the limit counts (``VmData``): a dead process cannot be asked any more."""
-        with contextlib.suppress(OSError):  # it has ended, or this is no Linux
+        """Track the peak of the memory that the limit counts (``VmData``), unknown once the process has ended."""
+        with contextlib.suppress(OSError):  # the process has ended, or this is not Linux
             while True:
                 pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[5])
                 self._peak_data = max(self._peak_data, pages * os.sysconf("SC_PAGE_SIZE"))
                 await asyncio.sleep(SAMPLE_SECONDS)
 
     async def _follow(self, task: dict[str, Any], on_progress: OnProgress) -> dict[str, Any] | None:
-        """Pass progress on until the last word, or until there is none."""
+        """Forward progress until the final event; return that, or None if the process ended without one."""
         process = self._process
         assert process is not None and process.stdin is not None and process.stdout is not None  # noqa: S101, PT018
-        with contextlib.suppress(ConnectionError):  # it has died already: its silence says so
+        with contextlib.suppress(ConnectionError):  # it has ended already, which the missing final event shows
             process.stdin.write(json.dumps(task).encode() + b"\n")
             await process.stdin.drain()
         while line := await process.stdout.readline():
@@ -138,22 +145,22 @@ class JobProcess:
             await on_progress(event["stage"], event["fraction"], event["note"])
         return None
 
-    def _explain(self, status: int, trace: Path, memory: int) -> Outcome:
+    def _explain(self, status: int, stderr_file: Path, memory: int) -> Outcome:
         if self._killed:
             return Outcome("stopped")
-        said = trace.read_text(encoding="utf-8", errors="replace")[-4000:] if trace.exists() else ""
-        log.error("a job's process ended with status %d\n%s", status, said)
+        stderr = stderr_file.read_text(encoding="utf-8", errors="replace")[-4000:] if stderr_file.exists() else ""
+        log.error("a job's process ended with status %d\n%s", status, stderr)
         near_limit = self._peak_data >= NEAR_LIMIT * memory and status != -signal.SIGKILL
-        if near_limit or OUT_OF_MEMORY.search(said):
+        if near_limit or OUT_OF_MEMORY.search(stderr):
             return Outcome("error", {"code": "memory-limit", "detail": MEMORY_DETAIL})
         if status < 0:
             name = signal.Signals(-status).name
             return Outcome("crashed", {"detail": f"the job's process was ended by {name}; submit the scene again"})
-        detail = "kissgs failed on this scene in a way that it should not; please report it with the scene"
+        detail = "the job failed because of an error in kissgs; please report it with the scene"
         return Outcome("error", {"code": "internal", "detail": detail})
 
 
 def _environment() -> dict[str, str]:
-    """Ours, without the service's settings, some of which are secrets."""
+    """Return this process's environment without the service's settings, some of which are secrets."""
     inherited = {name: value for name, value in os.environ.items() if not name.upper().startswith("KISSGS_")}
     return {**inherited, "OMP_WAIT_POLICY": "PASSIVE", "PYTHONUNBUFFERED": "1"}

@@ -1,4 +1,4 @@
-"""From a row of the table to what a client sees of a job."""
+"""Job status for clients, with estimates of waiting times."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from service.storage.job_store import Store
 
 
 class QueueEstimator:
-    """What is to be done, and how long that will take. Reads the queue once, when it is first asked.
+    """Estimates of positions and times from one reading of the queue, on first use.
 
     Args:
-        store: of the jobs.
-        workers: jobs that run at the same time.
+        store: job store.
+        workers: maximum number of running jobs.
     """
 
     def __init__(self, store: Store, workers: int) -> None:
@@ -26,16 +26,16 @@ class QueueEstimator:
         self._rates: dict[tuple[str, bool], float | None] = {}
 
     def position(self, job: Job) -> int:
-        """Of a waiting job; 1 is next."""
+        """Return the position of a queued job; 1 is next."""
         return 1 + sum(other.state == State.QUEUED for other in self._ahead(job))
 
     def seconds_left(self, job: Job) -> float:
-        """Until a job that waits or runs will be done: a guess."""
+        """Estimate the seconds until a queued or running job ends."""
         ahead = self._ahead(job) if job.state == State.QUEUED else []
         return self._work(job) + sum(map(self._work, ahead)) / self._workers
 
     def seconds_to_room(self) -> float:
-        """When a place in the queue will be free: a guess, from 1 to 300."""
+        """Estimate the seconds until the queue has room, 1 to 300."""
         running = [self._work(job) for job in self._jobs() if job.state == State.RUNNING]
         return min(300.0, max(1.0, min(running, default=1.0) / self._workers))
 
@@ -48,19 +48,19 @@ class QueueEstimator:
         return [other for other in self._jobs() if other.state == State.RUNNING or other.number < job.number]
 
     def _work(self, job: Job) -> float:
-        """What a job itself still needs, judged by the latest of its kind on this machine."""
+        """Estimate the remaining seconds of a job itself, from recent jobs with equal preset and evaluation."""
         kind = job.preset, job.evaluate
         if kind not in self._rates:
             rates = self._store.rates(*kind)
             self._rates[kind] = statistics.median(rates) if rates else None
         rate = self._rates[kind]
-        whole = usual_seconds(*kind, job.gaussians) if rate is None else rate * job.gaussians
+        total = usual_seconds(*kind, job.gaussians) if rate is None else rate * job.gaussians
         spent = self.now - job.started_at if job.state == State.RUNNING and job.started_at is not None else 0.0
-        return max(whole - spent, 0.1 * whole, 0.5)  # it runs: it is not done, however wrong the guess was
+        return max(total - spent, 0.1 * total, 0.5)  # a running job is never taken for done
 
 
 def job_status(job: Job, queue: QueueEstimator) -> JobStatus:
-    """Everything there is to know of a job, now."""
+    """Return the current status of a job."""
     waits, runs, result = job.state == State.QUEUED, job.state == State.RUNNING, job.result or {}
     return JobStatus(
         id=job.id,

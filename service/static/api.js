@@ -1,4 +1,4 @@
-/** Talking to the service: its key, its problem documents, its answers. */
+/** Requests to the service: keys, problem documents, responses. */
 
 /**
  * @typedef {{stage: string, fraction: number, note?: string}} Progress
@@ -34,7 +34,7 @@ export const key = {
   forget: () => sessionStorage.removeItem(STORED),
 };
 
-/** A request that did not succeed, in the service's words or, where it could not be reached, in ours. */
+/** A failed request, with the service's problem document, or one of this page if the service did not respond. */
 export class Problem extends Error {
   /** @param {ProblemDocument} document */
   constructor(document) {
@@ -46,24 +46,24 @@ export class Problem extends Error {
     return this.document.code;
   }
 
-  /** Whether the answer would be the same again: asking once more is pointless. */
+  /** Whether a repetition would fail as well. */
   get final() {
     return this.document.status >= 400 && this.document.status < 500 && !this.document.retryable;
   }
 }
 
-/** The service did not answer at all. */
+/** Return the problem of a service that does not respond. */
 export const unreachable = () =>
   new Problem({
     title: "The service cannot be reached",
-    detail: "The connection failed or was cut. Check your network, then try again.",
+    detail: "The connection failed or was interrupted. Check your network, then try again.",
     code: "unreachable",
     status: 0,
     retryable: true,
   });
 
 /**
- * What an answer that is not a success says is wrong. Not every proxy on the way writes problem documents.
+ * Return the problem of a failed response, which a proxy may have sent without a problem document.
  * @param {number} status
  * @param {string} body
  */
@@ -72,16 +72,16 @@ export function problemFrom(status, body) {
     const document = JSON.parse(body);
     if (typeof document.title === "string" && typeof document.detail === "string") return new Problem(document);
   } catch {
-    // no JSON: told below
+    // not JSON: handled below
   }
-  const detail = `The server, or one in front of it, answered with status ${status}.`;
+  const detail = `The server, or a proxy, responded with status ${status}.`;
   return new Problem({ title: "The request failed", detail, code: "unknown", status, retryable: status >= 500 });
 }
 
 /** @type {() => void} */
 let onUnauthorized = () => {};
 
-/** @param {() => void} handler called whenever a key is refused, whoever has used it */
+/** @param {() => void} handler called whenever a key is rejected */
 export function whenUnauthorized(handler) {
   onUnauthorized = handler;
 }
@@ -90,7 +90,7 @@ export function whenUnauthorized(handler) {
 export const authorization = () => (key.get() ? { Authorization: `Bearer ${key.get()}` } : {});
 
 /**
- * Read a refusal, and have the page ask for another key where that is the reason.
+ * Return the problem of a failed response, and show the key form if a key was rejected.
  * @param {number} status
  * @param {string} body
  */
@@ -101,7 +101,7 @@ export function refused(status, body) {
 }
 
 /**
- * `fetch` with the key; what is no success is thrown.
+ * Call `fetch` with the key; throw a problem if the response is not a success.
  * @param {string} path
  * @param {RequestInit & {headers?: Record<string, string>}} [options]
  * @throws {Problem}

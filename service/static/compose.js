@@ -1,22 +1,22 @@
-/** The form: which scene, and how to compress it. */
+/** The form with the scene and the options of a job. */
 
 import { announce, byId, el } from "./dom.js";
 import { bytes, count } from "./format.js";
 import { goalField } from "./goal.js";
-import { Unsuitable, inspect } from "./ply.js";
+import { UnsuitableFile, inspect } from "./ply.js";
 import { presetList } from "./presets.js";
 
 /**
  * @typedef {{preset: string, evaluate: boolean, encode?: import("./goal.js").Goals,
  *   compact?: {ratio?: number | null, auto_count?: boolean}, finetune?: {enabled?: boolean}}} Options
- * @typedef {{file: File, options: Options}} Order
+ * @typedef {{file: File, options: Options}} Submission
  */
 
 /**
- * Bring the form to life.
+ * Connect the controls of the form.
  * @param {import("./api.js").Limits} limits
  * @param {import("./api.js").Presets} presets
- * @param {(order: Order) => void} submit
+ * @param {(submission: Submission) => void} submit
  */
 export function composer(limits, presets, submit) {
   const [form, input] = [byId("compose"), byId("file")];
@@ -24,61 +24,61 @@ export function composer(limits, presets, submit) {
   const goal = goalField(presets, list.chosen);
   /** @type {File | null} */
   let chosen = null;
-  let looks = 0; // at files: only the latest look may speak
+  let inspections = 0; // only the result of the latest is shown
 
   byId("file-limits").textContent =
     `Up to ${bytes(limits.max_upload_bytes)} and ${count(limits.max_gaussians)} Gaussians.`;
 
   byId("keep-note").textContent = limits.training
-    ? "Those that stay learn to do the work of the others: a smaller file, after some minutes of training."
-    : "This server has no torch: choose Fast to have fewer. Nothing is trained then, and pictures become rougher.";
+    ? "The remaining Gaussians are trained to preserve the images: a smaller file after a few minutes of training."
+    : "This server has no torch: choose Fast, which prunes without training, at a greater loss of quality.";
 
   byId("finetune").disabled = !limits.training;
   byId("finetune-note").textContent = limits.training
-    ? "Fits what was rounded to pictures of the scene: better at the same size, after a minute or two."
-    : "This server has no torch to train with.";
+    ? "Trains the quantised scene with renderings: better quality at equal size, after one or two minutes."
+    : "This server has no torch, which training needs.";
 
   /** @param {File} file */
-  async function take(file) {
-    const look = ++looks;
-    say("");
+  async function choose(file) {
+    const inspection = ++inspections;
+    showError("");
     try {
       const facts = await inspect(file, limits);
-      if (look !== looks) return;
+      if (inspection !== inspections) return;
       chosen = file;
       show(file, facts);
       list.estimate(facts.gaussians);
     } catch (error) {
-      if (look !== looks) return;
-      if (!(error instanceof Unsuitable)) throw error;
+      if (inspection !== inspections) return;
+      if (!(error instanceof UnsuitableFile)) throw error;
       chosen = null;
       clear();
       list.estimate(null);
-      say(error.message);
+      showError(error.message);
     }
   }
 
   input.addEventListener("change", () => {
-    if (input.files[0]) take(input.files[0]);
-    input.value = ""; // so that the same file, mended, can be chosen again
+    if (input.files[0]) choose(input.files[0]);
+    input.value = ""; // so that a file can be chosen again after a correction
   });
   form.addEventListener("submit", (/** @type {SubmitEvent} */ event) => {
     event.preventDefault();
     const [preset, evaluate, encode] = [list.chosen(), byId("evaluate").checked, goal.chosen()];
     const [compact, finetune] = [budget(byId("keep").value), byId("finetune").checked && { enabled: true }];
-    const asked = { ...(encode && { encode }), ...(compact && { compact }), ...(finetune && { finetune }) };
-    if (chosen) return submit({ file: chosen, options: { preset, evaluate, ...asked } });
-    say("Choose a .ply first.");
+    const optional = { ...(encode && { encode }), ...(compact && { compact }), ...(finetune && { finetune }) };
+    if (chosen) return submit({ file: chosen, options: { preset, evaluate, ...optional } });
+    showError("Choose a .ply first.");
     input.focus();
   });
 
   return {
-    take,
-    ask: say,
+    choose,
+    showError,
     /** @param {boolean} visible */
     show: (visible) => (form.hidden = !visible),
     focus: () => byId("compose-title").focus({ preventScroll: true }),
-    /** As they were the last time, for another try. @param {Options} options */
+    /** Set the options of an earlier job. @param {Options} options */
     prefer(options) {
       list.choose(options.preset);
       goal.prefer(options.encode ?? {});
@@ -95,11 +95,11 @@ export function composer(limits, presets, submit) {
   };
 }
 
-/** @param {string} kept how many Gaussians: a share, "auto", or nothing for all */
+/** @param {string} kept share of Gaussians, "auto", or empty for all */
 const budget = (kept) => (kept === "auto" ? { auto_count: true } : kept ? { ratio: Number(kept) } : null);
 
 /** @param {string} text */
-function say(text) {
+function showError(text) {
   byId("file-error").textContent = text;
   byId("drop").classList.toggle("refused", text !== "");
 }
@@ -113,44 +113,44 @@ function show(file, facts) {
   const text = [bytes(file.size), `${count(facts.gaussians)} Gaussians`, kind].filter(Boolean).join(" · ");
   byId("file-title").replaceChildren(file.name);
   byId("file-facts").textContent = text;
-  hold(true);
+  setChosen(true);
   announce(`${file.name} chosen: ${text}.`);
 }
 
 function clear() {
   byId("file-title").replaceChildren(el("u", {}, "Choose a .ply"), " or drop it anywhere on this page");
-  hold(false);
+  setChosen(false);
 }
 
-/** @param {boolean} held whether a file is chosen */
-function hold(held) {
-  byId("drop").classList.toggle("held", held);
-  byId("file-facts").hidden = !held;
-  byId("file-limits").hidden = held;
-  byId("drop").querySelector(".drop-change").hidden = !held;
+/** @param {boolean} chosen whether a file is chosen */
+function setChosen(chosen) {
+  byId("drop").classList.toggle("held", chosen);
+  byId("file-facts").hidden = !chosen;
+  byId("file-limits").hidden = chosen;
+  byId("drop").querySelector(".drop-change").hidden = !chosen;
 }
 
 /**
- * Files dropped anywhere on the page, with a veil over it while one is above.
- * @param {{willing: () => boolean, take: (file: File) => void}} page
+ * Accept files dropped anywhere on the page, with an overlay during dragging.
+ * @param {{accepts: () => boolean, choose: (file: File) => void}} page
  */
-export function dropAnywhere({ willing, take }) {
-  const veil = /** @param {boolean} down */ (down) => document.body.classList.toggle("dragging", down);
+export function dropAnywhere({ accepts, choose }) {
+  const setOverlay = /** @param {boolean} visible */ (visible) => document.body.classList.toggle("dragging", visible);
   const files = /** @param {DragEvent} event */ (event) => event.dataTransfer?.types.includes("Files");
   window.addEventListener("dragover", (event) => {
     if (!files(event)) return;
-    event.preventDefault(); // also where it is not wanted: the browser would leave the page and show the file
-    if (event.dataTransfer && !willing()) event.dataTransfer.dropEffect = "none";
-    veil(willing());
+    event.preventDefault(); // always: otherwise the browser would open the file
+    if (event.dataTransfer && !accepts()) event.dataTransfer.dropEffect = "none";
+    setOverlay(accepts());
   });
   window.addEventListener("dragleave", (event) => {
-    if (!event.relatedTarget) veil(false); // it has left the window, not just an element
+    if (!event.relatedTarget) setOverlay(false); // the pointer has left the window, not just an element
   });
   window.addEventListener("drop", (event) => {
     if (!files(event)) return;
     event.preventDefault();
-    veil(false);
+    setOverlay(false);
     const file = event.dataTransfer?.files[0];
-    if (file && willing()) take(file);
+    if (file && accepts()) choose(file);
   });
 }

@@ -1,9 +1,9 @@
-/** Making and finding elements. Data only ever becomes text: nothing here parses HTML. */
+/** Creation and look-up of elements. Data is inserted as text only: nothing here parses HTML. */
 
 /**
- * The element with an id, which is on the page or the page is broken.
+ * Return the element with an id; throw an error if there is none.
  * @param {string} id
- * @returns {any} any, because every caller knows which kind it is
+ * @returns {any} any, because callers know the type
  */
 export function byId(id) {
   const found = document.getElementById(id);
@@ -12,26 +12,26 @@ export function byId(id) {
 }
 
 /**
- * A new element.
+ * Create an element.
  * @param {string} name
- * @param {Record<string, any>} [attributes] functions listen (`onclick`), booleans switch, null and undefined are left out
+ * @param {Record<string, any>} [attributes] functions become listeners (`onclick`), booleans toggle, null and undefined are ignored
  * @param {...(Node | string | null | undefined)} children strings become text
  * @returns {any}
  */
 export function el(name, attributes = {}, ...children) {
-  const made = document.createElement(name);
+  const element = document.createElement(name);
   for (const [key, value] of Object.entries(attributes)) {
-    if (typeof value === "function") made.addEventListener(key.slice(2), value);
-    else if (typeof value === "boolean") made.toggleAttribute(key, value);
-    else if (value !== null && value !== undefined) made.setAttribute(key, String(value));
+    if (typeof value === "function") element.addEventListener(key.slice(2), value);
+    else if (typeof value === "boolean") element.toggleAttribute(key, value);
+    else if (value !== null && value !== undefined) element.setAttribute(key, String(value));
   }
-  made.append(...children.filter((child) => child !== null && child !== undefined));
-  return made;
+  element.append(...children.filter((child) => child !== null && child !== undefined));
+  return element;
 }
 
 /**
- * Name and value pairs, as they stand side by side in a `<dl>`.
- * @param {[string, string | Node, string?][]} pairs name, value, and a remark in small print
+ * Create a `<dl>` of name and value pairs.
+ * @param {[string, string | Node, string?][]} pairs name, value, optional remark in small print
  */
 export function facts(pairs) {
   const items = pairs.map(([name, value, remark]) =>
@@ -41,7 +41,7 @@ export function facts(pairs) {
 }
 
 /**
- * A `<time>` element: for people as text, for machines as it was given.
+ * Create a `<time>` element with a readable text.
  * @param {string} iso
  * @param {string} text
  */
@@ -51,8 +51,8 @@ export const time = (iso, text) => el("time", { datetime: iso, title: new Date(i
 let pending;
 
 /**
- * Tell people who listen instead of look. Of several in quick succession only the last is said: the replayed history
- * of a job would otherwise be read out in full.
+ * Announce a text to screen readers. Of several in quick succession only the last is announced, so that the past
+ * events of a job are not read out.
  * @param {string} text
  */
 export function announce(text) {
@@ -61,9 +61,9 @@ export function announce(text) {
 }
 
 /**
- * Say in the tab what goes on.
+ * Set the title of the page.
  * @param {string} [text]
  */
-export function entitle(text) {
+export function setTitle(text) {
   document.title = text ? `${text} · kissgs` : "kissgs";
 }

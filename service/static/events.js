@@ -1,9 +1,9 @@
-/** Server-sent events by `fetch`: unlike EventSource it can send a key, and tells refusals from broken lines. */
+/** Server-sent events with `fetch`, which unlike EventSource can send a key and distinguishes errors from lost connections. */
 
 /** @typedef {{id: string, event: string, data: string}} Message */
 
 /**
- * The messages of a stream, until it ends.
+ * Yield the messages of a stream until it ends.
  * @param {ReadableStream<BufferSource>} body
  * @returns {AsyncGenerator<Message>}
  */
@@ -13,7 +13,7 @@ export async function* messages(body) {
   try {
     for (;;) {
       const { value, done } = await reader.read();
-      if (done) return; // what is left of `rest` was not ended by an empty line: it is no message
+      if (done) return; // an incomplete message in `rest` is discarded
       const blocks = (rest + value).replaceAll("\r\n", "\n").split("\n\n");
       rest = blocks.pop() ?? "";
       for (const block of blocks) {
@@ -22,13 +22,13 @@ export async function* messages(body) {
       }
     }
   } finally {
-    reader.cancel().catch(() => {}); // whoever stops listening ends the connection, too
+    reader.cancel().catch(() => {}); // closes the connection
   }
 }
 
 /**
  * @param {string} block
- * @returns {Message | null} null for comments and settings
+ * @returns {Message | null} null for comments and fields without data
  */
 function parse(block) {
   const message = { id: "", event: "message", data: "" };

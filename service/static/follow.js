@@ -1,32 +1,32 @@
-/** Following a job to its end, over broken connections and restarts of the service. */
+/** Tracking of a job until its end, over lost connections and restarts of the service. */
 
 import { Problem, active, call, status as statusOf } from "./api.js";
 import { messages } from "./events.js";
 
-const REFRESH_MS = 3000; // of the status: only it knows the place in the queue and when the job will be done
-const LONGEST_WAIT_MS = 15000; // between two tries to connect
+const REFRESH_MS = 3000; // of the status, which has the queue position and the time estimate
+const MAX_RETRY_MS = 15000; // between attempts to connect
 
 /**
  * @typedef {import("./api.js").Status} Status
  * @typedef {object} Watcher
- * @property {(status: Status) => void} status called first with the status at the start, last with that of the end
+ * @property {(status: Status) => void} status called for each status, from the start to the end
  * @property {(progress: import("./api.js").Progress) => void} progress
- * @property {() => void} restarted its work begins anew
+ * @property {() => void} restarted the job has started again
  * @property {(connected: boolean) => void} connection
- * @property {(problem: Problem) => void} lost the job cannot be followed any more
+ * @property {(problem: Problem) => void} lost the job cannot be tracked any more
  */
 
 /**
- * Follow a job that has not ended.
+ * Track a job that has not ended.
  * @param {string} id
  * @param {Watcher} watcher
- * @returns {() => void} call it to stop
+ * @returns {() => void} stops tracking
  */
 export function follow(id, watcher) {
   const stopper = new AbortController();
   const { signal } = stopper;
   const stop = () => stopper.abort();
-  /** @type {boolean | null} null until the first try has ended */
+  /** @type {boolean | null} null until the first attempt has ended */
   let connected = null;
 
   /** @param {Status} status */
@@ -38,29 +38,29 @@ export function follow(id, watcher) {
   }
 
   /** @param {unknown} error */
-  function stumble(error) {
+  function handleError(error) {
     if (signal.aborted) return;
     if (error instanceof Problem && error.final) {
       stop();
       return watcher.lost(error);
     }
-    connect(false);
+    setConnected(false);
   }
 
   /** @param {boolean} now */
-  function connect(now) {
+  function setConnected(now) {
     if (now !== connected) watcher.connection(now);
     connected = now;
   }
 
   /** @param {import("./events.js").Message} message */
-  async function take({ event, data }) {
-    const told = JSON.parse(data);
-    if (event === "progress") return watcher.progress(told);
+  async function handle({ event, data }) {
+    const content = JSON.parse(data);
+    if (event === "progress") return watcher.progress(content);
     if (event !== "state") return;
-    if (told.start > 1) watcher.restarted();
-    if (told.job) accept(told.job);
-    else if (!active(told)) accept(await statusOf(id, signal)); // deleted in between, or the like
+    if (content.start > 1) watcher.restarted();
+    if (content.job) accept(content.job);
+    else if (!active(content)) accept(await statusOf(id, signal)); // for example after a deletion
   }
 
   async function listen() {
@@ -69,20 +69,20 @@ export function follow(id, watcher) {
       try {
         const headers = last ? { "Last-Event-ID": last } : undefined;
         const answer = await call(`/v1/jobs/${id}/events`, { headers, signal });
-        connect(true);
+        setConnected(true);
         if (answer.status === 204 || !answer.body) accept(await statusOf(id, signal));
         else
           for await (const message of messages(answer.body)) {
             failures = 0;
             last = message.id || last;
-            await take(message);
+            await handle(message);
           }
-        failures += 1; // it ended, and the job has not: the service is stopping
+        failures += 1; // the stream ended before the job: the service is stopping
       } catch (error) {
         failures += 1;
-        stumble(error);
+        handleError(error);
       }
-      await sleep(Math.min(LONGEST_WAIT_MS, 500 * 2 ** failures), signal);
+      await sleep(Math.min(MAX_RETRY_MS, 500 * 2 ** failures), signal);
     }
   }
 
@@ -91,7 +91,7 @@ export function follow(id, watcher) {
       try {
         accept(await statusOf(id, signal));
       } catch (error) {
-        stumble(error);
+        handleError(error);
       }
       await sleep(REFRESH_MS, signal);
     }
@@ -104,7 +104,7 @@ export function follow(id, watcher) {
 
 /**
  * @param {number} milliseconds
- * @param {AbortSignal} signal ends it early
+ * @param {AbortSignal} signal ends the wait early
  */
 function sleep(milliseconds, signal) {
   return new Promise((resolve) => {

@@ -1,4 +1,4 @@
-/** Numbers, sizes and times for people. The page is written in English; its numbers follow the text, not the browser. */
+/** Formatting of numbers, sizes and times, in English like the page, whatever the browser's language. */
 
 const LOCALE = "en";
 
@@ -23,7 +23,7 @@ const sizes = SIZES.map((unit) =>
 /** @param {number} value */
 export const count = (value) => whole.format(value);
 
-/** @param {number} value three digits */
+/** @param {number} value shown with three digits */
 export const short = (value) => brief.format(value);
 
 /** @param {number} value from 0 to 1 */
@@ -39,17 +39,17 @@ export const decibels = (value) => `${signed.format(value).replace("-", "−")} 
 export const moment = (iso) => dates.format(new Date(iso));
 
 /**
- * Bytes, in the unit that keeps the number short.
+ * Format bytes with the unit that gives a short number.
  * @param {number} value
  */
 export function bytes(value) {
-  // 999,600 rounded to three digits would read "1,000 kB": it belongs to the next unit already.
+  // 999,600 bytes would be rounded to "1,000 kB", so they take the next unit.
   const step = Math.min(SIZES.length - 1, Math.max(0, Math.floor(Math.log10(Math.max(value, 1) * 1.0005) / 3)));
   return sizes[step].format(value / 1000 ** step);
 }
 
 /**
- * A span of time: "0.4 s", "12 s", "3 min 20 s", "2 h 5 min".
+ * Format a duration: "0.4 s", "12 s", "3 min 20 s", "2 h 5 min".
  * @param {number} seconds
  */
 export function duration(seconds) {
@@ -62,13 +62,13 @@ export function duration(seconds) {
 }
 
 /**
- * A running clock: whole seconds, so that it does not flicker.
+ * Format elapsed time in whole seconds.
  * @param {number} seconds
  */
 export const clock = (seconds) => duration(Math.max(0, Math.floor(seconds)));
 
 /**
- * A guess, no more precise than it deserves: "about 7 s", "about 3 min".
+ * Format an estimate with few digits: "about 7 s", "about 3 min".
  * @param {number} seconds
  */
 export function roughly(seconds) {
@@ -79,7 +79,7 @@ export function roughly(seconds) {
 }
 
 /**
- * How long ago, or in how long.
+ * Format a time relative to now.
  * @param {string} iso
  */
 export function ago(iso) {
@@ -91,6 +91,6 @@ export function ago(iso) {
       [60, "minute"],
     ].find(([size]) => Math.abs(seconds) >= Number(size)) ?? [1, "second"]
   );
-  if (unit === "second" && Math.abs(seconds) < 30) return "just now"; // clocks may differ by that much, too
+  if (unit === "second" && Math.abs(seconds) < 30) return "just now"; // clocks may differ by this much
   return ages.format(Math.round(seconds / size), unit);
 }

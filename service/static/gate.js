@@ -1,8 +1,8 @@
-/** Asking for a key where the service wants one. It stays in this tab's session storage. */
+/** The form for a key, if the service requires one. The key is kept in this tab's session storage. */
 
 import { Problem, json, key, whenUnauthorized } from "./api.js";
 import { byId } from "./dom.js";
-import { explain, sentence } from "./trouble.js";
+import { explain, sentence } from "./problems.js";
 
 /**
  * @param {boolean} required
@@ -11,46 +11,46 @@ import { explain, sentence } from "./trouble.js";
 export function gate(required, app) {
   const [field, error] = [byId("gate-key"), byId("gate-error")];
 
-  /** @param {string} text why */
-  function shut(text) {
+  /** @param {string} text reason */
+  function lock(text) {
     key.forget();
     app.leave();
-    turn(false);
+    show(false);
     error.textContent = text;
     field.focus();
   }
 
-  function pass() {
-    turn(true);
+  function unlock() {
+    show(true);
     app.enter();
   }
 
   /** @param {boolean} open */
-  function turn(open) {
+  function show(open) {
     byId("gate").hidden = open;
     byId("app").hidden = !open;
     byId("forget").hidden = !open || !required;
   }
 
-  byId("forget").addEventListener("click", () => shut(""));
+  byId("forget").addEventListener("click", () => lock(""));
   byId("gate-form").addEventListener("submit", async (/** @type {SubmitEvent} */ event) => {
     event.preventDefault();
     error.textContent = "";
     key.set(field.value.trim());
     try {
-      await json("/v1/jobs?limit=1"); // the cheapest question that needs a key
+      await json("/v1/jobs?limit=1"); // a cheap request that needs the key
       field.value = "";
-      pass();
+      unlock();
     } catch (refusal) {
       key.forget();
-      const known = refusal instanceof Problem && refusal.code === "unauthorized";
-      error.textContent = known ? "This key is not known here." : sentence(explain(refusal).detail);
+      const rejected = refusal instanceof Problem && refusal.code === "unauthorized";
+      error.textContent = rejected ? "This key is unknown." : sentence(explain(refusal).detail);
     }
   });
   whenUnauthorized(() => {
-    if (byId("gate").hidden) shut("Your key is not accepted any more.");
+    if (byId("gate").hidden) lock("Your key is no longer accepted.");
   });
 
-  if (required && !key.get()) shut("");
-  else pass();
+  if (required && !key.get()) lock("");
+  else unlock();
 }

@@ -1,4 +1,4 @@
-/** What is wanted of the container: what the preset gives, a size, or a loss of quality. */
+/** The goal of a compression: none, a maximum size, or a maximum PSNR loss. */
 
 import { byId } from "./dom.js";
 
@@ -12,7 +12,7 @@ const GOALS = {
     usual: 3,
     step: 0.1,
     most: 1e5,
-    note: "The best container of that size, found by making a few.",
+    note: "The best container of at most this size, found by a search.",
   },
   max_psnr_drop: {
     unit: "dB",
@@ -20,40 +20,41 @@ const GOALS = {
     usual: 0.1,
     step: 0.05,
     most: 20,
-    note: "The smallest container whose pictures lose no more: told as if the scene were 30 dB from photographs.",
+    note: "The smallest container whose renderings lose at most this, assuming that the scene has 30 dB against photographs.",
   },
 };
 
 /**
- * Bring the field to life.
+ * Connect the controls of the goal.
  * @param {import("./api.js").Presets} presets
- * @param {() => string} preset the chosen one's name
+ * @param {() => string} preset returns the name of the chosen preset
  */
 export function goalField(presets, preset) {
   const [goal, amount] = [/** @type {HTMLSelectElement} */ (byId("goal")), byId("amount")];
-  const weighs = () => presets.presets.find(({ name }) => name === preset())?.settings.encode.rate_distortion ?? false;
-  const named = () => GOALS[goal.value];
+  const hasGoals = () =>
+    presets.presets.find(({ name }) => name === preset())?.settings.encode.rate_distortion ?? false;
+  const selected = () => GOALS[goal.value];
 
   function refresh() {
-    goal.disabled = !weighs();
+    goal.disabled = !hasGoals();
     if (goal.disabled) goal.value = "";
-    const chosen = named();
+    const chosen = selected();
     byId("goal-amount").hidden = amount.disabled = !chosen;
-    byId("goal-note").textContent = chosen?.note ?? (goal.disabled ? "This preset seeks none." : "");
+    byId("goal-note").textContent = chosen?.note ?? (goal.disabled ? "This preset does not support goals." : "");
     const [auto, keep] = [byId("keep-auto"), /** @type {HTMLSelectElement} */ (byId("keep"))];
     auto.disabled = !chosen;
     if (auto.disabled && keep.value === "auto") keep.value = "";
   }
 
-  /** @param {number} value in the unit of the field */
+  /** @param {number} value in the displayed unit */
   function fill(value) {
-    const { unit, step, most } = named();
+    const { unit, step, most } = selected();
     Object.assign(amount, { value: String(value), step: "any", min: String(step / 100), max: String(most) });
     byId("unit").textContent = unit;
   }
 
   goal.addEventListener("change", () => {
-    if (named()) fill(named().usual);
+    if (selected()) fill(selected().usual);
     refresh();
   });
   byId("preset-list").addEventListener("change", refresh);
@@ -61,8 +62,8 @@ export function goalField(presets, preset) {
   return {
     /** @returns {Goals | null} */
     chosen() {
-      if (!named()) return null;
-      const value = Number((Number(amount.value) * named().factor).toPrecision(12));
+      if (!selected()) return null;
+      const value = Number((Number(amount.value) * selected().factor).toPrecision(12));
       return { [goal.value]: goal.value === "target_size" ? Math.floor(value) : value };
     },
     /** @param {Goals} goals */

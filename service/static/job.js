@@ -1,21 +1,21 @@
-/** The card of one job, from its place in the queue to its end. */
+/** The card of a job, from the queue to its end. */
 
 import { Problem, active, cancel, status as statusOf } from "./api.js";
-import { announce, byId, el, entitle } from "./dom.js";
+import { announce, byId, el, setTitle } from "./dom.js";
 import { follow } from "./follow.js";
 import { count, short } from "./format.js";
 import { resultView } from "./result.js";
 import { runningView } from "./running.js";
-import { explain, problemBox } from "./trouble.js";
-import { stateWord } from "./words.js";
+import { explain, problemBox } from "./problems.js";
+import { stateLabel } from "./labels.js";
 
 /** @typedef {import("./api.js").Status} Status */
 
 /**
- * Shows one job at a time.
+ * Create the job card, which shows one job at a time.
  * @param {{keyed: boolean, seen: (status: Status | null) => void, again: (status: Status) => void}} page
- *   seen is told every status that arrives, null for a job that is lost; again is called when a scene shall be submitted
- *   once more
+ *   seen is called with each status, null for a job that cannot be tracked any more; again is called to repeat a
+ *   submission
  */
 export function jobCard(page) {
   const card = byId("job");
@@ -24,7 +24,7 @@ export function jobCard(page) {
 
   /** @param {(Node | string)[]} children @param {boolean} [focus] */
   function fill(children, focus = false) {
-    const keeps = focus || card.contains(document.activeElement); // what had the focus goes: keep it in the card
+    const keeps = focus || card.contains(document.activeElement); // keep the focus in the card
     card.replaceChildren(...children);
     if (keeps) card.querySelector("h1")?.focus({ preventScroll: !focus });
   }
@@ -56,14 +56,14 @@ export function jobCard(page) {
     };
   }
 
-  /** @param {Status | null} status @param {Problem} [problem] why there is none */
+  /** @param {Status | null} status @param {Problem} [problem] reason if there is no status */
   function end(status, problem) {
     stop();
     stop = () => {};
     if (status) {
       fill(ended(status));
       announce(summary(status));
-      entitle(`${stateWord(status.state)}: ${status.name}`);
+      setTitle(`${stateLabel(status.state)}: ${status.name}`);
     } else if (problem) fill(missing(problem));
     page.seen(status);
   }
@@ -74,7 +74,7 @@ export function jobCard(page) {
       return [...resultView({ ...status, sizes: status.sizes }, page.keyed), another()];
     const retry = status.state === "cancelled" || status.state === "expired" || status.problem?.retryable;
     return [
-      el("p", { class: `kicker ${status.state === "failed" ? "bad" : ""}` }, stateWord(status.state)),
+      el("p", { class: `kicker ${status.state === "failed" ? "bad" : ""}` }, stateLabel(status.state)),
       el("h1", { id: "job-title", tabindex: "-1" }, status.name),
       el("p", { class: "muted" }, `${count(status.gaussians)} Gaussians · ${status.options.preset} preset`),
       status.problem ? problemBox(status.problem) : el("p", {}, reason(status)),
@@ -95,20 +95,20 @@ export function jobCard(page) {
     shown = "";
     card.hidden = true;
     card.replaceChildren();
-    entitle();
+    setTitle();
   }
 
-  /** @param {string} id @param {boolean} focus whether somebody asked for it just now */
+  /** @param {string} id @param {boolean} focus whether the user has requested it */
   async function open(id, focus) {
     close();
     shown = id;
     try {
       const status = await statusOf(id);
-      if (shown !== id) return; // another was opened while this one was on its way
+      if (shown !== id) return; // another job was opened meanwhile
       card.hidden = false;
       if (active(status)) return watch(status, focus);
       fill(ended(status), focus);
-      entitle(`${stateWord(status.state)}: ${status.name}`);
+      setTitle(`${stateLabel(status.state)}: ${status.name}`);
     } catch (error) {
       if (shown !== id || (error instanceof Problem && error.code === "unauthorized")) return;
       card.hidden = false;
@@ -138,13 +138,13 @@ function missing(error, retry) {
 
 /** @param {Status} status */
 function reason(status) {
-  if (status.state === "cancelled") return "It was cancelled before it was done.";
-  const gone = "Its time is over, and its files were removed.";
+  if (status.state === "cancelled") return "The job was cancelled before it ended.";
+  const gone = "The job has expired, and its files were removed.";
   return status.sizes ? `${gone} The container was ${short(status.sizes.ratio)} times smaller than the upload.` : gone;
 }
 
 /** @param {Status} status */
 function summary(status) {
   const gain = status.sizes ? `, ${short(status.sizes.ratio)} times smaller` : "";
-  return `${status.name}: ${stateWord(status.state)}${gain}.`;
+  return `${status.name}: ${stateLabel(status.state)}${gain}.`;
 }

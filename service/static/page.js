@@ -1,15 +1,15 @@
-/** The page as a whole: which of its cards is to be seen, and what leads from one to the other. */
+/** The page: which of its cards is visible, and the transitions between them. */
 
 import { json } from "./api.js";
 import { composer, dropAnywhere } from "./compose.js";
 import { byId } from "./dom.js";
 import { gate } from "./gate.js";
 import { jobCard } from "./job.js";
+import { showProblem } from "./problems.js";
 import { recentJobs } from "./recent.js";
-import { trouble } from "./trouble.js";
 import { uploader } from "./upload.js";
 
-/** The job that the address names: a reload, or a link sent to somebody, leads back to it. */
+/** Return the id of the job in the page's address, which makes links to jobs possible; empty if there is none. */
 const jobInAddress = () => location.hash.match(/^#([0-9a-f]{32})$/)?.[1] ?? "";
 
 /**
@@ -17,8 +17,8 @@ const jobInAddress = () => location.hash.match(/^#([0-9a-f]{32})$/)?.[1] ?? "";
  * @param {import("./api.js").Presets} presets
  */
 function run(limits, presets) {
-  /** What was uploaded from this tab, for another try. @type {Map<string, import("./compose.js").Order>} */
-  const orders = new Map();
+  /** Submissions from this tab, for repetitions. @type {Map<string, import("./compose.js").Submission>} */
+  const submissions = new Map();
   const recent = recentJobs((id) => id === job.shown() && home());
   const upload = uploader({ started: () => show(false), accepted, abandoned: () => show(true) });
   const compose = composer(limits, presets, upload.send);
@@ -38,7 +38,7 @@ function run(limits, presets) {
     if (!status || !recent.see(status)) refresh();
   }
 
-  /** @param {boolean} focus whether somebody has just asked for what is shown now */
+  /** @param {boolean} focus whether the user has requested this view */
   function show(focus) {
     const id = jobInAddress();
     if (id && id !== job.shown()) job.open(id, focus);
@@ -49,31 +49,31 @@ function run(limits, presets) {
     if (focus) window.scrollTo({ top: 0 });
   }
 
-  /** @param {import("./api.js").Status} status @param {import("./compose.js").Order} order */
-  function accepted(status, order) {
-    orders.set(status.id, order);
-    if (!jobInAddress()) location.hash = status.id; // unless another job is being looked at
+  /** @param {import("./api.js").Status} status @param {import("./compose.js").Submission} submission */
+  function accepted(status, submission) {
+    submissions.set(status.id, submission);
+    if (!jobInAddress()) location.hash = status.id; // unless another job is open
     refresh();
   }
 
   /** @param {import("./api.js").Status} status */
   function again(status) {
-    const order = orders.get(status.id);
+    const submission = submissions.get(status.id);
     home();
     compose.prefer(status.options);
-    if (order && !upload.busy()) upload.send(order);
-    else compose.ask(`Choose ${status.name}.ply once more: this page does not have it any more.`);
+    if (submission && !upload.busy()) upload.send(submission);
+    else compose.showError(`Choose ${status.name}.ply again: this page no longer has the file.`);
   }
 
   window.addEventListener("hashchange", () => show(true));
   document.addEventListener("visibilitychange", () => !document.hidden && !byId("app").hidden && refresh());
   dropAnywhere({
-    willing: () => !byId("app").hidden && !upload.busy(), // one after the other
-    take(file) {
+    accepts: () => !byId("app").hidden && !upload.busy(), // one upload at a time
+    choose(file) {
       upload.dismiss();
       home();
-      show(false); // the address may have been that already
-      compose.take(file);
+      show(false); // the address may not have changed
+      compose.choose(file);
     },
   });
   gate(limits.keys_required, {
@@ -89,13 +89,13 @@ function run(limits, presets) {
 }
 
 async function start() {
-  trouble(null);
+  showProblem(null);
   try {
     const [limits, presets, version] = await Promise.all([json("/v1/limits"), json("/v1/presets"), json("/version")]);
     byId("version").textContent = `kissgs ${version.kissgs} · API ${version.api} · ${version.container}`;
     run(limits, presets);
   } catch (error) {
-    trouble(error, start);
+    showProblem(error, start);
   }
 }
 

@@ -1,4 +1,4 @@
-/** The presets as a group of radio buttons, each with what it costs and gives. */
+/** Radio buttons of the presets, with estimated size, time and quality. */
 
 import { byId, el } from "./dom.js";
 import { bytes, decibels, roughly } from "./format.js";
@@ -7,27 +7,27 @@ import { bytes, decibels, roughly } from "./format.js";
 
 const MILLION = 1e6;
 const CORES = 2;
-const START_SECONDS = 1; // what a job takes however small it is
+const START_SECONDS = 1; // start of a job's process
 
 /** @param {Preset} preset @param {number} gaussians */
 const seconds = (preset, gaussians) => START_SECONDS + (preset.cpu_seconds_per_million * gaussians) / MILLION / CORES;
 
 /**
- * Fill the group.
+ * Create the radio buttons.
  * @param {import("./api.js").Presets} presets
  */
 export function presetList(presets) {
-  // "paper" is there to compare with, not to use: it stands last wherever it is in the answer
+  // "paper" is for comparisons, so it comes last
   const sorted = [...presets.presets].sort((a, b) => Number(a.name === "paper") - Number(b.name === "paper"));
   const rows = sorted.map((preset) => row(preset, preset.name === presets.default));
   byId("preset-list").replaceChildren(...rows.map(({ element }) => element));
   const radios = () => /** @type {HTMLInputElement[]} */ ([...byId("preset-list").querySelectorAll("input")]);
-  /** @param {number | null} gaussians of the chosen scene; null while there is none */
+  /** @param {number | null} gaussians of the chosen scene; null if none is chosen */
   function estimate(gaussians) {
     rows.forEach(({ update }) => update(gaussians ?? MILLION));
     byId("preset-note").textContent =
       `Estimates for ${gaussians === null ? "a million Gaussians" : "this scene"} on a small two-core server; quality ` +
-      `is the change of renderings against photographs. Measured on ${presets.measured_on}.`;
+      `is the PSNR change of renderings against photographs. Measured on ${presets.measured_on}.`;
   }
   estimate(null);
   return {

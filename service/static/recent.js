@@ -1,16 +1,16 @@
-/** The list of recent jobs: open one again, or delete it. */
+/** The list of recent jobs, which can be opened or deleted. */
 
 import { active, json, remove } from "./api.js";
 import { announce, byId, el, time } from "./dom.js";
 import { ago, short } from "./format.js";
-import { explain, sentence } from "./trouble.js";
-import { stateWord } from "./words.js";
+import { explain, sentence } from "./problems.js";
+import { stateLabel } from "./labels.js";
 
 /** @typedef {import("./api.js").Status} Status */
 
-const PAGE = 10;
-const MOST = 100; // that the service lists at once
-const REFRESH_MS = 5000; // while some job in the list has not ended
+const PAGE_SIZE = 10;
+const MAX_PAGE_SIZE = 100; // limit of the service
+const REFRESH_MS = 5000; // while a listed job has not ended
 
 /**
  * @param {(id: string) => void} deleted
@@ -23,30 +23,30 @@ export function recentJobs(deleted) {
   let next = null;
   let timer = 0;
 
-  /** The first page anew, as long as the list has become by now. */
+  /** Reload the list with its present length. */
   async function load() {
     clearTimeout(timer);
-    await guarded(async () => {
-      const limit = Math.min(MOST, Math.max(PAGE, rows.size));
+    await withErrors(async () => {
+      const limit = Math.min(MAX_PAGE_SIZE, Math.max(PAGE_SIZE, rows.size));
       /** @type {import("./api.js").JobPage} */
       const page = await json(`/v1/jobs?limit=${limit}`);
       arrange(page.jobs);
-      paged(page);
+      updatePaging(page);
     });
   }
 
   async function older() {
-    await guarded(async () => {
+    await withErrors(async () => {
       /** @type {import("./api.js").JobPage} */
-      const page = await json(`/v1/jobs?limit=${PAGE}&cursor=${next}`);
+      const page = await json(`/v1/jobs?limit=${PAGE_SIZE}&cursor=${next}`);
       arrange([...[...rows.values()].map((row) => row.job()), ...page.jobs]);
-      paged(page);
+      updatePaging(page);
       if (page.jobs[0]) rows.get(page.jobs[0].id)?.focus();
     });
   }
 
   /** @param {import("./api.js").JobPage} page */
-  function paged(page) {
+  function updatePaging(page) {
     next = page.next ?? null;
     more.hidden = next === null;
     byId("recent").hidden = rows.size === 0;
@@ -55,7 +55,7 @@ export function recentJobs(deleted) {
   }
 
   /**
-   * Rows that stay are not moved: they may have the focus.
+   * Show these jobs in this order; remaining rows are not moved, because they may have the focus.
    * @param {Status[]} jobs
    */
   function arrange(jobs) {
@@ -76,12 +76,12 @@ export function recentJobs(deleted) {
   /** @param {Status} job */
   async function ask(job) {
     if (!(await confirmed(job))) return;
-    await guarded(async () => {
+    await withErrors(async () => {
       await remove(job.id);
       announce(`${job.name} was deleted.`);
       deleted(job.id);
       await load();
-      byId("recent-title").focus({ preventScroll: true }); // the button that was pressed is gone
+      byId("recent-title").focus({ preventScroll: true }); // the pressed button was removed
     });
   }
 
@@ -89,29 +89,29 @@ export function recentJobs(deleted) {
   return {
     load,
     /**
-     * Something newer than the list.
+     * Update the row of a job.
      * @param {Status} job
-     * @returns {boolean} whether the list has it
+     * @returns {boolean} whether the job is listed
      */
     see(job) {
       rows.get(job.id)?.update(job);
       return rows.has(job.id);
     },
     stop: () => clearTimeout(timer),
-    /** @param {string} id which job is open, if any */
+    /** @param {string} id id of the open job, or empty */
     mark: (id) => rows.forEach((row) => row.mark(id)),
   };
 }
 
 /** @param {() => Promise<void>} work */
-async function guarded(work) {
-  const place = byId("recent-error");
+async function withErrors(work) {
+  const message = byId("recent-error");
   try {
     await work();
-    place.textContent = "";
+    message.textContent = "";
   } catch (error) {
     const { title, detail } = explain(error);
-    place.textContent = `${title}. ${sentence(detail)}`;
+    message.textContent = `${title}. ${sentence(detail)}`;
     byId("recent").hidden = false;
   }
 }
@@ -137,7 +137,7 @@ function row(ask) {
       job = next;
       link.textContent = job.name;
       link.href = `#${job.id}`;
-      state.textContent = stateWord(job.state);
+      state.textContent = stateLabel(job.state);
       state.className = `badge ${job.state}`;
       ratio.textContent = job.sizes ? `${short(job.sizes.ratio)}×` : "";
       age.replaceChildren(time(job.timings.created_at, ago(job.timings.created_at)));
@@ -155,11 +155,11 @@ function confirmed(job) {
   const dialog = byId("confirm");
   byId("confirm-title").textContent = `Delete ${job.name}?`;
   byId("confirm-text").textContent = active(job)
-    ? "Its work stops, and the upload is removed."
-    : "Whatever is left of it on the server is removed. This cannot be undone.";
+    ? "The job is cancelled, and the upload is removed."
+    : "All its files on the server are removed. This cannot be undone.";
   byId("confirm-yes").onclick = () => dialog.close("yes");
   byId("confirm-no").onclick = () => dialog.close("");
-  dialog.returnValue = ""; // Escape leaves it as it is
+  dialog.returnValue = ""; // Escape does not change it
   dialog.showModal();
   return new Promise((resolve) => {
     dialog.addEventListener("close", () => resolve(dialog.returnValue === "yes"), { once: true });

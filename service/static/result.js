@@ -1,10 +1,10 @@
-/** A job that has ended well: what became of the scene, and where to get it. */
+/** The view of a succeeded job: results and downloads. */
 
 import { call } from "./api.js";
 import { el, facts, time } from "./dom.js";
 import { ago, bytes, count, duration, moment, share, short } from "./format.js";
-import { explain, problemBox } from "./trouble.js";
-import { mended, planes } from "./words.js";
+import { explain, problemBox } from "./problems.js";
+import { cleaningNotes, planes } from "./labels.js";
 
 /**
  * @typedef {import("./api.js").Status} Status
@@ -13,11 +13,11 @@ import { mended, planes } from "./words.js";
 
 /**
  * @param {Status & {sizes: Sizes}} status
- * @param {boolean} keyed whether downloads need a key, which links cannot carry
+ * @param {boolean} keyed whether downloads need a key, which links cannot send
  */
 export function resultView(status, keyed) {
   const { sizes, name } = status;
-  const notes = mended(status);
+  const notes = cleaningNotes(status);
   return [
     el("p", { class: "kicker good" }, "Done"),
     el("h1", { id: "job-title", tabindex: "-1" }, name),
@@ -25,7 +25,7 @@ export function resultView(status, keyed) {
     downloads(status, keyed),
     figures(status),
     planeTable(sizes),
-    notes.length ? mendedList(notes) : null,
+    notes.length ? notesList(notes) : null,
   ].filter((child) => child !== null);
 }
 
@@ -55,9 +55,9 @@ function figures(status) {
     ["Time", duration(timings.run_seconds ?? 0), waited >= 1 ? `after ${duration(waited)} in the queue` : undefined],
     ["Preset", status.options.preset],
   ];
-  if (finetuning) pairs.push(["Fine-tuning", gain(finetuning), "on views that were held out"]);
+  if (finetuning) pairs.push(["Fine-tuning", gain(finetuning), "on held-out views"]);
   if (evaluation) {
-    const { psnr, ssim, worst } = evaluation; // no PSNR: there is no noise at all
+    const { psnr, ssim, worst } = evaluation; // no PSNR if the images are identical
     pairs.push([
       "PSNR",
       typeof psnr === "number" ? `${psnr.toFixed(2)} dB` : "identical",
@@ -77,9 +77,9 @@ function point(position) {
 }
 
 /** @param {NonNullable<Status["finetuning"]>} finetuning */
-function gain({ kept, psnr_before: before, psnr_after: after, bytes_before: whole, bytes_after: part }) {
-  if (!kept || before === null || after === null) return kept ? "kept" : "no help here";
-  const [psnr, share] = [after - before, (100 * part) / whole - 100];
+function gain({ kept, psnr_before: before, psnr_after: after, bytes_before: first, bytes_after: last }) {
+  if (!kept || before === null || after === null) return kept ? "kept" : "no improvement";
+  const [psnr, share] = [after - before, (100 * last) / first - 100];
   return `${psnr < 0 ? "−" : "+"}${Math.abs(psnr).toFixed(2)} dB, ${share < 0 ? "−" : "+"}${Math.abs(share).toFixed(1)} %`;
 }
 
@@ -87,7 +87,7 @@ function gain({ kept, psnr_before: before, psnr_after: after, bytes_before: whol
 function planeTable(sizes) {
   const rows = planes(sizes.files);
   const largest = Math.max(...rows.map(([, size]) => size));
-  const whole = rows.reduce((sum, [, size]) => sum + size, 0); // the zip has names, too
+  const total = rows.reduce((sum, [, size]) => sum + size, 0); // without the zip's directory
   const lines = rows.map(([name, size]) => {
     const bar = el("span");
     bar.style.inlineSize = `${(100 * size) / largest}%`;
@@ -97,7 +97,7 @@ function planeTable(sizes) {
       el("th", { scope: "row" }, name),
       el("td", { class: "bar", "aria-hidden": "true" }, bar),
       el("td", {}, bytes(size)),
-      el("td", { class: "muted share" }, share(size / whole)),
+      el("td", { class: "muted share" }, share(size / total)),
     );
   });
   const head = (/** @type {string} */ text, /** @type {string} */ kind) =>
@@ -118,9 +118,9 @@ function planeTable(sizes) {
 }
 
 /** @param {string[]} notes */
-function mendedList(notes) {
+function notesList(notes) {
   const items = notes.map((note) => el("li", {}, note));
-  return el("section", { class: "mended" }, el("h2", {}, "Mended in the upload"), el("ul", {}, ...items));
+  return el("section", { class: "notes" }, el("h2", {}, "Corrected in the upload"), el("ul", {}, ...items));
 }
 
 /**
@@ -128,7 +128,7 @@ function mendedList(notes) {
  * @param {boolean} keyed
  */
 function downloads({ name, links, expires_at: expires }, keyed) {
-  const trouble = el("div");
+  const message = el("div");
   /** @type {[string, string, string, string][]} */
   const all = [
     ["result", "Download container (zip)", `${name}.zip`, "primary"],
@@ -139,10 +139,10 @@ function downloads({ name, links, expires_at: expires }, keyed) {
     .filter(([link]) => links[link])
     .map(([link, label, file, kind]) =>
       keyed
-        ? fetchButton(links[link], label, file, kind, trouble)
+        ? fetchButton(links[link], label, file, kind, message)
         : el("a", { class: `button ${kind}`, href: links[link], download: file }, label),
     );
-  // in this tab, because no other has the key
+  // in this tab, because other tabs do not have the key
   const preview = links.preview ? el("a", { class: "button quiet", href: links.preview }, "Preview") : null;
   const [container, ...others] = buttons;
   const until = expires
@@ -153,28 +153,28 @@ function downloads({ name, links, expires_at: expires }, keyed) {
     { class: "downloads" },
     el("div", { class: "buttons" }, container, preview, ...others),
     until,
-    trouble,
+    message,
   );
 }
 
 /**
- * A download with the key in its header: links cannot send one.
+ * Create a download button that sends the key in a header, which links cannot.
  * @param {string} path
  * @param {string} label
  * @param {string} file
  * @param {string} kind
- * @param {HTMLElement} trouble where to tell of it
+ * @param {HTMLElement} message element for errors
  */
-function fetchButton(path, label, file, kind, trouble) {
+function fetchButton(path, label, file, kind, message) {
   const button = el("button", { class: kind, type: "button", onclick: press }, label);
   async function press() {
     button.disabled = true;
-    button.textContent = "Fetching…";
-    trouble.replaceChildren();
+    button.textContent = "Downloading…";
+    message.replaceChildren();
     try {
       save(await (await call(path)).blob(), file);
     } catch (error) {
-      trouble.replaceChildren(problemBox(explain(error)));
+      message.replaceChildren(problemBox(explain(error)));
     }
     button.disabled = false;
     button.textContent = label;
@@ -190,5 +190,5 @@ function fetchButton(path, label, file, kind, trouble) {
 function save(blob, file) {
   const url = URL.createObjectURL(blob);
   el("a", { href: url, download: file }).click();
-  setTimeout(() => URL.revokeObjectURL(url), 60_000); // some browsers begin to read it late
+  setTimeout(() => URL.revokeObjectURL(url), 60_000); // some browsers start reading late
 }

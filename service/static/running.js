@@ -1,23 +1,23 @@
-/** A job that waits or runs: where it is, and how long it will take. */
+/** The view of a queued or running job: stage, progress and time estimate. */
 
-import { announce, el, entitle } from "./dom.js";
+import { announce, el, setTitle } from "./dom.js";
 import { clock, count, percent, roughly } from "./format.js";
-import { plannedStages, stageWord } from "./words.js";
+import { plannedStages, stageLabel } from "./labels.js";
 
 /** @typedef {import("./api.js").Status} Status */
 
 /**
- * The view of one job on its way.
+ * Create the view of a job that has not ended.
  * @param {Status} first
  * @param {() => void} cancel
  */
 export function runningView(first, cancel) {
   const kicker = el("p", { class: "kicker" });
   const [headline, amount] = [el("span", { class: "stage" }), el("span", { class: "stage" })];
-  const bar = el("progress", { max: 1, "aria-label": "Of this stage" });
+  const bar = el("progress", { max: 1, "aria-label": "Progress of this stage" });
   const [elapsed, left] = [el("span"), el("span")];
-  const note = el("p", { class: "note small muted", hidden: true }); // not read out: it changes all the time
-  const notice = el("p", { class: "small muted", hidden: true }, "The connection was lost; connecting again…");
+  const note = el("p", { class: "note small muted", hidden: true }); // not announced: it changes often
+  const notice = el("p", { class: "small muted", hidden: true }, "The connection was lost; reconnecting…");
   const button = el("button", { class: "quiet", type: "button", onclick: press }, "Cancel job");
   const steps = stepList(first);
   const children = [
@@ -41,7 +41,7 @@ export function runningView(first, cancel) {
   }
 
   /** @param {string} text */
-  function headlineIs(text) {
+  function setHeadline(text) {
     if (headline.textContent === text) return;
     headline.textContent = text;
     announce(`${first.name}: ${text}.`);
@@ -51,14 +51,14 @@ export function runningView(first, cancel) {
   function update(next) {
     [status, seen] = [next, performance.now()];
     const queued = next.state === "queued";
-    kicker.textContent = queued ? "Waiting" : "Compressing";
+    kicker.textContent = queued ? "Queued" : "Compressing";
     steps.element.hidden = queued;
     if (queued) {
       stage = "";
-      headlineIs(next.position === 1 ? "Next in the queue" : `Number ${next.position ?? "?"} in the queue`);
+      setHeadline(next.position === 1 ? "Next in the queue" : `Number ${next.position ?? "?"} in the queue`);
       note.hidden = true;
-      measure(0);
-    } else if (!stage) headlineIs("Starting");
+      showFraction(0);
+    } else if (!stage) setHeadline("Starting");
     tick();
   }
 
@@ -67,32 +67,32 @@ export function runningView(first, cancel) {
     if (now.stage !== stage) {
       stage = now.stage;
       steps.at(stage);
-      headlineIs(stageWord(stage));
+      setHeadline(stageLabel(stage));
       note.hidden = true;
     }
-    measure(now.fraction);
+    showFraction(now.fraction);
     note.textContent = now.note ?? "";
-    if (now.note) note.hidden = false; // for the whole stage, so that nothing jumps while it has nothing to say
+    if (now.note) note.hidden = false; // stays visible for the whole stage, so that the layout is stable
   }
 
   /**
-   * Many stages do not tell how far they are, or go on after all that they count: then the bar says only that they do.
+   * Show the completed fraction; many stages report only 0 or 1, and then the bar is indeterminate.
    * @param {number} fraction
    */
-  function measure(fraction) {
+  function showFraction(fraction) {
     const known = fraction > 0 && fraction < 1;
     if (known) bar.value = fraction;
     else bar.removeAttribute("value");
     amount.textContent = known ? percent(fraction) : "";
-    entitle(`${known ? percent(fraction) : "…"} ${first.name}`);
+    setTitle(`${known ? percent(fraction) : "…"} ${first.name}`);
   }
 
   function tick() {
     const since = (performance.now() - seen) / 1000;
     elapsed.textContent =
       status.timings.run_seconds === undefined ? "" : `${clock(status.timings.run_seconds + since)} elapsed`;
-    const guess = status.estimate ? Math.max(1, status.estimate.seconds_left - since) : null;
-    left.textContent = guess === null ? "" : `${roughly(guess)} left`;
+    const seconds = status.estimate ? Math.max(1, status.estimate.seconds_left - since) : null;
+    left.textContent = seconds === null ? "" : `${roughly(seconds)} left`;
   }
 
   update(first);
@@ -108,7 +108,7 @@ export function runningView(first, cancel) {
     },
     /** @param {boolean} connected */
     connection: (connected) => (notice.hidden = connected),
-    /** It could not be cancelled: let it be tried again. */
+    /** Enable the cancel button again after a failed cancellation. */
     release() {
       button.disabled = false;
       button.textContent = "Cancel job";
@@ -117,7 +117,7 @@ export function runningView(first, cancel) {
 }
 
 /**
- * The stages: those behind, this one, and those that will come.
+ * Create the list of past, present and future stages.
  * @param {Status} status
  */
 function stepList(status) {
@@ -126,7 +126,7 @@ function stepList(status) {
   /** @type {string[]} */
   let passed = [];
 
-  /** @param {string} now empty before the first */
+  /** @param {string} now empty before the first stage */
   function at(now) {
     if (!now) passed = [];
     else if (!passed.includes(now)) passed.push(now);
@@ -134,7 +134,7 @@ function stepList(status) {
     const items = [...passed, ...ahead.filter((name) => !passed.includes(name))].map((name) => {
       const here = name === now;
       const kind = here ? "now" : passed.includes(name) ? "past" : "later";
-      return el("li", { class: kind, "aria-current": here ? "step" : null }, stageWord(name));
+      return el("li", { class: kind, "aria-current": here ? "step" : null }, stageLabel(name));
     });
     element.replaceChildren(...items);
   }

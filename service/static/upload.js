@@ -1,18 +1,18 @@
-/** Bringing a scene to the service, with a card that shows how far it is. */
+/** Upload of a scene, with a card that shows its progress. */
 
 import { Problem, authorization, refused, unreachable } from "./api.js";
-import { announce, byId, el, entitle } from "./dom.js";
+import { announce, byId, el, setTitle } from "./dom.js";
 import { bytes, percent, roughly } from "./format.js";
-import { problemBox } from "./trouble.js";
+import { problemBox } from "./problems.js";
 
-/** @typedef {import("./compose.js").Order} Order */
+/** @typedef {import("./compose.js").Submission} Submission */
 
 /**
- * One upload at a time, in its own card: other jobs can be looked at while it goes on.
- * @param {{started: () => void, accepted: (job: import("./api.js").Status, order: Order) => void,
- *   abandoned: (order: Order) => void}} watcher
+ * Create the upload card, for one upload at a time; other jobs can be opened during an upload.
+ * @param {{started: () => void, accepted: (job: import("./api.js").Status, submission: Submission) => void,
+ *   abandoned: (submission: Submission) => void}} callbacks
  */
-export function uploader(watcher) {
+export function uploader(callbacks) {
   const card = byId("upload");
   /** @type {XMLHttpRequest | null} */
   let request = null;
@@ -22,7 +22,7 @@ export function uploader(watcher) {
   function finish() {
     request = null;
     window.removeEventListener("beforeunload", warn);
-    entitle();
+    setTitle();
   }
 
   function close() {
@@ -31,27 +31,27 @@ export function uploader(watcher) {
   }
 
   /**
-   * @param {Order} order
-   * @param {string} idempotencyKey the same for every try: a job whose answer was lost is not made twice
+   * @param {Submission} submission
+   * @param {string} idempotencyKey unchanged in repetitions, so that a job is not created twice if a response was lost
    */
-  function send(order, idempotencyKey) {
-    const view = progressView(order.file, () => request?.abort());
+  function send(submission, idempotencyKey) {
+    const view = progressView(submission.file, () => request?.abort());
     card.replaceChildren(...view.children);
     card.hidden = false;
     window.addEventListener("beforeunload", warn);
-    watcher.started();
+    callbacks.started();
     card.querySelector("h1").focus();
-    request = post(order, idempotencyKey, {
+    request = post(submission, idempotencyKey, {
       progress: view.update,
       accepted(job) {
         finish();
         close();
-        watcher.accepted(job, order);
+        callbacks.accepted(job, submission);
       },
       failed(problem) {
         finish();
-        if (problem.code === "unauthorized") return close(); // the page asks for another key
-        card.replaceChildren(...failedView(order, problem, () => send(order, idempotencyKey), giveUp));
+        if (problem.code === "unauthorized") return close(); // the page shows the key form
+        card.replaceChildren(...failedView(submission, problem, () => send(submission, idempotencyKey), giveUp));
         card.querySelector("h1").focus();
       },
       aborted: giveUp,
@@ -61,30 +61,30 @@ export function uploader(watcher) {
       finish();
       close();
       announce("The upload was cancelled.");
-      watcher.abandoned(order);
+      callbacks.abandoned(submission);
     }
   }
 
   return {
-    /** @param {Order} order */
-    send: (order) => send(order, uniqueKey()),
-    /** Whether its card is to be seen, with an upload or with what became of it. */
+    /** @param {Submission} submission */
+    send: (submission) => send(submission, uniqueKey()),
+    /** Whether the card is visible, with an upload or its failure. */
     shown: () => !card.hidden,
-    /** Whether bytes are on their way. */
+    /** Whether an upload is in progress. */
     busy: () => request !== null,
-    /** Forget an upload that has failed. */
+    /** Close the card after a failed upload. */
     dismiss: close,
   };
 }
 
 /**
- * @param {Order} order
+ * @param {Submission} submission
  * @param {string} idempotencyKey
  * @param {{progress: (sent: number) => void, accepted: (job: any) => void, failed: (problem: Problem) => void,
  *   aborted: () => void}} then
  */
 function post({ file, options }, idempotencyKey, then) {
-  const request = new XMLHttpRequest(); // fetch cannot tell how much of a body has been sent
+  const request = new XMLHttpRequest(); // fetch does not report upload progress
   const query = new URLSearchParams({ name: file.name, options: JSON.stringify(options) });
   request.open("POST", `/v1/jobs?${query}`);
   const headers = {
@@ -111,7 +111,7 @@ function post({ file, options }, idempotencyKey, then) {
 function progressView(file, abort) {
   const bar = el("progress", { max: 1, value: 0, "aria-labelledby": "upload-title" });
   const [done, left] = [el("span", {}, "0%"), el("span", {}, "")];
-  const begun = performance.now();
+  const started = performance.now();
   const children = [
     el("p", { class: "kicker" }, "Uploading"),
     el("h1", { id: "upload-title", tabindex: "-1" }, file.name),
@@ -122,18 +122,18 @@ function progressView(file, abort) {
   /** @param {number} loaded */
   function update(loaded) {
     const fraction = file.size ? Math.min(1, loaded / file.size) : 1;
-    const spent = (performance.now() - begun) / 1000;
+    const spent = (performance.now() - started) / 1000;
     bar.value = fraction;
     done.textContent = `${bytes(loaded)} of ${bytes(file.size)} · ${percent(fraction)}`;
-    if (fraction >= 1) left.textContent = "The service checks it…";
-    else if (spent > 1) left.textContent = `${roughly((spent / fraction) * (1 - fraction))} left`; // not from the first packet
-    entitle(`${percent(fraction)} ${file.name}`);
+    if (fraction >= 1) left.textContent = "The service checks the scene…";
+    else if (spent > 1) left.textContent = `${roughly((spent / fraction) * (1 - fraction))} left`; // the first second is not representative
+    setTitle(`${percent(fraction)} ${file.name}`);
   }
   return { children, update };
 }
 
 /**
- * @param {Order} order
+ * @param {Submission} submission
  * @param {Problem} problem
  * @param {() => void} retry
  * @param {() => void} giveUp
@@ -150,7 +150,7 @@ function failedView({ file }, problem, retry, giveUp) {
   ];
 }
 
-/** Random, also where `randomUUID` is missing: browsers have it on https and localhost only. */
+/** Return a random key, also without `randomUUID`, which browsers provide on https and localhost only. */
 function uniqueKey() {
   if (crypto.randomUUID) return crypto.randomUUID();
   return [...crypto.getRandomValues(new Uint8Array(16))].map((byte) => byte.toString(16).padStart(2, "0")).join("");

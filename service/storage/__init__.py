@@ -1,1 +1,1 @@
-"""Jobs at rest: the database, the data folder, and that both belong together."""
+"""Persistence of jobs: the database, the data folder, and the binding between both."""

@@ -1,4 +1,4 @@
-"""Seeing whether the job database is still the one that was opened: there, whole, and open to writing."""
+"""``DatabaseMonitor``: checks that the job database is the one that was opened, intact and writable."""
 
 from __future__ import annotations
 
@@ -19,51 +19,51 @@ from sqlalchemy.orm import Session
 from service.core.models import Base, Meta
 
 WAIT_SECONDS = 2.0
-"""How long to wait for another's lock, when looking whether the database can be written to."""
+"""Maximum wait for a lock during a check, seconds."""
 
-SHARE = 0.01
-"""The part of the time, at most, that goes into reading the whole of an SQLite database in search of damage."""
+MAX_SCAN_SHARE = 0.01
+"""Maximum share of time spent on reading all pages of an SQLite database in search of damage."""
 
 IDENTITY = "identity"
-"""The row of ``meta`` with a number that no other database has."""
+"""Row of ``meta`` with a random number that identifies the database."""
 
 OWNER = "owner"
-"""The row with the number of the service that uses it."""
+"""Row of ``meta`` with the number of the service that holds the lease."""
 
 IDENTITY_BITS = 48
-"""How large that number is: a column of floats holds it exactly."""
+"""Bits of these numbers, which a float column holds exactly."""
 
 
 class DatabaseReplacedError(SQLAlchemyError):
-    """The database was removed or replaced, or became another service's, while this one had it open."""
+    """The database was removed or replaced, or another service took it over, while this one had it open."""
 
 
-def file_of(url: sa.URL) -> Path | None:
-    """The file of an SQLite database; None for a server, or for memory."""
+def sqlite_file(url: sa.URL) -> Path | None:
+    """Return the file of an SQLite database; None for a database server or a database in memory."""
     if url.get_backend_name() != "sqlite" or url.database in (None, "", ":memory:"):
         return None
     return Path(str(url.database).removeprefix("file:")).absolute()
 
 
 def error_text(error: BaseException) -> str:
-    """What a driver says, in one line."""
+    """Return the first line of a database driver's message."""
     lines = str(getattr(error, "orig", None) or error).strip().splitlines()
     return lines[0].strip() if lines else type(error).__name__
 
 
-def read_a_row(connection: sa.Connection) -> None:
-    """Read the last row of every table, with all columns.
+def check_rows(connection: sa.Connection) -> None:
+    """Read the last row of each table, with all columns, as a quick check.
 
     Raises:
-        SQLAlchemyError: a table or a column is missing, or damaged.
+        SQLAlchemyError: a table or a column is missing or damaged.
     """
     for table in Base.metadata.sorted_tables:
         last = [column.desc() for column in table.primary_key]
         connection.execute(sa.select(table).order_by(*last).limit(1)).all()
 
 
-def change_nothing(connection: sa.Connection) -> None:
-    """Write what is there already: SQLite refuses a read-only database no earlier.
+def check_writable(connection: sa.Connection) -> None:
+    """Overwrite a value with itself, because SQLite reports a read-only database only on a write.
 
     Raises:
         SQLAlchemyError: the database cannot be written to.
@@ -71,101 +71,105 @@ def change_nothing(connection: sa.Connection) -> None:
     connection.execute(sa.update(Meta).where(Meta.name == IDENTITY).values(value=Meta.value))
 
 
-def read_every_page(connection: sa.Connection) -> str | None:
-    """What is wrong with the structure of an SQLite database; None if nothing is."""
+def check_pages(connection: sa.Connection) -> str | None:
+    """Check the structure of an SQLite database; return a description of the damage, None if there is none."""
     found = connection.exec_driver_sql("PRAGMA quick_check(1)").scalar()
     return None if found == "ok" else " ".join(str(found).split())
 
 
-def leave_open(connection: sqlite3.Connection) -> None:
-    """Keep a connection open up to the very end of the process.
+def keep_open(connection: sqlite3.Connection) -> None:
+    """Keep a connection open until the process ends.
 
-    Closing the last one of a database removes the file of its journal by name; once the database has been replaced,
-    that name is another's.
+    Closing the last connection to a database removes its journal by name; if the database has been replaced, that would
+    be the journal of the new one.
     """
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(connection))
 
 
 class DatabaseMonitor:
-    """Checks an open database.
+    """Monitor of an open database.
 
     Args:
-        engine: what the service works with.
+        engine: engine of the service.
+
+    Attributes:
+        identity: number that the database must have in ``meta``.
+        owner: number of this service's lease; None without a lease.
     """
 
     def __init__(self, engine: sa.Engine) -> None:
         self.identity: float | None = None
         self.owner: float | None = None
-        self._turn = threading.Lock()
-        self._begun, self._found = 0.0, ""
-        self._read, self._cost = time.monotonic(), 0.0
+        self._lock = threading.Lock()
+        self._check_started, self._last_problem = 0.0, ""
+        self._last_scan, self._scan_seconds = time.monotonic(), 0.0
         self._files: dict[Path, tuple[int, int] | None] = {}
-        self._file, self._probe = file_of(engine.url), engine
+        self._file, self._probe = sqlite_file(engine.url), engine
         if self._file is not None:
-            self._keep(self._file)
+            self._hold_open(self._file)
 
     def close(self) -> None:
-        """Let go of the database; if it is no longer there, without touching what stands in its place."""
+        """Close the database; if it was removed or replaced, leave the new files untouched."""
         if self._file is not None:
             with contextlib.suppress(DatabaseReplacedError):
-                self.require()
-                self._keeper.close()
+                self.check_files()
+                self._connection.close()
                 return
-            leave_open(self._keeper)
+            keep_open(self._connection)
 
-    def leave(self) -> None:
-        """Let go of the database as it is, its journal included."""
+    def abandon(self) -> None:
+        """Stop using the database without closing it, so that its files, including the journal, stay unchanged."""
         if self._file is not None:
-            leave_open(self._keeper)
+            keep_open(self._connection)
 
-    def require(self) -> None:
-        """See that the database's files are those that were opened: a matter of microseconds.
+    def check_files(self) -> None:
+        """Check that the database's files are those that were opened; takes microseconds.
 
         Raises:
-            DatabaseReplacedError: they are not.
+            DatabaseReplacedError: a file was removed or replaced.
         """
         for path, known in self._files.items():
             found = _inode(path)
             if found != known:
-                done = "removed" if found is None else "replaced"
+                change = "removed" if found is None else "replaced"
                 raise DatabaseReplacedError(
-                    f"{path.name} was {done} while the service runs; put it back and restart the service"
+                    f"{path.name} was {change} while the service runs; put it back and restart the service"
                 )
 
     def ownership_problem(self, connection: sa.Connection | Session) -> str | None:
-        """Why an open database is not, or no longer, this service's; None if it is."""
-        wanted = sa.select(Meta.name, Meta.value).where(Meta.name.in_((IDENTITY, OWNER)))
-        found = {name: value for name, value in connection.execute(wanted)}  # noqa: C416  dict() takes it for a mapping
+        """Return why the open database does not belong to this service any more; None if it does."""
+        query = sa.select(Meta.name, Meta.value).where(Meta.name.in_((IDENTITY, OWNER)))
+        found = {name: value for name, value in connection.execute(query)}  # noqa: C416  dict() takes it for a mapping
         if found.get(IDENTITY) != self.identity:
-            return "it was replaced by another"
+            return "it was replaced by another database"
         if self.owner is not None and found.get(OWNER) != self.owner:
-            return "another service has taken it over; stop one of them, and restart the other"
+            return "another service has taken it over; stop one of the two and restart the other"
         return None
 
     def health_problem(self) -> str | None:
-        """Why the database cannot be relied on; None if it can. Takes a millisecond or two, and may wait for a lock.
+        """Check the database; return the problem, None if there is none. Takes 2 ms, or longer to wait for a lock.
 
-        Those who ask at the same time share an answer, but none gets one that is older than the question.
+        Concurrent calls share one check, which never started before the call.
         """
-        asked = time.monotonic()
-        with self._turn:
-            if self._begun < asked:
-                self._begun = time.monotonic()
-                self._found = self._look()
-            return self._found or None
+        called = time.monotonic()
+        with self._lock:
+            if self._check_started < called:
+                self._check_started = time.monotonic()
+                self._last_problem = self._run_checks()
+            return self._last_problem or None
 
-    def _keep(self, file: Path) -> None:
-        """Hold the database open, so that its journal stays the same file from now on."""
-        self._keeper = sqlite3.connect(file, timeout=WAIT_SECONDS, check_same_thread=False)
-        self._keeper.execute("SELECT count(*) FROM meta").fetchall()
+    def _hold_open(self, file: Path) -> None:
+        """Keep a connection open, so that the journal stays the same file."""
+        self._connection = sqlite3.connect(file, timeout=WAIT_SECONDS, check_same_thread=False)
+        self._connection.execute("SELECT count(*) FROM meta").fetchall()
         real = os.path.realpath(file)
         self._files = {path: _inode(path) for path in (file, Path(f"{real}-wal"), Path(f"{real}-shm"))}
         self._probe = sa.create_engine("sqlite://", creator=lambda: _open(file), poolclass=sa.NullPool)
 
-    def _look(self) -> str:
+    def _run_checks(self) -> str:
         try:
-            self.require()
-            if self._file is not None and not self._file.stat().st_size:  # SQLite would remove its journal
+            self.check_files()
+            if self._file is not None and not self._file.stat().st_size:  # opening it would remove the journal
                 return "its file is empty"
             with self._probe.connect() as connection:
                 return self._inspect(connection)
@@ -173,25 +177,25 @@ class DatabaseMonitor:
             return error_text(error)
 
     def _inspect(self, connection: sa.Connection) -> str:
-        mine = sa.select(Meta.value).where(Meta.name == IDENTITY)
+        query = sa.select(Meta.value).where(Meta.name == IDENTITY)
         with _short_transaction(connection):
-            connection.scalar(mine.with_for_update())
-            if why := self.ownership_problem(connection):
-                return why
-            change_nothing(connection)
-            read_a_row(connection)
+            connection.scalar(query.with_for_update())
+            if problem := self.ownership_problem(connection):
+                return problem
+            check_writable(connection)
+            check_rows(connection)
         begun = time.monotonic()
-        if self._file is None or begun - self._read < self._cost / SHARE:
+        if self._file is None or begun - self._last_scan < self._scan_seconds / MAX_SCAN_SHARE:
             return ""
-        damage = read_every_page(connection)
-        self._read = time.monotonic()
-        self._cost = self._read - begun
+        damage = check_pages(connection)
+        self._last_scan = time.monotonic()
+        self._scan_seconds = self._last_scan - begun
         return f"it is damaged: {damage}" if damage else ""
 
 
 @contextlib.contextmanager
 def _short_transaction(connection: sa.Connection) -> Iterator[None]:
-    """Begin a transaction that could write and does not wait long for others; undo it."""
+    """Begin a write transaction that waits for a lock at most :data:`WAIT_SECONDS`; roll it back at the end."""
     if connection.dialect.name == "sqlite":
         connection.exec_driver_sql("BEGIN IMMEDIATE")
     elif connection.dialect.name == "postgresql":
@@ -203,7 +207,7 @@ def _short_transaction(connection: sa.Connection) -> Iterator[None]:
 
 
 def _open(file: Path) -> sqlite3.Connection:
-    """Open a database that is there; none is made."""
+    """Open an existing database; never create one."""
     address = f"file:{quote(str(file))}?mode=rw"
     return sqlite3.connect(address, uri=True, timeout=WAIT_SECONDS, isolation_level=None, check_same_thread=False)
 

@@ -1,8 +1,7 @@
-"""One service at a time uses a job database: the one whose number stands in it, as long as that shows signs of life.
+"""Database lease: the guarantee that one service at a time uses a job database.
 
-Its own row of ``meta`` has the number; two more tell which process of which machine it is; and the row with the time,
-which it writes again every few seconds, is the sign. No two machines need to agree about the time: what counts is
-that the row changes.
+The owner's rows in ``meta`` are its number, its process and its machine; the row with the time is its heartbeat,
+written every few seconds. Only a change of that row counts, so the clocks of machines need not agree.
 """
 
 from __future__ import annotations
@@ -26,13 +25,13 @@ from service.storage.database_health import IDENTITY, IDENTITY_BITS, OWNER
 log = logging.getLogger("kissgs.service")
 
 HEARTBEAT_SECONDS = 5.0
-"""Between two signs of life."""
+"""Seconds between heartbeats."""
 
 TAKEOVER_SECONDS = 20.0
-"""How long a start waits for a sign of life of a service that may have crashed."""
+"""Seconds that a start waits for a heartbeat of an owner that may have crashed."""
 
 POLL_SECONDS = 0.25
-"""Between two looks for one."""
+"""Seconds between checks for a heartbeat."""
 
 TIME, PROCESS, MACHINE = "time", "owner-process", "owner-machine"
 
@@ -40,13 +39,12 @@ Rows = dict[str, float]
 
 
 def acquire(writing: Sessions, reading: Sessions) -> float:
-    """Write down that the database is this service's, and by which number.
+    """Take the lease and return the number of this owner.
 
-    A service that stopped in order has left no row, and one that crashed on this machine is known not to run: after
-    both, nothing is waited for.
+    There is no wait if the previous owner has released the lease, or has crashed on this machine.
 
     Raises:
-        SettingsError: it is another's.
+        SettingsError: another service holds the lease.
     """
     with reading() as session:
         seen = _rows(session)
@@ -54,31 +52,34 @@ def acquire(writing: Sessions, reading: Sessions) -> float:
         seen = _wait_for_heartbeat(seen, reading)
     number = secrets.randbits(IDENTITY_BITS)
     with writing.begin() as session:
-        session.get(Meta, IDENTITY, with_for_update=True)  # two that start at once come one after the other
+        session.get(Meta, IDENTITY, with_for_update=True)  # serialises simultaneous starts
         if _rows(session) != seen:
-            raise _taken(seen)
+            raise _in_use_error(seen)
         for name, value in {OWNER: number, PROCESS: os.getpid(), MACHINE: _machine()}.items():
             session.merge(Meta(name=name, value=value))
     return number
 
 
 def release(session: Session) -> None:
-    """Let the next service have the database at once."""
+    """Release the lease, so that the next service need not wait."""
     session.execute(sa.delete(Meta).where(Meta.name.in_((OWNER, PROCESS, MACHINE))))
 
 
 def _rows(session: Session) -> Rows:
-    wanted = sa.select(Meta).where(Meta.name.in_((OWNER, PROCESS, MACHINE, TIME)))
-    return {fact.name: fact.value for fact in session.scalars(wanted)}
+    query = sa.select(Meta).where(Meta.name.in_((OWNER, PROCESS, MACHINE, TIME)))
+    return {row.name: row.value for row in session.scalars(query)}
 
 
 def _wait_for_heartbeat(seen: Rows, reading: Sessions) -> Rows:
-    """Wait for a sign of life of the owner.
+    """Wait for a heartbeat of the owner.
 
     Returns:
-        What stands in the database when there was none, or when the owner has stopped.
+        The rows after the wait: those of the crashed owner, or none of an owner that has released the lease.
+
+    Raises:
+        SettingsError: there was a heartbeat.
     """
-    log.warning("the job database is that of another service; waiting %g s for a sign of its life", TAKEOVER_SECONDS)
+    log.warning("another service holds the job database's lease; waiting %g s for its heartbeat", TAKEOVER_SECONDS)
     end = time.monotonic() + TAKEOVER_SECONDS
     while time.monotonic() < end:
         time.sleep(POLL_SECONDS)
@@ -87,18 +88,18 @@ def _wait_for_heartbeat(seen: Rows, reading: Sessions) -> Rows:
         if OWNER not in now:
             return now
         if now != seen:
-            raise _taken(now)
-    log.warning("there was none; this service takes its place")
+            raise _in_use_error(now)
+    log.warning("there was no heartbeat; this service takes the lease over")
     return seen
 
 
 def _is_free(rows: Rows) -> bool:
-    """Whether it is certain that the owner does not run."""
-    return OWNER not in rows or (rows.get(MACHINE) == _machine() and not _runs(int(rows.get(PROCESS, 0))))
+    """Whether the owner certainly does not run."""
+    return OWNER not in rows or (rows.get(MACHINE) == _machine() and not _may_run(int(rows.get(PROCESS, 0))))
 
 
-def _runs(process: int) -> bool:
-    """Whether it may be that another process of this machine has this number."""
+def _may_run(process: int) -> bool:
+    """Whether another process of this machine may have this number."""
     if process < 1 or process == os.getpid():
         return False
     try:
@@ -111,20 +112,20 @@ def _runs(process: int) -> bool:
 
 
 def _machine() -> int:
-    """A number of this machine, or container, that changes when it is started."""
+    """Return a number of this machine or container that changes with each start of it."""
     try:
-        started = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii")
-        inside = Path("/proc/self/ns/pid").readlink()
+        boot_id = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii")
+        namespace = Path("/proc/self/ns/pid").readlink()
     except OSError:
-        started, inside = platform.node(), Path()
-    digest = hashlib.sha256(f"{started} {inside}".encode()).digest()
+        boot_id, namespace = platform.node(), Path()
+    digest = hashlib.sha256(f"{boot_id} {namespace}".encode()).digest()
     return int.from_bytes(digest[: IDENTITY_BITS // 8], "big")
 
 
-def _taken(rows: Rows) -> SettingsError:
+def _in_use_error(rows: Rows) -> SettingsError:
     here = rows.get(MACHINE) == _machine()
     which = f"process {rows.get(PROCESS, 0):.0f}" if here else "on another machine or in another container"
     return SettingsError(
-        f"KISSGS_DATABASE_URL: another service ({which}) is using the job database; stop that one, or give this one "
-        "a database and a data folder of its own"
+        f"KISSGS_DATABASE_URL: another service ({which}) is using the job database; stop that one, or use "
+        "a separate database and data folder"
     )

@@ -1,7 +1,7 @@
-"""A data folder and its database belong together: each keeps the other's number, and neither works with a stranger.
+"""Binding of a data folder to its database: each stores the number of the other, and a wrong pair is refused.
 
-The service removes the files of jobs that its database says are over. With another database, those would be files of
-somebody else.
+The service removes files of jobs that have ended according to its database; with a wrong database, it would remove the
+files of others.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from service.storage.database_health import IDENTITY, IDENTITY_BITS, error_text
 from service.storage.job_storage import JobStorage, sync_folder
 from service.storage.job_store import Store
 
-NEARLY_FULL = 1 << 20
-"""The free bytes of a disk below which a database may not open."""
+NEARLY_FULL_BYTES = 1 << 20
+"""Free disk space below which a database may fail to open, bytes."""
 
 
 def open_store(settings: ServiceSettings, storage: JobStorage, clock: Callable[[], float]) -> Store:
@@ -30,89 +30,94 @@ def open_store(settings: ServiceSettings, storage: JobStorage, clock: Callable[[
     Raises:
         SettingsError: it cannot be opened, does not belong to the folder, or is in use. Nothing has been removed.
     """
-    held = storage.held()
+    stored = storage.job_ids()
     try:
-        store = _open(settings, storage, clock, may_be_new=not held)
+        store = _open(settings, storage, clock, create=not stored)
     except NewDatabaseError as error:
-        raise _unknown(storage, held, "the job database is new and knows none of them") from error
+        raise _unknown_jobs_error(storage, stored, "the job database is new and has none of them") from error
     try:
-        _pair(store, storage, held)
+        _bind(store, storage, stored)
         store.acquire_database()
     except BaseException as error:
-        store.leave()
+        store.abandon()
         if isinstance(error, SQLAlchemyError):
             raise SettingsError(f"KISSGS_DATABASE_URL: the job database cannot be used: {error_text(error)}") from error
         raise
     return store
 
 
-def _open(settings: ServiceSettings, storage: JobStorage, clock: Callable[[], float], *, may_be_new: bool) -> Store:
+def _open(settings: ServiceSettings, storage: JobStorage, clock: Callable[[], float], *, create: bool) -> Store:
     try:
-        return Store(settings.database, clock, may_be_new=may_be_new)
+        return Store(settings.database, clock, create=create)
     except SettingsError:
-        if storage.free_bytes() >= NEARLY_FULL:
+        if storage.free_bytes() >= NEARLY_FULL_BYTES:
             raise
-    storage.remove_uploads()  # this may make the room that the database needs
-    return Store(settings.database, clock, may_be_new=may_be_new)
+    storage.remove_uploads()  # this may free enough space for the database
+    return Store(settings.database, clock, create=create)
 
 
-def _pair(store: Store, storage: JobStorage, held: set[str]) -> None:
-    """See that database and folder know each other; if neither knows another one, introduce them.
+def _bind(store: Store, storage: JobStorage, stored: set[str]) -> None:
+    """Check that database and folder belong together; bind them if neither belongs to another one.
 
-    What was made before both numbers existed is recognised by its jobs.
+    A missing number is restored if the other one, or common jobs, show that they belong together.
     """
-    database, its_folder = store.fact(IDENTITY), store.fact("folder")
-    folder, its_database = read_mark(storage.root, "identity"), read_mark(storage.root, "database")
-    share_jobs = bool(held & store.ids())
+    database, its_folder = store.meta_value(IDENTITY), store.meta_value("folder")
+    folder, its_database = read_number(storage.root, "identity"), read_number(storage.root, "database")
+    share_jobs = bool(stored & store.ids())
     named = database is not None and its_database == database
-    lost = folder is None and (named or share_jobs)  # the file alone
+    lost = folder is None and (named or share_jobs)  # only the file with the number is missing
     if its_folder not in (None, folder) and not lost:
         raise SettingsError(
-            "KISSGS_DATABASE_URL, KISSGS_DATA_DIR: this database is that of another data folder; "
-            "each service needs its own of both"
+            "KISSGS_DATABASE_URL, KISSGS_DATA_DIR: this database belongs to another data folder; "
+            "use a separate database and data folder for each service"
         )
-    if held and not share_jobs and not named:
+    if stored and not share_jobs and not named:
         if its_folder is None:
-            raise _unknown(storage, held, "the job database knows none of them")
+            raise _unknown_jobs_error(storage, stored, "the job database has none of them")
         if its_database is not None:
-            raise _unknown(storage, held, "they came with another database than this")
+            raise _unknown_jobs_error(storage, stored, "they belong to another database")
     active = store.ids(*ACTIVE)
-    if active and not active & held:
-        raise _lost(storage, active)
-    mine = next((int(mark) for mark in (folder, its_folder) if mark is not None), secrets.randbits(IDENTITY_BITS))
+    if active and not active & stored:
+        raise _missing_jobs_error(storage, active)
+    folder_number = next(
+        (int(known) for known in (folder, its_folder) if known is not None), secrets.randbits(IDENTITY_BITS)
+    )
     number = int(database) if database is not None else secrets.randbits(IDENTITY_BITS)
     if folder is None:
-        write_mark(storage.root, "identity", mine)
-    if (its_folder, database) != (mine, number):
-        store.belong_to(mine, number)
+        write_number(storage.root, "identity", folder_number)
+    if (its_folder, database) != (folder_number, number):
+        store.bind_to(folder_number, number)
     if its_database != number:
-        write_mark(storage.root, "database", number)
+        write_number(storage.root, "database", number)
 
 
-def _unknown(storage: JobStorage, held: set[str], why: str) -> SettingsError:
+def _unknown_jobs_error(storage: JobStorage, stored: set[str], why: str) -> SettingsError:
     return SettingsError(
-        f"KISSGS_DATA_DIR, KISSGS_DATABASE_URL: {storage.jobs} holds the files of {len(held)} jobs, but {why}; restore "
-        "the database that they came with, name it in KISSGS_DATABASE_URL, choose another data folder, or move that "
-        "folder away to begin anew"
+        f"KISSGS_DATA_DIR, KISSGS_DATABASE_URL: {storage.jobs} has the files of {len(stored)} jobs, but {why}; restore "
+        "their database, set KISSGS_DATABASE_URL to it, choose another data folder, or move that folder away to start "
+        "without jobs"
     )
 
 
-def _lost(storage: JobStorage, active: set[str]) -> SettingsError:
+def _missing_jobs_error(storage: JobStorage, active: set[str]) -> SettingsError:
     return SettingsError(
-        f"KISSGS_DATA_DIR, KISSGS_DATABASE_URL: {storage.jobs} holds none of the jobs that wait or run, of which there "
-        f"are {len(active)} in the job database; mount or restore that folder, or, if they are lost, make the empty "
-        f"folder {storage.jobs / min(active)} and start again to have them reported as failed"
+        f"KISSGS_DATA_DIR, KISSGS_DATABASE_URL: {storage.jobs} has none of the {len(active)} jobs that are queued or "
+        "running in the job database; mount or restore that folder, or, if they are lost, create the empty folder "
+        f"{storage.jobs / min(active)} and start again, so that they are recorded as failed"
     )
 
 
-# Marks ---------------------------------------------------------------------------------------------------------------
+# Numbers -------------------------------------------------------------------------------------------------------------
 
 
-def read_mark(root: Path, name: str) -> int | None:
-    """A number that a data folder keeps: ``identity``, its own, or ``database``, that of its database.
+def read_number(root: Path, name: str) -> int | None:
+    """Read a number of the data folder: ``identity``, its own, or ``database``, that of its database.
+
+    Returns:
+        The number; None if the file is missing or empty.
 
     Raises:
-        SettingsError: its file holds something else.
+        SettingsError: the file cannot be read or has other content.
     """
     path = root / name
     try:
@@ -122,12 +127,12 @@ def read_mark(root: Path, name: str) -> int | None:
     except OSError as error:
         raise SettingsError(f"KISSGS_DATA_DIR: cannot read {path}: {(error.strerror or '').lower()}") from error
     if text and not re.fullmatch(rb"[0-9]{1,18}", text):
-        raise SettingsError(f"KISSGS_DATA_DIR: {path} does not hold a number; restore it, or choose another folder")
+        raise SettingsError(f"KISSGS_DATA_DIR: {path} does not contain a number; restore it, or choose another folder")
     return int(text) if text else None
 
 
-def write_mark(root: Path, name: str, number: int) -> None:
-    """Write such a number, all at once.
+def write_number(root: Path, name: str, number: int) -> None:
+    """Write a number of the data folder atomically.
 
     Raises:
         SettingsError: it cannot be written.

@@ -1,17 +1,17 @@
-"""The data folder: uploads on their way in, a folder for each job, and nothing whose name a client chose.
+"""``JobStorage``: the data folder, with uploads in progress and one folder per job; clients choose no file names.
 
-    incoming/TOKEN.part          an upload as it arrives
-    jobs/ID/scene.ply            the upload, whole
-    jobs/ID/work-TOKEN/          what a running job has written so far
-    jobs/ID/checkpoint*.npz      where its training stands: all that outlives its process, until the job has ended
-    jobs/ID/result/              the result, renamed into place once it is whole and on the disk
+    incoming/TOKEN.part          an upload in progress
+    jobs/ID/scene.ply            the complete upload
+    jobs/ID/work-TOKEN/          files of a running job process
+    jobs/ID/checkpoint*.npz      checkpoints of training, kept until the job ends
+    jobs/ID/result/              the result, renamed to this when it is complete and on the disk
         scene.zip  report.json  files/NAME
-    jobs/ID/decoded.ply          made when first asked for; decoded.json has its size and checksum
-    jobs/.orphaned/ID/           what no job of the database owns; nothing here is read or removed
-    lock, identity, database     who uses the folder, its own number, and that of its database
+    jobs/ID/decoded.ply          the decoded scene, after the first request; decoded.json has its size and checksum
+    jobs/.orphaned/ID/           folders of jobs that the database does not know; never read or removed
+    lock, identity, database     lock of the service, number of the folder, number of its database
 
-What a killed service leaves half-written stands under a name that nothing reads, and is swept at the next start. Only
-what bears a name of this list is ever removed, and nothing behind a link in the place of a job's folder.
+Incomplete files of a killed service have names that are never read, and the next start removes them. Only files with
+names of this list are removed, and nothing behind a link in place of a job's folder.
 """
 
 from __future__ import annotations
@@ -33,22 +33,25 @@ from service.core.settings import SettingsError
 log = logging.getLogger("kissgs.service")
 
 ORPHANED = ".orphaned"
+"""Name of the folder, within ``jobs``, for folders that no job of the database owns."""
 
 UNFINISHED = ("work-*", ".*.part")
-"""What a process that was ended leaves in its job's folder: a folder of its own, and the file that was to become the
-next checkpoint."""
+"""Patterns of incomplete files in a job's folder: work folders, and checkpoints that are being written."""
 
-OF_A_JOB = (*UNFINISHED, "scene.ply", "result", "checkpoint*.npz", "decoded.ply", "decoded.json")
-"""All that the service puts into a job's folder."""
+JOB_FILES = (*UNFINISHED, "scene.ply", "result", "checkpoint*.npz", "decoded.ply", "decoded.json")
+"""Patterns of all files that the service creates in a job's folder."""
 
 _JOB, _UPLOAD = re.compile("[0-9a-f]{32}"), re.compile(r"[0-9a-f]{16}\.part")
 
 
 class JobStorage:
-    """The data folder, which belongs to one service at a time.
+    """Data folder, locked by one service at a time.
+
+    Args:
+        root: the folder; created if it does not exist.
 
     Raises:
-        SettingsError: it cannot be made or written to, or another service uses it.
+        SettingsError: it cannot be created or written to, or another service uses it.
     """
 
     def __init__(self, root: Path) -> None:
@@ -67,25 +70,25 @@ class JobStorage:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             self._lock.close()
-            raise SettingsError(f"KISSGS_DATA_DIR: another service is using {root}; give this one its own") from error
-        # Open, so that they stay the same to every file system for as long as they are.
+            raise SettingsError(f"KISSGS_DATA_DIR: another service is using {root}; use a separate folder") from error
+        # Kept open, so that no file system reuses their inode numbers.
         self._opened = {folder: os.open(folder, os.O_RDONLY) for folder in (self.incoming, self.jobs)}
         if os.path.lexists(self.orphaned) and not self.orphaned.is_dir():
             self.close()
             raise SettingsError(f"KISSGS_DATA_DIR: {self.orphaned} is not a folder; move it away")
 
     def close(self) -> None:
-        """Let another service have the folder."""
+        """Release the folder for other services."""
         while self._opened:
             os.close(self._opened.popitem()[1])
         self._lock.close()
 
     def new_upload(self) -> Path:
-        """Where an upload may arrive."""
+        """Return a new path for an upload."""
         return self.incoming / f"{secrets.token_hex(8)}.part"
 
     def adopt(self, upload: Path, job_id: str) -> None:
-        """Make a whole upload that of a job."""
+        """Move a complete upload to the folder of a job."""
         folder = self.jobs / job_id
         folder.mkdir()
         upload.rename(folder / "scene.ply")
@@ -93,43 +96,43 @@ class JobStorage:
         sync_folder(self.jobs)
 
     def upload(self, job_id: str) -> Path:
-        """The job's ``.ply``."""
+        """Return the path of the job's upload."""
         return self.jobs / job_id / "scene.ply"
 
     def result(self, job_id: str) -> Path:
-        """The folder of the job's result; there if and only if the result is whole."""
+        """Return the path of the job's result, a folder that exists only if the result is complete."""
         return self.jobs / job_id / "result"
 
     def decoded(self, job_id: str) -> Path:
-        """The decoded scene, if it has been asked for."""
+        """Return the path of the decoded scene, which exists after the first request."""
         return self.jobs / job_id / "decoded.ply"
 
     def checkpoint(self, job_id: str) -> Path:
-        """Where the job's training keeps its state."""
+        """Return the path of the job's checkpoint."""
         return self.jobs / job_id / "checkpoint.npz"
 
     def discard_checkpoints(self, job_id: str) -> None:
-        """They are of no more use."""
+        """Remove the checkpoints of a job."""
         for path in (self.jobs / job_id).glob("checkpoint*.npz"):
             self.discard(path)
 
     def reclaimable_files(self, job_id: str) -> list[Path]:
-        """What an ended job can do without: its upload and its decoded scene, as far as they are there."""
+        """Return the files that an ended job can do without, if they exist: its upload and its decoded scene."""
         return [path for path in (self.upload(job_id), self.decoded(job_id)) if path.exists()]
 
     def new_work(self, job_id: str) -> Path:
-        """A fresh folder for a job's process to write into."""
+        """Create a new work folder for a job process."""
         folder = self.jobs / job_id / f"work-{secrets.token_hex(8)}"
         folder.mkdir()
         return folder
 
     def keep_result(self, job_id: str) -> None:
-        """Make what a job's process has written its result, all at once; nothing to do if that is done already.
+        """Move the result from a job's work folder to its final path; do nothing if that is done already.
 
-        A former result makes room for it, and goes with what else its process has left.
+        A previous result moves to the work folder.
 
         Raises:
-            OSError: that is not possible, or there is no result.
+            OSError: the result cannot be moved, or there is none.
         """
         result = self.result(job_id)
         for written in (self.jobs / job_id).glob("work-*/result"):
@@ -138,22 +141,22 @@ class JobStorage:
             written.rename(result)
             sync_folder(self.jobs / job_id)
         if not result.is_dir():
-            raise FileNotFoundError(errno.ENOENT, "its result has vanished")
+            raise FileNotFoundError(errno.ENOENT, "its result is missing")
 
     def keep_decoded(self, work: Path, job_id: str) -> None:
-        """Make a decoded scene the job's, all at once."""
+        """Move a decoded scene from a work folder to its final path."""
         (work / "decoded.json").rename(self.decoded(job_id).with_suffix(".json"))
         (work / "decoded.ply").rename(self.decoded(job_id))
         sync_folder(self.jobs / job_id)
 
     def remove_work(self, job_id: str) -> None:
-        """Remove what a process of the job has left, but for its checkpoint."""
+        """Remove the incomplete files of a job; complete checkpoints stay."""
         for pattern in UNFINISHED:
             for path in (self.jobs / job_id).glob(pattern):
                 self.discard(path)
 
     def discard(self, path: Path) -> None:
-        """Remove a file or folder, if it is there; of a link, only the link."""
+        """Remove a file or folder if it exists; of a link, remove only the link."""
         if path.parent.parent == self.jobs and path.parent.is_symlink():
             return
         if path.is_dir() and not path.is_symlink():
@@ -163,13 +166,13 @@ class JobStorage:
                 path.unlink()
 
     def remove_job(self, job_id: str) -> None:
-        """Remove all files of a job. What is no folder, or holds anything else, is set aside instead.
+        """Remove all files of a job; files that cannot be removed stay, with a warning in the log.
 
-        What the system does not let go stays where it is, and the log says so.
+        If the job's path is not a folder, or has other content, it is moved to the orphaned folder instead.
         """
         folder = self.jobs / job_id
         if not _JOB.fullmatch(job_id):
-            raise ValueError(f"{job_id!r} is no id of a job")
+            raise ValueError(f"{job_id!r} is not a job id")
         try:
             if not self._remove(folder):
                 log.warning("job %s: its folder cannot be removed", job_id)
@@ -177,19 +180,19 @@ class JobStorage:
             log.warning("job %s: its folder cannot be removed: %s", job_id, (error.strerror or str(error)).lower())
 
     def _remove(self, folder: Path) -> bool:
-        """Remove the folder of a job, or set it aside; False if it is still there."""
-        for _ in range(20):  # its process may write a last file while it is being ended
+        """Remove the folder of a job, or move it to the orphaned folder; return False if it still exists."""
+        for _ in range(20):  # its process may still write a file while it is being killed
             if not os.path.lexists(folder):
                 return True
             if folder.is_symlink() or not folder.is_dir():
-                self.set_aside(folder.name, "is no folder of ours")
+                self.move_to_orphaned(folder.name, "was not created by the service")
                 return True
-            for pattern in OF_A_JOB:
+            for pattern in JOB_FILES:
                 for path in folder.glob(pattern):
                     self.discard(path)
             with contextlib.suppress(FileNotFoundError):
-                if not all(any(path.match(pattern) for pattern in OF_A_JOB) for path in folder.iterdir()):
-                    self.set_aside(folder.name, "holds files of others")
+                if not all(any(path.match(pattern) for pattern in JOB_FILES) for path in folder.iterdir()):
+                    self.move_to_orphaned(folder.name, "has files that are not the service's")
                     return True
                 with contextlib.suppress(OSError):
                     folder.rmdir()
@@ -198,101 +201,103 @@ class JobStorage:
         return False
 
     def remove_unfinished(self, known: set[str]) -> None:
-        """Remove what was being written when a former service ended: uploads, and work of known jobs."""
+        """Remove incomplete files of a previous service: uploads, and work folders of known jobs."""
         self.remove_uploads()
-        for job_id in self.held() & known:
+        for job_id in self.job_ids() & known:
             self.remove_work(job_id)
 
     def remove_uploads(self) -> None:
-        """Remove what had arrived of uploads when a former service ended."""
+        """Remove incomplete uploads of a previous service."""
         for path in self.incoming.iterdir():
             if _UPLOAD.fullmatch(path.name):
                 self.discard(path)
 
-    # What others own -----------------------------------------------------------------------------------------------
+    # Orphaned folders -----------------------------------------------------------------------------------------------
 
     @property
     def orphaned(self) -> Path:
-        """The folder of what has been set aside."""
+        """Folder for folders that no job of the database owns."""
         return self.jobs / ORPHANED
 
-    def held(self) -> set[str]:
-        """The ids of all jobs that have a folder."""
+    def job_ids(self) -> set[str]:
+        """Return the ids of all jobs that have a folder."""
         return {path.name for path in self.jobs.iterdir() if _JOB.fullmatch(path.name) and path.is_dir()}
 
-    def set_aside(self, job_id: str, why: str) -> None:
-        """Move the folder of a job out of the way, with all that it holds; the log says why and where it lies now."""
-        self._move_aside(self.jobs / job_id)
-        log.warning("job %s: its folder %s and lies in %s now", job_id, why, self.orphaned)
+    def move_to_orphaned(self, job_id: str, why: str) -> None:
+        """Move the folder of a job to the orphaned folder and log why; ``why`` continues "its folder ..."."""
+        self._move_to_orphaned(self.jobs / job_id)
+        log.warning("job %s: its folder %s and was moved to %s", job_id, why, self.orphaned)
 
-    def keep_aside(self, job_id: str, why: str) -> None:
-        """Set the folder of a job aside, if there is anything in it."""
-        with contextlib.suppress(OSError):  # not empty, no folder, or not there
+    def move_to_orphaned_unless_empty(self, job_id: str, why: str) -> None:
+        """Move the folder of a job to the orphaned folder; remove it if it is empty."""
+        with contextlib.suppress(OSError):  # not empty, not a folder, or missing
             (self.jobs / job_id).rmdir()
         if os.path.lexists(self.jobs / job_id):
-            self.set_aside(job_id, why)
+            self.move_to_orphaned(job_id, why)
 
-    def set_aside_unknown(self, known: set[str]) -> int:
-        """Move the folders of all jobs but the known ones out of the way: only while nothing arrives.
+    def move_orphans(self, known: set[str]) -> int:
+        """Move the folders of all jobs except ``known`` ones to the orphaned folder; call it before uploads start.
 
         Returns:
-            How many there were.
+            The number of folders moved.
         """
-        unknown = sorted(self.held() - known)
+        unknown = sorted(self.job_ids() - known)
         for job_id in unknown:
-            self._move_aside(self.jobs / job_id)
+            self._move_to_orphaned(self.jobs / job_id)
         return len(unknown)
 
     def count_orphaned(self) -> int:
-        """Count the folders that have been set aside and are still there."""
+        """Return the number of entries of the orphaned folder."""
         try:
             return sum(1 for _ in self.orphaned.iterdir())
         except OSError:
             return 0
 
-    def _move_aside(self, folder: Path) -> None:
+    def _move_to_orphaned(self, folder: Path) -> None:
         self.orphaned.mkdir(exist_ok=True)
-        place, number = self.orphaned / folder.name, 1
-        while os.path.lexists(place):
+        target, number = self.orphaned / folder.name, 1
+        while os.path.lexists(target):
             number += 1
-            place = self.orphaned / f"{folder.name}-{number}"
-        folder.rename(place)
+            target = self.orphaned / f"{folder.name}-{number}"
+        folder.rename(target)
 
     # The disk ------------------------------------------------------------------------------------------------------
 
     def health_problem(self) -> str | None:
-        """Why nothing can be kept in the folder; None if it can. A matter of microseconds."""
+        """Return why files cannot be stored; None if they can. Takes microseconds."""
         for folder, opened in self._opened.items():
             try:
                 same = os.path.samestat(folder.stat(), os.fstat(opened))
             except OSError:
-                return f"the data folder cannot be used: its folder {folder.name} is not there; put it back"
+                return f"the data folder cannot be used: its folder {folder.name} is missing; restore it"
             if not same:
                 return f"the data folder cannot be used: its folder {folder.name} was replaced; restart the service"
             if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
-                return f"the data folder cannot be used: its folder {folder.name} cannot be written to"
+                return (
+                    f"the data folder cannot be used: its folder {folder.name} is not writable; change its permissions"
+                )
         return None
 
-    def require(self) -> None:
-        """See that files can be kept.
+    def check(self) -> None:
+        """Check that files can be stored.
 
         Raises:
             OSError: they cannot.
         """
-        if health_problem := self.health_problem():
-            raise OSError(health_problem)
+        if problem := self.health_problem():
+            raise OSError(problem)
 
     def free_bytes(self) -> int:
-        """What the disk has left."""
+        """Return the free bytes of the disk."""
         return shutil.disk_usage(self.root).free
 
     def job_bytes(self, job_id: str) -> int:
-        """What the files of a job take."""
+        """Return the size of all files of a job, bytes."""
         return sum(path.stat().st_size for path in (self.jobs / job_id).rglob("*") if path.is_file())
 
 
 def sync_folder(folder: Path) -> None:
-    """Have the names in a folder on the disk, so that a power cut cannot undo a rename."""
+    """Flush a folder's entries to the disk, so that a power failure cannot undo a rename."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -1,7 +1,7 @@
-"""What is known of every job: all reading and writing of the tables, each change one transaction.
+"""``Store``: all reading and writing of the tables of jobs and events; each change is one transaction.
 
-States change only as the table of :data:`_NEXT` allows, compared and set in one step, so that a cancellation and a
-result that arrive together cannot both win. Every change that a client may want to hear of leaves an event.
+State transitions are limited to :data:`_PREDECESSORS`, and compared and set in one step, so that of a simultaneous
+cancellation and result only one takes effect. Each change of state or progress adds an event for clients.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from service.storage import database_lease
 from service.storage.database import connect
 from service.storage.database_health import IDENTITY, DatabaseMonitor, DatabaseReplacedError
 
-_NEXT: dict[State, tuple[State, ...]] = {
+_PREDECESSORS: dict[State, tuple[State, ...]] = {
     State.RUNNING: (State.QUEUED,),
     State.QUEUED: (State.RUNNING,),  # started again
     State.SUCCEEDED: (State.RUNNING,),
@@ -27,11 +27,15 @@ _NEXT: dict[State, tuple[State, ...]] = {
     State.CANCELLED: (State.QUEUED, State.RUNNING),
     State.EXPIRED: ENDED,
 }
-"""State -> those it may be reached from."""
+"""States from which each state can be reached."""
 
 
 class LimitExceeded(Exception):
-    """A job was not added, because a limit would be passed; ``limit`` names it: queue, owner or key."""
+    """A job was not added because of a limit: ``"queue"``, ``"owner"`` or ``"key"``.
+
+    Attributes:
+        limit: name of the limit.
+    """
 
     def __init__(self, limit: str) -> None:
         super().__init__(limit)
@@ -42,77 +46,77 @@ class Store:
     """Jobs and events in a database. Methods block for milliseconds and are safe in any thread.
 
     Args:
-        url: of SQLAlchemy.
-        clock: tells the time.
-        may_be_new: whether tables may be made.
+        url: SQLAlchemy URL.
+        clock: returns the time, seconds since 1970.
+        create: whether a new database may be created.
 
     Raises:
-        SettingsError: as :func:`service.storage.database.connect`.
+        SettingsError: as for :func:`service.storage.database.connect`.
     """
 
-    def __init__(self, url: str, clock: Callable[[], float], *, may_be_new: bool = True) -> None:
-        self._engine, self._writing, self._reading = connect(url, may_be_new=may_be_new)
-        self._watch = DatabaseMonitor(self._engine)
-        self._watch.identity = self.fact(IDENTITY)
+    def __init__(self, url: str, clock: Callable[[], float], *, create: bool = True) -> None:
+        self._engine, self._writing, self._reading = connect(url, create=create)
+        self._monitor = DatabaseMonitor(self._engine)
+        self._monitor.identity = self.meta_value(IDENTITY)
         self.clock = clock
 
     def close(self) -> None:
-        """Let go of all connections, and let the next service have the database."""
-        if self._watch.owner is not None and self.health_problem() is None:
+        """Release the database lease and close all connections."""
+        if self._monitor.owner is not None and self.health_problem() is None:
             with contextlib.suppress(SQLAlchemyError), self._write() as session:
                 database_lease.release(session)
         self._engine.dispose()
-        self._watch.close()
+        self._monitor.close()
 
-    def leave(self) -> None:
-        """Let go of a database that is not to be touched."""
-        self._watch.leave()
+    def abandon(self) -> None:
+        """Close without changing the database's files or releasing the lease."""
+        self._monitor.abandon()
         self._engine.dispose()
 
     # The database itself -------------------------------------------------------------------------------------------
 
-    def require(self) -> None:
-        """See that the database's files are those that were opened: a matter of microseconds.
+    def check(self) -> None:
+        """Check that the database's files are those that were opened; takes microseconds.
 
         Raises:
-            DatabaseReplacedError: they are not.
+            DatabaseReplacedError: a file was removed or replaced.
         """
-        self._watch.require()
+        self._monitor.check_files()
 
     def health_problem(self) -> str | None:
-        """Why the database cannot be relied on; None if it can."""
-        return self._watch.health_problem()
+        """Check the database; return the problem, None if there is none."""
+        return self._monitor.health_problem()
 
-    def fact(self, name: str) -> float | None:
-        """A number that the database keeps about itself: ``identity``, ``folder`` or ``time``."""
+    def meta_value(self, name: str) -> float | None:
+        """Return a row of ``meta``, such as ``identity``, ``folder`` or ``time``; None if it does not exist."""
         with self._reading() as session:
             found = session.get(Meta, name)
         return found.value if found is not None else None
 
-    def belong_to(self, folder: float, identity: float) -> None:
-        """Write down which data folder the database belongs to, and which number it is known by."""
+    def bind_to(self, folder: float, identity: float) -> None:
+        """Store the number of the data folder that the database belongs to, and the number of the database itself."""
         with self._writing.begin() as session:
             session.merge(Meta(name="folder", value=folder))
             session.merge(Meta(name=IDENTITY, value=identity))
-        self._watch.identity = identity
+        self._monitor.identity = identity
 
     def acquire_database(self) -> None:
-        """Keep other services from using the database as long as this one calls :meth:`heartbeat` again and again.
+        """Take the database lease, which periodic calls of :meth:`heartbeat` renew.
 
         Raises:
-            SettingsError: another service is using it.
+            SettingsError: another service holds the lease.
         """
-        self._watch.owner = database_lease.acquire(self._writing, self._reading)
+        self._monitor.owner = database_lease.acquire(self._writing, self._reading)
 
     @contextlib.contextmanager
     def _write(self) -> Iterator[Session]:
-        """A transaction that counts only if the database is still there when it has ended."""
-        self.require()
+        """Begin a transaction; raise an error if the database is removed or replaced before it ends."""
+        self.check()
         with self._writing.begin() as session:
-            if why := self._watch.ownership_problem(session):
-                raise DatabaseReplacedError(f"the job database is no longer this service's: {why}")
+            if problem := self._monitor.ownership_problem(session):
+                raise DatabaseReplacedError(f"the job database no longer belongs to this service: {problem}")
             yield session
-        self.require()
+        self.check()
 
     # Jobs ----------------------------------------------------------------------------------------------------------
 
@@ -120,37 +124,37 @@ class Store:
         """Queue a job.
 
         Raises:
-            LimitExceeded: ``max_queue`` jobs wait already, ``max_owner`` of its owner's are active, or its idempotency
-                key is taken.
+            LimitExceeded: ``max_queue`` jobs are queued, ``max_owner`` jobs of its owner are active, or its idempotency
+                key is in use.
         """
         try:
             with self._write() as session:
                 if self._count(session, Job.state == State.QUEUED) >= max_queue:
                     raise LimitExceeded("queue")
-                mine = Job.owner == job.owner, Job.owner != "", Job.state.in_(ACTIVE)
-                if self._count(session, *mine) >= max_owner:
+                active = Job.owner == job.owner, Job.owner != "", Job.state.in_(ACTIVE)
+                if self._count(session, *active) >= max_owner:
                     raise LimitExceeded("owner")
                 job.created_at = self.clock()
                 session.add(job)
                 session.flush()
-                _note(session, job, "state", {"state": State.QUEUED})
+                _add_event(session, job, "state", {"state": State.QUEUED})
         except IntegrityError as error:
             raise LimitExceeded("key") from error
         return job
 
     def get(self, job_id: str, owner: str | None = None) -> Job | None:
-        """A job by its id; None if there is none, or if it is not ``owner``'s."""
+        """Return a job by id; None if it does not exist or has another owner than ``owner``."""
         with self._reading() as session:
             job = session.scalar(sa.select(Job).where(Job.id == job_id))
         return job if job is not None and owner in (None, job.owner) else None
 
     def by_idempotency_key(self, owner: str, key: str) -> Job | None:
-        """The job that ``owner`` submitted with this key."""
+        """Return the job that ``owner`` submitted with this key; None if there is none."""
         with self._reading() as session:
             return session.scalar(sa.select(Job).where(Job.owner == owner, Job.idempotency_key == key))
 
     def listing(self, owner: str, *, limit: int, before: int | None = None, state: State | None = None) -> list[Job]:
-        """Jobs of an owner, newest first, from the one before number ``before``."""
+        """Return up to ``limit`` jobs of an owner with a number below ``before``, newest first."""
         query = sa.select(Job).where(Job.owner == owner).order_by(Job.number.desc()).limit(limit)
         if before is not None:
             query = query.where(Job.number < before)
@@ -160,12 +164,12 @@ class Store:
             return list(session.scalars(query))
 
     def in_state(self, *states: State) -> list[Job]:
-        """All jobs in one of ``states``, oldest first."""
+        """Return all jobs in one of ``states``, oldest first."""
         with self._reading() as session:
             return list(session.scalars(sa.select(Job).where(Job.state.in_(states)).order_by(Job.number)))
 
     def active(self) -> list[Job]:
-        """Jobs that wait or run: what estimates need of them."""
+        """Return all queued and running jobs, with only the columns that estimates need."""
         columns = load_only(Job.state, Job.preset, Job.evaluate, Job.gaussians, Job.started_at)
         with self._reading() as session:
             return list(session.scalars(sa.select(Job).where(Job.state.in_(ACTIVE)).options(columns)))
@@ -173,7 +177,7 @@ class Store:
     # Changes -------------------------------------------------------------------------------------------------------
 
     def claim(self) -> Job | None:
-        """The job that has waited longest, now running; None if none waits."""
+        """Set the oldest queued job to running and return it; None if the queue is empty."""
         with self._write() as session:
             query = sa.select(Job).where(Job.state == State.QUEUED).order_by(Job.number).limit(1)
             job = session.scalar(query.with_for_update(skip_locked=True))
@@ -183,26 +187,26 @@ class Store:
             job.started_at = self.clock()
             job.disk_bytes = job.upload_bytes + job.work_bytes
             job.state = State.RUNNING
-            _note(session, job, "state", {"state": State.RUNNING, "start": job.starts})
+            _add_event(session, job, "state", {"state": State.RUNNING, "start": job.starts})
             return job
 
     def progress(self, number: int, stage: str, fraction: float, note: str = "") -> None:
-        """Note how far a running job is, and what it has to say of that, if anything."""
+        """Store the progress of a running job: stage, fraction from 0 to 1, and an optional note."""
         with self._write() as session:
             job = session.get(Job, number, with_for_update=True)
             if job is not None and job.state == State.RUNNING:
                 job.stage, job.fraction, job.note = stage, fraction, note[:NOTE_CHARS] or None
-                said = {"note": job.note} if job.note else {}
-                _note(session, job, "progress", {"stage": stage, "fraction": fraction, **said})
+                optional = {"note": job.note} if job.note else {}
+                _add_event(session, job, "progress", {"stage": stage, "fraction": fraction, **optional})
 
     def move(self, number: int, state: State, **values: Any) -> bool:  # noqa: ANN401
-        """Set a job's state, and ``values`` with it; False if it is no longer in a state that leads there.
+        """Set a job's state and the columns ``values``; return False if its current state does not allow it.
 
-        A job that goes back into the queue has nothing behind it.
+        A job that returns to the queue loses its progress.
         """
         with self._write() as session:
             job = session.get(Job, number, with_for_update=True)
-            if job is None or job.state not in _NEXT[state]:
+            if job is None or job.state not in _PREDECESSORS[state]:
                 return False
             for name, value in values.items():
                 setattr(job, name, value)
@@ -211,11 +215,11 @@ class Store:
             if state in ENDED:
                 job.finished_at = self.clock()
             job.state = state
-            _note(session, job, "state", {"state": state, **({"problem": job.problem} if job.problem else {})})
+            _add_event(session, job, "state", {"state": state, **({"problem": job.problem} if job.problem else {})})
             return True
 
     def update(self, number: int, **values: Any) -> None:  # noqa: ANN401
-        """Set columns that nobody needs to hear of."""
+        """Set columns without adding an event."""
         with self._write() as session:
             session.execute(sa.update(Job).where(Job.number == number).values(**values))
 
@@ -228,7 +232,7 @@ class Store:
     # Events --------------------------------------------------------------------------------------------------------
 
     def events(self, number: int, after: int = 0) -> list[Event]:
-        """What happened to a job after event ``after``."""
+        """Return the events of a job with a ``seq`` above ``after``, in order."""
         query = sa.select(Event).where(Event.job == number, Event.seq > after).order_by(Event.seq)
         with self._reading() as session:
             return list(session.scalars(query))
@@ -236,67 +240,67 @@ class Store:
     # Sums ----------------------------------------------------------------------------------------------------------
 
     def counts(self) -> dict[State, int]:
-        """Jobs in each state."""
+        """Return the number of jobs in each state."""
         with self._reading() as session:
             rows = session.execute(sa.select(Job.state, sa.func.count()).group_by(Job.state)).all()
         found = {State(state): count for state, count in rows}
         return {state: found.get(state, 0) for state in State}
 
     def active_of(self, owner: str) -> int:
-        """Jobs of an owner that wait or run."""
+        """Return the number of queued and running jobs of an owner."""
         with self._reading() as session:
             return self._count(session, Job.owner == owner, Job.state.in_(ACTIVE))
 
     def disk_bytes(self) -> int:
-        """What the files of all jobs take."""
+        """Return the disk space of all jobs, bytes."""
         with self._reading() as session:
             return int(session.scalar(sa.select(sa.func.coalesce(sa.func.sum(Job.disk_bytes), 0))) or 0)
 
     def rates(self, preset: str, evaluate: bool, limit: int = 21) -> list[float]:
-        """Seconds per Gaussian of the latest jobs of a preset, with or without evaluation."""
+        """Return seconds per Gaussian of up to ``limit`` recent jobs of a preset, with or without evaluation."""
         kind = Job.preset == preset, Job.evaluate == evaluate, Job.state == State.SUCCEEDED
         query = sa.select(Job.finished_at - Job.started_at, Job.gaussians).where(*kind)
         with self._reading() as session:
             latest = session.execute(query.order_by(Job.number.desc()).limit(5 * limit)).all()
-        # Of small scenes, most of the time is the process' own.
+        # In jobs with small scenes, the start of the process dominates.
         return [spent / count for spent, count in latest if spent and count >= 10_000][:limit]
 
     def ids(self, *states: State) -> set[str]:
-        """The ids of all jobs in ``states``; without any, of all jobs."""
+        """Return the ids of all jobs in ``states``, by default of all jobs."""
         with self._reading() as session:
             return set(session.scalars(sa.select(Job.id).where(Job.state.in_(states or tuple(State)))))
 
     def due(self, states: Iterable[State], before: float, limit: int = 200) -> list[tuple[int, str]]:
-        """Number and id of some jobs in ``states`` that expire before a time."""
+        """Return number and id of up to ``limit`` jobs in ``states`` that expire before a time."""
         query = sa.select(Job.number, Job.id).where(Job.state.in_(tuple(states)), Job.expires_at < before)
         with self._reading() as session:
             return [(number, job_id) for number, job_id in session.execute(query.limit(limit))]
 
     def reclaimable(self, limit: int = 50) -> list[tuple[int, str]]:
-        """Number and id of some ended jobs that have something to give up, oldest first."""
+        """Return number and id of up to ``limit`` ended jobs with reclaimable files, oldest first."""
         query = sa.select(Job.number, Job.id).where(Job.reclaimable_bytes > 0, Job.state.in_(ENDED))
         with self._reading() as session:
             return [(number, job_id) for number, job_id in session.execute(query.order_by(Job.number).limit(limit))]
 
     def reclaimable_bytes(self) -> int:
-        """What ended jobs could give up."""
+        """Return the bytes of all reclaimable files of ended jobs."""
         query = sa.select(sa.func.coalesce(sa.func.sum(Job.reclaimable_bytes), 0)).where(Job.reclaimable_bytes > 0)
         with self._reading() as session:
             return int(session.scalar(query.where(Job.state.in_(ENDED))) or 0)
 
     def waiting(self) -> int:
-        """Jobs in the queue."""
+        """Return the number of queued jobs."""
         with self._reading() as session:
             return self._count(session, Job.state == State.QUEUED)
 
     # The clock -----------------------------------------------------------------------------------------------------
 
     def latest_time(self) -> float:
-        """What :meth:`heartbeat` has written last."""
-        return self.fact("time") or 0.0
+        """Return the time of the last :meth:`heartbeat`; 0 if there was none."""
+        return self.meta_value("time") or 0.0
 
     def heartbeat(self) -> None:
-        """Write down the time, and see that the database can be written to."""
+        """Store the current time, which renews the lease and checks that the database is writable."""
         with self._write() as session:
             session.merge(Meta(name="time", value=self.clock()))
 
@@ -305,6 +309,6 @@ class Store:
         return session.scalar(sa.select(sa.func.count()).select_from(Job).where(*where)) or 0
 
 
-def _note(session: Session, job: Job, kind: str, data: dict[str, Any]) -> None:
+def _add_event(session: Session, job: Job, kind: str, data: dict[str, Any]) -> None:
     job.last_event = (job.last_event or 0) + 1
     session.add(Event(job=job.number, seq=job.last_event, kind=kind, data=data))

@@ -1,4 +1,4 @@
-"""Oracle: pictures whose every pixel is known, saved by Pillow in each kind of file, and what the eye would see."""
+"""Oracle: images with known pixels, saved by Pillow in every supported format."""
 
 import io
 import struct
@@ -16,7 +16,7 @@ from kissgs.core.errors import InvalidViewsError, KissgsError, UnsupportedError
 BLACK, WHITE = np.zeros(3, dtype=np.float32), np.ones(3, dtype=np.float32)
 GREY = np.arange(0, 240, 10, dtype=np.uint8).reshape(4, 6)
 COLOUR = np.stack([GREY, GREY[::-1], 255 - GREY], axis=-1)
-UNREADABLE = "is damaged, cut short, or no JPEG, PNG, WebP, TIFF or BMP file; copy or export it again"
+UNREADABLE = "is damaged, truncated, or not a JPEG, PNG, WebP, TIFF or BMP file; copy or export it again"
 
 
 def saved(folder, image, name="a.png", **options):
@@ -44,7 +44,7 @@ def test_grey_of_8_and_16_bits_and_two_levels(tmp_path):
 
 
 def test_colour_of_16_bits(tmp_path):
-    """Pillow cannot write these: packed by hand."""
+    """The PNG file is written by hand, because Pillow cannot write 16-bit colour."""
     rows = b"".join(b"\0" + (row.astype(">u2") * 257).tobytes() for row in COLOUR)
     parts = [(b"IHDR", struct.pack(">IIBBBBB", 6, 4, 16, 2, 0, 0, 0)), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")]
     data = b"\x89PNG\r\n\x1a\n"
@@ -76,7 +76,7 @@ def test_palettes_and_grey_with_transparency(tmp_path):
     assert (read_photo(path, 6, 4, WHITE) == 255).all()
 
 
-def test_printers_colours(tmp_path):
+def test_cmyk(tmp_path):
     path = saved(tmp_path, Image.new("CMYK", (6, 4), (0, 255, 255, 0)), "a.jpg")
     assert np.abs(read_photo(path, 6, 4, BLACK).astype(int) - (255, 0, 0)).max() < 6
 
@@ -109,15 +109,15 @@ def jpeg():
     return stream.getvalue()
 
 
-def test_what_is_no_photograph(tmp_path):
+def test_missing_and_damaged_photographs(tmp_path):
     path = tmp_path / "a.jpg"
-    assert message(path) == f"cannot read {path}: there is no such photograph"
+    assert message(path) == f"cannot read {path}: there is no such file"
     for data in (b"", b"hello", b"GIF89a" + bytes(20), jpeg()[:2000], jpeg()[:10]):
         path.write_bytes(data)
         assert message(path) == f"{path} {UNREADABLE}"
 
 
-def test_headers_of_photographs_cut_short_are_still_read(tmp_path):
+def test_headers_of_truncated_photographs_are_still_read(tmp_path):
     path = tmp_path / "a.jpg"
     path.write_bytes(jpeg()[:2000])
     assert read_photo_header(path) == PhotoHeader(60, 40, transparent=False)
@@ -128,12 +128,14 @@ def test_too_many_pixels(tmp_path):
     data = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + b"IHDR" + header
     path = tmp_path / "a.png"
     path.write_bytes(data + struct.pack(">I", zlib.crc32(b"IHDR" + header)) + struct.pack(">I4s", 9, b"IDAT"))
-    assert message(path) == f"{path} has too many pixels to be read safely; save it smaller"
+    assert message(path) == f"{path} has more pixels than can be read safely; reduce it"
 
 
 def test_pixels_of_32_bits(tmp_path):
     path = saved(tmp_path, Image.fromarray(GREY.astype(np.float32)), "a.tif")
-    assert message(path, UnsupportedError) == f"{path} has pixels of 32 bits; save it with 8 or 16 bits per channel"
+    assert message(path, UnsupportedError) == (
+        f"{path} has 32 bits per channel, which is not supported; save it with 8 or 16"
+    )
 
 
 def files():
@@ -154,7 +156,7 @@ def files():
 FILES = list(files())
 
 
-@pytest.mark.filterwarnings("ignore::UserWarning")  # Pillow's, on damaged TIFF and EXIF data
+@pytest.mark.filterwarnings("ignore::UserWarning")  # Pillow warns about damaged TIFF and EXIF data
 @settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_damaged_files(tmp_path, data):

@@ -1,4 +1,4 @@
-"""Oracle: a smooth picture painted through the lens pixel by pixel, by inverting it with SciPy; and brute force."""
+"""Oracle: a smooth function imaged project the lens, whose distortion SciPy inverts for every pixel."""
 
 import numpy as np
 import pytest
@@ -15,8 +15,8 @@ RATIONAL = Distortion(k1=0.3, k2=0.1, p1=0.001, p2=0.001, k3=0.05, k4=0.2, k5=0.
 LENSES = [Lens(90, 95, 62.3, 38.1, 120, 80, d) for d in (BARREL, PINCUSHION, RATIONAL, Distortion(k1=1e-9))]
 
 
-def through(lens, x, y):
-    """The lens written out, one ray at a time."""
+def project(lens, x, y):
+    """Return the pixel coordinates of the ray (x, y, 1)."""
     d = lens.distortion
     r2 = x**2 + y**2
     radial = (1 + d.k1 * r2 + d.k2 * r2**2 + d.k3 * r2**3) / (1 + d.k4 * r2 + d.k5 * r2**2 + d.k6 * r2**3)
@@ -26,7 +26,7 @@ def through(lens, x, y):
 
 
 def scene(x, y):
-    """What lies in the direction (x, y, 1)."""
+    """Return the colour in the direction (x, y, 1)."""
     return 128 + 100 * np.stack([np.sin(4 * x + 1), np.cos(5 * y), np.sin(3 * x - 4 * y)], axis=-1)
 
 
@@ -36,41 +36,41 @@ def photograph(lens):
         for column in range(lens.width):
             target = np.array([column + 0.5, row + 0.5])
             start = (target - (lens.cx, lens.cy)) / (lens.fx, lens.fy)
-            ray = fsolve(lambda p, t=target: np.subtract(through(lens, *p), t), start)
+            ray = fsolve(lambda p, t=target: np.subtract(project(lens, *p), t), start)
             photo[row, column] = scene(*ray)
     return np.rint(photo).astype(np.uint8)
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_the_scene_is_where_a_pinhole_sees_it(lens):
+def test_undistorted_pixels_equal_those_of_a_pinhole(lens):
     window = full_window(lens)
-    picture = undistort(photograph(lens), lens, window)
+    image = undistort(photograph(lens), lens, window)
     K = window.K(lens)
     x = (np.arange(window.width) + 0.5 - K[0, 2]) / K[0, 0]
     y = (np.arange(window.height) + 0.5 - K[1, 2]) / K[1, 1]
     expected = scene(*np.meshgrid(x, y))
-    assert np.abs(picture - expected)[2:-2, 2:-2].max() < 1.5  # rounding twice, and what lies between pixels
-    assert np.abs(picture - expected).max() < 4  # at the border the last pixel goes on
+    assert np.abs(image - expected)[2:-2, 2:-2].max() < 1.5  # rounding twice, and interpolation
+    assert np.abs(image - expected).max() < 4  # border pixels are repeated
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_every_pixel_has_a_source_and_one_more_ring_has_not(lens):
+def test_the_photograph_covers_the_window_but_no_larger_one(lens):
     window = full_window(lens)
-    assert all_shown(lens, window)
+    assert all_covered(lens, window)
     larger = Window(window.left - 1, window.top - 1, window.width + 2, window.height + 2)
     in_photo = larger.left >= 0 and larger.top >= 0
     in_photo = in_photo and larger.left + larger.width <= 120 and larger.top + larger.height <= 80
-    assert not (in_photo and all_shown(lens, larger))
+    assert not (in_photo and all_covered(lens, larger))
 
 
-def all_shown(lens, window):
+def all_covered(lens, window):
     columns, rows = window.left + np.arange(window.width), window.top + np.arange(window.height)
     x, y = np.meshgrid((columns + 0.5 - lens.cx) / lens.fx, (rows + 0.5 - lens.cy) / lens.fy)
-    u, v = through(lens, x, y)
+    u, v = project(lens, x, y)
     return (u >= 0).all() and (u <= lens.width).all() and (v >= 0).all() and (v <= lens.height).all()
 
 
-def test_a_barrel_loses_nothing_and_a_pincushion_keeps_its_shape():
+def test_barrel_distortion_loses_nothing_and_pincushion_keeps_the_aspect_ratio():
     assert full_window(LENSES[0]) == Window(0, 0, 120, 80)
     window = full_window(LENSES[1])
     assert 90 < window.width < 120
@@ -80,7 +80,7 @@ def test_a_barrel_loses_nothing_and_a_pincushion_keeps_its_shape():
     )
 
 
-def test_without_distortion_nothing_changes():
+def test_photographs_without_distortion_stay_unchanged():
     photo = np.random.default_rng(0).integers(0, 256, (80, 120, 3), dtype=np.uint8)
     lens = Lens(90, 95, 62.3, 38.1, 120, 80)
     assert not lens.distortion
@@ -88,8 +88,8 @@ def test_without_distortion_nothing_changes():
     np.testing.assert_array_equal(undistort(photo, lens, Window(5, 7, 20, 30)), photo[7:37, 5:25])
 
 
-def test_folds_are_left_out():
-    """With k1 this negative, rays far out come back to the middle: bounds alone would find them in the photograph."""
+def test_windows_exclude_rays_beyond_the_invertible_range():
+    """A k1 this negative images rays far from the axis inside the photograph again, so bounds are not enough."""
     lens = Lens(60, 60, 60, 40, 120, 80, Distortion(k1=-0.4))
     window = full_window(lens)
     corner = np.hypot(window.width / 2 - 0.5, window.height / 2 - 0.5) / 60
@@ -111,7 +111,7 @@ def test_folds_are_left_out():
         ),
     ],
 )
-def test_lenses_of_no_use(lens, sentence):
+def test_invalid_lenses(lens, sentence):
     with pytest.raises(InvalidViewsError) as caught:
         full_window(lens)
     assert str(caught.value) == sentence
@@ -131,5 +131,5 @@ def test_any_coefficients(distortion, focal, cx):
     assert window.width * window.height >= MIN_AREA * 120 * 80
     assert window.left >= 0
     assert window.left + window.width <= 120
-    picture = undistort(np.full((80, 120, 3), 77, dtype=np.uint8), lens, window)
-    assert (picture == 77).all()
+    image = undistort(np.full((80, 120, 3), 77, dtype=np.uint8), lens, window)
+    assert (image == 77).all()

@@ -90,7 +90,7 @@ def test_missing_photographs_are_reported(folder: Path, tmp_path: Path) -> None:
     capture = write_capture(tmp_path / "capture")
     (capture / "images").rename(capture / "rgb")
     words = ["evaluate", folder / "a.ply", folder / "c.ply", "--views", capture]
-    note = f"no photographs were found (looked in {capture} for 'images', 'input'); name their folder with --images"
+    note = f"no photographs were found (searched {capture} for 'images', 'input'); name their folder with --images"
     text = " ".join(run(*words, "--html", tmp_path / "page.html").stdout.decode().split())
     assert note.replace(" ", "") in text.replace(" ", "")
     assert note[1:].replace("'", "&#x27;") in (tmp_path / "page.html").read_text(encoding="utf-8")

@@ -86,7 +86,7 @@ def test_virtual_views_by_number_and_name(folder: Path, tmp_path: Path, virtual:
         view = by_name(kissgs.virtual_views(scene, width=80, height=60))[3]
         assert view.name == fourth.name
         assert close(pixels(done.stdout), shown(view.camera, scene, (1, 128 / 255, 0)))
-    assert "count from 0 to 31" in failure("render", folder / "a.ply", "-o", tmp_path / "a.png", "--view", "32")
+    assert "numbers go from 0 to 31" in failure("render", folder / "a.ply", "-o", tmp_path / "a.png", "--view", "32")
 
 
 def test_views_of_a_capture_have_their_own_size(folder: Path, tmp_path: Path) -> None:

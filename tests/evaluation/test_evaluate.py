@@ -220,7 +220,7 @@ def test_photographs_of_only_some_views_are_rejected(capture):
 def test_missing_photographs_are_an_error(tmp_path):
     views = load_views(write_capture(tmp_path / "capture"))
     views.test[0].photo.unlink()
-    with pytest.raises(InvalidViewsError, match="there is no such photograph"):
+    with pytest.raises(InvalidViewsError, match="there is no such file"):
         evaluate(SCENE, SCENE, views)
 
 

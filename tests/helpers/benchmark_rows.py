@@ -36,7 +36,7 @@ def evaluation(psnr, photo=None):
         reference=reference, candidate=image_metrics(photo or psnr), candidate_vs_reference=image_metrics(psnr)
     )
     view = ViewComparison(view=VIEW, comparison=seen)
-    about = {"against": "renderings", "split": "test", "source": "nowhere", "background": black()}
+    about = {"against": "renderings", "split": "test", "source": "test", "background": black()}
     return Evaluation(**about, reference_count=30, candidate_count=30, views=(view,))
 
 

@@ -1,4 +1,4 @@
-"""Small scenes for the tests of the codec, made without the library."""
+"""Small scenes for the codec tests, created without the library."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PLANES = (
 
 
 def unit(quats):
-    """Float32 quaternions of unit length."""
+    """Return float32 quaternions of unit length."""
     wide = np.asarray(quats, dtype=np.float64)
     return (wide / np.linalg.norm(wide, axis=1, keepdims=True)).astype(np.float32)
 
@@ -58,7 +58,7 @@ def replaced(splats, **arrays):
 
 
 def covariances(quats, scales):
-    """R diag(s^2) R^T of every Gaussian by the textbook formula of R, in float64; quaternions are normalised first."""
+    """Return the covariances R diag(s²) Rᵀ in float64, with R from the normalised quaternions."""
     w, x, y, z = (np.asarray(quats, np.float64) / np.linalg.norm(np.asarray(quats, np.float64), axis=1)[:, None]).T
     rotation = np.empty((len(w), 3, 3))
     rotation[:, 0] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=1)
@@ -69,7 +69,7 @@ def covariances(quats, scales):
 
 
 def product(p, q):
-    """Hamilton product of w, x, y, z quaternions, as SciPy multiplies rotations. Signs are those of p q."""
+    """Return the Hamilton product p q of quaternions w, x, y, z, from SciPy's rotations."""
     w, x, y, z = np.moveaxis(np.asarray(p, np.float64), -1, 0)
     a, b, c, d = np.moveaxis(np.asarray(q, np.float64), -1, 0)
     parts = [w * a - x * b - y * c - z * d, w * b + x * a + y * d - z * c]
@@ -99,7 +99,7 @@ def signed_log(x):
 
 
 def rounding(values):
-    """Return the error that rounding of values, ranges and steps to float32 may cause, by the largest value."""
+    """Return a bound for the error from rounding values, ranges and steps to float32, for the largest value."""
     return 1e-6 * np.abs(values).max(initial=0) + 1e-44
 
 

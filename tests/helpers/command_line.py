@@ -1,6 +1,6 @@
-"""The command ``kissgs``, run in this process, where modules are imported and kernels loaded once for all tests.
+"""The command ``kissgs``, run in this process, so that all tests share imported modules and loaded kernels.
 
-Tests of signals, pipes and start-up run the executable ``KISSGS`` as a process of its own.
+Tests of signals, pipes and start-up run the executable ``KISSGS`` as a separate process.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def run(*words: object, stdin: bytes = b"", cwd: Path | None = None) -> subproce
 
 
 def failure(*words: object, stdin: bytes = b"", cwd: Path | None = None) -> str:
-    """Run what must fail: exit code 2, one line, no traceback. Returns the line."""
+    """Run a command that must fail with exit code 2 and one line, and return the line."""
     done = run(*words, stdin=stdin, cwd=cwd)
     assert done.returncode == 2, done
     lines = done.stderr.decode().splitlines()
@@ -56,7 +56,7 @@ def _exit_code() -> int:
 
 @contextlib.contextmanager
 def _process_state() -> Iterator[None]:
-    """Restore what the command changes of the process: arguments, signal handlers, the hook for lost exceptions."""
+    """Restore process state that commands change: arguments, signal handlers, the hook for unraisable exceptions."""
     arguments, hook = sys.argv, sys.unraisablehook
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -69,7 +69,7 @@ def _process_state() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _standard_files(*files: BinaryIO) -> Iterator[None]:
-    """Put files in the place of standard input, output and error, for Python and for libraries in C."""
+    """Replace standard input, output and error by files, for Python and for C libraries."""
     before = sys.stdin, sys.stdout, sys.stderr
     sys.stdout.flush()
     sys.stderr.flush()

@@ -1,4 +1,4 @@
-"""Data folders with jobs, and services that are opened in this process, without a server."""
+"""Data folders with jobs, and services in this process, without an HTTP server."""
 
 import contextlib
 import os
@@ -19,7 +19,7 @@ from service.jobs.recovery import recover
 
 @pytest.fixture
 def no_variables(monkeypatch):
-    """None of the service's in the environment."""
+    """Remove the service's variables from the environment."""
     for name in os.environ:
         if name.startswith("KISSGS_"):
             monkeypatch.delenv(name)
@@ -41,7 +41,7 @@ def service(folder, url=None):
 
 
 def add_a_job(context):
-    """One that waits."""
+    """Add a queued job; return its id."""
     job_id = uuid.uuid4().hex
     upload = context.storage.new_upload()
     upload.write_bytes(b"ply")
@@ -55,6 +55,7 @@ def add_a_job(context):
 
 
 def finish_a_job(context, state=State.SUCCEEDED):
+    """Add a job that has succeeded, or that has also expired; return its id."""
     job_id = add_a_job(context)
     result = context.storage.result(job_id)
     result.mkdir()
@@ -68,7 +69,7 @@ def finish_a_job(context, state=State.SUCCEEDED):
 
 @pytest.fixture(scope="module")
 def sample_folder(tmp_path_factory):
-    """A data folder with 120 jobs that have succeeded."""
+    """Data folder with 120 succeeded jobs."""
     folder = tmp_path_factory.mktemp("sample") / "data"
     with service(folder) as context:
         for _ in range(120):

@@ -1,4 +1,4 @@
-"""Scenes of Gaussians as no training leaves them."""
+"""Degenerate scenes, unlike any result of training."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Small scenes at the edge: arrays of float64 by attribute, as no trainer should leave them; and cameras."""
+"""Small extreme scenes, as float64 arrays by attribute, and cameras."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Arrays = dict[str, np.ndarray]
 
 
 def cloud(count=12, degree=1, seed=5) -> Arrays:
-    """Coloured blobs about the origin, none of them so opaque that a pixel ends."""
+    """Return coloured Gaussians around the origin, not opaque enough to terminate a pixel."""
     rng = np.random.default_rng([seed, count, degree])
     quats = rng.normal(size=(count, 4))
     return {
@@ -180,7 +180,7 @@ def long_quaternions():
     return changed(quats=cloud()["quats"] * 1e38)
 
 
-# No numbers
+# Non-finite numbers
 
 
 def no_numbers():
@@ -234,7 +234,7 @@ def alike():
 
 
 def cauchy():
-    """Opacities stay below the point at which pixels end."""
+    """Return Cauchy-distributed values, with opacities too low to terminate a pixel."""
     rng, before = np.random.default_rng(3), cloud(40)
     wide = {name: rng.standard_cauchy(values.shape) for name, values in before.items()}
     wide["scales"] = (wide["scales"] * 0.3 - 2).clip(-30, 30)
@@ -266,7 +266,7 @@ def ties():
 
 
 def near_ties():
-    """All 3 from the camera but for less than half an ulp; the scene's order is not that of depth."""
+    """Return Gaussians with depths within half an ulp of 3, not stored in order of depth."""
     depths = 1e-8 * np.random.default_rng(2).permutation(12)
     return changed(means=np.column_stack([cloud()["means"][:, :2], depths]))
 
@@ -283,7 +283,7 @@ def layers():
 
 
 def near_plane():
-    """Along the line of sight, from behind the camera to 0.1 before it."""
+    """Return Gaussians along the line of sight, from behind the camera to 0.1 in front of it."""
     view, depths = camera(), np.array([-1, -1e-3, 0, 1e-9, 5e-3, 9.9e-3, 0.0101, 0.012, 0.02, 0.04, 0.07, 0.1])
     side = np.linspace(-0.2, 0.2, 12) * np.abs(depths)
     means = view.position + depths[:, None] * view.viewmat[2, :3] + side[:, None] * view.viewmat[0, :3]

@@ -1,4 +1,4 @@
-"""The stages, and their errors against float64 oracles: one number for each extreme, 0 for an empty scene."""
+"""Stages and their errors against float64 oracles: one number per extreme, 0 for an empty scene."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from kissgs.training.loop import torch_threads
 
 
 def clean(name):
-    """Largest difference of the cleaned scene, relative for values above 1; infinite if a count is wrong."""
+    """Return the largest difference of the cleaned scene, relative for values above 1; infinite if a count is wrong."""
     extreme, (found, report) = BY_NAME[name], scene(name)
     rows, counts = reference_float64.cleaned(extreme.arrays())
     stated = {change: count for change, count in report.as_dict().items() if count}
@@ -36,7 +36,7 @@ def clean(name):
 
 
 def image_error(name):
-    """Largest difference of a pixel to the naive rasteriser, of colours beyond 1 relative to the brightest."""
+    """Return the largest difference of a pixel to the naive rasteriser, relative to the brightest colour if above 1."""
     splats, view = scene(name)[0], BY_NAME[name].camera()
     expected = reference_rasterizer.draw(in_float64(splats), view, np.array(BACKGROUND))
     sure = ~expected.doubtful
@@ -51,7 +51,7 @@ def image_error(name):
 
 
 def gradient(name):
-    """Largest difference of a gradient, relative to the largest of its kind, or to 1e-4 of the largest of all."""
+    """Return the largest error of a gradient, relative to its attribute's largest, or to 1e-4 of the overall one."""
     splats, view = scene(name)[0], BY_NAME[name].camera()
     wanted, rng = reference_float64.tensors(splats, leaf=True), np.random.default_rng(1)
     expected = reference_float64.draw(wanted, view, BACKGROUND)
@@ -79,7 +79,7 @@ def _weighted(image, alpha, weights):
 
 
 def relative(found, wanted, splats, view):
-    """Positions are measured in distances of the nearest that is drawn, so that gradients can be compared."""
+    """Return relative errors; positions are divided by the nearest drawn depth, for comparable gradients."""
     depth = splats.means.astype(np.float64) @ view.viewmat[2, :3] + view.viewmat[2, 3]
     unit = {"means": depth[depth >= 0.01].min(initial=np.inf) if (depth >= 0.01).any() else 1.0}
     none = torch.zeros(())
@@ -94,7 +94,7 @@ def relative(found, wanted, splats, view):
 
 
 def score(name):
-    """Largest difference to the squared change by removal, relative to the largest."""
+    """Return the largest error of a removal score, relative to the largest score."""
     splats, view = scene(name)[0], BY_NAME[name].camera()
     wanted = reference_float64.removed(
         reference_float64.draw(reference_float64.tensors(splats), view, BACKGROUND), len(splats), BACKGROUND
@@ -104,19 +104,19 @@ def score(name):
 
 
 def rank(name):
-    """Largest error of the loss of effective rank (relative, from 1 up) and of its gradient, which is 2 at most."""
+    """Return the largest error of the effective-rank loss (relative above 1) and of its gradient, at most 2."""
     scales = torch.from_numpy(scene(name)[0].scales).clone().requires_grad_()
     loss = needle_loss(scales)
     loss.sum().backward()
     wanted, slope = reference_float64.needle_loss(scales.detach())
     off = np.abs(scales.grad.numpy() - slope).max(axis=1, initial=0)
-    at_kink = wanted < 1e-5  # of a disc, a gradient of 0 is as right as that of what is a little longer
+    at_kink = wanted < 1e-5  # at a disc, both one-sided gradients are correct
     off = np.where(at_kink & (scales.grad.numpy() == 0).all(axis=1), 0, off)
     return largest(np.abs(loss.detach().numpy() - wanted) / np.maximum(wanted, 1), off)
 
 
 def step(name):
-    """Largest difference after three steps of training, in learning rates, beyond what float32 can hold."""
+    """Return the largest error after three training steps, in learning rates, beyond float32 rounding."""
     return trained(scene(name)[0], BY_NAME[name].camera())
 
 
@@ -137,6 +137,6 @@ STAGES = {
 
 @functools.cache
 def measured(name, stage):
-    """The error of a stage at an extreme."""
-    with torch_threads(1):  # several are slower where tests run side by side
+    """Return the error of a stage for an extreme."""
+    with torch_threads(1):  # more threads slow down parallel tests
         return STAGES[stage](name)

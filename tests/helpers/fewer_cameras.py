@@ -1,4 +1,4 @@
-"""Fewer camera candidates, for tests of other things."""
+"""Fewer camera candidates, for faster tests."""
 
 from kissgs.cameras.virtual import candidates, select
 

@@ -1,4 +1,4 @@
-"""Scenes that consist of surfaces."""
+"""Scenes of surfaces."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from kissgs.core.splats import SH_C0, Splats
 
 
 def surface(points, normals_along, size, thin=0.1, colour=0.5):
-    """Flat opaque Gaussians across the axis numbered ``normals_along``."""
+    """Return flat opaque Gaussians at ``points``, with normals along the axes ``normals_along`` (0 to 2)."""
     count = len(points)
     scales = np.full((count, 3), np.log(size))
     scales[np.arange(count), normals_along] += np.log(thin)
@@ -21,7 +21,7 @@ def surface(points, normals_along, size, thin=0.1, colour=0.5):
 
 
 def box(half, count=20_000, size=0.06, seed=0):
-    """The six faces of a box about the origin."""
+    """Return the six faces of a box around the origin."""
     rng = np.random.default_rng(seed)
     axis = rng.integers(0, 3, count)
     points = rng.uniform(-1, 1, (count, 3)) * half

@@ -1,12 +1,12 @@
-"""How much memory a call takes: what it trusts of a damaged file shows there."""
+"""Memory use of a call, which reveals unchecked counts from damaged files."""
 
 import threading
 import tracemalloc
 from collections.abc import Callable
 
 ATTEMPTS = 3
-"""Whatever another thread of the process holds is counted, too: a test before this one may have left one at work. A
-call that takes too much does so every time."""
+"""Number of attempts: memory of other threads counts, too, such as those of an earlier test, but a call that needs too
+much memory does so every time."""
 
 
 def takes_less_than(limit: float, call: Callable[[], object]) -> bool:
@@ -20,7 +20,7 @@ def _peak(call: Callable[[], object]) -> int:
         call()
         return tracemalloc.get_traced_memory()[1]
     finally:
-        # After an error, a task that had begun may still run; stopping amid it can crash Python 3.11 (gh-128679).
+        # Tasks may still run after an error, and tracemalloc.stop() during one can crash Python 3.11 (gh-128679).
         for thread in threading.enumerate():
             if thread.name.startswith("ThreadPoolExecutor"):
                 thread.join()

@@ -1,4 +1,4 @@
-"""A small container, and the same with other metadata."""
+"""A small container, and variants with other metadata."""
 
 import json
 
@@ -23,13 +23,13 @@ def with_yaml(text):
 
 
 def with_document(changed):
-    """The document as another encoder would write it: without a checksum of its numbers."""
+    """Return the files with this document as YAML, without a checksum, as from another encoder."""
     changed = {key: value for key, value in changed.items() if key != CHECKSUM}
     return with_yaml(yaml.safe_dump(changed))
 
 
 def with_json(change):
-    """Files without the YAML, ``meta.json`` without its checksum and changed by a function."""
+    """Return the files without YAML, with ``meta.json`` changed by a function and without its checksum."""
     meta = json.loads(FILES["meta.json"])
     del meta[CHECKSUM]
     change(meta)
@@ -39,7 +39,7 @@ def with_json(change):
 
 
 def quantize_of(changed, field):
-    """The part of a document that holds the range of ``field``."""
+    """Return the part of a document with the range of ``field``."""
     op = next(op for op in changed["ops"] if op["input_fields"] == [field])
     return op["transforms"][0]["simple_quantize"]
 

@@ -1,4 +1,4 @@
-"""Odd ``meta.json``: what is read and what is refused, by every decoder of this project alike."""
+"""Unusual ``meta.json`` files, and whether all decoders of this project must accept them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ DELETED = object()
 
 @dataclass(frozen=True)
 class Odd:
-    """A change of the value at a dotted path, and whether a decoder takes the result."""
+    """Change of the value at a dotted path, and whether a decoder accepts the result."""
 
     name: str
     change: Callable[[dict[str, Any]], None]
@@ -20,7 +20,7 @@ class Odd:
 
 
 def put(path: str, value: Any, *, accepted: bool = False) -> Odd:
-    """The value stands at the path, or nothing does."""
+    """Return a change that sets the value at a path, or removes it."""
 
     def change(meta: dict[str, Any]) -> None:
         *parents, last = path.split(".")
@@ -69,7 +69,7 @@ ODD = [
     *(put("mask.files", value, accepted=True) for value in (["active_mask.webp", 5], ["./active_mask.webp"], ["webp"])),
     put("mask.files", "active_mask.webp"),
     put("mask.files", {"0": "active_mask.webp"}),
-    # Kinds
+    # Version, format and encodings
     *(put("version", value) for value in ("3", None, True, [3], 2, 4, {})),
     *(put("version", value, accepted=True) for value in (3.0, DELETED)),
     *(put("format", value) for value in ("sog", None, ["sog-xt"], "SOG-XT", "")),
@@ -84,7 +84,7 @@ ODD = [
         for value in (None, "15", "3", 4, [3], True)
     ),
     *(put(f"shN.{key}", DELETED, accepted=True) for key in ("coeffs", "tileRows", "tileCols")),
-    # Ours
+    # Keys of kissgs
     *(put("kissgs", value) for value in (None, 5, True, "text", [], {}, {"sh_degree": 3}, {"version": "0.1.0"})),
     put("kissgs", DELETED, accepted=True),
     put("kissgs", {"sh_degree": 3, "version": "99.0", "mood": [1]}, accepted=True),
@@ -94,7 +94,7 @@ ODD = [
     *(put("kissgs.crc32", {"note.txt": value}) for value in ("7", None, True, 1.5, -1, 2**32, [7], {})),
     *(put("kissgs.crc32", {"f_dc.webp": value}) for value in ("7", None, True, 7)),
     *(put("kissgs_crc32", value) for value in (None, 0, "x", True, [], {}, 1.5)),
-    # What nobody looks at
+    # Ignored keys
     *(put("profile", value, accepted=True) for value in (None, 5, {}, DELETED)),
     *(put("extra", value, accepted=True) for value in (None, {"__proto__": 1}, 10**400)),
     *(put("means.files", value, accepted=True) for value in (None, "x", DELETED)),

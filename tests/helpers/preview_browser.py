@@ -1,4 +1,4 @@
-"""A Chromium with software WebGL, and common actions of the tests of the preview page."""
+"""Chromium with software WebGL, and common actions of the tests of the preview page."""
 
 import base64
 import io
@@ -19,25 +19,25 @@ SOFTWARE = [
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
 ]
 
-BOOKS = """
-const made = new Map();
+COUNT_RESOURCES = """
+const contexts = new Map();
 let frames = 0;
 const getContext = HTMLCanvasElement.prototype.getContext;
 HTMLCanvasElement.prototype.getContext = function (kind, ...others) {
   const context = getContext.call(this, kind, ...others);
-  if (kind === "webgl2" && context && !made.has(context)) made.set(context, 0);
+  if (kind === "webgl2" && context && !contexts.has(context)) contexts.set(context, 0);
   return context;
 };
 const { createTexture, deleteTexture } = WebGL2RenderingContext.prototype;
-const count = (context, more) => made.set(context, made.get(context) + more);
+const count = (context, more) => contexts.set(context, contexts.get(context) + more);
 Object.assign(WebGL2RenderingContext.prototype, {
   createTexture(...all) { count(this, 1); return createTexture.apply(this, all); },
   deleteTexture(texture) { count(this, texture ? -1 : 0); return deleteTexture.call(this, texture); },
 });
 const request = window.requestAnimationFrame;
 window.requestAnimationFrame = (call) => { frames++; return request(call); };
-window.books = () => {
-  const alive = [...made].filter(([context]) => !context.isContextLost());
+window.resourceCounts = () => {
+  const alive = [...contexts].filter(([context]) => !context.isContextLost());
   return { contexts: alive.length, textures: alive.reduce((sum, [, textures]) => sum + textures, 0), frames };
 };
 """
@@ -58,41 +58,41 @@ def software_browser():
 
 
 class Preview:
-    """A tab with the preview page, and what went wrong in it."""
+    """Tab with the preview page; ``errors`` are all errors in it."""
 
     def __init__(self, browser, **options):
         self.context = browser.new_context(**{"viewport": {"width": 820, "height": 400}, **options})
         self.page = self.context.new_page()
         self.page.set_default_timeout(20_000)
-        self.page.add_init_script(BOOKS)
-        self.requests, self.wrong, self.origin = [], [], ""
+        self.page.add_init_script(COUNT_RESOURCES)
+        self.requests, self.errors, self.origin = [], [], ""
         self.page.on("request", self._request)
-        self.page.on("pageerror", lambda error: self.wrong.append(f"page error: {error}"))
+        self.page.on("pageerror", lambda error: self.errors.append(f"page error: {error}"))
         self.page.on("requestfailed", self._failed)
         self.page.on(
-            "response", lambda answer: answer.status < 400 or self.wrong.append(f"{answer.status} {answer.url}")
+            "response", lambda answer: answer.status < 400 or self.errors.append(f"{answer.status} {answer.url}")
         )
         self.page.on("console", self._console)
 
-    def _request(self, asked):
-        self.requests.append((asked.method, asked.url))
-        if not asked.url.startswith((self.origin, "blob:", "data:")):
-            self.wrong.append(f"elsewhere: {asked.url}")
+    def _request(self, request):
+        self.requests.append((request.method, request.url))
+        if not request.url.startswith((self.origin, "blob:", "data:")):
+            self.errors.append(f"other host: {request.url}")
 
-    def _failed(self, asked):
-        if "ERR_ABORTED" not in asked.failure:  # by the page itself, or by leaving it
-            self.wrong.append(f"failed: {asked.url} {asked.failure}")
+    def _failed(self, request):
+        if "ERR_ABORTED" not in request.failure:  # aborted by the page, or because it was left
+            self.errors.append(f"failed: {request.url} {request.failure}")
 
-    def _console(self, said):
-        if said.type == "error" or "Content Security Policy" in said.text or "too many" in said.text.lower():
-            self.wrong.append(said.text)
+    def _console(self, line):
+        if line.type == "error" or "Content Security Policy" in line.text or "too many" in line.text.lower():
+            self.errors.append(line.text)
 
-    def forgive(self, *patterns):
-        """Take these off the list of what went wrong; each must be on it."""
+    def expect_errors(self, *patterns):
+        """Remove errors that match; each pattern must match at least one."""
         for pattern in patterns:
-            found = [line for line in self.wrong if re.search(pattern, line)]
-            assert found, (pattern, self.wrong)
-            self.wrong = [line for line in self.wrong if line not in found]
+            found = [line for line in self.errors if re.search(pattern, line)]
+            assert found, (pattern, self.errors)
+            self.errors = [line for line in self.errors if line not in found]
 
     def open(self, service, path=""):
         self.origin = service.url
@@ -100,7 +100,7 @@ class Preview:
         return self
 
     def shown(self, gaussians):
-        """Wait for the scene and its final image; return that."""
+        """Wait for the scene and return its final image."""
         self.fact("Gaussians", f"{gaussians:,}")
         self.page.locator("#loading").wait_for(state="hidden")
         self.page.locator("#viewport").wait_for()
@@ -116,7 +116,7 @@ class Preview:
         return np.asarray(Image.open(io.BytesIO(screenshot)).convert("RGB")).astype(int)
 
     def still_image(self, seconds=20, still=3):
-        """Return a screenshot once ``still`` ones, 0.2 s apart, are equal: Spark may still be sorting."""
+        """Return a screenshot when ``still`` of them, 0.2 s apart, are equal, so that Spark has finished sorting."""
         end = time.monotonic() + seconds
         seen = [self.pixels()]
         while time.monotonic() < end:
@@ -124,20 +124,20 @@ class Preview:
             seen = [*seen[1 - still :], self.pixels()]
             if len(seen) == still and all(np.array_equal(seen[0], other) for other in seen[1:]):
                 return seen[-1]
-        raise AssertionError("the image does not become still")
+        raise AssertionError("the image keeps changing")
 
-    def health_problem(self, *words):
-        """The one sentence, which has these words."""
-        said = self.page.locator("#trouble:visible p")
-        said.wait_for()
-        text = said.inner_text()
+    def error_message(self, *words):
+        """Return the error message, which must be one sentence with these words."""
+        message = self.page.locator("#trouble:visible p")
+        message.wait_for()
+        text = message.inner_text()
         assert all(word in text for word in words), text
         assert re.fullmatch(r"[^\n]{10,250}[.]", text), text
         assert "fault of its own" not in text
         return text
 
     def choose(self, *files, button="#open"):
-        """Through the dialog that a button opens; files are pairs of name and bytes."""
+        """Choose files in the dialog that a button opens; files are pairs of name and bytes."""
         with self.page.expect_file_chooser() as chooser:
             self.page.locator(button).click()
         kind = "application/octet-stream"
@@ -163,7 +163,7 @@ class Preview:
 
 @pytest.fixture
 def preview(software_browser):
-    """``preview(**options)`` opens a tab; at the end nothing may have gone wrong that was not forgiven."""
+    """``preview(**options)`` opens a tab; errors that were not expected fail the test."""
     tabs = []
 
     def begin(**options):
@@ -173,11 +173,11 @@ def preview(software_browser):
     yield begin
     for tab in tabs:
         tab.context.close()
-    wrong = [line for tab in tabs for line in tab.wrong]
-    assert not wrong, wrong
+    errors = [line for tab in tabs for line in tab.errors]
+    assert not errors, errors
 
 
-def looks_like(one, other):
+def psnr(one, other):
     """Return the PSNR of two images."""
     return -10 * np.log10(max(np.mean((one - other) ** 2) / 255**2, 1e-10))
 

@@ -1,4 +1,4 @@
-"""Sensitivities that no image was measured for."""
+"""Random sensitivities."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from kissgs.sogxt.encode import encode
 
 
 def random_sensitivity(splats, seed=0, spread=2.0):
-    """Sensitivity of random size; each shape's form a random positive one."""
+    """Return a sensitivity of random size, with random positive semidefinite shape Hessians."""
     rng = np.random.default_rng(seed)
     count = len(splats)
     roots = rng.normal(size=(count, 7, 7))

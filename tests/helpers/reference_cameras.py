@@ -1,4 +1,4 @@
-"""Captures written by hand: cameras by SciPy's rotations, files by struct and string formatting."""
+"""Writers of captures, without code of kissgs: cameras from SciPy's rotations, files from struct and formatting."""
 
 import json
 import struct
@@ -102,7 +102,7 @@ def write_json(path: Path, document):
 
 
 def write_photo(path: Path, width, height, mode="RGB", value=None):
-    """Write a ramp, which differs from a resized or flipped one."""
+    """Write a colour ramp, which shows whether an image was resized or flipped."""
     path.parent.mkdir(parents=True, exist_ok=True)
     y, x = np.mgrid[:height, :width]
     channels = len(mode)

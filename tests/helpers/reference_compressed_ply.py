@@ -1,4 +1,4 @@
-"""A naive packer of PlayCanvas' compressed .ply, and of what its words mean, value by value; no code of kissgs."""
+"""A naive writer of PlayCanvas' compressed .ply, value by value, without code of kissgs."""
 
 import math
 import struct
@@ -38,7 +38,7 @@ def pack_sh(value):
 
 
 def compressed_bytes(gaussians, rest_count, *, colour_bounds=True, order="<"):
-    """``gaussians``: dicts of position, quat, log_scale, rgb, opacity (0 to 1) and rest (f_rest_* in file order)."""
+    """Return a file; ``gaussians`` are dicts of position, quat, log_scale, rgb, opacity (0 to 1), rest (f_rest_*)."""
     body, packed, sh = b"", b"", b""
     for start in range(0, len(gaussians), 256):
         chunk = gaussians[start : start + 256]
@@ -58,7 +58,7 @@ def compressed_bytes(gaussians, rest_count, *, colour_bounds=True, order="<"):
 
 
 def extents(chunk, key):
-    """Minimum and maximum of each of the three values, as float32 holds them."""
+    """Return minimum and maximum of each of the three values, as float32."""
     columns = [[g[key][i] for g in chunk] for i in range(3)]
     return [struct.unpack("<2f", struct.pack("<2f", min(column), max(column))) for column in columns]
 

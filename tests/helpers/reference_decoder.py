@@ -1,4 +1,4 @@
-"""Two naive decoders written from the description of the format alone (docs/reference/format.md), as oracles.
+"""Two naive decoders, written from the description of the format alone (docs/reference/format.md), as oracles.
 
 ``decode`` does what the paper's Python decoder does: whole arrays, float32, activated values and back.
 ``decode_browser`` does what viewers and other tools do: it looks at ``meta.json`` only, and checks what they check.
@@ -25,7 +25,7 @@ COLUMNS = (
 
 
 def as_files(source):
-    """Files by name, out of a dict or the bytes of a zip."""
+    """Return files by name, from a dict or the bytes of a zip."""
     if isinstance(source, Mapping):
         return dict(source)
     with zipfile.ZipFile(io.BytesIO(source)) as archive:
@@ -33,12 +33,12 @@ def as_files(source):
 
 
 def pixels(files, name):
-    """An image as Pillow opens it, as integers."""
+    """Return the pixels of an image as integers, from Pillow."""
     return np.asarray(Image.open(io.BytesIO(files[name]))).astype(np.int64)
 
 
 def levels(files, name, channels):
-    """Rows of an image with exactly as many channels as the format asks for."""
+    """Return an image as rows of pixels, and check its number of channels."""
     image = pixels(files, f"{name}.webp")
     assert image.ndim == 3
     assert image.shape[2] == channels, f"{name} has {image.shape[2]} channels"
@@ -46,14 +46,14 @@ def levels(files, name, channels):
 
 
 def stretched(raw):
-    """Observed minimum -> 0, observed maximum -> 1, over everything in the array."""
+    """Scale an array from its minimum and maximum to 0 and 1."""
     raw = raw.astype(F)
     low, high = raw.min(), raw.max()
     return (raw - low) / (high - low + F(1e-8))
 
 
 def ranges_of(document):
-    """Field -> (min_values, max_values); later ones replace earlier ones."""
+    """Return (min_values, max_values) by field; later ranges replace earlier ones."""
     found = {}
     for op in document["ops"]:
         if len(op["input_fields"]) != 1:
@@ -66,13 +66,13 @@ def ranges_of(document):
 
 
 def between(raw, limits, channels):
-    """Levels to values; ``channels`` None stands for a scalar range."""
+    """Convert levels to values in a range; ``channels`` None stands for a scalar range."""
     low, high = (np.asarray(limit, dtype=F).reshape(channels) if channels else F(float(limit)) for limit in limits)
     return stretched(raw) * (high - low) + low
 
 
 def untiled(image, side):
-    """(15 tiles of S x S in 3 rows of 5) -> (S*S, 45), index = channel * 15 + coefficient."""
+    """Convert 15 tiles of S x S pixels in 3 rows to ``(S*S, 45)``, with index channel * 15 + coefficient."""
     assert image.shape == (3 * side, 5 * side, 3)
     entries = np.empty((side * side, 45), dtype=image.dtype)
     for row in range(3):
@@ -84,7 +84,7 @@ def untiled(image, side):
 
 
 def decode(source):
-    """The 62 columns of the .ply that the paper's decoder writes, float32, by name."""
+    """Return the 62 float32 columns, by name, of the .ply that the paper's decoder writes."""
     files = as_files(source)
     document = yaml.safe_load(files["container_meta.yaml"].decode("ascii"))
     grid, side = int(document["meta"]["grid_side"]), int(document["meta"]["f_rest_centroids_side"])
@@ -122,8 +122,8 @@ def as_columns(splats):
     return dict(zip(COLUMNS, np.concatenate([*parts, splats.scales, splats.quats], axis=1).T, strict=True))
 
 
-def reach_of(ranges, column):
-    """Largest magnitude in the range of a column's channel."""
+def range_magnitude(ranges, column):
+    """Return the largest magnitude in the range of a column's channel."""
     name, _, index = column.rpartition("_")
     field, index = {
         "f_dc": ("f_dc", index),
@@ -149,7 +149,7 @@ def assert_equal_scenes(ours, reference, files):
         assert np.isfinite(wanted).all(), name
         if name in ("nx", "ny", "nz"):
             continue
-        tolerance = 5e-7 * max(reach_of(ranges, name), 1)
+        tolerance = 5e-7 * max(range_magnitude(ranges, name), 1)
         if name in "xyz":
             tolerance *= 1 + np.abs(found)
         if name == "opacity":
@@ -158,7 +158,7 @@ def assert_equal_scenes(ours, reference, files):
 
 
 def check_browser(files):
-    """Metadata of ``meta.json``, after the checks that other tools make before they decode."""
+    """Return ``meta.json`` after the checks of other tools."""
     meta = json.loads(files["meta.json"])
     assert (meta["version"], meta["format"], meta["profile"]) == (3, "sog-xt", "SOG-XT")
     grid = meta["gridSide"]

@@ -57,7 +57,7 @@ class Rendering:
     order: np.ndarray  # (M,) front to back
     alphas: torch.Tensor  # (M, H W), 0 where not drawn
     colours: torch.Tensor  # (M, 3)
-    ended: np.ndarray  # (H, W): a pixel's list has an end before its last Gaussian
+    ended: np.ndarray  # (H, W): blending ended before the last Gaussian
 
 
 def tensors(splats, *, leaf=False):
@@ -73,7 +73,7 @@ def rotations(quats):
 
 
 def exponents(params, camera, W, t):
-    """(N, H W) half squared Mahalanobis distances, as sums of squares; a footprint that is a needle loses no digits."""
+    """Return ``(N, H W)`` half squared Mahalanobis distances, as sums of squares, which are accurate for needles."""
     K, width, height = camera.K, camera.width, camera.height
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     x, y, z = (params["means"] @ W.T + t).T
@@ -137,7 +137,7 @@ def draw(params, camera, background):
 
 
 def composed(alphas, colours, background):
-    """Front to back: colours of the pixels (P, 3), and what is left of the background (P,)."""
+    """Blend front to back; return colours ``(P, 3)`` and remaining transmittance ``(P,)`` of the pixels."""
     through = torch.cat([torch.ones_like(alphas[:1]), torch.cumprod(1 - alphas, dim=0)])
     if not len(alphas):
         through = torch.ones(1, alphas.shape[1], dtype=torch.float64)
@@ -158,7 +158,7 @@ def removed(rendering, count, background):
 
 
 def needle_loss(scales):
-    """max(-ln(erank - 1 + 1e-7), 0) as the paper writes it, (N,), and its gradient (N, 3)."""
+    """Return the paper's loss max(-ln(erank - 1 + 1e-7), 0), ``(N,)``, and its gradient ``(N, 3)``."""
     scales = np.asarray(scales, np.float64)
     squares = np.exp(2 * scales)
     share = squares / squares.sum(1, keepdims=True)

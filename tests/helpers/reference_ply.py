@@ -1,4 +1,4 @@
-"""A naive PLY writer and reader's expectation: one struct.pack per value, sharing no code with kissgs."""
+"""A naive PLY writer and the expected scenes, without code of kissgs."""
 
 import random
 import struct
@@ -25,13 +25,13 @@ Columns = dict[str, list[float]]
 
 
 def names(degree):
-    """INRIA's order, without the normals."""
+    """Return the property names in INRIA's order, without normals."""
     dc_and_rest = [f"f_dc_{i}" for i in range(3)] + [f"f_rest_{i}" for i in range(REST[degree])]
     return ["x", "y", "z", *dc_and_rest, "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
 
 
 def random_columns(count, degree, *, integers=False):
-    """Values that float32 holds exactly; with ``integers``, also every other type."""
+    """Return random values that are exact in float32; with ``integers``, exact in all PLY types."""
     rng = random.Random(f"{count} {degree}")
     draw = (lambda: rng.randrange(0, 100)) if integers else (lambda: rng.randrange(-(2**20), 2**20) / 2**12)
     return {name: [draw() for _ in range(count)] for name in names(degree)}
@@ -59,7 +59,7 @@ def ply_bytes(columns, encoding="binary_little_endian", kind="float"):
 
 
 def expected(columns, degree):
-    """The scene in ``columns``, value by value."""
+    """Return the scene of ``columns``, value by value."""
     count, k = len(columns["x"]), REST[degree] // 3
 
     def array(*keys):
@@ -81,7 +81,7 @@ def expected(columns, degree):
 
 
 def assert_identical(a, b):
-    """Bit by bit, so that NaN equals itself and -0 does not equal 0."""
+    """Assert that scenes are equal bit by bit, so that NaN equals itself and -0 differs from 0."""
     for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
         x, y = getattr(a, name), getattr(b, name)
         assert x.shape == y.shape, name

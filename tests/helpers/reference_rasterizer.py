@@ -1,6 +1,6 @@
-"""The oracle: gsplat's classic mode written down in float64, pixel by pixel, with full covariance matrices.
+"""Oracle of rendering: gsplat's classic mode in float64, pixel by pixel, with full covariance matrices.
 
-It shares no code with the renderer under test, and of its formulas only the definitions.
+It shares no code with the renderer under test.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ class Drawn:
     image: np.ndarray  # (H, W, 3)
     alpha: np.ndarray  # (H, W)
     decisions: list  # per Gaussian, front to back: its number, where it was drawn, where its alpha was clamped
-    doubtful: np.ndarray  # (H, W): a decision here hung on less than float32 can tell
+    doubtful: np.ndarray  # (H, W): a decision depends on less than float32 can resolve
     layers: list  # per Gaussian, front to back: its number, alphas, transmittances before it, colour
 
 
@@ -47,7 +47,7 @@ def inverse(covariance, transform, R, scales):
 
 
 def harmonics(x, y, z):
-    """The real ones of bands 1 to 3."""
+    """Return the real spherical harmonics of bands 1 to 3."""
     xx, yy, zz = x * x, y * y, z * z
     return [
         -0.4886025119029199 * y,
@@ -73,9 +73,15 @@ def sh_values(direction, count):
 
 
 def draw(params, camera, background, frozen=None, removed=None, alpha_max=0.99):
-    """``params``: name -> float64 array, as in Splats. ``frozen``: decisions of an earlier image, kept unchanged.
+    """Render an image.
 
-    ``removed``: a Gaussian that is left out. ``alpha_max``: gsplat's releases clamp elsewhere than the rest.
+    Args:
+        params: float64 arrays by name, as in ``Splats``.
+        camera: camera.
+        background: RGB.
+        frozen: decisions of an earlier image to keep.
+        removed: a Gaussian to leave out.
+        alpha_max: largest alpha, which differs between releases of gsplat.
     """
     means, quats, scales, opacities, sh0, shN = (
         params[name] for name in ("means", "quats", "scales", "opacities", "sh0", "shN")
@@ -136,7 +142,7 @@ def draw(params, camera, background, frozen=None, removed=None, alpha_max=0.99):
 
 
 def gradient_by_differences(params, camera, background, v_image, v_alpha, step=1e-5, alpha_max=0.99):
-    """Central differences of sum(image * v_image) + sum(alpha * v_alpha), decisions frozen, by every parameter."""
+    """Return central differences of sum(image * v_image) + sum(alpha * v_alpha), with frozen decisions."""
     frozen = draw(params, camera, background, alpha_max=alpha_max).decisions
 
     def loss(changed):

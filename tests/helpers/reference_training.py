@@ -1,4 +1,4 @@
-"""Oracle of training: a second implementation of loop, loss and Adam, in float64."""
+"""Oracle of training: an independent implementation of loop, loss and Adam, in float64."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ def stripes(camera):
 
 
 def trained(splats, camera):
-    """Largest difference of a parameter after three steps, in steps of its learning rate, float32's grain left out.
+    """Return the largest error of a parameter after three steps, in learning rates, beyond float32 rounding.
 
-    Adam's step has the size of the learning rate however small the gradient is. So numbers are left out whose gradient
-    is less than a thousandth of the largest of their kind, or moves the loss less than a ten-thousandth of what the
-    steepest does: even the sign of these is a matter of rounding.
+    Adam's steps have the size of the learning rate even for tiny gradients, whose signs depend on rounding. So numbers
+    are left out whose gradient is below 1e-3 of the largest of their attribute, or changes the loss by less than 1e-4
+    of the steepest.
     """
     away = np.linalg.norm(splats.means.astype(np.float64) - camera.position, axis=1)
     targets, rates = stripes(camera), RATES | {"means": RATES["means"] * (np.median(away) if len(away) else 1.0)}
@@ -42,14 +42,14 @@ def trained(splats, camera):
         found, target = model.parameters[name].detach().numpy(), wanted[name]
         if not np.isfinite(found).all():
             return math.inf
-        grain = STEPS * np.spacing(np.maximum(np.abs(target), np.abs(found)).astype(np.float32)).astype(np.float64)
-        excess = (np.abs(found - target) - grain).clip(0) / (rates[name] * STEPS)
+        rounding = STEPS * np.spacing(np.maximum(np.abs(target), np.abs(found)).astype(np.float32)).astype(np.float64)
+        excess = (np.abs(found - target) - rounding).clip(0) / (rates[name] * STEPS)
         worst = max(worst, float(excess[clear[name]].max(initial=0)))
     return worst
 
 
 def oracle(splats, targets, rates):
-    """The parameters after the same steps, and which of them have gradients that are clearly not 0."""
+    """Return the parameters after these steps, and masks of parameters whose gradients are clearly not 0."""
     leaves = reference_float64.tensors(splats)
     moments = {name: (torch.zeros_like(leaf), torch.zeros_like(leaf)) for name, leaf in leaves.items()}
     clear = {name: np.ones(leaf.shape, bool) for name, leaf in leaves.items()}
@@ -74,7 +74,7 @@ def oracle(splats, targets, rates):
 
 
 def adam(leaf, slope, moments, step, rate):
-    """Kingma and Ba 2015, algorithm 1; the moments are changed in place."""
+    """Return a leaf after a step of Adam (Kingma and Ba 2015, algorithm 1), and update the moments in place."""
     mean, square = moments
     mean.mul_(0.9).add_(0.1 * slope)
     square.mul_(0.999).add_(0.001 * slope.square())

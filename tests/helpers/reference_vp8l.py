@@ -13,7 +13,7 @@ PREDICTOR, CROSS_COLOUR, SUBTRACT_GREEN, INDEXING = range(4)
 
 
 def stream_of(data):
-    """The VP8L chunk of a file."""
+    """Return the VP8L chunk of a file."""
     at = 12
     while data[at : at + 4] != b"VP8L":
         size = struct.unpack_from("<I", data, at + 4)[0]
@@ -22,7 +22,7 @@ def stream_of(data):
 
 
 def codes_of(lengths):
-    """(length, code) -> symbol of a canonical code, shortest first."""
+    """Return the symbols of a canonical code by (length, code), shortest first."""
     code, last, found = 0, 0, {}
     for length, symbol in sorted((length, symbol) for symbol, length in enumerate(lengths) if length):
         code <<= length - last
@@ -55,7 +55,7 @@ class Facts:
 
 
 class Reader:
-    """Reads a stream to its end; no transform is undone."""
+    """Reader of a whole stream, without inverting transforms."""
 
     def __init__(self, data):
         self.bits = np.unpackbits(np.frombuffer(stream_of(data), np.uint8), bitorder="little").tolist()
@@ -181,7 +181,7 @@ class Reader:
         return pixels
 
 
-# As RFC 9649 lists them: columns to the left, rows up.
+# In the order of RFC 9649: columns to the left, rows up.
 NEAR = [
     *((0, 1), (1, 0), (1, 1), (-1, 1), (0, 2), (2, 0), (1, 2), (-1, 2), (2, 1), (-2, 1), (2, 2), (-2, 2), (0, 3)),
     *((3, 0), (1, 3), (-1, 3), (3, 1), (-3, 1), (2, 3), (-2, 3), (3, 2), (-3, 2), (0, 4), (4, 0), (1, 4), (-1, 4)),
@@ -197,7 +197,7 @@ NEAR = [
 
 
 class Writer:
-    """Bits of a stream, lowest first."""
+    """Writer of a stream's bits, lowest first."""
 
     def __init__(self, width, height, alpha=1, version=0):
         self.bits = []
@@ -211,7 +211,7 @@ class Writer:
         self.bits += [value >> i & 1 for i in range(count)]
 
     def simple(self, *symbols):
-        """A code of one or two symbols."""
+        """Write a code of one or two symbols."""
         self.put(1, 1)
         self.put(len(symbols) - 1, 1)
         self.put(1, 1)
@@ -220,7 +220,7 @@ class Writer:
         return codes_of([int(symbol in symbols) for symbol in range(256)])
 
     def code(self, lengths, size=None):
-        """A code of any lengths, zeros up to ``size`` included; the code of lengths has four bits for each."""
+        """Write a code with these lengths, padded with zeros to ``size``; each length takes four bits."""
         self.put(0, 1)
         self.put(15, 4)
         for symbol in ORDER:
@@ -239,13 +239,13 @@ class Writer:
         self.bits += [code >> i & 1 for i in reversed(range(length))]
 
     def literal_codes(self, cache=0, lengths=False):
-        """Five codes in which every symbol can be written: 8 bits a value, or 9 bits with lengths and colours."""
+        """Write five codes with all symbols: 8 bits per value, or 9 bits with lengths and cached colours."""
         size = 280 + (1 << cache if cache else 0)
         if not cache and not lengths:
             green = self.code([8] * 256, size)
         else:
             depth = (size - 1).bit_length()
-            short = (1 << depth) - size  # so many codes are one bit shorter: the sum must be one
+            short = (1 << depth) - size  # this number of codes is one bit shorter, so that the code is complete
             green = self.code([depth - 1] * short + [depth] * (size - short))
         rest = [self.code([8] * 256) for _ in range(3)]
         return [green, *rest, self.code([5] * 24 + [6] * 16)]
@@ -255,7 +255,7 @@ class Writer:
             self.symbol(code, argb >> shift & 255)
 
     def image(self, pixels, main=False):
-        """Literals only, without a cache or a choice of codes."""
+        """Write an image as literals, without a cache or meta codes."""
         self.put(0, 1 + main)
         codes = self.literal_codes()
         for argb in pixels:

@@ -1,4 +1,4 @@
-"""Small scenes to draw, and cameras that look at them."""
+"""Small scenes for rendering tests, and cameras that see them."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ SHAPES = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": 
 
 
 def blobs(count, degree=1, seed=0, spread=0.8, log_scale=-1.5):
-    """Random Gaussians about the origin, of random shape, rotation (of any length), opacity and colour."""
+    """Return Gaussians around the origin with random shapes, rotations (not normalised), opacities and colours."""
     rng = np.random.default_rng(seed)
     return Splats(
         means=rng.normal(0, spread, (count, 3)).astype(np.float32),
@@ -22,7 +22,7 @@ def blobs(count, degree=1, seed=0, spread=0.8, log_scale=-1.5):
 
 
 def one(mean=(0, 0, 0), quat=(1, 0, 0, 0), scale=(-2, -2, -2), opacity=2.0, sh0=(1, 1, 1), shN=()):
-    """A single Gaussian."""
+    """Return a single Gaussian."""
     return Splats(
         means=np.array([mean], np.float32),
         quats=np.array([quat], np.float32),

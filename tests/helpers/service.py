@@ -1,4 +1,4 @@
-"""A real service in a process of its own, on loopback."""
+"""``Service``: a service in a separate process, on the loopback interface."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def scene_bytes(gaussians=300, degree=1, seed=0):
 
 
 SMALL = scene_bytes()
-"""Scene whose job takes little longer than the start of its process."""
+"""Scene whose job takes hardly longer than the start of its process."""
 
 FAST = json.dumps({"preset": "fast"})
 SLOW = json.dumps({"preset": "paper", "encode": {"plas_radius_decay": 0.99, "sh_kmeans_iterations": 50}})
@@ -37,7 +37,7 @@ SLOW = json.dumps({"preset": "paper", "encode": {"plas_radius_decay": 0.99, "sh_
 
 
 class Service:
-    """``with Service(folder, KISSGS_X=…) as service``; ``service.http`` is a client of it."""
+    """Service for use as ``with Service(folder, KISSGS_X=…) as service``; ``service.http`` is its HTTP client."""
 
     def __init__(self, folder: Path, **settings: object) -> None:
         self.folder = folder
@@ -65,8 +65,8 @@ class Service:
                 stderr=log,
             )
         for _ in range(600):
-            said = self.log.read_bytes()[begin:].decode(errors="replace")
-            found = re.search(r"listening on (http://127\.0\.0\.1:([0-9]+))", said)
+            output = self.log.read_bytes()[begin:].decode(errors="replace")
+            found = re.search(r"listening on (http://127\.0\.0\.1:([0-9]+))", output)
             if found:
                 self.url, self.port = found[1], int(found[2])
                 self.http = httpx.Client(base_url=self.url, timeout=60, trust_env=False)
@@ -77,7 +77,7 @@ class Service:
         raise AssertionError(f"the service did not start: {self.log.read_text()[-3000:]}")
 
     def kill(self, number: int) -> int:
-        """Send a signal and wait for the end; the exit status."""
+        """Send a signal, wait for the end, and return the exit status."""
         if self.process.poll() is None:
             self.process.send_signal(number)
         return self.process.wait(timeout=60)
@@ -86,7 +86,7 @@ class Service:
         self.http.close()
         return self.start()
 
-    # What tests do again and again ---------------------------------------------------------------------------------
+    # Common actions of tests ---------------------------------------------------------------------------------
 
     def submit(self, data: bytes = SMALL, options: str = FAST, **headers: str) -> dict:
         answer = self.http.post(
@@ -109,7 +109,7 @@ class Service:
         raise AssertionError(f"job {job['id']} has not ended: {status}")
 
     def running(self, job: dict, stage: str | None = None, seconds: float = 30) -> dict:
-        """Once its process is at work (in ``stage``, if that is given)."""
+        """Wait until the job's process runs, in ``stage`` if given; return the status."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             status = self.status(job)
@@ -121,32 +121,32 @@ class Service:
         raise AssertionError(f"job {job['id']} does not run: {status}\n{self.log.read_text()[-3000:]}")
 
     def children(self) -> list[int]:
-        """Process ids of the jobs that run."""
+        """Return the ids of all job processes."""
         with contextlib.suppress(OSError):
             tasks = Path(f"/proc/{self.process.pid}/task").iterdir()
             return [int(pid) for task in tasks for pid in (task / "children").read_text().split()]
         return []
 
     def memory(self) -> int:
-        """Resident bytes of the server itself, at most so far."""
+        """Return the peak resident memory of the server process, bytes."""
         text = Path(f"/proc/{self.process.pid}/status").read_text()
         return int(re.search(r"VmHWM:\s+([0-9]+) kB", text)[1]) << 10
 
-    def strays(self) -> list[str]:
-        """Files that belong to nothing."""
+    def leftovers(self) -> list[str]:
+        """Return the paths of temporary files."""
         jobs = self.folder / "jobs"
         found = [*(self.folder / "incoming").iterdir(), *jobs.glob("*/work-*"), *jobs.glob("*/.*")]
         return [str(path.relative_to(self.folder)) for path in found]
 
     def raw(self, data: bytes) -> socket.socket:
-        """A connection that has sent these bytes."""
+        """Open a connection and send these bytes."""
         connection = socket.create_connection(("127.0.0.1", self.port), timeout=30)
         connection.sendall(data)
         return connection
 
 
-def said(connection: socket.socket) -> bytes:
-    """A whole answer from a connection."""
+def read_response(connection: socket.socket) -> bytes:
+    """Return one HTTP response from a connection."""
     answer = b""
     with contextlib.suppress(ConnectionError):
         while block := connection.recv(65536):
@@ -159,7 +159,7 @@ def said(connection: socket.socket) -> bytes:
 
 
 def problem(answer: httpx.Response, status: int, code: str) -> dict:
-    """The problem document of an answer, which must be this one."""
+    """Return the problem document of a response, which must have this status and code."""
     assert (answer.status_code, answer.headers["content-type"]) == (status, "application/problem+json"), answer.text
     found = answer.json()
     assert found["code"] == code, found
@@ -171,7 +171,7 @@ def problem(answer: httpx.Response, status: int, code: str) -> dict:
 
 
 def events(text: str) -> list[tuple[int, str, dict]]:
-    """Id, kind and data of each event of a stream, parsed as the standard says."""
+    """Return id, kind and data of each server-sent event of a stream."""
     found = []
     for block in text.split("\n\n"):
         fields = dict(line.split(": ", 1) for line in block.splitlines() if not line.startswith(":"))

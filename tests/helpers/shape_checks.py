@@ -1,4 +1,4 @@
-"""How types and array shapes are checked while the tests run: an int will do where a float is asked for."""
+"""Run-time checks of types and array shapes during tests; an int is accepted for a float."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,5 +9,5 @@ _check = beartype(conf=BeartypeConf(is_pep484_tower=True))
 
 
 def typechecker(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Functions within functions are left alone: they are made anew at every call, and so would their checks be."""
+    """Add checks to a function, except to local ones, whose checks would be rebuilt at every call."""
     return function if "<locals>" in getattr(function, "__qualname__", "") else _check(function)

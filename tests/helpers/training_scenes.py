@@ -9,7 +9,7 @@ from kissgs.training.targets import training_targets
 
 
 def cloud(count=60, degree=1, seed=0):
-    """Coloured blobs around the origin."""
+    """Return coloured Gaussians around the origin."""
     rng = np.random.default_rng(seed)
     k = (0, 3, 8, 15)[degree]
     f32 = np.float32
@@ -26,7 +26,7 @@ def cloud(count=60, degree=1, seed=0):
 
 
 def around(count=4, size=40):
-    """Views from a circle around the origin."""
+    """Return views on a circle around the origin."""
     views = []
     for n in range(count):
         angle = 2 * np.pi * n / count

@@ -1,4 +1,4 @@
-"""Plans to fine-tune, and their scenes."""
+"""Encoding plans for fine-tuning tests, and their scenes."""
 
 import numpy as np
 
@@ -32,7 +32,7 @@ def choices():
 
 
 def shuffled(work, seed=0, far=3.0):
-    """Move all latents somewhere."""
+    """Move all latents randomly."""
     rng = np.random.default_rng(seed)
     for name, latents in work.latents.items():
         latents.data += latents.new_tensor(rng.normal(0, far, latents.shape))

@@ -1,4 +1,4 @@
-"""Containers for the tests of the JavaScript decoder, and its results beside those of kissgs' own decoder."""
+"""Containers for the tests of the JavaScript decoder, and comparison of its results with those of kissgs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ COEFFICIENTS = (0, 3, 8, 15)
 
 
 def scene_of(count, degree=0, seed=0, **replaced):
-    """Values without any order, as encoders like them least."""
+    """Return a scene of random, incompressible values."""
     rng = np.random.default_rng([seed, count, degree])
     quats = rng.normal(size=(count, 4))
     arrays = {
@@ -41,7 +41,7 @@ def scene_of(count, degree=0, seed=0, **replaced):
 
 @functools.cache
 def container(preset="fast", degree=3, count=65):
-    """Files by name."""
+    """Return a container as files by name."""
     settings = kissgs.Settings.from_preset(preset, sensitivity_views=4, sensitivity_view_size=48)
     return dict(kissgs.compress(scene_of(count, degree), settings=settings).files)
 
@@ -56,7 +56,7 @@ def zipped(files, method=zipfile.ZIP_STORED, folder="", comment=b""):
 
 
 def with_meta(files, change):
-    """The container after a change of what ``meta.json`` says, which then has no checksum."""
+    """Return the container with a changed ``meta.json``, without its checksum."""
     meta = json.loads(files["meta.json"])
     meta.pop(CHECKSUM, None)
     change(meta)
@@ -68,7 +68,7 @@ def without_checksums(files):
 
 
 def job(source, **more):
-    """A job for bytes of a zip, files, or an address."""
+    """Return a decoding job for the bytes of a zip, files by name, or an address."""
     if isinstance(source, str):
         return {"source": {"url": source}, **more}
     data = zipped(source) if isinstance(source, dict) else source
@@ -86,7 +86,7 @@ def array_of(text, field):
 
 
 def ulps(found, wanted):
-    """The largest distance, in steps of float32."""
+    """Return the largest difference, in units of float32's last place."""
     assert found.shape == wanted.shape
     assert np.isfinite(found).all()
 
@@ -97,44 +97,44 @@ def ulps(found, wanted):
     return int(np.abs(steps(found) - steps(wanted)).max(initial=0))
 
 
-def assert_scene(said, files):
-    """All that came out is as kissgs and Pillow have it. Returns the largest distance of floats, in ulps."""
-    assert "error" not in said, said["error"]
+def assert_scene(answer, files):
+    """Assert that a result equals that of kissgs and Pillow; return the largest difference of floats, ulps."""
+    assert "error" not in answer, answer["error"]
     meta = json.loads(files["meta.json"])
     images = {name: pillow(files[name]) for name in IMAGES}
     mask = images["active_mask.webp"][:, :, 0].ravel() > 0
     cells = np.flatnonzero(mask)
     side = meta["shN"]["centroidSide"]
     labels = images["f_rest_labels.webp"].reshape(-1, 4)[cells].astype(int)
-    arrays = {field: array_of(text, field) for field, text in said["arrays"].items()}
-    assert (said["count"], said["gridSide"], said["codebookSide"]) == (len(cells), meta["gridSide"], side)
+    arrays = {field: array_of(text, field) for field, text in answer["arrays"].items()}
+    assert (answer["count"], answer["gridSide"], answer["codebookSide"]) == (len(cells), meta["gridSide"], side)
     assert (arrays["cells"] == cells).all()
     assert (arrays["labels"] == labels[:, 1] * side + labels[:, 0]).all()
-    assert said["sizes"] == {name: len(files[name]) for name in (*IMAGES, "meta.json")}
-    for name, (width, height, text) in said["planes"].items():
+    assert answer["sizes"] == {name: len(files[name]) for name in (*IMAGES, "meta.json")}
+    for name, (width, height, text) in answer["planes"].items():
         assert (height, width) == images[name].shape[:2]
         assert base64.b64decode(text) == images[name].tobytes(), name
     splats = decode_in_python(files)
-    assert said["degree"] == splats.sh_degree
+    assert answer["degree"] == splats.sh_degree
     wanted = {name: getattr(splats, name) for name in ("means", "quats", "scales", "opacities", "sh0", "shN")}
-    count, coefficients = len(cells), COEFFICIENTS[said["degree"]]
+    count, coefficients = len(cells), COEFFICIENTS[answer["degree"]]
     codebook = arrays["centroids"].reshape(side * side, 3 * coefficients)
     assert (codebook[arrays["labels"]].ravel() == arrays["shN"]).all()
     assert len(arrays["shN"]) == 3 * coefficients * count
     kinds = {"labels": "Uint16Array", "cells": "Uint32Array"}
-    assert said["types"] == {field: kinds.get(field, "Float32Array") for field in said["types"]}
+    assert answer["types"] == {field: kinds.get(field, "Float32Array") for field in answer["types"]}
     return max(ulps(arrays[name], np.ravel(array)) for name, array in wanted.items())
 
 
-def assert_progress(said):
-    """Progress only grows and ends complete; the mask is first of all, each image comes once."""
-    progress = said["progress"]
+def assert_progress(answer):
+    """Assert that progress increases to completion, with the mask first and each image once."""
+    progress = answer["progress"]
     for key in ("received", "total", "decoded"):
         values = [entry[key] for entry in progress]
         assert values == sorted(values), key
     assert all(entry["received"] <= entry["total"] for entry in progress)
     assert progress[-1]["decoded"] == progress[-1]["planes"] == 9
     assert progress[-1]["received"] == progress[-1]["total"]
-    assert said["order"][0] == "active_mask.webp"
-    assert sorted(said["order"]) == sorted(IMAGES)
-    assert said["later"] == 0
+    assert answer["order"][0] == "active_mask.webp"
+    assert sorted(answer["order"]) == sorted(IMAGES)
+    assert answer["later"] == 0

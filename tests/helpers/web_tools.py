@@ -1,4 +1,4 @@
-"""Helpers of the tests of the JavaScript decoder: Node, Pillow as the reference for pixels, a server."""
+"""Helpers of the JavaScript decoder's tests: Node, Pillow as the reference for pixels, and an HTTP server."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ OLDEST_NODE = (20, 12)
 
 @functools.cache
 def node():
-    """The path of a usable Node; skips the test where there is none."""
+    """Return the path of a usable Node; skip the test if there is none."""
     beside = Path(sys.executable).parent / "node"
     found = shutil.which("node") or (str(beside) if beside.exists() else None)
     if found is None:
@@ -44,7 +44,7 @@ def node():
 
 
 def run_node(program, text="", *arguments, timeout=300, flags=()):
-    """Standard output of a program of this folder (or any path), given a text to read."""
+    """Run a JavaScript program with this standard input and return its standard output."""
     done = subprocess.run(
         [node(), *flags, str(PROGRAMS / program), *map(str, arguments)],
         input=text,
@@ -58,7 +58,7 @@ def run_node(program, text="", *arguments, timeout=300, flags=()):
 
 
 def decode_all(folder, files, **options):
-    """Decode each file by ``decodeWebP``: dicts of width, height, sha256 and ms, or of name and error."""
+    """Decode files with ``decodeWebP``; return dicts of width, height, sha256 and ms, or of name and error."""
     blob = folder / "files.bin"
     blob.write_bytes(b"".join(files))
     job = {"sizes": [len(data) for data in files], **options}
@@ -68,7 +68,7 @@ def decode_all(folder, files, **options):
 
 
 def webp(array, *, exact=True, **options):
-    """Lossless WebP by Pillow."""
+    """Encode an array as lossless WebP with Pillow."""
     buffer = io.BytesIO()
     image = Image.fromarray(np.squeeze(array, 2) if array.shape[2] == 1 else array)
     image.save(buffer, "WEBP", lossless=True, exact=exact, **options)
@@ -76,14 +76,14 @@ def webp(array, *, exact=True, **options):
 
 
 def as_rgba(array):
-    """An image of 1, 3 or 4 channels as a browser has it."""
+    """Convert an image of 1, 3 or 4 channels to RGBA."""
     rgba = np.full((*array.shape[:2], 4), 255, dtype=np.uint8)
     rgba[:, :, : max(array.shape[2], 3)] = array
     return rgba
 
 
 def pillow(data):
-    """Decode by libwebp to four channels; None if it refuses the file."""
+    """Decode a file with libwebp to RGBA; return None if that fails."""
     try:
         with WebPImagePlugin.WebPImageFile(io.BytesIO(data)) as image:
             image.load()
@@ -93,7 +93,7 @@ def pillow(data):
 
 
 class Site:
-    """A server of this project's files, and of whatever a test puts into ``files``; some answers are late."""
+    """HTTP server of this project's files and of ``files``; some responses are delayed."""
 
     def __init__(self):
         self.files: dict[str, bytes] = {}
@@ -148,7 +148,7 @@ class Site:
         return None
 
     def put(self, folder, files):
-        """Address of a folder with these files."""
+        """Serve these files in a folder and return its address."""
         self.files.update({f"/{folder}/{name}": data for name, data in files.items()})
         return f"{self.url}/{folder}/"
 
@@ -159,5 +159,5 @@ class Site:
 
 
 def sha_of(array):
-    """SHA-256 of an array's bytes."""
+    """Return the SHA-256 of an array's bytes."""
     return hashlib.sha256(np.ascontiguousarray(array)).hexdigest()

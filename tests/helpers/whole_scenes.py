@@ -1,6 +1,6 @@
-"""Scenes in which something is easily overlooked, and cameras that look everywhere.
+"""Scenes with parts that are easily overlooked, and cameras that see all parts.
 
-The cameras are this file's own: nothing here imports what the encoder or the evaluation choose cameras with.
+The cameras are independent of those of the encoder and the evaluation.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ BACKGROUNDS = (0.0, 0.5, 1.0)
 
 
 def moved(splats: Splats, *, by: tuple[float, float, float] = (0, 0, 0), scale: float = 1.0) -> Splats:
-    """A copy, scaled about the origin and then moved."""
+    """Return a copy, scaled about the origin and then translated."""
     return Splats(
         means=(splats.means.astype(np.float64) * scale + by).astype(np.float32),
         quats=splats.quats,
@@ -29,14 +29,14 @@ def moved(splats: Splats, *, by: tuple[float, float, float] = (0, 0, 0), scale: 
 
 
 def joined(*parts: Splats) -> Splats:
-    """All of them in one scene, shuffled so that the order tells nothing."""
+    """Return all parts in one scene, in random order."""
     order = np.random.default_rng(5).permutation(sum(len(part) for part in parts))
     names = ("means", "quats", "scales", "opacities", "sh0", "shN")
     return Splats(**{name: np.concatenate([getattr(part, name) for part in parts])[order] for name in names})
 
 
 def surface(points: np.ndarray, normals: np.ndarray, size: float, seed: int) -> Splats:
-    """Flat, nearly opaque Gaussians on a surface, in colours that vary from place to place."""
+    """Return flat, nearly opaque Gaussians on a surface, with varying colours."""
     rng = np.random.default_rng(seed)
     n = len(points)
     axis = np.cross(np.array([0.0, 0.0, 1.0]), normals)
@@ -58,12 +58,12 @@ def surface(points: np.ndarray, normals: np.ndarray, size: float, seed: int) -> 
 
 
 def two(distance: float, scale: float = 1.0) -> Splats:
-    """Two objects of 6,000 Gaussians."""
+    """Return two objects of 6,000 Gaussians."""
     return joined(sample_scene(6000), moved(sample_scene(6000, seed=1), by=(distance, 0, 0), scale=scale))
 
 
 def five() -> Splats:
-    """Five objects of 600 to 9,600 Gaussians."""
+    """Return five objects of 600 to 9,600 Gaussians."""
     places = ((0, 0, 0), (150, 0, 0), (0, 0, 150), (-150, 20, 0), (300, 0, 300))
     counts = (9600, 4800, 2400, 1200, 600)
     return joined(
@@ -72,24 +72,24 @@ def five() -> Splats:
 
 
 def small_detail() -> Splats:
-    """A detailed object of 4,000 Gaussians at 0.03 of the size, in front of a surface."""
+    """Return a detailed object of 4,000 Gaussians at 0.03 of the size, in front of a surface."""
     return joined(sample_scene(12_000), moved(sample_scene(4000, seed=2), by=(0.6, -1.9, -1.2), scale=0.03))
 
 
 def nested() -> Splats:
-    """A scene in the middle of one that is fifty times as large."""
+    """Return a scene in the middle of one fifty times as large."""
     return joined(moved(sample_scene(6000), scale=50), moved(sample_scene(6000, seed=3), by=(20, -70, -30)))
 
 
 def wall() -> Splats:
-    """A plane seen from both sides."""
+    """Return a plane that is seen from both sides."""
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.uniform(-5, 5, (8000, 2)), rng.normal(0, 0.01, (8000, 1))], axis=1)
     return surface(points, np.tile([0.0, 0, 1], (8000, 1)), 10 / np.sqrt(8000), 1)
 
 
 def huge_opaque() -> Splats:
-    """One immense opaque Gaussian beside the scene."""
+    """Return a scene with an enormous opaque Gaussian beside it."""
     one = sample_scene(1)
     giant = Splats(
         means=np.array([[150, 0, 0]], np.float32),
@@ -103,7 +103,7 @@ def huge_opaque() -> Splats:
 
 
 def enormous_sh() -> Splats:
-    """Five Gaussians with an SH coefficient of 1e5."""
+    """Return a scene with an SH coefficient of 1e5 in five Gaussians."""
     scene = sample_scene(10_000)
     shN = scene.shN.copy()
     shN[::2000, 4, 1] = 1e5
@@ -111,7 +111,7 @@ def enormous_sh() -> Splats:
 
 
 def hollow_room() -> Splats:
-    """Six walls seen from within, and nothing in the middle."""
+    """Return six walls seen from inside, with nothing in the middle."""
     rng = np.random.default_rng(2)
     points, normals = rng.uniform(-1, 1, (10_000, 3)), np.zeros((10_000, 3))
     axis, side = rng.integers(0, 3, 10_000), rng.choice([-1.0, 1.0], 10_000)
@@ -121,7 +121,7 @@ def hollow_room() -> Splats:
 
 
 def far_sky() -> Splats:
-    """A scene under 3,000 large Gaussians, a hundred times as far."""
+    """Return a scene under 3,000 large Gaussians at a hundred times the distance."""
     rng = np.random.default_rng(4)
     directions = rng.normal(size=(3000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -146,7 +146,7 @@ SCENES: dict[str, Callable[[], Splats]] = {
 
 
 def camera_at(place: np.ndarray, target: np.ndarray, rng: np.random.Generator, size: tuple[int, int]) -> Camera:
-    """A camera with a field of view of 60 degrees and any roll."""
+    """Return a camera with a field of view of 60 degrees and random roll."""
     ahead = (target - place) / np.linalg.norm(target - place)
     right = np.cross(ahead, rng.normal(size=3))
     right /= np.linalg.norm(right)
@@ -160,7 +160,7 @@ def camera_at(place: np.ndarray, target: np.ndarray, rng: np.random.Generator, s
 def cameras(
     splats: Splats, count: int = 32, seed: int = 11, size: tuple[int, int] = (160, 120)
 ) -> dict[str, list[Camera]]:
-    """``count`` random cameras of each kind: all around; around a random Gaussian; across the scene."""
+    """Return ``count`` random cameras of each kind: all around; around a random Gaussian; across the scene."""
     rng = np.random.default_rng(seed)
     means = splats.means.astype(np.float64)
     middle = np.median(means, axis=0)
@@ -169,9 +169,9 @@ def cameras(
     sizes = np.exp(splats.scales.max(axis=1).astype(np.float64))
 
     def steady(draw: Callable[[], Camera]) -> Camera:
-        """The next one in which no rounding of a position, however small, decides over a large part of the image.
+        """Return the next camera whose image does not depend strongly on tiny changes of positions.
 
-        It does inside a Gaussian, and where one beside the camera is just before or just behind the near plane.
+        It does inside a Gaussian, and if one next to the camera is close to the near plane.
         """
         while True:
             camera = draw()

@@ -1,4 +1,4 @@
-"""Services for the tests: one that many share, and fresh ones."""
+"""Fixtures: a shared service, new services, and a PostgreSQL server."""
 
 import os
 import pwd
@@ -19,7 +19,7 @@ from service.core.models import Base
 
 @pytest.fixture(scope="package")
 def service(tmp_path_factory):
-    """One for all tests that leave it as it was."""
+    """Service shared by tests that do not restart it."""
     with Service(
         tmp_path_factory.mktemp("shared") / "data", KISSGS_MAX_UPLOAD_BYTES="4MB", KISSGS_MAX_GAUSSIANS=20000
     ) as it:
@@ -28,7 +28,7 @@ def service(tmp_path_factory):
 
 @pytest.fixture
 def start(tmp_path):
-    """``start(KISSGS_X=…)`` starts one, or more, that end with the test."""
+    """``start(KISSGS_X=…)`` starts a service, which ends with the test."""
     started = []
 
     def begin(**settings):
@@ -48,13 +48,13 @@ def programs():
 
 @pytest.fixture(scope="session")
 def postgresql_server():
-    """A PostgreSQL server of our own, where its programs are installed."""
+    """A PostgreSQL server for the tests, if its programs are installed."""
     binaries = programs()
     if binaries is None:
         pytest.skip("PostgreSQL is not installed")
-    folder = Path(tempfile.mkdtemp(prefix="kissgs-postgresql-"))  # pytest's own folders are closed to other users
+    folder = Path(tempfile.mkdtemp(prefix="kissgs-postgresql-"))  # other users cannot open pytest's folders
     user = {}
-    if os.geteuid() == 0:  # it refuses to run as root
+    if os.geteuid() == 0:  # PostgreSQL refuses to run as root
         try:
             account = pwd.getpwnam("postgres")
         except KeyError:
@@ -67,7 +67,7 @@ def postgresql_server():
     data, settings = folder / "data", f"listen_addresses=127.0.0.1 -c unix_socket_directories={folder} -c fsync=off"
 
     def run(program, *arguments):
-        with (folder / "log").open("ab") as log:  # a pipe would be held open by the server
+        with (folder / "log").open("ab") as log:  # the server would keep a pipe open
             subprocess.run([binaries / program, "-D", data, *arguments], cwd=folder, check=True, stdout=log, **user)
 
     run("initdb", "-A", "trust", "-U", "postgres", "-E", "UTF8", "--no-sync")
@@ -79,7 +79,7 @@ def postgresql_server():
 
 @pytest.fixture
 def postgresql(postgresql_server):
-    """The URL of its database, without any tables."""
+    """URL of a database without tables."""
     yield postgresql_server
     engine = sa.create_engine(postgresql_server)
     Base.metadata.drop_all(engine)

@@ -1,4 +1,4 @@
-"""Two services on one database, with data folders of their own; oracle: what the first one's jobs come to."""
+"""Two services on one database, with separate data folders; oracle: the outcomes of the first service's jobs."""
 
 import os
 import shutil
@@ -27,24 +27,24 @@ def url(request, tmp_path):
 
 
 @pytest.fixture
-def elsewhere(monkeypatch):
-    """``elsewhere(n)``: from now on this process is another one, on machine ``n``."""
+def on_machine(monkeypatch):
+    """``on_machine(n)`` lets the lease take this process for one on machine ``n``."""
 
-    def move(number):
+    def change(number):
         monkeypatch.setattr(database_lease, "_machine", lambda: number)
 
-    return move
+    return change
 
 
-def facts(url):
+def lease_rows(url):
     store = Store(url, time.time)
-    found = {name: store.fact(name) for name in ("owner", "owner-process", "owner-machine")}
+    found = {name: store.meta_value(name) for name in ("owner", "owner-process", "owner-machine")}
     store.close()
     return found
 
 
-def test_a_copied_folder_on_the_same_database(tmp_path, url):
-    """Its marks are copied with it. The second service used to fail all jobs of the first."""
+def test_a_copied_data_folder_on_the_same_database(tmp_path, url):
+    """The copy has the folder's numbers, too; the second service once marked all jobs of the first as failed."""
     with Service(tmp_path / "first", KISSGS_DATABASE_URL=url) as first:
         running = first.submit(scene_bytes(20_000, 3), SLOW)
         first.running(running)
@@ -64,11 +64,11 @@ def test_a_copied_folder_on_the_same_database(tmp_path, url):
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_the_next_start_waits_for_nobody(tmp_path, url, number):
+def test_a_restart_does_not_wait(tmp_path, url, number):
     with Service(tmp_path / "data", KISSGS_DATABASE_URL=url) as it:
         job = it.ended(it.submit())
         it.kill(number)
-        assert (facts(url)["owner"] is None) == (number == signal.SIGTERM)
+        assert (lease_rows(url)["owner"] is None) == (number == signal.SIGTERM)
         begun = time.monotonic()
         it.restart()
         assert time.monotonic() - begun < 10
@@ -77,46 +77,44 @@ def test_the_next_start_waits_for_nobody(tmp_path, url, number):
 
 
 @pytest.mark.usefixtures("no_variables")
-def test_one_that_crashed_elsewhere_is_waited_for(tmp_path, url, elsewhere, monkeypatch, caplog):
+def test_a_start_waits_for_a_service_that_crashed_on_another_machine(tmp_path, url, on_machine, monkeypatch, caplog):
     monkeypatch.setattr(database_lease, "TAKEOVER_SECONDS", 1.0)
-    elsewhere(1)
+    on_machine(1)
     first = opened(tmp_path / "data", url)
     add_a_job(first)
     first.storage.close()
-    elsewhere(2)
+    on_machine(2)
     begun = time.monotonic()
     with service(tmp_path / "data", url) as context:
         assert 1 <= time.monotonic() - begun < 5
         assert context.store.counts()[State.QUEUED] == 1
-        assert "waiting 1 s for a sign of its life" in caplog.text
-        assert "there was none" in caplog.text
-        with pytest.raises(
-            DatabaseReplacedError, match="another service has taken it over"
-        ):  # it did not crash after all
+        assert "waiting 1 s for its heartbeat" in caplog.text
+        assert "there was no heartbeat" in caplog.text
+        with pytest.raises(DatabaseReplacedError, match="another service has taken it over"):  # it had not crashed
             first.store.claim()
         assert "another service has taken it over" in first.store.health_problem()
         first.store.close()
         context.store.heartbeat()
         assert context.store.health_problem() is None
-    assert facts(url)["owner"] is None
+    assert lease_rows(url)["owner"] is None
 
 
 @pytest.mark.usefixtures("no_variables")
 @pytest.mark.parametrize("ends", ["lives", "stops"])
-def test_one_that_lives_elsewhere(tmp_path, url, elsewhere, ends):
-    elsewhere(1)
+def test_a_service_that_runs_on_another_machine(tmp_path, url, on_machine, ends):
+    on_machine(1)
     first = opened(tmp_path / "data", url)
     job = add_a_job(first)
     shutil.copytree(tmp_path / "data", tmp_path / "copy", ignore=shutil.ignore_patterns("lock"))
-    elsewhere(2)
-    show = first.store.heartbeat if ends == "lives" else first.store.close
-    timer = threading.Timer(1.0, show)
+    on_machine(2)
+    action = first.store.heartbeat if ends == "lives" else first.store.close
+    timer = threading.Timer(1.0, action)
     timer.start()
     begun = time.monotonic()
     if ends == "lives":
-        with pytest.raises(SettingsError, match="on another machine or in another container") as told:
+        with pytest.raises(SettingsError, match="on another machine or in another container") as caught:
             opened(tmp_path / "copy", url)
-        assert "\n" not in str(told.value)
+        assert "\n" not in str(caught.value)
         assert first.store.health_problem() is None
         assert first.store.claim().id == job
         first.store.close()
@@ -129,8 +127,8 @@ def test_one_that_lives_elsewhere(tmp_path, url, elsewhere, ends):
     assert names(tmp_path / "copy" / "jobs") == {job}
 
 
-def test_one_whose_place_was_taken_says_so(tmp_path, url):
-    """It was stopped for a while, as a machine may be. It starts no more jobs and records none."""
+def test_a_service_whose_lease_was_taken_over(tmp_path, url):
+    """A service may be suspended with its machine; afterwards it neither starts nor records jobs."""
     with Service(tmp_path / "data", KISSGS_DATABASE_URL=url) as it:
         it.ended(it.submit())
         store = Store(url, time.time)
@@ -142,10 +140,10 @@ def test_one_whose_place_was_taken_says_so(tmp_path, url):
         assert "another service has taken it over" in ready.json()["checks"]["database"]
         problem(it.http.post("/v1/jobs", content=SMALL), 503, "database")
         assert it.kill(signal.SIGTERM) == 0
-        assert facts(url)["owner"] == 7  # what is another's stays
+        assert lease_rows(url)["owner"] == 7  # the other service's row stays
 
 
-CLAIMING = """
+ACQUIRE = """
 import sys, time
 from service.storage.job_store import Store
 store = Store(sys.argv[1], time.time)
@@ -153,21 +151,21 @@ print("ready", flush=True)
 sys.stdin.readline()
 try:
     store.acquire_database()
-    print("mine", flush=True)
+    print("acquired", flush=True)
 except Exception as error:
     print(error, flush=True)
-while store._watch.owner is not None:
+while store._monitor.owner is not None:
     time.sleep(0.1)
     store.heartbeat()
 """
 
 
-def test_many_that_start_at_once(url):
-    """One of them gets it."""
+def test_simultaneous_starts(url):
+    """Exactly one acquires the lease."""
     store = Store(url, time.time)
-    store.belong_to(1, 2)
+    store.bind_to(1, 2)
     store.close()
-    arguments = [sys.executable, "-c", CLAIMING, url]
+    arguments = [sys.executable, "-c", ACQUIRE, url]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "env": {**os.environ, "PYTHONPATH": str(ROOT)}}
     started = [subprocess.Popen(arguments, text=True, **pipes) for _ in range(4)]
     try:
@@ -175,24 +173,24 @@ def test_many_that_start_at_once(url):
         for process in started:
             process.stdin.write("go\n")
             process.stdin.flush()
-        said = sorted(process.stdout.readline() for process in started)
+        outputs = sorted(process.stdout.readline() for process in started)
     finally:
         for process in started:
             process.kill()
             process.communicate()
-    assert said[3] == "mine\n"
-    assert all("another service" in text for text in said[:3])
+    assert outputs[3] == "acquired\n"
+    assert all("another service" in text for text in outputs[:3])
 
 
 @pytest.mark.parametrize("process", [0, -1, 2.0**40, 1e300])
-def test_process_numbers_that_are_none(process):
+def test_invalid_process_numbers(process):
     assert database_lease._is_free({"owner": 5.0, "owner-process": process, "owner-machine": database_lease._machine()})
 
 
-def test_a_process_that_may_run():
+def test_processes_that_may_run():
     rows = {"owner": 5.0, "owner-process": float(os.getppid()), "owner-machine": database_lease._machine()}
     assert not database_lease._is_free(rows)
     assert not database_lease._is_free({**rows, "owner-machine": 1.0, "owner-process": 2.0**22})
     assert database_lease._is_free(
         {**rows, "owner-process": float(os.getpid())}
-    )  # we are it, after a restart of a container
+    )  # this process, after a restart of a container

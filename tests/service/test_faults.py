@@ -1,4 +1,4 @@
-"""What happens to jobs when things go wrong; oracle: the result of the same job where nothing does."""
+"""Jobs when processes are killed or resources run out; oracle: the result of the job without faults."""
 
 import asyncio
 import contextlib
@@ -22,7 +22,7 @@ MEDIUM = scene_bytes(6_000, 2)
 EXPECTED = kissgs.compress(SMALL, settings=kissgs.Settings(preset="fast")).to_zip()
 
 
-def gone(pid, seconds=5):
+def has_ended(pid, seconds=5):
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         with contextlib.suppress(OSError):
@@ -33,23 +33,23 @@ def gone(pid, seconds=5):
     return False
 
 
-def whole(service, job):
-    """That a job has succeeded, and that nothing is left over."""
+def result_of(service, job):
+    """Return the container of a job, which must succeed and leave no temporary files."""
     status = service.ended(job, seconds=120)
     assert status["state"] == "succeeded", status
     content = service.http.get(status["links"]["result"]).content
-    assert service.strays() == []
+    assert service.leftovers() == []
     return content
 
 
-def test_the_server_is_killed_while_a_job_waits(start):
+def test_the_server_is_killed_while_a_job_is_queued(start):
     service = start()
     running, waiting = service.submit(BIG, SLOW), service.submit()
     service.running(running)
     service.kill(signal.SIGKILL)
     service.restart()
     service.http.post(f"/v1/jobs/{running['id']}/cancel")
-    assert whole(service, waiting) == EXPECTED
+    assert result_of(service, waiting) == EXPECTED
 
 
 def test_the_server_is_killed_while_a_job_runs(start):
@@ -58,14 +58,14 @@ def test_the_server_is_killed_while_a_job_runs(start):
     service.running(job)
     (child,) = service.children()
     service.kill(signal.SIGKILL)
-    assert gone(child), "the job's process outlived the service"
+    assert has_ended(child), "the job's process outlived the service"
     service.restart()
     status = service.ended(job)
     assert (status["state"], status["starts"]) == ("succeeded", 2)
-    assert whole(service, job) == kissgs.compress(MEDIUM, settings=kissgs.Settings(preset="fast")).to_zip()
+    assert result_of(service, job) == kissgs.compress(MEDIUM, settings=kissgs.Settings(preset="fast")).to_zip()
 
 
-def test_the_server_is_killed_while_an_upload_arrives(start):
+def test_the_server_is_killed_during_an_upload(start):
     service = start()
     with service.raw(b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9000000\r\n\r\n" + BIG[:2_000_000]):
         end = time.monotonic() + 10
@@ -74,24 +74,24 @@ def test_the_server_is_killed_while_an_upload_arrives(start):
         assert list((service.folder / "incoming").iterdir())
         service.kill(signal.SIGKILL)
     service.restart()
-    assert service.strays() == []
+    assert service.leftovers() == []
     assert service.http.get("/v1/jobs").json() == {"jobs": []}
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_the_server_is_killed_at_any_time(start, seed):
-    """Again and again, until the job is done all the same."""
+    """The job succeeds although the server is killed several times."""
     service = start(KISSGS_JOB_STARTS=1000)
-    pause = random.Random(seed)
+    rng = random.Random(seed)
     job = service.submit()
     for _ in range(6):
-        time.sleep(pause.uniform(0.0, 2.5))
+        time.sleep(rng.uniform(0.0, 2.5))
         service.kill(signal.SIGKILL)
         service.restart()
-    assert whole(service, job) == EXPECTED
+    assert result_of(service, job) == EXPECTED
 
 
-def test_a_job_that_takes_the_server_down_is_given_up(start):
+def test_a_job_that_crashes_the_server_fails_after_its_last_start(start):
     service = start(KISSGS_JOB_STARTS=2)
     job = service.submit(BIG, SLOW)
     for _ in range(2):
@@ -103,8 +103,8 @@ def test_a_job_that_takes_the_server_down_is_given_up(start):
     assert "2 times" in status["problem"]["detail"]
 
 
-def test_a_result_that_was_whole_is_taken_up(tmp_path):
-    """The server is killed after the result is in its place, and before that is written down."""
+def test_a_complete_result_is_recovered(tmp_path):
+    """The server is killed after the result is in its final folder, but before this is recorded."""
     with Service(tmp_path / "data") as service:
         job = service.ended(service.submit())
         service.kill(signal.SIGKILL)
@@ -112,10 +112,10 @@ def test_a_result_that_was_whole_is_taken_up(tmp_path):
         service.restart()
         status = service.status(job)
         assert (status["state"], status["starts"]) == ("succeeded", 1)
-        assert whole(service, job) == EXPECTED
+        assert result_of(service, job) == EXPECTED
 
 
-def test_a_result_that_was_half_written_is_not(tmp_path):
+def test_an_incomplete_result_is_not_recovered(tmp_path):
     with Service(tmp_path / "data") as service:
         job = service.ended(service.submit())
         service.kill(signal.SIGKILL)
@@ -125,18 +125,18 @@ def test_a_result_that_was_half_written_is_not(tmp_path):
         (folder / "work-0123" / "result" / "scene.zip").write_bytes(b"PK half")
         rewind(service, job, "running")
         service.restart()
-        assert whole(service, job) == EXPECTED
+        assert result_of(service, job) == EXPECTED
         assert service.status(job)["starts"] == 2
 
 
-def test_an_upload_that_has_vanished_fails_its_job(tmp_path):
+def test_a_missing_upload_fails_its_job(tmp_path):
     with Service(tmp_path / "data") as service:
         job = service.ended(service.submit())
         service.kill(signal.SIGKILL)
         rewind(service, job, "queued")
         (service.folder / "jobs" / job["id"] / "scene.ply").unlink()
         shutil.rmtree(service.folder / "jobs" / job["id"] / "result")
-        (service.folder / "jobs" / ("0" * 32)).mkdir()  # of no job
+        (service.folder / "jobs" / ("0" * 32)).mkdir()  # belongs to no job
         service.restart()
         status = service.status(job)
         assert (status["state"], status["problem"]["code"]) == ("failed", "internal")
@@ -144,8 +144,10 @@ def test_an_upload_that_has_vanished_fails_its_job(tmp_path):
         assert [path.name for path in (service.folder / "jobs" / ".orphaned").iterdir()] == ["0" * 32]
         ready = service.http.get("/readyz")
         assert (ready.status_code, ready.json()["ready"]) == (200, True)
-        assert ready.json()["checks"]["orphaned"].endswith("lie in jobs/.orphaned of the data folder: 1")
-        assert f"were set aside in {service.folder}/jobs/.orphaned: 1\n" in service.log.read_text()
+        assert ready.json()["checks"]["orphaned"].endswith(
+            "folders without a job in jobs/.orphaned of the data folder: 1"
+        )
+        assert f"were moved to {service.folder}/jobs/.orphaned: 1\n" in service.log.read_text()
 
 
 def test_the_server_is_killed_while_the_result_is_written(start):
@@ -156,16 +158,16 @@ def test_the_server_is_killed_while_the_result_is_written(start):
         time.sleep(0.001)
     service.kill(signal.SIGKILL)
     service.restart()
-    assert whole(service, job) == kissgs.compress(MEDIUM, settings=kissgs.Settings(preset="fast")).to_zip()
+    assert result_of(service, job) == kissgs.compress(MEDIUM, settings=kissgs.Settings(preset="fast")).to_zip()
 
 
-def test_jobs_in_postgresql_survive_as_well(start, postgresql):
+def test_jobs_in_postgresql_survive(start, postgresql):
     service = start(KISSGS_DATABASE_URL=postgresql)
     done, running, waiting = service.ended(service.submit()), service.submit(MEDIUM), service.submit()
     service.running(running)
     service.kill(signal.SIGKILL)
     service.restart()
-    assert whole(service, waiting) == whole(service, done) == EXPECTED
+    assert result_of(service, waiting) == result_of(service, done) == EXPECTED
     assert service.status(running)["starts"] == 2
     listed = service.http.get("/v1/jobs").json()["jobs"]
     assert [job["id"] for job in listed] == [job["id"] for job in (waiting, running, done)]
@@ -173,7 +175,7 @@ def test_jobs_in_postgresql_survive_as_well(start, postgresql):
 
 
 def rewind(service, job, state):
-    """Make the database of a dead service say that a job is not done yet."""
+    """Reset a job in the database of a stopped service to a state before its end."""
     import sqlite3
 
     with contextlib.closing(sqlite3.connect(service.folder / "jobs.sqlite")) as database, database:
@@ -190,10 +192,10 @@ def test_the_job_process_is_killed_once(start):
     os.kill(service.children()[0], signal.SIGKILL)
     status = service.ended(job)
     assert (status["state"], status["starts"]) == ("succeeded", 2)
-    assert service.strays() == []
+    assert service.leftovers() == []
 
 
-def test_the_job_process_is_killed_again(start):
+def test_the_job_process_is_killed_twice(start):
     service = start()
     job, next_one = service.submit(BIG, SLOW), service.submit()
     for start_number in (1, 2):
@@ -204,10 +206,10 @@ def test_the_job_process_is_killed_again(start):
     assert (status["state"], status["starts"]) == ("failed", 2)
     assert (status["problem"]["code"], status["problem"]["retryable"]) == ("crashed", True)
     assert "SIGKILL" in status["problem"]["detail"]
-    assert whole(service, next_one) == EXPECTED
+    assert result_of(service, next_one) == EXPECTED
 
 
-def test_a_job_that_needs_too_much_memory(start):
+def test_a_job_beyond_the_memory_limit(start):
     service = start(KISSGS_JOB_MEMORY="256MiB")
     job = service.ended(service.submit(scene_bytes(120_000, 3), '{"preset": "balanced"}'), seconds=120)
     assert (job["state"], job["starts"]) == ("failed", 1)
@@ -218,7 +220,7 @@ def test_a_job_that_needs_too_much_memory(start):
 
 
 @pytest.mark.parametrize(
-    "last_words",
+    "output",
     [
         "LLVM ERROR: out of memory\nBuffer allocation failed",
         "OpenBLAS error: Memory allocation still failed after 10 retries, giving up.",
@@ -226,12 +228,12 @@ def test_a_job_that_needs_too_much_memory(start):
         "numpy._core._exceptions._ArrayMemoryError: Unable to allocate 17 MiB",
     ],
 )
-def test_libraries_that_meet_the_memory_limit_in_their_own_words(tmp_path, last_words):
-    trace = tmp_path / "stderr.txt"
-    trace.write_text(last_words)
-    assert JobProcess(seconds=1)._explain(-signal.SIGABRT, trace, 1 << 30).data["code"] == "memory-limit"
-    trace.write_text("Segmentation fault")
-    assert JobProcess(seconds=1)._explain(-signal.SIGSEGV, trace, 1 << 30).kind == "crashed"
+def test_messages_of_libraries_at_the_memory_limit(tmp_path, output):
+    stderr_file = tmp_path / "stderr.txt"
+    stderr_file.write_text(output)
+    assert JobProcess(seconds=1)._explain(-signal.SIGABRT, stderr_file, 1 << 30).data["code"] == "memory-limit"
+    stderr_file.write_text("Segmentation fault")
+    assert JobProcess(seconds=1)._explain(-signal.SIGSEGV, stderr_file, 1 << 30).kind == "crashed"
 
 
 @pytest.mark.parametrize(
@@ -239,19 +241,19 @@ def test_libraries_that_meet_the_memory_limit_in_their_own_words(tmp_path, last_
     [
         (-signal.SIGSEGV, 0.9, "memory-limit"),
         (-signal.SIGSEGV, 0.7, "crashed"),
-        (-signal.SIGKILL, 0.9, "crashed"),  # from outside: the machine's memory, or a person
+        (-signal.SIGKILL, 0.9, "crashed"),  # killed from outside: by the system or by a person
         (1, 0.9, "memory-limit"),
         (1, 0.7, "internal"),
     ],
 )
-def test_a_process_that_dies_without_a_word_near_its_memory_limit(tmp_path, status, used, expected):
-    child = JobProcess(seconds=1)
-    child._peak_data = int(used * (1 << 30))
-    outcome = child._explain(status, tmp_path / "stderr.txt", 1 << 30)
+def test_a_crash_without_a_message_near_the_memory_limit(tmp_path, status, used, expected):
+    process = JobProcess(seconds=1)
+    process._peak_data = int(used * (1 << 30))
+    outcome = process._explain(status, tmp_path / "stderr.txt", 1 << 30)
     assert outcome.data.get("code", outcome.kind) == expected
 
 
-def test_a_job_that_takes_too_long(start):
+def test_a_job_beyond_the_time_limit(start):
     service = start(KISSGS_JOB_SECONDS=1.5)
     job, next_one = service.submit(BIG, SLOW), service.submit()
     status = service.ended(job)
@@ -263,11 +265,11 @@ def test_a_job_that_takes_too_long(start):
 
 @pytest.fixture
 def tiny_disk(tmp_path):
-    """A file system of 3 MB."""
+    """File system of 3 MB."""
     folder = tmp_path / "tiny"
     folder.mkdir()
     if os.geteuid() != 0 or os.system(f"mount -t tmpfs -o size=3m tmpfs '{folder}' 2>/dev/null") != 0:
-        pytest.skip("mounting a small file system needs root, and leave to mount")
+        pytest.skip("mounting a small file system is not permitted")
     yield folder
     os.system(f"umount -l '{folder}'")
 
@@ -278,8 +280,8 @@ def test_a_disk_that_fills_up_during_an_upload(tiny_disk):
         for body in (BIG, iter([BIG[:2_000_000], BIG[2_000_000:]])):
             answer = service.http.post("/v1/jobs", content=body, params={"options": FAST})
             problem(answer, 507, "disk-full")
-            assert service.strays() == []
-        assert whole(service, service.submit()) == EXPECTED
+            assert service.leftovers() == []
+        assert result_of(service, service.submit()) == EXPECTED
 
 
 def test_a_disk_that_fills_up_during_a_job(tiny_disk):
@@ -291,15 +293,15 @@ def test_a_disk_that_fills_up_during_a_job(tiny_disk):
             while True:
                 file.write(bytes(4096))
         time.sleep(3)
-        filler.unlink()  # while the disk is full, not even the failure can be written down
+        filler.unlink()  # while the disk is full, not even the failure can be recorded
         status = service.ended(job)
         assert status["state"] in ("failed", "succeeded")
         if status["state"] == "failed":
             assert (status["problem"]["code"], status["problem"]["retryable"]) == ("output", True)
-        assert whole(service, service.submit()) == EXPECTED
+        assert result_of(service, service.submit()) == EXPECTED
 
 
-def test_stopping_lets_a_short_job_finish(start):
+def test_a_short_job_ends_before_the_service_stops(start):
     service = start()
     job = service.submit(MEDIUM)
     service.running(job)
@@ -309,38 +311,38 @@ def test_stopping_lets_a_short_job_finish(start):
     assert (status["state"], status["starts"]) == ("succeeded", 1)
 
 
-def test_stopping_puts_a_long_job_back(start):
+def test_a_long_job_is_requeued_when_the_service_stops(start):
     service = start(KISSGS_DRAIN_SECONDS=0.5)
     job = service.submit(BIG, SLOW)
     service.running(job)
     (child,) = service.children()
-    heard = []
+    lines = []
 
     def listen():
         with contextlib.suppress(Exception), service.http.stream("GET", job["links"]["events"]) as answer:
-            heard.extend(answer.iter_lines())
+            lines.extend(answer.iter_lines())
 
     listener = threading.Thread(target=listen)
     listener.start()
     time.sleep(0.3)
     begun = time.monotonic()
     assert service.kill(signal.SIGTERM) == 0
-    assert time.monotonic() - begun < 5  # the open stream does not hold it up
+    assert time.monotonic() - begun < 5  # the open stream does not delay it
     listener.join(5)
     assert not listener.is_alive()
-    assert gone(child)
+    assert has_ended(child)
     service.restart()
     service.running(job)
-    assert service.status(job)["starts"] == 1  # an orderly stop counts against nobody
+    assert service.status(job)["starts"] == 1  # an orderly stop does not count as a start
     seen = service.http.get("/v1/jobs").json()
     assert len(seen["jobs"]) == 1
 
 
-def test_many_jobs_at_once(start):
-    """200 at the same time: none is lost, none is done twice, memory stays flat."""
+def test_many_simultaneous_jobs(start):
+    """No job of 200 is lost or runs twice, and the server's memory hardly grows."""
     service = start(KISSGS_MAX_QUEUE=500, KISSGS_MAX_UPLOADS=32, KISSGS_WORKERS=2, KISSGS_JOB_THREADS=1)
     scenes = [scene_bytes(20, 0, seed=i) for i in range(200)]
-    whole(service, service.submit(scenes[0]))
+    result_of(service, service.submit(scenes[0]))
     before = service.memory()
 
     def send(i):
@@ -350,7 +352,7 @@ def test_many_jobs_at_once(start):
                 return answer.json()
             problem(answer, 429, "too-many-uploads")
             time.sleep(0.2)
-        raise AssertionError("never let in")
+        raise AssertionError("never accepted")
 
     with ThreadPoolExecutor(50) as pool:
         jobs = list(pool.map(send, range(200)))
@@ -367,10 +369,10 @@ def test_many_jobs_at_once(start):
         if status["state"] == "succeeded":
             expected = kissgs.compress(scenes[i], settings=kissgs.Settings(preset="fast")).to_zip()
             assert service.http.get(status["links"]["result"]).content == expected
-    assert service.strays() == []
+    assert service.leftovers() == []
 
 
-def test_one_key_at_the_same_time(start):
+def test_simultaneous_requests_with_one_idempotency_key(start):
     service = start()
     with ThreadPoolExecutor(8) as pool:
         jobs = list(pool.map(lambda _: service.submit(MEDIUM, **{"Idempotency-Key": "same"}), range(8)))
@@ -378,28 +380,28 @@ def test_one_key_at_the_same_time(start):
     assert len(service.http.get("/v1/jobs").json()["jobs"]) == 1
     assert service.ended(jobs[0])["state"] == "succeeded"
     assert len(list((service.folder / "jobs").iterdir())) == 1
-    assert service.strays() == []
+    assert service.leftovers() == []
 
 
 def test_expiry(start):
     service = start(KISSGS_KEEP_SECONDS=3, KISSGS_SWEEP_SECONDS=0.2)
     job = service.ended(service.submit())
-    assert whole(service, job) == EXPECTED
+    assert result_of(service, job) == EXPECTED
     end = time.monotonic() + 20
     while service.status(job)["state"] != "expired":
         assert time.monotonic() < end
         time.sleep(0.1)
     problem(service.http.get(f"/v1/jobs/{job['id']}/result"), 410, "gone")
-    while (service.folder / "jobs" / job["id"]).exists():  # removed once that is written down
+    while (service.folder / "jobs" / job["id"]).exists():  # removed after this is recorded
         assert time.monotonic() < end
         time.sleep(0.02)
     assert list((service.folder / "jobs").iterdir()) == []
-    while service.http.get(f"/v1/jobs/{job['id']}").status_code != 404:  # and forgotten, after as long again
+    while service.http.get(f"/v1/jobs/{job['id']}").status_code != 404:  # deleted after as long again
         assert time.monotonic() < end
         time.sleep(0.1)
 
 
-def test_uploads_are_not_kept_where_that_is_not_wanted(start):
+def test_uploads_can_be_removed_after_success(start):
     service = start(KISSGS_KEEP_UPLOADS="false")
     job = service.ended(service.submit())
     assert "source" not in job["links"]
@@ -413,8 +415,8 @@ def test_two_services_cannot_share_a_folder(start, tmp_path):
     assert service.http.get("/livez").status_code == 200
 
 
-def test_the_clock_jumps(tmp_path, monkeypatch):
-    """A year forward, and back: nothing expires before its time, nothing takes less than no time."""
+def test_clock_jumps(tmp_path, monkeypatch):
+    """A jump of the clock by a year neither expires jobs early nor makes durations negative."""
     from service.core.models import State
     from service.core.settings import ServiceSettings
     from service.http.app import build
@@ -436,7 +438,7 @@ def test_the_clock_jumps(tmp_path, monkeypatch):
         assert 0 <= found.started_at - found.created_at < 60
     context.store.close()
     context.storage.close()
-    restarted = build(ServiceSettings.from_environment())  # a year back: time goes on from where it was
+    restarted = build(ServiceSettings.from_environment())  # a year back: the time continues
     assert 0 <= restarted.clock() - found.finished_at < 60
     restarted.storage.close()
 

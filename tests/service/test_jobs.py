@@ -1,4 +1,4 @@
-"""Jobs over HTTP; oracles: kissgs.compress of the same scene, and the specifications of HTTP and its headers."""
+"""Jobs over HTTP; oracles: kissgs.compress of the scene, and the specifications of HTTP headers."""
 
 import base64
 import hashlib
@@ -27,11 +27,11 @@ def job(service):
 
 @pytest.fixture(scope="module")
 def local():
-    """The same, without a service."""
+    """Compress the scene without a service."""
     return kissgs.compress(SMALL, settings=kissgs.Settings(preset="fast"))
 
 
-def test_submitting_a_body(service):
+def test_submitting_a_raw_body(service):
     answer = service.http.post("/v1/jobs", content=SMALL, params={"options": FAST, "name": "/etc/pass wd.PLY"})
     assert answer.status_code == 202
     status = answer.json()
@@ -77,12 +77,12 @@ def test_training_in_a_job(service):
     "compact",
     [{"ratio": 2}, {"count": 0}, {"count": 5, "ratio": 0.1}, {"max_psnr_drop": -1}, {"speed": 1}, {"auto_count": True}],
 )
-def test_impossible_budgets_are_refused(service, compact):
+def test_invalid_budgets_are_refused(service, compact):
     answer = service.http.post("/v1/jobs", content=SMALL, params={"options": json.dumps({"compact": compact})})
     problem(answer, 422, "invalid-request")
 
 
-def test_a_service_without_torch_does_not_accept_what_it_cannot_do(monkeypatch):
+def test_training_needs_torch(monkeypatch):
     monkeypatch.setattr("service.http.submission.can_train", lambda: False)
     with pytest.raises(ProblemError, match="need torch, which this server does not have"):
         parse_options('{"compact": {"ratio": 0.2}}')
@@ -95,12 +95,12 @@ def test_a_service_without_torch_does_not_accept_what_it_cannot_do(monkeypatch):
     ("compact", "resumable"),
     [({"ratio": 0.2}, True), ({"count": 9}, True), ({"max_psnr_drop": 0.2}, False), ({}, False)],
 )
-def test_which_training_can_be_taken_up(compact, resumable):
+def test_resumable_options(compact, resumable):
     assert parse_options(json.dumps({"compact": compact})).resumable == resumable
     assert not parse_options(json.dumps({"preset": "fast", "compact": compact})).resumable
 
 
-def test_a_goal_and_as_many_gaussians_as_it_needs(service):
+def test_goals_and_count_search(service):
     prune = {
         "auto_count": True,
         "max_compactions": 1,
@@ -120,7 +120,7 @@ def test_a_goal_and_as_many_gaussians_as_it_needs(service):
     assert lost["state"] == "succeeded", lost
 
 
-def test_limits_tell_whether_it_trains(service):
+def test_limits_say_if_training_is_possible(service):
     assert service.http.get("/v1/limits").json()["training"] is True
 
 
@@ -135,7 +135,7 @@ def test_a_body_without_a_length(service):
     assert service.ended(answer.json())["state"] == "succeeded"
 
 
-def test_the_status_tells_what_the_library_reports(service, job, local):
+def test_the_status_equals_the_report(service, job, local):
     report = local.report
     assert (job["state"], job["kept"], job["invisible"]) == ("succeeded", report.count, report.invisible)
     assert job["cleaned"] == report.as_dict()["cleaned"]
@@ -151,7 +151,7 @@ def test_the_status_tells_what_the_library_reports(service, job, local):
     assert "cancel" not in job["links"]
 
 
-def test_every_link_leads_somewhere(service, job):
+def test_every_link_works(service, job):
     for name, link in job["links"].items():
         for file in job["sizes"]["files"] if name == "files" else [""]:
             answer = service.http.get(link.replace("{name}", file))
@@ -174,18 +174,18 @@ def test_the_result_is_the_container_of_the_library(service, job, local):
 
 
 @pytest.mark.parametrize("name", ["result", "report", "source", "decoded"])
-def test_head_answers_what_get_does_without_a_body(service, job, name):
-    got, head = service.http.get(job["links"][name]), service.http.head(job["links"][name])
+def test_head_equals_get_without_a_body(service, job, name):
+    get, head = service.http.get(job["links"][name]), service.http.head(job["links"][name])
     assert head.content == b""
     volatile = ("date", "x-request-id")
     assert {k: v for k, v in head.headers.items() if k not in volatile} == {
-        k: v for k, v in got.headers.items() if k not in volatile
+        k: v for k, v in get.headers.items() if k not in volatile
     }
-    assert int(head.headers["content-length"]) == len(got.content)
+    assert int(head.headers["content-length"]) == len(get.content)
 
 
 @pytest.mark.parametrize(
-    ("asked", "slice_"),
+    ("requested", "slice_"),
     [
         ("bytes=0-3", slice(0, 4)),
         ("bytes=10-", slice(10, None)),
@@ -193,17 +193,17 @@ def test_head_answers_what_get_does_without_a_body(service, job, name):
         ("bytes=5-99999999", slice(5, None)),
     ],
 )
-def test_ranges(service, job, local, asked, slice_):
-    answer = service.http.get(job["links"]["result"], headers={"Range": asked})
-    whole = local.to_zip()
-    assert (answer.status_code, answer.content) == (206, whole[slice_])
-    start = slice_.indices(len(whole))[0]
-    assert answer.headers["content-range"] == f"bytes {start}-{start + len(answer.content) - 1}/{len(whole)}"
-    assert "content-digest" not in answer.headers  # which would be of these bytes
+def test_ranges(service, job, local, requested, slice_):
+    answer = service.http.get(job["links"]["result"], headers={"Range": requested})
+    full = local.to_zip()
+    assert (answer.status_code, answer.content) == (206, full[slice_])
+    start = slice_.indices(len(full))[0]
+    assert answer.headers["content-range"] == f"bytes {start}-{start + len(answer.content) - 1}/{len(full)}"
+    assert "content-digest" not in answer.headers  # it would be the digest of the range
     assert "repr-digest" in answer.headers
 
 
-def test_a_range_of_another_version_is_not_served(service, job, local):
+def test_if_range(service, job, local):
     tag = service.http.head(job["links"]["result"]).headers["etag"]
     same = service.http.get(job["links"]["result"], headers={"Range": "bytes=0-3", "If-Range": tag})
     other = service.http.get(job["links"]["result"], headers={"Range": "bytes=0-3", "If-Range": '"other"'})
@@ -212,21 +212,21 @@ def test_a_range_of_another_version_is_not_served(service, job, local):
 
 
 @pytest.mark.parametrize(
-    "asked", ["bytes=3-1", "bytes=a-b", "lines=1-2", "bytes=0-1,4-5", "bytes", "bytes=-", "bytes=" + "9" * 50 + "-"]
+    "requested", ["bytes=3-1", "bytes=a-b", "lines=1-2", "bytes=0-1,4-5", "bytes", "bytes=-", "bytes=" + "9" * 50 + "-"]
 )
-def test_ranges_that_are_none_are_ignored(service, job, local, asked):
-    answer = service.http.get(job["links"]["result"], headers={"Range": asked})
+def test_invalid_ranges_are_ignored(service, job, local, requested):
+    answer = service.http.get(job["links"]["result"], headers={"Range": requested})
     assert (answer.status_code, answer.content) == (200, local.to_zip())
 
 
-@pytest.mark.parametrize("asked", ["bytes=99999999-", "bytes=-0"])
-def test_ranges_outside_the_file(service, job, asked):
-    answer = service.http.get(job["links"]["result"], headers={"Range": asked})
+@pytest.mark.parametrize("requested", ["bytes=99999999-", "bytes=-0"])
+def test_ranges_outside_the_file(service, job, requested):
+    answer = service.http.get(job["links"]["result"], headers={"Range": requested})
     problem(answer, 416, "range")
     assert answer.headers["content-range"] == f"bytes */{job['sizes']['container']}"
 
 
-def test_what_the_client_has_is_not_sent_again(service, job):
+def test_if_none_match(service, job):
     tag = service.http.head(job["links"]["result"]).headers["etag"]
     for sent in (tag, f'"x", W/{tag}', "*"):
         answer = service.http.get(job["links"]["result"], headers={"If-None-Match": sent})
@@ -247,7 +247,7 @@ def test_files_by_name(service, job, local):
     "name",
     ["summary.json", "..%2fscene.zip", "..%2Freport.json", "%2e%2e%2f%2e%2e", "nothing", "META.JSON", "files", "%00"],
 )
-def test_other_names_are_no_files(service, job, name):
+def test_unknown_file_names(service, job, name):
     problem(service.http.get(f"/v1/jobs/{job['id']}/files/{name}"), 404, "not-found")
 
 
@@ -269,7 +269,7 @@ def test_the_source_and_the_report(service, job, local):
     }
 
 
-def test_following_by_events(service):
+def test_following_an_event_stream(service):
     job = service.submit()
     answer = service.http.get(job["links"]["events"])
     assert answer.headers["content-type"].startswith("text/event-stream")
@@ -284,12 +284,12 @@ def test_following_by_events(service):
     assert found[-1][2]["job"]["sizes"] == service.status(job)["sizes"]
 
 
-def test_events_are_taken_up_where_they_broke_off(service, job):
-    everything = events(service.http.get(job["links"]["events"]).text)
-    for last in range(1, len(everything)):
+def test_events_resume_after_the_last_id(service, job):
+    all_events = events(service.http.get(job["links"]["events"]).text)
+    for last in range(1, len(all_events)):
         rest = service.http.get(job["links"]["events"], headers={"Last-Event-ID": str(last)})
-        assert events(rest.text) == everything[last:]
-    over = service.http.get(job["links"]["events"], headers={"Last-Event-ID": str(len(everything))})
+        assert events(rest.text) == all_events[last:]
+    over = service.http.get(job["links"]["events"], headers={"Last-Event-ID": str(len(all_events))})
     assert (over.status_code, over.content) == (204, b"")
     problem(service.http.get(job["links"]["events"], headers={"Last-Event-ID": "x"}), 422, "invalid-request")
 
@@ -359,13 +359,13 @@ def test_cancelling_stops_the_work(start):
     assert answer.json()["state"] == "cancelled"
     assert service.children() == []
     assert "problem" not in answer.json()
-    assert service.http.post(job["links"]["cancel"] or "").json()["state"] == "cancelled"  # again: nothing changes
+    assert service.http.post(job["links"]["cancel"] or "").json()["state"] == "cancelled"  # no change
     problem(service.http.get(f"/v1/jobs/{job['id']}/result"), 409, "not-succeeded")
     assert not (service.folder / "jobs" / job["id"]).exists()
-    assert service.ended(service.submit())["state"] == "succeeded"  # the worker goes on
+    assert service.ended(service.submit())["state"] == "succeeded"  # the worker continues
 
 
-def test_cancelling_what_waits_and_what_has_ended(start):
+def test_cancelling_queued_and_ended_jobs(start):
     service = start()
     running, waiting = service.submit(scene_bytes(20_000, 3), SLOW), service.submit()
     assert service.http.post(waiting["links"]["cancel"]).json()["state"] == "cancelled"
@@ -386,7 +386,7 @@ def test_deleting(start):
     assert list((service.folder / "jobs").iterdir()) == []
 
 
-def test_results_of_jobs_that_have_none(start):
+def test_results_of_active_jobs(start):
     service = start()
     job = service.submit(scene_bytes(20_000, 3), SLOW)
     for name in ("result", "report", "decoded", "source", "files/meta.json"):
@@ -395,14 +395,14 @@ def test_results_of_jobs_that_have_none(start):
         assert int(answer.headers["retry-after"]) >= 1
 
 
-def test_compressing_while_one_waits(service, local):
+def test_synchronous_compression(service, local):
     answer = service.http.post("/v1/compress", content=SMALL, params={"options": FAST})
     assert (answer.status_code, answer.content) == (200, local.to_zip())
     job = service.http.get(answer.headers["link"].split(";")[0].strip("<>")).json()
     assert job["links"]["result"] == answer.headers["content-location"]
 
 
-def test_compressing_becomes_a_job_when_the_time_is_over(start):
+def test_synchronous_compression_becomes_a_job_after_the_time_limit(start):
     service = start(KISSGS_SYNC_SECONDS=0.5)
     answer = service.http.post("/v1/compress", content=scene_bytes(20_000, 3), params={"options": SLOW})
     assert answer.status_code == 202
@@ -411,7 +411,7 @@ def test_compressing_becomes_a_job_when_the_time_is_over(start):
     assert service.status(answer.json())["state"] in ("queued", "running")
 
 
-def test_a_client_that_only_takes_a_zip_gets_an_error_when_the_time_is_over(start):
+def test_a_client_that_only_accepts_zip_gets_an_error_after_the_time_limit(start):
     service = start(KISSGS_SYNC_SECONDS=0.5)
     answer = service.http.post(
         "/v1/compress",
@@ -497,7 +497,7 @@ def test_an_idempotency_key_makes_one_job(service):
     assert list((service.folder / "incoming").iterdir()) == []
 
 
-def test_names_are_never_paths(service):
+def test_names_are_sanitised(service):
     for name, kept in {
         "../../x.ply": "x",
         "a\\b.ply": "b",

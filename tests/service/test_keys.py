@@ -1,4 +1,4 @@
-"""Who may do what; oracle: SHA-256 by the standard library."""
+"""Authorisation by keys, origins and host names; oracle: SHA-256 of the standard library."""
 
 import hashlib
 
@@ -18,7 +18,7 @@ def guarded(start):
     return start(KISSGS_KEYS=", ".join(entries), KISSGS_MAX_JOBS_PER_KEY=2)
 
 
-def test_without_a_key_nothing_is_told(guarded):
+def test_a_missing_or_unknown_key(guarded):
     for headers in (
         {},
         bearer("kissgs_x"),
@@ -46,8 +46,8 @@ def test_a_body_is_not_read_without_a_key(guarded):
         assert connection.recv(65536).startswith(b"HTTP/1.1 401")
 
 
-def test_jobs_are_their_owners(guarded):
-    """Both keys of one owner, which is how keys are exchanged; nobody else's."""
+def test_jobs_are_private_to_their_owner(guarded):
+    """All keys of an owner give access, so that keys can be replaced; keys of other owners do not."""
     alice, bob = bearer("kissgs_a1"), bearer("kissgs_b")
     params = {"options": FAST}
     job = guarded.http.post("/v1/jobs", content=SMALL, params=params, headers={**alice, "Idempotency-Key": "k"}).json()
@@ -87,8 +87,8 @@ def test_other_origins(start, service):
     assert allowed.http.options("/v1/jobs", headers=asked).status_code == 200
 
 
-def test_pages_of_other_sites_cannot_use_it(service, start):
-    """A browser sends a form anywhere without asking; it does say whose page it was."""
+def test_pages_of_other_sites_are_refused(service, start):
+    """Browsers send forms to other sites without a preflight request, but with the origin of the page."""
     form = {"file": ("x.ply", SMALL)}
     for origin in ("https://evil.example", "null", service.url.replace("127.0.0.1", "localhost")):
         answer = service.http.post("/v1/jobs", files=form, headers={"Origin": origin})
@@ -96,15 +96,15 @@ def test_pages_of_other_sites_cannot_use_it(service, start):
     for method, path in (("POST", "/v1/jobs/" + "0" * 32 + "/cancel"), ("DELETE", "/v1/jobs/" + "0" * 32)):
         problem(service.http.request(method, path, headers={"Origin": "https://evil.example"}), 403, "foreign")
     assert service.http.post("/v1/jobs", files=form, headers={"Origin": service.url}).status_code == 202
-    for origin, host in (("LOCALHOST", "localhost"), ("localhost", "LocalHost")):  # names have no case
+    for origin, host in (("LOCALHOST", "localhost"), ("localhost", "LocalHost")):  # host names are case-insensitive
         headers = {"Origin": f"http://{origin}:{service.port}", "Host": f"{host}:{service.port}"}
         assert service.http.post("/v1/jobs", files=form, headers=headers).status_code == 202
     allowed = start(KISSGS_CORS_ORIGINS="https://Good.example")
     assert allowed.http.post("/v1/jobs", files=form, headers={"Origin": "https://good.example"}).status_code == 202
 
 
-def test_it_answers_to_its_own_names(service, start):
-    """A name that somebody else has pointed here makes his pages ours in the eyes of a browser."""
+def test_unknown_host_names_are_refused(service, start):
+    """DNS rebinding: pages of a foreign name that resolves to this address would count as the same origin."""
     for host in ("evil.example", f"evil.example:{service.port}", "127.0.0.1.evil.example", ""):
         problem(service.http.get("/v1/jobs", headers={"Host": host}), 403, "foreign")
     for host in ("localhost", f"LOCALHOST:{service.port}", "127.0.0.1", f"[::1]:{service.port}"):

@@ -1,4 +1,4 @@
-"""Many clients, idle ones and hostile ones; oracle: what one client meets when it is alone."""
+"""Many clients, also idle and hostile ones; oracle: the responses for a single client."""
 
 import contextlib
 import os
@@ -12,13 +12,13 @@ import time
 import uuid
 
 import pytest
-from helpers.service import SLOW, SMALL, events, problem, said, scene_bytes
+from helpers.service import SLOW, SMALL, events, problem, read_response, scene_bytes
 
 BIG = scene_bytes(20_000, 3)
 
 
-def worst(service, count=60):
-    """Seconds of the slowest of some looks at the limits."""
+def slowest(service, count=60):
+    """Return the seconds of the slowest of ``count`` requests for the limits."""
     spent = []
     for _ in range(count):
         begun = time.perf_counter()
@@ -28,17 +28,17 @@ def worst(service, count=60):
     return max(spent)
 
 
-def test_idle_connections_harm_no_job(start):
-    """With few descriptors, three hundred of them made jobs fail that could not open their files."""
+def test_idle_connections_do_not_fail_jobs(start):
+    """Idle connections once used up all file descriptors, so that jobs could not open their files."""
     service = start()
     resource.prlimit(service.process.pid, resource.RLIMIT_NOFILE, (300, 300))
     jobs = [service.submit() for _ in range(3)]
-    crowd = []
+    connections = []
     for _ in range(400):
         with contextlib.suppress(OSError):
-            crowd.append(socket.create_connection(("127.0.0.1", service.port), timeout=5))
+            connections.append(socket.create_connection(("127.0.0.1", service.port), timeout=5))
     time.sleep(3)
-    for connection in crowd:
+    for connection in connections:
         connection.close()
     for job in jobs:
         status = service.ended(job)
@@ -52,32 +52,32 @@ def test_abandoned_long_polls_cost_nothing(start):
     for _ in range(300):
         with service.raw(b"GET /v1/jobs/%b?wait=30 HTTP/1.1\r\nHost: localhost\r\n\r\n" % job["id"].encode()):
             pass
-    assert worst(service) < 2
+    assert slowest(service) < 2
     begun = time.monotonic()
     assert service.kill(signal.SIGTERM) == 0
-    assert time.monotonic() - begun < 8  # nobody is waited for but the job
+    assert time.monotonic() - begun < 8  # it waits for the job only
 
 
-def test_many_followers_see_the_same(start):
+def test_many_event_streams_are_equal(start):
     service = start()
     job = service.submit(scene_bytes(4_000, 1))
-    heard = [None] * 30
+    streams = [None] * 30
 
     def follow(i):
-        heard[i] = service.http.get(job["links"]["events"]).text
+        streams[i] = service.http.get(job["links"]["events"]).text
 
     threads = [threading.Thread(target=follow, args=(i,)) for i in range(30)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join(60)
-    # What a state tells beside its name is how things stood when it was sent.
-    told = [[(number, kind, {**data, "job": None}) for number, kind, data in events(text)] for text in heard]
-    assert all(story == told[0] for story in told)
-    assert told[0][-1][2]["state"] == "succeeded"
+    # The status in a state event depends on when it was sent.
+    found = [[(number, kind, {**data, "job": None}) for number, kind, data in events(text)] for text in streams]
+    assert all(stream == found[0] for stream in found)
+    assert found[0][-1][2]["state"] == "succeeded"
 
 
-def test_bodies_in_single_bytes_are_cut_off(start):
+def test_bodies_in_single_bytes_are_rejected(start):
     service = start()
     stop, closed = threading.Event(), threading.Event()
 
@@ -97,10 +97,10 @@ def test_bodies_in_single_bytes_are_cut_off(start):
     assert closed.wait(20)
     stop.set()
     attacker.join()
-    assert worst(service) < 1
+    assert slowest(service) < 1
 
 
-def test_what_is_only_announced_takes_nothing_from_anybody(start):
+def test_announced_bodies_reserve_no_disk_space(start):
     service = start(KISSGS_MAX_DISK_BYTES=10 * len(SMALL))
     job = service.ended(service.submit())
     for size in (5 * len(SMALL), 100 * len(SMALL)):
@@ -109,11 +109,11 @@ def test_what_is_only_announced_takes_nothing_from_anybody(start):
         ) as connection:
             connection.settimeout(1)
             with contextlib.suppress(TimeoutError):
-                assert b"507" in said(connection)
+                assert b"507" in read_response(connection)
     assert service.http.get(job["links"]["source"]).status_code == 200
 
 
-def test_decoded_scenes_make_room_too(start):
+def test_decoded_scenes_are_reclaimable(start):
     service = start(KISSGS_MAX_DISK_BYTES=5 * len(SMALL), KISSGS_KEEP_UPLOADS="false")
     jobs = [service.ended(service.submit(scene_bytes(300, 1, seed))) for seed in range(2)]
     for job in jobs:
@@ -122,39 +122,39 @@ def test_decoded_scenes_make_room_too(start):
     assert service.http.get(jobs[0]["links"]["decoded"]).status_code in (200, 507)
 
 
-def test_a_long_tail_of_a_form_is_refused(service):
+def test_a_long_form_epilogue_is_refused(service):
     body = b'--b\r\nContent-Disposition: form-data; name="file"; filename="x"\r\n\r\n' + SMALL + b"\r\n--b--\r\n"
     headers = {"Content-Type": "multipart/form-data; boundary=b"}
     answer = service.http.post("/v1/jobs", content=iter([body, *([bytes(60_000)] * 20)]), headers=headers)
     problem(answer, 422, "invalid-request")
-    whole = body + bytes(5_000_000)
-    problem(service.http.post("/v1/jobs", content=whole, headers=headers), 413, "too-large")
+    full = body + bytes(5_000_000)
+    problem(service.http.post("/v1/jobs", content=full, headers=headers), 413, "too-large")
 
 
-def test_a_form_needs_no_more_room_than_it_is_large(start):
+def test_a_form_reserves_only_its_size(start):
     service = start(KISSGS_MAX_DISK_BYTES=4 * len(SMALL))
     assert service.http.post("/v1/jobs", files={"file": ("x.ply", SMALL)}).status_code == 202
 
 
-def test_a_decode_ends_with_its_job(start):
+def test_a_decoding_ends_with_its_job(start):
     service = start()
     job = service.ended(service.submit(scene_bytes(120_000, 3)))
     answers = []
-    asking = threading.Thread(target=lambda: answers.append(service.http.get(job["links"]["decoded"])))
-    asking.start()
+    requesting = threading.Thread(target=lambda: answers.append(service.http.get(job["links"]["decoded"])))
+    requesting.start()
     end = time.monotonic() + 10
     while not service.children() and time.monotonic() < end:
         time.sleep(0.005)
     assert service.http.delete(f"/v1/jobs/{job['id']}").status_code == 204
-    asking.join(20)
-    if answers[0].status_code != 200:  # it was not faster
+    requesting.join(20)
+    if answers[0].status_code != 200:  # unless the decoding was faster
         problem(answers[0], 410, "gone")
     assert str(service.folder) not in answers[0].text[:2000]
     assert list((service.folder / "jobs").iterdir()) == []
     assert service.http.get("/readyz").status_code == 200
 
 
-def test_two_at_once_decode_once(start):
+def test_simultaneous_requests_decode_once(start):
     service = start()
     job = service.ended(service.submit())
     answers = []
@@ -169,8 +169,8 @@ def test_two_at_once_decode_once(start):
     assert {answer.status_code for answer in answers} == {200}
 
 
-def test_a_fault_of_ours_is_said_to_be_one(tmp_path):
-    """It looked like a crash from outside: the interpreter could not end while a thread waited for standard input."""
+def test_an_error_in_the_job_process_is_internal(tmp_path):
+    """It once looked like a crash, because the interpreter could not exit while a thread read standard input."""
     import asyncio
 
     from service.jobs.runner import JobProcess
@@ -178,13 +178,13 @@ def test_a_fault_of_ours_is_said_to_be_one(tmp_path):
     async def ignore(stage, fraction, note):
         pass
 
-    order = {"task": "no such task", "work": str(tmp_path), "source": "", "memory": 1 << 30}
-    outcome = asyncio.run(JobProcess(seconds=30).run(order, ignore))
+    task = {"kind": "no such task", "work": str(tmp_path), "source": "", "memory": 1 << 30}
+    outcome = asyncio.run(JobProcess(seconds=30).run(task, ignore))
     assert (outcome.kind, outcome.data["code"]) == ("error", "internal")
 
 
-def test_stopping_the_whole_group_puts_the_job_back(start):
-    """As some supervisors do: the signal reaches the job's process, too."""
+def test_a_signal_to_the_process_group_requeues_the_job(start):
+    """Some supervisors signal the job process, too."""
     service = start(KISSGS_DRAIN_SECONDS=0.5)
     job = service.submit(BIG, SLOW)
     service.running(job)
@@ -200,7 +200,7 @@ def test_stopping_the_whole_group_puts_the_job_back(start):
     assert (status["state"] in ("queued", "running"), status["starts"] <= 1) == (True, True)
 
 
-def test_asked_twice_it_stops_at_once(start):
+def test_a_second_signal_stops_the_service_at_once(start):
     service = start(KISSGS_DRAIN_SECONDS=60)
     job = service.submit(BIG, SLOW)
     service.running(job)
@@ -213,7 +213,7 @@ def test_asked_twice_it_stops_at_once(start):
     assert service.status(job)["state"] in ("queued", "running")
 
 
-def test_an_upload_while_it_stops_is_told_so(start):
+def test_an_upload_while_the_service_stops(start):
     service = start()
     head = b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n" % len(BIG)
     with service.raw(head + BIG[:100_000]) as connection:
@@ -222,13 +222,13 @@ def test_an_upload_while_it_stops_is_told_so(start):
         time.sleep(0.3)
         with contextlib.suppress(ConnectionError):
             connection.sendall(BIG[100_000:200_000])
-        answer = said(connection)
+        answer = read_response(connection)
     assert answer.startswith(b"HTTP/1.1 503")
     assert b'"stopping"' in answer
     assert service.process.wait(20) == 0
 
 
-def test_nothing_a_client_writes_becomes_a_line_or_a_label(service):
+def test_clients_cannot_add_log_lines_or_metric_labels(service):
     service.http.get("/x%0a2026-01-01%20ERROR%20forged")
     for _ in range(3):
         service.http.request(f"FOO{uuid.uuid4().hex[:6].upper()}", "/livez")
@@ -238,21 +238,21 @@ def test_nothing_a_client_writes_becomes_a_line_or_a_label(service):
     assert 'method="other"' in metrics
 
 
-def test_a_fault_has_an_id(start):
-    """The database is damaged under a running service: the answer can be found in the log."""
+def test_errors_have_a_request_id(start):
+    """The error of a damaged database can be found in the log."""
     service = start()
     for path in service.folder.glob("jobs.sqlite*"):
         path.unlink()
     (service.folder / "jobs.sqlite").write_bytes(b"no database")
     answer = service.http.get("/v1/jobs", headers={"X-Request-ID": "find-me"})
-    if answer.status_code != 200:  # its connections may still have the old file
+    if answer.status_code != 200:  # open connections may still use the old file
         problem(answer, 503, "database")
     assert answer.headers["x-request-id"] == "find-me"
     time.sleep(0.3)  # the log is written after the answer
     assert "find-me" in service.log.read_text()
 
 
-def test_what_nobody_foresaw_is_a_problem_document():
+def test_unexpected_errors_are_problem_documents():
     import asyncio
 
     from service.core.metrics import Metrics
@@ -260,9 +260,9 @@ def test_what_nobody_foresaw_is_a_problem_document():
     from service.http.middleware import RequestMiddleware
 
     async def application(scope, receive, send):
-        raise RuntimeError("nobody's business")
+        raise RuntimeError("internal detail")
 
-    async def ask():
+    async def request():
         scope = {"type": "http", "method": "GET", "path": "/x", "headers": [(b"host", b"localhost")]}
         await RequestMiddleware(application, Metrics(), ServiceSettings())(scope, None, send)
 
@@ -271,20 +271,20 @@ def test_what_nobody_foresaw_is_a_problem_document():
     async def send(message):
         sent.append(message)
 
-    asyncio.run(ask())
+    asyncio.run(request())
     headers = dict(sent[0]["headers"])
     assert (sent[0]["status"], headers[b"content-type"]) == (500, b"application/problem+json")
     assert headers[b"x-request-id"] in sent[1]["body"]
-    assert b"nobody's business" not in sent[1]["body"]
+    assert b"internal detail" not in sent[1]["body"]
 
 
 @pytest.mark.parametrize("path", ["/", "/livez", "/readyz", "/version", "/favicon.ico"])
-def test_monitors_may_ask_for_headers_only(service, path):
+def test_monitors_can_use_head(service, path):
     answer = service.http.head(path)
     assert (answer.status_code, answer.content) == (200, b"")
 
 
-def test_refused_methods_are_told_the_others(service):
+def test_refused_methods_list_the_allowed_ones(service):
     for path, allowed in (("/livez", "GET, HEAD"), ("/v1/jobs", "GET, POST"), ("/v1/jobs/x", "DELETE, GET, HEAD")):
         answer = service.http.patch(path)
         assert (answer.headers["allow"], allowed in answer.json()["detail"]) == (allowed, True)
@@ -301,7 +301,7 @@ def test_another_data_folder_is_refused(tmp_path):
         assert service.status(job)["state"] == "succeeded"
 
 
-def test_events_go_on_over_a_restart(start):
+def test_events_continue_after_a_restart(start):
     service = start()
     job = service.submit(scene_bytes(6_000, 2))
     service.running(job)
@@ -320,7 +320,7 @@ def test_events_go_on_over_a_restart(start):
     assert '"succeeded"' in rest
 
 
-def test_the_measuring_command(monkeypatch, capsys, tmp_path):
+def test_the_bench_command(monkeypatch, capsys, tmp_path):
     from service.cli import bench
 
     for name, value in (("UPLOAD_BYTES", 5_000_000), ("POLLS", 5), ("REPEATS", 1)):
@@ -344,14 +344,14 @@ def test_the_measuring_command(monkeypatch, capsys, tmp_path):
     assert (missing.returncode, "no such file" in missing.stderr) == (2, True)
 
 
-def test_an_upload_that_stalls_does_not_hold_up_a_stop(start):
+def test_a_stalled_upload_does_not_delay_a_stop(start):
     service = start()
     head = b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 500000\r\n\r\nply\n"
     with service.raw(head) as connection:
         time.sleep(0.3)
         begun = time.monotonic()
         service.process.send_signal(signal.SIGTERM)
-        answer = said(connection)
+        answer = read_response(connection)
     assert answer.startswith(b"HTTP/1.1 503")
     assert service.process.wait(20) == 0
     assert time.monotonic() - begun < 6

@@ -1,5 +1,5 @@
-"""What stands in the place of a job's folder, or within it, and was not put there by the service; and folders of the
-service that go away while it runs. Oracle: what lay there before."""
+"""Files and links that the service did not create, in place of a job's folder or in it; and folders that disappear
+while the service runs. Oracle: the files before."""
 
 import asyncio
 import errno
@@ -33,52 +33,52 @@ def a_link_to_nothing(folder, elsewhere):
     folder.symlink_to(elsewhere)
 
 
-WAYS = [a_file, a_link, a_link_to_nothing]
+CHANGES = [a_file, a_link, a_link_to_nothing]
 
 
-def lies_aside(folder, way, elsewhere, before):
-    """That nothing was removed, and nothing is left where it stood."""
+def assert_orphaned(folder, change, elsewhere, before):
+    """Assert that the entry was moved to the orphaned folder, unchanged."""
     assert not os.path.lexists(folder)
-    aside = folder.parent / ".orphaned" / folder.name
-    assert aside.read_text() == "mine" if way is a_file else aside.is_symlink()
-    if way is a_link:
+    moved = folder.parent / ".orphaned" / folder.name
+    assert moved.read_text() == "mine" if change is a_file else moved.is_symlink()
+    if change is a_link:
         assert listing(elsewhere) == before
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_deleting(start, way, tmp_path):
+@pytest.mark.parametrize("change", CHANGES)
+def test_deleting(start, change, tmp_path):
     it = start()
     job = it.ended(it.submit())
     folder = it.folder / "jobs" / job["id"]
     before = listing(folder)
-    way(folder, tmp_path / "elsewhere")
+    change(folder, tmp_path / "elsewhere")
     assert it.http.delete(f"/v1/jobs/{job['id']}").status_code == 204
     problem(it.http.get(f"/v1/jobs/{job['id']}"), 404, "not-found")
-    lies_aside(folder, way, tmp_path / "elsewhere", before)
-    assert f"job {job['id']}: its folder is no folder of ours and lies in" in it.log.read_text()
+    assert_orphaned(folder, change, tmp_path / "elsewhere", before)
+    assert f"job {job['id']}: its folder was not created by the service and was moved to" in it.log.read_text()
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("change", CHANGES)
 @pytest.mark.usefixtures("no_variables")
-def test_expiring(tmp_path, way):
-    """The others expire all the same."""
+def test_expiring(tmp_path, change):
+    """Other jobs expire nevertheless."""
     with service(tmp_path / "data") as context:
         jobs = [finish_a_job(context) for _ in range(3)]
         folder = context.storage.jobs / jobs[0]
         before = listing(folder)
-        way(folder, tmp_path / "elsewhere")
+        change(folder, tmp_path / "elsewhere")
         context.clock._offset += 10**5
         assert sorted(ExpiryTask(context, 0.0).sweep()) == sorted(jobs)
         context.clock._offset += 10**5
         ExpiryTask(context, 0.0).sweep()
         assert context.store.ids() == set()
-        lies_aside(folder, way, tmp_path / "elsewhere", before)
+        assert_orphaned(folder, change, tmp_path / "elsewhere", before)
         assert names(context.storage.jobs) == {".orphaned"}
 
 
 @pytest.mark.usefixtures("no_variables")
-def test_what_cannot_be_removed_stays(tmp_path, monkeypatch, caplog):
-    """The log says so, and the others go."""
+def test_folders_that_cannot_be_removed(tmp_path, monkeypatch, caplog):
+    """There is a warning in the log, and other jobs are removed."""
     with service(tmp_path / "data") as context:
         jobs = [finish_a_job(context) for _ in range(3)]
 
@@ -96,7 +96,7 @@ def test_what_cannot_be_removed_stays(tmp_path, monkeypatch, caplog):
 
 
 @pytest.mark.usefixtures("no_variables")
-def test_links_within_a_folder_are_removed_alone(tmp_path):
+def test_links_in_a_folder_are_removed_without_their_targets(tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "scene.zip").write_text("mine")
     with service(tmp_path / "data") as context:
@@ -111,7 +111,7 @@ def test_links_within_a_folder_are_removed_alone(tmp_path):
 
 
 @pytest.mark.usefixtures("no_variables")
-def test_a_start_follows_no_links(tmp_path):
+def test_recovery_follows_no_links(tmp_path):
     with service(tmp_path / "data") as context:
         jobs = [finish_a_job(context, State.EXPIRED), finish_a_job(context), add_a_job(context)]
         for job in jobs:
@@ -128,12 +128,12 @@ def test_a_start_follows_no_links(tmp_path):
     assert [listing(tmp_path / job) for job in jobs] == before
 
 
-# A result that cannot be kept ----------------------------------------------------------------------------------------
+# Results that cannot be stored ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("no_variables")
-def test_a_result_that_can_never_be_kept_ends_its_job(tmp_path, monkeypatch):
-    """A folder that was not empty once held up its worker for ever."""
+def test_a_permanent_error_fails_the_job(tmp_path, monkeypatch):
+    """A folder that was not empty once blocked its worker for ever."""
 
     def refuse(job_id):
         raise OSError(errno.ENOTEMPTY, "Directory not empty")
@@ -142,43 +142,43 @@ def test_a_result_that_can_never_be_kept_ends_its_job(tmp_path, monkeypatch):
         job = context.store.get(add_a_job(context))
         context.store.claim()
         monkeypatch.setattr(context.storage, "keep_result", refuse)
-        asyncio.run(asyncio.wait_for(context.worker._settle(job, Outcome("done", {})), 10))
+        asyncio.run(asyncio.wait_for(context.worker._finish(job, Outcome("done", {})), 10))
         found = context.store.get(job.id)
         assert (found.state, found.problem["code"]) == (State.FAILED, "output")
         assert found.problem["detail"].endswith("cannot be written: directory not empty; try again later")
 
 
 @pytest.mark.parametrize("error", [errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR, errno.ENOENT])
-def test_which_errors_are_final(tmp_path, monkeypatch, error):
+def test_permanent_errors(tmp_path, monkeypatch, error):
     monkeypatch.setenv("KISSGS_DATA_DIR", str(tmp_path / "data"))
     with service(tmp_path / "data") as context:
         worker: Worker = context.worker
-        assert worker._is_final(OSError(error, os.strerror(error)))
-        assert not worker._is_final(OSError(errno.ENOSPC, "no space left on device"))
+        assert worker._is_permanent(OSError(error, os.strerror(error)))
+        assert not worker._is_permanent(OSError(errno.ENOSPC, "no space left on device"))
         context.storage.jobs.rename(tmp_path / "away")
-        assert not worker._is_final(OSError(error, os.strerror(error)))
+        assert not worker._is_permanent(OSError(error, os.strerror(error)))
         (tmp_path / "away").rename(context.storage.jobs)
 
 
-# Folders of the service that go away ----------------------------------------------------------------------------------
+# Folders that disappear ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["jobs", "incoming"])
-@pytest.mark.parametrize("way", ["moved away", "a file", "another folder"])
-def test_readiness(start, name, way):
+@pytest.mark.parametrize("change", ["moved away", "a file", "another folder"])
+def test_readiness(start, name, change):
     it = start()
     folder = it.folder / name
     folder.rename(it.folder / "away")
-    if way == "a file":
+    if change == "a file":
         folder.write_text("")
-    if way == "another folder":
+    if change == "another folder":
         folder.mkdir()
     ready = it.http.get("/readyz")
     assert (ready.status_code, ready.json()["ready"]) == (503, False)
-    said = "is not there; put it back" if way == "moved away" else "was replaced; restart the service"
-    assert ready.json()["checks"]["disk"] == f"the data folder cannot be used: its folder {name} {said}"
-    if way != "moved away":
-        folder.unlink() if way == "a file" else folder.rmdir()
+    reason = "is missing; restore it" if change == "moved away" else "was replaced; restart the service"
+    assert ready.json()["checks"]["disk"] == f"the data folder cannot be used: its folder {name} {reason}"
+    if change != "moved away":
+        folder.unlink() if change == "a file" else folder.rmdir()
     (it.folder / "away").rename(folder)
     assert it.http.get("/readyz").status_code == 200
     assert it.ended(it.submit())["state"] == "succeeded"
@@ -187,16 +187,16 @@ def test_readiness(start, name, way):
 def test_a_folder_that_cannot_be_written_to(start):
     it = start()
     if os.geteuid() == 0:
-        pytest.skip("root may write to any folder")
+        pytest.skip("root can write to every folder")
     (it.folder / "incoming").chmod(0o500)
     ready = it.http.get("/readyz")
     (it.folder / "incoming").chmod(0o700)
     assert ready.status_code == 503
-    assert ready.json()["checks"]["disk"].endswith("its folder incoming cannot be written to")
+    assert ready.json()["checks"]["disk"].endswith("its folder incoming is not writable; change its permissions")
 
 
-def test_no_job_fails_because_all_folders_are_away(start):
-    """They are done when the folders are back: what runs as well as what waits."""
+def test_no_job_fails_while_the_folder_of_jobs_is_missing(start):
+    """Running and queued jobs succeed once the folder is back."""
     it = start()
     running, waiting = it.submit(scene_bytes(6_000, 2)), [it.submit(), it.submit()]
     it.running(running)

@@ -1,4 +1,4 @@
-"""The OpenAPI document; oracles: the snapshot in docs/, and schemathesis, which tries what the document promises."""
+"""The OpenAPI document; oracles: the snapshot in docs/, and schemathesis, which tests the service against it."""
 
 import json
 import os
@@ -10,13 +10,13 @@ import pytest
 from helpers.service import ROOT, Service
 
 
-def test_the_document_is_the_one_in_the_docs(service):
-    """A change here is a change for every client: look at the diff, then run `make docs`."""
+def test_the_document_equals_the_snapshot(service):
+    """A change affects every client: review the difference, then run `make docs`."""
     expected = json.loads((ROOT / "docs" / "reference" / "openapi.json").read_text(encoding="utf-8"))
     assert service.http.get("/openapi.json").json() == expected
 
 
-def test_everything_is_explained(service):
+def test_everything_is_documented(service):
     document = service.http.get("/openapi.json").json()
     assert len(document["info"]["description"]) > 100
     for path, operations in document["paths"].items():
@@ -33,14 +33,14 @@ def test_everything_is_explained(service):
                     assert list(answer["content"]) == ["application/problem+json"], (where, status)
 
 
-def test_keys_are_asked_for_where_they_are_needed(start):
+def test_keys_are_documented(start):
     guarded = start(KISSGS_KEYS=f"alice:{'0' * 64}").http.get("/openapi.json").json()
     assert guarded["paths"]["/v1/jobs"]["post"]["security"] == [{"HTTPBearer": []}]
 
 
 @pytest.mark.parametrize("seed", [1])
-def test_schemathesis_finds_nothing(tmp_path, seed):
-    """Its examples, its corners, its fuzzing, and its walks along the links from one answer to the next request."""
+def test_schemathesis(tmp_path, seed):
+    """Run its examples, boundary values, fuzzing and stateful tests along the links between responses and requests."""
     with Service(tmp_path / "data") as service:
         found = subprocess.run(
             [

@@ -1,4 +1,4 @@
-"""What operators see: settings, health, metrics, the command; oracles: the Prometheus parser, the table of settings."""
+"""Settings, health, metrics and commands for operators; oracles: the Prometheus parser and the settings model."""
 
 import hashlib
 import os
@@ -43,8 +43,8 @@ def test_settings_come_from_the_environment(environment):
     assert [key.owner for key in settings.keys] == ["a", "b", "a"]
 
 
-def test_all_that_is_wrong_is_told_at_once(environment):
-    wrong = {
+def test_all_invalid_settings_are_reported_at_once(environment):
+    invalid = {
         "KISSGS_PROT": "80",
         "KISSGS_PORT": "65536",
         "KISSGS_MAX_UPLOAD_BYTES": "many",
@@ -55,31 +55,31 @@ def test_all_that_is_wrong_is_told_at_once(environment):
         "KISSGS_LOG_LEVEL": "loud",
         "KISSGS_WORKERS": "0",
     }
-    for name, value in wrong.items():
+    for name, value in invalid.items():
         environment.setenv(name, value)
     with pytest.raises(SettingsError) as caught:
         ServiceSettings.from_environment()
     lines = str(caught.value).splitlines()
-    for name in wrong:
+    for name in invalid:
         assert sum(line.startswith(f"{name}: ") for line in lines) == 1, name
     assert "secret" not in str(caught.value)
 
 
-def test_wrong_settings_end_in_a_message(tmp_path):
+def test_invalid_settings_end_in_a_message(tmp_path):
     ended = command(KISSGS_PROT="80", KISSGS_WORKERS="none")
     assert ended.returncode == 2
     assert "KISSGS_PROT: there is no such setting" in ended.stderr
     assert "Traceback" not in ended.stderr
     blocked = tmp_path / "file"
     blocked.write_text("")
-    for settings, said in (
+    for settings, message in (
         ({"KISSGS_DATA_DIR": str(blocked / "data")}, "not a directory"),
         ({"KISSGS_DATABASE_URL": "nothing://x"}, "KISSGS_DATABASE_URL"),
         ({"KISSGS_DATABASE_URL": f"sqlite:///{tmp_path}/no/jobs.sqlite"}, "cannot be opened"),
     ):
         ended = command(**{"KISSGS_DATA_DIR": str(tmp_path / "data"), **settings})
         assert (ended.returncode, ended.stdout) == (2, "")
-        assert said in ended.stderr
+        assert message in ended.stderr
         assert "Traceback" not in ended.stderr
 
 
@@ -96,14 +96,14 @@ def test_a_database_of_another_version_is_refused(tmp_path):
     assert "version 99" in ended.stderr
 
 
-def test_a_port_that_is_taken(service, tmp_path):
+def test_a_port_in_use(service, tmp_path):
     ended = command(KISSGS_PORT=str(service.port), KISSGS_DATA_DIR=str(tmp_path / "data"))
     assert ended.returncode != 0
     assert "address already in use" in ended.stderr
     assert "Traceback" not in ended.stderr
 
 
-def test_making_a_key():
+def test_the_key_command():
     ended = command("key", "alice")
     key = re.search(r"kissgs_[A-Za-z0-9_-]{43}", ended.stdout)[0]
     assert f"alice:{hashlib.sha256(key.encode()).hexdigest()}" in ended.stdout
@@ -116,9 +116,9 @@ def test_every_setting_is_listed():
         assert f"KISSGS_{name.upper()}\n" in listed
 
 
-def test_health_by_command(service):
-    well = command("health", KISSGS_PORT=str(service.port))
-    assert (well.returncode, '"ready":true' in well.stdout) == (0, True)
+def test_the_health_command(service):
+    healthy = command("health", KISSGS_PORT=str(service.port))
+    assert (healthy.returncode, '"ready":true' in healthy.stdout) == (0, True)
     assert command("health", KISSGS_PORT="1").returncode == 1
 
 
@@ -129,7 +129,7 @@ def test_health(service):
     assert service.http.get("/version").json()["container"] == "SOG-XT"
 
 
-def test_a_dead_worker_is_not_ready(tmp_path, environment):
+def test_an_ended_worker_is_not_ready(tmp_path, environment):
     import asyncio
 
     from service.http.app import build
@@ -181,15 +181,15 @@ def test_the_page(service):
     page = service.http.get("/")
     assert page.headers["content-type"].startswith("text/html")
     assert "default-src 'none'" in page.headers["content-security-policy"]
-    assert "<script>" not in page.text  # the policy would not run it
+    assert "<script>" not in page.text  # the policy forbids it
     for path in re.findall(r'(?:href|src)="(/[^"#]*)"', page.text):
         if path != "/docs":
             assert service.http.get(path).status_code == 200, path
-    assert not re.search(r'(?:src|href)="(?:https?:)?//', page.text)  # nothing from elsewhere
+    assert not re.search(r'(?:src|href)="(?:https?:)?//', page.text)  # nothing from other hosts
 
 
-def test_status_is_quick_while_a_job_uses_the_processors(start):
-    """Half of all answers within the time that 99 of 100 take on an idle machine; the 99 are measured, not tested."""
+def test_status_requests_are_fast_during_a_job(start):
+    """The median must be below the 99th percentile of an idle service."""
     service = start()
     job = service.submit(scene_bytes(20_000, 3), SLOW)
     service.running(job)

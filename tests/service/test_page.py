@@ -1,4 +1,4 @@
-"""The page in a real Chromium; oracle: what the API says of the same job, and what a person would do."""
+"""The web page in Chromium; oracle: the API's status of the job."""
 
 import hashlib
 import json
@@ -32,26 +32,24 @@ def browser():
 
 @pytest.fixture
 def visit(browser, service):
-    """``visit(at=service)`` opens its page, where nothing may go wrong and nothing come from elsewhere."""
-    contexts, wrong = [], []
+    """``visit(at=service)`` opens the page; errors and requests to other hosts fail the test."""
+    contexts, errors = [], []
 
     def begin(at=service, **options):
         context = browser.new_context(**options)
         contexts.append(context)
         page = context.new_page()
         page.set_default_timeout(20_000)
-        page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on("console", lambda said: wrong.append(said.text) if "Content Security Policy" in said.text else None)
-        page.on(
-            "request", lambda asked: wrong.append(asked.url) if not asked.url.startswith((at.url, "blob:")) else None
-        )
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("console", lambda line: errors.append(line.text) if "Content Security Policy" in line.text else None)
+        page.on("request", lambda sent: errors.append(sent.url) if not sent.url.startswith((at.url, "blob:")) else None)
         page.goto(at.url)
         return page
 
     yield begin
     for context in contexts:
         context.close()
-    assert wrong == []
+    assert errors == []
 
 
 def choose(page, data=SMALL, name="my scene.ply"):
@@ -63,7 +61,7 @@ def newest(service):
     return service.http.get("/v1/jobs", params={"limit": 1}).json()["jobs"][0]
 
 
-def test_the_whole_path(visit, service, tmp_path):
+def test_upload_compression_and_download(visit, service, tmp_path):
     page = visit()
     choose(page)
     page.get_by_text("300 Gaussians").wait_for()
@@ -85,7 +83,7 @@ def test_the_whole_path(visit, service, tmp_path):
     assert download.value.suggested_filename == "my scene.decoded.ply"
 
 
-def test_by_keyboard_alone(visit, service):
+def test_keyboard_operation(visit, service):
     page = visit()
     choose(page)
     page.get_by_text("300 Gaussians").wait_for()
@@ -99,25 +97,25 @@ def test_by_keyboard_alone(visit, service):
     assert newest(service)["options"]["preset"] == "fast"
 
 
-def test_a_size_is_asked_for(visit, service):
+def test_goals(visit, service):
     page = visit()
     choose(page)
     page.get_by_text("300 Gaussians").wait_for()
     goal, keep = page.get_by_label("Goal"), page.get_by_label("Gaussians", exact=True)
     auto = keep.locator("option[value=auto]")
     page.get_by_label("Fast").check()
-    assert goal.is_disabled()  # it weighs no bits
+    assert goal.is_disabled()  # this preset has no rate-distortion planning
     page.get_by_label("Balanced").check()
     assert auto.is_disabled()
-    goal.select_option("A size of at most")
+    goal.select_option("Maximum size")
     assert (page.locator("#amount").input_value(), page.locator("#unit").inner_text()) == ("3", "MB")
     assert auto.is_enabled()
     keep.select_option("auto")
-    goal.select_option("A loss of at most")
+    goal.select_option("Maximum PSNR loss")
     assert (page.locator("#amount").input_value(), page.locator("#unit").inner_text()) == ("0.1", "dB")
-    goal.select_option("As the preset has it")
+    goal.select_option("Preset default")
     assert keep.input_value() == ""
-    goal.select_option("A size of at most")
+    goal.select_option("Maximum size")
     page.locator("#amount").fill("0.008")
     page.get_by_role("button", name="Compress").click()
     page.get_by_text("smaller").first.wait_for()
@@ -127,25 +125,25 @@ def test_a_size_is_asked_for(visit, service):
 
 
 @pytest.mark.parametrize(
-    ("data", "said"), [(b"hello " * 99, "ply"), (SMALL.replace(b"vertex 300\n", b"vertex 99999\n"), "99,999")]
+    ("data", "message"), [(b"hello " * 99, "ply"), (SMALL.replace(b"vertex 300\n", b"vertex 99999\n"), "99,999")]
 )
-def test_what_is_no_use_is_said_before_it_is_sent(visit, service, data, said):
+def test_unsuitable_files_are_rejected_before_the_upload(visit, service, data, message):
     before = newest(service)["id"] if service.http.get("/v1/jobs").json()["jobs"] else None
     page = visit()
     choose(page, data)
-    page.locator("#file-error", has_text=said).wait_for()
+    page.locator("#file-error", has_text=message).wait_for()
     page.get_by_role("button", name="Compress").click()
     assert before is None or newest(service)["id"] == before
 
 
-def test_what_the_service_refuses_is_said(visit):
+def test_refusals_are_shown(visit):
     page = visit()
     choose(page, SMALL.replace(b"opacity", b"opaqity"))
     page.get_by_role("button", name="Compress").click()
     page.get_by_role("alert").filter(has_text="opacity").wait_for()
 
 
-def test_a_reload_goes_on_following_and_cancel_cancels(visit, start):
+def test_reload_and_cancel(visit, start):
     service = start()
     page = visit(service)
     job = service.submit(scene_bytes(20_000, 3), SLOW)
@@ -157,7 +155,7 @@ def test_a_reload_goes_on_following_and_cancel_cancels(visit, start):
     assert service.status(job)["state"] == "cancelled"
 
 
-def test_training_tells_what_it_has_come_to(visit, start):
+def test_training_notes_are_shown(visit, start):
     service = start()
     page = visit(service)
     changes = {"count": 100, "sparsify_steps": 1000, "refine_steps": 1000, "views": 24, "view_size": 48}
@@ -165,10 +163,10 @@ def test_training_tells_what_it_has_come_to(visit, start):
     page.goto(f"{service.url}/#{job['id']}")
     page.locator("#job .note", has_text="Gaussians, loss").wait_for()
     page.locator("#live", has_text="Training").wait_for(state="attached")
-    assert "loss" not in page.locator("#live").inner_text()  # what is read out is the stage
+    assert "loss" not in page.locator("#live").inner_text()  # screen readers announce only the stage
 
 
-def test_deleting_asks_first(visit, start):
+def test_deletion_must_be_confirmed(visit, start):
     service = start()
     job = service.ended(service.submit())
     page = visit(service)
@@ -181,7 +179,7 @@ def test_deleting_asks_first(visit, start):
     assert service.http.get("/v1/jobs").json() == {"jobs": []}
 
 
-def test_names_are_text(visit, start):
+def test_names_are_inserted_as_text(visit, start):
     service = start()
     answer = service.http.post("/v1/jobs", content=SMALL, params={"name": "<img src=x onerror=alert(1)>"})
     service.ended(answer.json())
@@ -191,7 +189,7 @@ def test_names_are_text(visit, start):
     assert "img src=x" in page.locator("#recent-list").inner_text()
 
 
-def test_keys_are_asked_for(visit, start):
+def test_key_form(visit, start):
     service = start(KISSGS_KEYS=f"alice:{hashlib.sha256(b'secret').hexdigest()}")
     page = visit(service)
     page.get_by_role("textbox", name="Key").fill("wrong")
@@ -203,7 +201,7 @@ def test_keys_are_asked_for(visit, start):
     page.get_by_label("Fast").check()
     page.get_by_role("button", name="Compress").click()
     page.get_by_text("smaller").first.wait_for()
-    assert page.get_by_role("link", name="Preview").count() == 1  # the page has the key: it needs none in its address
+    assert page.get_by_role("link", name="Preview").count() == 1  # the preview finds the key in the session storage
     with page.expect_download() as download:
         page.get_by_role("button", name="Download container").click()
     assert download.value.suggested_filename == "my scene.zip"
@@ -211,10 +209,10 @@ def test_keys_are_asked_for(visit, start):
 
 @pytest.mark.parametrize("width", [360, 768, 1400])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_nothing_sticks_out(visit, service, width, scheme):
+def test_no_horizontal_overflow(visit, service, width, scheme):
     job = service.ended(service.submit())
     page = visit(viewport={"width": width, "height": 800}, color_scheme=scheme)
-    for where in ("", f"#{job['id']}"):
-        page.goto(f"{service.url}/{where}")
+    for address in ("", f"#{job['id']}"):
+        page.goto(f"{service.url}/{address}")
         page.locator("#recent-list li").first.wait_for()
         assert page.evaluate("document.documentElement.scrollWidth") <= width

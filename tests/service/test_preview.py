@@ -1,4 +1,4 @@
-"""The preview page as the service gives it out; oracle: its files, and for the policy Chromium, which enforces it."""
+"""The preview page as served; oracle: its files, and for the content security policy Chromium."""
 
 import asyncio
 import base64
@@ -11,7 +11,7 @@ from urllib.parse import urljoin
 
 import httpx
 import pytest
-from helpers.service import ROOT, problem, said
+from helpers.service import ROOT, problem, read_response
 
 from service.core.settings import ServiceSettings
 from service.http.app import create_app
@@ -39,7 +39,7 @@ UNSERVED = (
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """Stands for web_decoder: all that may lie there."""
+    """Copy of web_decoder with small files, some of which must not be served."""
     folder = tmp_path / "web_decoder"
     for name in (*FILES, *UNSERVED):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -50,10 +50,10 @@ def folder(tmp_path, monkeypatch):
 
 @pytest.fixture
 def ask(folder, tmp_path):
-    """``ask(path)`` asks an application whose preview is that folder."""
+    """``ask(path)`` sends a request to an application that serves this folder."""
     app = create_app(ServiceSettings(data_dir=tmp_path / "data"))
 
-    def asking(path, method="GET", **headers):
+    def request(path, method="GET", **headers):
         async def once():
             transport = httpx.ASGITransport(app)
             async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
@@ -61,12 +61,12 @@ def ask(folder, tmp_path):
 
         return asyncio.run(once())
 
-    yield asking
+    yield request
     app.state.context.store.close()
     app.state.context.storage.close()
 
 
-def fixed(answer):
+def stable_headers(answer):
     return {name: value for name, value in answer.headers.items() if name not in ("date", "x-request-id")}
 
 
@@ -84,11 +84,11 @@ def test_the_page_and_its_policy(ask, path):
     assert policy.pop("img-src") == "'self' data:"
     assert {policy.pop(name) for name in ("style-src", "connect-src")} == {"'self'"}
     assert policy == dict.fromkeys(("default-src", "form-action", "base-uri", "frame-ancestors"), "'none'")
-    assert fixed(ask(path, "HEAD")) == fixed(answer)
+    assert stable_headers(ask(path, "HEAD")) == stable_headers(answer)
 
 
 def test_the_policy_follows_the_page(ask, folder):
-    """As browsers read it: a hash is that of the text with plain line ends."""
+    """Browsers hash the text with normalised line ends."""
     before = ask("/preview/").headers["content-security-policy"]
     (folder / "preview.html").write_bytes(FILES["preview.html"].replace("\n", "\r\n").encode())
     assert ask("/preview/").headers["content-security-policy"] == before
@@ -107,18 +107,18 @@ def test_the_policy_follows_the_page(ask, folder):
         ("vendor/versions.json", "application/json"),
     ],
 )
-def test_its_parts(ask, name, media_type):
+def test_served_files(ask, name, media_type):
     answer = ask(f"/preview/{name}")
     assert (answer.status_code, answer.text) == (200, FILES[name])
     assert (answer.headers["content-type"], answer.headers["cache-control"]) == (media_type, "no-cache")
     assert "unsafe" not in answer.headers["content-security-policy"]
     same = ask(f"/preview/{name}", **{"If-None-Match": answer.headers["etag"]})
     assert (same.status_code, same.content, same.headers["cache-control"]) == (304, b"", "no-cache")
-    assert fixed(ask(f"/preview/{name}", "HEAD")) == fixed(answer)
+    assert stable_headers(ask(f"/preview/{name}", "HEAD")) == stable_headers(answer)
 
 
 @pytest.mark.parametrize("name", [*UNSERVED, "none.js", "0a" * 15, "0A" * 16, "0a" * 16 + "/", "preview"])
-def test_nothing_else(ask, name):
+def test_other_paths_are_not_served(ask, name):
     for written in {name, name.replace("..", "%2e%2e"), name.replace("/", "%2F")}:
         answer = ask(f"/preview/{written}")
         problem(answer, 404, "not-found")
@@ -126,8 +126,8 @@ def test_nothing_else(ask, name):
         assert ask(f"/preview/{written}", "HEAD").status_code == 404
 
 
-def test_what_was_not_installed_is_not_found(ask, folder):
-    """The service works without the vendor folder, whose want the page tells itself, and even without the page."""
+def test_missing_files_are_not_found(ask, folder):
+    """The service works without the vendor folder and without the page."""
     shutil.rmtree(folder / "vendor")
     problem(ask("/preview/vendor/three/build/three.module.min.js"), 404, "not-found")
     assert ask("/preview/").status_code == 200
@@ -136,7 +136,7 @@ def test_what_was_not_installed_is_not_found(ask, folder):
     problem(ask("/preview/preview.js"), 404, "not-found")
 
 
-def test_without_the_slash_it_leads_there(ask):
+def test_redirect_to_the_folder(ask):
     for method in ("GET", "HEAD"):
         answer = ask("/preview", method)
         assert (answer.status_code, answer.headers["location"]) == (307, "preview/")
@@ -153,23 +153,23 @@ def test_without_the_slash_it_leads_there(ask):
         *("preview.js%00.css", "vendor/%2e%2e/%2e%2e/service/app.py"),
     ],
 )
-def test_no_way_out(service, path):
-    """Written to the socket, because clients tidy what they are given."""
+def test_paths_outside_the_folder(service, path):
+    """The request is written to the socket, because clients normalise paths."""
     request = f"GET /preview/{path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
     with service.raw(request.encode()) as connection:
-        answer = said(connection)
+        answer = read_response(connection)
     assert answer.startswith((b"HTTP/1.1 404", b"HTTP/1.1 400"))
     assert b"[project]" not in answer
 
 
-def test_whether_a_job_exists_is_not_told(start):
-    """Nor to anybody without a key."""
+def test_the_page_does_not_reveal_whether_a_job_exists(start):
+    """The response is the same for an existing and a missing job, without a key."""
     service = start(KISSGS_KEYS=f"alice:{hashlib.sha256(b'secret').hexdigest()}")
     job = service.submit(Authorization="Bearer secret")
-    there, nowhere = (service.http.get(f"/preview/{id}") for id in (job["id"], "0" * 32))
-    assert there.status_code == nowhere.status_code == 200
-    assert there.content == nowhere.content
-    assert fixed(there) == fixed(nowhere)
+    existing, missing = (service.http.get(f"/preview/{id}") for id in (job["id"], "0" * 32))
+    assert existing.status_code == missing.status_code == 200
+    assert existing.content == missing.content
+    assert stable_headers(existing) == stable_headers(missing)
 
 
 def test_only_a_result_has_a_preview(start):
@@ -182,7 +182,7 @@ def test_only_a_result_has_a_preview(start):
 
 
 class Addresses(HTMLParser):
-    """What a page loads: ``found``."""
+    """Parser that collects the addresses that a page loads in ``found``."""
 
     def __init__(self, page):
         super().__init__()
@@ -199,8 +199,8 @@ class Addresses(HTMLParser):
         self._tag = {}
 
 
-def test_all_that_the_real_page_asks_for_is_there(service):
-    """From the page's address on, along the imports of its modules."""
+def test_all_files_of_the_page_exist(service):
+    """Follow the imports of modules from the page's address."""
     here = service.url + "/preview/" + "0" * 32
     page = service.http.get(here).text
     named = {address for address in Addresses(page).found if not address.startswith("data:")}
@@ -246,16 +246,16 @@ DRAW = """async () => {
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
 @pytest.mark.skipif(not VENDOR.exists(), reason="scripts/vendor has not run")
-def test_spark_draws_under_the_policy(service):
-    """A splat appears only once Spark has sorted: in WebAssembly, in a worker made from a blob."""
+def test_spark_draws_with_the_policy(service):
+    """A splat appears only after Spark has sorted, in WebAssembly, in a worker created from a blob."""
     playwright = pytest.importorskip("playwright.sync_api")
     software = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--no-sandbox"]
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=software)
         page = browser.new_page()
-        refused, elsewhere = [], []
-        page.on("console", lambda text: refused.append(text.text) if "Content Security" in text.text else None)
-        page.on("request", lambda asked: elsewhere.append(asked.url))
+        blocked, requested = [], []
+        page.on("console", lambda text: blocked.append(text.text) if "Content Security" in text.text else None)
+        page.on("request", lambda sent: requested.append(sent.url))
         page.goto(f"{service.url}/preview/")
         red, *others = page.evaluate(DRAW)
         assert red > 200
@@ -263,5 +263,5 @@ def test_spark_draws_under_the_policy(service):
         with pytest.raises(playwright.Error, match=r"(?i)content security policy|unsafe-eval"):
             page.evaluate("new Promise((_, no) => setTimeout(() => { try { eval('1') } catch (e) { no(e) } }))")
         browser.close()
-    assert refused == []
-    assert [url for url in elsewhere if not url.startswith((service.url, "blob:"))] == []
+    assert blocked == []
+    assert [url for url in requested if not url.startswith((service.url, "blob:"))] == []

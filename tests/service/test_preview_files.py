@@ -1,4 +1,4 @@
-"""The preview of files in a real Chromium, and whether everybody can use it; oracle: what Python reads of the files."""
+"""The preview of local files in Chromium, and its accessibility; oracle: the files decoded in Python."""
 
 import io
 import json
@@ -7,7 +7,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from helpers.preview_browser import colours, looks_like
+from helpers.preview_browser import colours, psnr
 from helpers.service import scene_bytes
 from PIL import Image
 
@@ -70,25 +70,25 @@ def test_dropping_files(preview, service):
         ("mesh.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n", [".ply"]),
     ],
 )
-def test_files_that_are_no_use(preview, service, name, data, words):
-    """Neither at first, nor while a scene is shown, which stays."""
+def test_unsuitable_files(preview, service, name, data, words):
+    """They are rejected with a message, and a scene that is shown stays."""
     tab = preview().open(service)
     tab.drop((name, data))
-    tab.health_problem(*words)
+    tab.error_message(*words)
     assert tab.page.locator("#empty").is_visible()
     tab.drop(("b.zip", OTHER))
     before = tab.shown(OTHERS)
     assert not tab.page.locator("#trouble").is_visible()
     tab.drop((name, data))
-    tab.health_problem(*words)
+    tab.error_message(*words)
     tab.page.get_by_role("button", name="Dismiss").click()
-    assert looks_like(tab.shown(OTHERS), before) > 60
+    assert psnr(tab.shown(OTHERS), before) > 60
 
 
 def test_one_scene_after_the_other_releases_the_first(preview, service):
-    """Browsers keep 16 contexts."""
+    """Browsers limit the number of WebGL contexts to 16."""
     tab = preview().open(service)
-    first, books = None, []
+    first, counts = None, []
     for turn in range(20):
         name, data, count = [("a", ZIP, COUNT), ("b", OTHER, OTHERS)][turn % 2]
         tab.drop((f"{name}{turn}.zip", data), (f"{name}.ply", PLY))
@@ -98,17 +98,17 @@ def test_one_scene_after_the_other_releases_the_first(preview, service):
         tab.fact("Gaussians", f"{count:,}")
         if turn in (1, 19):
             tab.page.locator("#compare").click()  # ends it
-            picture = tab.still_image()
-            first = picture if first is None else first
-            books.append(tab.page.evaluate("books()"))
+            image = tab.still_image()
+            first = image if first is None else first
+            counts.append(tab.page.evaluate("resourceCounts()"))
     assert colours(first) > 3000
-    assert looks_like(picture, first) > 60
-    assert books[1]["contexts"] == books[0]["contexts"] <= 2
-    assert books[1]["textures"] <= books[0]["textures"] + 8
+    assert psnr(image, first) > 60
+    assert counts[1]["contexts"] == counts[0]["contexts"] <= 2
+    assert counts[1]["textures"] <= counts[0]["textures"] + 8
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_everybody_can_use_it(preview, service, scheme):
+def test_accessibility(preview, service, scheme):
     tab = preview(color_scheme=scheme, reduced_motion="reduce", viewport={"width": 820, "height": 700}).open(service)
     page = tab.page
     assert [node for node in controls(tab) if not node[1]] == []
@@ -116,27 +116,27 @@ def test_everybody_can_use_it(preview, service, scheme):
     page.get_by_role("slider").wait_for()
     tab.shown(COUNT)
     tab.drop(("letter.txt", b"Dear reader"))
-    tab.health_problem("zip")
+    tab.error_message("zip")
     found = controls(tab)
     assert {"button", "slider", "link"} <= {role for role, _ in found}
     assert [node for node in found if not node[1]] == []
     assert len(found) > 15
     assert page.get_by_role("slider").get_attribute("aria-valuenow") == "50"
-    assert page.evaluate(TOO_FAINT) == []
+    assert page.evaluate(LOW_CONTRAST) == []
     dark = page.evaluate("getComputedStyle(document.body).backgroundColor.match(/[0-9]+/g).map(Number)")
     assert (np.mean(dark) < 60) == (scheme == "dark")
-    assert page.evaluate(MOVES) == []
+    assert page.evaluate(ANIMATED) == []
 
 
 def controls(tab):
-    """Role and name of all that can be operated, as screen readers are told."""
+    """Return role and name of all controls in the accessibility tree."""
     tree = tab.context.new_cdp_session(tab.page).send("Accessibility.getFullAXTree")["nodes"]
     roles = ("button", "slider", "link", "application", "textbox")
     nodes = [(node.get("role", {}).get("value"), node.get("name", {}).get("value")) for node in tree]
     return [(role, name) for role, name in nodes if role in roles]
 
 
-TOO_FAINT = """() => {
+LOW_CONTRAST = """() => {
   const parts = (colour) => {
     const [r, g, b, a = 1] = colour.match(/[0-9.]+/g).map(Number);
     return [r, g, b, a];
@@ -163,13 +163,13 @@ TOO_FAINT = """() => {
   return faint;
 }"""
 
-MOVES = """() => [...document.querySelectorAll("*")].filter((element) => {
+ANIMATED = """() => [...document.querySelectorAll("*")].filter((element) => {
   const { transitionDuration, transitionProperty, animationName } = getComputedStyle(element);
   return (transitionProperty !== "none" && parseFloat(transitionDuration) > 0) || animationName !== "none";
 }).map((element) => element.outerHTML)"""
 
 
-def test_focus_goes_everywhere_and_is_seen(preview, service):
+def test_every_control_gets_a_visible_focus(preview, service):
     tab = preview().open(service)
     tab.drop(("a.zip", ZIP), ("a.ply", PLY))
     tab.page.get_by_role("slider").wait_for()
@@ -197,7 +197,7 @@ def test_focus_goes_everywhere_and_is_seen(preview, service):
 
 
 @pytest.mark.parametrize("width", [360, 768, 1400])
-def test_nothing_sticks_out_of_the_preview(preview, service, width):
+def test_no_horizontal_overflow_of_the_preview(preview, service, width):
     tab = preview(viewport={"width": width, "height": 500}).open(service)
     assert tab.page.evaluate("document.documentElement.scrollWidth") <= width
     tab.drop((f"{'a-very-long-name' * 9}.zip", OTHER))
@@ -211,13 +211,13 @@ def test_nothing_sticks_out_of_the_preview(preview, service, width):
 
 
 def served(tab, service, data, name="garden.zip"):
-    """Open a zip at an address."""
+    """Open the preview with the address of a zip."""
     tab.page.route(f"{service.url}/{name}", lambda route: route.fulfill(body=data))
     return tab.open(service, f"?src=../{name}")
 
 
-def said_of(tab):
-    """Statistics, but for the time it took."""
+def statistics(tab):
+    """Return the text of the statistics without the loading time."""
     return re.sub(r"Loaded in\s+\S+ \S+", "", tab.page.locator("#statistics").inner_text())
 
 
@@ -225,23 +225,23 @@ def test_an_address_and_a_file_have_the_same_statistics(preview, service):
     tab = served(preview(), service, ZIP)
     tab.shown(COUNT)
     assert tab.page.get_by_role("heading", name="garden").is_visible()
-    there = said_of(tab)
-    assert f"{len(ZIP):,}" in there
+    remote = statistics(tab)
+    assert f"{len(ZIP):,}" in remote
     tab.drop(("b.zip", OTHER))
     tab.shown(OTHERS)
     tab.drop(("garden.zip", ZIP))
     tab.shown(COUNT)
-    assert said_of(tab) == there
+    assert statistics(tab) == remote
 
 
 @pytest.mark.parametrize("address", ["%25E0%25A4%25A.zip", "http://[bad"])
-def test_what_is_no_address(preview, service, address):
+def test_invalid_addresses(preview, service, address):
     tab = preview().open(service, f"?src={address}")
-    tab.health_problem("not an address")
+    tab.error_message("not an address")
     assert tab.page.locator("#empty").is_visible()
 
 
-def test_no_gaussians(preview, service):
+def test_an_empty_scene(preview, service):
     none = kissgs.compress(scene_bytes(0, 0), settings=kissgs.Settings(preset="fast")).to_zip()
     tab = preview().open(service)
     tab.drop(("none.zip", none))
@@ -258,7 +258,7 @@ def test_a_small_file_cannot_claim_a_large_scene(preview, service):
             other.writestr(name, json.dumps(meta) if name == "meta.json" else original.read(name))
     tab = preview().open(service)
     tab.drop(("large.zip", file.getvalue()))
-    assert "10000000" in re.sub("[ ,]", "", tab.health_problem("arger than", "Gaussians"))
+    assert "10000000" in re.sub("[ ,]", "", tab.error_message("arger than", "Gaussians"))
 
 
 PROGRESS = """async (states) => {
@@ -274,10 +274,10 @@ PROGRESS = """async (states) => {
 }"""
 
 
-def test_progress_never_goes_back(preview, service):
+def test_progress_never_decreases(preview, service):
     tab = preview().open(service)
-    told = [(0, 400, 0), (200, 400, 0), (200, 4000, 0), (400, 4000, 3), (4500, 4000, 9)]
-    shares, texts = zip(*tab.page.evaluate(PROGRESS, told), strict=True)
+    states = [(0, 400, 0), (200, 400, 0), (200, 4000, 0), (400, 4000, 3), (4500, 4000, 9)]
+    shares, texts = zip(*tab.page.evaluate(PROGRESS, states), strict=True)
     assert [share or 0 for share in shares] == sorted(share or 0 for share in shares)
     assert shares == (None, 0.25, 0.25, 0.25, 1)
     assert texts[1] == "200 bytes of 400 bytes · 0 of 9 planes"
@@ -288,7 +288,7 @@ def test_progress_never_goes_back(preview, service):
     ]
 
 
-def test_a_lost_picture_is_told(preview, service):
+def test_a_lost_webgl_context_is_reported(preview, service):
     tab = preview().open(service)
     tab.drop(("a.zip", ZIP))
     tab.shown(COUNT)
@@ -296,10 +296,10 @@ def test_a_lost_picture_is_told(preview, service):
     tab.page.evaluate(
         "document.querySelector('#viewport').getContext('webgl2').getExtension('WEBGL_lose_context').loseContext()"
     )
-    tab.health_problem("graphics driver has reset", "reload the page")
+    tab.error_message("graphics driver has reset", "reload the page")
     tab.drop(("b.zip", OTHER))
     tab.fact("Gaussians", f"{OTHERS:,}")
-    tab.health_problem("graphics driver has reset")
+    tab.error_message("graphics driver has reset")
 
 
 def levels_of(file):
@@ -307,7 +307,7 @@ def levels_of(file):
         return np.asarray(Image.open(io.BytesIO(archive.read(file))).convert("RGBA"))
 
 
-def test_fingers_mark_a_gaussian(preview, service):
+def test_touch_marks_a_gaussian(preview, service):
     tab = preview(viewport={"width": 390, "height": 780}, has_touch=True, is_mobile=True).open(service)
     tab.drop(("a.zip", ZIP))
     before = tab.shown(COUNT)
@@ -317,12 +317,12 @@ def test_fingers_mark_a_gaussian(preview, service):
     size = canvas.bounding_box()["width"]
     side = int(canvas.get_attribute("width"))
     splats = kissgs.decompress(ZIP)
-    index = np.argmin(np.linalg.norm(splats.means, axis=1))  # in the picture
+    index = np.argmin(np.linalg.norm(splats.means, axis=1))  # in the image
     mask = levels_of("active_mask.webp")[..., 0]
     row, column = divmod(int(np.flatnonzero(mask)[index]), side)
     canvas.tap(position={"x": (column + 0.5) / side * size, "y": (row + 0.5) / side * size})
     readout.get_by_text(f"Column {column}, row {row}: Gaussian {index}").wait_for()
-    assert looks_like(tab.still_image(), before) < 50  # it is marked
+    assert psnr(tab.still_image(), before) < 50  # the marker is visible
     box = canvas.bounding_box()
     finger = tab.context.new_cdp_session(tab.page)
     for kind, across in (("touchStart", 0.1), *(("touchMove", 0.1 * step) for step in range(2, 9)), ("touchEnd", None)):
@@ -355,7 +355,7 @@ def test_thumbnails_are_painted_in_turn(preview, service):
     tab.drop(("b.zip", OTHER))
     tab.shown(OTHERS)
     assert tab.page.evaluate("waiting.length") == 2
-    tab.page.evaluate("waiting.shift()()")  # of the scene before
+    tab.page.evaluate("waiting.shift()()")  # belongs to the previous scene
     assert tab.page.evaluate("[waiting.length, painted()[0]]") == [1, False]
 
 
@@ -379,8 +379,8 @@ def test_planes_show_their_levels(preview, service, idle):
         assert tab.page.locator(".plane canvas").evaluate("(it) => pixelsOf(it)") == levels.ravel().tolist()
 
 
-def test_no_scene_is_shown_under_the_name_of_another(preview, service):
-    """The second has lost its positions: what was drawn of the first goes, and comes back with a third."""
+def test_a_scene_without_positions_hides_the_previous_one(preview, service):
+    """The second scene has damaged positions, so the drawing of the first is hidden until a third is loaded."""
     tab = preview().open(service)
     tab.choose(("first.zip", ZIP), button="#choose")
     tab.shown(COUNT)
@@ -389,7 +389,7 @@ def test_no_scene_is_shown_under_the_name_of_another(preview, service):
         for name in whole.namelist():
             archive.writestr(name, whole.read(name)[: 30 if name == "means_bytes_1.webp" else None])
     tab.choose(("second.zip", damaged.getvalue()))
-    tab.health_problem("means_bytes_1.webp")
+    tab.error_message("means_bytes_1.webp")
     tab.page.locator("#empty").wait_for()
     assert not tab.page.locator("#viewport").is_visible()
     tab.choose(("third.zip", ZIP))

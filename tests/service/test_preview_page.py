@@ -1,4 +1,4 @@
-"""The preview of a job in a real Chromium; oracle: what Python reads out of the same container."""
+"""The preview of a job in Chromium; oracle: the container decoded in Python."""
 
 import hashlib
 import io
@@ -6,7 +6,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from helpers.preview_browser import colours, looks_like
+from helpers.preview_browser import colours, psnr
 from helpers.service import SLOW, scene_bytes
 from PIL import Image
 
@@ -32,7 +32,7 @@ def decoded(container):
     return kissgs.decompress(container)
 
 
-def test_from_the_upload_to_the_picture(preview, service):
+def test_upload_to_preview(preview, service):
     tab = preview()
     page = tab.page
     tab.origin = service.url
@@ -46,11 +46,11 @@ def test_from_the_upload_to_the_picture(preview, service):
     page.locator("#viewport").wait_for()
     job = service.http.get("/v1/jobs", params={"limit": 1}).json()["jobs"][0]
     count = len(kissgs.decompress(service.http.get(job["links"]["result"]).content))
-    picture = tab.shown(count)
+    image = tab.shown(count)
     assert page.get_by_role("heading", name="knot").is_visible()
     assert page.title() == "knot · kissgs"
-    assert colours(picture) > 5000
-    assert (picture.max(axis=2) > 40).mean() > 0.3
+    assert colours(image) > 5000
+    assert (image.max(axis=2) > 40).mean() > 0.3
     assert page.locator("#live").inner_text() == f"knot: {count:,} Gaussians."
     facts = page.locator("#statistics .facts").inner_text()
     assert f"{job['sizes']['container']:,}" in facts
@@ -74,41 +74,41 @@ def test_keys_and_mouse_move_the_camera(preview, service, job, decoded):
     home = tab.shown(len(decoded))
     page.locator("#viewport").focus()
     still = tab.still_image()
-    frames = page.evaluate("books().frames")
+    frames = page.evaluate("resourceCounts().frames")
     page.wait_for_timeout(700)
-    assert page.evaluate("books().frames") == frames  # nothing moves, so nothing is drawn
+    assert page.evaluate("resourceCounts().frames") == frames  # nothing moves, so nothing is drawn
     assert (tab.pixels() == still).all()
     for key in ("ArrowLeft", "a"):
         press(key)
         moved = tab.still_image()
-        assert looks_like(moved, still) < 40, key
+        assert psnr(moved, still) < 40, key
         press("Home")
-        assert looks_like(tab.still_image(), still) > 60, key
+        assert psnr(tab.still_image(), still) > 60, key
     for key, least, most in (("+", 1.3, 3), ("-", 0.3, 0.8)):
         for _ in range(8):
             press(key)
         assert least < red(tab.still_image()) / red(still) < most, key
         press("r")
-    assert looks_like(tab.still_image(), still) > 60
+    assert psnr(tab.still_image(), still) > 60
     middle = page.locator("#viewport").bounding_box()
     at = (middle["x"] + middle["width"] / 2, middle["y"] + middle["height"] / 2)
     page.mouse.move(*at)
     page.mouse.wheel(0, -300)
-    assert looks_like(tab.still_image(), still) < 35
+    assert psnr(tab.still_image(), still) < 35
     page.locator("#reset").click()
     page.mouse.move(*at)
     page.mouse.down()
     page.mouse.move(at[0] + 60, at[1], steps=3)
     page.mouse.up()
-    assert looks_like(tab.still_image(), home) < 35
+    assert psnr(tab.still_image(), home) < 35
 
 
-def red(picture):
-    """Pixels of the ball."""
-    return ((picture[..., 0] > 120) & (picture[..., 1] < 80) & (picture[..., 2] < 80)).sum()
+def red(image):
+    """Return the number of red pixels, which belong to the ball."""
+    return ((image[..., 0] > 120) & (image[..., 1] < 80) & (image[..., 2] < 80)).sum()
 
 
-def test_panels_can_be_hidden_and_keys_are_listed(preview, service, job, decoded):
+def test_panels_and_help(preview, service, job, decoded):
     tab = preview().open(service, job["id"])
     page = tab.page
     narrow = tab.shown(len(decoded))
@@ -128,7 +128,7 @@ def test_panels_can_be_hidden_and_keys_are_listed(preview, service, job, decoded
     assert not page.get_by_role("dialog").is_visible()
     page.locator("#background").click()
     assert tab.page.locator("#background").get_attribute("aria-pressed") == "true"
-    before, after = ((picture[:-80].max(axis=2) < 40).sum() for picture in (narrow, tab.still_image()))
+    before, after = ((image[:-80].max(axis=2) < 40).sum() for image in (narrow, tab.still_image()))
     assert after < before / 2
 
 
@@ -151,16 +151,16 @@ def test_comparing_with_the_original(preview, service, job, decoded):
     for key, place in (("ArrowRight", 52), ("ArrowDown", 50), ("PageUp", 60), ("PageDown", 50), ("Home", 0)):
         page.keyboard.press(key)
         assert share() == place
-    free = np.s_[60:-80, 60:-60]  # of the handle, of labels and of tools
+    free = np.s_[60:-80, 60:-60]  # without the handle, labels and tools
     compressed = tab.still_image()
-    assert looks_like(compressed[free], before[free]) > 60
+    assert psnr(compressed[free], before[free]) > 60
     page.keyboard.press("End")
     assert share() == 100
     original = tab.still_image()
-    between = looks_like(original[free], compressed[free])
+    between = psnr(original[free], compressed[free])
     assert 20 < between < 50
     for turned in (original[free][:, ::-1], original[free][::-1]):
-        assert looks_like(turned, compressed[free]) < between - 5
+        assert psnr(turned, compressed[free]) < between - 5
     box, stage = handle.bounding_box(), page.locator("#stage").bounding_box()
     page.mouse.move(box["x"] + box["width"] / 2 - 5, stage["y"] + 200)
     page.mouse.down()
@@ -169,13 +169,13 @@ def test_comparing_with_the_original(preview, service, job, decoded):
     assert share() == 25
     both, width = tab.still_image(), before.shape[1]
     left, right = np.s_[60:-80, 20 : int(0.25 * width) - 30], np.s_[60:-80, int(0.25 * width) + 30 : -20]
-    assert looks_like(both[left], original[left]) > 60
-    assert looks_like(both[right], compressed[right]) > 60
+    assert psnr(both[left], original[left]) > 60
+    assert psnr(both[right], compressed[right]) > 60
     page.locator("#viewport").focus()
-    page.keyboard.press("ArrowLeft")  # both turn
+    page.keyboard.press("ArrowLeft")  # both scenes rotate
     turned = tab.still_image()
-    assert looks_like(turned[left], both[left]) < 45
-    assert looks_like(turned[right], both[right]) < 45
+    assert psnr(turned[left], both[left]) < 45
+    assert psnr(turned[right], both[right]) < 45
     page.get_by_role("button", name="End comparison").click()
     assert page.get_by_role("slider").count() == 0
     assert page.get_by_role("button", name="Compare with original").is_visible()
@@ -184,10 +184,10 @@ def test_comparing_with_the_original(preview, service, job, decoded):
 ORANGE = (255, 176, 32)
 
 
-def marked(picture, before):
-    """Where the marker is, and how far it reaches."""
-    orange = np.abs(picture - ORANGE).max(axis=2) < 60
-    rows, columns = np.nonzero(orange & (np.abs(picture - before).max(axis=2) > 30))
+def marked(image, before):
+    """Return the marker's column, row and extent, pixels."""
+    orange = np.abs(image - ORANGE).max(axis=2) < 60
+    rows, columns = np.nonzero(orange & (np.abs(image - before).max(axis=2) > 30))
     assert len(columns) > 20
     return np.median(columns), np.median(rows), max(columns.std(), rows.std())
 
@@ -196,7 +196,7 @@ def numbers(text):
     return [float(part) for part in text.replace("−", "-").replace(",", "").split()]
 
 
-def test_pointing_at_a_plane(preview, service, job, container, decoded):
+def test_hovering_over_a_plane(preview, service, job, container, decoded):
     tab = preview(viewport={"width": 820, "height": 760}).open(service, job["id"])
     page = tab.page
     before = tab.shown(len(decoded))
@@ -218,7 +218,7 @@ def test_pointing_at_a_plane(preview, service, job, container, decoded):
     leftmost, rightmost, lowest = (
         central[at(decoded.means[central, axis])] for axis, at in ((0, np.argmin), (0, np.argmax), (1, np.argmax))
     )
-    places = {}
+    markers = {}
     for index in (leftmost, rightmost, lowest):
         readout = point_at(cells[index])
         column, row = cells[index] % side, cells[index] // side
@@ -235,13 +235,13 @@ def test_pointing_at_a_plane(preview, service, job, container, decoded):
         book = len(planes["f_rest_centroids.webp"]) // 3
         assert numbers(shown["SH entry"]) == [label[0] + book * label[1]]
         assert numbers(shown["Levels RGBA"]) == [*planes["scales.webp"][row, column], 255]
-        places[index] = marked(tab.still_image(), before)
-        assert places[index][2] < 40
-    assert places[leftmost][0] < places[rightmost][0] - 50
-    assert places[lowest][1] > min(places[leftmost][1], places[rightmost][1])
+        markers[index] = marked(tab.still_image(), before)
+        assert markers[index][2] < 40
+    assert markers[leftmost][0] < markers[rightmost][0] - 50
+    assert markers[lowest][1] > min(markers[leftmost][1], markers[rightmost][1])
     padding = np.flatnonzero(mask.reshape(side * side, -1)[:, 0] == 0)[-1]
     assert "padding" in point_at(padding).inner_text()
-    assert looks_like(tab.still_image(), before) > 60
+    assert psnr(tab.still_image(), before) > 60
     canvas.press("ArrowLeft")
     assert f"Column {padding % side - 1}" in page.locator(".readout").inner_text()
     page.get_by_role("button", name="SH codebook").click()
@@ -267,26 +267,26 @@ def flipped(body):
         ("meta.json", None),
     ],
 )
-def test_a_damaged_file_is_named(preview, service, job, file, damage):
+def test_the_message_names_a_damaged_file(preview, service, job, file, damage):
     tab = preview()
 
-    def meddle(route):
+    def respond(route):
         answer = route.fetch()
         status, body = (200, damage(answer.body())) if damage else (404, b"{}")
         route.fulfill(status=status, body=body)
 
-    tab.page.route(f"**/files/{file}", meddle)
+    tab.page.route(f"**/files/{file}", respond)
     tab.open(service, job["id"])
-    tab.health_problem(file, *(() if damage else ("404",)))
+    tab.error_message(file, *(() if damage else ("404",)))
     tab.page.locator("#loading").wait_for(state="hidden")
     assert tab.page.locator("#viewport:visible, #empty:visible").count() == 1
     if damage is None:
-        tab.forgive("^404 ", "Failed to load resource.*404")
+        tab.expect_errors("^404 ", "Failed to load resource.*404")
     tab.page.get_by_role("button", name="Dismiss").click()
     assert not tab.page.locator("#trouble").is_visible()
 
 
-def test_the_picture_is_drawn_without_what_is_damaged(preview, service, job, decoded):
+def test_the_scene_is_drawn_without_damaged_planes(preview, service, job, decoded):
     tab = preview(viewport={"width": 820, "height": 760})
 
     def opened(damaged=None):
@@ -295,7 +295,7 @@ def test_the_picture_is_drawn_without_what_is_damaged(preview, service, job, dec
             tab.page.route(f"**/files/{damaged}.webp", lambda route: route.fulfill(body=flipped(route.fetch().body())))
         tab.open(service, job["id"])
         if damaged:
-            tab.health_problem(f"{damaged}.webp")
+            tab.error_message(f"{damaged}.webp")
             tab.fact("Loaded in", "cut short")
             assert tab.page.locator("#planes .thumb").count() == 8
             tab.page.get_by_role("button", name="Dismiss").click()
@@ -305,43 +305,43 @@ def test_the_picture_is_drawn_without_what_is_damaged(preview, service, job, dec
         tab.page.locator(".plane canvas").hover(position={"x": 3, "y": 3})
         return tab.page.locator(".readout").inner_text()
 
-    def bright(picture):
-        return (picture[:-80].max(axis=2) > 40).mean()
+    def bright(image):
+        return (image[:-80].max(axis=2) > 40).mean()
 
-    def of_colour(picture):
-        return (picture.max(axis=2) - picture.min(axis=2)).mean()
+    def saturation(image):
+        return (image.max(axis=2) - image.min(axis=2)).mean()
 
-    whole = opened()
+    intact = opened()
     assert "not known" not in readout()
     grey = opened("f_dc")
     assert readout().count("not known") == 1
     assert bright(grey) > 0.6
-    assert of_colour(grey) < of_colour(whole) / 3
+    assert saturation(grey) < saturation(intact) / 3
     assert 0.1 < bright(opened("scales")) < 0.4
     for file in ("opacities", "quaternions", "means_bytes_0"):
-        assert 22 < looks_like(opened(file), whole) < 40, file
+        assert 22 < psnr(opened(file), intact) < 40, file
     base = [opened(file) for file in ("f_rest_labels", "f_rest_centroids")]
-    assert 30 < looks_like(base[0], whole) < 45
-    assert looks_like(*base) > 60
+    assert 30 < psnr(base[0], intact) < 45
+    assert psnr(*base) > 60
 
 
 @pytest.mark.parametrize("file", ["active_mask.webp", "means_bytes_1.webp"])
-def test_without_places_there_is_no_picture(preview, service, job, file):
+def test_without_positions_nothing_is_drawn(preview, service, job, file):
     tab = preview()
     tab.page.route(f"**/files/{file}", lambda route: route.fulfill(body=flipped(route.fetch().body())))
     tab.open(service, job["id"])
-    tab.health_problem(file)
+    tab.error_message(file)
     tab.page.locator("#empty").wait_for()
     tab.page.wait_for_timeout(300)
     assert not tab.page.locator("#viewport").is_visible()
     assert tab.page.locator("#planes .thumb").count() == (0 if file.startswith("active") else 8)
 
 
-def test_no_such_job(preview, service):
+def test_unknown_job(preview, service):
     tab = preview().open(service, "0" * 32)
-    tab.health_problem("does not have this")
+    tab.error_message("does not have this")
     assert tab.page.locator("#empty").is_visible()
-    tab.forgive("^404 ", "Failed to load resource.*404")
+    tab.expect_errors("^404 ", "Failed to load resource.*404")
 
 
 def test_jobs_without_a_result(start, preview):
@@ -349,11 +349,11 @@ def test_jobs_without_a_result(start, preview):
     job = service.submit(scene_bytes(20_000, 3), SLOW)
     service.running(job)
     tab = preview().open(service, job["id"])
-    assert "running" in tab.health_problem("no container")
+    assert "running" in tab.error_message("no container")
     service.http.post(job["links"]["cancel"])
     service.ended(job)
     tab.open(service, job["id"])
-    assert "cancelled" in tab.health_problem("no container")
+    assert "cancelled" in tab.error_message("no container")
 
 
 def test_with_keys(start, preview):
@@ -361,8 +361,8 @@ def test_with_keys(start, preview):
     service.http.headers["Authorization"] = "Bearer secret"
     job = service.ended(service.submit())
     tab = preview().open(service, job["id"])
-    tab.health_problem("key", "enter it on its page")
-    tab.forgive("^401 ", "Failed to load resource.*401")
+    tab.error_message("key", "enter it on its page")
+    tab.expect_errors("^401 ", "Failed to load resource.*401")
     page = tab.page
     for key, works in (("other", False), ("secret", True)):
         page.evaluate("key => sessionStorage.setItem('kissgs-key', key)", key)
@@ -373,8 +373,8 @@ def test_with_keys(start, preview):
             page.get_by_role("slider").wait_for()
             page.locator("#loading").wait_for(state="hidden")
         else:
-            tab.health_problem("does not have this")
-            tab.forgive("^404 ", "Failed to load resource.*404")
+            tab.error_message("does not have this")
+            tab.expect_errors("^404 ", "Failed to load resource.*404")
     assert not any("secret" in url for _, url in tab.requests)
 
 
@@ -392,20 +392,20 @@ def test_one_finger_orbits(preview, service, job, decoded):
     ):
         touches = [{"x": left, "y": top} for left, top in points]
         finger.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": touches})
-    assert looks_like(tab.still_image(), before) < 30
+    assert psnr(tab.still_image(), before) < 30
     assert tab.page.evaluate("scrollY") == 0
     tab.page.locator("#reset").tap()
-    assert looks_like(tab.still_image()[:-80], before[:-80]) > 60
+    assert psnr(tab.still_image()[:-80], before[:-80]) > 60
 
 
-def test_without_the_viewer(preview, service, job, decoded):
+def test_without_the_vendor_folder(preview, service, job, decoded):
     tab = preview()
     tab.page.route("**/vendor/**", lambda route: route.fulfill(status=404, body="none"))
     tab.open(service, job["id"])
-    tab.health_problem("not installed", "scripts/vendor")
+    tab.error_message("not installed", "scripts/vendor")
     tab.fact("Gaussians", f"{len(decoded):,}")
     tab.page.get_by_role("button", name="Opacity").click()
     tab.page.locator(".plane canvas").hover(position={"x": 3, "y": 3})
     assert "Column 0, row 0" in tab.page.locator(".readout").inner_text()
     assert tab.page.locator("#trouble").is_visible()
-    tab.forgive("^404 .*vendor", "Failed to load resource.*404")
+    tab.expect_errors("^404 .*vendor", "Failed to load resource.*404")

@@ -1,4 +1,4 @@
-"""Starts with a database or a data folder that is older, damaged or not there; oracle: what lay there before."""
+"""Starts with an older, damaged or missing database or data folder; oracle: the files before."""
 
 import hashlib
 import json
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.usefixtures("no_variables")
 
 
 def write_result(context, job_id, folder=None):
-    """What a job's process leaves when it is done."""
+    """Write a result as a job process does."""
     folder = folder or context.storage.result(job_id)
     (folder / "files").mkdir(parents=True)
     contents = {"scene.zip": b"PK", "report.json": b"{}", "files/meta.json": b"{} "}
@@ -38,7 +38,7 @@ def state_of(context, job_id):
 
 @pytest.fixture
 def two_jobs(tmp_path):
-    """A data folder with one job that waits and one that runs, in this order."""
+    """Data folder with a queued and a running job, in this order."""
     with service(tmp_path / "data") as context:
         first, second = add_a_job(context), add_a_job(context)
         context.store.claim()
@@ -49,8 +49,8 @@ def two_jobs(tmp_path):
 
 
 @pytest.mark.parametrize("upload", ["kept", "gone"])
-def test_a_result_of_a_job_that_waits_is_taken_up(two_jobs, upload, caplog):
-    """The database was restored: since that copy was made, the job has been done."""
+def test_a_result_of_a_queued_job_is_recovered(two_jobs, upload, caplog):
+    """The database is a restored copy, made before the job ran."""
     folder, waiting, running = two_jobs
     with service(folder) as context:
         summary = write_result(context, waiting)
@@ -68,7 +68,7 @@ def test_a_result_of_a_job_that_waits_is_taken_up(two_jobs, upload, caplog):
 
 
 def test_a_restored_database_with_a_running_service(tmp_path):
-    """One job was done and has lost its upload, one has kept it: the copy says that both wait."""
+    """Both jobs are queued in the copy, but have succeeded since; one has lost its upload, the other has kept it."""
     with Service(tmp_path / "data", KISSGS_KEEP_UPLOADS="false") as it:
         long = it.submit(scene_bytes(20_000, 3), SLOW)
         it.running(long)
@@ -90,26 +90,24 @@ def test_a_restored_database_with_a_running_service(tmp_path):
         assert it.status(long)["problem"]["detail"].startswith("the upload is no longer")
 
 
-# Folders that are not there -------------------------------------------------------------------------------------------
+# Missing folders -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("way", ["emptied", "moved away", "of other jobs"])
-def test_no_folder_of_the_jobs_that_wait_or_run(two_jobs, way):
+@pytest.mark.parametrize("change", ["emptied", "moved away", "of other jobs"])
+def test_folders_of_all_active_jobs_are_missing(two_jobs, change):
     folder, waiting, running = two_jobs
     (folder / "jobs").rename(folder / "away")
-    if way != "moved away":
+    if change != "moved away":
         (folder / "jobs").mkdir()
-    if way == "of other jobs":
+    if change == "of other jobs":
         (folder / "jobs" / ("0" * 32)).mkdir()
     for _ in range(2):
-        with pytest.raises(
-            SettingsError, match=r"holds none of the jobs that wait or run, of which there are 2"
-        ) as told:
+        with pytest.raises(SettingsError, match=r"has none of the 2 jobs that are queued or running") as caught:
             opened(folder)
-        assert "\n" not in str(told.value)
+        assert "\n" not in str(caught.value)
     ended = command(folder)
     assert (ended.returncode, len(ended.stderr.splitlines())) == (2, 1)
-    if way == "moved away":
+    if change == "moved away":
         (folder / "jobs").rmdir()
     else:
         shutil.rmtree(folder / "jobs")
@@ -118,13 +116,13 @@ def test_no_folder_of_the_jobs_that_wait_or_run(two_jobs, way):
         assert state_of(context, waiting) == state_of(context, running) == State.QUEUED
 
 
-def test_going_on_without_them(two_jobs):
-    """As that sentence says."""
+def test_a_start_without_the_folders_of_all_active_jobs(two_jobs):
+    """The message describes how."""
     folder, *jobs = two_jobs
     shutil.rmtree(folder / "jobs")
-    with pytest.raises(SettingsError) as told:
+    with pytest.raises(SettingsError) as caught:
         opened(folder)
-    named = str(told.value).split("make the empty folder ")[1].split(" ")[0]
+    named = str(caught.value).split("create the empty folder ")[1].split(" ")[0]
     assert named == str(folder / "jobs" / min(jobs))
     (folder / "jobs" / min(jobs)).mkdir()
     with service(folder) as context:
@@ -146,7 +144,7 @@ def test_a_job_without_its_upload_keeps_its_folder(two_jobs, caplog):
                 assert state_of(context, job) == State.FAILED
                 assert "no longer on the server's disk" in context.store.get(job).problem["detail"]
         assert listing(folder / "jobs" / ".orphaned") == before
-    assert caplog.text.count("has lost its upload and lies in") == 2
+    assert caplog.text.count("has lost its upload and was moved to") == 2
     assert f"job {waiting} failed before it was started" in caplog.text
 
 
@@ -159,10 +157,10 @@ def test_a_result_of_a_job_that_failed_is_kept(two_jobs):
     before = listing(folder / "jobs" / running)
     with service(folder):
         assert listing(folder / "jobs" / ".orphaned" / running) == before
-        assert not (folder / "jobs" / waiting).exists()  # an upload is of no more use
+        assert not (folder / "jobs" / waiting).exists()  # without a result, the folder is removed
 
 
-# What is damaged -----------------------------------------------------------------------------------------------------
+# Damage -----------------------------------------------------------------------------------------------------
 
 DAMAGES = {
     "cut off": lambda result: (result / "summary.json").write_text('{"container": {"by'),
@@ -180,7 +178,7 @@ DAMAGES = {
 @pytest.mark.parametrize("damage", DAMAGES)
 @pytest.mark.parametrize("state", ["waiting", "running"])
 def test_a_damaged_result(two_jobs, damage, state, caplog):
-    """The job is done once more, and its new result takes the place of that one."""
+    """The job runs again, and its new result replaces the damaged one."""
     folder, waiting, running = two_jobs
     job = waiting if state == "waiting" else running
     with service(folder) as context:
@@ -192,13 +190,13 @@ def test_a_damaged_result(two_jobs, damage, state, caplog):
         assert f"job {job}: its result is damaged" in caplog.text
         summary = write_result(context, job, context.storage.new_work(job) / "result")
         context.storage.keep_result(job)
-        context.storage.keep_result(job)  # once more, because its end could not be recorded
+        context.storage.keep_result(job)  # repeated if the end could not be recorded
         context.storage.remove_work(job)
         assert sorted(path.name for path in (folder / "jobs" / job).iterdir()) == ["result", "scene.ply"]
         assert json.loads((context.storage.result(job) / "summary.json").read_text()) == summary
 
 
-def test_a_result_that_has_vanished_is_none(two_jobs):
+def test_a_missing_result(two_jobs):
     folder, waiting, _ = two_jobs
-    with service(folder) as context, pytest.raises(FileNotFoundError, match="vanished"):
+    with service(folder) as context, pytest.raises(FileNotFoundError, match="its result is missing"):
         context.storage.keep_result(waiting)

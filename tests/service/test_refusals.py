@@ -1,4 +1,4 @@
-"""Every way a request can be refused; oracle: the table of codes and what RFC 9457 and HTTP ask for."""
+"""Refused requests; oracle: the problem types, RFC 9457 and HTTP."""
 
 import contextlib
 import gzip
@@ -10,7 +10,7 @@ import zipfile
 
 import httpx
 import pytest
-from helpers.service import FAST, SLOW, SMALL, problem, said, scene_bytes
+from helpers.service import FAST, SLOW, SMALL, problem, read_response, scene_bytes
 
 from service.core.problems import PROBLEM_TYPES
 
@@ -45,8 +45,8 @@ HOSTILE = {
     "a list": FULL.replace(b"property float x\n", b"property list uchar int x\n") + bytes(99999),
     "truncated": SMALL[:-1],
     "header alone": FULL,
-    "count that lies": SMALL.replace(b"vertex 300\n", b"vertex 301\n"),
-    "count beyond belief": SMALL.replace(b"vertex 300\n", b"vertex 999999999999999999\n"),
+    "wrong count": SMALL.replace(b"vertex 300\n", b"vertex 301\n"),
+    "enormous count": SMALL.replace(b"vertex 300\n", b"vertex 999999999999999999\n"),
     "count no number": SMALL.replace(b"vertex 300\n", b"vertex 3e2\n"),
     "negative count": SMALL.replace(b"vertex 300\n", b"vertex -1\n"),
     "two vertex elements": FULL.replace(b"end_header", b"element vertex 3\nend_header") + bytes(99999),
@@ -71,7 +71,7 @@ def test_hostile_scenes(service, kind, form):
     assert not found["retryable"]
 
 
-def test_what_only_the_body_shows_fails_the_job(service):
+def test_errors_in_the_body_fail_the_job(service):
     text = header(2, "".join(f"property float {n}\n" for n in NAMES), "ascii") + b"1 2 three\n" * 50
     found = service.ended(submit(service, text).json())
     assert (found["state"], found["problem"]["code"]) == ("failed", "invalid-scene")
@@ -95,22 +95,22 @@ NAMES = [
 ]
 
 
-def test_too_many_gaussians_are_refused_by_the_header(service):
-    """Long before the body has come, which here it never does."""
+def test_too_many_gaussians_are_refused_after_the_header(service):
+    """The rest of the body is never sent."""
     start = scene_bytes(1, 1).replace(b"vertex 1\n", b"vertex 20001\n")[:2000]
     request = b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 3000000\r\n\r\n" + start
     with service.raw(request) as connection:
-        answer = said(connection).decode()
+        answer = read_response(connection).decode()
     assert answer.startswith("HTTP/1.1 422")
     assert "20,001 Gaussians" in answer
     assert "the limit is 20,000" in answer
     assert '"code":"unsupported"' in answer
 
 
-def test_a_scene_that_cannot_be_whole_is_refused_by_its_length(service):
+def test_an_incomplete_scene_is_refused_by_its_length(service):
     request = b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n" % (len(SMALL) - 1)
     with service.raw(request + FULL) as connection:
-        assert b"cut short" in said(connection)
+        assert b"cut short" in read_response(connection)
 
 
 @pytest.mark.parametrize("chunked", [False, True])
@@ -121,23 +121,23 @@ def test_too_large(service, chunked):
     assert list((service.folder / "incoming").iterdir()) == []
 
 
-def test_too_large_is_said_before_the_body_comes(service):
+def test_too_large_uploads_are_refused_before_the_body(service):
     with service.raw(b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5000000\r\n\r\n") as connection:
-        assert said(connection).startswith(b"HTTP/1.1 413")
+        assert read_response(connection).startswith(b"HTTP/1.1 413")
 
 
-UNUSABLE = [
+INVALID_OPTIONS = [
     *("", "{", "[]", "null", "7", "{" * 5000, '{"x": 1}', '{"preset": "tiny"}', '{"evaluate": "perhaps"}'),
     *(
-        f'{{"encode": {wrong}}}'
-        for wrong in ('{"gaussians_per_codebook_entry": -1}', '{"nothing": 1}', '{"seed": 1e400}', "null")
+        f'{{"encode": {value}}}'
+        for value in ('{"gaussians_per_codebook_entry": -1}', '{"nothing": 1}', '{"seed": 1e400}', "null")
     ),
 ]
 
 
-@pytest.mark.parametrize("options", UNUSABLE)
+@pytest.mark.parametrize("options", INVALID_OPTIONS)
 @pytest.mark.parametrize("form", [False, True])
-def test_options_that_cannot_be_used(service, options, form):
+def test_invalid_options(service, options, form):
     if form:
         answer = service.http.post("/v1/jobs", files={"options": (None, options), "file": ("x.ply", SMALL)})
     else:
@@ -150,12 +150,12 @@ def test_options_that_cannot_be_used(service, options, form):
 @pytest.mark.parametrize(
     "kind", ["text/plain", "application/json", "application/x-www-form-urlencoded", "image/png", "x"]
 )
-def test_types_that_are_not_read(service, kind):
+def test_unsupported_media_types(service, kind):
     found = problem(submit(service, headers={"Content-Type": kind}), 415, "media-type")
     assert "curl -F" in found["detail"]
 
 
-def test_encodings_that_are_not_read(service):
+def test_unsupported_content_encodings(service):
     problem(submit(service, gzip.compress(SMALL), headers={"Content-Encoding": "gzip"}), 415, "media-type")
 
 
@@ -166,23 +166,23 @@ OPTIONS = PART % (b"options", b"{}")
 FORMS = {
     "no boundary": ("multipart/form-data", b"--b\r\n"),
     "empty boundary": ("multipart/form-data; boundary=", b""),
-    "endless boundary": ("multipart/form-data; boundary=" + "b" * 300, b""),
-    "nothing": (FORM["Content-Type"], b""),
-    "no form": (FORM["Content-Type"], b"nothing of the kind"),
+    "long boundary": ("multipart/form-data; boundary=" + "b" * 300, b""),
+    "empty": (FORM["Content-Type"], b""),
+    "text": (FORM["Content-Type"], b"nothing of the kind"),
     "no parts": (FORM["Content-Type"], b"--b--\r\n"),
     "a part without a name": (FORM["Content-Type"], b"--b\r\n\r\nno name\r\n--b--\r\n"),
     "another field": (FORM["Content-Type"], PART % (b"other", b"x") + b"--b--\r\n"),
     "no scene": (FORM["Content-Type"], OPTIONS + b"--b--\r\n"),
     "options twice": (FORM["Content-Type"], OPTIONS + OPTIONS + b"--b--\r\n"),
-    "endless header": (FORM["Content-Type"], b"--b\r\nX: " + b"x" * 20_000 + b"\r\n\r\n\r\n--b--\r\n"),
-    "endless options": (FORM["Content-Type"], PART % (b"options", b" " * 70_000)),
+    "long header": (FORM["Content-Type"], b"--b\r\nX: " + b"x" * 20_000 + b"\r\n\r\n\r\n--b--\r\n"),
+    "long options": (FORM["Content-Type"], PART % (b"options", b" " * 70_000)),
     "scene twice": (FORM["Content-Type"], (PART % (b"file", SMALL)) * 2 + b"--b--\r\n"),
-    "breaks off within the scene": (FORM["Content-Type"], (PART % (b"file", SMALL))[:-2]),
+    "truncated scene": (FORM["Content-Type"], (PART % (b"file", SMALL))[:-2]),
 }
 
 
 @pytest.mark.parametrize("kind", FORMS)
-def test_forms_that_are_none(service, kind):
+def test_invalid_forms(service, kind):
     content_type, body = FORMS[kind]
     answer = submit(service, body, headers={"Content-Type": content_type}, params={})
     problem(answer, 422, "invalid-request")
@@ -197,7 +197,7 @@ def test_options_in_two_places(service):
 
 
 @pytest.mark.parametrize("key", ["x" * 256, "a b", "é"])
-def test_idempotency_keys_that_are_none(service, key):
+def test_invalid_idempotency_keys(service, key):
     answer = submit(service, headers={"Idempotency-Key": key.encode("latin-1")})
     problem(answer, 422, "invalid-request")
 
@@ -218,17 +218,17 @@ def test_idempotency_keys_that_are_none(service, key):
         ("DELETE", "/v1/limits", 405, "method-not-allowed"),
     ],
 )
-def test_what_is_not_there(service, method, path, status, code):
+def test_unknown_resources(service, method, path, status, code):
     problem(service.http.request(method, path), status, code)
 
 
-def test_a_wait_that_is_too_long(service):
+def test_invalid_waits(service):
     job = service.submit()
     for wait in (31, -1, "nan", "soon"):
         problem(service.http.get(f"/v1/jobs/{job['id']}", params={"wait": wait}), 422, "invalid-request")
 
 
-def test_every_code_is_explained(service):
+def test_every_code_is_described(service):
     listed = service.http.get("/v1/problems").json()
     assert [kind["code"] for kind in listed] == list(PROBLEM_TYPES)
     for kind in listed:
@@ -245,10 +245,10 @@ def test_a_full_queue(start):
     assert problem(answer, 429, "queue-full")["retryable"]
     assert 1 <= int(answer.headers["retry-after"]) <= 300
     with service.raw(b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 500000\r\n\r\n") as connection:
-        assert said(connection).startswith(b"HTTP/1.1 429")  # before the body
+        assert read_response(connection).startswith(b"HTTP/1.1 429")  # before the body
 
 
-def test_a_full_queue_still_knows_what_it_has_taken(start):
+def test_idempotency_keys_work_with_a_full_queue(start):
     service = start(KISSGS_MAX_QUEUE=1)
     service.running(service.submit(scene_bytes(20_000, 3), SLOW))
     first = service.submit(**{"Idempotency-Key": "k"})
@@ -263,11 +263,11 @@ def test_too_many_uploads(start):
     wait_for(lambda: submit(service).status_code == 202)
 
 
-def test_no_room(start):
+def test_disk_limit(start):
     service = start(KISSGS_MAX_DISK_BYTES=2 * len(SMALL), KISSGS_KEEP_UPLOADS="true")
     job = service.ended(service.submit())
     assert "source" in job["links"]
-    second = service.ended(service.submit(scene_bytes(300, seed=1)))  # for which the first's upload is given up
+    second = service.ended(service.submit(scene_bytes(300, seed=1)))  # the first job's upload is reclaimed
     assert second["state"] == "succeeded"
     assert "source" not in service.status(job)["links"]
     problem(service.http.get(f"/v1/jobs/{job['id']}/source"), 410, "gone")
@@ -278,26 +278,26 @@ def test_no_room(start):
     assert list((service.folder / "incoming").iterdir()) == []
 
 
-def test_a_disk_that_must_keep_some_free(start):
+def test_minimum_free_disk_space(start):
     service = start(KISSGS_MIN_FREE_BYTES="1000TB")
     problem(submit(service), 507, "disk-full")
     answer = service.http.get("/readyz")
     assert (answer.status_code, answer.json()["ready"]) == (503, False)
-    assert "bytes are free" in answer.json()["checks"]["disk"]
+    assert "free bytes" in answer.json()["checks"]["disk"]
     assert service.http.get("/livez").status_code == 200
 
 
-def test_an_upload_that_stalls(start):
+def test_a_stalled_upload(start):
     service = start(KISSGS_UPLOAD_IDLE_SECONDS=0.5)
     with service.raw(b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 500000\r\n\r\nply\n") as connection:
-        answer = said(connection)
+        answer = read_response(connection)
         assert answer.startswith(b"HTTP/1.1 408")
         assert b"upload-timeout" in answer
     assert list((service.folder / "incoming").iterdir()) == []
 
 
-def test_an_upload_that_drips(start):
-    """A byte now and then keeps no slot of the service."""
+def test_a_slow_upload(start):
+    """Single bytes do not keep an upload alive."""
     service = start(KISSGS_UPLOAD_IDLE_SECONDS=1)
     connection = service.raw(b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 500000\r\n\r\n")
     connection.settimeout(0.2)
@@ -308,13 +308,13 @@ def test_an_upload_that_drips(start):
             answer += connection.recv(65536)
         if answer:
             break
-    answer += said(connection)
+    answer += read_response(connection)
     connection.close()
     assert b"upload-timeout" in answer
     assert time.monotonic() - begun < 5
 
 
-def test_a_client_that_goes_away(service):
+def test_a_client_that_disconnects(service):
     before = json.loads(service.http.get("/v1/jobs", params={"limit": 1}).text)
     with service.raw(
         b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 500000\r\n\r\n" + SMALL[:30_000]
@@ -332,9 +332,9 @@ def wait_for(condition, seconds=10):
         time.sleep(0.05)
 
 
-def test_garbage_instead_of_http(service):
+def test_invalid_http(service):
     with service.raw(b"\x16\x03\x01\x02\x00\x01\x00 no HTTP at all\r\n\r\n") as connection:
-        answer = said(connection)
+        answer = read_response(connection)
         assert answer.startswith(b"HTTP/1.1 400")
         assert b"application/problem+json" in answer
         assert b'"code":"bad-http"' in answer
@@ -342,5 +342,5 @@ def test_garbage_instead_of_http(service):
         service.raw(b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"x" * 200_000) as connection,
         contextlib.suppress(ConnectionError),
     ):
-        assert said(connection).startswith(b"HTTP/1.1 4")
+        assert read_response(connection).startswith(b"HTTP/1.1 4")
     assert httpx.get(f"{service.url}/livez").status_code == 200

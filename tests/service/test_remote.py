@@ -1,4 +1,4 @@
-"""The client in Python and on the command line, against a real service; oracle: kissgs.compress here."""
+"""The client, in Python and on the command line, with a real service; oracle: local kissgs.compress."""
 
 import hashlib
 import json
@@ -26,40 +26,40 @@ def scene(tmp_path):
 FAST = kissgs.Settings(preset="fast")
 
 
-def test_compressing_there_gives_what_compressing_here_does(service, scene, tmp_path):
-    heard = []
+def test_remote_compression_equals_local_compression(service, scene, tmp_path):
+    received = []
     with kissgs.Remote(service.url) as remote:
         status = remote.compress(
-            scene, tmp_path / "there.zip", settings=FAST, progress=lambda *event: heard.append(event)
+            scene, tmp_path / "remote.zip", settings=FAST, progress=lambda *event: received.append(event)
         )
-    kissgs.compress(scene, tmp_path / "here.zip", settings=FAST)
-    assert (tmp_path / "there.zip").read_bytes() == (tmp_path / "here.zip").read_bytes()
+    kissgs.compress(scene, tmp_path / "local.zip", settings=FAST)
+    assert (tmp_path / "remote.zip").read_bytes() == (tmp_path / "local.zip").read_bytes()
     assert (status["state"], status["name"], status["gaussians"]) == ("succeeded", "Schloß 1", 300)
-    stages = [stage for stage, _ in heard]
+    stages = [stage for stage, _ in received]
     assert [stages.index(stage) for stage in ("upload", "queue", "read", "images", "download")] == sorted(
         stages.index(stage) for stage in ("upload", "queue", "read", "images", "download")
     )
-    assert all(0 <= fraction <= 1 for _, fraction in heard)
-    assert heard[-1] == ("download", 1.0)
+    assert all(0 <= fraction <= 1 for _, fraction in received)
+    assert received[-1] == ("download", 1.0)
 
 
-def test_notes_of_training_are_heard_here(service, scene, tmp_path):
+def test_training_notes_are_received(service, scene, tmp_path):
     changes = {"count": 100, "sparsify_steps": 4, "refine_steps": 4, "views": 24, "view_size": 48}
-    heard = []
+    received = []
     with kissgs.Remote(service.url) as remote:
         remote.compress(
             scene,
             tmp_path / "x.zip",
             settings=kissgs.Settings.from_preset("fast", compact=changes),
-            progress=lambda *event: heard.append(event),
+            progress=lambda *event: received.append(event),
         )
-    notes = {stage: note for stage, _, *said in heard for note in said}
+    notes = {stage: note for stage, _, *optional in received for note in optional}
     assert notes.keys() == {"sparsify", "refine"}
     assert all(note.startswith("1") and "Gaussians" in note for note in notes.values())
 
 
 @pytest.mark.parametrize(
-    ("data", "kind", "said"),
+    ("data", "kind", "message"),
     [
         (b"hello", kissgs.InvalidSceneError, "not a PLY file"),
         (SMALL[:-1], kissgs.InvalidSceneError, "cut short"),
@@ -67,22 +67,22 @@ def test_notes_of_training_are_heard_here(service, scene, tmp_path):
         (SMALL + bytes(5_000_000), kissgs.RemoteError, "4,000,000 bytes"),
     ],
 )
-def test_what_the_service_refuses_is_raised_here(service, tmp_path, data, kind, said):
+def test_refusals_raise_exceptions(service, tmp_path, data, kind, message):
     path = tmp_path / "x.ply"
     path.write_bytes(data)
-    with kissgs.Remote(service.url) as remote, pytest.raises(kind, match=said):
+    with kissgs.Remote(service.url) as remote, pytest.raises(kind, match=message):
         remote.compress(path, tmp_path / "x.zip")
     assert not (tmp_path / "x.zip").exists()
 
 
-def test_what_goes_wrong_here_is_told(service, scene, tmp_path):
+def test_local_errors(service, scene, tmp_path):
     with kissgs.Remote(service.url) as remote:
         with pytest.raises(kissgs.InvalidSceneError, match="no such file"):
             remote.compress(tmp_path / "nothing.ply", tmp_path / "x.zip")
-        (tmp_path / "x.zip").write_text("mine")
+        (tmp_path / "x.zip").write_text("existing")
         with pytest.raises(kissgs.OutputError, match="exists already"):
             remote.compress(scene, tmp_path / "x.zip", settings=FAST)
-        assert (tmp_path / "x.zip").read_text() == "mine"
+        assert (tmp_path / "x.zip").read_text() == "existing"
         with pytest.raises(kissgs.RemoteError, match="no job"):
             remote.status("0" * 32)
     for address in ("localhost:8000", "ftp://x", "http://[x"):
@@ -90,18 +90,18 @@ def test_what_goes_wrong_here_is_told(service, scene, tmp_path):
             kissgs.Remote(address)
 
 
-def test_a_service_that_is_not_there(scene, tmp_path, monkeypatch):
+def test_an_unreachable_service(scene, tmp_path, monkeypatch):
     from kissgs.client import remote
 
     monkeypatch.setattr(remote, "RETRY_SECONDS", 1.0)
-    with socket.socket() as nobody:
-        nobody.bind(("127.0.0.1", 0))
-        url = f"http://127.0.0.1:{nobody.getsockname()[1]}"
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        url = f"http://127.0.0.1:{unused.getsockname()[1]}"
         with kissgs.Remote(url) as client, pytest.raises(kissgs.RemoteError, match="cannot reach"):
             client.compress(scene, tmp_path / "x.zip")
 
 
-def test_stopping_here_stops_it_there(start, tmp_path):
+def test_cancelled_raised_by_progress_cancels_the_job(start, tmp_path):
     service = start()
     scene = tmp_path / "scene.ply"
     scene.write_bytes(scene_bytes(20_000, 3))
@@ -117,7 +117,7 @@ def test_stopping_here_stops_it_there(start, tmp_path):
     assert service.children() == []
 
 
-def test_a_job_that_is_cancelled_there(start, tmp_path):
+def test_a_job_cancelled_on_the_server(start, tmp_path):
     service = start()
     scene = tmp_path / "scene.ply"
     scene.write_bytes(scene_bytes(20_000, 3))
@@ -131,8 +131,8 @@ def test_a_job_that_is_cancelled_there(start, tmp_path):
         remote.compress(scene, tmp_path / "x.zip", settings=kissgs.Settings(preset="paper"), progress=cancel)
 
 
-def test_the_service_restarts_meanwhile(tmp_path):
-    """Killed while the job runs, back at the same address a moment later: the client notices nothing."""
+def test_the_service_restarts_during_a_job(tmp_path):
+    """The client continues when a killed service is back at its address."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -155,7 +155,7 @@ def test_the_service_restarts_meanwhile(tmp_path):
     assert (tmp_path / "x.zip").read_bytes() == kissgs.compress(scene, settings=FAST).to_zip()
 
 
-def test_a_crowded_service_is_asked_again(start, scene, tmp_path):
+def test_a_full_queue_is_retried(start, scene, tmp_path):
     service = start(KISSGS_MAX_QUEUE=1)
 
     def run(i):
@@ -167,7 +167,7 @@ def test_a_crowded_service_is_asked_again(start, scene, tmp_path):
     assert len({(tmp_path / f"{i}.zip").read_bytes() for i in range(5)}) == 1
 
 
-def test_a_container_that_is_damaged_on_its_way(service, scene, tmp_path, monkeypatch):
+def test_a_container_damaged_in_transit(service, scene, tmp_path, monkeypatch):
     import httpx
 
     real = httpx.Response.iter_bytes
@@ -214,13 +214,13 @@ def test_the_command_with_a_goal(service, scene, tmp_path):
 def test_the_command_with_keys(start, scene):
     service = start(KISSGS_KEYS=f"alice:{hashlib.sha256(b'secret').hexdigest()}")
     without = kissgs_command("compress", scene, "--server", service.url)
-    assert (without.returncode, "needs a key" in without.stderr) == (2, True)
+    assert (without.returncode, "requires a key" in without.stderr) == (2, True)
     assert kissgs_command("compress", scene, "--server", service.url, KISSGS_KEY="secret").returncode == 0
 
 
-@pytest.mark.parametrize("wrong", [["--server", "nonsense"], ["-p", "tiny"], ["--set", "x=1"], ["-o", "-"]])
-def test_wrong_commands(scene, wrong):
-    done = kissgs_command("compress", scene, *wrong)
+@pytest.mark.parametrize("arguments", [["--server", "nonsense"], ["-p", "tiny"], ["--set", "x=1"], ["-o", "-"]])
+def test_invalid_commands(scene, arguments):
+    done = kissgs_command("compress", scene, *arguments)
     assert done.returncode == 2
     assert done.stderr.startswith("kissgs: ")
     assert len(done.stderr.splitlines()) == 1
@@ -238,7 +238,7 @@ def test_interrupting_the_command_cancels_the_job(start, tmp_path):
     )
     while not service.children():
         time.sleep(0.05)
-    time.sleep(2)  # until the answer has reached the client: before, it knows of no job
+    time.sleep(2)  # until the client has received the job's id
     running.send_signal(signal.SIGINT)
     assert running.wait(20) == 130
     assert "interrupted" in running.stderr.read()

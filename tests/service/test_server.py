@@ -1,4 +1,4 @@
-"""Connections that are only there to be there; oracle: a clock."""
+"""Idle and slow connections; oracle: a clock."""
 
 import asyncio
 import contextlib
@@ -11,11 +11,11 @@ import uvicorn
 
 from service.http import server
 
-PATIENCE = 0.6
+TIMEOUT = 0.6
 
 
 async def application(scope, receive, send):
-    """Answers ``/`` at once, and anything else with more than any buffer takes, slowly asked or not."""
+    """Respond to ``/`` with little data, and to other paths with more data than all buffers hold."""
     assert scope["type"] == "http"
     await send({"type": "http.response.start", "status": 200, "headers": []})
     for _ in range(1 if scope["path"] == "/" else 400):
@@ -26,8 +26,8 @@ async def application(scope, receive, send):
 
 @pytest.fixture
 def port(monkeypatch):
-    monkeypatch.setattr(server, "HEADER_SECONDS", PATIENCE)
-    monkeypatch.setattr(server, "READ_SECONDS", PATIENCE)
+    monkeypatch.setattr(server, "HEADER_SECONDS", TIMEOUT)
+    monkeypatch.setattr(server, "READ_SECONDS", TIMEOUT)
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -46,7 +46,7 @@ def port(monkeypatch):
 
 def seconds_until_closed(connection):
     begun = time.monotonic()
-    connection.settimeout(20 * PATIENCE)
+    connection.settimeout(20 * TIMEOUT)
     with contextlib.suppress(ConnectionError):
         while connection.recv(1 << 16):
             pass
@@ -58,57 +58,57 @@ REQUEST = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"
 
 
 @pytest.mark.parametrize(
-    "said", [b"", b"GET / HTTP/1.1\r\nHost", REQUEST + b"GET / HTT", REQUEST + REQUEST + b"G"], ids=repr
+    "sent", [b"", b"GET / HTTP/1.1\r\nHost", REQUEST + b"GET / HTT", REQUEST + REQUEST + b"G"], ids=repr
 )
-def test_a_request_that_never_comes(port, said):
+def test_incomplete_requests(port, sent):
     with socket.create_connection(("127.0.0.1", port)) as connection:
-        connection.sendall(said)
-        assert 0.5 * PATIENCE < seconds_until_closed(connection) < 10 * PATIENCE
+        connection.sendall(sent)
+        assert 0.5 * TIMEOUT < seconds_until_closed(connection) < 10 * TIMEOUT
 
 
-def test_headers_that_drip(port):
+def test_slow_headers(port):
     begun = time.monotonic()
     with socket.create_connection(("127.0.0.1", port)) as connection, contextlib.suppress(ConnectionError):
         for byte in b"GET / HTTP/1.1\r\nX: " + b"x" * 1000:
             connection.sendall(bytes([byte]))
             time.sleep(0.05)
-    assert time.monotonic() - begun < 10 * PATIENCE
+    assert time.monotonic() - begun < 10 * TIMEOUT
 
 
-def test_an_answer_that_nobody_takes(port):
+def test_a_response_that_is_not_read(port):
     with socket.create_connection(("127.0.0.1", port)) as connection:
         connection.sendall(b"GET /long HTTP/1.1\r\nHost: x\r\n\r\n")
-        time.sleep(4 * PATIENCE)
-        taken = 0
+        time.sleep(4 * TIMEOUT)
+        received = 0
         with contextlib.suppress(ConnectionError):
             while block := connection.recv(1 << 20):
-                taken += len(block)
-    assert taken < 400 * 100_000
+                received += len(block)
+    assert received < 400 * 100_000
 
 
-def test_an_answer_that_is_taken_slowly_but_surely(port):
+def test_a_response_that_is_read_slowly(port):
     with socket.create_connection(("127.0.0.1", port)) as connection:
         connection.sendall(b"GET /long HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
-        taken = 0
+        received = 0
         while block := connection.recv(1 << 20):
-            taken += len(block)
+            received += len(block)
             time.sleep(0.02)
-    assert taken > 400 * 100_000
+    assert received > 400 * 100_000
 
 
-def test_what_is_used_stays_open(port):
+def test_active_connections_stay_open(port):
     with socket.create_connection(("127.0.0.1", port)) as connection:
         for _ in range(6):
             connection.sendall(REQUEST)
-            time.sleep(0.5 * PATIENCE)
+            time.sleep(0.5 * TIMEOUT)
             answer = b""
             while not answer.endswith(b"\r\n0\r\n\r\n"):
                 answer += connection.recv(1 << 20)
             assert answer.startswith(b"HTTP/1.1 200")
 
 
-def test_a_connection_may_be_used_for_long(port):
-    """What parsing costs counts against a body, not against thousands of requests in a row."""
+def test_a_connection_with_thousands_of_requests(port):
+    """The limit on parsing time applies to each body, not to all requests of a connection."""
     with socket.create_connection(("127.0.0.1", port)) as connection:
         for _ in range(2000):
             connection.sendall(REQUEST)

@@ -1,4 +1,4 @@
-"""Starts that go on with the jobs of a data folder, and what they set aside there; oracle: what lay there before."""
+"""Starts with the jobs of a data folder, and folders that move to the orphaned one; oracle: the files before."""
 
 import shutil
 
@@ -8,47 +8,47 @@ from helpers.data_folders import database, finish_a_job, listing, names, opened,
 
 from service.core.models import SCHEMA_VERSION, State
 from service.core.settings import SettingsError
-from service.storage import folder_binding as pairing
+from service.storage import folder_binding
 from service.storage.job_store import Store
 
 pytestmark = pytest.mark.usefixtures("no_variables")
 
 
-def test_starts_one_after_the_other(tmp_path):
+def test_repeated_starts(tmp_path):
     with service(tmp_path / "data") as context:
         job = finish_a_job(context)
-    marks = (tmp_path / "data" / "identity").read_text(), (tmp_path / "data" / "database").read_text()
+    numbers = (tmp_path / "data" / "identity").read_text(), (tmp_path / "data" / "database").read_text()
     for _ in range(2):
         with service(tmp_path / "data") as context:
             assert context.store.get(job).state == State.SUCCEEDED
             assert context.storage.result(job).exists()
             assert context.storage.count_orphaned() == 0
-    assert ((tmp_path / "data" / "identity").read_text(), (tmp_path / "data" / "database").read_text()) == marks
+    assert ((tmp_path / "data" / "identity").read_text(), (tmp_path / "data" / "database").read_text()) == numbers
 
 
 @pytest.mark.parametrize("lost", [["database"], ["identity"], ["identity", "database"]])
 @pytest.mark.parametrize("numbered", [True, False])
 def test_a_folder_of_a_development_version(jobs_folder, lost, numbered):
-    """Neither had the other's number; the jobs that they share tell."""
+    """Missing numbers are restored, because folder and database have common jobs."""
     for name in lost:
         (jobs_folder / name).unlink()
     if not numbered:
         database(jobs_folder, "DELETE FROM meta WHERE name = 'identity'")
     with service(jobs_folder) as context:
-        assert context.storage.held() == context.store.ids()
+        assert context.storage.job_ids() == context.store.ids()
         assert context.store.health_problem() is None
         assert finish_a_job(context) in context.store.ids()
     with service(jobs_folder) as context:
         assert len(context.store.ids()) == 121
 
 
-@pytest.mark.parametrize("step", ["write_mark", "belong_to"])
-def test_a_first_start_that_is_cut_off(tmp_path, monkeypatch, step):
+@pytest.mark.parametrize("step", ["write_number", "bind_to"])
+def test_an_interrupted_first_start(tmp_path, monkeypatch, step):
     def end(*arguments):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr({"write_mark": pairing, "belong_to": Store}[step], step, end)
+        patch.setattr({"write_number": folder_binding, "bind_to": Store}[step], step, end)
         with pytest.raises(KeyboardInterrupt):
             opened(tmp_path / "data")
     with service(tmp_path / "data") as context:
@@ -57,7 +57,7 @@ def test_a_first_start_that_is_cut_off(tmp_path, monkeypatch, step):
         assert len(context.store.ids()) == 1
 
 
-def test_beginning_anew_beside_what_was_moved_away(jobs_folder):
+def test_a_start_after_the_jobs_were_moved_away(jobs_folder):
     (jobs_folder / "jobs.sqlite").unlink()
     (jobs_folder / "jobs").rename(jobs_folder / "old")
     with service(jobs_folder) as context:
@@ -82,11 +82,11 @@ def test_a_database_in_memory_is_refused(tmp_path):
             opened(tmp_path / "data", url)
 
 
-# What is set aside ---------------------------------------------------------------------------------------------------
+# Orphaned folders ---------------------------------------------------------------------------------------------------
 
 
-def test_folders_of_unknown_jobs_are_set_aside(jobs_folder, caplog):
-    """The database is an older copy: it does not know the jobs that came later."""
+def test_folders_of_unknown_jobs_are_moved(jobs_folder, caplog):
+    """The database is an older copy without the latest job."""
     known = names(jobs_folder / "jobs")
     shutil.copy(jobs_folder / "jobs.sqlite", jobs_folder.parent / "old.sqlite")
     with service(jobs_folder) as context:
@@ -97,24 +97,31 @@ def test_folders_of_unknown_jobs_are_set_aside(jobs_folder, caplog):
     (jobs_folder / "jobs" / job / "work-0123456789abcdef").mkdir()
     before = listing(jobs_folder / "jobs" / job)
     with service(jobs_folder) as context:
-        assert context.storage.held() == known
+        assert context.storage.job_ids() == known
         assert context.storage.count_orphaned() == 2
     assert listing(jobs_folder / "jobs" / ".orphaned" / f"{job}-2") == before
     assert (jobs_folder / "jobs" / ".orphaned" / job / "scene.ply").read_bytes() == b"an earlier one"
-    assert f"that the database does not know were set aside in {jobs_folder}/jobs/.orphaned: 1" in caplog.text
+    assert f"that the database does not know were moved to {jobs_folder}/jobs/.orphaned: 1" in caplog.text
     caplog.clear()
     with service(jobs_folder) as context:
         assert context.storage.count_orphaned() == 2
     assert caplog.text == ""
 
 
-STRAYS = ["notes.txt", "incoming/notes.txt", "incoming/x.part", "jobs/notes.txt", "jobs/mine/scene.ply", "work-1/x"]
+OTHER_FILES = [
+    "notes.txt",
+    "incoming/notes.txt",
+    "incoming/x.part",
+    "jobs/notes.txt",
+    "jobs/mine/scene.ply",
+    "work-1/x",
+]
 
 
-def test_nothing_of_others_is_removed(jobs_folder):
+def test_other_files_are_not_removed(jobs_folder):
     job = min(names(jobs_folder / "jobs"))
-    strays = [*STRAYS, "lock", f"jobs/{job}/notes.txt"]
-    for name in strays:
+    others = [*OTHER_FILES, "lock", f"jobs/{job}/notes.txt"]
+    for name in others:
         (jobs_folder / name).parent.mkdir(exist_ok=True)
         (jobs_folder / name).write_text("mine")
     (jobs_folder / "incoming" / "0123456789abcdef.part").write_text("half an upload")
@@ -122,58 +129,62 @@ def test_nothing_of_others_is_removed(jobs_folder):
     with service(jobs_folder) as context:
         assert not (jobs_folder / "incoming" / "0123456789abcdef.part").exists()
         assert not (jobs_folder / "jobs" / job / "work-0123456789abcdef").exists()
-        assert {name: (jobs_folder / name).read_text() for name in strays} == dict.fromkeys(strays, "mine")
+        assert {name: (jobs_folder / name).read_text() for name in others} == dict.fromkeys(others, "mine")
         from service.jobs.expiry import ExpiryTask
 
         context.clock._offset += 10**6
         ExpiryTask(context, 0.0).sweep()
-        assert context.storage.held() == set()
-    strays[-1] = f"jobs/.orphaned/{job}/notes.txt"
-    assert {name: (jobs_folder / name).read_text() for name in strays} == dict.fromkeys(strays, "mine")
+        assert context.storage.job_ids() == set()
+    others[-1] = f"jobs/.orphaned/{job}/notes.txt"
+    assert {name: (jobs_folder / name).read_text() for name in others} == dict.fromkeys(others, "mine")
     assert names(jobs_folder / "jobs" / ".orphaned" / job) == {"notes.txt"}
 
 
-def test_a_removal_that_was_interrupted_is_finished(tmp_path):
+def test_an_interrupted_removal_is_completed(tmp_path):
     with service(tmp_path / "data") as context:
         job = finish_a_job(context, State.EXPIRED)
-        assert context.storage.held() == {job}
+        assert context.storage.job_ids() == {job}
     with service(tmp_path / "data") as context:
-        assert (context.storage.held(), context.storage.count_orphaned()) == (set(), 0)
+        assert (context.storage.job_ids(), context.storage.count_orphaned()) == (set(), 0)
 
 
 @pytest.mark.parametrize("name", ["", "..", ".", "../jobs", ".orphaned", "a/b", "0" * 31])
 def test_only_jobs_are_removed(jobs_folder, name):
-    with service(jobs_folder) as context, pytest.raises(ValueError, match="no id"):
+    with service(jobs_folder) as context, pytest.raises(ValueError, match="not a job id"):
         context.storage.remove_job(name)
 
 
 # PostgreSQL ----------------------------------------------------------------------------------------------------------
 
 
-def test_all_of_that_with_postgresql(postgresql, tmp_path):
+def test_starts_with_postgresql(postgresql, tmp_path):
     with service(tmp_path / "data", postgresql) as context:
         job = finish_a_job(context)
         assert context.store.health_problem() is None
     with service(tmp_path / "data", postgresql) as context:
-        assert context.storage.held() == {job}
+        assert context.storage.job_ids() == {job}
     before = listing(tmp_path / "data")
     with pytest.raises(SettingsError, match="another data folder"):
         opened(tmp_path / "other", postgresql)
     engine = sa.create_engine(postgresql)
 
-    def told(*statements, says):
+    def assert_refused(*statements, message):
         with engine.begin() as connection:
             for statement in statements:
                 connection.execute(sa.text(statement))
-        with pytest.raises(SettingsError, match=says) as caught:
+        with pytest.raises(SettingsError, match=message) as caught:
             opened(tmp_path / "data", postgresql)
         assert "\n" not in str(caught.value)
 
-    told("UPDATE meta SET value = 99 WHERE name = 'schema'", says="tables of version 99")
-    told(f"UPDATE meta SET value = {SCHEMA_VERSION} WHERE name = 'schema'", "DROP TABLE events", says="no table events")
-    told("DELETE FROM jobs", "DELETE FROM meta", says="is new and knows none of them")
-    told("DROP TABLE jobs, meta", says="is new and knows none of them")
+    assert_refused("UPDATE meta SET value = 99 WHERE name = 'schema'", message="schema version 99")
+    assert_refused(
+        f"UPDATE meta SET value = {SCHEMA_VERSION} WHERE name = 'schema'",
+        "DROP TABLE events",
+        message="no table events",
+    )
+    assert_refused("DELETE FROM jobs", "DELETE FROM meta", message="is new and has none of them")
+    assert_refused("DROP TABLE jobs, meta", message="is new and has none of them")
     with engine.connect() as connection:
-        assert sa.inspect(connection).get_table_names() == []  # none was made
+        assert sa.inspect(connection).get_table_names() == []  # none was created
     engine.dispose()
     assert listing(tmp_path / "data") == before

@@ -1,4 +1,4 @@
-"""Starts that are refused: a database that is not that of the data folder; oracle: what lay there before."""
+"""Refused starts, because the database and the data folder do not belong together; oracle: the files before."""
 
 import contextlib
 import os
@@ -17,16 +17,16 @@ from service.storage.job_store import Store
 pytestmark = pytest.mark.usefixtures("no_variables")
 
 
-def wrong(folder):
+def no_database(folder):
     (folder / "jobs.sqlite").write_bytes(b"this is no database" * 1000)
 
 
-def another_programs(folder):
+def of_another_program(folder):
     (folder / "jobs.sqlite").unlink()
     database(folder, "CREATE TABLE jobs (name TEXT)", "INSERT INTO jobs VALUES ('x')")
 
 
-def a_folder_in_its_place(folder):
+def a_folder_instead(folder):
     (folder / "jobs.sqlite").unlink()
     (folder / "jobs.sqlite").mkdir()
 
@@ -52,26 +52,26 @@ def replaced(folder):
     Store(f"sqlite:///{folder / 'jobs.sqlite'}", time.time).close()
 
 
-def of_former_times(folder):
-    """The folder's own database, before it was given another one and jobs."""
-    mark = int((folder / "identity").read_text())
+def of_an_earlier_binding(folder):
+    """Use a database that was bound to the folder before its present one."""
+    number = int((folder / "identity").read_text())
     (folder / "jobs.sqlite").unlink()
     store = Store(f"sqlite:///{folder / 'jobs.sqlite'}", time.time)
-    store.belong_to(mark, 5)
+    store.bind_to(number, 5)
     store.close()
 
 
-def of_another_tenant(folder):
-    with service(folder.parent / "theirs") as context:
+def of_another_service(folder):
+    with service(folder.parent / "other") as context:
         finish_a_job(context)
-    shutil.copy(folder.parent / "theirs" / "jobs.sqlite", folder / "jobs.sqlite")
+    shutil.copy(folder.parent / "other" / "jobs.sqlite", folder / "jobs.sqlite")
 
 
-def with_the_folder_of_another_tenant(folder):
-    with service(folder.parent / "theirs") as context:
+def with_the_folder_of_another_service(folder):
+    with service(folder.parent / "other") as context:
         finish_a_job(context)
-    shutil.copytree(folder.parent / "theirs" / "jobs", folder / "jobs", dirs_exist_ok=True)
-    shutil.copy(folder.parent / "theirs" / "identity", folder / "identity")
+    shutil.copytree(folder.parent / "other" / "jobs", folder / "jobs", dirs_exist_ok=True)
+    shutil.copy(folder.parent / "other" / "identity", folder / "identity")
 
 
 def read_only(folder):
@@ -86,7 +86,7 @@ def a_table_dropped(folder):
     database(folder, "DROP TABLE jobs")
 
 
-def the_table_of_versions_dropped(folder):
+def the_meta_table_dropped(folder):
     database(folder, "DROP TABLE meta")
 
 
@@ -106,40 +106,40 @@ def of_a_newer_version(folder):
     database(folder, f"UPDATE meta SET value = {SCHEMA_VERSION + 1} WHERE name = 'schema'")
 
 
-def a_mark_damaged(folder):
+def a_number_damaged(folder):
     (folder / "identity").write_bytes(b"\0\0\0")
 
 
 REFUSED = {
-    wrong: "file is not a database; restore it",
-    another_programs: "does not say which version",
-    a_folder_in_its_place: "cannot be opened",
-    new: "the job database is new and knows none of them; restore",
-    deleted: "the job database is new and knows none of them; restore",
-    emptied: "the job database is new and knows none of them; restore",
-    rows_deleted: "the job database is new and knows none of them; restore",
-    replaced: "knows none of them; restore",
-    of_former_times: "they came with another database than this; restore",
-    of_another_tenant: "this database is that of another data folder",
-    with_the_folder_of_another_tenant: "this database is that of another data folder",
-    read_only: "readonly database; let the service write to it",
+    no_database: "file is not a database; restore it",
+    of_another_program: "the schema version of its tables is missing",
+    a_folder_instead: "cannot be opened",
+    new: "the job database is new and has none of them; restore",
+    deleted: "the job database is new and has none of them; restore",
+    emptied: "the job database is new and has none of them; restore",
+    rows_deleted: "the job database is new and has none of them; restore",
+    replaced: "has none of them; restore",
+    of_an_earlier_binding: "they belong to another database; restore",
+    of_another_service: "this database belongs to another data folder",
+    with_the_folder_of_another_service: "this database belongs to another data folder",
+    read_only: "readonly database; give the service write permission",
     truncated: "damaged|malformed",
     a_table_dropped: "damaged: it has no table jobs; restore it",
-    the_table_of_versions_dropped: "damaged: it does not say which version",
+    the_meta_table_dropped: "damaged: the schema version of its tables is missing",
     a_column_dropped: "no such column: jobs.note",
     a_value_damaged: "damaged: ",
-    of_an_older_version: f"tables of version {SCHEMA_VERSION - 1}, this service of {SCHEMA_VERSION}",
-    of_a_newer_version: f"tables of version {SCHEMA_VERSION + 1}, this service of {SCHEMA_VERSION}",
-    a_mark_damaged: "does not hold a number",
+    of_an_older_version: f"schema version {SCHEMA_VERSION - 1}, but this service needs {SCHEMA_VERSION}",
+    of_a_newer_version: f"schema version {SCHEMA_VERSION + 1}, but this service needs {SCHEMA_VERSION}",
+    a_number_damaged: "does not contain a number",
 }
 
 
-@pytest.mark.parametrize("way", REFUSED, ids=lambda way: way.__name__)
-def test_a_start_that_is_refused_removes_nothing(jobs_folder, way):
-    url = way(jobs_folder)
+@pytest.mark.parametrize("change", REFUSED, ids=lambda change: change.__name__)
+def test_a_refused_start_removes_nothing(jobs_folder, change):
+    url = change(jobs_folder)
     before = listing(jobs_folder)
-    for _ in range(2):  # the first leaves no trace by which the second could go on
-        with pytest.raises(SettingsError, match=REFUSED[way]) as caught:
+    for _ in range(2):  # the first attempt must not change the result of the second
+        with pytest.raises(SettingsError, match=REFUSED[change]) as caught:
             opened(jobs_folder, url)
         assert "\n" not in str(caught.value)
         assert listing(jobs_folder).items() >= before.items()
@@ -148,10 +148,21 @@ def test_a_start_that_is_refused_removes_nothing(jobs_folder, way):
 
 
 @pytest.mark.parametrize(
-    "way", [wrong, new, deleted, replaced, read_only, truncated, a_table_dropped, of_another_tenant, of_a_newer_version]
+    "change",
+    [
+        no_database,
+        new,
+        deleted,
+        replaced,
+        read_only,
+        truncated,
+        a_table_dropped,
+        of_another_service,
+        of_a_newer_version,
+    ],
 )
-def test_a_refused_command_says_so_in_a_sentence(jobs_folder, way):
-    url = way(jobs_folder)
+def test_a_refused_command_prints_one_line(jobs_folder, change):
+    url = change(jobs_folder)
     before = listing(jobs_folder)
     ended = command(jobs_folder, **({"KISSGS_DATABASE_URL": url} if url else {}))
     assert (ended.returncode, ended.stdout) == (2, "")
@@ -161,7 +172,7 @@ def test_a_refused_command_says_so_in_a_sentence(jobs_folder, way):
     assert listing(jobs_folder).items() >= before.items()
 
 
-def test_a_database_that_is_locked(jobs_folder):
+def test_a_locked_database(jobs_folder):
     before = listing(jobs_folder)
     with contextlib.closing(sqlite3.connect(jobs_folder / "jobs.sqlite")) as other:
         other.execute("PRAGMA locking_mode=EXCLUSIVE")
@@ -170,17 +181,17 @@ def test_a_database_that_is_locked(jobs_folder):
         ended = command(jobs_folder)
         assert time.monotonic() - begun < 20
     (line,) = ended.stderr.splitlines()
-    assert (ended.returncode, "locked; another program holds it" in line) == (2, True)
+    assert (ended.returncode, "locked; another program has locked it" in line) == (2, True)
     assert listing(jobs_folder).items() >= before.items()
     with service(jobs_folder) as context:
         assert len(context.store.ids()) == 120
 
 
-def test_a_folder_that_is_read_only(jobs_folder):
+def test_a_read_only_folder(jobs_folder):
     if os.geteuid() == 0:
         bind = f"(mount --bind '{jobs_folder}' '{jobs_folder}' && mount -o remount,ro,bind '{jobs_folder}') 2>/dev/null"
         if os.system(bind) != 0:
-            pytest.skip("mounting a folder needs leave to mount")
+            pytest.skip("mounting a folder is not permitted")
     else:
         jobs_folder.chmod(0o500)
     before = listing(jobs_folder)
@@ -194,36 +205,36 @@ def test_a_folder_that_is_read_only(jobs_folder):
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_bytes_that_are_flipped(jobs_folder, seed):
-    """Wherever they lie: the service starts and knows all jobs, or says in a sentence that it cannot."""
+def test_flipped_bits(jobs_folder, seed):
+    """Wherever they are, the service starts and has all jobs, or refuses with one line."""
     import random
 
-    dice = random.Random(seed)
+    rng = random.Random(seed)
     path = jobs_folder / "jobs.sqlite"
     content = bytearray(path.read_bytes())
-    for _ in range(dice.choice([1, 20, 500])):
-        content[dice.randrange(len(content))] ^= 1 << dice.randrange(8)
+    for _ in range(rng.choice([1, 20, 500])):
+        content[rng.randrange(len(content))] ^= 1 << rng.randrange(8)
     path.write_bytes(content)
     before = {name: data for name, data in listing(jobs_folder).items() if name.parts[0] == "jobs"}
-    said = ""
+    message = ""
     try:
         with service(jobs_folder):
             pass
     except SettingsError as error:
-        said = str(error)
-    assert "\n" not in said
+        message = str(error)
+    assert "\n" not in message
     after = [name.parent.name for name in listing(jobs_folder) if name.parts[0] == "jobs"]
     assert sorted(after) == sorted(name.parent.name for name in before)
 
 
-def test_a_journal_is_kept_for_the_database_it_belongs_to(sample_folder, tmp_path):
-    """A service was killed; what it wrote last is in the journal only, and a refused start must not put that away."""
-    with service(tmp_path / "mine") as context:
+def test_a_refused_start_keeps_the_journal(sample_folder, tmp_path):
+    """The last changes of a killed service are only in the journal, which a refused start must not remove."""
+    with service(tmp_path / "own") as context:
         finish_a_job(context)
-        shutil.copytree(tmp_path / "mine", tmp_path / "killed")
-    with service(tmp_path / "theirs") as context:
+        shutil.copytree(tmp_path / "own", tmp_path / "killed")
+    with service(tmp_path / "other") as context:
         finish_a_job(context)
-    shutil.copy(tmp_path / "theirs" / "identity", tmp_path / "killed" / "identity")
+    shutil.copy(tmp_path / "other" / "identity", tmp_path / "killed" / "identity")
     before = listing(tmp_path / "killed")
     assert {"jobs.sqlite-wal", "jobs.sqlite"} <= {str(name) for name in before}
     ended = command(tmp_path / "killed")
@@ -235,20 +246,20 @@ def test_a_journal_is_kept_for_the_database_it_belongs_to(sample_folder, tmp_pat
 
 @pytest.mark.parametrize("name", ["identity", "folder", "schema", "time"])
 @pytest.mark.parametrize("value", ["'text'", "x'00ff'", "1e999", "-1", "0.5"])
-def test_facts_of_the_database_that_are_no_numbers(jobs_folder, name, value):
+def test_invalid_values_in_the_meta_table(jobs_folder, name, value):
     database(jobs_folder, f"INSERT OR REPLACE INTO meta VALUES ('{name}', {value})")
     if name == "time" and value in ("-1", "0.5"):
         with service(jobs_folder):
             return
-    with pytest.raises(SettingsError) as told:
+    with pytest.raises(SettingsError) as caught:
         opened(jobs_folder)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
     if name != "schema" or value not in ("-1", "0.5"):
-        assert f"damaged: its table meta holds no usable {name}" in str(told.value)
+        assert f"damaged: its table meta has no valid {name}" in str(caught.value)
 
 
-def test_what_is_set_aside_needs_a_folder(jobs_folder):
-    (jobs_folder / "jobs" / ".orphaned").write_text("mine")
+def test_the_orphaned_folder_must_be_a_folder(jobs_folder):
+    (jobs_folder / "jobs" / ".orphaned").write_text("own")
     (jobs_folder / "jobs" / ("0" * 32)).mkdir()
     before = listing(jobs_folder)
     ended = command(jobs_folder)

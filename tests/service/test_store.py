@@ -1,4 +1,4 @@
-"""The job store on SQLite and on PostgreSQL; oracle: a table of which state may follow which."""
+"""The job store on SQLite and PostgreSQL; oracle: a table of allowed state transitions."""
 
 import contextlib
 import itertools
@@ -33,20 +33,20 @@ def store(url):
     opened.close()
 
 
-def bring(store, number, state):
-    """A queued job into a state, by the shortest way."""
-    ways = {
+def set_state(store, number, state):
+    """Move a queued job to a state by the shortest path."""
+    paths = {
         State.QUEUED: [], State.RUNNING: [State.RUNNING], State.SUCCEEDED: [State.RUNNING, State.SUCCEEDED],
         State.FAILED: [State.FAILED], State.CANCELLED: [State.CANCELLED], State.EXPIRED: [State.FAILED, State.EXPIRED],
     }  # fmt: skip
-    for step in ways[state]:
+    for step in paths[state]:
         assert store.move(number, step)
 
 
 @pytest.mark.parametrize(("before", "after"), list(itertools.product(State, State)))
-def test_states_follow_each_other_as_they_may(store, before, after):
+def test_state_transitions(store, before, after):
     number = add(store).number
-    bring(store, number, before)
+    set_state(store, number, before)
     events = len(store.events(number))
     assert store.move(number, after) == ((before, after) in ALLOWED)
     assert len(store.events(number)) == events + ((before, after) in ALLOWED)
@@ -54,7 +54,7 @@ def test_states_follow_each_other_as_they_may(store, before, after):
 
 def test_jobs_are_claimed_once_and_in_order(store):
     ids = [add(store).id for _ in range(8)]
-    claimed = [found.id if found else None for found in together(*[(store.claim,)] * 16)]
+    claimed = [found.id if found else None for found in run_together(*[(store.claim,)] * 16)]
     assert sorted(filter(None, claimed)) == sorted(ids)
     assert claimed.count(None) == 8
     again = [add(store).id for _ in range(3)]
@@ -62,30 +62,30 @@ def test_jobs_are_claimed_once_and_in_order(store):
     assert store.claim() is None
 
 
-def together(*calls):
-    """The results of calls made at the same time."""
+def run_together(*calls):
+    """Run calls simultaneously and return their results."""
     with ThreadPoolExecutor(len(calls)) as pool:
         return [future.result() for future in [pool.submit(*call) for call in calls]]
 
 
-def test_a_cancellation_and_a_result_cannot_both_win(store):
+def test_of_a_cancellation_and_a_result_only_one_takes_effect(store):
     for _ in range(10):
         number = add(store).number
         store.claim()
-        won = together((store.move, number, State.SUCCEEDED), (store.move, number, State.CANCELLED))
-        assert sorted(won) == [False, True]
+        moved = run_together((store.move, number, State.SUCCEEDED), (store.move, number, State.CANCELLED))
+        assert sorted(moved) == [False, True]
 
 
-def test_events_count_up_without_gaps_from_many_threads(store):
+def test_event_numbers_have_no_gaps_with_many_threads(store):
     number = add(store).number
     store.claim()
-    together(*[(store.progress, number, "order", 0.5)] * 20)
+    run_together(*[(store.progress, number, "order", 0.5)] * 20)
     found = store.events(number)
     assert [event.seq for event in found] == list(range(1, 23))
     assert [event.seq for event in store.events(number, after=20)] == [21, 22]
 
 
-def test_notes_last_as_long_as_they_are_true(store):
+def test_progress_notes(store):
     found = add(store)
     store.claim()
     store.progress(found.number, "refine", 0.5, "x" * 1000)
@@ -99,13 +99,13 @@ def test_notes_last_as_long_as_they_are_true(store):
     assert (waiting.stage, waiting.fraction, waiting.note) == (None, 0.0, None)
 
 
-def test_what_a_job_may_write_counts_from_its_start_to_its_end(store):
+def test_work_bytes_count_while_a_job_runs(store):
     number = add(store, upload_bytes=100, disk_bytes=100, work_bytes=600).number
     assert store.disk_bytes() == 100
     store.claim()
     assert store.disk_bytes() == 700
     store.move(number, State.QUEUED)
-    assert store.disk_bytes() == 700  # the next start takes up what there is
+    assert store.disk_bytes() == 700  # its checkpoints are kept
     store.claim()
     store.move(number, State.SUCCEEDED, disk_bytes=120)
     assert store.disk_bytes() == 120
@@ -122,7 +122,7 @@ def test_limits(store):
         add(store)
 
 
-def test_idempotency_keys_are_an_owners(store):
+def test_idempotency_keys_are_per_owner(store):
     first = add(store, "alice", idempotency_key="k")
     add(store, "bob", idempotency_key="k")
     with pytest.raises(LimitExceeded, match="key"):
@@ -132,7 +132,7 @@ def test_idempotency_keys_are_an_owners(store):
     assert store.by_idempotency_key("alice", "x") is None
 
 
-def test_sums_and_lists(store):
+def test_queries(store):
     jobs = [add(store, owner) for owner in ("alice", "bob", "alice")]
     assert store.disk_bytes() == 9_000_000_000
     assert [found.id for found in store.listing("alice", limit=9)] == [jobs[2].id, jobs[0].id]
@@ -147,14 +147,14 @@ def test_sums_and_lists(store):
     assert store.due(ENDED, 6.0) == [(jobs[0].number, jobs[0].id)]
     assert (store.reclaimable(), store.reclaimable_bytes()) == ([], 0)
     store.update(jobs[0].number, reclaimable_bytes=2_000_000_000)
-    store.update(jobs[1].number, reclaimable_bytes=5)  # of one that still waits, nothing can be spared
+    store.update(jobs[1].number, reclaimable_bytes=5)  # a queued job needs its upload
     assert (store.reclaimable(), store.reclaimable_bytes()) == ([(jobs[0].number, jobs[0].id)], 2_000_000_000)
     store.forget(jobs[0].number)
     assert store.get(jobs[0].id) is None
     assert store.events(jobs[0].number) == []
 
 
-def test_what_is_written_is_there_again(url):
+def test_jobs_survive_reopening(url):
     first = Store(url, lambda: 5.0)
     number = add(first, name="Schloß \u4e2d", options={"preset": "fast", "encode": {"seed": 2**31 - 1}}).number
     first.heartbeat()
@@ -167,8 +167,8 @@ def test_what_is_written_is_there_again(url):
     second.close()
 
 
-def test_numbers_are_never_given_twice(store):
-    """They are cursors of lists that clients hold on to."""
+def test_numbers_are_never_reused(store):
+    """Clients use them as cursors of lists."""
     first = add(store).number
     store.forget(first)
     with contextlib.suppress(LimitExceeded):

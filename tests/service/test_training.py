@@ -1,4 +1,4 @@
-"""Training in jobs, and what becomes of it when it is interrupted; oracle: the same work where nothing does that."""
+"""Training in jobs and its interruption; oracle: the result without interruption."""
 
 import json
 import os
@@ -16,7 +16,7 @@ from kissgs import CompactSettings
 from kissgs.compaction.result import CompactionStep
 from kissgs.core.errors import OutputError
 from service.core.disk_estimates import STEPS_BYTES, checkpoint_bytes
-from service.jobs import job_process as child
+from service.jobs import job_process
 
 pytest.importorskip("torch")
 
@@ -31,13 +31,13 @@ BRIEF, LONG = options(4), options(600)
 
 @pytest.fixture(scope="module")
 def expected():
-    """The container of LONG, by the library."""
+    """Container of LONG, from the library."""
     return kissgs.compress(SMALL, settings=kissgs.Settings.model_validate(LONG)).to_zip()
 
 
 @pytest.fixture
 def start_saving(start, tmp_path):
-    """Starts a service whose jobs save their state all the time, not every half minute."""
+    """Start a service whose jobs save checkpoints every 0.05 s instead of every half minute."""
     (tmp_path / "sitecustomize.py").write_text(
         "from kissgs.training import checkpoint\ncheckpoint.SAVE_INTERVAL = 0.05\n"
     )
@@ -49,7 +49,7 @@ def folder_of(service, job):
 
 
 def training(service, job, stage="sparsify", fraction=0.0):
-    """Once its training has come so far, and has been saved."""
+    """Wait until training has reached a stage and fraction and a checkpoint exists; return the progress."""
     while True:
         progress = service.running(job, stage)["progress"]
         if progress["fraction"] >= fraction and (folder_of(service, job) / "checkpoint.npz").exists():
@@ -57,8 +57,8 @@ def training(service, job, stage="sparsify", fraction=0.0):
         time.sleep(0.02)
 
 
-def told(service, job):
-    """What was heard of its training, start by start: stage and fraction."""
+def training_events(service, job):
+    """Return stage and fraction of the progress events of training, for each start of the job."""
     starts = []
     for _, kind, data in events(service.http.get(job["links"]["events"]).text):
         if kind == "state" and data["state"] == "running":
@@ -71,7 +71,7 @@ def told(service, job):
 def kill_the_service(service):
     service.kill(signal.SIGKILL)
     for folder in (service.folder / "jobs").iterdir():
-        (folder / ".kissgs.half.part").write_bytes(b"PK half")  # the checkpoint that was being written
+        (folder / ".kissgs.half.part").write_bytes(b"PK half")  # an incomplete checkpoint
     service.restart()
 
 
@@ -87,7 +87,7 @@ def kill_the_job(service):
 @pytest.mark.parametrize(
     ("stage", "interrupt"), [("sparsify", kill_the_service), ("refine", stop_the_service), ("refine", kill_the_job)]
 )
-def test_training_is_taken_up_where_it_was_left(start_saving, expected, stage, interrupt):
+def test_training_continues_after_an_interruption(start_saving, expected, stage, interrupt):
     service = start_saving(KISSGS_DRAIN_SECONDS=0)
     job = service.submit(options=json.dumps(LONG))
     training(service, job, stage, 0.4)
@@ -95,9 +95,9 @@ def test_training_is_taken_up_where_it_was_left(start_saving, expected, stage, i
     status = service.ended(job)
     assert status["state"] == "succeeded", status
     assert service.http.get(status["links"]["result"]).content == expected
-    before, after = told(service, job)
+    before, after = training_events(service, job)
     assert before[0] == ("sparsify", 0.0)
-    assert after[0] != before[0]  # how far the last checkpoint had come depends on the machine
+    assert after[0] != before[0]  # the progress of the last checkpoint depends on the machine
     assert sorted(path.name for path in folder_of(service, job).iterdir()) == ["result", "scene.ply"]
 
 
@@ -105,17 +105,17 @@ def damaged(path):
     path.write_bytes(path.read_bytes()[:-100] if path.exists() else b"")
 
 
-def of_other_work(path):
+def of_another_version(path):
     np.savez(path, key="another version's")
 
 
-@pytest.mark.parametrize("spoil", [damaged, of_other_work])
-def test_a_checkpoint_of_no_use_is_no_obstacle(start, spoil):
+@pytest.mark.parametrize("damage", [damaged, of_another_version])
+def test_unusable_checkpoints_are_replaced(start, damage):
     service = start()
     job = service.submit(options=json.dumps(BRIEF))
     service.running(job)
     service.kill(signal.SIGKILL)
-    spoil(folder_of(service, job) / "checkpoint.npz")
+    damage(folder_of(service, job) / "checkpoint.npz")
     service.restart()
     status = service.ended(job)
     assert (status["state"], status["starts"]) == ("succeeded", 2)
@@ -124,8 +124,8 @@ def test_a_checkpoint_of_no_use_is_no_obstacle(start, spoil):
 
 
 @pytest.mark.parametrize("saved", [0, 1])
-def test_a_disk_without_room_for_checkpoints_is_no_obstacle(tmp_path, monkeypatch, saved):
-    """Neither at the first one nor later; and the report, which clients read, tells nothing of the server's folders."""
+def test_a_full_disk_disables_checkpoints(tmp_path, monkeypatch, saved):
+    """The job succeeds without them, and its report does not reveal paths of the server."""
     from kissgs.training import checkpoint
 
     real, left = checkpoint.atomic_file, [None] * saved
@@ -142,7 +142,7 @@ def test_a_disk_without_room_for_checkpoints_is_no_obstacle(tmp_path, monkeypatc
     work.mkdir()
     (tmp_path / "scene.ply").write_bytes(SMALL)
     monkeypatch.chdir(work)
-    order = {
+    task = {
         "source": str(tmp_path / "scene.ply"),
         "work": str(work),
         "settings": BRIEF,
@@ -150,7 +150,7 @@ def test_a_disk_without_room_for_checkpoints_is_no_obstacle(tmp_path, monkeypatc
         "checkpoint": str(tmp_path / "checkpoint.npz"),
         "threads": 0,
     }
-    child._compress(order, lambda event: None)
+    job_process._compress(task, lambda event: None)
     result = (work / "result" / "scene.zip").read_bytes()
     assert result == kissgs.compress(SMALL, settings=kissgs.Settings.model_validate(BRIEF)).to_zip()
     report = (work / "result" / "report.json").read_text()
@@ -158,7 +158,7 @@ def test_a_disk_without_room_for_checkpoints_is_no_obstacle(tmp_path, monkeypatc
     assert str(tmp_path) not in report
 
 
-def test_room_for_a_checkpoint_is_set_aside_until_the_job_has_ended(start_saving):
+def test_disk_space_for_checkpoints_is_reserved_until_the_job_ends(start_saving):
     service = start_saving(KISSGS_MAX_DISK_BYTES=4 * len(SMALL))
     job = service.submit(options=json.dumps(LONG))
     training(service, job)
@@ -170,28 +170,28 @@ def test_room_for_a_checkpoint_is_set_aside_until_the_job_has_ended(start_saving
     assert service.ended(service.submit())["state"] == "succeeded"
 
 
-def test_the_longest_story_of_a_training_has_room():
-    """A pruning and a training for each of as many rounds as there may be."""
+def test_the_largest_record_of_steps():
+    """The record of the maximum number of pruning rounds, each with its training, is below the bound."""
     step = asdict(CompactionStep(name="sparsify", count=20_000_000, seconds=123.456789012345))
     (most,) = [limit.le for limit in CompactSettings.model_fields["prune_rounds"].metadata if hasattr(limit, "le")]
     assert len(json.dumps([step] * (2 * most + 3))) < STEPS_BYTES
 
 
-def test_training_tells_what_it_has_come_to(service):
+def test_training_notes(service):
     job = service.submit(options=json.dumps(LONG))
     note = ""
-    while "loss" not in note:  # not before the first step, nor while Gaussians go
+    while "loss" not in note:  # not before the first step, nor while Gaussians are pruned
         note = training(service, job).get("note", "")
     assert re.fullmatch(r"1\d\d Gaussians, loss 0\.\d{4}, PSNR \d\d\.\d\d", note)
-    heard = [data for _, kind, data in events(service.http.get(job["links"]["events"]).text) if kind == "progress"]
-    assert {data["stage"] for data in heard if "note" in data} == {"sparsify", "refine"}
-    assert any(data.get("note") == note for data in heard)
+    sent = [data for _, kind, data in events(service.http.get(job["links"]["events"]).text) if kind == "progress"]
+    assert {data["stage"] for data in sent if "note" in data} == {"sparsify", "refine"}
+    assert any(data.get("note") == note for data in sent)
 
 
 FINETUNED = {"preset": "fast", "finetune": {"enabled": True, "steps": 300, "views": 24, "view_size": 48}}
 
 
-def test_fine_tuning_is_taken_up_where_it_was_left_and_its_gain_is_told(start_saving):
+def test_fine_tuning_continues_and_its_gain_is_reported(start_saving):
     service = start_saving(KISSGS_DRAIN_SECONDS=0)
     job = service.submit(options=json.dumps(FINETUNED))
     kept = folder_of(service, job) / "checkpoint-finetune.npz"
@@ -205,6 +205,6 @@ def test_fine_tuning_is_taken_up_where_it_was_left_and_its_gain_is_told(start_sa
     assert service.http.get(status["links"]["result"]).content == expected.to_zip()
     gain = expected.report.finetuning.as_dict()
     assert {**status["finetuning"], "seconds": 0} == {**gain, "seconds": 0}
-    _, after = told(service, job)
+    _, after = training_events(service, job)
     assert after[0][1] > 0.2
     assert sorted(path.name for path in folder_of(service, job).iterdir()) == ["result", "scene.ply"]

@@ -1,4 +1,4 @@
-"""A job database that goes away, changes or breaks under a running service; oracle: what was answered and what lies on
+"""A job database that is removed, replaced or damaged while the service runs; oracle: its responses and the files on
 the disk."""
 
 import contextlib
@@ -12,10 +12,10 @@ from functools import partial
 
 import pytest
 import sqlalchemy as sa
-from helpers.service import SLOW, SMALL, Service, problem, said, scene_bytes
+from helpers.service import SLOW, SMALL, Service, problem, read_response, scene_bytes
 
 from service.core.models import State
-from service.storage import database_health as watch
+from service.storage import database_health
 from service.storage.database_health import DatabaseReplacedError
 from service.storage.job_store import Store
 
@@ -43,15 +43,15 @@ def replace(folder):
     copy.replace(folder / "jobs.sqlite")
 
 
-def become_another(folder):
+def change_identity(folder):
     execute(folder, "UPDATE meta SET value = 7 WHERE name = 'identity'")
 
 
 def overwrite(folder):
     with (folder / "jobs.sqlite").open("r+b") as file:
         size = file.seek(0, os.SEEK_END)
-        for place in range(100, size, 4096):
-            file.seek(place)
+        for position in range(100, size, 4096):
+            file.seek(position)
             file.write(b"\xff" * 400)
 
 
@@ -59,13 +59,13 @@ def truncate(folder, size=0):
     os.truncate(folder / "jobs.sqlite", size)
 
 
-WAYS = {
+CHANGES = {
     "removed": (remove, "jobs.sqlite was removed"),
     "the file alone removed": (partial(remove, pattern="jobs.sqlite"), "jobs.sqlite was removed"),
     "the journal removed": (partial(remove, pattern="*-wal"), "jobs.sqlite-wal was removed"),
     "the index removed": (partial(remove, pattern="*-shm"), "jobs.sqlite-shm was removed"),
     "replaced by a copy": (replace, "jobs.sqlite was replaced"),
-    "another's": (become_another, "replaced by another"),
+    "another database": (change_identity, "replaced by another database"),
     "jobs dropped": (lambda folder: execute(folder, "DROP TABLE jobs"), "no such table: jobs"),
     "events dropped": (lambda folder: execute(folder, "DROP TABLE events"), "no such table: events"),
     "meta dropped": (lambda folder: execute(folder, "DROP TABLE meta"), "no such table: meta"),
@@ -77,33 +77,33 @@ WAYS = {
 }
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_it_is_noticed_before_an_upload_is_taken(start, way):
+@pytest.mark.parametrize("kind", CHANGES)
+def test_changes_are_detected_before_an_upload_is_read(start, kind):
     service = start()
     job = service.ended(service.submit())
-    change, reason = WAYS[way]
+    change, reason = CHANGES[kind]
     execute(service.folder, "PRAGMA wal_checkpoint(TRUNCATE)")
     change(service.folder)
     ready = service.http.get("/readyz")
     assert (ready.status_code, ready.json()["ready"]) == (503, False)
     assert reason in ready.json()["checks"]["database"]
     with service.raw(HEAD % 500_000) as connection:  # not a byte of the scene
-        answer = said(connection)
+        answer = read_response(connection)
     assert answer.startswith(b"HTTP/1.1 503")
     assert b'"code":"database"' in answer
     assert b"retry-after: " in answer.lower()
     refused = service.http.post("/v1/compress", content=SMALL)
     assert problem(refused, 503, "database")["retryable"]
     assert service.http.get("/livez").status_code == 200
-    assert service.strays() == []
+    assert service.leftovers() == []
     assert (service.folder / "jobs" / job["id"] / "result" / "scene.zip").exists()
 
 
 @pytest.mark.parametrize(
     "damage", [overwrite, partial(truncate, size=5 * 4096 + 100)], ids=["overwritten", "truncated"]
 )
-def test_damage_in_any_page_is_noticed(tmp_path, damage):
-    """Pages that no request reads: of the rows in the middle."""
+def test_damage_in_any_page_is_detected(tmp_path, damage):
+    """The damaged pages have rows that no request reads."""
     store = Store(f"sqlite:///{tmp_path / 'jobs.sqlite'}", time.time)
     execute(tmp_path, *[f"INSERT INTO meta VALUES ('{number:032}', 1.0)" for number in range(3000)])
     execute(tmp_path, "PRAGMA wal_checkpoint(TRUNCATE)")
@@ -116,7 +116,7 @@ def test_damage_in_any_page_is_noticed(tmp_path, damage):
     assert "damaged" in store.health_problem() or "malformed" in store.health_problem()
 
 
-def test_a_data_folder_that_is_gone(start):
+def test_a_removed_data_folder(start):
     service = start()
     shutil.rmtree(service.folder)
     ready = service.http.get("/readyz")
@@ -127,22 +127,22 @@ def test_a_data_folder_that_is_gone(start):
     assert not service.folder.exists()
 
 
-def test_an_upload_that_arrives_meanwhile_is_not_accepted(start):
+def test_an_upload_during_the_removal_is_not_accepted(start):
     service = start()
     with service.raw(HEAD % len(SMALL) + SMALL[:-10]) as connection:
         time.sleep(0.5)
         remove(service.folder)
         connection.sendall(SMALL[-10:])
-        answer = said(connection)
+        answer = read_response(connection)
     assert answer.startswith(b"HTTP/1.1 503"), answer
     assert b'"code":"database"' in answer
-    assert service.strays() == []
+    assert service.leftovers() == []
     assert list((service.folder / "jobs").iterdir()) == []
 
 
-def test_no_job_that_was_accepted_is_lost(start):
-    """Many submit while the database is removed: whatever was answered with 202 still has its scene after a restart,
-    which says what is missing."""
+def test_no_accepted_job_is_lost(start):
+    """Jobs accepted with 202 keep their uploads if the database is removed during submissions, and a restart without
+    the database is refused."""
     service = start(KISSGS_MAX_QUEUE=1000)
     service.running(service.submit(scene_bytes(20_000, 3), SLOW))
     accepted, refused = [], []
@@ -165,27 +165,27 @@ def test_no_job_that_was_accepted_is_lost(start):
     for answer in refused:
         problem(answer, 503, "database")
     assert len(accepted) > 4
-    held = {path.name for path in (service.folder / "jobs").iterdir()}
-    assert held >= {answer.json()["id"] for answer in accepted}
+    stored = {path.name for path in (service.folder / "jobs").iterdir()}
+    assert stored >= {answer.json()["id"] for answer in accepted}
     time.sleep(1.5)
     running = service.http.get("/v1/jobs", params={"state": "running"}).json()["jobs"]
-    assert len(running) == 1  # none was started since
+    assert len(running) == 1  # none was started after the removal
     assert "no job is started: jobs.sqlite was removed" in service.log.read_text() or service.children()
     service.kill(signal.SIGKILL)
-    with pytest.raises(AssertionError, match="the job database is new and knows none of them; restore"):
+    with pytest.raises(AssertionError, match="the job database is new and has none of them; restore"):
         service.restart()
-    assert {path.name for path in (service.folder / "jobs").iterdir()} == held
+    assert {path.name for path in (service.folder / "jobs").iterdir()} == stored
     for link in kept:
         link.rename(link.with_name(link.name.removeprefix("kept-")))
     service.restart()
-    known = {job["id"]: job for job in every(service)}
-    assert known.keys() >= held
-    written = [job for job_id, job in known.items() if job_id not in held]  # just before the removal was noticed
+    known = {job["id"]: job for job in all_jobs(service)}
+    assert known.keys() >= stored
+    written = [job for job_id, job in known.items() if job_id not in stored]  # just before the removal was detected
     assert len(written) <= len(refused)
     assert all(job["state"] == "failed" and "upload is no longer" in job["problem"]["detail"] for job in written)
 
 
-def every(service):
+def all_jobs(service):
     cursor = {}
     while True:
         page = service.http.get("/v1/jobs", params={"limit": 100, **cursor}).json()
@@ -195,8 +195,8 @@ def every(service):
         cursor = {"cursor": page["next"]}
 
 
-def test_a_database_that_is_put_back(start):
-    """Moved away and back again: the job that ran meanwhile is recorded, the one that waited is done."""
+def test_a_restored_database(start):
+    """After the database is moved away and back, the running job is recorded and the queued one succeeds."""
     service = start()
     running, waiting = service.submit(scene_bytes(6_000, 2)), service.submit()
     service.running(running)
@@ -220,11 +220,11 @@ def test_a_database_that_is_put_back(start):
         path.rename(service.folder / path.name)
     assert service.ended(running)["state"] == service.ended(waiting)["state"] == "succeeded"
     assert service.http.get("/readyz").status_code == 200
-    assert service.strays() == []
+    assert service.leftovers() == []
 
 
-def test_what_stands_in_its_place_is_left_alone(tmp_path):
-    """A restored database with a journal of its own, while the former one is still open."""
+def test_files_of_a_replacement_stay_unchanged(tmp_path):
+    """A backup with its own journal replaces the database while that is open."""
     with Service(tmp_path / "data") as service:
         service.ended(service.submit())
         backup = tmp_path / "backup"
@@ -240,10 +240,10 @@ def test_what_stands_in_its_place_is_left_alone(tmp_path):
         service.kill(signal.SIGTERM)
         assert {path.name: path.read_bytes() for path in files(service.folder)} == before
         service.restart()
-        assert [job["state"] for job in every(service)] == ["succeeded"]
+        assert [job["state"] for job in all_jobs(service)] == ["succeeded"]
 
 
-def test_a_database_that_is_locked(start):
+def test_a_locked_database(start):
     service = start()
     with contextlib.closing(sqlite3.connect(service.folder / "jobs.sqlite", isolation_level=None)) as other:
         other.execute("BEGIN IMMEDIATE")
@@ -253,24 +253,24 @@ def test_a_database_that_is_locked(start):
         problem(service.http.post("/v1/jobs", content=SMALL), 503, "database")
         assert time.monotonic() - begun < 6
         begun = time.monotonic()
-        assert service.http.get("/livez").status_code == 200  # nobody waits for it who does not need it
+        assert service.http.get("/livez").status_code == 200  # a request without the database does not wait for it
         assert time.monotonic() - begun < 1
         other.execute("ROLLBACK")
     assert service.ended(service.submit())["state"] == "succeeded"
     assert service.http.get("/readyz").status_code == 200
 
 
-def test_a_database_that_is_read_only(tmp_path, monkeypatch):
+def test_a_read_only_database(tmp_path, monkeypatch):
     def read_only(file):
         return sqlite3.connect(f"file:{file}?mode=ro", uri=True, isolation_level=None, check_same_thread=False)
 
-    monkeypatch.setattr(watch, "_open", read_only)
+    monkeypatch.setattr(database_health, "_open", read_only)
     store = Store(f"sqlite:///{tmp_path / 'jobs.sqlite'}", time.time)
     assert "readonly" in store.health_problem()
     store.close()
 
 
-def test_nothing_is_started_or_written_without_a_database(tmp_path):
+def test_nothing_is_started_or_written_after_the_removal(tmp_path):
     from helpers.job_rows import add
 
     store = Store(f"sqlite:///{tmp_path / 'jobs.sqlite'}", time.time)
@@ -289,24 +289,24 @@ def test_nothing_is_started_or_written_without_a_database(tmp_path):
             DatabaseReplacedError, match=r"jobs\.sqlite was removed while the service runs; put it back"
         ):
             change()
-    assert files(tmp_path) == []  # nor was another made
+    assert files(tmp_path) == []  # no new one was created
     assert store.counts()[State.QUEUED] == 2
     store.close()
     assert files(tmp_path) == []
 
 
-def test_what_is_written_while_it_vanishes_does_not_count(tmp_path, monkeypatch):
+def test_a_transaction_during_the_removal_fails(tmp_path, monkeypatch):
     from helpers.job_rows import add
 
     store = Store(f"sqlite:///{tmp_path / 'jobs.sqlite'}", time.time)
-    monkeypatch.setattr("service.storage.job_store._note", lambda *arguments: remove(tmp_path))
+    monkeypatch.setattr("service.storage.job_store._add_event", lambda *arguments: remove(tmp_path))
     with pytest.raises(DatabaseReplacedError):
         add(store)
     store.close()
 
 
-def test_looking_takes_little(tmp_path):
-    """Oracle: a clock. It happens before every submission."""
+def test_checks_are_fast(tmp_path):
+    """The check runs before every submission; its median duration is measured."""
     store = Store(f"sqlite:///{tmp_path / 'jobs.sqlite'}", time.time)
     spent = []
     for _ in range(100):
@@ -342,7 +342,7 @@ def test_a_database_server(postgresql):
         store._engine.dispose()
     assert store.health_problem() is None
     change("UPDATE meta SET value = 7 WHERE name = 'identity'")
-    assert store.health_problem() == "it was replaced by another"
+    assert store.health_problem() == "it was replaced by another database"
     with pytest.raises(DatabaseReplacedError):
         store.heartbeat()
     change("ALTER TABLE jobs DROP COLUMN note")

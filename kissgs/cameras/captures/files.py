@@ -1,4 +1,4 @@
-"""Opening files of cameras: what can go wrong becomes one sentence."""
+"""Opening of camera files, with errors as one sentence."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from kissgs.core.errors import InvalidViewsError
 
 @contextlib.contextmanager
 def open_file(path: Path) -> Iterator[tuple[io.BufferedReader, int]]:
-    """Open a regular file to read bytes; gives it and its size.
+    """Open a regular file for reading; yield it and its size in bytes.
 
     Raises:
-        InvalidViewsError: it cannot be opened or read.
+        InvalidViewsError: it is missing or no regular file, or it cannot be read.
     """
     try:
-        if not path.is_file():  # asked first, because opening a named pipe would wait for its writer
+        if not path.is_file():  # opening a named pipe would wait for its writer
             reason = "it is a folder or a device" if path.exists() else "there is no such file"
             raise InvalidViewsError(f"cannot read {path}: {reason}")
         with path.open("rb") as file:
@@ -30,5 +30,5 @@ def open_file(path: Path) -> Iterator[tuple[io.BufferedReader, int]]:
 
 
 def quoted(text: str) -> str:
-    """``text`` in quotes, unprintable characters escaped, cut to what fits a sentence."""
+    """Return ``text`` in quotes, with unprintable characters escaped, of at most 80 characters."""
     return repr(text if len(text) <= 80 else text[:79] + "…")

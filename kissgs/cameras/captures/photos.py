@@ -1,8 +1,8 @@
-"""Where the photographs of a capture are: full-size or scaled folders, other extensions, other capitals.
+"""Search for the photographs of a capture in full-size and scaled folders, whatever their extension and case.
 
-A file of cameras names photographs as they were when it was made. Captures are often passed on with only scaled
-copies of them, in folders such as ``images_4`` beside where ``images`` was; or with ``input`` alone, from which INRIA's
-``convert.py`` makes ``images``.
+A camera file names photographs as they were when it was made. Captures are often distributed with scaled copies only,
+in folders such as ``images_4`` next to the former ``images``, or only with ``input``, from which INRIA's ``convert.py``
+makes ``images``.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from kissgs.cameras.pixels import EXTENSIONS
 from kissgs.core.errors import InvalidViewsError
 
 MAX_FACTOR = 64
-"""Of scaled folders; a larger number after the underscore, such as a year, is part of the name."""
+"""Maximum scale of a folder; a larger number after the underscore, such as a year, is part of the name."""
 
 IMAGES, INPUT = "images", "input"
-"""The usual folder of photographs, and that of the originals where it is missing."""
+"""Usual folder of photographs, and the folder of originals that replaces it if it is missing."""
 
-MOST_FOLDERS = 4
-"""To list for people."""
+MAX_LISTED_FOLDERS = 4
+"""Maximum number of folders named in a message."""
 
 
 @dataclass(frozen=True, slots=True)
 class FoundPhoto:
-    """A photograph.
+    """File of a photograph.
 
     Attributes:
-        path: of its file.
-        factor: how many times smaller than the original it is, as the folder's name says.
-        folder: of the photographs, in which or below which it is.
+        path: the file.
+        factor: original size divided by this photograph's size, according to the folder's name.
+        folder: folder of photographs that contains the file, perhaps in a subfolder.
     """
 
     path: Path
@@ -43,108 +43,110 @@ class FoundPhoto:
 
 
 @dataclass(frozen=True, slots=True)
-class _Place:
-    """Where a photograph is looked for.
+class _SearchFolder:
+    """Folder in which a photograph is searched for.
 
-    ``names`` are tried in ``folder``, whose files are ``factor`` times smaller than the originals. ``promising`` means
-    that the folder is there and surely for photographs, rather than being the capture's own.
+    Attributes:
+        folder: the folder.
+        factor: original size divided by the size of its photographs.
+        names: names to try, in order, relative to the folder.
+        has_photos: whether the folder exists and is certainly for photographs, unlike the capture's own folder.
     """
 
     folder: Path
     factor: int
     names: tuple[str, ...]
-    promising: bool
+    has_photos: bool
 
 
 def find_photos(
     names: Sequence[str], root: Path, *, scale: int | None = None, images: Path | None = None
 ) -> tuple[FoundPhoto, ...] | None:
-    """Find all photographs, or learn that the capture comes without.
+    """Find the file of each photograph.
 
-    Without ``scale`` the full-size folder is taken if there is one, else that of scale 4, at which the protocol of 3DGS
-    trains outdoor scenes, else the largest; ``input`` if there is no ``images`` of any scale. A file may have another
-    extension, or other capitals, than its name says, where that name itself does not exist. An absolute name that leads
-    nowhere here is looked up in the capture's folder: first in a folder that is called as the file's own was, then in
-    ``images``.
+    The default is the full-size folder, else that of scale 4, at which the protocol of 3DGS trains outdoor scenes, else
+    the largest; ``input`` if there is no ``images`` of any scale. If no file has the exact name, one with another
+    extension or case is accepted. An absolute path that does not exist is searched for in the capture's folder: first
+    in a folder with the name of the path's own folder, then in ``images``.
 
     Args:
-        names: of photographs with forward slashes, relative to ``root`` or absolute; an extension may lack.
-        root: the capture's folder.
-        scale: take the folder whose name ends with this, such as ``images_4``; 1 is the full-size one.
-        images: take this folder instead of those that ``names`` begin with; its names are looked up with and without
-            their own folders. Relative to the working directory, or else to ``root``.
+        names: paths of photographs, relative to ``root`` or absolute, with or without extension.
+        root: folder of the capture.
+        scale: use the folder whose name ends with this number, such as ``images_4``; 1 is the full-size folder.
+        images: use this folder instead of those in ``names``, and try each name with and without its own folders.
+            Relative to the working directory, else to ``root``.
 
     Returns:
-        One for each name, in order; None if there is no folder of photographs at all.
+        One file per name, in order; None if there is no folder of photographs.
 
     Raises:
-        InvalidViewsError: the folder that was asked for does not exist, or some photographs are missing.
+        InvalidViewsError: the requested folder does not exist, or some photographs are missing.
     """
     if images is not None and scale is not None:
-        raise InvalidViewsError("a folder of photographs and a scale exclude each other; give --images or --scale")
-    disk = _Disk()
+        raise InvalidViewsError("--images and --scale exclude each other; give only one of them")
+    listing = _FolderListing()
     if images is None:
-        places = [_places(name, root, scale, disk) for name in names]
+        searched = [_search_folders(name, root, scale, listing) for name in names]
     else:
         folder = _named_folder(images, root)
-        places = [[_within(folder, name)] for name in names]
-    found = [disk.find_first(tried) for tried in places]
+        searched = [[_within(folder, name)] for name in names]
+    found = [listing.find_first(folders) for folders in searched]
     missing = [i for i, photo in enumerate(found) if photo is None]
-    if len(missing) == len(names) and not any(place.promising for tried in places for place in tried):
+    if len(missing) == len(names) and not any(entry.has_photos for folders in searched for entry in folders):
         return None
     if missing:
-        tried = places[missing[0]]
-        folder = next((place.folder for place in tried if place.promising), tried[0].folder)
+        folders = searched[missing[0]]
+        folder = next((entry.folder for entry in folders if entry.has_photos), folders[0].folder)
         raise InvalidViewsError(
-            f"{len(missing)} of {len(names)} photographs are missing, the first is {quoted(names[missing[0]])}, "
-            f"looked for in {folder}; add them, or name the folder that has them all (--images)"
+            f"{len(missing)} of {len(names)} photographs are missing; the first is {quoted(names[missing[0]])}, "
+            f"searched in {folder}; add them, or name the folder that has all of them (--images)"
         )
     return tuple(photo for photo in found if photo is not None)
 
 
-def where_looked(names: Sequence[str], root: Path) -> str:
-    """For people: the folders in which :func:`find_photos` looks for these names. Of scaled ones it is silent."""
+def searched_folders(names: Sequence[str], root: Path) -> str:
+    """Describe the folders in which :func:`find_photos` searches for these names, without scaled ones."""
     folders = dict.fromkeys(folder for name in names for folder, _ in _candidates(name, root))
-    sought = []
+    searched = []
     for folder in folders:
         if folder != root:
-            sought.append(quoted(str(folder.relative_to(root) if folder.is_relative_to(root) else folder)))
+            searched.append(quoted(str(folder.relative_to(root) if folder.is_relative_to(root) else folder)))
         if folder == root / IMAGES:
-            sought.append(quoted(INPUT))
-    listed = ", ".join(sought[:MOST_FOLDERS]) + (", …" if len(sought) > MOST_FOLDERS else "")
-    return f"{root} for {listed}" if sought else str(root)
+            searched.append(quoted(INPUT))
+    listed = ", ".join(searched[:MAX_LISTED_FOLDERS]) + (", …" if len(searched) > MAX_LISTED_FOLDERS else "")
+    return f"{root} for {listed}" if searched else str(root)
 
 
 def is_absolute(name: str) -> bool:
-    """Whether a photograph's name is an absolute path, of this machine or of another."""
+    """Whether a photograph's name is an absolute path, of POSIX or of Windows."""
     return re.match(r"[A-Za-z]:[/\\]|[/\\]", name) is not None
 
 
-def _usual(factors: Collection[int]) -> int:
+def _default_factor(factors: Collection[int]) -> int:
     return next((factor for factor in (1, 4) if factor in factors), min(factors))
 
 
-class _Disk:
-    """What folders hold, each looked at once."""
+class _FolderListing:
+    """Files of folders; each folder is read once."""
 
     def __init__(self) -> None:
         self._listings: dict[Path, tuple[set[str], dict[str, list[str]]]] = {}
         self._variants: dict[Path, dict[int, Path]] = {}
 
-    def find_first(self, places: Iterable[_Place]) -> FoundPhoto | None:
-        """The photograph of the first of the places, and there of the first of the names, that is there."""
-        for place in places:
-            for name in place.names:
+    def find_first(self, folders: Iterable[_SearchFolder]) -> FoundPhoto | None:
+        """Return the first photograph found, by folder and then by name; None if there is none."""
+        for entry in folders:
+            for name in entry.names:
                 path = PurePosixPath(name)
-                file = self._match(place.folder / path.parent, path.name)
+                file = self._match(entry.folder / path.parent, path.name)
                 if file is not None:
-                    return FoundPhoto(place.folder / path.parent / file, place.factor, place.folder)
+                    return FoundPhoto(entry.folder / path.parent / file, entry.factor, entry.folder)
         return None
 
     def variants(self, folder: Path) -> dict[int, Path]:
-        """``folder`` and its scaled copies, as far as they are there, by how many times smaller they are.
+        """Return the existing ones of ``folder`` and its scaled copies, by scale.
 
-        In place of ``images``, of which there is none, ``input``.
+        If there is no ``images`` of any scale, ``input`` takes its place with scale 1.
         """
         if folder not in self._variants:
             found = {1: folder} if _is_folder(folder) else {}
@@ -158,21 +160,21 @@ class _Disk:
         return self._variants[folder]
 
     def _match(self, folder: Path, name: str) -> str | None:
-        """The file in ``folder`` that ``name`` means: itself, or one of the same stem."""
+        """Return the file of ``folder`` with this name, else the most similar one with its stem, else None."""
         if folder not in self._listings:
             self._listings[folder] = _list(folder)
         files, stems = self._listings[folder]
         if name in files:
             return name
 
-        def unlikeness(file: str) -> tuple[bool, bool, str]:
+        def dissimilarity(file: str) -> tuple[bool, bool, str]:
             return _stem(file) != _stem(name), file.lower() != name.lower(), file
 
-        return min(stems.get(_stem(name).lower(), ()), key=unlikeness, default=None)
+        return min(stems.get(_stem(name).lower(), ()), key=dissimilarity, default=None)
 
 
 def _list(folder: Path) -> tuple[set[str], dict[str, list[str]]]:
-    """All files of ``folder``; and those that may be photographs by stem in lower case."""
+    """Return all files of ``folder``, and its image files by stem in lower case."""
     try:
         with os.scandir(folder) as entries:
             files = {entry.name for entry in entries if entry.is_file()}
@@ -188,38 +190,47 @@ def _list(folder: Path) -> tuple[set[str], dict[str, list[str]]]:
 
 
 def _stem(name: str) -> str:
-    # Names without extension may have a dot, as in frame.0001: only an image's extension is one.
+    # A name without extension may have a dot, as in frame.0001, so only image extensions count.
     path = PurePosixPath(name)
     return path.stem if path.suffix.lower() in EXTENSIONS else path.name
 
 
-def _places(name: str, root: Path, scale: int | None, disk: _Disk) -> list[_Place]:
-    """Where to look for ``name``, in order; one place at least."""
-    return [_place(folder, names, root, scale, disk) for folder, names in _candidates(name, root)]
+def _search_folders(name: str, root: Path, scale: int | None, listing: _FolderListing) -> list[_SearchFolder]:
+    """Return the folders in which to search for ``name``, in order; at least one."""
+    return [_search_folder(folder, names, root, scale, listing) for folder, names in _candidates(name, root)]
 
 
-def _place(folder: Path, names: tuple[str, ...], root: Path, scale: int | None, disk: _Disk) -> _Place:
-    """In ``folder``, or its scaled copy."""
+def _search_folder(
+    folder: Path, names: tuple[str, ...], root: Path, scale: int | None, listing: _FolderListing
+) -> _SearchFolder:
+    """Return ``folder`` or its scaled copy, as a folder to search."""
     if folder == root or folder.name == "..":  # the names have no folder of their own, so there are no scaled ones
-        return _Place(folder, 1, names, promising=False)
-    variants = disk.variants(folder)
+        return _SearchFolder(folder, 1, names, has_photos=False)
+    variants = listing.variants(folder)
     if not variants:
-        return _Place(folder, 1, names, promising=False)
-    factor = _usual(variants) if scale is None else scale
+        return _SearchFolder(folder, 1, names, has_photos=False)
+    factor = _default_factor(variants) if scale is None else scale
     if factor not in variants:
         wanted = folder.name if factor == 1 else f"{folder.name}_{factor}"
-        there = ", ".join(variants[known].name for known in sorted(variants))
-        raise InvalidViewsError(f"there is no folder {wanted} in {folder.parent}, only {there}; choose another --scale")
-    # What is called input may be anything.
-    return _Place(variants[factor], factor, names, promising=folder.name == INPUT or variants[factor].name != INPUT)
+        existing = ", ".join(variants[known].name for known in sorted(variants))
+        raise InvalidViewsError(
+            f"there is no folder {wanted} in {folder.parent}, only {existing}; choose another --scale"
+        )
+    # A folder named input may hold something else than photographs, unless the camera file names it.
+    has_photos = folder.name == INPUT or variants[factor].name != INPUT
+    return _SearchFolder(variants[factor], factor, names, has_photos)
 
 
 def _candidates(name: str, root: Path) -> list[tuple[Path, tuple[str, ...]]]:
-    """The folders of photographs that ``name`` may mean, in order, with its names within each."""
+    """Return the folders of photographs that ``name`` may refer to, in order, each with the names to try in it."""
     path = PurePosixPath(name.replace("\\", "/"))
-    if is_absolute(name):  # on another machine it was elsewhere
+    if is_absolute(name):  # the capture may have been moved
         names = (path.name,)
-        return [(Path(path.parent), names), (root / path.parent.name, names), (root / IMAGES, _endings(path.parts[1:]))]
+        return [
+            (Path(path.parent), names),
+            (root / path.parent.name, names),
+            (root / IMAGES, _suffixes(path.parts[1:])),
+        ]
     parts = path.parts
     ups = next((i for i, part in enumerate(parts) if part != ".."), len(parts))
     folder = root.joinpath(*parts[:ups])
@@ -228,8 +239,8 @@ def _candidates(name: str, root: Path) -> list[tuple[Path, tuple[str, ...]]]:
     return [(folder, ("/".join(parts[ups:]),))]
 
 
-def _endings(parts: Sequence[str]) -> tuple[str, ...]:
-    """Of a path, the longest first."""
+def _suffixes(parts: Sequence[str]) -> tuple[str, ...]:
+    """Return all suffixes of a path, the longest first."""
     return tuple("/".join(parts[i:]) for i in range(len(parts)))
 
 
@@ -237,18 +248,18 @@ def _named_folder(images: Path, root: Path) -> Path:
     for folder in (images, root / images):
         if _is_folder(folder):
             return folder
-    raise InvalidViewsError(f"there is no folder {images} of photographs, nor {root / images}; check --images")
+    raise InvalidViewsError(f"there is neither a folder {images} nor {root / images}; check --images")
 
 
-def _within(folder: Path, name: str) -> _Place:
+def _within(folder: Path, name: str) -> _SearchFolder:
     parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("..", "/", "//")]
     suffix = re.search(r"_([0-9]{1,2})$", folder.name)
     factor = int(suffix[1]) if suffix and 2 <= int(suffix[1]) <= MAX_FACTOR else 1
-    return _Place(folder, factor, _endings(parts) or ("",), promising=True)
+    return _SearchFolder(folder, factor, _suffixes(parts) or ("",), has_photos=True)
 
 
 def _is_folder(path: Path) -> bool:
     try:
         return path.is_dir()
-    except (OSError, ValueError):  # a name that no file system has
+    except (OSError, ValueError):  # too long, or invalid in any file system
         return False

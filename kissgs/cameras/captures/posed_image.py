@@ -1,4 +1,4 @@
-"""What a file of cameras says of each photograph, before the photograph itself is looked for."""
+"""``Capture``: the content of a camera file, before its photographs are searched for."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from kissgs.core.array_types import Float64
 from kissgs.core.errors import InvalidViewsError
 
 MAX_SIDE = 1_000_000
-"""Pixels; the largest stitched panoramas have some hundred thousand."""
+"""Maximum side of a photograph, pixels; the largest stitched panoramas have a few hundred thousand."""
 
 
 @dataclass(frozen=True, slots=True)
 class Intrinsics:
-    """Of a camera, as far as its file tells; lengths in pixels of a photograph of ``width`` x ``height``.
+    """Intrinsics from a camera file; lengths in pixels of a photograph of ``width`` x ``height``.
 
-    What is None follows from the rest: sides from the photograph, a focal length from the angle of view (radians) or
-    the other focal length, the principal point from the middle.
+    Defaults of values that are None: the size of the photograph; for a focal length the angle of view (radians) or the
+    other focal length; for the principal point the centre of the image.
     """
 
     width: int | None = None
@@ -36,7 +36,11 @@ class Intrinsics:
     distortion: Distortion = NO_DISTORTION
 
     def lens(self, nominal: tuple[int, int], size: tuple[int, int]) -> Lens:
-        """For a photograph of ``size`` pixels, the camera's own size being ``nominal``; both (width, height).
+        """Return the lens for a photograph of another size, with all defaults filled in.
+
+        Args:
+            nominal: (width, height) that the intrinsics refer to, pixels.
+            size: (width, height) of the photograph, pixels.
 
         Raises:
             InvalidViewsError: there is neither a focal length nor an angle of view.
@@ -54,15 +58,15 @@ class Intrinsics:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedImage:
-    """One posed photograph.
+    """A photograph with its pose and intrinsics.
 
     Attributes:
-        name: of the view, unique in most captures.
-        photo: where its file of cameras says the photograph is, with forward slashes; relative to the capture's root.
-        where: file and entry, for messages.
-        viewmat: ``(4, 4)`` rigid transform from the world to the camera, axes as those of ``Camera``.
-        intrinsics: of its camera.
-        split: to which part it belongs; None where the capture does not say.
+        name: name of the view, unique in most captures.
+        photo: path of the photograph according to the camera file; absolute, or relative to the capture's root.
+        where: camera file and entry, for error messages.
+        viewmat: ``(4, 4)`` float64, rigid transform from world to camera, with the axes of ``Camera``.
+        intrinsics: intrinsics of its camera.
+        split: whether it is for training or held out; None if the capture does not define it.
     """
 
     name: str
@@ -75,16 +79,16 @@ class PosedImage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capture:
-    """All shots of a capture, in the order of its file.
+    """All posed images of a capture, in the order of its camera file.
 
     Attributes:
-        shots: at least one.
-        root: the folder to which photographs are relative.
-        source: what was read, for people.
-        white: whether transparent pixels of its photographs stand for white.
+        images: at least one.
+        root: folder that paths of photographs are relative to.
+        source: description of the files that were read, for messages.
+        white: whether transparent pixels are composited over white.
     """
 
-    shots: tuple[PosedImage, ...]
+    images: tuple[PosedImage, ...]
     root: Path
     source: str
     white: bool = False

@@ -1,9 +1,9 @@
-"""``transforms.json`` of NeRF's synthetic scenes, of instant-ngp and of nerfstudio.
+"""Parser of the ``transforms.json`` of NeRF's synthetic scenes, of instant-ngp and of nerfstudio.
 
-Their cameras look along -z with y up (OpenGL's axes) and are given from the camera to the world; ours look along z with
-y down and are given from the world to the camera. The world is the file's own, unchanged: for instant-ngp without its
-``scale`` and ``offset``, for nerfstudio after the ``applied_transform`` that its preparation of a COLMAP model already
-made. Gaussians that were trained on that COLMAP model itself stand in another world; give the model instead.
+Poses in these files go from camera to world, with OpenGL's axes (z backward, y up); they are converted to world to
+camera, with z forward and y down. World coordinates are those of the file: instant-ngp's ``scale`` and ``offset`` are
+not applied, and nerfstudio's ``applied_transform``, with which it converted a COLMAP model, is not undone. Gaussians
+trained on that COLMAP model have other coordinates; for them, use the model.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from kissgs.core.array_types import Float64
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 
 MAX_JSON_BYTES = 1 << 28
-"""Ten thousand frames take some 10 MB."""
+"""Maximum bytes of a file; ten thousand frames take about 10 MB."""
 
 MAX_SKEW = 0.01
-"""Relative deviation of a rotation's axes from one common length, and of their angles from 90 degrees."""
+"""Maximum relative difference between the singular values of a rotation matrix, to accept rounded numbers."""
 
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE")
-"""Values of ``camera_model`` that are read; the coefficients count whichever it is."""
+"""Supported values of ``camera_model``; all given distortion coefficients apply, whatever the value."""
 
 _Side = Annotated[FiniteFloat, Field(ge=1, le=MAX_SIDE)]
 _Length = Annotated[FiniteFloat, Field(gt=0)]
@@ -38,8 +38,8 @@ _Angle = Annotated[FiniteFloat, Field(gt=0, lt=math.pi)]
 _Row = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]
 
 
-class _Lens(BaseModel):
-    """What may stand at the top, for all frames, and in a frame."""
+class _Intrinsics(BaseModel):
+    """Intrinsics, either for all frames or of one frame."""
 
     model_config = ConfigDict(extra="ignore", protected_namespaces=())
 
@@ -61,12 +61,12 @@ class _Lens(BaseModel):
     is_fisheye: bool | None = None
 
 
-class _Frame(_Lens):
+class _Frame(_Intrinsics):
     file_path: str
     transform_matrix: Annotated[list[_Row], Field(min_length=3, max_length=4)]
 
 
-class _Transforms(_Lens):
+class _Transforms(_Intrinsics):
     frames: Annotated[list[_Frame], Field(min_length=1)]
     train_filenames: list[str] | None = None
     test_filenames: list[str] | None = None
@@ -74,47 +74,49 @@ class _Transforms(_Lens):
 
 
 def read_transforms(path: Path) -> Capture:
-    """Read one file of cameras, with the split that it has itself, if any.
+    """Read a ``transforms.json`` with the split that it defines, if any.
 
-    nerfstudio's ``train_filenames`` are for training, its ``test_filenames`` held out, or ``val_filenames`` where that
-    is empty; a file with only one of these lists has all other frames in the other part. Frames in no list are left
-    out, those in both are held out.
+    nerfstudio's ``train_filenames`` are for training, and ``test_filenames`` (``val_filenames`` if that is empty) are
+    held out. If there is only one of these lists, all other frames are in the other part. If there are both, frames in
+    neither are left out, and frames in both are held out.
 
     Raises:
-        InvalidViewsError: the file is no readable JSON, or lacks or contradicts something.
-        UnsupportedError: a camera is a fisheye, or has a coefficient k4.
+        InvalidViewsError: the file cannot be read or is not JSON, or fields are missing, invalid or contradictory.
+        UnsupportedError: a camera is a fisheye or has a distortion coefficient k4.
     """
     document = _read(path)
-    shots = _shots(path, document)
-    parts = _parts(path, document)
-    if parts is not None:
-        shots = [_with_split(shot, parts[shot.name]) for shot in shots if shot.name in parts]
-    return Capture(tuple(shots), path.parent, f"cameras of {path}", _is_synthetic(document))
+    images = _posed_images(path, document)
+    splits = _splits(path, document)
+    if splits is not None:
+        images = [_with_split(image, splits[image.name]) for image in images if image.name in splits]
+    return Capture(tuple(images), path.parent, f"cameras of {path}", _is_synthetic(document))
 
 
 def read_split_transforms(folder: Path) -> Capture:
-    """Read ``transforms_train.json``, and ``transforms_test.json`` or else ``transforms_val.json`` to be held out.
+    """Read ``transforms_train.json``, and ``transforms_test.json`` or else ``transforms_val.json`` as held-out frames.
 
     Raises:
-        InvalidViewsError: as :func:`read_transforms`.
-        UnsupportedError: likewise.
+        InvalidViewsError: as for :func:`read_transforms`.
+        UnsupportedError: as for :func:`read_transforms`.
     """
     train_path = folder / "transforms_train.json"
     tests = [folder / f"transforms_{name}.json" for name in ("test", "val")]
     test_path = next((path for path in tests if path.is_file()), None)
     document = _read(train_path)
-    train, white = _shots(train_path, document), _is_synthetic(document)
+    train, white = _posed_images(train_path, document), _is_synthetic(document)
     if test_path is None:
         return Capture(tuple(train), folder, f"cameras of {train_path}", white)
-    test = _shots(test_path, _read(test_path))
-    shots = [*(_with_split(shot, "train") for shot in train), *(_with_split(shot, "test") for shot in test)]
-    return Capture(tuple(shots), folder, f"cameras of {train_path} and {test_path.name}", white)
+    test = _posed_images(test_path, _read(test_path))
+    images = [*(_with_split(image, "train") for image in train), *(_with_split(image, "test") for image in test)]
+    return Capture(tuple(images), folder, f"cameras of {train_path} and {test_path.name}", white)
 
 
 def _read(path: Path) -> _Transforms:
     with open_file(path) as (file, size):
         if size > MAX_JSON_BYTES:
-            raise InvalidViewsError(f"{path} has {size:,} bytes; cameras take fewer than {MAX_JSON_BYTES:,}")
+            raise InvalidViewsError(
+                f"{path} has {size:,} bytes; at most {MAX_JSON_BYTES:,} are read; is it a camera file?"
+            )
         data = file.read()
     try:
         return _Transforms.model_validate_json(data.removeprefix(b"\xef\xbb\xbf"))
@@ -122,26 +124,26 @@ def _read(path: Path) -> _Transforms:
         problem = error.errors(include_url=False, include_context=False, include_input=False)[0]
         if problem["type"] == "json_invalid":
             raise InvalidViewsError(f"{path} is not JSON: {problem['msg'].removeprefix('Invalid JSON: ')}") from error
-        place = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in problem["loc"]).lstrip(".")
+        field = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in problem["loc"]).lstrip(".")
         raise InvalidViewsError(
-            f"{path}{', ' if place else ''}{place}: {problem['msg'][0].lower()}{problem['msg'][1:]}"
+            f"{path}{', ' if field else ''}{field}: {problem['msg'][0].lower()}{problem['msg'][1:]}"
         ) from error
 
 
 def _is_synthetic(document: _Transforms) -> bool:
-    """Whether it is of the dialect that NeRF's synthetic scenes brought: one angle of view, nothing in pixels."""
+    """Whether the file is in the format of NeRF's synthetic scenes: one angle of view, no lengths in pixels."""
     return document.camera_angle_x is not None and document.fl_x is None and document.frames[0].fl_x is None
 
 
-def _shots(path: Path, document: _Transforms) -> list[PosedImage]:
-    shots = []
+def _posed_images(path: Path, document: _Transforms) -> list[PosedImage]:
+    images = []
     for index, frame in enumerate(document.frames):
         where = f"{path}, frame {index} ({quoted(frame.file_path)})"
-        name = _normalised(frame.file_path)
-        shots.append(
+        name = _normalized(frame.file_path)
+        images.append(
             PosedImage(name, frame.file_path, where, _viewmat(frame, where), _intrinsics(document, frame, where))
         )
-    return shots
+    return images
 
 
 def _intrinsics(document: _Transforms, frame: _Frame, where: str) -> Intrinsics:
@@ -153,11 +155,13 @@ def _intrinsics(document: _Transforms, frame: _Frame, where: str) -> Intrinsics:
     fisheye = document.is_fisheye if frame.is_fisheye is None else frame.is_fisheye
     if fisheye or (model is not None and model.upper() not in PINHOLES):
         raise UnsupportedError(
-            f"{where}: camera model {quoted('is_fisheye' if fisheye else str(model))} is not read; undistort the "
-            f"photographs first, for example with 'colmap image_undistorter' (read are {', '.join(PINHOLES)})"
+            f"{where}: the camera model {quoted('is_fisheye' if fisheye else str(model))} is not supported, only "
+            f"{', '.join(PINHOLES)}; undistort the photographs first, for example with 'colmap image_undistorter'"
         )
     if value("k4"):
-        raise UnsupportedError(f"{where}: the distortion coefficient k4 is not read; undistort the photographs first")
+        raise UnsupportedError(
+            f"{where}: the distortion coefficient k4 is not supported; undistort the photographs first"
+        )
     coefficients = {name: value(name) or 0.0 for name in ("k1", "k2", "k3", "p1", "p2")}
     width, height = value("w"), value("h")
     return Intrinsics(
@@ -176,22 +180,22 @@ def _intrinsics(document: _Transforms, frame: _Frame, where: str) -> Intrinsics:
 def _viewmat(frame: _Frame, where: str) -> Float64[np.ndarray, "4 4"]:
     matrix = np.array(frame.transform_matrix)
     if len(matrix) == 4 and not np.allclose(matrix[3], (0, 0, 0, 1)):
-        raise InvalidViewsError(f"{where}: the last row of transform_matrix is not 0 0 0 1")
-    rotation = _rotation(matrix[:3, :3], where) * (1, -1, -1)  # the camera's y and z axes turned round
+        raise InvalidViewsError(f"{where}: the last row of transform_matrix is not 0 0 0 1; export it again")
+    rotation = _rotation(matrix[:3, :3], where) * (1, -1, -1)  # flip the camera's y and z axes
     viewmat = np.eye(4)
     viewmat[:3, :3] = rotation.T
-    with np.errstate(all="ignore"):  # what overflows, Camera refuses
+    with np.errstate(all="ignore"):  # Camera rejects values that overflow
         viewmat[:3, 3] = -rotation.T @ matrix[:3, 3]
     return viewmat
 
 
 def _rotation(matrix: Float64[np.ndarray, "3 3"], where: str) -> Float64[np.ndarray, "3 3"]:
-    """The rotation nearest to ``matrix``, which may be scaled as a whole and rounded in its last digits."""
+    """Return the rotation nearest to ``matrix``, which may have a uniform scale and rounding errors."""
     largest = np.abs(matrix).max()
     left, lengths, right = np.linalg.svd(matrix / max(largest, np.finfo(np.float64).tiny))
     if largest == 0 or lengths[2] < (1 - MAX_SKEW) * lengths[0]:
         raise InvalidViewsError(
-            f"{where}: transform_matrix is no rotation: its axes are skewed or of different lengths; export it again"
+            f"{where}: transform_matrix is not a rotation: its axes are skewed or differ in length; export it again"
         )
     rotation = left @ right
     if not np.linalg.det(rotation) > 0:
@@ -199,34 +203,36 @@ def _rotation(matrix: Float64[np.ndarray, "3 3"], where: str) -> Float64[np.ndar
     return np.asarray(rotation)
 
 
-def _parts(path: Path, document: _Transforms) -> dict[str, Literal["train", "test"]] | None:
-    """Part of each frame, by its name; None if the file does not say."""
+def _splits(path: Path, document: _Transforms) -> dict[str, Literal["train", "test"]] | None:
+    """Return the split of each frame by name; None if the file defines none."""
     train, held_out = document.train_filenames, document.test_filenames
     if not held_out and document.val_filenames is not None:
         held_out = document.val_filenames
     if train is None and held_out is None:
         return None
-    everything = {_normalised(frame.file_path) for frame in document.frames}
+    all_names = {_normalized(frame.file_path) for frame in document.frames}
     for names, key in ((train, "train_filenames"), (held_out, "test_filenames or val_filenames")):
-        unknown = next((name for name in names or () if _normalised(name) not in everything), None)
+        unknown = next((name for name in names or () if _normalized(name) not in all_names), None)
         if unknown is not None:
-            raise InvalidViewsError(f"{path}: {quoted(unknown)} of {key} is the file_path of no frame")
-    tested = _set(held_out) if held_out is not None else everything - _set(train)
-    trained = (everything if train is None else _set(train)) - tested
-    if not trained:
-        raise InvalidViewsError(f"{path}: its lists of file names leave no frame to learn from; mend train_filenames")
-    parts: dict[str, Literal["train", "test"]] = dict.fromkeys(trained, "train")
-    return {**parts, **dict.fromkeys(tested, "test")}
+            raise InvalidViewsError(
+                f"{path}: {quoted(unknown)} in {key} is not the file_path of a frame; correct the list"
+            )
+    test = _name_set(held_out) if held_out is not None else all_names - _name_set(train)
+    training = (all_names if train is None else _name_set(train)) - test
+    if not training:
+        raise InvalidViewsError(f"{path}: its lists of file names leave no training frame; correct train_filenames")
+    splits: dict[str, Literal["train", "test"]] = dict.fromkeys(training, "train")
+    return {**splits, **dict.fromkeys(test, "test")}
 
 
-def _set(names: Iterable[str] | None) -> set[str]:
-    return {_normalised(name) for name in names or ()}
+def _name_set(names: Iterable[str] | None) -> set[str]:
+    return {_normalized(name) for name in names or ()}
 
 
-def _with_split(shot: PosedImage, split: Literal["train", "test"]) -> PosedImage:
-    return dataclasses.replace(shot, split=split)
+def _with_split(image: PosedImage, split: Literal["train", "test"]) -> PosedImage:
+    return dataclasses.replace(image, split=split)
 
 
-def _normalised(name: str) -> str:
-    """Without ``./`` and with forward slashes."""
+def _normalized(name: str) -> str:
+    """Return a path without ``./`` and with forward slashes."""
     return str(PurePosixPath(name.replace("\\", "/")))

@@ -1,4 +1,4 @@
-"""What routes share: how errors are documented, and finding a job."""
+"""Functions shared by the routes: documentation of errors, look-up of jobs, and waiting for their end."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from service.jobs.container import Owner, Service, ServiceContainer
 from service.jobs.status import QueueEstimator, job_status
 
 MAX_WAIT_SECONDS = 30.0
-"""Of a long poll: shorter than proxies keep a silent connection."""
+"""Maximum duration of a long poll, shorter than typical idle time-outs of proxies."""
 
 NO_STORE = {"Cache-Control": "no-store"}
 
 
 def problems(*codes: str) -> dict[int | str, dict[str, Any]]:
-    """The answers of a route that are problem documents, for OpenAPI."""
+    """Return the OpenAPI responses of a route that are problem documents."""
     answers: dict[int | str, dict[str, Any]] = {}
     for code in ("unauthorized", "invalid-request", "internal", "database", *codes):
         answer = answers.setdefault(
@@ -45,7 +45,7 @@ def problems(*codes: str) -> dict[int | str, dict[str, Any]]:
 async def _find(
     context: Service,
     owner: Owner,
-    id: Annotated[str, Path(description="Of a job: 32 hexadecimal digits.", max_length=100)],
+    id: Annotated[str, Path(description="Id of a job: 32 hexadecimal digits.", max_length=100)],
 ) -> Job:
     job = await run_sync(context.store.get, id, owner) if re.fullmatch("[0-9a-f]{32}", id) else None
     if job is None:
@@ -53,44 +53,51 @@ async def _find(
     return job
 
 
-Found = Annotated[Job, Depends(_find)]
+RequestedJob = Annotated[Job, Depends(_find)]
 
 
-async def show(context: ServiceContainer, *jobs: Job) -> list[JobStatus]:
-    """What a client sees of jobs."""
+async def statuses(context: ServiceContainer, *jobs: Job) -> list[JobStatus]:
+    """Return the statuses of jobs."""
 
-    def look() -> list[JobStatus]:
+    def read() -> list[JobStatus]:
         queue = QueueEstimator(context.store, context.settings.workers)
         return [job_status(job, queue) for job in jobs]
 
-    return await run_sync(look)
+    return await run_sync(read)
 
 
-async def fresh(context: ServiceContainer, job: Job) -> Job:
-    """The job as it is now."""
+async def reload(context: ServiceContainer, job: Job) -> Job:
+    """Return the current row of a job.
+
+    Raises:
+        ProblemError: it has been deleted.
+    """
     current = await run_sync(context.store.get, job.id)
     if current is None:
         raise ProblemError("not-found", f"there is no job {job.id}; it has just been deleted")
     return current
 
 
-async def finished(context: ServiceContainer, job: Job, seconds: float, request: Request) -> Job:
-    """The job once it has ended, or as it is when the time is over, the client has gone, or the service stops."""
+async def wait_for_end(context: ServiceContainer, job: Job, seconds: float, request: Request) -> Job:
+    """Wait up to ``seconds`` for the end of a job; return its current row.
+
+    The wait ends early if the client disconnects or the service stops.
+    """
     clock = asyncio.get_running_loop().time
     end = clock() + seconds
-    gone = asyncio.create_task(_gone(request))
+    disconnected = asyncio.create_task(_disconnected(request))
     try:
         while True:
-            subscribe = context.notifier.subscribe(ended(job.id))
-            job = await fresh(context, job)
+            changed = context.notifier.subscribe(ended(job.id))
+            job = await reload(context, job)
             left = end - clock()
-            if job.state not in ACTIVE or left <= 0 or context.notifier.closing or gone.done():
+            if job.state not in ACTIVE or left <= 0 or context.notifier.closing or disconnected.done():
                 return job
-            rung = asyncio.create_task(subscribe.wait())
-            await asyncio.wait((rung, gone), timeout=left, return_when=asyncio.FIRST_COMPLETED)
-            rung.cancel()
+            notified = asyncio.create_task(changed.wait())
+            await asyncio.wait((notified, disconnected), timeout=left, return_when=asyncio.FIRST_COMPLETED)
+            notified.cancel()
     finally:
-        gone.cancel()
+        disconnected.cancel()
 
 
 def accepts(headers: Iterable[str], media_type: str) -> bool:
@@ -105,7 +112,7 @@ def accepts(headers: Iterable[str], media_type: str) -> bool:
     return next((weights[name] > 0 for name in ranges if name in weights), not weights)
 
 
-async def _gone(request: Request) -> None:
-    """Until the client has closed the connection."""
+async def _disconnected(request: Request) -> None:
+    """Wait until the client has closed the connection."""
     while (await request.receive())["type"] != "http.disconnect":
         pass

@@ -1,4 +1,4 @@
-"""What the service says of itself: limits, presets, problems, version, health, metrics."""
+"""Routes about the service itself: limits, presets, problem types, version, health, metrics."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ API_VERSION = "1.0"
 CONTAINER = "SOG-XT"
 
 
-@router.get("/v1/limits", tags=["facts"], operation_id="limits", summary="What is accepted")
+@router.get("/v1/limits", tags=["facts"], operation_id="limits", summary="Get the limits")
 async def get_limits(context: Service) -> Limits:
-    """Ask before uploading: whatever is beyond these is refused."""
+    """Limits of uploads and jobs; requests beyond them are refused."""
     settings = context.settings
     return Limits(
         formats=["ply", "compressed.ply"],
@@ -47,15 +47,15 @@ async def get_limits(context: Service) -> Limits:
     )
 
 
-@router.get("/v1/presets", tags=["facts"], operation_id="presets", summary="What can be chosen")
+@router.get("/v1/presets", tags=["facts"], operation_id="presets", summary="List the presets")
 async def get_presets() -> Presets:
-    """All presets, with what each costs and gives, and every setting that options may replace."""
+    """All presets, with the typical size, time and quality of each, and all settings that options may change."""
     return presets()
 
 
-@router.get("/v1/problems", tags=["facts"], operation_id="problems", summary="What can go wrong")
+@router.get("/v1/problems", tags=["facts"], operation_id="problems", summary="List the problem types")
 async def get_problems() -> list[ProblemKind]:
-    """Every code that a problem document may have."""
+    """All codes that a problem document can have."""
     return [_kind(code) for code in PROBLEM_TYPES]
 
 
@@ -63,27 +63,27 @@ async def get_problems() -> list[ProblemKind]:
     "/v1/problems/{code}",
     tags=["facts"],
     operation_id="problem",
-    summary="What a code means",
+    summary="Get a problem type",
     responses=problems("not-found"),
 )
-async def get_problem(code: Annotated[str, Path(description="Of a problem.", max_length=64)]) -> ProblemKind:
-    """Where the `type` of a problem document leads."""
+async def get_problem(code: Annotated[str, Path(description="Code of a problem type.", max_length=64)]) -> ProblemKind:
+    """Description of a problem type; the `type` of a problem document links to it."""
     if code not in PROBLEM_TYPES:
         raise ProblemError("not-found", f"there is no code {code!r}; GET /v1/problems lists all")
     return _kind(code)
 
 
 @router.head("/version", include_in_schema=False)
-@router.get("/version", tags=["health"], operation_id="version", summary="Which software this is")
+@router.get("/version", tags=["health"], operation_id="version", summary="Get the version")
 async def get_version() -> Version:
-    """Of the library, of this interface, and the kind of containers."""
+    """Versions of the library and of this API, and the container format."""
     return Version(kissgs=kissgs.__version__, api=API_VERSION, container=CONTAINER)
 
 
 @router.head("/livez", include_in_schema=False)
-@router.get("/livez", tags=["health"], operation_id="livez", summary="Whether the process is alive")
+@router.get("/livez", tags=["health"], operation_id="livez", summary="Check that the process is alive")
 async def get_livez() -> Health:
-    """It answers: it is. Restart it when it does not."""
+    """Always succeeds; restart the service if there is no response."""
     return Health(ready=True, checks={"process": "ok"})
 
 
@@ -92,20 +92,20 @@ async def get_livez() -> Health:
     "/readyz",
     tags=["health"],
     operation_id="readyz",
-    summary="Whether it can take jobs",
-    responses={503: {"model": Health, "description": "Some part does not do its work."}},
+    summary="Check that jobs can be accepted",
+    responses={503: {"model": Health, "description": "A check has failed."}},
 )
 async def get_readyz(context: Service, response: Response) -> Health:
-    """Tests the worker's loop, the database and the disk. Send requests elsewhere while it is not ready."""
-    health_problem = {
+    """Checks of the worker, the database and the disk; route requests elsewhere while one of them fails."""
+    found = {
         "worker": context.worker.health_problem(),
         "database": await run_sync(_database_problem, context),
         "disk": await run_sync(_disk_problem, context),
     }
-    ready = not any(health_problem.values())
-    checks = {part: text or "ok" for part, text in health_problem.items()}
+    ready = not any(found.values())
+    checks = {part: text or "ok" for part, text in found.items()}
     if orphaned := await run_sync(context.storage.count_orphaned):
-        checks["orphaned"] = f"folders that no job owns lie in jobs/{ORPHANED} of the data folder: {orphaned}"
+        checks["orphaned"] = f"folders without a job in jobs/{ORPHANED} of the data folder: {orphaned}"
     response.status_code = 200 if ready else 503
     response.headers.update(NO_STORE)
     return Health(ready=ready, checks=checks)
@@ -115,12 +115,12 @@ async def get_readyz(context: Service, response: Response) -> Health:
     "/metrics",
     tags=["health"],
     operation_id="metrics",
-    summary="Figures for Prometheus",
+    summary="Get metrics for Prometheus",
     response_class=Response,
     responses={200: {"content": {CONTENT_TYPE: {"schema": {"type": "string"}}}, "description": "OpenMetrics."}},
 )
 async def get_metrics(context: Service) -> Response:
-    """Queue, states, durations of jobs and stages, bytes, ratios, requests. None of them names a client."""
+    """Metrics of the queue, jobs, stages, sizes and requests; none identifies a client."""
     counts, disk = await run_sync(lambda: (context.store.counts(), context.store.disk_bytes()))
     context.metrics.uploads.set(context.admission.uploads)
     return Response(context.metrics.text(counts, disk), media_type=CONTENT_TYPE)
@@ -132,21 +132,25 @@ def _kind(code: str) -> ProblemKind:
 
 
 def _database_problem(context: ServiceContainer) -> str | None:
-    health_problem = context.store.health_problem()
-    if health_problem is None:
+    problem = context.store.health_problem()
+    if problem is None:
         try:
             context.store.heartbeat()
         except SQLAlchemyError as error:
-            health_problem = error_text(error)
-    return None if health_problem is None else f"the job database cannot be used: {health_problem}"
+            problem = error_text(error)
+    return None if problem is None else f"the job database cannot be used: {problem}"
 
 
 def _disk_problem(context: ServiceContainer) -> str | None:
     needed = context.settings.min_free_bytes
-    if health_problem := context.storage.health_problem():
-        return health_problem
+    if problem := context.storage.health_problem():
+        return problem
     try:
         free = context.storage.free_bytes()
     except OSError as error:
         return f"the data folder cannot be used: {(error.strerror or str(error)).lower()}"
-    return None if free >= needed else f"{free:,} bytes are free, {needed:,} are to stay free"
+    return (
+        None
+        if free >= needed
+        else f"the disk has {free:,} free bytes, fewer than KISSGS_MIN_FREE_BYTES ({needed:,}); free some space"
+    )

@@ -13,7 +13,16 @@ from service.core.models import ACTIVE, Job, State
 from service.core.notifier import ended
 from service.core.problems import ProblemError
 from service.core.schemas import JobPage, JobStatus
-from service.http.routes.common import MAX_WAIT_SECONDS, NO_STORE, Found, accepts, finished, fresh, problems, show
+from service.http.routes.common import (
+    MAX_WAIT_SECONDS,
+    NO_STORE,
+    RequestedJob,
+    accepts,
+    problems,
+    reload,
+    statuses,
+    wait_for_end,
+)
 from service.http.routes.results import container
 from service.http.submission import RAW_TYPES, submit
 from service.jobs.container import Owner, Service, ServiceContainer
@@ -25,17 +34,19 @@ router = APIRouter(prefix="/v1", tags=["jobs"])
 Options = Annotated[
     str | None,
     Query(
-        description="JobOptions as JSON, where the body is the scene itself; in a form they are its field `options`.",
+        description="JobOptions as JSON, if the body is the scene itself; in a form, use the field `options`.",
         max_length=8192,
         examples=['{"preset": "fast"}'],
     ),
 ]
-Name = Annotated[str | None, Query(description="What to call the scene; in a form, the file's name.", max_length=1000)]
+Name = Annotated[
+    str | None, Query(description="Name of the scene. Default: the file name in the form.", max_length=1000)
+]
 IdempotencyKey = Annotated[
     str | None,
     Header(
-        description="Chosen by the client, new for every job. Sent again with the same scene and options it gives the "
-        "same job again, so that a request whose answer was lost can be repeated.",
+        description="Unique key of a job, chosen by the client. A repeated request with an identical scene and options "
+        "returns the existing job, so a request whose response was lost can be repeated.",
         min_length=1,
         max_length=255,
         pattern="^[!-~]+$",
@@ -43,7 +54,7 @@ IdempotencyKey = Annotated[
 ]
 Wait = Annotated[
     float,
-    Query(description="Seconds to wait for the job's end, if it has not ended yet.", ge=0, le=MAX_WAIT_SECONDS),
+    Query(description="Maximum wait for the end of the job, seconds.", ge=0, le=MAX_WAIT_SECONDS),
 ]
 
 _REFUSALS = (
@@ -54,7 +65,7 @@ _REFUSALS = (
 _BODY: dict[str, Any] = {
     "requestBody": {
         "required": True,
-        "description": "The scene: as the field `file` of a form, with `options` beside it, or as the body itself.",
+        "description": "The scene: the field `file` of a form with an optional field `options`, or the body itself.",
         "content": {
             "multipart/form-data": {
                 "schema": {
@@ -76,10 +87,13 @@ _BODY: dict[str, Any] = {
 _ACCEPTED: dict[int | str, dict[str, Any]] = {
     202: {
         "model": JobStatus,
-        "description": "Accepted: follow `Location`, not before `Retry-After` seconds.",
+        "description": "The job was accepted; request `Location` after `Retry-After` seconds.",
         "headers": {
-            "Location": {"schema": {"type": "string"}, "description": "Of the job."},
-            "Retry-After": {"schema": {"type": "integer"}, "description": "When to look for the first time, seconds."},
+            "Location": {"schema": {"type": "string"}, "description": "Path of the job."},
+            "Retry-After": {
+                "schema": {"type": "integer"},
+                "description": "Delay before the first status request, seconds.",
+            },
         },
     }
 }
@@ -87,7 +101,7 @@ _ACCEPTED: dict[int | str, dict[str, Any]] = {
 
 _EVENT: dict[str, Any] = {
     "type": "object",
-    "description": "Of each event.",
+    "description": "Server-sent event.",
     "required": ["id", "event", "data"],
     "properties": {
         "id": {"type": "string", "pattern": "^[0-9]+$"},
@@ -115,10 +129,10 @@ async def submit_job(
     name: Name = None,
     idempotency_key: IdempotencyKey = None,
 ) -> JobStatus:
-    """Upload a `.ply` and get a job that compresses it.
+    """Upload a `.ply` and create a job that compresses it.
 
-    The header is checked as soon as it has arrived, limits while the body does. Once this answers, the job is on disk
-    and survives whatever happens to the server.
+    The header and the limits are checked during the upload. After the response, the job is stored on disk and survives
+    a crash of the service.
     """
     job, _ = await submit(context, request, owner, options=options, name=name, key=idempotency_key)
     return await _accepted(context, response, job)
@@ -132,7 +146,7 @@ async def submit_job(
     response_class=Response,
     responses={
         200: {
-            "description": "The container. `Content-Location` is that of the result, `Link` of the job.",
+            "description": "The container. `Content-Location` is the path of the result, `Link` that of the job.",
             "content": {"application/zip": {"schema": {"type": "string", "format": "binary"}}},
         },
         **_ACCEPTED,
@@ -154,7 +168,7 @@ async def compress_now(
     successful answer as a container never saves a status.
     """
     job, _ = await submit(context, request, owner, options=options, name=name, key=idempotency_key)
-    job = await finished(context, job, context.settings.sync_seconds, request)
+    job = await wait_for_end(context, job, context.settings.sync_seconds, request)
     if job.state == State.SUCCEEDED:
         result = f"/v1/jobs/{job.id}/result"
         answer = container(context, job)
@@ -189,16 +203,16 @@ async def list_jobs(
     context: Service,
     owner: Owner,
     response: Response,
-    limit: Annotated[int, Query(ge=1, le=100, description="Jobs on a page.")] = 20,
-    cursor: Annotated[str | None, Query(pattern="^[0-9]{1,18}$", description="The `next` of the page before.")] = None,
+    limit: Annotated[int, Query(ge=1, le=100, description="Maximum number of jobs on a page.")] = 20,
+    cursor: Annotated[str | None, Query(pattern="^[0-9]{1,18}$", description="`next` of the previous page.")] = None,
     state: Annotated[State | None, Query(description="Only jobs in this state.")] = None,
 ) -> JobPage:
-    """The jobs of your key; where the service asks for none, all."""
+    """List the jobs of the request's key; all jobs if the service requires no keys."""
     response.headers.update(NO_STORE)
     before = int(cursor) if cursor is not None else None
     jobs = await run_sync(lambda: context.store.listing(owner, limit=limit + 1, before=before, state=state))
     return JobPage(
-        jobs=await show(context, *jobs[:limit]), next=str(jobs[limit - 1].number) if len(jobs) > limit else None
+        jobs=await statuses(context, *jobs[:limit]), next=str(jobs[limit - 1].number) if len(jobs) > limit else None
     )
 
 
@@ -206,18 +220,20 @@ async def list_jobs(
 @router.get(
     "/jobs/{id}",
     operation_id="status",
-    summary="Look at a job",
+    summary="Get the status of a job",
     response_model_exclude_none=True,
     responses=problems("not-found"),
 )
-async def get_job(request: Request, context: Service, job: Found, response: Response, wait: Wait = 0) -> JobStatus:
-    """Where it stands. With `wait`, the answer comes when the job has ended or the time is over."""
+async def get_job(
+    request: Request, context: Service, job: RequestedJob, response: Response, wait: Wait = 0
+) -> JobStatus:
+    """Return the status. With `wait`, the response comes when the job ends or the time is over."""
     if wait > 0:
-        job = await finished(context, job, wait, request)
+        job = await wait_for_end(context, job, wait, request)
     response.headers.update(NO_STORE)
     if job.state in ACTIVE:
         response.headers["Retry-After"] = "1"
-    return (await show(context, job))[0]
+    return (await statuses(context, job))[0]
 
 
 @router.get(
@@ -228,7 +244,7 @@ async def get_job(request: Request, context: Service, job: Found, response: Resp
     responses={
         200: {
             "description": "Server-sent events until the job has ended: `state` with the job's status, `progress` with "
-            "a stage, a fraction of it and, while it trains, a note. Ids count from 1 without gaps.",
+            "a stage, its fraction from 0 to 1 and, during training, a note. Ids count from 1 without gaps.",
             "content": {"text/event-stream": {"schema": _EVENT}},
         },
         204: {"description": "The job has ended, and `Last-Event-ID` was its last event."},
@@ -237,12 +253,13 @@ async def get_job(request: Request, context: Service, job: Found, response: Resp
 )
 async def follow_job(
     context: Service,
-    job: Found,
+    job: RequestedJob,
     last_event_id: Annotated[
-        str | None, Header(pattern="^[0-9]{1,9}$", description="Where to go on after a broken connection.")
+        str | None,
+        Header(pattern="^[0-9]{1,9}$", description="Id of the last event received, to resume after a lost connection."),
     ] = None,
 ) -> Response:
-    """Everything that has happened to it, and what happens from now on, as server-sent events."""
+    """Stream all past and future events of a job as server-sent events."""
     after = int(last_event_id or 0)
     if job.state not in ACTIVE and after >= job.last_event:
         return Response(status_code=204)
@@ -260,11 +277,11 @@ async def follow_job(
     response_model_exclude_none=True,
     responses=problems("not-found"),
 )
-async def cancel_job(context: Service, job: Found, response: Response) -> JobStatus:
-    """Stop its work, now. A job that has ended already stays as it is."""
+async def cancel_job(context: Service, job: RequestedJob, response: Response) -> JobStatus:
+    """Stop a job immediately. A job that has ended stays unchanged."""
     await context.worker.cancel(job)
     response.headers.update(NO_STORE)
-    return (await show(context, await fresh(context, job)))[0]
+    return (await statuses(context, await reload(context, job)))[0]
 
 
 @router.delete(
@@ -272,15 +289,15 @@ async def cancel_job(context: Service, job: Found, response: Response) -> JobSta
     status_code=204,
     operation_id="delete",
     summary="Delete a job",
-    responses={204: {"description": "It is gone."}, **problems("not-found")},
+    responses={204: {"description": "The job was deleted."}, **problems("not-found")},
 )
-async def delete_job(context: Service, job: Found) -> Response:
-    """Cancel it if need be, and remove everything there is of it."""
+async def delete_job(context: Service, job: RequestedJob) -> Response:
+    """Cancel a job if it has not ended, and remove all its data."""
     await context.worker.cancel(job)
     context.decoder.stop(job.id)
     gone = {"upload_kept": False, "disk_bytes": 0, "reclaimable_bytes": 0}
     await run_sync(lambda: context.store.move(job.number, State.EXPIRED, **gone))
-    await run_sync(context.storage.remove_job, job.id)  # now: a folder that no job owns would be kept
+    await run_sync(context.storage.remove_job, job.id)  # first, because a folder without a job would be kept
     await run_sync(context.store.forget, job.number)
     context.notifier.notify(job.id)
     context.notifier.notify(ended(job.id))
@@ -289,7 +306,7 @@ async def delete_job(context: Service, job: Found) -> Response:
 
 
 async def _accepted(context: ServiceContainer, response: Response, job: Job) -> JobStatus:
-    (status,) = await show(context, job)
+    (status,) = await statuses(context, job)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     seconds = status.estimate.seconds_left if status.estimate else 0
     response.headers["Retry-After"] = str(max(1, min(60, round(seconds))))

@@ -1,4 +1,4 @@
-"""The page for people."""
+"""Routes of the web page."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ router = APIRouter(include_in_schema=False)
 
 STATIC = Path(__file__).parents[2] / "static"
 
-FRESH = {"Cache-Control": "no-cache"}
-"""Ask whether it has changed: after an upgrade, old and new files must not meet."""
+REVALIDATE = {"Cache-Control": "no-cache"}
+"""Headers that make browsers revalidate a cached file, so that old and new files do not mix after an upgrade."""
 
 
-class Fresh(StaticFiles):
-    """Files that browsers keep, and ask about each time."""
+class RevalidatedFiles(StaticFiles):
+    """Static files that browsers cache and revalidate on each request."""
 
     async def get_response(self, path: str, scope: Scope) -> Response:
-        """As the base class, with that header."""
+        """Return the response of the base class with :data:`REVALIDATE`."""
         response = await super().get_response(path, scope)
-        response.headers.update(FRESH)
+        response.headers.update(REVALIDATE)
         return response
 
 
 @router.head("/")
 @router.get("/")
 async def get_page() -> FileResponse:
-    """Drop a scene, follow it, fetch the container."""
-    return FileResponse(STATIC / "index.html", headers=FRESH)
+    """Return the web page."""
+    return FileResponse(STATIC / "index.html", headers=REVALIDATE)
 
 
 @router.head("/favicon.ico")
 @router.get("/favicon.ico")
 async def get_icon() -> FileResponse:
-    """What browsers ask for unbidden."""
-    return FileResponse(STATIC / "icon.svg", media_type="image/svg+xml", headers=FRESH)
+    """Return the icon that browsers request by default."""
+    return FileResponse(STATIC / "icon.svg", media_type="image/svg+xml", headers=REVALIDATE)

@@ -1,4 +1,4 @@
-"""What a job has made: the container, its files, the decoded scene, the report."""
+"""Routes of a job's files: container, its single files, decoded scene, upload, report."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from fastapi import APIRouter, Path, Response
 from service.core.models import Job, State
 from service.core.problems import ProblemError
 from service.http.file_response import StoredFile, described
-from service.http.routes.common import Found, problems
+from service.http.routes.common import RequestedJob, problems
 from service.jobs.container import Service, ServiceContainer
 
 router = APIRouter(prefix="/v1/jobs/{id}", tags=["results"])
@@ -19,7 +19,7 @@ _MEDIA_TYPES = {".webp": "image/webp", ".json": "application/json", ".yaml": "ap
 
 _PRIVATE = {"Cache-Control": "private, no-cache"}
 _FOREVER = {"Cache-Control": "private, max-age=31536000, immutable"}
-"""A job's files never change; a new upload is a new job."""
+"""Headers of container files, which never change."""
 
 _UNREADY = ("not-found", "not-finished", "not-succeeded", "gone", "range")
 
@@ -27,33 +27,36 @@ _UNREADY = ("not-found", "not-finished", "not-succeeded", "gone", "range")
 def _file_answers(media_types: str, *codes: str) -> dict[int | str, dict[str, Any]]:
     headers = {
         "ETag": {"schema": {"type": "string"}, "description": "SHA-256 of the file."},
-        "Repr-Digest": {"schema": {"type": "string"}, "description": "RFC 9530, of the whole file."},
+        "Repr-Digest": {"schema": {"type": "string"}, "description": "RFC 9530 digest of the whole file."},
         "Accept-Ranges": {"schema": {"type": "string"}, "description": "bytes"},
     }
-    whole = {**headers, "Content-Digest": {"schema": {"type": "string"}, "description": "RFC 9530, of this answer."}}
+    full = {
+        **headers,
+        "Content-Digest": {"schema": {"type": "string"}, "description": "RFC 9530 digest of this response."},
+    }
     binary, json = {"type": "string", "format": "binary"}, {"type": "object"}
     content = {name: {"schema": json if name == "application/json" else binary} for name in media_types.split()}
     return {
-        200: {"description": "The file.", "content": content, "headers": whole},
+        200: {"description": "The file.", "content": content, "headers": full},
         206: {
-            "description": "The range that was asked for.",
+            "description": "The requested range.",
             "content": {name: {"schema": binary} for name in content},
             "headers": headers,
         },
-        304: {"description": "It is the one that `If-None-Match` names."},
+        304: {"description": "The file matches `If-None-Match`."},
         **problems(*_UNREADY, *codes),
     }
 
 
-async def get_result(context: Service, job: Found) -> Response:
-    """The container as one zip: any SOG-XT reader opens it. As often as wanted, until the job expires."""
+async def get_result(context: Service, job: RequestedJob) -> Response:
+    """The container as a zip, for any SOG-XT reader, until the job expires."""
     return container(context, job)
 
 
 async def get_file(
-    context: Service, job: Found, name: Annotated[str, Path(description="One of `sizes.files` of the job.")]
+    context: Service, job: RequestedJob, name: Annotated[str, Path(description="One of `sizes.files` of the job.")]
 ) -> Response:
-    """One file of the container, for readers that fetch only what they need. It may be cached for ever."""
+    """One file of the container, for readers that need only some. It never changes and may be cached."""
     _ready(job)
     entry = described(job.result or {}, ("files", name))
     path = context.storage.result(job.id) / "files" / name
@@ -61,8 +64,8 @@ async def get_file(
     return StoredFile(path, sha256=entry["sha256"], media_type=media_type, headers=_FOREVER)
 
 
-async def get_decoded(context: Service, job: Found) -> Response:
-    """The container turned back into a `.ply`, made when it is first asked for."""
+async def get_decoded(context: Service, job: RequestedJob) -> Response:
+    """The container decoded to a `.ply`, on the first request."""
     _ready(job)
     path, entry = await context.decoder.scene(job)
     media_type = "application/octet-stream"
@@ -70,18 +73,18 @@ async def get_decoded(context: Service, job: Found) -> Response:
     return StoredFile(path, sha256=entry["sha256"], media_type=media_type, download=download, headers=_PRIVATE)
 
 
-async def get_source(context: Service, job: Found) -> Response:
-    """The `.ply` as it was uploaded, as long as the server has room for it: for comparisons."""
+async def get_source(context: Service, job: RequestedJob) -> Response:
+    """The uploaded `.ply`, for comparisons, unless it was removed to free disk space."""
     _ready(job)
     path = context.storage.upload(job.id)
     if not job.upload_kept:
-        raise ProblemError("gone", "the upload was removed to make room; the result is still there")
+        raise ProblemError("gone", "the upload was removed to free disk space; the result is still available")
     media_type, download = "application/octet-stream", f"{job.name}.ply"
     return StoredFile(path, sha256=job.upload_sha256, media_type=media_type, download=download, headers=_PRIVATE)
 
 
-async def get_report(context: Service, job: Found) -> Response:
-    """What the compression took and gave, as the library reports it."""
+async def get_report(context: Service, job: RequestedJob) -> Response:
+    """The report of the compression, as from the library."""
     _ready(job)
     entry = described(job.result or {}, ("report",))
     path = context.storage.result(job.id) / "report.json"
@@ -89,10 +92,10 @@ async def get_report(context: Service, job: Found) -> Response:
 
 
 def container(context: ServiceContainer, job: Job) -> StoredFile:
-    """The zip of a job that has succeeded.
+    """Return the response with the zip of a succeeded job.
 
     Raises:
-        ProblemError: it has not.
+        ProblemError: the job has not succeeded.
     """
     _ready(job)
     entry = described(job.result or {}, ("container",))
@@ -106,7 +109,7 @@ def _ready(job: Job) -> None:
         case State.SUCCEEDED:
             return
         case State.QUEUED | State.RUNNING:
-            text = f"the job is {job.state}; follow it at /v1/jobs/{job.id}/events or ask again"
+            text = f"the job is {job.state}; follow it at /v1/jobs/{job.id}/events or try again later"
             raise ProblemError("not-finished", text, retry_after=2)
         case State.EXPIRED:
             raise ProblemError("gone", "the job has expired and its files were removed; submit the scene again")
@@ -118,7 +121,7 @@ def _ready(job: Job) -> None:
 
 
 def _add(endpoint: Callable[..., Any], path: str, summary: str, media_types: str, *codes: str) -> None:
-    """Serve a file by GET and by HEAD, each documented."""
+    """Add documented GET and HEAD routes of a file."""
     name = endpoint.__name__.removeprefix("get_")
     for method, operation in (("GET", name), ("HEAD", f"{name}_head")):
         router.add_api_route(
@@ -132,11 +135,17 @@ def _add(endpoint: Callable[..., Any], path: str, summary: str, media_types: str
         )
 
 
-_add(get_result, "/result", "Fetch the container", "application/zip")
-_add(get_file, "/files/{name}", "Fetch one file of the container", " ".join(_MEDIA_TYPES.values()))
+_add(get_result, "/result", "Download the container", "application/zip")
+_add(get_file, "/files/{name}", "Download one file of the container", " ".join(_MEDIA_TYPES.values()))
 _add(
-    *(get_decoded, "/decoded", "Fetch the decoded scene", "application/octet-stream"),
-    *("disk-full", "memory-limit", "crashed", "time-limit"),
+    get_decoded,
+    "/decoded",
+    "Download the decoded scene",
+    "application/octet-stream",
+    "disk-full",
+    "memory-limit",
+    "crashed",
+    "time-limit",
 )
-_add(get_source, "/source", "Fetch the upload", "application/octet-stream")
-_add(get_report, "/report", "Fetch the report", "application/json")
+_add(get_source, "/source", "Download the upload", "application/octet-stream")
+_add(get_report, "/report", "Download the report", "application/json")

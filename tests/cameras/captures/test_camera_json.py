@@ -1,4 +1,4 @@
-"""Oracle: what 3DGS' own camera_to_JSON writes, retold here, and a projection by the textbook."""
+"""Oracle: a copy of camera_to_JSON of 3DGS, and an independent pinhole projection."""
 
 import json
 
@@ -20,7 +20,7 @@ def some_camera(seed=0):
 
 
 def inrias_entry(number, R, T, width, height, fov_x, fov_y):
-    """camera_to_JSON of graphdeco-inria/gaussian-splatting: R is from the camera to the world, T from the world."""
+    """Return what camera_to_JSON of graphdeco-inria/gaussian-splatting does; R goes to the world, T from it."""
     Rt = np.zeros((4, 4))
     Rt[:3, :3] = R.transpose()
     Rt[:3, 3] = T
@@ -51,7 +51,7 @@ def written(path, document):
     return path
 
 
-def refused(path, document=None):
+def refusal(path, document=None):
     with pytest.raises(InvalidViewsError) as caught:
         read_cameras(path if document is None else written(path, document))
     message = str(caught.value)
@@ -60,7 +60,7 @@ def refused(path, document=None):
     return message
 
 
-def test_a_camera_comes_back_as_it_was(tmp_path):
+def test_cameras_survive_a_round_trip(tmp_path):
     camera = some_camera()
     write_camera(tmp_path / "here.json", camera)
     (found,) = read_cameras(tmp_path / "here.json")
@@ -75,13 +75,13 @@ def test_a_camera_comes_back_as_it_was(tmp_path):
     assert not np.array_equal(read_cameras(tmp_path / "here.json")[0].camera.viewmat, camera.viewmat)
 
 
-def test_cameras_of_3dgs_see_points_where_the_textbook_says(tmp_path):
+def test_cameras_of_3dgs_project_points_correctly(tmp_path):
     entries = inrias_entries()
     views = read_cameras(written(tmp_path / "cameras.json", entries))
     assert [view.name for view in views] == ["DSC_0000", "DSC_0001", "DSC_0002"]
     rng = np.random.default_rng(3)
     for entry, view in zip(entries, views, strict=True):
-        axes = np.array(entry["rotation"]).T  # the camera's axes, each a row, in the world
+        axes = np.array(entry["rotation"]).T  # each row is an axis of the camera, in world coordinates
         for _ in range(5):
             ahead = np.array([*rng.uniform(-0.3, 0.3, 2), 1]) * rng.uniform(1, 9)
             point = np.array(entry["position"]) + ahead[0] * axes[0] + ahead[1] * axes[1] + ahead[2] * axes[2]
@@ -91,24 +91,24 @@ def test_cameras_of_3dgs_see_points_where_the_textbook_says(tmp_path):
             assert (x / z, y / z) == (pytest.approx(u), pytest.approx(v))
 
 
-def test_a_single_entry_does_without_a_name(tmp_path):
+def test_entries_without_a_name(tmp_path):
     entry = {key: value for key, value in inrias_entries(1)[0].items() if key not in ("id", "img_name")}
-    assert [view.name for view in read_cameras(written(tmp_path / "lone.json", entry))] == ["lone"]
+    assert [view.name for view in read_cameras(written(tmp_path / "single.json", entry))] == ["single"]
     names = [view.name for view in read_cameras(written(tmp_path / "list.json", [entry, entry]))]
     assert names == ["list_0", "list_1"]
 
 
-def test_a_file_of_cameras_can_be_told_from_a_name_and_one_be_picked(tmp_path):
+def test_selection_from_a_camera_file(tmp_path):
     path = written(tmp_path / "cameras.json", inrias_entries())
     assert [is_camera_file(which) for which in ("a.json", "A.JSON:0", "a.json:b", "a", "7")] == [True] * 3 + [False] * 2
     assert view_of_file(f"{path}:2").name == view_of_file(f"{path}:DSC_0002").name == "DSC_0002"
-    with pytest.raises(InvalidViewsError, match=r"holds 3 cameras; pick one, as in .*cameras\.json:0 or .*:DSC_0000"):
+    with pytest.raises(InvalidViewsError, match=r"has 3 cameras; select one, as in .*cameras\.json:0 or .*:DSC_0000"):
         view_of_file(str(path))
-    with pytest.raises(InvalidViewsError, match="they count from 0 to 2"):
+    with pytest.raises(InvalidViewsError, match="numbers go from 0 to 2"):
         view_of_file(f"{path}:3")
 
 
-def test_views_are_picked_by_name_number_and_file_name():
+def test_selection_by_name_number_and_file_name():
     camera = some_camera()
     names = ("images/7.png", "left/a.png", "right/a.png", "right/b.png", "1")
     parts = tuple(View(name, camera) for name in names)
@@ -116,32 +116,36 @@ def test_views_are_picked_by_name_number_and_file_name():
     assert [view.name for view in views] == sorted(names)
     assert pick_view(views, "images/7.png", "x").name == "images/7.png"
     assert pick_view(views, "b.png", "x").name == pick_view(views, "b", "x").name == "right/b.png"
-    assert pick_view(views, "0", "x").name == "1", "a number is a place"
+    assert pick_view(views, "0", "x").name == "1", "a number is an index"
     assert pick_view(views, "1", "x").name == "1", "unless it is a name"
-    for which, said in (("7", "from 0 to 4"), ("a", "2 views in x are called 'a'"), ("c", "the first is 1, the last")):
-        with pytest.raises(InvalidViewsError, match=said):
+    for which, sentence in (
+        ("7", "from 0 to 4"),
+        ("a", "2 views in x have the name 'a'"),
+        ("c", "the first is 1, the last"),
+    ):
+        with pytest.raises(InvalidViewsError, match=sentence):
             pick_view(views, which, "x")
 
 
-def test_what_is_no_camera_file_is_refused_with_its_place(tmp_path):
+def test_invalid_camera_files_are_rejected_with_the_field(tmp_path):
     path = tmp_path / "camera.json"
     good, entry = camera_as_dict(some_camera()), inrias_entries(1)[0]
-    assert "no such file" in refused(path)
-    assert "is not JSON" in refused(path, "{")
-    assert "is not JSON" in refused(path, "[" * 100_000)
-    assert "empty list" in refused(path, [])
-    assert "is no camera: it has neither" in refused(path, 3)
-    assert "give it to --views" in refused(path, {"frames": []})
-    assert "camera 1 is no camera" in refused(path, [entry, {"fx": 1}])
-    assert "camera 0, position[1]: input should be a finite number" in refused(
+    assert "no such file" in refusal(path)
+    assert "is not JSON" in refusal(path, "{")
+    assert "is not JSON" in refusal(path, "[" * 100_000)
+    assert "empty list" in refusal(path, [])
+    assert "is not a camera: it has neither" in refusal(path, 3)
+    assert "pass it to --views" in refusal(path, {"frames": []})
+    assert "camera 1 is not a camera" in refusal(path, [entry, {"fx": 1}])
+    assert "camera 0, position[1]: input should be a finite number" in refusal(
         path, json.dumps([{**entry, "position": [0, float("nan"), 0]}])
     )
-    assert "fx: input should be greater than 0" in refused(path, {**entry, "fx": 0})
-    assert "width: input should be" in refused(path, {**good, "width": "9"})
-    assert "height: field required" in refused(path, {key: good[key] for key in ("viewmat", "K", "width")})
-    assert "viewmat: list should have at least 4" in refused(path, {**good, "viewmat": good["viewmat"][:3]})
-    assert "must hold a rotation" in refused(path, {**entry, "rotation": np.diag([1.0, 1, -1]).tolist()})
-    assert "0 0 0 1" in refused(path, {**good, "viewmat": np.transpose(good["viewmat"]).tolist()})
-    assert "no skew" in refused(path, {**good, "K": [[1, 2, 3], [0, 1, 2], [0, 0, 1]]})
+    assert "fx: input should be greater than 0" in refusal(path, {**entry, "fx": 0})
+    assert "width: input should be" in refusal(path, {**good, "width": "9"})
+    assert "height: field required" in refusal(path, {key: good[key] for key in ("viewmat", "K", "width")})
+    assert "viewmat: list should have at least 4" in refusal(path, {**good, "viewmat": good["viewmat"][:3]})
+    assert "must hold a rotation" in refusal(path, {**entry, "rotation": np.diag([1.0, 1, -1]).tolist()})
+    assert "0 0 0 1" in refusal(path, {**good, "viewmat": np.transpose(good["viewmat"]).tolist()})
+    assert "skew is not supported" in refusal(path, {**good, "K": [[1, 2, 3], [0, 1, 2], [0, 0, 1]]})
     far = 1.7e308 * np.sign(np.array(entry["rotation"])[:, 0])
-    assert "finite numbers" in refused(path, {**entry, "position": far.tolist()})
+    assert "finite numbers" in refusal(path, {**entry, "position": far.tolist()})

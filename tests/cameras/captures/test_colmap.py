@@ -1,4 +1,4 @@
-"""Oracle: cameras made by SciPy, and files of them packed by hand; for fox, the points that COLMAP saw."""
+"""Oracle: cameras made with SciPy and files packed by hand; for fox, COLMAP's observations of points."""
 
 import os
 import struct
@@ -21,7 +21,7 @@ def test_cameras_and_names(tmp_path, write):
     images = poses(NAMES)
     write(tmp_path, {1: PINHOLE}, images)
     capture = read_colmap(tmp_path)
-    assert [shot.name for shot in capture.shots] == NAMES
+    assert [posed.name for posed in capture.images] == NAMES
     for view, pose in zip(load_views(tmp_path, hold_out=0).train, sorted(images, key=lambda p: p.name), strict=True):
         assert view.name == pose.name
         assert_camera(view.camera, pose, K, 120, 80)
@@ -33,7 +33,7 @@ def test_every_model(tmp_path, write, model):
     names = MODELS[model][1].split()
     values = {name: 0.01 * i for i, name in enumerate(names, start=1)}
     write(tmp_path, {1: PINHOLE, 7: (model, 120, 80, tuple(values.values()))}, [poses(["a"])[0], pose_of(7)])
-    intrinsics = read_colmap(tmp_path).shots[1].intrinsics
+    intrinsics = read_colmap(tmp_path).images[1].intrinsics
     fx, fy = values.pop("fx", values.get("f")), values.pop("fy", values.get("f"))
     values.pop("f", None)
     assert (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy) == (fx, fy, values.pop("cx"), values.pop("cy"))
@@ -58,46 +58,46 @@ def test_quaternions_need_not_be_of_unit_length(tmp_path):
 
 
 def test_text_with_a_byte_order_mark(tmp_path):
-    """As some editors save it; before a comment, and before a record."""
+    """Some editors add one: before a comment, or before a record."""
     images = poses(NAMES)
     write_text(tmp_path, {1: PINHOLE}, images)
     for path, comments in ((tmp_path / "cameras.txt", 0), (tmp_path / "images.txt", 2)):
         path.write_bytes(b"\xef\xbb\xbf" + b"".join(path.read_bytes().splitlines(keepends=True)[comments:]))
-    assert [shot.name for shot in read_colmap(tmp_path).shots] == NAMES
+    assert [posed.name for posed in read_colmap(tmp_path).images] == NAMES
 
 
 @WRITERS
-@pytest.mark.parametrize("start", ["C:\\data\\pictures\\", "/data/pictures/"])
+@pytest.mark.parametrize("start", ["C:\\data\\photos\\", "/data/photos/"])
 def test_absolute_names(tmp_path, write, start):
-    """They are looked for where they say, and then in the capture's own folder."""
+    """Absolute paths that do not exist are searched for in the capture's folder."""
     images = poses([f"{start}{name}" for name in ("1.jpg", "2.jpg")])
     write(tmp_path / "sparse" / "0", {1: PINHOLE}, images)
     write_photo(tmp_path / "images" / "1.jpg", 120, 80)
-    write_photo(tmp_path / "pictures" / "2.jpg", 120, 80)
-    assert [shot.photo for shot in read_colmap(tmp_path / "sparse" / "0").shots] == [pose.name for pose in images]
+    write_photo(tmp_path / "photos" / "2.jpg", 120, 80)
+    assert [posed.photo for posed in read_colmap(tmp_path / "sparse" / "0").images] == [pose.name for pose in images]
     views = load_views(tmp_path, hold_out=0).train
-    assert [view.photo for view in views] == [tmp_path / "images" / "1.jpg", tmp_path / "pictures" / "2.jpg"]
+    assert [view.photo for view in views] == [tmp_path / "images" / "1.jpg", tmp_path / "photos" / "2.jpg"]
 
 
-@pytest.mark.parametrize("place", ["", "sparse/0", "sparse", "colmap/sparse/0", "0"])
-def test_usual_places(tmp_path, place):
-    write_text(tmp_path / place, {1: PINHOLE}, poses(NAMES))
-    assert find_colmap(tmp_path) == tmp_path / place
+@pytest.mark.parametrize("folder", ["", "sparse/0", "sparse", "colmap/sparse/0", "0"])
+def test_model_folders(tmp_path, folder):
+    write_text(tmp_path / folder, {1: PINHOLE}, poses(NAMES))
+    assert find_colmap(tmp_path) == tmp_path / folder
 
 
-def test_binary_counts_before_text_and_own_folder_before_sparse(tmp_path):
+def test_binary_precedes_text_and_the_folder_itself_precedes_sparse(tmp_path):
     write_text(tmp_path, {1: PINHOLE}, poses(["text"]))
     write_binary(tmp_path, {1: PINHOLE}, poses(["binary"]))
     write_binary(tmp_path / "sparse" / "0", {1: PINHOLE}, poses(["sparse"]))
     (tmp_path / "rigs.bin").write_bytes(b"not read")
     (tmp_path / "frames.bin").write_bytes(b"not read")
-    assert [shot.name for shot in read_colmap(find_colmap(tmp_path)).shots] == ["binary"]
+    assert [posed.name for posed in read_colmap(find_colmap(tmp_path)).images] == ["binary"]
 
 
 @pytest.mark.parametrize("start", ["", "sparse", "sparse/0"])
 @pytest.mark.parametrize("photos", ["images", "images_4", "input"])
 def test_root_is_where_the_photographs_are(tmp_path, start, photos):
-    capture = tmp_path / "360"  # a name that could be a model's
+    capture = tmp_path / "360"  # also a name that a model's folder may have
     write_binary(capture / "sparse" / "0", {1: PINHOLE}, poses(NAMES))
     (capture / photos).mkdir()
     (tmp_path / "images").mkdir()
@@ -105,41 +105,40 @@ def test_root_is_where_the_photographs_are(tmp_path, start, photos):
 
 
 @WRITERS
-def test_fisheyes_are_refused_only_where_used(tmp_path, write):
+def test_fisheyes_are_rejected_only_if_an_image_uses_them(tmp_path, write):
     cameras = {1: PINHOLE, 2: ("OPENCV_FISHEYE", 120, 80, (100.0, 100.0, 60.0, 40.0, 0.1, 0.0, 0.0, 0.0))}
     write(tmp_path, cameras, poses(NAMES))
-    assert len(read_colmap(tmp_path).shots) == 3
+    assert len(read_colmap(tmp_path).images) == 3
     write(tmp_path, cameras, [pose_of(2)])
     name = "cameras.bin" if write is write_binary else "cameras.txt"
-    with pytest.raises(Exception, match="fisheye") as caught:
+    with pytest.raises(Exception, match="FISHEYE") as caught:
         read_colmap(tmp_path)
     assert caught.value.code == "unsupported"
     assert str(caught.value) == (
-        f"{tmp_path / name}, camera 2 is of model 'OPENCV_FISHEYE', which no pinhole can replace here; run "
-        "'colmap image_undistorter' first (read are SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, "
-        "FULL_OPENCV)"
+        f"{tmp_path / name}, camera 2: the camera model 'OPENCV_FISHEYE' is not supported, only SIMPLE_PINHOLE, "
+        "PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV; run 'colmap image_undistorter' first"
     )
 
 
-def test_fox_sees_its_points_where_colmap_did(shared_data):
-    """Track observations against our projection, in pixels of ``images_2``: COLMAP reports 0.586 per point."""
+def test_fox_cameras_project_points_to_colmaps_observations(shared_data):
+    """The mean reprojection error in pixels of ``images_2`` is about COLMAP's, which is 0.586 per point."""
     model = shared_data / "fox" / "sparse" / "0"
-    points, seen = naive_points(model / "points3D.bin"), naive_observations(model / "images.bin")
+    points, seen = read_points(model / "points3D.bin"), read_observations(model / "images.bin")
     errors = []
-    for shot in read_colmap(model).shots:
-        ids, observed = seen[shot.name]
+    for posed in read_colmap(model).images:
+        ids, observed = seen[posed.name]
         world = np.array([points[i] for i in ids])
-        local = world @ shot.viewmat[:3, :3].T + shot.viewmat[:3, 3]
-        projected = local @ shot.intrinsics.lens((1080, 1920), (540, 960)).K.T
+        local = world @ posed.viewmat[:3, :3].T + posed.viewmat[:3, 3]
+        projected = local @ posed.intrinsics.lens((1080, 1920), (540, 960)).K.T
         assert (projected[:, 2] > 0).all()
         errors.append(projected[:, :2] / projected[:, 2:] - observed / 2)
     assert len(errors) == 50
     assert max(np.linalg.norm(error, axis=1).mean() for error in errors) < 1
     assert np.linalg.norm(np.concatenate(errors), axis=1).mean() < 0.7
-    assert np.abs(np.concatenate(errors).mean(axis=0)).max() < 0.001  # half a pixel's shift would show here
+    assert np.abs(np.concatenate(errors).mean(axis=0)).max() < 0.001  # a shift by half a pixel would exceed this
 
 
-def naive_points(path):
+def read_points(path):
     data, at, points = path.read_bytes(), 8, {}
     for _ in range(struct.unpack_from("<Q", data)[0]):
         number, *position = struct.unpack_from("<Q3d", data, at)
@@ -149,7 +148,7 @@ def naive_points(path):
     return points
 
 
-def naive_observations(path):
+def read_observations(path):
     data, at, seen = path.read_bytes(), 8, {}
     for _ in range(struct.unpack_from("<Q", data)[0]):
         at += 4 + 56 + 4
@@ -162,7 +161,7 @@ def naive_observations(path):
     return seen
 
 
-def test_a_named_pipe_is_not_waited_for(tmp_path):
+def test_reading_does_not_wait_for_a_named_pipe(tmp_path):
     write_text(tmp_path, {1: PINHOLE}, poses(NAMES))
     (tmp_path / "images.txt").unlink()
     os.mkfifo(tmp_path / "images.txt")

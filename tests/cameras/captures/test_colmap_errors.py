@@ -1,4 +1,4 @@
-"""Oracle: for each way in which a model can be wrong, the sentence to read; and no byte leads astray."""
+"""Oracle: the expected message for each error in a model; and mutated files, which may raise no other exception."""
 
 import struct
 
@@ -8,7 +8,7 @@ from helpers.reference_cameras import PINHOLE, camera_bytes, image_bytes, poses,
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from kissgs.cameras.captures import colmap_records as colmap_files
+from kissgs.cameras.captures import colmap_records
 from kissgs.cameras.captures.colmap import read_colmap
 from kissgs.cameras.captures.load import load_views
 from kissgs.core.errors import InvalidViewsError, KissgsError, UnsupportedError
@@ -16,7 +16,7 @@ from kissgs.core.errors import InvalidViewsError, KissgsError, UnsupportedError
 CAMERAS, IMAGES = {1: PINHOLE}, poses(["a.jpg", "b.jpg"])
 GOOD_CAMERAS, GOOD_IMAGES = camera_bytes(CAMERAS), image_bytes(IMAGES)
 MEMORY = 5_000_000
-"""Bytes; the files here are below 1 kB, so anything near this came from trusting a count."""
+"""Memory limit, bytes: the files here are below 1 kB, so only an unchecked count could exceed it."""
 
 
 def message(folder, kind=InvalidViewsError):
@@ -36,28 +36,36 @@ def pose_bytes(*numbers, camera=1, name=b"x\0", points=0):
 
 
 BINARY = {
-    "cameras.bin is cut short; copy or export it again": {"cameras": b"\1\0\0"},
-    "cameras.bin declares 1,099,511,627,776 cameras, but has room for 1 at most; it is cut short, or not COLMAP's": {
-        "cameras": struct.pack("<Q", 1 << 40) + GOOD_CAMERAS[8:]
+    "cameras.bin is truncated; copy or export it again": {"cameras": b"\1\0\0"},
+    "cameras.bin declares 1,099,511,627,776 cameras, but has room for 1 at most; it is truncated, or "
+    "not from COLMAP: export it again": {"cameras": struct.pack("<Q", 1 << 40) + GOOD_CAMERAS[8:]},
+    "images.bin declares 18,446,744,073,709,551,615 images, but has room for 2 at most; it is truncated, "
+    "or not from COLMAP: export it again": {
+        "images": b"\xff" * 8 + image_bytes(poses(["a" * 60, "b" * 10], seed=3)[:2])[8:170]
     },
-    "images.bin declares 18,446,744,073,709,551,615 images, but has room for 2 at most; it is cut short, or not "
-    "COLMAP's": {"images": b"\xff" * 8 + image_bytes(poses(["a" * 60, "b" * 10], seed=3)[:2])[8:170]},
-    "cameras.bin has two cameras of number 1; it is damaged": {"cameras": struct.pack("<Q", 2) + 2 * GOOD_CAMERAS[8:]},
-    "cameras.bin goes on for 3 bytes after its last camera; it is damaged": {"cameras": GOOD_CAMERAS + b"abc"},
-    "images.bin goes on for 1 bytes after its last image; it is damaged": {"images": GOOD_IMAGES + b"a"},
-    "images.bin is cut short; copy or export it again": {"images": pose_bytes(1, 0, 0, 0, 0, 0, 0, points=1 << 60)},
-    "images.bin, image 'x': there is no camera 9 in cameras.bin": {"images": pose_bytes(1, 0, 0, 0, 0, 0, 0, camera=9)},
-    "images.bin, image 'x': its pose is not a rotation and a translation of finite numbers": {
+    "cameras.bin has two cameras with number 1; it is damaged, export it again": {
+        "cameras": struct.pack("<Q", 2) + 2 * GOOD_CAMERAS[8:]
+    },
+    "cameras.bin continues for 3 bytes after its last camera; it is damaged, export it again": {
+        "cameras": GOOD_CAMERAS + b"abc"
+    },
+    "images.bin continues for 1 bytes after its last image; it is damaged, export it again": {
+        "images": GOOD_IMAGES + b"a"
+    },
+    "images.bin is truncated; copy or export it again": {"images": pose_bytes(1, 0, 0, 0, 0, 0, 0, points=1 << 60)},
+    "images.bin, image 'x': there is no camera 9 in cameras.bin; export the model again": {
+        "images": pose_bytes(1, 0, 0, 0, 0, 0, 0, camera=9)
+    },
+    "images.bin, image 'x': its pose has a zero quaternion or non-finite numbers; reconstruct the capture again": {
         "images": pose_bytes(0, 0, 0, 0, 0, 0, 0)
     },
-    "images.bin: the name 'xxxxxxxxxxxxxxxxxxxxxxxxx' has no end; the file is damaged or cut short": {
-        "images": pose_bytes(1, 0, 0, 0, 0, 0, 0, name=b"x" * 25)[:-8]
-    },
-    "images.bin, name '�': not text in UTF-8; rename the photographs or save it again": {
+    "images.bin: the name 'xxxxxxxxxxxxxxxxxxxxxxxxx' has no end; the file is damaged or truncated, copy or export it "
+    "again": {"images": pose_bytes(1, 0, 0, 0, 0, 0, 0, name=b"x" * 25)[:-8]},
+    "images.bin, name '�': not UTF-8 text; rename the photographs or save the file as UTF-8": {
         "images": pose_bytes(1, 0, 0, 0, 0, 0, 0, name=b"\xff\0")
     },
     "images.bin has no images; reconstruct the capture again": {"images": bytes(8)},
-    "cameras.bin, camera 1: 0x80 pixels is no size of a photograph": {
+    "cameras.bin, camera 1: 0x80 pixels is not a valid image size": {
         "cameras": camera_bytes({1: ("PINHOLE", 0, 80, (1.0, 1.0, 1.0, 1.0))})
     },
     "cameras.bin, camera 1: the parameters are not finite numbers; calibrate again": {
@@ -73,16 +81,16 @@ def test_binary(tmp_path, sentence):
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_poses_of_infinite_numbers(tmp_path, value):
-    for place in range(7):
+    for index in range(7):
         numbers = [1.0] * 7
-        numbers[place] = value
-        assert "its pose is not" in message(binary(tmp_path, images=pose_bytes(*numbers)))
+        numbers[index] = value
+        assert "its pose has" in message(binary(tmp_path, images=pose_bytes(*numbers)))
 
 
-def test_models_of_the_future(tmp_path):
+def test_unknown_model_numbers(tmp_path):
     cameras = struct.pack("<QIiQQ3d", 1, 5, 12, 10, 10, 1, 2, 3)
     assert message(binary(tmp_path, cameras=cameras), UnsupportedError) == (
-        "cameras.bin: camera 5 is of the unknown model number 12; run 'colmap image_undistorter' first"
+        "cameras.bin: camera 5 has the unknown model number 12; run 'colmap image_undistorter' first"
     )
 
 
@@ -91,8 +99,10 @@ TEXT = {
     "cameras.txt, line 2: not a camera (CAMERA_ID MODEL WIDTH HEIGHT PARAMETERS…)": {
         "cameras": "# here\none PINHOLE 120 80 1 1 1 1"
     },
-    "cameras.txt, line 2: a second camera of number 1": {"cameras": "1 PINHOLE 9 8 1 1 1 1\n1 PINHOLE 9 8 1 1 1 1"},
-    "cameras.txt, line 1: not text in UTF-8; rename the photographs or save it again": {"cameras": "\udcff"},
+    "cameras.txt, line 2: a second camera with number 1; export the model again": {
+        "cameras": "1 PINHOLE 9 8 1 1 1 1\n1 PINHOLE 9 8 1 1 1 1"
+    },
+    "cameras.txt, line 1: not UTF-8 text; rename the photographs or save the file as UTF-8": {"cameras": "\udcff"},
     "cameras.txt, camera 1: PINHOLE has 4 parameters, not 3": {"cameras": "1 PINHOLE 120 80 1 1 1"},
     "images.txt, line 1: not an image (IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME)": {"images": "1 1 0 0 0 0 0 0 1"},
     "images.txt, line 2: expected the points of the image above (X Y POINT3D_ID, any number of times), or an empty "
@@ -112,14 +122,14 @@ def test_text(tmp_path, sentence):
     assert message(tmp_path) == sentence
 
 
-def test_endless_lines(tmp_path, monkeypatch):
-    monkeypatch.setattr(colmap_files, "MAX_LINE_BYTES", 100)
+def test_lines_beyond_the_limit(tmp_path, monkeypatch):
+    monkeypatch.setattr(colmap_records, "MAX_LINE_BYTES", 100)
     write_text(tmp_path, CAMERAS, IMAGES)
     (tmp_path / "images.txt").write_text("1" * 101)
-    assert message(tmp_path) == "images.txt, line 1: longer than 100 bytes; it is damaged"
+    assert message(tmp_path) == "images.txt, line 1: longer than the limit of 100 bytes; the file is damaged"
 
 
-def test_missing_files_and_folders_in_their_place(tmp_path):
+def test_missing_files_and_folders_instead_of_files(tmp_path):
     with pytest.raises(InvalidViewsError, match=r"^cannot read .*cameras.txt: there is no such file$"):
         read_colmap(tmp_path)
     (tmp_path / "cameras.txt").mkdir()
@@ -127,7 +137,7 @@ def test_missing_files_and_folders_in_their_place(tmp_path):
         read_colmap(tmp_path)
 
 
-def test_cameras_that_are_none(tmp_path):
+def test_invalid_focal_lengths(tmp_path):
     write_binary(tmp_path, {1: ("PINHOLE", 120, 80, (-1.0, 1.0, 60.0, 40.0))}, IMAGES)
     with pytest.raises(InvalidViewsError) as caught:
         load_views(tmp_path)
@@ -137,25 +147,25 @@ def test_cameras_that_are_none(tmp_path):
     )
 
 
-def test_every_truncation_is_noticed(tmp_path):
+def test_every_truncation_is_detected(tmp_path):
     for cut in range(len(GOOD_CAMERAS)):
         message(binary(tmp_path, cameras=GOOD_CAMERAS[:cut]))
     for cut in range(len(GOOD_IMAGES)):
         message(binary(tmp_path, images=GOOD_IMAGES[:cut]))
 
 
-def outcome(folder):
-    """Read it; anything raised but a KissgsError fails the test, as does much memory."""
-    outcomes = []
+def check(folder):
+    """Load the capture; fail on exceptions other than KissgsError and on use of much memory."""
+    results = []
 
     def run():
         try:
-            outcomes.append((load_views(folder), ""))
+            results.append((load_views(folder), ""))
         except KissgsError as error:
-            outcomes.append((None, str(error)))
+            results.append((None, str(error)))
 
     assert takes_less_than(MEMORY, run)
-    views, sentence = outcomes[0]
+    views, sentence = results[0]
     assert "\n" not in sentence
     assert views is None or all(view.camera.width >= 1 for view in views.train)
 
@@ -183,7 +193,7 @@ def test_mutated_binaries(tmp_path, cameras, images, which):
         cameras=GOOD_CAMERAS if which == "images" else cameras,
         images=GOOD_IMAGES if which == "cameras" else images,
     )
-    outcome(tmp_path)
+    check(tmp_path)
 
 
 @FUZZ
@@ -192,4 +202,4 @@ def test_mutated_texts(tmp_path, data, which):
     write_text(tmp_path, CAMERAS, IMAGES)
     path = tmp_path / which
     path.write_bytes(data.draw(mutated(path.read_bytes())))
-    outcome(tmp_path)
+    check(tmp_path)

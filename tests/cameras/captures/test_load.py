@@ -1,4 +1,4 @@
-"""Oracle: small captures made by hand, fox's README, and INRIA's and COLMAP's rules written out again."""
+"""Oracle: small captures written by hand, the README of fox, and independent code for the rules of INRIA and COLMAP."""
 
 import struct
 
@@ -25,7 +25,7 @@ HELD_OUT = ["0001.jpg", "0012.jpg", "0027.jpg", "0042.jpg", "0073.jpg", "0089.jp
 
 
 def capture(folder, camera=PINHOLE, names=NAMES, photos="images", size=None):
-    """A model, and photographs of ``size`` for it."""
+    """Write a COLMAP model, and photographs if there is a ``size``."""
     images = poses(names)
     write_text(folder / "sparse" / "0", {1: camera}, images)
     for name in names if size else []:
@@ -40,13 +40,13 @@ def test_fox(shared_data):
     assert {(view.camera.width, view.camera.height) for view in views.train} == {(540, 960)}
     np.testing.assert_allclose(views.train[0].camera.K, [[714.1977, 0, 270], [0, 714.1977, 480], [0, 0, 1]], atol=1e-4)
     assert views.background.tolist() == [0, 0, 0]
-    quarter = load_views(shared_data / "fox").test[0]  # the scale that nobody has to name
+    quarter = load_views(shared_data / "fox").test[0]  # the default scale of a capture without full-size photographs
     with Image.open(shared_data / "fox" / "images_4" / "0001.jpg") as image:
         np.testing.assert_array_equal(quarter.load_photo(), np.asarray(image))
 
 
 def test_garden_has_cameras_only(shared_data, tmp_path):
-    """Its archive has no photographs; written as a model, the cameras come back."""
+    """Cameras of an archive without photographs survive a round trip through a COLMAP model."""
     with np.load(shared_data / "garden" / "test_garden.npz") as archive:
         viewmats, Ks = archive["viewmats"].astype(float), archive["Ks"].astype(float)
     data = struct.pack("<Q", 3)
@@ -64,13 +64,13 @@ def test_garden_has_cameras_only(shared_data, tmp_path):
         np.testing.assert_allclose(view.camera.K, K)
         assert view.photo is None
     assert views.source == f"COLMAP model {tmp_path}, no photographs"
-    looked = f"looked in {tmp_path} for 'images', 'input'"
-    assert views.note == f"no photographs were found ({looked}); name their folder with --images"
+    searched = f"searched {tmp_path} for 'images', 'input'"
+    assert views.note == f"no photographs were found ({searched}); name their folder with --images"
 
 
 @pytest.mark.parametrize("photos", ["images", "images_4", "input"])
-def test_photographs_that_are_found_need_no_note(tmp_path, photos):
-    """The folder is told, whichever camera of a rig was first."""
+def test_source_names_the_folder_of_photographs(tmp_path, photos):
+    """Subfolders of a camera rig are not named, and there is no note."""
     names = ["left/1.jpg", "left/2.jpg", "right/1.jpg"]
     factor = 4 if photos == "images_4" else 1
     capture(tmp_path, names=names, photos=photos, size=(120 // factor, 80 // factor))
@@ -81,14 +81,14 @@ def test_photographs_that_are_found_need_no_note(tmp_path, photos):
     assert views.note == ""
 
 
-def test_photographs_in_an_unusual_folder_are_missed_aloud(tmp_path):
+def test_photographs_in_an_unusual_folder_cause_a_note(tmp_path):
     capture(tmp_path, photos="rgb", size=(120, 80))
     assert "no photographs were found" in load_views(tmp_path).note
     views = load_views(tmp_path, images=tmp_path / "rgb")
     assert (views.note, views.source.split(", ")[-1]) == ("", "photographs of rgb")
 
 
-def test_all_folders_are_told(tmp_path, monkeypatch):
+def test_source_names_all_folders(tmp_path, monkeypatch):
     parts = ["train", "test", "val"]
     documents = [{"w": 12, "h": 8, "fl_x": 10, "frames": frames(poses(["a.png"]), f"{part}/")} for part in parts]
     for part, document in zip(parts, documents, strict=True):
@@ -105,14 +105,14 @@ def test_all_folders_are_told(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("hold_out", "test"), [(8, "ai"), (3, "adgj"), (2, "acegi"), (0, ""), (100, "a")])
-def test_hold_out_counts_sorted_names(tmp_path, hold_out, test):
+def test_hold_out_selects_by_sorted_name(tmp_path, hold_out, test):
     capture(tmp_path)
     views = load_views(tmp_path, hold_out=hold_out)
     assert [view.name[0] for view in views.test] == list(test)
     assert [view.name[0] for view in views.train] == sorted(set("abcdefghij") - set(test))
 
 
-def test_a_single_view_is_for_learning(tmp_path):
+def test_a_single_view_is_for_training(tmp_path):
     capture(tmp_path, names=["a.jpg"])
     views = load_views(tmp_path)
     assert (len(views.train), len(views.test)) == (1, 0)
@@ -130,7 +130,7 @@ def test_a_single_view_is_for_learning(tmp_path):
         ((240, 160), 1, (1, 1)),
     ],
 )
-def test_cameras_take_the_size_of_their_photographs(tmp_path, size, resolution, expected):
+def test_cameras_have_the_size_of_their_photographs(tmp_path, size, resolution, expected):
     pose = capture(tmp_path, names=["a.jpg"], size=size)[0]
     view = load_views(tmp_path, resolution=resolution).train[0]
     across, down = expected[0] / 120, expected[1] / 80
@@ -139,16 +139,16 @@ def test_cameras_take_the_size_of_their_photographs(tmp_path, size, resolution, 
     assert view.load_photo().shape == (*expected[::-1], 3)
 
 
-def test_the_longer_side_of_portrait_pictures_counts(tmp_path):
-    """Where INRIA's code would look at the width alone, and reduce nothing."""
+def test_resolution_limits_the_longer_side_of_portrait_photographs(tmp_path):
+    """INRIA's code limits the width only and would not reduce them."""
     capture(tmp_path, ("PINHOLE", 1200, 3200, (900.0, 900.0, 600.0, 1600.0)))
     camera = load_views(tmp_path).train[0].camera
     assert (camera.width, camera.height) == (600, 1600)
 
 
 @pytest.mark.parametrize("width", [1601, 1610, 1999, 5187])
-def test_reduction_is_inrias(tmp_path, width):
-    """``int(w / (w / 1600))`` is 1599 for some widths; published figures are of these sizes."""
+def test_reduced_sizes_equal_inrias(tmp_path, width):
+    """``int(w / (w / 1600))`` is 1599 for some widths, and published results use these sizes."""
     capture(tmp_path, ("PINHOLE", width, 1000, (900.0, 900.0, width / 2, 500.0)))
     scale = width / 1600
     camera = load_views(tmp_path).train[0].camera
@@ -162,31 +162,31 @@ def test_scale_without_photographs_reduces_the_cameras(tmp_path):
 
 
 def test_a_distorting_lens_is_undistorted(tmp_path):
-    """Straight lines of the scene, bent by the lens, are straight again, and where the camera says."""
+    """Lines that the lens bends are straight after undistortion, at the positions that the camera gives."""
     size, focal, k1 = (240, 160), 200.0, 0.3
     capture(tmp_path, ("SIMPLE_RADIAL", *size, (focal, 120.0, 80.0, k1)), names=["a.png"])
     v, u = np.mgrid[:160, :240] + 0.5
     x, y = (u - 120) / focal, (v - 80) / focal
-    undone = np.stack([x, y])
+    undistorted = np.stack([x, y])
     for _ in range(100):
-        undone = np.stack([x, y]) / (1 + k1 * (undone**2).sum(axis=0))
-    grey = 128 + 100 * np.sin(12 * undone[0])  # vertical stripes
+        undistorted = np.stack([x, y]) / (1 + k1 * (undistorted**2).sum(axis=0))
+    grey = 128 + 100 * np.sin(12 * undistorted[0])  # vertical stripes
     photo = np.repeat(grey[:, :, None], 3, axis=2).round().astype(np.uint8)
     (tmp_path / "images").mkdir()
     Image.fromarray(photo).save(tmp_path / "images" / "a.png")
     view = load_views(tmp_path).train[0]
-    picture, camera = view.load_photo(), view.camera
-    assert picture.shape == (camera.height, camera.width, 3)
+    image, camera = view.load_photo(), view.camera
+    assert image.shape == (camera.height, camera.width, 3)
     assert 200 < camera.width < 240
     columns = (np.arange(camera.width) + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
     assert camera.K[0, 0] == focal
-    assert np.abs(picture[2:-2, 2:-2, 0] - (128 + 100 * np.sin(12 * columns))[2:-2]).max() < 1.6
+    assert np.abs(image[2:-2, 2:-2, 0] - (128 + 100 * np.sin(12 * columns))[2:-2]).max() < 1.6
     half = load_views(tmp_path, resolution=120).train[0]
     assert half.load_photo().shape == (half.camera.height, half.camera.width, 3)
     assert half.camera.width == pytest.approx(camera.width / 2, abs=1.5)
 
 
-def test_colmap_counts_before_transforms(tmp_path):
+def test_colmap_precedes_transforms(tmp_path):
     capture(tmp_path, names=["colmap.jpg"])
     document = {"w": 120, "h": 80, "fl_x": 100, "frames": frames(poses(["json.jpg"]), "")}
     for name in ("transforms.json", "transforms_train.json"):
@@ -196,12 +196,12 @@ def test_colmap_counts_before_transforms(tmp_path):
     assert [view.name for view in load_views(tmp_path / "sparse" / "0" / "images.txt").train] == ["colmap.jpg"]
 
 
-def test_loading_opens_no_pixels(tmp_path):
+def test_loading_reads_no_pixels(tmp_path):
     capture(tmp_path, names=["a.jpg"], size=(120, 80))
     photo = tmp_path / "images" / "a.jpg"
     photo.write_bytes(photo.read_bytes()[:-100])
     view = load_views(tmp_path).train[0]
-    with pytest.raises(InvalidViewsError, match=r"a.jpg is damaged, cut short"):
+    with pytest.raises(InvalidViewsError, match=r"a.jpg is damaged, truncated"):
         view.load_photo()
 
 
@@ -211,21 +211,21 @@ def message(path, **options):
     return str(caught.value)
 
 
-def test_photographs_of_another_shape(tmp_path):
+def test_photographs_of_another_aspect_ratio(tmp_path):
     capture(tmp_path, names=["a.jpg"], size=(120, 86))
     assert message(tmp_path) == (
-        f"{tmp_path}/images/a.jpg is 120x86 pixels, but its camera ({tmp_path}/sparse/0/images.txt, image 'a.jpg') is "
-        "for 120x80, another shape; name the folder of the photographs that the cameras belong to (--images)"
+        f"{tmp_path}/images/a.jpg has 120x86 pixels, but its camera ({tmp_path}/sparse/0/images.txt, image 'a.jpg') is "
+        "for 120x80, another aspect ratio; name the folder of the cameras' photographs (--images)"
     )
 
 
 def test_no_capture(tmp_path):
-    places = "there or in sparse/0, sparse, colmap/sparse/0"
-    assert message(tmp_path) == f"{tmp_path} has no cameras: neither a COLMAP model ({places}) nor a transforms.json"
+    folders = "in it or in sparse/0, sparse, colmap/sparse/0"
+    assert message(tmp_path) == f"{tmp_path} has no cameras: neither a COLMAP model ({folders}) nor a transforms.json"
     assert message(tmp_path / "x") == f"there is no folder {tmp_path}/x; name the folder of a capture"
     (tmp_path / "scene.ply").touch()
     assert message(tmp_path / "scene.ply") == (
-        f"{tmp_path}/scene.ply is no file of cameras; name the capture's folder or a transforms.json"
+        f"{tmp_path}/scene.ply is not a camera file; name the capture's folder or a transforms.json"
     )
     (tmp_path / "images.bin").touch()
     assert message(tmp_path) == f"{tmp_path} has images.bin but no cameras.bin; a COLMAP model needs both"
@@ -238,16 +238,16 @@ def test_no_capture(tmp_path):
         ({"scale": 0}, "scale must be 1 or more, not 0"),
         ({"resolution": 0}, "resolution must be 1 or more, not 0"),
         ({"hold_out": -1}, "hold_out must be 0 or more, not -1"),
-        ({"hold_out": 1}, "hold_out 1 would leave no view to learn from; give 0 for none, or 2 or more"),
+        ({"hold_out": 1}, "hold_out 1 would leave no training view; give 0 for no held-out views, or 2 or more"),
     ],
 )
-def test_impossible_arguments(tmp_path, options, sentence):
+def test_arguments_out_of_range(tmp_path, options, sentence):
     assert message(tmp_path, **options) == sentence
 
 
-def test_views_without_photograph_say_so(tmp_path):
+def test_views_without_a_photograph(tmp_path):
     capture(tmp_path)
     view = load_views(tmp_path).train[0]
     assert isinstance(view, View)
-    with pytest.raises(InvalidViewsError, match=r"^view b.jpg has no photograph, only a camera$"):
+    with pytest.raises(InvalidViewsError, match=r"^view b.jpg has no photograph, only a camera; add"):
         view.load_photo()

@@ -1,4 +1,4 @@
-"""Oracle: folders made by hand, and which of their files a person would say is meant."""
+"""Oracle: folders made by hand, and the expected file of each name."""
 
 import os
 
@@ -6,7 +6,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from kissgs.cameras.captures.photos import FoundPhoto, find_photos, where_looked
+from kissgs.cameras.captures.photos import FoundPhoto, find_photos, searched_folders
 from kissgs.core.errors import InvalidViewsError
 
 
@@ -45,7 +45,7 @@ def test_folders_by_scale(tmp_path, folders, scale, expected):
 
 
 @pytest.mark.parametrize(
-    ("there", "wanted", "expected"),
+    ("existing", "name", "expected"),
     [
         (["a.jpg", "a.png", "A.jpg"], "a.jpg", "a.jpg"),
         (["a.png"], "a.jpg", "a.png"),
@@ -59,9 +59,9 @@ def test_folders_by_scale(tmp_path, folders, scale, expected):
         (["a.heic"], "a.heic", "a.heic"),
     ],
 )
-def test_names_by_stem(tmp_path, there, wanted, expected):
-    touch(tmp_path, *(f"images/{name}" for name in there))
-    assert found(tmp_path, f"images/{wanted}") == [f"images/{expected}"]
+def test_names_by_stem(tmp_path, existing, name, expected):
+    touch(tmp_path, *(f"images/{file}" for file in existing))
+    assert found(tmp_path, f"images/{name}") == [f"images/{expected}"]
 
 
 def test_spellings_of_a_path(tmp_path):
@@ -73,23 +73,23 @@ def test_spellings_of_a_path(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["/home/elsewhere/capture/images/a.jpg", "C:\\captures\\images\\a.jpg"])
-def test_absolute_paths_of_another_machine(tmp_path, name):
+def test_absolute_paths_of_a_moved_capture(tmp_path, name):
     touch(tmp_path, "images_2/a.jpg")
     assert found(tmp_path, name) == ["images_2/a.jpg"]
 
 
 @pytest.mark.parametrize("start", ["/home/elsewhere/", "C:\\captures\\", "d:/captures/", "\\\\server\\share\\"])
 @pytest.mark.parametrize("photos", ["images", "images_4", "input"])
-def test_absolute_paths_by_their_ends(tmp_path, start, photos):
-    """As much of the name as there is here counts: the same number may have been taken by several cameras."""
+def test_absolute_paths_are_matched_by_their_longest_suffix(tmp_path, start, photos):
+    """Several cameras of a rig may have photographs with equal file names."""
     touch(tmp_path, f"{photos}/1.jpg", f"{photos}/left/1.jpg", f"{photos}/2.jpg", "elsewhere/2.jpg", "other_2/3.jpg")
-    names = [f"{start}pictures/{name}" for name in ("1.jpg", "left/1.jpg", "2.jpg")]
+    names = [f"{start}photos/{name}" for name in ("1.jpg", "left/1.jpg", "2.jpg")]
     assert found(tmp_path, *names) == [f"{photos}/1.jpg", f"{photos}/left/1.jpg", f"{photos}/2.jpg"]
-    assert found(tmp_path, f"{start}other/3.jpg") == ["other_2/3.jpg"], "a folder that is called the same comes first"
+    assert found(tmp_path, f"{start}other/3.jpg") == ["other_2/3.jpg"], "a folder of the same name comes first"
     assert found(tmp_path, *names, images=tmp_path / photos) == found(tmp_path, *names)
 
 
-def test_absolute_paths_that_are_here(tmp_path):
+def test_absolute_paths_that_exist(tmp_path):
     touch(tmp_path, "elsewhere/a.jpg", "elsewhere/images/c.jpg", "here/images/a.jpg", "here/images/b.jpg")
     elsewhere = tmp_path / "elsewhere"
     photos = find_photos([str(elsewhere / name) for name in ("a.jpg", "b.jpg", "images/c.jpg")], tmp_path / "here")
@@ -97,7 +97,7 @@ def test_absolute_paths_that_are_here(tmp_path):
     assert [str(photo.path.relative_to(tmp_path)) for photo in photos] == wanted
 
 
-def test_another_folder(tmp_path, monkeypatch):
+def test_a_given_folder(tmp_path, monkeypatch):
     touch(tmp_path, "images/a.jpg", "other_4/a.jpg", "other_4/train/r_0.png", "other_4/test/r_0.png")
     assert find_photos(["images/a.jpg"], tmp_path, images=tmp_path / "other_4")[0].factor == 4
     names = ["images/a.jpg", "train/r_0", "./test/r_0", "elsewhere/deep/a.png", "/x/a.jpg", "../a.jpg"]
@@ -117,7 +117,7 @@ def test_captures_without_photographs(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("names", "sought"),
+    ("names", "folders"),
     [
         (["images/a.jpg", "images/left/b.jpg"], " for 'images', 'input'"),
         (["train/a", "test/a"], " for 'train', 'test'"),
@@ -128,8 +128,8 @@ def test_captures_without_photographs(tmp_path):
         (["new\nline/a.jpg"], " for 'new\\nline'"),
     ],
 )
-def test_where_they_were_looked_for(tmp_path, names, sought):
-    assert where_looked(names, tmp_path) == f"{tmp_path}{sought}"
+def test_searched_folders(tmp_path, names, folders):
+    assert searched_folders(names, tmp_path) == f"{tmp_path}{folders}"
 
 
 def message(root, *names, **options):
@@ -140,22 +140,22 @@ def message(root, *names, **options):
 
 def test_missing_photographs(tmp_path):
     touch(tmp_path, "images_2/a.jpg", "images_2/c.png")
-    mend = "; add them, or name the folder that has them all (--images)"
+    remedy = "; add them, or name the folder that has all of them (--images)"
     assert message(tmp_path, *(f"images/{x}.jpg" for x in "abcd")) == (
-        f"2 of 4 photographs are missing, the first is 'images/b.jpg', looked for in {tmp_path}/images_2{mend}"
+        f"2 of 4 photographs are missing; the first is 'images/b.jpg', searched in {tmp_path}/images_2{remedy}"
     )
     assert message(tmp_path, "images/b.jpg") == (
-        f"1 of 1 photographs are missing, the first is 'images/b.jpg', looked for in {tmp_path}/images_2{mend}"
+        f"1 of 1 photographs are missing; the first is 'images/b.jpg', searched in {tmp_path}/images_2{remedy}"
     )
     assert message(tmp_path, "/else/images/b.jpg", "C:\\else\\rgb\\b.jpg").startswith(
-        f"2 of 2 photographs are missing, the first is '/else/images/b.jpg', looked for in {tmp_path}/images_2; "
+        f"2 of 2 photographs are missing; the first is '/else/images/b.jpg', searched in {tmp_path}/images_2; "
     )
     assert message(tmp_path, "images/a.jpg", "test/b.jpg") == (
-        f"1 of 2 photographs are missing, the first is 'test/b.jpg', looked for in {tmp_path}/test{mend}"
+        f"1 of 2 photographs are missing; the first is 'test/b.jpg', searched in {tmp_path}/test{remedy}"
     )
 
 
-def test_folders_that_are_not_there(tmp_path):
+def test_missing_folders(tmp_path):
     touch(tmp_path, "images/a.jpg", "images_4/a.jpg")
     where = f"in {tmp_path}, only images, images_4; choose another --scale"
     assert message(tmp_path, "images/a.jpg", scale=2) == f"there is no folder images_2 {where}"
@@ -169,22 +169,22 @@ def test_folders_that_are_not_there(tmp_path):
     )
     other = type(tmp_path)("nowhere")
     assert message(tmp_path, "images/a.jpg", images=other) == (
-        f"there is no folder nowhere of photographs, nor {tmp_path}/nowhere; check --images"
+        f"there is neither a folder nowhere nor {tmp_path}/nowhere; check --images"
     )
     assert message(tmp_path, "images/a.jpg", images=other, scale=2) == (
-        "a folder of photographs and a scale exclude each other; give --images or --scale"
+        "--images and --scale exclude each other; give only one of them"
     )
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
-def test_folders_that_may_not_be_read(tmp_path):
+@pytest.mark.skipif(os.geteuid() == 0, reason="root can read every folder")
+def test_folders_without_permission(tmp_path):
     touch(tmp_path, "images/a.jpg")
     (tmp_path / "images").chmod(0)
     assert message(tmp_path, "images/a.jpg") == f"cannot read {tmp_path}/images: permission denied"
     (tmp_path / "images").chmod(0o700)
 
 
-def test_names_too_long_for_any_folder(tmp_path):
+def test_names_that_are_too_long(tmp_path):
     touch(tmp_path, "images/a.jpg")
     assert message(tmp_path, f"images/{'a' * 500}/a.jpg").endswith(": file name too long")
 

@@ -1,4 +1,4 @@
-"""Oracle: cameras made by SciPy and written as each dialect does; for fox, the COLMAP model of the same photographs."""
+"""Oracle: cameras made with SciPy, written in each variant of the format; for fox, its COLMAP model."""
 
 import json
 import math
@@ -9,7 +9,7 @@ from helpers.reference_cameras import PINHOLE, assert_camera, frames, poses, wri
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from kissgs.cameras.captures import transforms_json as transforms
+from kissgs.cameras.captures import transforms_json
 from kissgs.cameras.captures.load import load_views
 from kissgs.cameras.captures.transforms_json import read_transforms
 from kissgs.cameras.undistort import Distortion
@@ -26,7 +26,7 @@ def document(**changes):
 
 
 def first_frame(**changes):
-    """A document with the first frame changed."""
+    """Return a document with a changed first frame."""
     entries = frames(POSES)
     entries[0].update(changes)
     return {**NERFSTUDIO, "frames": entries}
@@ -44,7 +44,7 @@ def test_nerfstudio(tmp_path):
         assert view.photo is None
 
 
-def test_the_same_cameras_as_colmap_and_transforms(tmp_path):
+def test_cameras_equal_those_of_a_colmap_model(tmp_path):
     write_binary(tmp_path / "colmap", {1: PINHOLE}, POSES)
     write_json(tmp_path / "transforms.json", document())
     pairs = zip(load_views(tmp_path / "colmap").train, load_views(tmp_path / "transforms.json").train, strict=True)
@@ -69,7 +69,7 @@ def test_frames_override_the_document(tmp_path):
     write_json(
         tmp_path / "transforms.json", first_frame(**own) | {"k1": 0.1, "k2": 0.2, "k3": 0.3, "p1": 0.4, "p2": 0.5}
     )
-    first, second, _ = read_transforms(tmp_path / "transforms.json").shots
+    first, second, _ = read_transforms(tmp_path / "transforms.json").images
     assert first.intrinsics.lens((60, 40), (60, 40)).K.tolist() == [[50, 0, 30], [0, 51, 20], [0, 0, 1]]
     assert (first.intrinsics.width, first.intrinsics.height) == (60, 40)
     assert first.intrinsics.distortion == Distortion(k1=0.5, k2=0.2, k3=0.3, p1=0.4, p2=0.5)
@@ -77,8 +77,8 @@ def test_frames_override_the_document(tmp_path):
 
 
 @pytest.mark.parametrize("photos", ["images", "images_2"])
-def test_instant_ngp_takes_the_size_from_the_photographs(tmp_path, photos):
-    """Its focal length is in pixels of the full size, even where only a scaled folder is left."""
+def test_instant_ngp_has_the_size_of_the_photographs(tmp_path, photos):
+    """The focal length is in pixels of the full size, even if there is only a scaled folder."""
     factor = 2 if photos == "images_2" else 1
     for name in NAMES:
         write_photo(tmp_path / photos / name, 120 // factor, 80 // factor)
@@ -172,14 +172,14 @@ SKEWED = [[1, 0, 0.1, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
 STRETCHED = [[1, 0, 0, 0], [0, 1.1, 0, 0], [0, 0, 1, 0]]
 MIRRORED = [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
 NO_ROTATION = (
-    ", frame 0 ('images/a.jpg'): transform_matrix is no rotation: its axes are skewed or of different lengths; "
+    ", frame 0 ('images/a.jpg'): transform_matrix is not a rotation: its axes are skewed or differ in length; "
 )
 FISHEYE = (
-    ", frame 0 ('images/a.jpg'): camera model {} is not read; undistort the photographs first, for example with "
-    "'colmap image_undistorter' (read are SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV, "
-    "PERSPECTIVE)"
+    ", frame 0 ('images/a.jpg'): the camera model {} is not supported, only SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, "
+    "RADIAL, OPENCV, FULL_OPENCV, PERSPECTIVE; undistort the photographs first, for example with 'colmap "
+    "image_undistorter'"
 )
-WRONG = [
+INVALID = [
     (document(frames=[]), ", frames: list should have at least 1 item after validation, not 0"),
     ({"w": 3}, ", frames: field required"),
     ([], ": input should be an object"),
@@ -203,11 +203,11 @@ WRONG = [
     ),
     (
         first_frame(transform_matrix=[*np.eye(4)[:3].tolist(), [0, 0, 1, 1]]),
-        ", frame 0 ('images/a.jpg'): the last row of transform_matrix is not 0 0 0 1",
+        ", frame 0 ('images/a.jpg'): the last row of transform_matrix is not 0 0 0 1; export it again",
     ),
     (
         {"frames": frames(POSES), "fl_x": 3},
-        ", frame 0 ('images/a.jpg'): it has neither a size (w, h) nor a photograph to take it from",
+        ", frame 0 ('images/a.jpg'): it has neither a size (w, h) nor a photograph; add w and h or the photographs",
     ),
     (
         {"frames": frames(POSES), "w": 3, "h": 3},
@@ -215,46 +215,46 @@ WRONG = [
     ),
     (
         document(train_filenames=["images/z.jpg"]),
-        ": 'images/z.jpg' of train_filenames is the file_path of no frame",
+        ": 'images/z.jpg' in train_filenames is not the file_path of a frame; correct the list",
     ),
     (
         document(test_filenames=["images/z.jpg"]),
-        ": 'images/z.jpg' of test_filenames or val_filenames is the file_path of no frame",
+        ": 'images/z.jpg' in test_filenames or val_filenames is not the file_path of a frame; correct the list",
     ),
     (
         document(train_filenames=["images/a.jpg"], test_filenames=["./images/a.jpg"]),
-        ": its lists of file names leave no frame to learn from; mend train_filenames",
+        ": its lists of file names leave no training frame; correct train_filenames",
     ),
     (
         document(train_filenames=[]),
-        ": its lists of file names leave no frame to learn from; mend train_filenames",
+        ": its lists of file names leave no training frame; correct train_filenames",
     ),
     (first_frame(camera_model="OPENCV_FISHEYE"), FISHEYE.format("'OPENCV_FISHEYE'")),
     (document(is_fisheye=True), FISHEYE.format("'is_fisheye'")),
     (
         document(k4=0.1),
-        ", frame 0 ('images/a.jpg'): the distortion coefficient k4 is not read; undistort the photographs first",
+        ", frame 0 ('images/a.jpg'): the distortion coefficient k4 is not supported; undistort the photographs first",
     ),
 ]
 
 
-@pytest.mark.parametrize(("wrong", "sentence"), WRONG)
-def test_wrong_documents(tmp_path, wrong, sentence):
-    path = write_json(tmp_path / "transforms.json", wrong)
+@pytest.mark.parametrize(("content", "sentence"), INVALID)
+def test_invalid_documents(tmp_path, content, sentence):
+    path = write_json(tmp_path / "transforms.json", content)
     with pytest.raises((InvalidViewsError, UnsupportedError)) as caught:
         load_views(path)
     assert str(caught.value) == f"{path}{sentence}"
 
 
-def test_what_is_no_json(tmp_path, monkeypatch):
+def test_files_that_are_not_json(tmp_path, monkeypatch):
     path = tmp_path / "transforms.json"
     for text in ("", "{", "[" * 100_000, '{"w": 1e', "\udc80"):
         path.write_bytes(text.encode("utf-8", "surrogateescape"))
         with pytest.raises(InvalidViewsError, match=r"transforms\.json is not JSON: "):
             load_views(path)
-    monkeypatch.setattr(transforms, "MAX_JSON_BYTES", 10)
+    monkeypatch.setattr(transforms_json, "MAX_JSON_BYTES", 10)
     path.write_text("{          }")
-    with pytest.raises(InvalidViewsError, match=r"has 12 bytes; cameras take fewer than 10$"):
+    with pytest.raises(InvalidViewsError, match=r"has 12 bytes; at most 10 are read; is it a camera file\?$"):
         load_views(path)
 
 
@@ -264,7 +264,7 @@ TOP = [*sorted(NERFSTUDIO), "k1", "k4", "p2", "camera_angle_x", "is_fisheye", "t
 
 
 def check(path):
-    """Views, or one sentence; anything else that is raised fails the test."""
+    """Load the capture; fail on exceptions other than a KissgsError of one line."""
     try:
         views, sentence = load_views(path), ""
     except KissgsError as error:
@@ -280,7 +280,7 @@ def changes(keys):
 @settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(top=changes(TOP), frame=changes([*TOP, "file_path", "transform_matrix"]), row=changes(["0", "1", "2", "3"]))
 def test_mutated_documents(tmp_path, top, frame, row):
-    """Whatever stands in a document, cameras or a KissgsError come of it."""
+    """Any document gives views or a KissgsError."""
     changed = first_frame(**frame) | {"k1": 0.1} | top
     matrix = frames(POSES)[0]["transform_matrix"]
     for column, value in row.items():

@@ -1,10 +1,10 @@
-/** Showing what has gone wrong. */
+/** Display of errors. */
 
 import { Problem } from "./api.js";
 import { byId, el } from "./dom.js";
 
 /**
- * A problem document for people; screen readers say it at once.
+ * Create a box with a problem, which screen readers announce at once.
  * @param {{title: string, detail: string}} problem
  */
 export function problemBox({ title, detail }) {
@@ -12,16 +12,16 @@ export function problemBox({ title, detail }) {
 }
 
 /**
- * The service's details begin small, as they may be part of a longer line; here they stand alone.
+ * Convert a detail of the service, which starts with a small letter, to a sentence.
  * @param {string} text
  */
 export function sentence(text) {
-  const whole = text.charAt(0).toUpperCase() + text.slice(1);
-  return /[.!?…]$/.test(whole) ? whole : `${whole}.`;
+  const capitalised = text.charAt(0).toUpperCase() + text.slice(1);
+  return /[.!?…]$/.test(capitalised) ? capitalised : `${capitalised}.`;
 }
 
 /**
- * What to say of an error from anywhere; a fault of this page is told as such.
+ * Return title and detail of any error; other errors than problems are errors of the page.
  * @param {unknown} error
  */
 export function explain(error) {
@@ -31,15 +31,15 @@ export function explain(error) {
 }
 
 /**
- * Trouble of the page as a whole, above everything else.
- * @param {unknown} error null when it is over
+ * Show an error of the whole page at its top.
+ * @param {unknown} error null to hide it
  * @param {() => void} [retry]
  */
-export function trouble(error, retry) {
-  const place = byId("trouble");
-  place.hidden = error === null;
-  if (error === null) return place.replaceChildren();
+export function showProblem(error, retry) {
+  const box = byId("problem");
+  box.hidden = error === null;
+  if (error === null) return box.replaceChildren();
   const { title, detail } = explain(error);
   const again = retry ? el("button", { class: "quiet", type: "button", onclick: retry }, "Try again") : null;
-  place.replaceChildren(el("strong", {}, title), el("p", {}, sentence(detail)), again ?? "");
+  box.replaceChildren(el("strong", {}, title), el("p", {}, sentence(detail)), again ?? "");
 }

@@ -1,4 +1,4 @@
-/** What the service's own names mean to people. What is not in here is shown as it is. */
+/** Labels for the service's names of states, stages, files and corrections; unknown names are shown unchanged. */
 
 import { count } from "./format.js";
 
@@ -6,7 +6,7 @@ import { count } from "./format.js";
 
 /** @type {Record<string, string>} */
 const STATES = {
-  queued: "waiting",
+  queued: "queued",
   running: "running",
   succeeded: "done",
   failed: "failed",
@@ -14,24 +14,24 @@ const STATES = {
   expired: "expired",
 };
 
-/** In their order: a job passes through them from first to last. @type {Record<string, string>} */
+/** Labels of the stages, in the order of a job. @type {Record<string, string>} */
 const STAGES = {
   read: "Reading the scene",
   kernels: "Preparing",
   cameras: "Placing cameras",
   score: "Scoring Gaussians",
-  judge: "Judging what it has come to",
-  targets: "Taking pictures to learn from",
-  sparsify: "Training while Gaussians go",
-  refine: "Training those that stay",
-  sensitivity: "Seeing what matters",
-  rate_distortion: "Weighing bits against errors",
-  order: "Putting Gaussians in order",
-  forms: "Choosing forms",
+  judge: "Evaluating the result",
+  targets: "Rendering training targets",
+  sparsify: "Training with sparsification",
+  refine: "Refining the remaining Gaussians",
+  sensitivity: "Measuring sensitivity",
+  rate_distortion: "Rate–distortion planning",
+  order: "Ordering Gaussians",
+  forms: "Choosing rotation forms",
   codebook: "Building the codebook",
   "sort codebook": "Sorting the codebook",
-  rounding: "Rounding by price",
-  refit: "Refitting colours",
+  rounding: "RDO quantisation",
+  refit: "Refitting base colours",
   finetune: "Fine-tuning",
   images: "Compressing images",
   write: "Writing the container",
@@ -39,18 +39,18 @@ const STAGES = {
 };
 
 const ALWAYS = ["read", "kernels", "order", "forms", "images"];
-const WEIGHED = ["cameras", "sensitivity", "rate_distortion", "rounding"];
+const RATE_DISTORTION = ["cameras", "sensitivity", "rate_distortion", "rounding"];
 const COMPACTED = ["cameras", "score"];
-const WITH_COLOURS_BY_ANGLE = ["codebook", "sort codebook"];
+const WITH_SH_REST = ["codebook", "sort codebook"];
 
 /** @type {[RegExp, string][]} */
 const PLANES = [
   [/^means_bytes_0\b/, "Positions, low bytes"],
   [/^means_bytes_1\b/, "Positions, high bytes"],
   [/^quaternions\b/, "Rotations"],
-  [/^scales\b/, "Sizes"],
-  [/^f_dc\b/, "Colours"],
-  [/^opacities\b/, "Opacity"],
+  [/^scales\b/, "Scales"],
+  [/^f_dc\b/, "Base colours"],
+  [/^opacities\b/, "Opacities"],
   [/^f_rest_centroids\b/, "SH codebook"],
   [/^f_rest_labels\b/, "SH labels"],
   [/^active_mask\b/, "Mask"],
@@ -59,29 +59,29 @@ const PLANES = [
 
 /** @type {Record<string, string>} */
 const CLEANED = {
-  non_finite: "removed: not a number, or infinite",
-  far_away: "removed: too far away to be placed",
+  non_finite: "removed: NaN or infinite values",
+  far_away: "removed: too far from the origin",
   infinite_opacities: "infinite opacities made finite",
-  saturated_opacities: "opacities limited to what pictures can show",
+  saturated_opacities: "opacities limited to the range that images can show",
   zero_quats: "rotations of zero length replaced",
-  unnormalised_quats: "rotations brought to unit length",
-  clamped_scales: "extreme sizes limited",
-  clamped_sh: "extreme colours limited",
+  unnormalised_quats: "rotations normalised",
+  clamped_scales: "extreme scales limited",
+  clamped_sh: "extreme SH coefficients limited",
 };
 
 /** @param {string} state */
-export const stateWord = (state) => STATES[state] ?? state;
+export const stateLabel = (state) => STATES[state] ?? state;
 
 /** @param {string} stage */
-export const stageWord = (stage) => STAGES[stage] ?? stage;
+export const stageLabel = (stage) => STAGES[stage] ?? stage;
 
 /**
- * The stages that a job will pass through, as far as that is known before.
+ * Return the expected stages of a job.
  * @param {Status} status
  */
 export function plannedStages(status) {
   const planned = new Set(ALWAYS);
-  if (status.options.encode.rate_distortion) WEIGHED.forEach((stage) => planned.add(stage));
+  if (status.options.encode.rate_distortion) RATE_DISTORTION.forEach((stage) => planned.add(stage));
   const {
     count: wanted,
     ratio,
@@ -97,13 +97,13 @@ export function plannedStages(status) {
     if (refine_steps > 0) planned.add("refine");
   }
   if (status.options.finetune.enabled) ["cameras", "targets", "finetune"].forEach((stage) => planned.add(stage));
-  if (status.sh_degree > 0) WITH_COLOURS_BY_ANGLE.forEach((stage) => planned.add(stage));
+  if (status.sh_degree > 0) WITH_SH_REST.forEach((stage) => planned.add(stage));
   if (status.options.evaluate) planned.add("evaluate");
   return Object.keys(STAGES).filter((stage) => planned.has(stage));
 }
 
 /**
- * Bytes of each plane of a container, largest first; files of one meaning are added up.
+ * Return the bytes of each part of a container, largest first; files with one label are added up.
  * @param {Record<string, number>} files
  * @returns {[string, number][]}
  */
@@ -118,13 +118,13 @@ export function planes(files) {
 }
 
 /**
- * What was wrong with an upload and has been mended, in words; empty if nothing was.
+ * Describe what cleaning, compaction and pruning have changed; empty if nothing.
  * @param {Status} status
  */
-export function mended(status) {
+export function cleaningNotes(status) {
   const counts = Object.entries(status.cleaned ?? {});
   const lines = counts.filter(([, n]) => n > 0).map(([name, n]) => `${count(n)} ${CLEANED[name] ?? name}`);
-  if (status.compacted) lines.unshift(`${count(status.compacted)} left out by compaction: others do their work`);
-  if (status.invisible) lines.unshift(`${count(status.invisible)} left out: no renderer would draw them`);
+  if (status.compacted) lines.unshift(`${count(status.compacted)} pruned by compaction`);
+  if (status.invisible) lines.unshift(`${count(status.invisible)} pruned because they are invisible`);
   return lines;
 }
