@@ -70,7 +70,7 @@ def test_as_few_as_lose_no_more_than_is_allowed(allowed):
 
 
 def test_that_a_drop_without_photographs_is_a_model_is_said():
-    assert "that of a scene 30 dB from them" in compacted(cloud(60), max_psnr_drop=1).report.note
+    assert "is estimated for a scene that has 30 dB" in compacted(cloud(60), max_psnr_drop=1).report.note
 
 
 def test_counts_are_of_the_cleaned_scene():
