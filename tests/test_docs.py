@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import re
 import runpy
+import shlex
 import subprocess
 from pathlib import Path
 
 import pytest
+import typer.main
 
 from kissgs import Preset
+from kissgs.cli.bench import app as bench
 from kissgs.sogxt.names import FILES
 
 ROOT = Path(__file__).parents[1]
@@ -75,6 +78,25 @@ def test_commands_of_the_readme_can_be_repeated() -> None:
         assert command[1] not in writing or ("--force" in command and new), command
         written |= set(new)
     assert written
+
+
+def documented_measurements() -> list[list[str]]:
+    """The words of every ``kissgs bench`` command with arguments, in code blocks and in running text."""
+    found = []
+    for page in pages():
+        text = page.read_text(encoding="utf-8")
+        lines = re.findall(r"^(?:\$ )?kissgs (bench .*)$", text, re.MULTILINE)
+        inline = re.findall(r"`kissgs (bench [^`]*)`", prose(page))
+        found += [shlex.split(line, comments=True) for line in lines + inline]
+    return [words for words in found if len(words) > 2]
+
+
+def test_documented_measurements_are_accepted() -> None:
+    commands = typer.main.get_group(bench).commands
+    found = documented_measurements()
+    assert {command for _, command, *_ in found} == set(commands)
+    for _, command, *arguments in found:
+        commands[command].make_context(command, arguments)
 
 
 def test_links_and_anchors_lead_somewhere() -> None:

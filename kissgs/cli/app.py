@@ -55,8 +55,8 @@ def _run() -> None:
 
 for command in (compress, decompress, compact, render, evaluate, info, sample, warmup):
     app.command()(command)
-app.add_typer(bench)
-app.add_typer(remote)
+for group in (bench, remote):
+    app.add_typer(group)
 
 
 @app.callback(invoke_without_command=True)

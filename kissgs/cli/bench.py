@@ -2,59 +2,35 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from kissgs.cli.arguments import FilesArgument, ImagesOption, ResolutionOption, ScaleOption, ViewsOption
-from kissgs.cli.bench_scenes import BenchOptions, BenchOutput
-from kissgs.cli.files import expand, print_json, show
+from kissgs.cli.arguments import FilesArgument, ImagesOption, ResolutionOption, ScaleOption, SetOption, ViewsOption
+from kissgs.cli.bench_arguments import (
+    JsonOption,
+    PlotOption,
+    PresetsOption,
+    RepeatsOption,
+    SetAllOption,
+    SupervisionOption,
+    ThreadsOption,
+)
+from kissgs.cli.bench_scenes import open_inputs, report
 from kissgs.cli.options import open_views
-from kissgs.core.errors import UnsupportedError
 
-app = typer.Typer(name="bench", help="Measure codecs, compaction, fine-tuning and rendering.", no_args_is_help=True)
-
-PresetsOption = Annotated[list[str] | None, typer.Option("--preset", "-p", help="Preset to measure; repeatable.")]
-PresetOption = Annotated[str, typer.Option("--preset", "-p", help="Preset to measure.")]
-ChangesOption = Annotated[
-    list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change a setting; repeatable.")
-]
-RepeatsOption = Annotated[
-    int, typer.Option(min=1, max=1000, help="Number of runs per codec: times are medians, memory is the maximum.")
-]
-EvaluateOption = Annotated[bool, typer.Option("--evaluate", help="Compare rendered images too; implied by --views.")]
-CountsOption = Annotated[
-    list[int], typer.Option("--gaussians", min=1, help="Resample the scene to this number of Gaussians; repeatable.")
-]
-RatiosOption = Annotated[
-    list[float] | None,
-    typer.Option("--ratio", min=0, max=1, help="Share of the Gaussians to keep; repeatable."),
-]
-SupervisionOption = Annotated[
-    str,
-    typer.Option(
-        metavar="WHAT",
-        help="Train with the [bold]photos[/] of --views, with renderings by its [bold]cameras[/], or with virtual "
-        "cameras of the [bold]scene[/] alone. The evaluation uses --views in any case.",
-    ),
-]
-OffsetsOption = Annotated[
-    list[float] | None, typer.Option("--quality-offset", min=-30, max=30, help="Quality offset, dB; repeatable.")
-]
-PlotOption = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="Plot the results of one scene as .svg, .png or .pdf.")
-]
-ThreadsOption = Annotated[int, typer.Option(min=0, help="Number of threads; 0 for one per processor.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+app = typer.Typer(
+    name="bench",
+    help="Measure presets, external codecs, parts of the codec and the rasteriser on your scenes.",
+    no_args_is_help=True,
+)
 
 
 @app.command()
 def codecs(
     scenes: FilesArgument,
     presets: PresetsOption = None,
-    changes: ChangesOption = None,
+    changes: SetAllOption = None,
     external_codecs: Annotated[
         list[str] | None,
         typer.Option("--external", help="External codec to measure, sog or spz, by splat-transform; repeatable."),
@@ -64,9 +40,22 @@ def codecs(
         int | None,
         typer.Option(min=1, help="K-means iterations over the SH of .sog; each takes minutes without a GPU."),
     ] = None,
+    quality_offsets: Annotated[
+        list[float] | None,
+        typer.Option(
+            "--quality-offset",
+            min=-30,
+            max=30,
+            help="Measure balanced, or the presets of --preset, at this quality offset (dB) too; repeatable.",
+        ),
+    ] = None,
     repeats: RepeatsOption = 1,
-    evaluate: EvaluateOption = False,
-    quality_offsets: OffsetsOption = None,
+    evaluate: Annotated[
+        bool,
+        typer.Option(
+            "--evaluate", help="Compare rendered images too; implied by --views, --quality-offset and --plot."
+        ),
+    ] = False,
     plot: PlotOption = None,
     views: ViewsOption = None,
     scale: ScaleOption = None,
@@ -75,39 +64,38 @@ def codecs(
     threads: ThreadsOption = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure bytes, time, memory and errors of presets and external codecs, each in a separate process.
+    """Measure bytes, times, memory and errors of presets and external codecs, each in a separate process."""
+    capture = open_views(views, scale=scale, images=images, resolution=resolution)
+    inputs = open_inputs(scenes, capture, threads, plot)
+    from kissgs.cli import bench_codecs
 
-    Without --preset, all presets are measured, and --quality-offset applies to balanced. --quality-offset and --plot
-    imply --evaluate.
-    """
-    options = BenchOptions(
-        scenes=_paths(scenes),
-        presets=presets or [],
+    output = bench_codecs.codecs(
+        inputs,
+        presets=presets,
         changes=changes,
         external_codecs=external_codecs or [],
         splat_transform=splat_transform,
         sog_iterations=sog_iterations,
-        repeats=repeats,
-        evaluate=evaluate,
         quality_offsets=quality_offsets or [],
-        plot=plot,
-        views=open_views(views, scale=scale, images=images, resolution=resolution),
-        threads=threads,
+        repeats=repeats,
+        evaluate=evaluate or plot is not None,
     )
-    _check_plot(options)
-    from kissgs.cli.bench_comparison import comparison
-
-    _print(comparison(options), plot, as_json)
+    report(output, as_json, plot)
 
 
 @app.command()
 def scaling(
     scenes: FilesArgument,
-    gaussians: CountsOption,
+    counts: Annotated[
+        list[int],
+        typer.Option("--gaussians", min=1, help="Measure the scene resampled to this number of Gaussians; repeatable."),
+    ],
     presets: PresetsOption = None,
-    changes: ChangesOption = None,
+    changes: SetAllOption = None,
     repeats: RepeatsOption = 1,
-    evaluate: EvaluateOption = False,
+    evaluate: Annotated[
+        bool, typer.Option("--evaluate", help="Compare rendered images too; implied by --views.")
+    ] = False,
     plot: PlotOption = None,
     views: ViewsOption = None,
     scale: ScaleOption = None,
@@ -116,29 +104,27 @@ def scaling(
     threads: ThreadsOption = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure presets on a scene resampled to several numbers of Gaussians."""
-    options = BenchOptions(
-        scenes=_paths(scenes),
-        presets=presets or [],
-        changes=changes,
-        repeats=repeats,
-        evaluate=evaluate,
-        plot=plot,
-        gaussians=gaussians,
-        views=open_views(views, scale=scale, images=images, resolution=resolution),
-        threads=threads,
-    )
-    _check_plot(options)
-    from kissgs.cli.bench_comparison import comparison
+    """Measure how bytes, times and memory of presets grow with the number of Gaussians."""
+    capture = open_views(views, scale=scale, images=images, resolution=resolution)
+    inputs = open_inputs(scenes, capture, threads, plot)
+    from kissgs.cli import bench_codecs
 
-    _print(comparison(options), plot, as_json)
+    output = bench_codecs.scaling(inputs, counts, presets=presets, changes=changes, repeats=repeats, evaluate=evaluate)
+    report(output, as_json, plot)
 
 
 @app.command()
 def ablation(
     scenes: FilesArgument,
-    presets: PresetsOption = None,
-    changes: ChangesOption = None,
+    presets: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--preset",
+            "-p",
+            help="Preset to measure: paper, balanced or small; repeatable. Default: paper and balanced.",
+        ),
+    ] = None,
+    changes: SetAllOption = None,
     views: ViewsOption = None,
     scale: ScaleOption = None,
     images: ImagesOption = None,
@@ -146,25 +132,30 @@ def ablation(
     threads: ThreadsOption = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure paper and balanced, or the presets of --preset, with one part of the codec left out at a time."""
-    from kissgs.cli import bench_comparison
+    """Measure bytes and PSNR of presets with one part of the codec left out or one setting changed at a time."""
+    capture = open_views(views, scale=scale, images=images, resolution=resolution)
+    inputs = open_inputs(scenes, capture, threads)
+    from kissgs.cli import bench_ablation
 
-    options = BenchOptions(
-        scenes=_paths(scenes),
-        presets=presets or [],
-        changes=changes,
-        views=open_views(views, scale=scale, images=images, resolution=resolution),
-        threads=threads,
-    )
-    _print(bench_comparison.ablation(options), None, as_json)
+    report(bench_ablation.ablation(inputs, presets=presets, changes=changes), as_json)
 
 
 @app.command()
 def compaction(
     scenes: FilesArgument,
-    preset: PresetOption = "balanced",
-    changes: ChangesOption = None,
-    ratios: RatiosOption = None,
+    preset: Annotated[
+        str, typer.Option("--preset", "-p", help="fast only prunes; balanced, small and paper also train.")
+    ] = "balanced",
+    changes: SetOption = None,
+    ratios: Annotated[
+        list[float] | None,
+        typer.Option(
+            "--ratio",
+            min=0,
+            max=1,
+            help="Share of the Gaussians to keep; repeatable. Default: 0.7, 0.5, 0.3, 0.2, 0.1 and 0.05.",
+        ),
+    ] = None,
     strategies: Annotated[
         list[str] | None, typer.Option("--strategy", help="Strategy to measure; repeatable. Default: all.")
     ] = None,
@@ -177,31 +168,48 @@ def compaction(
     threads: ThreadsOption = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare strategies of compaction, with the training of a preset."""
-    options = BenchOptions(
-        scenes=_paths(scenes),
-        presets=[preset],
+    """Compare strategies of compaction at equal numbers of Gaussians and of training steps."""
+    capture = open_views(views, scale=scale, images=images, resolution=resolution)
+    inputs = open_inputs(scenes, capture, threads, plot)
+    from kissgs.cli import bench_curves
+
+    output = bench_curves.compaction(
+        inputs,
+        preset=preset,
         changes=changes,
         ratios=ratios or [],
         strategies=strategies or [],
         supervision=supervision,
-        plot=plot,
-        views=open_views(views, scale=scale, images=images, resolution=resolution),
-        threads=threads,
     )
-    _check_plot(options)
-    from kissgs.cli import bench_curves
-
-    _print(bench_curves.compaction(options), plot, as_json)
+    report(output, as_json, plot)
 
 
 @app.command()
 def finetuning(
     scenes: FilesArgument,
-    preset: PresetOption = "balanced",
-    changes: ChangesOption = None,
-    quality_offsets: OffsetsOption = None,
-    ratios: RatiosOption = None,
+    preset: Annotated[
+        str, typer.Option("--preset", "-p", help="Preset with rate-distortion planning: balanced or small.")
+    ] = "balanced",
+    changes: SetOption = None,
+    quality_offsets: Annotated[
+        list[float] | None,
+        typer.Option(
+            "--quality-offset",
+            min=-30,
+            max=30,
+            help="Quality offset to measure (dB); repeatable. Default: -8, -5, -2 and 1; with --ratio, that of the "
+            "preset.",
+        ),
+    ] = None,
+    ratios: Annotated[
+        list[float] | None,
+        typer.Option(
+            "--ratio",
+            min=0,
+            max=1,
+            help="First compact the scene to this share of its Gaussians; repeatable. Default: no compaction.",
+        ),
+    ] = None,
     supervision: SupervisionOption = "photos",
     plot: PlotOption = None,
     views: ViewsOption = None,
@@ -212,29 +220,31 @@ def finetuning(
     as_json: JsonOption = False,
 ) -> None:
     """Measure bytes and PSNR with and without fine-tuning."""
-    options = BenchOptions(
-        scenes=_paths(scenes),
-        presets=[preset],
+    capture = open_views(views, scale=scale, images=images, resolution=resolution)
+    inputs = open_inputs(scenes, capture, threads, plot)
+    from kissgs.cli import bench_curves
+
+    output = bench_curves.finetuning(
+        inputs,
+        preset=preset,
         changes=changes,
         quality_offsets=quality_offsets or [],
         ratios=ratios or [],
         supervision=supervision,
-        plot=plot,
-        views=open_views(views, scale=scale, images=images, resolution=resolution),
-        threads=threads,
     )
-    _check_plot(options)
-    from kissgs.cli import bench_curves
-
-    _print(bench_curves.finetuning(options), plot, as_json)
+    report(output, as_json, plot)
 
 
 @app.command()
 def rendering(
     scenes: FilesArgument,
-    gaussians: Annotated[
+    counts: Annotated[
         list[int] | None,
-        typer.Option(min=1, help="Resample the scene to this number of Gaussians; repeatable. Default: all."),
+        typer.Option(
+            "--gaussians",
+            min=1,
+            help="Measure the scene resampled to this number of Gaussians; repeatable. Default: the scene as it is.",
+        ),
     ] = None,
     views: ViewsOption = None,
     scale: ScaleOption = None,
@@ -243,43 +253,9 @@ def rendering(
     threads: ThreadsOption = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure the rasteriser: forward, backward, loss, Adam and removal scores."""
-    from kissgs.cli import bench_comparison
+    """Measure CPU times of the rasteriser: forward, backward, loss, Adam and removal scores."""
+    capture = open_views(views, scale=scale, images=images, resolution=resolution)
+    inputs = open_inputs(scenes, capture, threads)
+    from kissgs.cli import bench_rendering
 
-    options = BenchOptions(
-        scenes=_paths(scenes),
-        gaussians=gaussians or [],
-        views=open_views(views, scale=scale, images=images, resolution=resolution),
-        threads=threads,
-    )
-    _print(bench_comparison.rendering(options), None, as_json)
-
-
-def _paths(scenes: list[str]) -> list[Path]:
-    return list(dict.fromkeys(map(Path, expand(scenes))))
-
-
-def _check_plot(options: BenchOptions) -> None:
-    """Refuse a plot that cannot be made, before a long measurement."""
-    if options.plot is not None:
-        from kissgs.benchmark.plots import check_plot
-
-        if len(options.scenes) > 1:
-            raise UnsupportedError("--plot takes one scene; give one FILE")
-        check_plot(options.plot)
-
-
-def _print(output: BenchOutput, plot: Path | None, as_json: bool) -> None:
-    """Print and plot the results; exit status 2 if a part failed."""
-    try:  # results that took long are plotted even if they cannot be printed
-        if as_json:
-            print_json(output.rows)
-        elif output.rows:
-            show(output.table)
-    finally:
-        if plot is not None and output.draw is not None:
-            output.draw(plot)
-    for failure in output.failures:
-        sys.stderr.write(f"kissgs: {failure}\n")
-    if output.failures:
-        raise typer.Exit(2)
+    report(bench_rendering.rendering(inputs, counts or []), as_json)

@@ -9,7 +9,7 @@ from rich.console import Group
 from rich.table import Column, Table
 from rich.text import Text
 
-from kissgs.cli.bench_scenes import BenchOptions, BenchOutput, each_scene
+from kissgs.cli.bench_scenes import BenchInputs, BenchOutput, each_scene
 from kissgs.cli.options import choice, chosen
 from kissgs.core.errors import UnsupportedError
 from kissgs.evaluation.results import format_metric
@@ -25,32 +25,40 @@ if TYPE_CHECKING:
     from kissgs.core.progress import Progress
 
 
-def compaction(options: BenchOptions) -> BenchOutput:
+def compaction(
+    inputs: BenchInputs,
+    *,
+    preset: str = "balanced",
+    changes: list[str] | None = None,
+    ratios: list[float] | None = None,
+    strategies: list[str] | None = None,
+    supervision: str = "photos",
+) -> BenchOutput:
     """Compare strategies of compaction."""
     from kissgs.benchmark.compaction_study import RATIOS, STRATEGIES, compare_strategies
     from kissgs.benchmark.plots import compaction_plot
     from kissgs.pipeline.scene_files import load
 
     known = {strategy.name: strategy for strategy in STRATEGIES}
-    for name in options.strategies:
+    for name in strategies or []:
         if name not in known:
             raise UnsupportedError(f"--strategy {name!r}: unknown strategy; choose one of: {'; '.join(known)}")
-    supervision = _supervision(options)
-    settings = chosen(options.preset, options.changes, group="compact").compact
+    source = _checked_supervision(inputs, supervision, ratios or [])
+    settings = chosen(preset, changes, group="compact").compact
 
     def measure(scene: Path, progress: Progress) -> list[CompactionPoint]:
         return compare_strategies(
-            load(scene, threads=options.threads, progress=progress),
+            load(scene, threads=inputs.threads, progress=progress),
             settings,
-            options.views,
-            ratios=options.ratios or RATIOS,
-            strategies=[known[name] for name in options.strategies or known],
-            supervision=supervision,
-            threads=options.threads,
+            inputs.views,
+            ratios=ratios or RATIOS,
+            strategies=[known[name] for name in strategies or known],
+            supervision=source,
+            threads=inputs.threads,
             progress=progress,
         )
 
-    rows, failures = each_scene(options, measure)
+    rows, failures = each_scene(inputs.scenes, measure)
     return BenchOutput(
         rows=[{"scene": scene, **point.as_dict()} for scene, point in rows],
         table=compaction_table(rows),
@@ -59,16 +67,16 @@ def compaction(options: BenchOptions) -> BenchOutput:
     )
 
 
-def _supervision(options: BenchOptions) -> TargetSource:
-    """Return the value of ``--supervision``, after a check of the options of training."""
+def _checked_supervision(inputs: BenchInputs, supervision: str, ratios: list[float]) -> TargetSource:
+    """Return the value of ``--supervision``, after a check of it and of the ratios."""
     from kissgs.cameras.views import TargetSource
 
-    if 0 in options.ratios:
+    if 0 in ratios:
         raise UnsupportedError("--ratio 0 keeps no Gaussian; give a share above 0")
-    supervision = cast(TargetSource, choice("--supervision", options.supervision, TargetSource))
-    if options.views is None and supervision == "cameras":
+    source = cast(TargetSource, choice("--supervision", supervision, TargetSource))
+    if inputs.views is None and source == "cameras":
         raise UnsupportedError("--supervision cameras needs a capture; give one with --views")
-    return supervision
+    return source
 
 
 def compaction_table(rows: list[tuple[str, CompactionPoint]]) -> Table:
@@ -81,28 +89,36 @@ def compaction_table(rows: list[tuple[str, CompactionPoint]]) -> Table:
     return table
 
 
-def finetuning(options: BenchOptions) -> BenchOutput:
+def finetuning(
+    inputs: BenchInputs,
+    *,
+    preset: str = "balanced",
+    changes: list[str] | None = None,
+    quality_offsets: list[float] | None = None,
+    ratios: list[float] | None = None,
+    supervision: str = "photos",
+) -> BenchOutput:
     """Measure bytes and quality with and without fine-tuning."""
     from kissgs.benchmark.finetuning_curves import rate_curves
     from kissgs.benchmark.plots import finetuning_plot
     from kissgs.pipeline.scene_files import load
 
-    supervision = _supervision(options)
-    settings = chosen(options.preset, options.changes, group="finetune")
+    source = _checked_supervision(inputs, supervision, ratios or [])
+    settings = chosen(preset, changes, group="finetune")
 
     def measure(scene: Path, progress: Progress) -> list[RatePoint]:
         return rate_curves(
-            load(scene, threads=options.threads, progress=progress),
+            load(scene, threads=inputs.threads, progress=progress),
             settings,
-            options.views,
-            quality_offsets=options.quality_offsets or None,
-            ratios=options.ratios,
-            supervision=supervision,
-            threads=options.threads,
+            inputs.views,
+            quality_offsets=quality_offsets or None,
+            ratios=ratios or [],
+            supervision=source,
+            threads=inputs.threads,
             progress=progress,
         )
 
-    rows, failures = each_scene(options, measure)
+    rows, failures = each_scene(inputs.scenes, measure)
     return BenchOutput(
         rows=[{"scene": scene, **point.as_dict()} for scene, point in rows],
         table=finetuning_table(rows),

@@ -1,13 +1,17 @@
-"""Options and output that the measurements of ``kissgs bench`` share."""
+"""Inputs and output that the commands of ``kissgs bench`` share."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from kissgs.core.errors import KissgsError
+import typer
+
+from kissgs.cli.files import expand, print_json, show
+from kissgs.core.errors import KissgsError, UnsupportedError
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -19,30 +23,18 @@ Row = TypeVar("Row")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BenchOptions:
-    """Options of the command line; those of other measurements have their defaults."""
+class BenchInputs:
+    """Inputs of a measurement.
+
+    Attributes:
+        scenes: paths of ``.ply`` files, all different.
+        views: a capture; None for virtual cameras.
+        threads: number of threads; 0 means one per processor.
+    """
 
     scenes: list[Path]
-    presets: list[str] = field(default_factory=list)
-    changes: list[str] | None = None
-    external_codecs: list[str] = field(default_factory=list)
-    splat_transform: str = "splat-transform"
-    sog_iterations: int | None = None
-    repeats: int = 1
-    evaluate: bool = False
-    quality_offsets: list[float] = field(default_factory=list)
-    ratios: list[float] = field(default_factory=list)
-    strategies: list[str] = field(default_factory=list)
-    supervision: str = "photos"
-    plot: Path | None = None
-    gaussians: list[int] = field(default_factory=list)
     views: Views | None = None
     threads: int = 0
-
-    @property
-    def preset(self) -> str:
-        """The first preset, by default "balanced", for measurements that take one."""
-        return self.presets[0] if self.presets else "balanced"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,8 +54,40 @@ class BenchOutput:
     failures: list[str] = field(default_factory=list)
 
 
+def open_inputs(scenes: list[str], views: Views | None, threads: int, plot: Path | None = None) -> BenchInputs:
+    """Return the inputs of a measurement, after a check that its plot can be written: a measurement takes long.
+
+    Raises:
+        KissgsError: a pattern matches no file, there are several scenes for one plot, or the plot cannot be written.
+    """
+    inputs = BenchInputs(scenes=list(dict.fromkeys(map(Path, expand(scenes)))), views=views, threads=threads)
+    if plot is not None:
+        from kissgs.benchmark.plots import check_plot
+
+        if len(inputs.scenes) > 1:
+            raise UnsupportedError("--plot takes one scene; give one FILE")
+        check_plot(plot)
+    return inputs
+
+
+def report(output: BenchOutput, as_json: bool, plot: Path | None = None) -> None:
+    """Print the results, write the plot, and exit with code 2 if a part of the measurement failed."""
+    try:  # results that took long are plotted even if they cannot be printed
+        if as_json:
+            print_json(output.rows)
+        elif output.rows:
+            show(output.table)
+    finally:
+        if plot is not None and output.draw is not None:
+            output.draw(plot)
+    for failure in output.failures:
+        sys.stderr.write(f"kissgs: {failure}\n")
+    if output.failures:
+        raise typer.Exit(2)
+
+
 def each_scene(
-    options: BenchOptions, measure: Callable[[Path, Progress], list[Row]]
+    scenes: list[Path], measure: Callable[[Path, Progress], list[Row]]
 ) -> tuple[list[tuple[str, Row]], list[str]]:
     """Return the results of ``measure`` on each scene with the scene's name, and the error messages of failed scenes.
 
@@ -74,11 +98,11 @@ def each_scene(
 
     rows, failures = list[tuple[str, Row]](), list[str]()
     with progress_bar(False) as progress:
-        for scene, name in zip(options.scenes, _names(options.scenes), strict=True):
+        for scene, name in zip(scenes, _names(scenes), strict=True):
             try:
                 rows += [(name, row) for row in measure(scene, progress)]
             except KissgsError as error:
-                if len(options.scenes) == 1:
+                if len(scenes) == 1:
                     raise
                 failures.append(str(error))  # the results of other scenes may have taken hours
     return rows, failures

@@ -11,8 +11,8 @@ from kissgs.benchmark import ablation
 from kissgs.benchmark.ablation import PAPER_VARIANTS, PARTS, PUBLISHED_BYTES, RATE_DISTORTION_VARIANTS, ablate
 from kissgs.benchmark.roundtrip import roundtrip
 from kissgs.cameras.captures.load import load_views
-from kissgs.cli import bench_comparison
-from kissgs.cli.bench_scenes import BenchOptions
+from kissgs.cli import bench_ablation
+from kissgs.cli.bench_scenes import BenchInputs
 from kissgs.cli.console import output
 
 QUICK = {"sensitivity_views": 4, "sensitivity_view_size": 60}
@@ -87,7 +87,7 @@ def test_the_command_lists_parts_and_changed_settings(tmp_path, monkeypatch):
     monkeypatch.setattr(ablation, "PAPER_VARIANTS", PAPER_VARIANTS[:2])
     scene = tmp_path / "scene.ply"
     kissgs.save(kissgs.sample_scene(200, sh_degree=0), scene)
-    result = bench_comparison.ablation(BenchOptions(scenes=[scene], presets=["paper"]))
+    result = bench_ablation.ablation(BenchInputs(scenes=[scene]), presets=["paper"])
     rows = json.loads(json.dumps(result.rows))
     assert {row["scene"] for row in rows} == {"scene.ply"}
     assert list(dict.fromkeys(row["table"] for row in rows)) == ["KISS-GS", "paper"]

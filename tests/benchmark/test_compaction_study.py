@@ -14,7 +14,7 @@ from kissgs.benchmark.compaction_study import STRATEGIES, compare_strategies
 from kissgs.benchmark.plots import check_plot, compaction_plot
 from kissgs.cameras.views import Views, black
 from kissgs.cli.bench_curves import compaction
-from kissgs.cli.bench_scenes import BenchOptions
+from kissgs.cli.bench_scenes import BenchInputs
 
 SHORT = CompactSettings(sparsify_steps=6, refine_steps=6, prune_rounds=2, synthetic_view_share=0)
 
@@ -98,7 +98,7 @@ def test_invalid_options_are_refused():
         ("unknown strategy; choose one of: random; opacity; ", {"strategies": ["mine"]}),
     ):
         with pytest.raises(UnsupportedError, match=message):
-            compaction(BenchOptions(scenes=[Path("x.ply")], presets=["fast"], **options))
+            compaction(BenchInputs(scenes=[Path("x.ply")]), preset="fast", **options)
 
 
 @pytest.mark.parametrize("kind", ["png", "svg", "pdf"])

@@ -1,0 +1,124 @@
+"""``kissgs bench codecs`` and ``scaling``."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+from kissgs.cli.bench_scenes import BenchInputs, BenchOutput, each_scene
+from kissgs.cli.options import chosen
+from kissgs.core.errors import UnsupportedError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from kissgs.benchmark.results import Measurement
+    from kissgs.core.progress import Progress
+    from kissgs.settings import Settings
+
+
+def codecs(
+    inputs: BenchInputs,
+    *,
+    presets: list[str] | None,
+    changes: list[str] | None,
+    external_codecs: list[str],
+    splat_transform: str,
+    sog_iterations: int | None,
+    quality_offsets: list[float],
+    repeats: int,
+    evaluate: bool,
+) -> BenchOutput:
+    """Measure presets, points of their quality curves and external codecs."""
+    from kissgs.benchmark.comparison import BenchmarkPlan, compare
+    from kissgs.benchmark.comparison_plots import comparison_plot
+    from kissgs.benchmark.results import at_equal_psnr
+    from kissgs.cli.bench_tables import bench_tables
+
+    settings = _all_settings(presets, changes)
+    curve_presets = _curve_presets(settings, only_balanced=not presets)
+    if quality_offsets and not curve_presets:
+        raise UnsupportedError("--quality-offset needs a preset with rate-distortion planning: balanced or small")
+    plan = BenchmarkPlan(
+        presets=settings,
+        curve_presets=curve_presets,
+        quality_offsets=quality_offsets,
+        external_codecs=external_codecs,
+        splat_transform=shlex.split(splat_transform),
+        sog_iterations=sog_iterations,
+        repeats=repeats,
+        evaluate=evaluate or inputs.views is not None or bool(quality_offsets),
+        views=inputs.views,
+        threads=inputs.threads,
+    )
+    external_failures = list[str]()
+
+    def measure(scene: Path, progress: Progress) -> list[Measurement]:
+        return compare(scene, plan, on_failure=external_failures.append, progress=progress)
+
+    found, failures = each_scene(inputs.scenes, measure)
+    rows = [replace(row, scene=name) for name, row in found]
+    equals = at_equal_psnr(rows)
+    entries = [row.as_dict() for row in rows]
+    for row, entry in zip(rows, entries, strict=True):
+        if row.is_external and quality_offsets:
+            matching = (equal for equal in equals if (equal.scene, equal.external) == (row.scene, row.codec))
+            entry["at_equal_psnr"] = [equal.as_dict() for equal in matching]
+    return BenchOutput(
+        rows=entries,
+        table=bench_tables(rows, equals),
+        draw=partial(comparison_plot, rows),
+        failures=external_failures + failures,
+    )
+
+
+def scaling(
+    inputs: BenchInputs,
+    counts: list[int],
+    *,
+    presets: list[str] | None,
+    changes: list[str] | None,
+    repeats: int,
+    evaluate: bool,
+) -> BenchOutput:
+    """Measure presets on scenes resampled to each count."""
+    from kissgs.benchmark.comparison import BenchmarkPlan, compare_at_counts
+    from kissgs.benchmark.comparison_plots import scaling_plot
+    from kissgs.cli.bench_tables import bench_tables
+
+    plan = BenchmarkPlan(
+        presets=_all_settings(presets, changes),
+        repeats=repeats,
+        evaluate=evaluate or inputs.views is not None,
+        views=inputs.views,
+        threads=inputs.threads,
+    )
+
+    def measure(scene: Path, progress: Progress) -> list[Measurement]:
+        return compare_at_counts(scene, counts, plan, progress=progress)
+
+    found, failures = each_scene(inputs.scenes, measure)
+    rows = [replace(row, scene=name) for name, row in found]
+    return BenchOutput(
+        rows=[row.as_dict() for row in rows],
+        table=bench_tables(rows, []),
+        draw=partial(scaling_plot, rows),
+        failures=failures,
+    )
+
+
+def _all_settings(presets: list[str] | None, changes: list[str] | None) -> list[Settings]:
+    """Return the settings of these presets, by default of all, with these changes."""
+    from kissgs.settings import Preset
+
+    return [chosen(name, changes) for name in presets or list(Preset)]
+
+
+def _curve_presets(settings: list[Settings], *, only_balanced: bool) -> list[Settings]:
+    """Return those of the settings that have a quality curve."""
+    from kissgs.settings import Preset
+
+    planned = [each for each in settings if each.encode.rate_distortion]
+    return [each for each in planned if each.preset == Preset.BALANCED] if only_balanced else planned
