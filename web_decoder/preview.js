@@ -11,7 +11,7 @@ import { STAGES, gaussianAt, lastStageOf, partsOf, stageOf } from "./preview/sce
 import { addressed, download, jobIn, namesSource } from "./preview/sources.js";
 import { stage } from "./preview/stage.js";
 import { plyStatisticsView, statisticsView } from "./preview/statistics.js";
-import { Trouble, aborted, trouble } from "./preview/trouble.js";
+import { UserError, aborted, showProblem } from "./preview/problem.js";
 
 /**
  * @typedef {import("./preview/scene.js").Scene} Scene
@@ -23,7 +23,7 @@ import { Trouble, aborted, trouble } from "./preview/trouble.js";
 const MAX_GAUSSIANS = 10_000_000;
 
 const loads = loader();
-const view = stage(trouble);
+const view = stage(showProblem);
 /** The container on display. @type {{scene: Scene, source: Source, seconds: number | null} | null} */
 let shown = null;
 
@@ -34,11 +34,11 @@ let shown = null;
  */
 async function during(what, work) {
   const load = loads.begin(what);
-  trouble(view.failure); // remains valid, whatever is opened
+  showProblem(view.failure); // remains valid, whatever is opened
   try {
     await work(load);
   } catch (error) {
-    if (!aborted(error)) trouble(error);
+    if (!aborted(error)) showProblem(error);
   }
   load.done();
   byId("empty").hidden = !byId("viewport").hidden || !byId("loading").hidden;
@@ -135,9 +135,9 @@ async function compareWith(bytes) {
 /** Replace errors of reading a .ply by a message. @template T @param {Promise<T>} reading */
 const readable = (reading) =>
   reading.catch((error) => {
-    throw error instanceof Trouble
+    throw error instanceof UserError
       ? error
-      : new Trouble("This .ply cannot be read: it holds no Gaussians, or is damaged.");
+      : new UserError("This .ply cannot be read: it holds no Gaussians, or is damaged.");
   });
 
 function labelCompare() {

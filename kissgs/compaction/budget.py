@@ -167,7 +167,7 @@ class Compactor:
 
     def pictures(self, found: Compacted) -> Evaluation:
         """From views that were not learned from, beside those of the scene."""
-        progress = as_stage("judge", self.progress)
+        progress = as_stage("evaluate", self.progress)
         if self.judges is None:
             drawn = evaluation_views(self.splats, seed=SEARCH_SEED, threads=self.threads, progress=progress)
             self.judges, self._taken = drawn, {}

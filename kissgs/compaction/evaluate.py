@@ -26,9 +26,9 @@ def evaluate_scene(
 ) -> tuple[ImageMetrics, int]:
     """How alike its pictures are to the photographs, or to those of ``reference`` where there are none; and its bytes.
 
-    The bytes are those of its container as the preset ``fast`` makes it. ``progress`` receives the stage ``"judge"``.
+    The bytes are those of its container as the preset ``fast`` makes it. ``progress`` receives the stage ``"evaluate"``.
     """
-    receive = as_stage("judge", progress)
+    receive = as_stage("evaluate", progress)
     views = exam(reference, supervision, threads, receive)
     compared = compare_images(reference, scene, views, threads=threads, progress=receive)
     encoded = encode(scene, Settings(preset=Preset.FAST).encode, threads=threads, progress=receive)

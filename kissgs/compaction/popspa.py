@@ -77,7 +77,7 @@ def popspa(
         threads: 0 means one per processor; the result does not depend on it.
         device: where it is trained; ``"cuda"`` needs the extra ``kissgs[cuda]``, and adds up in an order of chance: no
             two results are quite the same. Scores are always the processor's.
-        progress: receives "kernels", "score", "targets", "sparsify", "refine" and "judge".
+        progress: receives "kernels", "score", "targets", "sparsify", "refine" and "evaluate".
 
     Raises:
         InvalidViewsError: a photograph cannot be read.

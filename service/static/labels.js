@@ -20,7 +20,6 @@ const STAGES = {
   kernels: "Preparing",
   cameras: "Placing cameras",
   score: "Scoring Gaussians",
-  judge: "Evaluating the result",
   targets: "Rendering training targets",
   sparsify: "Training with sparsification",
   refine: "Refining the remaining Gaussians",

@@ -128,12 +128,12 @@ class Preview:
 
     def error_message(self, *words):
         """Return the error message, which must be one sentence with these words."""
-        message = self.page.locator("#trouble:visible p")
+        message = self.page.locator("#problem:visible p")
         message.wait_for()
         text = message.inner_text()
         assert all(word in text for word in words), text
         assert re.fullmatch(r"[^\n]{10,250}[.]", text), text
-        assert "fault of its own" not in text
+        assert "bug in it" not in text
         return text
 
     def choose(self, *files, button="#open"):

@@ -78,7 +78,7 @@ def test_unsuitable_files(preview, service, name, data, words):
     assert tab.page.locator("#empty").is_visible()
     tab.drop(("b.zip", OTHER))
     before = tab.shown(OTHERS)
-    assert not tab.page.locator("#trouble").is_visible()
+    assert not tab.page.locator("#problem").is_visible()
     tab.drop((name, data))
     tab.error_message(*words)
     tab.page.get_by_role("button", name="Dismiss").click()
@@ -247,7 +247,7 @@ def test_an_empty_scene(preview, service):
     tab.drop(("none.zip", none))
     tab.shown(0)
     tab.fact("Per Gaussian", "none")
-    assert not tab.page.locator("#trouble").is_visible()
+    assert not tab.page.locator("#problem").is_visible()
 
 
 def test_a_small_file_cannot_claim_a_large_scene(preview, service):
@@ -292,7 +292,7 @@ def test_a_lost_webgl_context_is_reported(preview, service):
     tab = preview().open(service)
     tab.drop(("a.zip", ZIP))
     tab.shown(COUNT)
-    assert not tab.page.locator("#trouble").is_visible()
+    assert not tab.page.locator("#problem").is_visible()
     tab.page.evaluate(
         "document.querySelector('#viewport').getContext('webgl2').getExtension('WEBGL_lose_context').loseContext()"
     )
@@ -369,7 +369,7 @@ def test_planes_show_their_levels(preview, service, idle):
     tab.drop(("a.zip", ZIP))
     tab.shown(COUNT)
     tab.page.wait_for_function("painted().length === 9 && painted().every(Boolean)")
-    for name, file in (("Mask", "active_mask"), ("Rotations", "quaternions"), ("Colours", "f_dc")):
+    for name, file in (("Mask", "active_mask"), ("Rotations", "quaternions"), ("Base colours", "f_dc")):
         levels = levels_of(f"{file}.webp").astype(float)
         levels[..., :3] = np.rint(255 * levels[..., :3] / levels[..., :3].max())
         levels[..., 3] = 255

@@ -205,7 +205,7 @@ def test_hovering_over_a_plane(preview, service, job, container, decoded):
     mask = planes["active_mask.webp"]
     side = len(mask)
     cells = np.flatnonzero(mask.reshape(side * side, -1)[:, 0])
-    page.get_by_role("button", name="Sizes").click()
+    page.get_by_role("button", name="Scales").click()
     canvas = page.locator(".plane canvas")
 
     def point_at(cell):
@@ -283,7 +283,7 @@ def test_the_message_names_a_damaged_file(preview, service, job, file, damage):
     if damage is None:
         tab.expect_errors("^404 ", "Failed to load resource.*404")
     tab.page.get_by_role("button", name="Dismiss").click()
-    assert not tab.page.locator("#trouble").is_visible()
+    assert not tab.page.locator("#problem").is_visible()
 
 
 def test_the_scene_is_drawn_without_damaged_planes(preview, service, job, decoded):
@@ -404,8 +404,8 @@ def test_without_the_vendor_folder(preview, service, job, decoded):
     tab.open(service, job["id"])
     tab.error_message("not installed", "scripts/vendor")
     tab.fact("Gaussians", f"{len(decoded):,}")
-    tab.page.get_by_role("button", name="Opacity").click()
+    tab.page.get_by_role("button", name="Opacities").click()
     tab.page.locator(".plane canvas").hover(position={"x": 3, "y": 3})
     assert "Column 0, row 0" in tab.page.locator(".readout").inner_text()
-    assert tab.page.locator("#trouble").is_visible()
+    assert tab.page.locator("#problem").is_visible()
     tab.expect_errors("^404 .*vendor", "Failed to load resource.*404")

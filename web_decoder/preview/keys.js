@@ -1,7 +1,7 @@
 /** Actions of keys, and of the buttons that do the same. */
 
 import { byId } from "./dom.js";
-import { Trouble, trouble } from "./trouble.js";
+import { UserError, showProblem } from "./problem.js";
 
 export const help = () => byId("keys").showModal();
 
@@ -10,7 +10,7 @@ export function switchPanels() {
 }
 
 export function switchFullScreen() {
-  const refused = () => trouble(new Trouble("This browser does not give its full screen to this page."));
+  const refused = () => showProblem(new UserError("This browser does not give its full screen to this page."));
   if (document.fullscreenElement) document.exitFullscreen();
   else if (document.fullscreenEnabled) document.documentElement.requestFullscreen().catch(refused);
   else refused();

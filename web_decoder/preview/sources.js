@@ -1,6 +1,6 @@
 /** Sources of scenes: the page's address, or a file. */
 
-import { Trouble } from "./trouble.js";
+import { UserError } from "./problem.js";
 
 /**
  * @typedef {object} Source
@@ -43,7 +43,7 @@ function ofAddress(address, here) {
     const name = decodeURIComponent(path.slice(path.lastIndexOf("/") + 1));
     return { name: name || url.host, container: url.href, zipped: path === url.pathname };
   } catch {
-    throw new Trouble("What this page is to open is not an address: check what stands after “src=” in its own.");
+    throw new UserError("What this page is to open is not an address: check what stands after “src=” in its own.");
   }
 }
 
@@ -62,7 +62,7 @@ async function ofJob(id, signal) {
   const request = withKey();
   const job = `../v1/jobs/${id}`; // relative: the service may be served under a prefix
   const status = await (await get(job, { ...request, signal })).json();
-  if (!status.sizes) throw new Trouble(`This job has no container to show: it is ${status.state}.`);
+  if (!status.sizes) throw new UserError(`This job has no container to show: it is ${status.state}.`);
   return {
     name: status.name,
     container: new URL(`${job}/files/`, window.location.href).href,
@@ -79,12 +79,15 @@ async function ofJob(id, signal) {
  */
 async function get(url, init) {
   const response = await fetch(url, init).catch((error) => {
-    throw init.signal?.aborted ? error : new Trouble("The server cannot be reached: check your network, then reload.");
+    throw init.signal?.aborted
+      ? error
+      : new UserError("The server cannot be reached: check your network, then reload.");
   });
   if (response.status === 401)
-    throw new Trouble("This service wants a key: enter it on its page, then open the preview from there.");
-  if (response.status === 404 || response.status === 410) throw new Trouble("The server does not have this any more.");
-  if (!response.ok) throw new Trouble(`The server answered with status ${response.status}.`);
+    throw new UserError("This service wants a key: enter it on its page, then open the preview from there.");
+  if (response.status === 404 || response.status === 410)
+    throw new UserError("The server does not have this any more.");
+  if (!response.ok) throw new UserError(`The server answered with status ${response.status}.`);
   return response;
 }
 

@@ -1,7 +1,7 @@
 /** The stage: viewer, camera and comparison, if this browser can draw them. */
 
 import { byId } from "./dom.js";
-import { Trouble } from "./trouble.js";
+import { UserError } from "./problem.js";
 
 /** @typedef {import("./scene.js").Scene} Scene */
 
@@ -13,11 +13,13 @@ const LOST = "The graphics driver has reset, so the rendering is gone; reload th
 /** The modules that need Spark, which may not be installed. */
 async function modules() {
   if (!document.createElement("canvas").getContext("webgl2"))
-    throw new Trouble("This browser has no WebGL2, so the scene cannot be drawn; its statistics and planes are shown.");
+    throw new UserError(
+      "This browser has no WebGL2, so the scene cannot be drawn; its statistics and planes are shown.",
+    );
   try {
     return await Promise.all([import("./viewer.js"), import("./navigation.js"), import("./compare.js")]);
   } catch {
-    throw new Trouble(
+    throw new UserError(
       "The viewer is not installed, so the scene cannot be drawn; `make setup` or `scripts/vendor` installs it.",
     );
   }
@@ -33,7 +35,7 @@ export function stage(failed) {
   let white = false;
 
   const ready = modules().then(([{ Viewer }, { navigation }, { comparison }]) => {
-    const viewer = new Viewer(canvas, { lost: () => fail(new Trouble(LOST)) });
+    const viewer = new Viewer(canvas, { lost: () => fail(new UserError(LOST)) });
     live = { viewer, camera: navigation(viewer) };
     new ResizeObserver(fit).observe(container);
     paint();

@@ -4,16 +4,16 @@ import { SogxtError } from "../sogxt.js";
 import { byId, el } from "./dom.js";
 
 /** An error with a message for users, a sentence. */
-export class Trouble extends Error {}
+export class UserError extends Error {}
 
 /** @param {unknown} error null to hide the message */
-export function trouble(error) {
-  const place = byId("trouble");
+export function showProblem(error) {
+  const place = byId("problem");
   place.hidden = error === null;
   if (error === null) return place.replaceChildren();
   const close = el(
     "button",
-    { type: "button", class: "close", "aria-label": "Dismiss", onclick: () => trouble(null) },
+    { type: "button", class: "close", "aria-label": "Dismiss", onclick: () => showProblem(null) },
     "×",
   );
   place.replaceChildren(el("p", {}, sentenceOf(error)), close);
@@ -21,9 +21,9 @@ export function trouble(error) {
 
 /** @param {unknown} error */
 function sentenceOf(error) {
-  if (error instanceof Trouble || error instanceof SogxtError) return sentence(error.message);
+  if (error instanceof UserError || error instanceof SogxtError) return sentence(error.message);
   const reason = error instanceof Error ? error.message : String(error);
-  return `This page has failed, which is a fault of its own: ${reason || "no reason was given"}.`;
+  return `This page failed because of a bug in it: ${reason || "no reason was given"}.`;
 }
 
 /**
