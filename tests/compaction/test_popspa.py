@@ -343,5 +343,5 @@ def test_a_gpu_trains_as_well():
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device here")
 def test_no_gpu_is_said_before_the_work():
-    with pytest.raises(UnsupportedError, match="torch finds no CUDA device here"):
+    with pytest.raises(UnsupportedError, match="torch finds no CUDA device"):
         compact_scene(cloud(60), settings(count=20), device="cuda", progress=None)

@@ -148,9 +148,8 @@ def test_a_psnr_is_met(change):
     made = max((trial for trial in found.report.trials if trial.bytes == len(found.to_zip())), key=lambda t: t.psnr)
     assert made.psnr >= wanted
     assert made.bytes == min(trial.bytes for trial in found.report.trials if trial.psnr >= wanted)
-    assert (
-        min(trial.rd_lambda for trial in found.report.trials if trial.psnr < wanted) < 1.5 * made.rd_lambda
-    )  # jumps exist
+    too_coarse = min(trial.rd_lambda for trial in found.report.trials if trial.psnr < wanted)
+    assert made.psnr <= wanted + 0.1 or too_coarse < 1.5 * made.rd_lambda  # near the goal, or at a jump over it
     assert made.worst <= made.fifth_percentile <= made.psnr
     assert abs(found.report.evaluation.mean.candidate_vs_reference.psnr - wanted) < 2.5
     assert found.report.evaluation.mean.candidate_vs_reference.psnr not in [trial.psnr for trial in found.report.trials]
