@@ -14,6 +14,7 @@ import typer.main
 from kissgs import Preset
 from kissgs.cli.bench import app as bench
 from kissgs.sogxt.names import FILES
+from service.core.presets import presets
 
 ROOT = Path(__file__).parents[1]
 GENERATED = runpy.run_path(str(ROOT / "docs" / "generate.py"))["PAGES"]
@@ -133,3 +134,13 @@ def test_no_page_is_left_unfinished() -> None:
             r"^[A-Z_]{6,}$|TODO|FIXME|[A-Z]{4,}SSIM", page.read_text(encoding="utf-8"), re.MULTILINE
         )
         assert not unfinished, f"{page.name}: {unfinished}"
+
+
+def test_presets_of_the_service_have_the_figures_of_the_benchmarks() -> None:
+    """Without cameras, as the service compresses: bytes per Gaussian and the change of PSNR to photographs."""
+    text = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8").partition("## Fox")[2].partition("### ")[0]
+    for facts in presets().presets:
+        name = f"`{facts.name}`" + (", no cameras" if facts.name in ("balanced", "small") else "")
+        (row,) = re.findall(rf"^\| {name} \| (.*)$", text, re.MULTILINE)
+        cells = [cell.strip() for cell in row.split("|")]
+        assert (cells[1], cells[4]) == (f"{facts.bytes_per_gaussian:.2f}", f"{facts.psnr_change:.2f}")

@@ -13,6 +13,7 @@ import numpy as np
 from kissgs.benchmark.bd_rate import pareto_front
 from kissgs.benchmark.plots import MARKERS, new_figure
 from kissgs.benchmark.results import Measurement, PsnrTarget
+from kissgs.core.errors import UnsupportedError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -77,8 +78,10 @@ def scaling_plot(rows: Sequence[Measurement], path: Path) -> None:
 
     Raises:
         OutputError: the file cannot be written.
-        UnsupportedError: matplotlib is not installed, or the format is unknown.
+        UnsupportedError: matplotlib is not installed, the format is unknown, or a scene has no Gaussians.
     """
+    if not all(row.gaussians for row in rows):
+        raise UnsupportedError(f"{path}: a scene without Gaussians cannot be plotted; leave out --plot")
     presets = list(dict.fromkeys(row.codec for row in rows))
     runs = [row.median_run for row in rows]
     stages = list(dict.fromkeys(stage for run in runs for stage in run.stage_seconds))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from kissgs.core.errors import UnsupportedError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
 from kissgs.core.threads import Workers
@@ -142,6 +143,9 @@ def resampled(splats: Splats, count: int, *, seed: int = 0) -> Splats:
         splats: a finite scene; an empty one is returned as it is.
         count: number of Gaussians of the result, 0 or more.
         seed: seed of the random positions.
+
+    Raises:
+        UnsupportedError: there is not enough memory.
     """
     if not len(splats):
         return splats
@@ -150,7 +154,10 @@ def resampled(splats: Splats, count: int, *, seed: int = 0) -> Splats:
         thinned = splats.select(keep)
         return _rescaled(thinned, thinned.means, np.log(len(splats) / max(count, 1)) / 2)
     rng = np.random.Generator(np.random.PCG64(seed))
-    many = splats.select(np.sort(np.arange(count) % len(splats)))
+    try:
+        many = splats.select(np.sort(np.arange(count) % len(splats)))
+    except MemoryError as error:
+        raise UnsupportedError(f"{count:,} Gaussians need more memory than there is; resample to fewer") from error
     w, x, y, z = many.quats.T
     steps = rng.standard_normal((count, 3), np.float32) * np.exp(many.scales) * np.float32(0.7)
     axis = np.stack([x, y, z], axis=1)

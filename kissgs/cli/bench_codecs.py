@@ -32,6 +32,8 @@ def codecs(
     evaluate: bool,
 ) -> BenchOutput:
     """Measure presets, points of their quality curves and external codecs."""
+    if sog_iterations is not None and "sog" not in external_codecs:
+        raise UnsupportedError("--sog-iterations needs --external sog")
     from kissgs.benchmark.comparison import BenchmarkPlan, compare
     from kissgs.benchmark.comparison_plots import comparison_plot
     from kissgs.benchmark.results import at_equal_psnr
@@ -46,7 +48,7 @@ def codecs(
         curve_presets=curve_presets,
         quality_offsets=quality_offsets,
         external_codecs=external_codecs,
-        splat_transform=shlex.split(splat_transform),
+        splat_transform=_command(splat_transform),
         sog_iterations=sog_iterations,
         repeats=repeats,
         evaluate=evaluate or inputs.views is not None or bool(quality_offsets),
@@ -97,7 +99,7 @@ def scaling(
     )
 
     def measure(scene: Path, progress: Progress) -> list[Measurement]:
-        return compare_at_counts(scene, counts, plan, progress=progress)
+        return compare_at_counts(scene, list(dict.fromkeys(counts)), plan, progress=progress)
 
     found, failures = each_scene(inputs.scenes, measure)
     rows = [replace(row, scene=name) for name, row in found]
@@ -122,3 +124,11 @@ def _curve_presets(settings: list[Settings], *, only_balanced: bool) -> list[Set
 
     planned = [each for each in settings if each.encode.rate_distortion]
     return [each for each in planned if each.preset == Preset.BALANCED] if only_balanced else planned
+
+
+def _command(text: str) -> list[str]:
+    """Split a command line into words."""
+    try:
+        return shlex.split(text)
+    except ValueError as error:
+        raise UnsupportedError(f"--splat-transform {text}: {str(error).lower()}; quote the command's words") from error

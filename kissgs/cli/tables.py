@@ -158,8 +158,9 @@ def info_table(info: Info) -> RenderableType:
         kind += f" ({info.details['encoding']}{', compressed' if info.details['compressed'] else ''})"
     head = Text.assemble((info.path, "bold"), f"  {kind}, {size(info.bytes)}")
     body = f"{info.count:,} Gaussians, SH degree {info.sh_degree}, {info.bits_per_gaussian:.1f} bits per Gaussian"
-    what = "value" if info.kind == "ply" else "level"  # channels share a step, so few reach the highest level
-    ranges = Table("attribute", _right(f"lowest {what}"), _right(f"highest {what}"), box=None, pad_edge=False)
+    of = "{} value" if info.kind == "ply" else "value of {} level"  # channels share a step, so few reach the highest
+    ends = [_right(of.format(end)) for end in ("lowest", "highest")]
+    ranges = Table("attribute", *ends, box=None, pad_edge=False)
     for name, (low, high) in info.ranges.items():
         ranges.add_row(name, f"{low:.5g}", f"{high:.5g}")
     blocks: list[RenderableType] = [head, Text(body), ranges]

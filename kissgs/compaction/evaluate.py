@@ -26,7 +26,7 @@ def evaluate_scene(
 ) -> tuple[ImageMetrics, int]:
     """How alike its pictures are to the photographs, or to those of ``reference`` where there are none; and its bytes.
 
-    The bytes are those of its container as the preset ``fast`` makes it. ``progress`` receives the stage ``"evaluate"``.
+    The bytes are those of its container with the preset ``fast``. ``progress`` receives the stage ``"evaluate"``.
     """
     receive = as_stage("evaluate", progress)
     views = exam(reference, supervision, threads, receive)

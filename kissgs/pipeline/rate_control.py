@@ -33,8 +33,11 @@ LOG2_LAMBDA_RANGE = (-70.0, -6.0)
 MIN_STEP_LOG2 = 1 / 32
 """Below this interval of log2(lambda), a jump of the size is taken for a discontinuity and not searched further."""
 
-FAR_BELOW_LOG2 = 0.5
-"""If the images of the first container could grow by this much (log2 of bytes), the finest container is tried next."""
+FAR_BELOW_LOG2 = 1.5
+"""If the images of the first container could grow by this much (log2 of bytes), the finest container is tried next.
+
+The finest container takes longest to make, and rarely has more than three times the bytes of the first.
+"""
 
 PLANE_CHANNELS = 21
 """Bytes per cell of all grid images before compression: mask 1, means 6, opacity 1, scales 3, quaternions 4, base
@@ -54,7 +57,7 @@ class Container:
         encoded: its files, with the report of the encoder.
         settings: the settings that it was made with.
         finetuning: report of its fine-tuning; None without fine-tuning.
-        note: what the user may not expect of it; empty if there is nothing to say.
+        note: a fact that may surprise the user; empty if there is none.
     """
 
     encoded: Encoded
@@ -116,7 +119,7 @@ class Goal:
         """Return why no trial meets the goal; ``suggest_compaction``: whether fewer Gaussians might, untried so far."""
         lambdas = [trial.rd_lambda for trial in trials if trial.rd_lambda]
         extreme = (max if self.by_size else min)(lambdas, default=None)
-        trials = [trial for trial in trials if trial.rd_lambda in (None, extreme)]  # the last resort of each search
+        trials = [trial for trial in trials if trial.rd_lambda in (None, extreme)]  # those at the extreme lambda
         if self.settings.target_size is not None:
             smallest, target = min(trial.bytes for trial in trials), int(self.settings.target_size)
             return (
@@ -222,7 +225,7 @@ class RateControl:
             )
 
     def _search_again(self, encoder: Encoder, rd_lambda: float, **changes: float) -> None:
-        remaining = self.settings.max_encodes - len(self.trials) + (self._finest is not None)
+        remaining = self.settings.max_encodes - len(self.trials)
         if remaining > 0 and not (self.stopped or self.cannot_improve):
             self.settings = self.settings.model_copy(update=changes)
             self.run(encoder, rd_lambda, remaining)
@@ -277,13 +280,10 @@ class RateControl:
         first_margin = self._evaluate(first)
         if first.encoded.rd_lambda is None:
             return
-        if (
-            rd_lambda is None
-            and attempts > 1
-            and self._is_far_below(self.trials[-1].bytes)
-            and self._finest_fits(encoder)
-        ):
-            return
+        if rd_lambda is None and attempts > 1 and first_margin >= 0 and self._is_far_below(self.trials[-1].bytes):
+            if self._finest_fits(encoder):
+                return
+            attempts -= 1
         start = math.log2(first.encoded.rd_lambda)
 
         def margin_at(x: float) -> float:
@@ -314,7 +314,7 @@ class RateControl:
         return growth >= 2**FAR_BELOW_LOG2 or target >= min(self._most_bytes(), self.original.nbytes)
 
     def _finest_fits(self, encoder: Encoder) -> bool:
-        """Make the finest container, with the largest codebook; it is not counted in ``max_encodes`` if too large."""
+        """Make the finest container, with the largest codebook, and return whether it fits into the target size."""
         limited = self._is_codebook_limited(self.settings)
         unlimited = self.settings.model_copy(update={"gaussians_per_codebook_entry": 1.0} if limited else {})
         settings = self._settings_at(2.0 ** LOG2_LAMBDA_RANGE[0], unlimited)

@@ -18,7 +18,7 @@ from kissgs.core.splats import Splats
 from kissgs.settings.training import TrainingViewSettings
 
 SCORING_STRIDE = 4
-"""Every so many-th virtual training camera scores Gaussians."""
+"""One in this many virtual training cameras scores Gaussians."""
 
 CLOSE_UPS, CLOSE_UP_SHRINK = 4, 4
 """Number of close-ups per virtual scoring camera, and the factor by which their sides are shorter."""

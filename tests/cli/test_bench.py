@@ -60,8 +60,11 @@ def test_images_are_compared_and_the_rasteriser_is_measured(scene: Path) -> None
     [
         ("codecs", "--quality-offset 1 -p fast", "--quality-offset needs a preset with rate-distortion planning"),
         ("codecs", "--external rar -p fast", "unknown external codec 'rar'; choose sog or spz"),
+        ("codecs", "--sog-iterations 1", "--sog-iterations needs --external sog"),
+        ("codecs", "--external sog --splat-transform '", "--splat-transform ': no closing quotation"),
         ("codecs", "--plot curve.jpg", "ends in .svg, .png or .pdf"),
         ("codecs", "--scale 4", "--views"),
+        ("rendering", "--gaussians 99999999999999", "need more memory than there is"),
         ("ablation", "-p fast", "balanced or small, not fast"),
         ("finetuning", "-p fast", "choose balanced or small"),
         ("finetuning", "--supervision cameras", "--supervision cameras needs a capture"),
@@ -107,6 +110,10 @@ def test_scenes_of_equal_file_names_have_different_names(scene: Path, tmp_path: 
 
 def test_an_empty_scene_is_not_resampled(tmp_path: Path) -> None:
     kissgs.save(kissgs.sample_scene(0), tmp_path / "none.ply")
+    plot = ["--plot", tmp_path / "p.svg"]
+    done = run("bench", "scaling", tmp_path / "none.ply", "-p", "fast", "--gaussians", 5, *plot)
+    assert done.returncode == 2
+    assert b"a scene without Gaussians cannot be plotted" in done.stderr
     rows = json.loads(run("bench", "scaling", tmp_path / "none.ply", "-p", "fast", "--gaussians", 5, "--json").stdout)
     assert [row["gaussians"] for row in rows] == [0]
 

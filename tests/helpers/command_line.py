@@ -6,6 +6,7 @@ Tests of signals, pipes and start-up run the executable ``KISSGS`` as a separate
 from __future__ import annotations
 
 import contextlib
+import faulthandler
 import os
 import signal
 import subprocess
@@ -18,6 +19,9 @@ from typing import BinaryIO
 from kissgs.cli.main import main
 
 KISSGS = Path(sys.executable).with_name("kissgs")
+
+TIMEOUT_SECONDS = 900.0
+"""A command that takes longer hangs: it ends its test process, after a traceback of all threads."""
 
 
 def run(*words: object, stdin: bytes = b"", cwd: Path | None = None) -> subprocess.CompletedProcess[bytes]:
@@ -46,10 +50,13 @@ def failure(*words: object, stdin: bytes = b"", cwd: Path | None = None) -> str:
 
 def _exit_code() -> int:
     code: object = 0
+    faulthandler.dump_traceback_later(TIMEOUT_SECONDS, exit=True, file=sys.__stderr__)
     try:
         main()
     except SystemExit as end:
         code = end.code or 0
+    finally:
+        faulthandler.cancel_dump_traceback_later()
     assert isinstance(code, int), code
     return code
 

@@ -124,6 +124,10 @@ def test_max_encodes_limits_the_trials():
         kissgs.compress(SCENE, settings=chosen)
     chosen = Settings.from_preset("balanced", target_size=int(1.5 * plain), max_encodes=1, **FEW_VIEWS)
     assert len(kissgs.compress(SCENE, settings=chosen).report.trials) == 1
+    finest = kissgs.compress(SCENE, settings=Settings.from_preset("balanced", rd_lambda=2.0**-70, **FEW_VIEWS))
+    almost = int(0.97 * len(finest.to_zip()))
+    chosen = Settings.from_preset("balanced", target_size=almost, max_encodes=2, **FEW_VIEWS)
+    assert len(kissgs.compress(SCENE, settings=chosen).report.trials) <= 2
 
 
 @pytest.mark.parametrize("share", [0.45, 0.8])

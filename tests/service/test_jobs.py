@@ -420,6 +420,7 @@ def test_a_client_that_only_accepts_zip_gets_an_error_after_the_time_limit(start
         headers={"Accept": "application/zip"},
     )
     found = problem(answer, 409, "not-finished")
+    assert int(answer.headers["retry-after"]) >= 1
     job = service.http.get(answer.headers["location"]).json()
     assert job["state"] in ("queued", "running")
     assert job["links"]["self"] in found["detail"]

@@ -29,6 +29,9 @@ from service.jobs.container import Owner, Service, ServiceContainer
 
 log = logging.getLogger("kissgs.service")
 
+FOLLOW_UP = ("Location", "Retry-After")
+"""Headers that tell a client where its job is, and when to look next."""
+
 router = APIRouter(prefix="/v1", tags=["jobs"])
 
 Options = Annotated[
@@ -184,9 +187,9 @@ async def compress_now(
     if not accepts(request.headers.getlist("accept"), "application/json"):
         text = (
             f"the job has not ended yet and continues; wait for it with GET /v1/jobs/{job.id}?wait="
-            f"{MAX_WAIT_SECONDS:g}, then download /v1/jobs/{job.id}/result"
+            f"{MAX_WAIT_SECONDS:g}, then download /v1/jobs/{job.id}/result instead of submitting the scene again"
         )
-        raise ProblemError("not-finished", text, headers={"Location": response.headers["Location"]})
+        raise ProblemError("not-finished", text, headers={name: response.headers[name] for name in FOLLOW_UP})
     response.body = status.model_dump_json(exclude_none=True).encode()
     response.headers["Content-Length"] = str(len(response.body))
     return response
