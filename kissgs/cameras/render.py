@@ -9,7 +9,7 @@ import numpy as np
 
 from kissgs.cameras.captures.select_view import is_camera_file, pick_view, view_of_file
 from kissgs.cameras.views import View, Views
-from kissgs.cameras.virtual.orbit import find_orbit
+from kissgs.cameras.virtual.orbit_search import find_orbit
 from kissgs.cameras.virtual.select import best_view, virtual_views
 from kissgs.core.array_types import UInt8
 from kissgs.core.errors import InvalidViewsError
@@ -96,9 +96,9 @@ class RenderJob:
         load_kernels(self.progress)
         width, height = self.size or FRAME_SIZE
         orbit = find_orbit(self.splats, width=width, height=height, threads=self.threads, progress=self.progress)
-        cameras = orbit.loop(frames or ANIMATION_FRAMES, width, height)
+        cameras = orbit.loop_cameras(frames or ANIMATION_FRAMES, width, height)
         return RenderedImages(
-            self._render(cameras, None), _numbered(cameras), f"{len(cameras)} frames, {orbit.in_words}"
+            self._render(cameras, None), _numbered(cameras), f"{len(cameras)} frames, {orbit.description}"
         )
 
     def orbit_sheet(self, frames: int | None = None) -> RenderedImages:
@@ -106,9 +106,9 @@ class RenderJob:
         load_kernels(self.progress)
         width, height = self.size or CELL_SIZE
         orbit = find_orbit(self.splats, width=width, height=height, threads=self.threads, progress=self.progress)
-        cameras = orbit.stops(frames or SHEET_FRAMES, width, height)
+        cameras = orbit.sheet_cameras(frames or SHEET_FRAMES, width, height)
         sheet = contact_sheet(self._render(cameras, None))
-        return RenderedImages([sheet], _numbered(cameras), f"{len(cameras)} images, {orbit.in_words}")
+        return RenderedImages([sheet], _numbered(cameras), f"{len(cameras)} images, {orbit.description}")
 
     def view_sheet(self, capture: Views | None) -> RenderedImages:
         """Render a contact sheet of the capture's views, else of the virtual views, with names and held-out marks."""

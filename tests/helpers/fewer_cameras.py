@@ -1,11 +1,11 @@
 """Fewer camera candidates, for faster tests."""
 
-from kissgs.cameras.virtual import candidates, select
+from kissgs.cameras.virtual import candidates, scored_candidates
 
 
 def try_fewer(patch, azimuths=8, radii=(1.1, 2.6)):
     """Reduce the camera candidates to some dozens, for tests that do not depend on their number."""
     patch.setattr(candidates, "AZIMUTHS", azimuths)
-    for module in (candidates, select):
-        patch.setattr(module, "WAYS_TO_LOOK", 4)
-        patch.setattr(module, "RADII", radii)
+    for module in (candidates, scored_candidates):
+        patch.setattr(module, "INSIDE_DIRECTIONS", 4)
+        patch.setattr(module, "ORBIT_RADII", radii)

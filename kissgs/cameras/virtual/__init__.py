@@ -1,1 +1,5 @@
-"""Cameras chosen for a scene that has none of its own. Takes Splats; gives Views."""
+"""Virtual cameras: cameras placed by kissgs, for a scene without a capture or beside one.
+
+Takes Splats, with the numbers, image sizes and seeds that the caller sets. Returns Views, lists of Camera, an Orbit, or
+WeightedCameras for the sensitivity. Renders thumbnails to score cameras; never uses the cameras of an evaluation.
+"""

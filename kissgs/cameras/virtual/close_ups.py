@@ -1,6 +1,6 @@
-"""Cameras close to single Gaussians, wherever these lie: they see what views of whole objects are too far away to see.
+"""``close_ups``: cameras close to single Gaussians, which see what views of whole objects are too far away to resolve.
 
-A pruned scene gets holes where no camera was near, behind and between what the others see.
+A scene that is pruned without them gets holes behind and between what other cameras see.
 """
 
 from __future__ import annotations
@@ -14,39 +14,42 @@ from kissgs.rendering.constants import NEAR
 from kissgs.rendering.local_scale import local_scale
 
 FIELD_OF_VIEW = np.radians(70)
-"""Angle along both sides, unless the camera would stand too near."""
+"""Angle of view along both sides, radians, where no longer lens is needed."""
 
 OCTAVES = 3.0
-"""Distances are from one local scale (:func:`~kissgs.rendering.local_scale.local_scale`) to so many octaves more."""
+"""Distances are one local scale (:func:`~kissgs.rendering.local_scale.local_scale`) to this many octaves more."""
 
-NEAREST = 5 * NEAR
-"""World units: a camera nearer than this would look past what it is aimed at, and takes a longer lens instead."""
+MIN_DISTANCE = 5 * NEAR
+"""Smallest distance of a camera from its target, world units. Nearer, the near plane would cut the target off; such a
+camera stands at this distance with a longer lens, which shows the same part of the scene."""
 
 UP = np.array([0.0, -1.0, 0.0])
-"""Any direction would do: it only turns the pictures."""
+"""Up direction in the images; arbitrary, because the roll does not matter."""
 
 
 def close_ups(splats: Splats, *, side: int, count: int, seed: int = 0) -> list[Camera]:
-    """Cameras for square pictures, each aimed at a Gaussian from any direction; the opaque are chosen more often.
+    """Return cameras for square images, each with a random Gaussian in the centre, from a random direction.
+
+    A Gaussian is drawn in proportion to its opacity.
 
     Args:
-        splats: finite.
-        side: of the pictures, pixels.
-        count: how many; none where no Gaussian can be seen.
-        seed: another one, other cameras.
+        splats: the scene, finite.
+        side: of the images, pixels.
+        count: number of cameras; without any visible Gaussian, the result is empty.
+        seed: random seed; equal seeds give equal cameras.
     """
-    chances = opacity(splats)
-    if not chances.sum() > 0:
+    weights = opacity(splats)
+    if not weights.sum() > 0:
         return []
     rng = np.random.default_rng(seed)
     scales = local_scale(splats)
-    found = []
-    for target in rng.choice(len(splats), count, p=chances / chances.sum()):
-        distance = scales[target] * 2 ** rng.uniform(0, OCTAVES)
-        away = max(distance, NEAREST)
-        fov = 2 * np.arctan(np.tan(FIELD_OF_VIEW / 2) * distance / away)
+    cameras = []
+    for target in rng.choice(len(splats), count, p=weights / weights.sum()):
+        wanted_distance = scales[target] * 2 ** rng.uniform(0, OCTAVES)
+        distance = max(wanted_distance, MIN_DISTANCE)
+        fov = 2 * np.arctan(np.tan(FIELD_OF_VIEW / 2) * wanted_distance / distance)
         direction = rng.standard_normal(3)
         direction /= max(float(np.linalg.norm(direction)), 1e-9)
-        middle = splats.means[target].astype(np.float64)
-        found.append(look_at(middle + away * direction, middle, UP, fov=float(fov), width=side, height=side))
-    return found
+        centre = splats.means[target].astype(np.float64)
+        cameras.append(look_at(centre + distance * direction, centre, UP, fov=float(fov), width=side, height=side))
+    return cameras

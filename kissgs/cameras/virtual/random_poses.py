@@ -1,140 +1,151 @@
-"""Cameras to learn from: at random, wherever a photograph of a scene might have been taken.
+"""``random_poses``: many virtual cameras for training, at random poses from which photographs might have been taken.
 
-:func:`kissgs.virtual_views` picks few cameras, each as good as can be, to judge by. What is fitted to pictures from
-such falls apart between them and beside them. These are many and of all sorts: near and far, high and low, from the
-sides as well, of every region of the scene, all that the critic lets pass.
+:func:`kissgs.virtual_views` selects a few cameras that are as good as possible. A scene that is trained from such views
+only falls apart between and beside them. Random cameras are near and far, high and low, around every region; only those
+with a low view score are left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from kissgs.cameras.views import Views
-from kissgs.cameras.virtual.candidates import ground
-from kissgs.cameras.virtual.regions import Region, allot, regions
-from kissgs.cameras.virtual.scene_bounds import Point, SceneBounds
+from kissgs.cameras.virtual.candidates import horizontal_axes
+from kissgs.cameras.virtual.regions import Region, allocate_cameras, find_regions
+from kissgs.cameras.virtual.scene_bounds import Vec3
 from kissgs.cameras.virtual.scene_views import scene_views
-from kissgs.cameras.virtual.select import Tried, split_views
-from kissgs.core.array_types import Float64
+from kissgs.cameras.virtual.scored_candidates import ScoredCandidates
+from kissgs.cameras.virtual.select import split_views
 from kissgs.core.errors import InvalidViewsError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
 from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera, look_at
 
-PASSABLE = 0.5
-"""How much lower than the best a view may score: as photographs of real captures do."""
+SCORE_MARGIN = 0.5
+"""How much lower than the best candidate a random camera may score; photographs of real captures stay within it."""
 
 FIELDS_OF_VIEW = np.radians((50, 90))
-"""Angles along the longer side: from phones' to wide angle."""
+"""Smallest and largest angle of view along the longer side, radians: from phone to wide-angle lens."""
 
-NEAR, FAR = 0.8, 2.6
-"""Distances from the middle, in radii of the scene, where that does not enclose the cameras."""
+MIN_DISTANCE, MAX_DISTANCE = 0.8, 2.6
+"""Distances from the centre, radii of the scene, in front of a scene with a background."""
 
-LOW, HIGH = -np.pi / 6, np.pi / 3
-"""Elevations above the ground, from the middle, likewise."""
+MIN_ELEVATION, MAX_ELEVATION = -np.pi / 6, np.pi / 3
+"""Elevations above the ground as seen from the centre, radians, where the scene does not enclose the cameras."""
 
-AIM = 0.35
-"""How far beside the middle a camera aims, radii of the scene along each axis: root mean square."""
+TARGET_SPREAD = 0.35
+"""Standard deviation of the look-at target around the centre along each axis, radii of the scene."""
 
-MOST = 4.0
-"""Times as many views as are asked for, at most, where a scene has several regions."""
+MAX_COUNT_FACTOR = 4.0
+"""Largest number of views of a scene with several regions, relative to ``count``."""
 
-PATIENCE = 8
-"""Tries for each camera, at most."""
+MAX_ATTEMPTS = 8
+"""Largest number of poses that are drawn for each camera."""
 
-Pose = tuple[Point, Point]
-"""Place and target."""
+Pose = tuple[Vec3, Vec3]
+"""Position and look-at target, world units."""
 
 
 def random_poses(
     splats: Splats, *, side: int, count: int, seed: int = 0, threads: int = 0, progress: Progress = silent
 ) -> Views:
-    """Cameras for square pictures, all about a scene that came without any; every 8th is for testing.
+    """Return views for square images from random poses around every region of a scene; every 8th is held out.
 
-    The same scene and seed give the same cameras, whatever the number of threads.
+    The result is the same for any number of threads.
 
     Args:
-        splats: finite (:func:`kissgs.clean`).
-        side: of the pictures, pixels.
-        count: how many views of a scene with one region; one with several gets more, as many as give the region that
-            shows most its ``count``, up to :data:`MOST` times that. Where a scene hardly shows, they are fewer.
-        seed: another one, other views.
-        threads: 0 means one per processor.
+        splats: the scene, finite (:func:`kissgs.clean`).
+        side: of the images, pixels.
+        count: number of views of a scene with one region, 1 or more. With several regions there are so many more that
+            the region with the largest share gets ``count``, at most :data:`MAX_COUNT_FACTOR` times ``count``. Where
+            few poses show the scene, there are fewer.
+        seed: random seed; equal seeds give equal views.
+        threads: number of threads; 0 means one per processor.
         progress: receives the stage ``"cameras"``.
 
     Raises:
-        InvalidViewsError: less than one view, or pictures of less than one pixel, are asked for.
+        InvalidViewsError: ``count`` or ``side`` is less than 1.
     """
     if count < 1:
-        raise InvalidViewsError(f"at least 1 view can be had, not {count}")
+        raise InvalidViewsError(f"there must be at least 1 view, not {count}")
     rng = np.random.default_rng(seed)
-    found: list[Camera] = []
+    cameras: list[Camera] = []
     with Workers(threads) as pool:
-        parts = regions(splats, (side, side), pool, progress, wanted=0)
-        largest = max(region.share for region in parts) or 1.0
-        most = round(count * min(1 / largest, MOST))
-        for region, share in zip(parts, allot(parts, most), strict=True):
-            found += _around(region, share, side, rng)
-    if len(found) < min(2, count):
+        regions = find_regions(splats, (side, side), pool, progress, camera_count=0)
+        largest_share = max(region.share for region in regions) or 1.0
+        total = round(count * min(1 / largest_share, MAX_COUNT_FACTOR))
+        for region, region_count in zip(regions, allocate_cameras(regions, total), strict=True):
+            cameras += _random_cameras(region, region_count, side, rng)
+    if len(cameras) < min(2, count):
         return scene_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
     progress("cameras", 1.0)
-    return split_views(found[:most])
+    return split_views(cameras[:total])
 
 
-def _around(region: Region, count: int, side: int, rng: np.random.Generator) -> list[Camera]:
-    """Random views of one region that are no worse than photographs would be."""
-    scene, tried = region.scene, region.tried
-    propose, small = _proposer(scene, tried, rng), tried.cameras[0].width
-    least = float(tried.scores.max()) - PASSABLE
-    found: list[Camera] = []
-    for _ in range(PATIENCE):
-        poses = [propose() for _ in range(count)]
+def _random_cameras(region: Region, count: int, side: int, rng: np.random.Generator) -> list[Camera]:
+    """Return at most ``count`` random cameras of a region that score within :data:`SCORE_MARGIN` of the best."""
+    candidates = region.candidates
+    sampler = _PoseSampler(candidates, rng)
+    up, thumbnail_side = candidates.bounds.up, candidates.cameras[0].width
+    min_score = float(candidates.scores.max()) - SCORE_MARGIN
+    cameras: list[Camera] = []
+    for _ in range(MAX_ATTEMPTS):
+        poses = [sampler.draw() for _ in range(count)]
         fields = rng.uniform(FIELDS_OF_VIEW[0], FIELDS_OF_VIEW[1], count)
-        thumbnails = [_take(pose, scene, fov, small) for pose, fov in zip(poses, fields, strict=True)]
-        passes = tried.scores_for(thumbnails, region.critic) >= least
-        found += [_take(poses[n], scene, fields[n], side) for n in np.flatnonzero(passes)]
-        if len(found) >= count:
+        thumbnails = [_square(pose, up, fov, thumbnail_side) for pose, fov in zip(poses, fields, strict=True)]
+        accepted = candidates.scores_of(thumbnails) >= min_score
+        cameras += [_square(poses[n], up, fields[n], side) for n in np.flatnonzero(accepted)]
+        if len(cameras) >= count:
             break
-    return found[:count]
+    return cameras[:count]
 
 
-def _take(pose: Pose, scene: SceneBounds, fov: float, side: int) -> Camera:
-    return look_at(*pose, scene.up, fov=fov, width=side, height=side)
+def _square(pose: Pose, up: Vec3, fov: float, side: int) -> Camera:
+    """Return a camera for square images at a pose; ``fov`` in radians."""
+    position, target = pose
+    return look_at(position, target, up, fov=fov, width=side, height=side)
 
 
-def _proposer(scene: SceneBounds, tried: Tried, rng: np.random.Generator) -> Callable[[], Pose]:
-    """Where to try, by the kind of scene: in a room, about an object, or before what has a background."""
-    east, north = ground(scene.up)
+class _PoseSampler:
+    """Draws random poses that suit the kind of scene."""
 
-    def towards(elevation: float) -> Float64[np.ndarray, "3"]:
-        """A direction at this angle above the ground, from any side."""
-        azimuth = rng.uniform(0, 2 * np.pi)
-        level = np.cos(azimuth) * east + np.sin(azimuth) * north
-        return np.asarray(np.cos(elevation) * level + np.sin(elevation) * scene.up)
+    def __init__(self, candidates: ScoredCandidates, rng: np.random.Generator) -> None:
+        self._bounds, self._candidates, self._rng = candidates.bounds, candidates, rng
+        self._east, self._north = horizontal_axes(candidates.bounds.up)
+        samplers = {"enclosed": self._inside, "background": self._in_front, "object": self._around_object}
+        self.draw = samplers[candidates.kind]
 
-    def elevation(low: float = LOW, high: float = HIGH) -> float:
-        return float(np.arcsin(rng.uniform(np.sin(low), np.sin(high))))
+    def _inside(self) -> Pose:
+        """Draw a position within one radius of the centre, near its height, and any roughly horizontal direction."""
+        rng, bounds = self._rng, self._bounds
+        offset = np.sqrt(rng.uniform()) * self._direction(0.0) + rng.uniform(-0.1, 0.4) * bounds.up
+        position = bounds.centre + bounds.radius * offset
+        return position, position + self._direction(self._elevation(-0.5, 0.3))
 
-    def beside(target: Point) -> Point:
-        return target + AIM * scene.radius * rng.normal(size=3)
+    def _around_object(self) -> Pose:
+        """Draw a position at 0.4 to 1 times the distance of a random candidate, looking roughly at the centre."""
+        rng, candidates, centre = self._rng, self._candidates, self._bounds.centre
+        framing = candidates.cameras[rng.integers(len(candidates.cameras))]
+        distance = rng.uniform(0.4, 1.0) * np.linalg.norm(framing.position - centre)
+        return centre + distance * self._direction(self._elevation()), self._target()
 
-    def in_a_room() -> Pose:
-        away = np.sqrt(rng.uniform()) * towards(0.0) + rng.uniform(-0.1, 0.4) * scene.up
-        place = scene.centre + scene.radius * away
-        return place, place + towards(elevation(-0.5, 0.3))
+    def _in_front(self) -> Pose:
+        """Draw a position at a log-uniform distance, looking roughly at the centre."""
+        bounds = self._bounds
+        distance = np.exp(self._rng.uniform(np.log(MIN_DISTANCE), np.log(MAX_DISTANCE)))
+        return bounds.centre + distance * bounds.radius * self._direction(self._elevation()), self._target()
 
-    def about_an_object() -> Pose:
-        framed = tried.cameras[rng.integers(len(tried.cameras))]
-        distance = rng.uniform(0.4, 1.0) * np.linalg.norm(framed.position - scene.centre)
-        return scene.centre + distance * towards(elevation()), beside(scene.centre)
+    def _direction(self, elevation: float) -> Vec3:
+        """Draw a unit vector at this elevation, radians, and a uniform azimuth."""
+        azimuth = self._rng.uniform(0, 2 * np.pi)
+        horizontal = np.cos(azimuth) * self._east + np.sin(azimuth) * self._north
+        return np.asarray(np.cos(elevation) * horizontal + np.sin(elevation) * self._bounds.up)
 
-    def before_it() -> Pose:
-        distance = np.exp(rng.uniform(np.log(NEAR), np.log(FAR)))
-        return scene.centre + distance * scene.radius * towards(elevation()), beside(scene.centre)
+    def _elevation(self, low: float = MIN_ELEVATION, high: float = MAX_ELEVATION) -> float:
+        """Draw an elevation, radians, so that directions are uniform on the sphere between the limits."""
+        return float(np.arcsin(self._rng.uniform(np.sin(low), np.sin(high))))
 
-    if tried.enclosed:
-        return in_a_room
-    return before_it if tried.whole else about_an_object
+    def _target(self) -> Vec3:
+        """Draw a look-at target around the centre."""
+        return self._bounds.centre + TARGET_SPREAD * self._bounds.radius * self._rng.normal(size=3)

@@ -1,8 +1,8 @@
-"""What there is to see in a scene, at every scale: its regions, and cameras that may be chosen for each.
+"""``find_regions``: parts of a scene that each need cameras at their own scale.
 
-The first region is the scene's densest part with all that can be seen from there. Wherever that leaves Gaussians that
-its cameras do not see, or see too small to tell apart, another region is found among these: an object far away or much
-smaller, the inside of another room.
+The first region is the densest part of the scene, with all that can be seen from there. Where its cameras leave
+Gaussians that they do not see, or see too small to resolve, further regions are found: a distant or a much smaller
+object, the inside of another room.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ import numpy as np
 from kissgs.cameras.views import black
 from kissgs.cameras.virtual.candidates import FIELD_OF_VIEW
 from kissgs.cameras.virtual.scene_bounds import SceneBounds, opacity, scene_bounds
-from kissgs.cameras.virtual.scoring import SKETCH, ViewScorer, sketch_of
-from kissgs.cameras.virtual.select import ROUNDS, Tried, choose, score_candidates
-from kissgs.core.array_types import Float64
+from kissgs.cameras.virtual.scored_candidates import ScoredCandidates, score_candidates
+from kissgs.cameras.virtual.scoring import PROXY_GAUSSIANS, ViewScorer, proxy_scene
+from kissgs.cameras.virtual.select import select_diverse
+from kissgs.core.array_types import Float64, Int
 from kissgs.core.progress import Progress
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats
@@ -26,145 +27,162 @@ from kissgs.rendering.camera import Camera, look_at
 from kissgs.rendering.coverage import Coverage
 from kissgs.rendering.local_scale import local_scale
 
-MOST = 16
-"""Regions that are looked for, at most."""
+MAX_FURTHER_REGIONS = 16
+"""Largest number of further regions that are looked for."""
 
-LEAST = 0.01
-"""Share of what a scene shows that a further region must add."""
+MIN_SHARE = 0.01
+"""Share of the scene's visible opacity that a further region must add, and below which the search ends."""
 
-POSES = 40
-"""Cameras that are tried around each further region."""
+MIN_UNSEEN_GAUSSIANS = 8
+"""Number of unseen Gaussians below which the search ends."""
 
-PROBES = 6
-"""Cameras by which it is told what a region's views show."""
+CANDIDATES_PER_REGION = 40
+"""Number of candidate cameras around each further region."""
 
-PROBE_SIDE = 160
-"""Pixels of their longer side."""
+PROBE_CAMERAS = 6
+"""Number of a region's cameras from which coverage is measured."""
 
-TYPICAL_SIDE = 384
-"""Pixels of the longer side of the images in which the scene will be looked at."""
+PROBE_SIZE = 160
+"""Longer side of the images in which coverage is measured, pixels."""
+
+TYPICAL_SIZE = 384
+"""Longer side of the images that the selected cameras will have, pixels; what they resolve depends on it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Region:
-    """A part of the scene to look at from around or within.
+    """A part of the scene that needs cameras around or inside it.
 
     Attributes:
-        scene: centre, radius and up.
-        critic: scores views of it.
-        tried: cameras that were scored.
-        share: of all that the scene shows, what only this region's cameras show, from 0 to 1.
+        candidates: scored candidate cameras, with the region's bounds.
+        share: share of the scene's visible opacity that only this region's cameras show, 0 to 1; of the first region,
+            all that its cameras show.
     """
 
-    scene: SceneBounds
-    critic: ViewScorer
-    tried: Tried
+    candidates: ScoredCandidates
     share: float
 
     def cameras(self, count: int) -> list[Camera]:
-        """The best of them, far from each other."""
-        return [self.tried.cameras[n] for n in choose(self.tried, self.scene, count)]
+        """Return ``count`` good cameras that are far from each other."""
+        return [self.candidates.cameras[n] for n in select_diverse(self.candidates, count)]
 
 
-def regions(splats: Splats, size: tuple[int, int], pool: Workers, progress: Progress, *, wanted: int) -> list[Region]:
-    """Regions of a scene in the order in which they were found, at least one.
+def find_regions(
+    splats: Splats, size: tuple[int, int], pool: Workers, progress: Progress, *, camera_count: int
+) -> list[Region]:
+    """Return the regions of a scene in the order in which they were found, at least one; shares add up to 1.
 
     Args:
-        splats: finite.
-        size: of the images, width and height in pixels.
-        pool: to render with.
+        splats: the scene, finite.
+        size: (width, height) of the images for which cameras are wanted, pixels.
+        pool: threads to render with.
         progress: receives the stage ``"cameras"``.
-        wanted: cameras that will be chosen in all.
+        camera_count: number of cameras that will be selected for the first region, at most.
 
     Raises:
-        InvalidViewsError: an image has no pixel.
+        InvalidViewsError: a side of the image is less than 1.
     """
-    scene, critic, tried = score_candidates(splats, size, pool, progress)
-    for _ in range(ROUNDS):
-        if len(tried.good()) >= 2 * wanted:
+    candidates = score_candidates(splats, size, pool, progress).refined(camera_count)
+    proxy = proxy_scene(splats)
+    visible, coverage, spacing = _visible_opacity(proxy), Coverage(proxy), local_scale(proxy)
+    regions = [Region(candidates, 1.0)]
+    unseen = visible * (1 - _updated_coverage(coverage, proxy, regions[0], pool))
+    gains = [float(visible.sum() - unseen.sum())]
+    for _ in range(MAX_FURTHER_REGIONS):
+        remaining = np.flatnonzero(unseen > 0.5 * visible)
+        if len(remaining) < MIN_UNSEEN_GAUSSIANS or visible[remaining].sum() < MIN_SHARE * visible.sum():
             break
-        tried = tried.with_more(scene, critic)
-    sketch = sketch_of(splats)
-    worth = _worth(sketch)
-    coverage, spacing = Coverage(sketch), local_scale(sketch)
-    found = [Region(scene, critic, tried, 1.0)]
-    unseen = worth * (1 - _look(sketch, found[0], coverage, pool))
-    shares = [float(worth.sum() - unseen.sum())]
-    for _ in range(MOST):
-        left = np.flatnonzero(unseen > 0.5 * worth)
-        if len(left) < 8 or worth[left].sum() < LEAST * worth.sum():
-            break
-        densest = left[np.argsort(spacing[left], kind="stable")[len(left) // 20]]
-        start = sketch.means[densest].astype(np.float64), 4 * float(spacing[densest])
-        part = scene_bounds(sketch.select(left), start)
-        part = SceneBounds(part.centre, part.radius, scene.up)
-        region = _region(splats, part, tried.cameras[0], pool, progress)
+        bounds = replace(_densest_part(proxy, remaining, spacing), up=candidates.bounds.up)
+        region = _further_region(splats, bounds, candidates.cameras[0], pool, progress)
         before = float(unseen.sum())
-        unseen = worth * (1 - _look(sketch, region, coverage, pool))
+        unseen = visible * (1 - _updated_coverage(coverage, proxy, region, pool))
         gain = before - float(unseen.sum())
-        if gain >= LEAST * float(worth.sum()):
-            found.append(region)
-            shares.append(gain)
-        near = np.linalg.norm(sketch.means[left] - part.centre, axis=1) <= 2 * part.radius
-        worth[left[near]] = 0.0  # looked at; what is still hidden there shows from nowhere
-        unseen = np.minimum(unseen, worth)
-    total = max(sum(shares), 1e-30)
-    return [replace(region, share=share / total) for region, share in zip(found, shares, strict=True)]
+        if gain >= MIN_SHARE * float(visible.sum()):
+            regions.append(region)
+            gains.append(gain)
+        near = np.linalg.norm(proxy.means[remaining] - bounds.centre, axis=1) <= 2 * bounds.radius
+        visible[remaining[near]] = 0.0  # what its cameras still do not show is hidden from all sides
+        unseen = np.minimum(unseen, visible)
+    total = max(sum(gains), 1e-30)
+    return [replace(region, share=gain / total) for region, gain in zip(regions, gains, strict=True)]
 
 
-def allot(found: list[Region], count: int, least: int = 4) -> list[int]:
-    """How many of ``count`` views each region gets: one at least, else by what it shows.
+def allocate_cameras(regions: list[Region], count: int, min_per_region: int = 4) -> list[int]:
+    """Divide ``count`` cameras among regions in proportion to their shares.
 
-    A region whose share is less than ``least`` views counts as if it were that much.
+    Args:
+        regions: one or more.
+        count: number of cameras, 1 or more.
+        min_per_region: a region whose share is less than this many cameras counts as if it had so many; reduced where
+            ``count`` does not suffice. Each region gets at least one.
+
+    Returns:
+        The number of cameras for each region. The sum is more than ``count`` only if there are more regions than that.
     """
-    least = min(least, max(1, count // len(found)))
-    wanted = np.maximum(np.array([region.share for region in found]) * count, least)
-    given = np.maximum(np.floor(wanted * count / wanted.sum()), min(least, 1)).astype(int)
-    given[0] += max(0, count - int(given.sum()))
-    return [int(n) for n in given]
+    min_per_region = min(min_per_region, max(1, count // len(regions)))
+    wanted = np.maximum(np.array([region.share for region in regions]) * count, min_per_region)
+    counts = np.maximum(np.floor(wanted * count / wanted.sum()), min(min_per_region, 1)).astype(int)
+    counts[0] += max(0, count - int(counts.sum()))
+    return [int(n) for n in counts]
 
 
-def _worth(sketch: Splats) -> Float64[np.ndarray, " n"]:
-    """What each Gaussian could show to a camera nearby; nothing where no renderer draws it."""
-    visible = opacity(sketch)
+def _visible_opacity(splats: Splats) -> Float64[np.ndarray, " n"]:
+    """Return opacities, ``(n,)`` float64, with 0 for those at or below 1/255, which no renderer draws."""
+    visible = opacity(splats)
     return np.where(visible > 1 / 255, visible, 0.0)
 
 
-def _look(sketch: Splats, region: Region, coverage: Coverage, pool: Workers) -> Float64[np.ndarray, " n"]:
-    """Coverage of the sketch once some of the region's views were rendered."""
+def _updated_coverage(coverage: Coverage, proxy: Splats, region: Region, pool: Workers) -> Float64[np.ndarray, " n"]:
+    """Add some of the region's cameras to ``coverage``; return the coverage of each Gaussian of the proxy, 0 to 1."""
     from kissgs.rendering.cpu.frame import add_sensitivities, draw
 
-    for camera in region.cameras(PROBES):
-        probe = camera.at_most(PROBE_SIDE)
-        shown = Sensitivity.none(len(sketch), 0)
-        add_sensitivities(draw(sketch, probe, black(), pool), 1.0, 0.0, shown, pool)
-        coverage.add(probe, shown.color_weight, TYPICAL_SIDE / PROBE_SIDE)
+    for camera in region.cameras(PROBE_CAMERAS):
+        probe = camera.at_most(PROBE_SIZE)
+        sensitivity = Sensitivity.none(len(proxy), 0)
+        add_sensitivities(draw(proxy, probe, black(), pool), 1.0, 0.0, sensitivity, pool)
+        coverage.add(probe, sensitivity.color_weight, TYPICAL_SIZE / PROBE_SIZE)
     return coverage.share
 
 
-def _region(splats: Splats, part: SceneBounds, like: Camera, pool: Workers, progress: Progress) -> Region:
-    """Score views all around a further part of the scene, of the scene in front of and behind it too."""
-    distance = np.linalg.norm(splats.means - part.centre, axis=1)
-    near = distance <= 6 * part.radius
-    sketch = _joined(
-        sketch_of(splats.select(np.flatnonzero(near)), SKETCH // 2),
-        sketch_of(splats.select(np.flatnonzero(~near)), SKETCH // 2),
+def _densest_part(proxy: Splats, remaining: Int[np.ndarray, " m"], spacing: Float64[np.ndarray, " n"]) -> SceneBounds:
+    """Return the bounds of the part where the Gaussians ``remaining`` are densest.
+
+    Mean shift starts at the 5 % quantile of spacing, because the smallest spacings are often single pairs.
+    """
+    densest = remaining[np.argsort(spacing[remaining], kind="stable")[len(remaining) // 20]]
+    start = proxy.means[densest].astype(np.float64), 4 * float(spacing[densest])
+    return scene_bounds(proxy.select(remaining), start)
+
+
+def _further_region(splats: Splats, bounds: SceneBounds, like: Camera, pool: Workers, progress: Progress) -> Region:
+    """Return a region with candidates all around ``bounds``, whose thumbnails have the size of ``like``.
+
+    Half of the proxy scene shows what is near the region, the other half what is in front of it and behind.
+    """
+    distance = np.linalg.norm(splats.means - bounds.centre, axis=1)
+    near = distance <= 6 * bounds.radius
+    proxy = _concatenated(
+        proxy_scene(splats.select(np.flatnonzero(near)), PROXY_GAUSSIANS // 2),
+        proxy_scene(splats.select(np.flatnonzero(~near)), PROXY_GAUSSIANS // 2),
     )
-    critic = ViewScorer(sketch, part, pool, progress)
-    cameras = list(_poses(part, like))
-    return Region(part, critic, Tried(cameras, critic.judge(cameras), False, False, np.zeros(len(cameras))), 0.0)
+    scorer = ViewScorer(proxy, bounds, pool, progress)
+    cameras = list(_surrounding_cameras(bounds, like))
+    return Region(ScoredCandidates(scorer, "object", cameras, scorer.measure(cameras), np.zeros(len(cameras))), 0.0)
 
 
-def _poses(part: SceneBounds, like: Camera) -> Iterator[Camera]:
-    """From all directions, evenly, at distances at which the part fills the image or leaves some air around."""
-    for n in range(POSES):
-        height, turn = 1 - (2 * n + 1) / POSES, n * np.pi * (3 - np.sqrt(5))
-        flat = np.sqrt(1 - height**2)
-        direction = np.array([flat * np.cos(turn), height, flat * np.sin(turn)])
-        place = part.centre + part.radius * (1.3, 2.0, 3.0)[n % 3] * direction
-        yield look_at(place, part.centre, part.up, fov=FIELD_OF_VIEW, width=like.width, height=like.height)
+def _surrounding_cameras(bounds: SceneBounds, like: Camera) -> Iterator[Camera]:
+    """Yield cameras evenly from all directions (a Fibonacci sphere), at 1.3, 2 and 3 radii in turn.
+
+    The region fills the image of the nearest, and has a margin around it in that of the farthest.
+    """
+    for n in range(CANDIDATES_PER_REGION):
+        height, azimuth = 1 - (2 * n + 1) / CANDIDATES_PER_REGION, n * np.pi * (3 - np.sqrt(5))  # the golden angle
+        horizontal = np.sqrt(1 - height**2)
+        direction = np.array([horizontal * np.cos(azimuth), height, horizontal * np.sin(azimuth)])
+        position = bounds.centre + bounds.radius * (1.3, 2.0, 3.0)[n % 3] * direction
+        yield look_at(position, bounds.centre, bounds.up, fov=FIELD_OF_VIEW, width=like.width, height=like.height)
 
 
-def _joined(first: Splats, second: Splats) -> Splats:
+def _concatenated(first: Splats, second: Splats) -> Splats:
     names = ("means", "quats", "scales", "opacities", "sh0", "shN")
     return Splats(**{name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names})

@@ -1,4 +1,4 @@
-"""What can be told of a scene from its Gaussians alone: where its middle is, how large it is, which way is up."""
+"""``scene_bounds``: centre, radius and up direction of a scene, estimated from its Gaussians alone."""
 
 from __future__ import annotations
 
@@ -9,90 +9,107 @@ import numpy as np
 from kissgs.core.array_types import Float64
 from kissgs.core.splats import Splats
 
-Point = Float64[np.ndarray, "3"]
+Vec3 = Float64[np.ndarray, "3"]
+"""``(3,)`` float64, a point or a direction in world space."""
 
-UP_OF_FILES = (np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
-"""COLMAP's worlds have y down, more or less; nerfstudio's z up. Where nothing speaks for another, it is the first."""
+UP_AXES = (np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+"""Up directions of scene files: COLMAP's y points roughly down, nerfstudio's z up. The first is the default."""
 
 
 @dataclass(frozen=True, slots=True)
 class SceneBounds:
-    """Where what matters is.
+    """Position, size and orientation of a scene's densest part.
 
     Attributes:
-        centre: of the densest part.
-        radius: half of what belongs to that part lies within it.
-        up: unit vector.
+        centre: ``(3,)`` float64, centre of the densest part, world units.
+        radius: distance from the centre within which half of the opacity of that part lies, world units.
+        up: ``(3,)`` float64 unit vector.
     """
 
-    centre: Point
+    centre: Vec3
     radius: float
-    up: Point
+    up: Vec3
 
 
-def scene_bounds(splats: Splats, start: tuple[Point, float] | None = None) -> SceneBounds:
-    """Middle, size and up of a scene; Gaussians count by their opacity, so floaters and sky hardly do.
+def scene_bounds(splats: Splats, start: tuple[Vec3, float] | None = None) -> SceneBounds:
+    """Estimate centre, radius and up direction of a scene.
 
-    A capture's attention shows in the density of Gaussians: the middle is found by climbing it (mean shift) from the
-    median, at a scale that follows what is found.
+    Gaussians count by their opacity, so that floaters and sky have little influence. A capture has most Gaussians where
+    its photographs point. The centre is a mode of that density, found by mean shift from the weighted median of the
+    positions; the bandwidth is the current radius.
 
     Args:
-        splats: finite.
-        start: place and radius from which to climb in place of the median's.
+        splats: the scene, finite. Without any opacity, the result is the unit sphere around the origin.
+        start: centre, ``(3,)``, and radius from which mean shift starts instead, world units.
     """
     means = splats.means.astype(np.float64)
     weights = opacity(splats)
     if not weights.sum() > 0:
-        return SceneBounds(np.zeros(3), 1.0, UP_OF_FILES[0])
-    centre = np.array([weighted_median(axis, weights) for axis in means.T]) if start is None else start[0]
+        return SceneBounds(np.zeros(3), 1.0, UP_AXES[0])
+    centre = np.array([weighted_quantile(axis, weights) for axis in means.T]) if start is None else start[0]
     distance = np.linalg.norm(means - centre, axis=1)
-    size = float(np.exp(np.median(splats.scales.max(axis=1)).astype(np.float64)))
-    smallest = max(2 * size, 1e-5 * float(np.abs(centre).max()), 1e-9)  # float32 positions are no finer
-    radius = max(weighted_median(distance, weights) if start is None else start[1], smallest)
+    gaussian_size = float(np.exp(np.median(splats.scales.max(axis=1)).astype(np.float64)))
+    min_radius = max(2 * gaussian_size, 1e-5 * float(np.abs(centre).max()), 1e-9)  # float32 positions are no finer
+    radius = max(weighted_quantile(distance, weights) if start is None else start[1], min_radius)
     for _ in range(30):
-        pull = weights * np.exp(-0.5 * (distance / radius) ** 2)
-        moved = pull @ means / pull.sum()
-        distance = np.linalg.norm(means - moved, axis=1)
+        kernel = weights * np.exp(-0.5 * (distance / radius) ** 2)
+        new_centre = kernel @ means / kernel.sum()
+        distance = np.linalg.norm(means - new_centre, axis=1)
         near = distance < 2.5 * radius
-        shrunk = max(weighted_median(distance[near], weights[near]), smallest) if near.any() else radius
-        still = np.linalg.norm(moved - centre) < 0.01 * radius and abs(shrunk - radius) < 0.01 * radius
-        centre, radius = moved, shrunk
-        if still:
+        new_radius = max(weighted_quantile(distance[near], weights[near]), min_radius) if near.any() else radius
+        moved = np.linalg.norm(new_centre - centre)
+        converged = moved < 0.01 * radius and abs(new_radius - radius) < 0.01 * radius
+        centre, radius = new_centre, new_radius
+        if converged:
             break
     return SceneBounds(centre, radius, _up(splats, weights * (distance < 3 * radius), means - centre))
 
 
 def opacity(splats: Splats) -> Float64[np.ndarray, " N"]:
-    """Opacities from 0 to 1."""
+    """Return opacities after the sigmoid, ``(N,)`` float64, 0 to 1."""
     return 1 / (1 + np.exp(-splats.opacities.astype(np.float64)))
 
 
-def weighted_median(values: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"], share: float = 0.5) -> float:
-    """The value below which ``share`` of the weight lies; 0 for no values."""
+def weighted_quantile(
+    values: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"], quantile: float = 0.5
+) -> float:
+    """Return the value at which the fraction ``quantile`` of the weight is reached; by default, the weighted median.
+
+    Args:
+        values: ``(n,)`` float64. Without any, the result is 0.
+        weights: ``(n,)`` float64, 0 or more.
+        quantile: 0 to 1.
+    """
     if not len(values):
         return 0.0
     order = np.argsort(values, kind="stable")
-    total = np.cumsum(weights[order])
-    return float(values[order][min(np.searchsorted(total, share * total[-1]), len(values) - 1)])
+    cumulative = np.cumsum(weights[order])
+    return float(values[order][min(np.searchsorted(cumulative, quantile * cumulative[-1]), len(values) - 1)])
 
 
-def _up(splats: Splats, weights: Float64[np.ndarray, " N"], offsets: Float64[np.ndarray, "N 3"]) -> Point:
-    """Along the axis that files use for it; tilted to the ground's normal if there is a ground.
+def _up(splats: Splats, weights: Float64[np.ndarray, " N"], offsets: Float64[np.ndarray, "N 3"]) -> Vec3:
+    """Return the up direction: the normal of the ground, or the axis that files use if there is no ground.
 
-    Flat Gaussians lie on surfaces, and their normals tell those that lie level. Which end is up: things stand on the
-    ground, dense below and thinning out above.
+    The short axes of flat Gaussians are surface normals; most of them near one file axis select that axis. The sign
+    follows from the skew of heights: objects stand on the ground, so that density falls off upwards.
+
+    Args:
+        splats: the scene.
+        weights: ``(N,)`` float64, 0 or more; 0 for Gaussians that do not count.
+        offsets: ``(N, 3)`` float64, positions relative to the centre.
     """
-    axis = UP_OF_FILES[0]
+    axis = UP_AXES[0]
     if not weights.any():
         return axis
-    spread = np.sort(splats.scales.astype(np.float64), axis=1)
-    area = np.exp(spread[:, 1] + spread[:, 2])
-    flat = np.clip(spread[:, 1] - spread[:, 0], 0, 1) * np.minimum(area, np.quantile(area, 0.95)) * weights
-    normals = _thin_axes(splats)
-    level = [float(flat @ (np.abs(normals @ candidate) > np.cos(np.radians(15)))) for candidate in UP_OF_FILES]
-    if level[1] > 2 * level[0] + 0.1 * flat.sum():
-        axis = UP_OF_FILES[1]
-    axis = _tilted(axis, normals, flat)
+    log_scales = np.sort(splats.scales.astype(np.float64), axis=1)
+    area = np.exp(log_scales[:, 1] + log_scales[:, 2])
+    flatness = np.clip(log_scales[:, 1] - log_scales[:, 0], 0, 1)
+    flat_weights = flatness * np.minimum(area, np.quantile(area, 0.95)) * weights
+    normals = _short_axes(splats)
+    level = [float(flat_weights @ (np.abs(normals @ each) > np.cos(np.radians(15)))) for each in UP_AXES]
+    if level[1] > 2 * level[0] + 0.1 * flat_weights.sum():
+        axis = UP_AXES[1]
+    axis = _ground_normal(axis, normals, flat_weights)
     heights = offsets @ axis
     mean = weights @ heights / weights.sum()
     deviation = np.sqrt(weights @ (heights - mean) ** 2 / weights.sum())
@@ -100,20 +117,23 @@ def _up(splats: Splats, weights: Float64[np.ndarray, " N"], offsets: Float64[np.
     return -axis if skew < -0.3 else axis
 
 
-def _tilted(axis: Point, normals: Float64[np.ndarray, "N 3"], weights: Float64[np.ndarray, " N"]) -> Point:
-    """The ground's normal if most surfaces within 30° of ``axis`` agree on one, else ``axis``."""
-    for narrow, share in ((30, 0.35), (15, 0.0), (8, 0.0)):
-        along = normals @ axis
-        near = (np.abs(along) > np.cos(np.radians(narrow))) * weights
-        if near.sum() <= share * weights.sum() or not near.any():
+def _ground_normal(axis: Vec3, normals: Float64[np.ndarray, "N 3"], weights: Float64[np.ndarray, " N"]) -> Vec3:
+    """Return the mean normal near ``axis``, or ``axis`` if less than 35 % of the weight has a normal within 30° of it.
+
+    The cone narrows in three steps, so that walls and slopes do not tilt the result.
+    """
+    for degrees, min_share in ((30, 0.35), (15, 0.0), (8, 0.0)):
+        cosines = normals @ axis
+        near = (np.abs(cosines) > np.cos(np.radians(degrees))) * weights
+        if near.sum() <= min_share * weights.sum() or not near.any():
             return axis
-        mean = (near * np.sign(along)) @ normals
+        mean = (near * np.sign(cosines)) @ normals
         axis = mean / np.linalg.norm(mean)
     return axis
 
 
-def _thin_axes(splats: Splats) -> Float64[np.ndarray, "N 3"]:
-    """The direction in which each Gaussian is thinnest."""
+def _short_axes(splats: Splats) -> Float64[np.ndarray, "N 3"]:
+    """Return the direction of each Gaussian's smallest scale, ``(N, 3)`` float64 unit vectors."""
     w, x, y, z = splats.quats.astype(np.float64).T
     columns = np.array(
         [
@@ -122,5 +142,5 @@ def _thin_axes(splats: Splats) -> Float64[np.ndarray, "N 3"]:
             [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-    thinnest = splats.scales.argmin(axis=1)
-    return np.asarray(columns[thinnest, :, np.arange(len(splats))])
+    shortest = splats.scales.argmin(axis=1)
+    return np.asarray(columns[shortest, :, np.arange(len(splats))])

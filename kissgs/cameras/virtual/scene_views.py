@@ -1,10 +1,10 @@
-"""Cameras that together see the whole of a scene that came without photographs."""
+"""``scene_views``: virtual cameras that together see every region of a scene."""
 
 from __future__ import annotations
 
 from kissgs.cameras.views import Views
-from kissgs.cameras.virtual.regions import allot, regions
-from kissgs.cameras.virtual.select import check_wanted, sized, split_views
+from kissgs.cameras.virtual.regions import allocate_cameras, find_regions
+from kissgs.cameras.virtual.select import check_request, split_views, with_size
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
 from kissgs.core.threads import Workers
@@ -19,24 +19,25 @@ def scene_views(
     threads: int = 0,
     progress: Progress = silent,
 ) -> Views:
-    """Cameras for every region of a scene, in number by what it shows; every 8th is for testing.
+    """Return views of every region of a scene, more of regions that show more; every 8th is held out.
 
-    The same scene gives the same cameras, whatever the number of threads.
+    The result is the same for any number of threads.
 
     Args:
-        splats: finite (:func:`kissgs.clean`).
+        splats: the scene, finite (:func:`kissgs.clean`).
         width: of the images, pixels.
         height: of the images, pixels.
-        count: how many views.
-        threads: 0 means one per processor.
+        count: number of views, 1 or more.
+        threads: number of threads; 0 means one per processor.
         progress: receives the stage ``"cameras"``.
 
     Raises:
-        InvalidViewsError: less than one view, or images of less than one pixel, are asked for.
+        InvalidViewsError: ``count``, ``width`` or ``height`` is less than 1.
     """
-    check_wanted(count, (width, height))
+    check_request(count, (width, height))
     with Workers(threads) as pool:
-        found = regions(splats, (width, height), pool, progress, wanted=count)
+        regions = find_regions(splats, (width, height), pool, progress, camera_count=count)
     progress("cameras", 1.0)
-    cameras = [camera for region, n in zip(found, allot(found, count), strict=True) for camera in region.cameras(n)]
-    return split_views(sized(cameras[:count], width, height))
+    counts = allocate_cameras(regions, count)
+    cameras = [camera for region, n in zip(regions, counts, strict=True) for camera in region.cameras(n)]
+    return split_views(with_size(cameras[:count], width, height))

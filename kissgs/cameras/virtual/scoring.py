@@ -1,4 +1,4 @@
-"""How good a view is, judged by a thumbnail of it."""
+"""View scores: how useful a camera is, from a thumbnail of what it sees."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kissgs.cameras.views import black
-from kissgs.cameras.virtual.scene_bounds import SceneBounds, weighted_median
+from kissgs.cameras.virtual.scene_bounds import SceneBounds, weighted_quantile
 from kissgs.core.array_types import Float64
 from kissgs.core.progress import Progress
 from kissgs.core.splats import SH_C0, Splats
@@ -15,112 +15,138 @@ from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu.frame import draw
 
-SKETCH = 30_000
-"""Gaussians in a thumbnail. Of larger scenes, evenly many are left out and the rest enlarged."""
+PROXY_GAUSSIANS = 30_000
+"""Largest number of Gaussians in the proxy scene that thumbnails show."""
 
 TOO_NEAR = 0.35
-"""Matter nearer than this, in radii of the scene's middle, is in the way."""
+"""Depth in radii of the scene; anything nearer to the camera counts as an obstruction."""
+
+CENTRE_SCALE = 30.0
+"""Factor by which the mark of central Gaussians is scaled, so that it uses half the range of a colour channel."""
 
 
 @dataclass(frozen=True, slots=True)
 class ViewStats:
-    """What a camera would see, as means over the picture.
+    """Statistics of a thumbnail.
 
     Attributes:
-        covered: alpha.
-        coarse: logarithm of the size of Gaussians, in world units; the median. What was not captured is coarse.
-        blurred: logarithm of the angle under which they are seen, in radians; the median.
-        near: the share of matter right before the lens.
-        middle: the share of the scene's middle.
+        alpha: mean alpha, 0 to 1.
+        log_size: median logarithm of the largest scale of the Gaussians, world units. Parts that no photograph shows
+            have large Gaussians.
+        log_angle: median logarithm of the angle that these scales subtend, radians.
+        near: mean alpha of what is nearer than :data:`TOO_NEAR`, 0 to 1.
+        centre: mean alpha of the central Gaussians, those within two radii of the centre, 0 to 1.
     """
 
-    covered: float
-    coarse: float
-    blurred: float
+    alpha: float
+    log_size: float
+    log_angle: float
     near: float
-    middle: float
+    centre: float
 
 
 class ViewScorer:
-    """Takes thumbnails and judges them."""
+    """Renders thumbnails of a proxy scene and measures their statistics.
 
-    def __init__(self, sketch: Splats, scene: SceneBounds, pool: Workers, progress: Progress) -> None:
-        self._scene, self._pool, self._progress = scene, pool, progress
-        self._sketch = sketch
-        self._size = sketch.scales.max(axis=1)
-        self._middle = np.linalg.norm(sketch.means - scene.centre, axis=1) < 2 * scene.radius
-        self._done = 0
+    Attributes:
+        bounds: bounds of the part of the scene that views should show.
+    """
 
-    def judge(self, cameras: list[Camera]) -> list[ViewStats]:
-        """What each sees."""
+    def __init__(self, proxy: Splats, bounds: SceneBounds, pool: Workers, progress: Progress) -> None:
+        """Store the arguments; nothing is rendered.
+
+        Args:
+            proxy: scene to render, from :func:`proxy_scene`.
+            bounds: bounds of the part of the scene that views should show.
+            pool: threads to render with.
+            progress: receives the stage ``"cameras"``.
+        """
+        self.bounds = bounds
+        self._proxy, self._pool, self._progress = proxy, pool, progress
+        self._log_sizes = proxy.scales.max(axis=1)
+        self._central = np.linalg.norm(proxy.means - bounds.centre, axis=1) < 2 * bounds.radius
+        self._measured = 0
+
+    def measure(self, cameras: list[Camera]) -> list[ViewStats]:
+        """Render a thumbnail from each camera, at the camera's size, and return its statistics."""
 
         def report(fraction: float) -> None:
-            tried = self._done + fraction * len(cameras)
-            self._progress("cameras", tried / (tried + 300))  # how many will follow is not known
+            measured = self._measured + fraction * len(cameras)
+            self._progress("cameras", measured / (measured + 300))  # the number of further cameras is unknown
 
-        found = self._pool.map(self._look, cameras, report)
-        self._done += len(cameras)
-        return found
+        stats = self._pool.map(self._stats, cameras, report)
+        self._measured += len(cameras)
+        return stats
 
-    def _look(self, camera: Camera) -> ViewStats:
-        """Draw the scene with size, depth and place for colours, so that the picture holds their visible means."""
-        depth = np.log(np.maximum(self._sketch.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3], 1e-12))
-        values = self._size, depth, 30.0 * self._middle
-        colours = np.stack([_as_colour(value) for value in values], axis=1)
-        s = self._sketch
-        painted = Splats(
-            means=s.means,
-            quats=s.quats,
-            scales=s.scales,
-            opacities=s.opacities,
+    def _stats(self, camera: Camera) -> ViewStats:
+        """Render log size, log depth and centrality as the three colours, so that blending averages what is visible."""
+        proxy = self._proxy
+        log_depth = np.log(np.maximum(proxy.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3], 1e-12))
+        values = self._log_sizes, log_depth, CENTRE_SCALE * self._central
+        colours = np.stack([_to_sh0(value) for value in values], axis=1)
+        coloured = Splats(
+            means=proxy.means,
+            quats=proxy.quats,
+            scales=proxy.scales,
+            opacities=proxy.opacities,
             sh0=colours.astype(np.float32),
-            shN=np.empty((len(s), 0, 3), np.float32),
+            shN=np.empty((len(proxy), 0, 3), np.float32),
         )
-        with Workers(1) as alone:
-            frame = draw(painted, camera, black(), alone)
+        with Workers(1) as single:  # cameras are already rendered in parallel
+            frame = draw(coloured, camera, black(), single)
         alpha = 1 - frame.transmittance.astype(np.float64)
-        size, depth, middle = (_from_colour(frame.image[:, :, c] / np.maximum(alpha, 1e-6)) for c in range(3))
-        near = (np.exp(depth) < TOO_NEAR * self._scene.radius) * alpha
+        size, depth, centre = (_from_colour(frame.image[:, :, c] / np.maximum(alpha, 1e-6)) for c in range(3))
+        near = (np.exp(depth) < TOO_NEAR * self.bounds.radius) * alpha
         return ViewStats(
-            covered=float(alpha.mean()),
-            coarse=weighted_median(size.ravel(), alpha.ravel()),
-            blurred=weighted_median((size - depth).ravel(), alpha.ravel()),
+            alpha=float(alpha.mean()),
+            log_size=weighted_quantile(size.ravel(), alpha.ravel()),
+            log_angle=weighted_quantile((size - depth).ravel(), alpha.ravel()),
             near=float(near.mean()),
-            middle=float((middle / 30 * alpha).mean()),
+            centre=float((centre / CENTRE_SCALE * alpha).mean()),
         )
 
 
-def _as_colour(logarithm: np.ndarray) -> np.ndarray:
+def _to_sh0(logarithm: np.ndarray) -> np.ndarray:
+    """Return the SH coefficient of a colour from 0 to 1 that stands for logarithms from -30 to 30."""
     return (np.clip(logarithm / 60 + 0.5, 0, 1) - 0.5) / SH_C0
 
 
 def _from_colour(colour: np.ndarray) -> np.ndarray:
+    """Return the logarithm that a colour from 0 to 1 stands for."""
     return (colour - 0.5) * 60
 
 
-def sketch_of(splats: Splats, most: int = SKETCH) -> Splats:
-    """The scene without gloss, in ``most`` Gaussians at most."""
-    step = max(1, -(-len(splats) // most))
-    thinned = splats.select(slice(None, None, step))
+def proxy_scene(splats: Splats, max_count: int = PROXY_GAUSSIANS) -> Splats:
+    """Return at most ``max_count`` evenly selected Gaussians, without SH rest, enlarged to cover the same area."""
+    step = max(1, -(-len(splats) // max_count))
+    selected = splats.select(slice(None, None, step))
     return Splats(
-        means=np.ascontiguousarray(thinned.means),
-        quats=np.ascontiguousarray(thinned.quats),
-        scales=thinned.scales + np.float32(np.log(step) / 2),
-        opacities=np.ascontiguousarray(thinned.opacities),
-        sh0=np.ascontiguousarray(thinned.sh0),
-        shN=np.empty((len(thinned), 0, 3), np.float32),
+        means=np.ascontiguousarray(selected.means),
+        quats=np.ascontiguousarray(selected.quats),
+        scales=selected.scales + np.float32(np.log(step) / 2),
+        opacities=np.ascontiguousarray(selected.opacities),
+        sh0=np.ascontiguousarray(selected.sh0),
+        shN=np.empty((len(selected), 0, 3), np.float32),
     )
 
 
-def scores_of(seen: list[ViewStats], *, whole: bool = True) -> Float64[np.ndarray, " n"]:
-    """1 for a sharp picture of the scene's middle, without holes and with nothing right before the lens; else less.
+def view_scores(stats: list[ViewStats], *, fills_image: bool = True) -> Float64[np.ndarray, " n"]:
+    """Return the view score of each camera, ``(n,)`` float64, at most 1.
 
-    ``whole``: the scene should fill the picture; if false, it stands alone, and only next to nothing is too little.
+    1 is a sharp image of the scene's centre, without holes and with nothing right in front of the camera. Size and
+    angle of Gaussians are compared with the best tenth of the views that show enough.
+
+    Args:
+        stats: statistics of all cameras to compare, at least one.
+        fills_image: whether the scene should fill the image; if not, an object stands alone, and only an image that is
+            much emptier than the others is a fault.
     """
-    names = ("covered", "coarse", "blurred", "near", "middle")
-    covered, coarse, blurred, near, middle = (np.array([getattr(view, name) for view in seen]) for name in names)
-    filled = covered >= 0.5 * covered.max()
-    excess = [np.maximum(value - np.quantile(value[filled], 0.1), 0) for value in (coarse, blurred)]
-    holes = 2 * (1 - covered) if whole else np.maximum(0.5 - covered / max(covered.max(), 1e-9), 0)
-    missed = np.maximum(1 - middle / 0.25, 0) if whole else np.zeros(len(seen))
-    return np.asarray(1 - holes - 0.4 * excess[0] - 0.35 * excess[1] - near - 0.5 * missed)
+    names = ("alpha", "log_size", "log_angle", "near", "centre")
+    alpha, log_size, log_angle, near, centre = (np.array([getattr(view, name) for view in stats]) for name in names)
+    enough = alpha >= 0.5 * alpha.max()
+    excess_size, excess_angle = (
+        np.maximum(value - np.quantile(value[enough], 0.1), 0) for value in (log_size, log_angle)
+    )
+    holes = 2 * (1 - alpha) if fills_image else np.maximum(0.5 - alpha / max(alpha.max(), 1e-9), 0)
+    off_centre = np.maximum(1 - centre / 0.25, 0) if fills_image else np.zeros(len(stats))
+    return np.asarray(1 - holes - 0.4 * excess_size - 0.35 * excess_angle - near - 0.5 * off_centre)

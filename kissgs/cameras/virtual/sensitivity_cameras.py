@@ -1,4 +1,7 @@
-"""From where a scene is watched while it is compressed: where it was photographed from, and a little all around."""
+"""``sensitivity_cameras``: cameras that sensitivity and the colour refit see a scene from.
+
+These are a capture's cameras and some virtual ones around the scene, or virtual ones alone.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +14,12 @@ from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.sensitivity import WeightedCameras
 
-AROUND = 0.3
-"""Weight of all virtual cameras together, in units of that of the photographs': what was never photographed must not
-fall apart, and hardly anything is lost for what was."""
+VIRTUAL_WEIGHT = 0.3
+"""Weight of all virtual cameras together, relative to all cameras of a capture. Parts that no photograph shows must not
+fall apart, and the photographed parts lose almost nothing by it."""
+
+WIDE_FOCAL_SCALE = 0.6
+"""Focal length of every other virtual camera, relative to the others: parts just outside their images count too."""
 
 
 def sensitivity_cameras(
@@ -25,40 +31,40 @@ def sensitivity_cameras(
     threads: int = 0,
     progress: Progress = silent,
 ) -> WeightedCameras:
-    """Cameras to weigh and to refit by.
+    """Return the cameras, each with its weight, that measure sensitivity and refit colours.
 
     Args:
-        splats: finite.
-        views: of a capture; its cameras for training are used, never those that are held out. None: virtual ones alone.
-        count: the largest number of a capture's cameras, taken evenly; and the number of virtual ones if there are no
-            others, of which there are else two thirds as many.
-        size: longer side of a picture, pixels; smaller pictures stay as they are.
-        threads: 0 means one per processor.
+        splats: the scene, finite (:func:`kissgs.clean`).
+        views: views of a capture; only training views are used, never held-out ones. None, or no training views: only
+            virtual cameras are used.
+        count: largest number of a capture's cameras, evenly selected, to which two thirds as many virtual ones are
+            added; without a capture, the number of virtual cameras. 1 or more.
+        size: longer side of the images, pixels; a capture's smaller images keep their size.
+        threads: number of threads; 0 means one per processor.
         progress: receives the stage ``"cameras"``.
+
+    Raises:
+        InvalidViewsError: ``count`` or ``size`` is too small for a view.
     """
     if views is None or not views.train:
         side = size * 4 // 5
-        found = scene_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
-        cameras = [_wider(view.camera) if n % 2 else view.camera for n, view in enumerate(found.all)]
-        return WeightedCameras(cameras, [1.0] * len(found.all), found.background)
-    given = [view.camera for view in views.train]
-    chosen = [given[n].at_most(size) for n in np.unique(np.linspace(0, len(given) - 1, count).astype(int))]
-    side = round(float(np.sqrt(chosen[0].width * chosen[0].height)))
-    around = scene_views(
+        virtual = scene_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
+        cameras = [_widened(view.camera) if n % 2 else view.camera for n, view in enumerate(virtual.all)]
+        return WeightedCameras(cameras, [1.0] * len(virtual.all), virtual.background)
+    captured = [view.camera for view in views.train]
+    selected = [captured[n].at_most(size) for n in np.unique(np.linspace(0, len(captured) - 1, count).astype(int))]
+    side = round(float(np.sqrt(selected[0].width * selected[0].height)))
+    virtual = scene_views(
         splats, width=side, height=side, count=max(1, count * 2 // 3), threads=threads, progress=progress
     )
-    weight = AROUND * len(chosen) / len(around.all)
-    cameras = [*chosen, *(view.camera for view in around.all)]
-    return WeightedCameras(
-        cameras, [1.0] * len(chosen) + [weight] * len(around.all), views.background, captured=len(chosen)
-    )
+    weight = VIRTUAL_WEIGHT * len(selected) / len(virtual.all)
+    cameras = [*selected, *(view.camera for view in virtual.all)]
+    weights = [1.0] * len(selected) + [weight] * len(virtual.all)
+    return WeightedCameras(cameras, weights, views.background, captured=len(selected))
 
 
-WIDER = 0.6
-"""Focal length of every other virtual camera, in units of that of the others: what they just do not see counts too."""
-
-
-def _wider(camera: Camera) -> Camera:
+def _widened(camera: Camera) -> Camera:
+    """Return the camera with a shorter focal length, that is, a wider field of view."""
     K = camera.K.copy()
-    K[[0, 1], [0, 1]] *= WIDER
+    K[[0, 1], [0, 1]] *= WIDE_FOCAL_SCALE
     return Camera(camera.viewmat, K, camera.width, camera.height)

@@ -1,4 +1,4 @@
-"""Oracle: scenes of which it is known how near their Gaussians lie, and what a camera close by shows of them."""
+"""Oracle: scenes with known distances between Gaussians, and geometry by hand."""
 
 from dataclasses import replace
 
@@ -11,26 +11,26 @@ from kissgs.cameras.virtual.close_ups import close_ups
 from kissgs.rendering.local_scale import local_scale
 
 
-def test_every_object_is_seen_close_up_whatever_its_size():
+def test_objects_of_all_sizes_have_close_ups():
     cameras = close_ups(two(1000, 1 / 50), side=32, count=80, seed=1)
     assert len(cameras) == 80
     assert {(camera.width, camera.height) for camera in cameras} == {(32, 32)}
     small = [camera.position for camera in cameras if camera.position[0] > 500]
-    assert 20 < len(small) < 60, "as many Gaussians in the one as in the other"
+    assert 20 < len(small) < 60, "both objects have equally many Gaussians"
     assert np.median(np.linalg.norm(np.array(small) - (1000, 0, 0), axis=1)) < 0.5
 
 
-def test_what_they_aim_at_is_in_the_middle():
+def test_the_target_is_in_the_middle_of_the_image():
     scene = sample_scene(500)
     for camera in close_ups(scene, side=16, count=20):
         depth = scene.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
-        places = scene.means @ camera.viewmat[:2, :3].T + camera.viewmat[:2, 3]
-        assert np.linalg.norm(places / depth[:, None], axis=1)[depth > 0].min() < 1e-4
+        offsets = scene.means @ camera.viewmat[:2, :3].T + camera.viewmat[:2, 3]
+        assert np.linalg.norm(offsets / depth[:, None], axis=1)[depth > 0].min() < 1e-4
 
 
 @pytest.mark.parametrize("scale", [1e-5, 1e5])
-def test_the_picture_is_the_same_at_any_scale(scale):
-    """No camera stands so near that nothing is drawn: there, a longer lens takes its place."""
+def test_images_are_alike_at_any_scale(scale):
+    """A longer lens takes the place of a camera so close that the near plane would cut the target off."""
     scene = sample_scene(2000)
     scaled = moved(scene, scale=scale)
     shown = [
@@ -41,42 +41,42 @@ def test_the_picture_is_the_same_at_any_scale(scale):
     assert shown[0] > 0.4
 
 
-def test_distances_directions_and_lens():
-    """From one local scale to eight, evenly by octaves; from all around; 70 degrees."""
+def test_distances_directions_and_fields_of_view():
+    """Distances are log-uniform from one local scale to eight, directions uniform, the field of view is 70 degrees."""
     scene = sample_scene(500)
     spacing = local_scale(scene)
-    octaves, ahead = [], []
+    octaves, forward = [], []
     for camera in close_ups(scene, side=16, count=200):
-        gaps = scene.means - camera.position
-        aimed = np.argmax(gaps @ camera.viewmat[2, :3] / np.linalg.norm(gaps, axis=1))
-        octaves.append(np.log2(np.linalg.norm(gaps[aimed]) / spacing[aimed]))
-        ahead.append(camera.viewmat[2, :3])
+        offsets = scene.means - camera.position
+        target = np.argmax(offsets @ camera.viewmat[2, :3] / np.linalg.norm(offsets, axis=1))
+        octaves.append(np.log2(np.linalg.norm(offsets[target]) / spacing[target]))
+        forward.append(camera.viewmat[2, :3])
         assert camera.K[0, 0] == pytest.approx(8 / np.tan(np.radians(35)))
     near, far = np.quantile(octaves, [0.05, 0.95])
     assert -0.1 < near < 0.5
     assert 2.5 < far < 3.1
-    assert np.linalg.norm(np.mean(ahead, axis=0)) < 0.2
+    assert np.linalg.norm(np.mean(forward, axis=0)) < 0.2
 
 
-def test_what_is_hardly_visible_is_hardly_looked_at():
+def test_faint_gaussians_are_rarely_targets():
     scene = sample_scene(1000)
     faint = scene.means[:, 0] > np.median(scene.means[:, 0])
     scene = replace(scene, opacities=np.where(faint, np.float32(-7), np.float32(3)))
-    aimed = []
+    targets = []
     for camera in close_ups(scene, side=16, count=100):
-        gaps = scene.means - camera.position
-        aimed.append(np.argmax(gaps @ camera.viewmat[2, :3] / np.linalg.norm(gaps, axis=1)))
-    assert faint[aimed].sum() < 5
+        offsets = scene.means - camera.position
+        targets.append(np.argmax(offsets @ camera.viewmat[2, :3] / np.linalg.norm(offsets, axis=1)))
+    assert faint[targets].sum() < 5
 
 
 def test_the_same_seed_gives_the_same_cameras():
     scene = sample_scene(300)
-    places = [[camera.position for camera in close_ups(scene, side=8, count=9, seed=seed)] for seed in (2, 2, 3)]
-    assert np.array_equal(places[0], places[1])
-    assert not np.array_equal(places[0], places[2])
+    positions = [[camera.position for camera in close_ups(scene, side=8, count=9, seed=seed)] for seed in (2, 2, 3)]
+    assert np.array_equal(positions[0], positions[1])
+    assert not np.array_equal(positions[0], positions[2])
 
 
-def test_where_nothing_can_be_seen_there_are_none():
+def test_a_scene_without_visible_gaussians_has_none():
     scene = sample_scene(20)
     unseen = replace(scene, opacities=np.full(20, -np.inf, np.float32))
     assert close_ups(unseen, side=8, count=5) == []

@@ -1,4 +1,4 @@
-"""Oracle: scenes made so that it is known where a visitor could stand, and the real cameras of a real one."""
+"""Oracle: scenes whose inside and outside are known by construction, and the cameras of a real capture."""
 
 import numpy as np
 import pytest
@@ -14,16 +14,16 @@ from kissgs.rendering.rasterizer import render
 
 
 @pytest.fixture(scope="module")
-def thing():
+def tall_box():
     return box((0.5, 1.5, 0.3), 3000, 0.1)
 
 
-def places_of(views):
+def positions_of(views):
     return np.array([view.camera.position for view in views.all])
 
 
-def test_views_are_split_named_square_and_of_many_angles(thing):
-    views = random_poses(thing, side=48, count=17)
+def test_views_are_split_named_square_and_of_several_fields_of_view(tall_box):
+    views = random_poses(tall_box, side=48, count=17)
     assert 17 <= len(views.all) <= 4 * 17
     assert sorted(view.name for view in views.all) == [f"virtual_{n:02}" for n in range(len(views.all))]
     assert [view.name for view in views.test] == ["virtual_00", "virtual_08", "virtual_16"]
@@ -38,21 +38,21 @@ def test_a_scene_of_several_objects_gets_more_views():
     assert 48 <= len(views.all) <= 4 * 24
 
 
-def test_the_same_seed_gives_the_same_views_for_any_number_of_threads(thing):
-    one, same = (random_poses(thing, side=32, count=9, seed=3, threads=threads) for threads in (1, 3))
-    assert np.array_equal(places_of(one), places_of(same))
-    other = random_poses(thing, side=32, count=9, seed=4)
-    assert not set(map(tuple, places_of(one))) & set(map(tuple, places_of(other)))
+def test_the_same_seed_gives_the_same_views_for_any_number_of_threads(tall_box):
+    one, same = (random_poses(tall_box, side=32, count=9, seed=3, threads=threads) for threads in (1, 3))
+    assert np.array_equal(positions_of(one), positions_of(same))
+    other = random_poses(tall_box, side=32, count=9, seed=4)
+    assert not set(map(tuple, positions_of(one))) & set(map(tuple, positions_of(other)))
 
 
-def test_an_object_is_seen_from_all_around_and_from_outside(thing):
-    views = random_poses(thing, side=48, count=40)
-    places = places_of(views)
-    outside = (np.abs(places) > (0.5, 1.5, 0.3)).any(axis=1)
-    assert outside.mean() > 0.9  # of a part that was overlooked a few see the inside
-    assert np.diff(np.sort(np.arctan2(*places[:, [0, 2]].T))).max() < np.pi / 3
+def test_an_object_is_seen_from_all_around_and_from_outside(tall_box):
+    views = random_poses(tall_box, side=48, count=40)
+    positions = positions_of(views)
+    outside = (np.abs(positions) > (0.5, 1.5, 0.3)).any(axis=1)
+    assert outside.mean() > 0.9  # further regions may lie on the inner side
+    assert np.diff(np.sort(np.arctan2(*positions[:, [0, 2]].T))).max() < np.pi / 3
     for view in views.all:
-        _, alpha = render(thing, view.camera)
+        _, alpha = render(tall_box, view.camera)
         assert alpha.mean() > 0.01
 
 
@@ -60,24 +60,24 @@ def test_a_room_is_seen_from_inside_in_all_directions():
     half = np.array([4.0, 1.4, 3.0])
     room = box(half, 10_000, 0.12)
     views = random_poses(room, side=48, count=40)
-    within = (np.abs(places_of(views)) < half).all(axis=1)
-    assert within.mean() > 0.8  # what is hidden from within, if anything, is looked at from outside
-    looks = np.array([view.camera.viewmat[2, :3] for view in views.all])
-    assert np.diff(np.sort(np.arctan2(*looks[:, [0, 2]].T))).max() < np.pi / 3
+    within = (np.abs(positions_of(views)) < half).all(axis=1)
+    assert within.mean() > 0.8  # further regions may lie on the outer side
+    directions = np.array([view.camera.viewmat[2, :3] for view in views.all])
+    assert np.diff(np.sort(np.arctan2(*directions[:, [0, 2]].T))).max() < np.pi / 3
     for view, inside in zip(views.all, within, strict=True):
         _, alpha = render(room, view.camera)
         assert alpha.mean() > (0.8 if inside else 0.01)
 
 
-def test_photographers_places_are_among_them(shared_data):
-    """From high and low as well: near each place where a photograph was taken stands one of them and looks that way."""
+def test_poses_of_photographs_are_among_them(shared_data):
+    """A random camera is near the position of each held-out photograph and looks in a similar direction."""
     splats, _ = clean(read_ply(shared_data / "fox" / "point_cloud.ply"))
     views = random_poses(splats, side=64, count=384).all
-    places = np.array([view.camera.position for view in views])
-    looks = np.array([view.camera.viewmat[2, :3] for view in views])
+    positions = np.array([view.camera.position for view in views])
+    directions = np.array([view.camera.viewmat[2, :3] for view in views])
     for view in load_views(shared_data / "fox").test:
-        near = np.linalg.norm(places - view.camera.position, axis=1) < 2.0  # of a scene that is about 6 across
-        assert (looks[near] @ view.camera.viewmat[2, :3]).max() > np.cos(np.radians(20)), view.name
+        near = np.linalg.norm(positions - view.camera.position, axis=1) < 2.0  # the scene is about 6 across
+        assert (directions[near] @ view.camera.viewmat[2, :3]).max() > np.cos(np.radians(20)), view.name
 
 
 @pytest.mark.parametrize(("count", "size", "log_scale", "opacity"), [(0, 1, 0, 0), (1, 1, 30, 3), (9, 1e6, -30, -13)])
@@ -99,21 +99,21 @@ def test_any_scene_gets_views(count, size, log_scale, opacity):
         assert np.isfinite(image).all()
 
 
-def test_one_view_is_for_training(thing):
-    views = random_poses(thing, side=24, count=1)
+def test_a_single_view_is_for_training(tall_box):
+    views = random_poses(tall_box, side=24, count=1)
     assert (len(views.train), len(views.test)) == (1, 0)
 
 
 @pytest.mark.parametrize("wrong", [{"count": 0, "side": 8}, {"count": 1, "side": 0}])
-def test_impossible_sizes_are_refused(thing, wrong):
+def test_numbers_below_one_are_refused(tall_box, wrong):
     with pytest.raises(InvalidViewsError, match="at least"):
-        random_poses(thing, **wrong)
+        random_poses(tall_box, **wrong)
 
 
-def test_it_can_be_stopped(thing):
+def test_the_work_can_be_stopped(tall_box):
     def stop(stage, fraction):
         assert stage == "cameras"
-        raise Cancelled("enough")
+        raise Cancelled("stopped")
 
     with pytest.raises(Cancelled):
-        random_poses(thing, side=24, count=4, progress=stop)
+        random_poses(tall_box, side=24, count=4, progress=stop)

@@ -1,4 +1,4 @@
-"""Regions and the cameras that are chosen for each; the oracle is where the objects were put."""
+"""Oracle: positions and sizes of the objects that scenes are made of."""
 
 from __future__ import annotations
 
@@ -11,48 +11,48 @@ from kissgs.cameras.virtual.random_poses import random_poses
 from kissgs.cameras.virtual.scene_views import scene_views
 
 
-def near(cameras: list[Camera], place: tuple[float, float, float], radius: float) -> int:
-    return sum(float(np.linalg.norm(camera.position - place)) < radius for camera in cameras)
+def count_near(cameras: list[Camera], position: tuple[float, float, float], radius: float) -> int:
+    return sum(float(np.linalg.norm(camera.position - position)) < radius for camera in cameras)
 
 
 def cameras_of(splats: Splats, count: int = 24) -> list[Camera]:
-    found = scene_views(clean(splats)[0], width=96, height=96, count=count)
-    assert len(found.all) == count
-    return [view.camera for view in found.all]
+    views = scene_views(clean(splats)[0], width=96, height=96, count=count)
+    assert len(views.all) == count
+    return [view.camera for view in views.all]
 
 
 @pytest.mark.parametrize("distance", [100, 10_000])
-def test_two_objects_far_from_each_other_have_cameras_each(distance: float):
-    found = cameras_of(two(distance))
-    assert near(found, (0, 0, 0), 30) >= 6
-    assert near(found, (distance, 0, 0), 30) >= 6
+def test_two_distant_objects_both_have_cameras(distance: float):
+    cameras = cameras_of(two(distance))
+    assert count_near(cameras, (0, 0, 0), 30) >= 6
+    assert count_near(cameras, (distance, 0, 0), 30) >= 6
 
 
 def test_a_small_object_has_cameras_at_its_own_scale():
-    found = cameras_of(two(12, 1 / 50))
-    assert near(found, (12, 0, 0), 0.6) >= 4
-    assert near(found, (0, 0, 0), 8) >= 4
+    cameras = cameras_of(two(12, 1 / 50))
+    assert count_near(cameras, (12, 0, 0), 0.6) >= 4
+    assert count_near(cameras, (0, 0, 0), 8) >= 4
 
 
 def test_each_of_five_objects_has_cameras():
-    found = cameras_of(SCENES["five of different density"](), count=48)
-    for place in ((0, 0, 0), (150, 0, 0), (0, 0, 150), (-150, 20, 0), (300, 0, 300)):
-        assert near(found, place, 60) >= 2
+    cameras = cameras_of(SCENES["five of different density"](), count=48)
+    for position in ((0, 0, 0), (150, 0, 0), (0, 0, 150), (-150, 20, 0), (300, 0, 300)):
+        assert count_near(cameras, position, 60) >= 2
 
 
-def test_random_cameras_to_learn_from_are_spread_over_both_objects():
+def test_random_poses_are_divided_among_both_objects():
     views = random_poses(clean(two(1000))[0], side=64, count=40)
-    found = [view.camera for view in views.all]
-    assert near(found, (0, 0, 0), 40) >= 12
-    assert near(found, (1000, 0, 0), 40) >= 12
+    cameras = [view.camera for view in views.all]
+    assert count_near(cameras, (0, 0, 0), 40) >= 12
+    assert count_near(cameras, (1000, 0, 0), 40) >= 12
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7])
-def test_scenes_of_hardly_anything_have_cameras(count: int):
+def test_scenes_of_few_gaussians_have_cameras(count: int):
     assert len(cameras_of(sample_scene(count), count=3)) == 3
 
 
-def test_the_number_of_threads_changes_nothing():
+def test_the_result_is_the_same_for_any_number_of_threads():
     scene = clean(joined(sample_scene(1500), moved(sample_scene(1500, seed=1), by=(300, 0, 0))))[0]
     one, many = (scene_views(scene, width=64, height=64, count=8, threads=threads) for threads in (1, 3))
     for a, b in zip(one.all, many.all, strict=True):
