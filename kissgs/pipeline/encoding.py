@@ -112,7 +112,11 @@ class Encoding:
     def search(self, planner: Planner | None = None, byte_limit: float = math.inf) -> RateControl:
         """Search for the goal of the settings without fine-tuning; see :class:`RateControl` for ``byte_limit``."""
         search = RateControl(
-            *(self.original, self.settings.encode, self.views, self.threads, self.progress),
+            self.original,
+            self.settings.encode,
+            self.views,
+            self.threads,
+            self.progress,
             count=len(self.splats),
             packed=self.packed,
             byte_limit=byte_limit,
@@ -128,7 +132,9 @@ class Encoding:
 
             def files(plan: EncodingPlan, finetune_steps: int, progress: Progress) -> Encoded:
                 return write_files(
-                    *(plan, self.splats, pruned if finetune_steps else settings),
+                    plan,
+                    self.splats,
+                    pruned if finetune_steps else settings,
                     cleaned=self.cleaned,
                     compacted=len(self.original) - len(self.splats),
                     finetune_steps=finetune_steps,
@@ -158,7 +164,9 @@ class Encoding:
         from kissgs.finetuning.tune import Tuner
 
         return Tuner.of(
-            *(self.original, self.settings.finetune, self.views),
+            self.original,
+            self.settings.finetune,
+            self.views,
             device=self.device,
             threads=self.threads,
             progress=self.progress,
@@ -187,7 +195,8 @@ class Encoding:
         if sensitivity is None or (captured and settings.color_refit_iterations):
             size = settings.sensitivity_view_size
             cameras = sensitivity_cameras(
-                *(splats, views),
+                splats,
+                views,
                 count=settings.sensitivity_views,
                 size=size,
                 threads=self.threads,
@@ -207,7 +216,8 @@ class Encoding:
                     progress(stage, fraction)
 
             return plan_encoding(
-                *(splats, chosen),
+                splats,
+                chosen,
                 sensitivity=sensitivity,
                 recolor=recolor,
                 threads=self.threads,

@@ -106,7 +106,9 @@ def compact(
     clock = StageTimer(progress)
     splats, cleaned, _ = open_scene(source, threads, clock)
     result = compact_scene(
-        *(splats, settings.compact, views),
+        splats,
+        settings.compact,
+        views,
         judges=evaluate,
         checkpoint=Path(checkpoint) if checkpoint is not None else None,
         threads=threads,

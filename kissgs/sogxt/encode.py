@@ -84,9 +84,7 @@ def encode(
         UnsupportedError: the scene is too large for one container.
     """
     plan = plan_encoding(splats, settings, sensitivity=sensitivity, recolor=recolor, threads=threads, progress=progress)
-    return write_files(
-        *(plan, splats, settings), cleaned=cleaned, compacted=compacted, threads=threads, progress=progress
-    )
+    return write_files(plan, splats, settings, cleaned=cleaned, compacted=compacted, threads=threads, progress=progress)
 
 
 def write_files(

@@ -228,7 +228,8 @@ def _queue(context: ServiceContainer, submission: Submission, owner: str) -> tup
         disk_bytes=received.size,
         work_bytes=(
             checkpoint_bytes(
-                *(received.info.count, received.info.sh_degree),
+                received.info.count,
+                received.info.sh_degree,
                 compact=options.retrains,
                 finetune=options.finetune.enabled,
             )
