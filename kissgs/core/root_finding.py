@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 ATTEMPTS = 10
 """Default number of evaluations."""
@@ -18,6 +19,19 @@ MIN_SLOPE_SHARE = 0.15
 """Share of the expected slope below which, over half of :data:`MAX_EXTRAPOLATION`, the search jumps to the bound."""
 
 
+@dataclass(frozen=True, slots=True)
+class StopRule:
+    """When :func:`find_root` ends without a margin within the tolerance.
+
+    Attributes:
+        attempts: largest number of evaluations; one at the bound is added if several did not meet the goal.
+        settled: whether the search between a point that meets the goal and the next one that does not can end.
+    """
+
+    attempts: int = ATTEMPTS
+    settled: Callable[[float, float], bool] = lambda inside, outside: False
+
+
 def find_root(
     margin: Callable[[float], float],
     start: float,
@@ -25,8 +39,7 @@ def find_root(
     tolerance: float,
     bounds: tuple[float, float],
     grain: float = 0.0,
-    attempts: int = ATTEMPTS,
-    settled: Callable[[float, float], bool] = lambda inside, outside: False,
+    stop: StopRule = StopRule(),
     before: Mapping[float, float] | None = None,
 ) -> float | None:
     """Find where a monotone function is slightly above zero.
@@ -43,20 +56,19 @@ def find_root(
         tolerance: a margin from 0 to this ends the search.
         bounds: smallest and largest point.
         grain: points are whole multiples of this; 0 for any number.
-        attempts: largest number of evaluations; one at the bound is added if several did not meet the goal.
-        settled: whether the search between a point that meets the goal and the next one that does not can end.
+        stop: limits of the search.
         before: known points and margins; they neither count as evaluations nor are returned.
 
     Returns:
         The point of smallest margin that meets the goal; None if none does.
     """
     known = dict(before or {})
-    attempts += len(known)
+    attempts = stop.attempts + len(known)
     x = _rounded(start, grain)
     while len(known) < attempts and x not in known:
         known[x] = margin(x)
         inside, outside = _bracket(known, slope)
-        if 0 <= known[x] <= tolerance or (inside is not None and outside is not None and settled(inside, outside)):
+        if 0 <= known[x] <= tolerance or (inside is not None and outside is not None and stop.settled(inside, outside)):
             break
         if (inside is None or outside is None) and _no_progress(known, slope):
             x = bounds[(inside is None) == (slope > 0)]

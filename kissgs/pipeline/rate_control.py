@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from kissgs.cameras.views import Views
 from kissgs.core.errors import StopSearch, UnsupportedError
 from kissgs.core.progress import SearchNote
-from kissgs.core.root_finding import find_root
+from kissgs.core.root_finding import StopRule, find_root
 from kissgs.core.splats import Splats
 from kissgs.evaluation.psnr_loss import SEARCH_SEED
 from kissgs.evaluation.results import MAX_VIEW_PSNR
@@ -34,7 +34,7 @@ MIN_STEP_LOG2 = 1 / 32
 """Below this interval of log2(lambda), a jump of the size is taken for a discontinuity and not searched further."""
 
 FAR_BELOW_LOG2 = 1.5
-"""If the images of the first container could grow by this much (log2 of bytes), the finest container is tried next.
+"""Room for growth of the first container's images (log2 of bytes) above which the finest container is tried next.
 
 The finest container takes longest to make, and rarely has more than three times the bytes of the first.
 """
@@ -299,9 +299,11 @@ class RateControl:
 
         find_root(
             margin_at,
-            *(start, self.goal.slope, self.goal.near, LOG2_LAMBDA_RANGE),
-            attempts=attempts,
-            settled=self._is_jump,
+            start,
+            self.goal.slope,
+            self.goal.near,
+            LOG2_LAMBDA_RANGE,
+            stop=StopRule(attempts, self._is_jump),
             before={x: sample.margin for x, sample in self._samples.items()},
         )
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import kissgs
 from kissgs import Settings, UnsupportedError
-from kissgs.core.root_finding import ATTEMPTS, MAX_EXTRAPOLATION, find_root
+from kissgs.core.root_finding import ATTEMPTS, MAX_EXTRAPOLATION, StopRule, find_root
 from kissgs.pipeline.rate_control import Goal
 from kissgs.pipeline.trial import Trial
 
@@ -48,7 +48,9 @@ def test_a_staircase():
 
 def test_a_jump_is_not_searched_further():
     margin = Recorded(lambda x: (1.0 if x < 0.3 else -1.0) - 0.1 * x)
-    found = find_root(margin, 1.0, -1.0, 0.01, (-9, 9), settled=lambda inside, outside: outside - inside < 1 / 32)
+    found = find_root(
+        margin, 1.0, -1.0, 0.01, (-9, 9), stop=StopRule(settled=lambda inside, outside: outside - inside < 1 / 32)
+    )
     assert found is not None
     assert 0.3 - 1 / 32 < found < 0.3
     assert len(margin.arguments) < ATTEMPTS - 1
@@ -61,7 +63,7 @@ def test_known_values_are_used():
     assert found == pytest.approx(math.log(5), abs=0.02)
     assert len(margin.arguments) <= 4
     assert min(margin.arguments[1:]) > 1.5
-    assert find_root(margin, 3.0, -1.0, 0.05, (-9, 9), before={1.0: 2.0}, attempts=1) is None
+    assert find_root(margin, 3.0, -1.0, 0.05, (-9, 9), before={1.0: 2.0}, stop=StopRule(attempts=1)) is None
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
@@ -76,7 +78,7 @@ def test_a_root_at_the_bound_is_found(sign):
 
 def test_the_bound_is_tried_after_the_last_attempt():
     margin = Recorded(lambda x: -1.0 - x)
-    assert find_root(margin, 30.0, -1.0, 0.05, (-40, 40), attempts=2) == -40
+    assert find_root(margin, 30.0, -1.0, 0.05, (-40, 40), stop=StopRule(attempts=2)) == -40
     assert margin.arguments == [30.0, 26.0, -40]
 
 
