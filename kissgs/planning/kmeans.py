@@ -32,6 +32,26 @@ OUTLIERS = 1e-3
 """Share of entries, at either end of a dimension, that may be clipped so that the step of the others stays small."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KMeansOptions:
+    """Options of :func:`fit`.
+
+    Attributes:
+        seed: seed of all random choices.
+        iterations: iterations of refinement across the borders of coarse clusters.
+        nprobe: number of coarse clusters that are searched for a vector's centroid during refinement.
+        tolerance: root mean square error per dimension below which a cluster is not split further.
+        lattice: step that centroids are rounded to, in units of the codebook's root mean square error; vectors are
+            then assigned to the rounded centroids. 0 does not round.
+    """
+
+    seed: int
+    iterations: int
+    nprobe: int
+    tolerance: float
+    lattice: float
+
+
 @dataclass(frozen=True, slots=True)
 class Clusters:
     """Result of a clustering.
@@ -52,12 +72,8 @@ def fit(
     weights: Float32[np.ndarray, " N"],
     size: int,
     pool: Workers,
+    options: KMeansOptions,
     *,
-    seed: int,
-    iterations: int,
-    nprobe: int,
-    tolerance: float,
-    lattice: float,
     report: Callable[[float], None] = lambda fraction: None,
 ) -> Clusters:
     """Find at most ``size`` centroids of small weighted squared error.
@@ -67,18 +83,14 @@ def fit(
         weights: positive weight of each vector's squared error.
         size: K, largest number of centroids.
         pool: threads.
-        seed: seed of all random choices.
-        iterations: iterations of refinement across the borders of coarse clusters.
-        nprobe: number of coarse clusters that are searched for a vector's centroid during refinement.
-        tolerance: root mean square error per dimension below which a cluster is not split further.
-        lattice: step that centroids are rounded to, in units of the codebook's root mean square error; vectors are
-            then assigned to the rounded centroids. 0 does not round.
+        options: options of the clustering.
         report: receives the fraction done, 0 to 1.
 
     Returns:
         The clusters; fewer than ``size`` if the vectors are few, similar or repeated.
     """
-    rng = np.random.Generator(np.random.PCG64(seed))
+    rng = np.random.Generator(np.random.PCG64(options.seed))
+    tolerance, lattice = options.tolerance, options.lattice
     mean = np.average(vectors, axis=0, weights=weights).astype(np.float32)
     if _rms(vectors, mean) <= tolerance:
         return Clusters(mean[None], np.zeros(len(vectors), dtype=np.int32), 0.0)
@@ -96,12 +108,12 @@ def fit(
     tree = _Tree(coarse, _edges(counts), _edges(shares))
     centroids, labels = _split(vectors, weights, tree, rng, pool)
     report(0.4)
-    near = tree.neighbours(nprobe)
-    for step in range(iterations):
+    near = tree.neighbours(options.nprobe)
+    for step in range(options.iterations):
         _update(centroids, vectors, weights, labels)
         distances = _reassign(vectors, centroids, labels, tree, near, pool)
         _reseed_empty(centroids, vectors, weights * distances, labels)
-        report(0.4 + 0.6 * (step + 1) / iterations)
+        report(0.4 + 0.6 * (step + 1) / options.iterations)
     _update(centroids, vectors, weights, labels)
     step = 0.0
     if lattice:

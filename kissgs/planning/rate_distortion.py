@@ -17,7 +17,15 @@ from kissgs.planning import kmeans
 from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.layout import layout_grid
 from kissgs.planning.quantize import MEANS_TOP, Quantized, clip_outliers, means_bits, quantize_means
-from kissgs.planning.rd_model import SEEN, SH_MEAN_SQUARE, CodebookErrorModel, Costs, default_error, lambda_for, step
+from kissgs.planning.rd_model import (
+    SEEN,
+    SH_MEAN_SQUARE,
+    CodebookErrorModel,
+    Costs,
+    RdCriterion,
+    default_error,
+    lambda_for,
+)
 from kissgs.planning.rdo_quantize import largest_changes, quantize_by_class, rdo_quantize_shapes
 from kissgs.planning.rotation_forms import canonicalize
 from kissgs.planning.sh_codebook import COEFFICIENTS, Codebook, bounded_weights, fit_codebook, size_weights
@@ -101,27 +109,26 @@ def plan_rate_distortion(
     codebook = fit_codebook(ordered, np.arange(len(order)), weights, size, settings, pool, progress)
     progress("rounding", 0.0)
     values = np.concatenate([ordered.opacities[:, None], scales, quats], axis=1).astype(np.float64)
+    criterion = RdCriterion(costs, classes, rd_lambda)
     captured = sensitivity.captured[order]
     largest = largest_changes(sensitivity.coverage[order], captured, slack)
     parts = (
-        quantize_by_class(values[:, :1], costs.opacity, classes, rd_lambda, largest["opacities"]),
-        quantize_by_class(values[:, 1:4], costs.scale, classes, rd_lambda, largest["scales"]),
-        quantize_by_class(values[:, 4:], 3 * costs.rotation, classes, rd_lambda, largest["quaternions"]),
+        quantize_by_class(values[:, :1], costs.opacity, criterion, largest["opacities"]),
+        quantize_by_class(values[:, 1:4], costs.scale, criterion, largest["scales"]),
+        quantize_by_class(values[:, 4:], 3 * costs.rotation, criterion, largest["quaternions"]),
     )
     if settings.rdo_quantization:
-        parts = rdo_quantize_shapes(
-            values, parts, sensitivity.shape_hessian[order], forms, costs, classes, rd_lambda, largest, pool
-        )
+        parts = rdo_quantize_shapes(values, parts, sensitivity.shape_hessian[order], forms, criterion, largest, pool)
     fields = dict(zip(("opacities", "scales", "quaternions"), parts, strict=True))
     coarser = np.rint(captured + np.log2(slack))
-    fields["means"] = _means(ordered, costs, classes, rd_lambda, settings.means_tolerance, coarser)
+    fields["means"] = _means(ordered, criterion, settings.means_tolerance, coarser)
 
     rest = _decoded_sh(codebook, ordered)
     compensation = np.einsum("nk,nkc->nc", sensitivity.mean_sh_basis[order], ordered.shN - rest) / np.float32(SH_C0)
     base = ordered.sh0 + np.clip(compensation, -MAX_COMPENSATION, MAX_COMPENSATION)
     if recolor is not None:
         base = recolor(_decoded(fields, base.astype(np.float32), rest), order)
-    fields["f_dc"], clipped = _colors(base.astype(np.float64), costs, classes, rd_lambda, largest["f_dc"])
+    fields["f_dc"], clipped = _colors(base.astype(np.float64), criterion, largest["f_dc"])
     wanted = {
         "means": signed_log(ordered.means),
         "opacities": values[:, :1],
@@ -208,11 +215,7 @@ def _codebook_error_model(
         _sh_weights(sensitivity, some, splats),
         entries,
         pool,
-        seed=settings.seed,
-        iterations=2,
-        nprobe=12,
-        tolerance=settings.sh_tolerance,
-        lattice=0.0,
+        kmeans.KMeansOptions(seed=settings.seed, iterations=2, nprobe=12, tolerance=settings.sh_tolerance, lattice=0.0),
     )
     squared = np.square(vectors - clusters.centroids[clusters.labels], dtype=np.float64).sum(axis=1)
     squared = np.minimum(squared, MAX_DISPLAYED_ERROR / SH_MEAN_SQUARE)
@@ -231,9 +234,7 @@ def _sh_weights(sensitivity: Sensitivity, chosen: Int[np.ndarray, " M"], splats:
 
 def _means(
     ordered: Splats,
-    costs: Costs,
-    classes: Int[np.ndarray, " M"],
-    rd_lambda: float,
+    criterion: RdCriterion,
     tolerance: float,
     coarser: Float[np.ndarray, " M"],
 ) -> Quantized:
@@ -245,24 +246,20 @@ def _means(
     most = np.clip(16 - means_bits(ordered, np.arange(len(ordered)), tolerance) + coarser, 0, 8)
     logs = signed_log(means)
     unit = max(float(np.ptp(logs)), 1e-30) / MEANS_TOP
-    coarse = [
-        max(np.floor(np.log2(step(float(costs.position[classes == c].mean()), rd_lambda) / unit) + 0.5), 0)
-        for c in range(int(classes.max()) + 1)
-    ]
-    return quantize_means(means, bits=16 - np.minimum(np.array(coarse)[classes], most).astype(np.int64))
+    steps = criterion.class_steps(criterion.costs.position)
+    coarse = [max(np.floor(np.log2(step / unit) + 0.5), 0) for step in steps]
+    return quantize_means(means, bits=16 - np.minimum(np.array(coarse)[criterion.classes], most).astype(np.int64))
 
 
 def _colors(
     base: Float64[np.ndarray, "M 3"],
-    costs: Costs,
-    classes: Int[np.ndarray, " M"],
-    rd_lambda: float,
+    criterion: RdCriterion,
     coarsest: Float64[np.ndarray, " M"],
 ) -> tuple[Quantized, int]:
     """Quantise base colours; return them and the number of clipped outliers."""
-    finest = min(step(float(costs.color[classes == c].mean()), rd_lambda) for c in range(int(classes.max()) + 1))
+    finest = min(criterion.class_steps(criterion.costs.color))
     clipped = clip_outliers(base, step=finest, share=OUTLIERS)
-    levels = quantize_by_class(clipped, costs.color, classes, rd_lambda, coarsest)
+    levels = quantize_by_class(clipped, criterion.costs.color, criterion, coarsest)
     return levels, int((clipped != base).any(axis=1).sum())
 
 

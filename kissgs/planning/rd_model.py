@@ -144,6 +144,25 @@ def step(cost: float, rd_lambda: float) -> float:
     return float(np.sqrt(6 * rd_lambda / (np.log(2) * cost)))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class RdCriterion:
+    """Costs, sensitivity classes and lambda, by which the levels of Gaussians are chosen.
+
+    Attributes:
+        costs: costs of the M Gaussians.
+        classes: ``(M,)`` sensitivity class of each, from 0; no class is empty.
+        rd_lambda: squared error per bit.
+    """
+
+    costs: Costs
+    classes: Int[np.ndarray, " M"]
+    rd_lambda: float
+
+    def class_steps(self, cost: Float64[np.ndarray, " M"]) -> list[float]:
+        """Return the optimal step of each class for the mean of ``cost``, squared error per squared unit."""
+        return [step(float(cost[self.classes == c].mean()), self.rd_lambda) for c in range(int(self.classes.max()) + 1)]
+
+
 @dataclass(frozen=True, slots=True)
 class CodebookErrorModel:
     """Error of a scene's shN by codebook size, extrapolated from a small codebook.

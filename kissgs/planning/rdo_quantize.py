@@ -14,7 +14,7 @@ import numpy as np
 from kissgs.core.array_types import Float, Float32, Float64, Int, UInt8
 from kissgs.core.threads import Workers
 from kissgs.planning.quantize import Quantized
-from kissgs.planning.rd_model import Costs, step
+from kissgs.planning.rd_model import RdCriterion
 from kissgs.planning.rotation_forms import PERMUTATIONS, ROTATIONS
 
 UNSEEN = {"opacities": 0.15, "scales": 0.11, "growth": 0.11, "quaternions": 0.023, "f_dc": 0.055}
@@ -89,8 +89,7 @@ AXIS_SIGNS = _axis_signs()
 def quantize_by_class(
     values: Float64[np.ndarray, "M C"],
     cost: Float64[np.ndarray, " M"],
-    classes: Int[np.ndarray, " M"],
-    rd_lambda: float,
+    criterion: RdCriterion,
     coarsest: Float64[np.ndarray, " M"],
 ) -> Quantized:
     """Round to the nearest of the levels that each sensitivity class uses.
@@ -98,8 +97,7 @@ def quantize_by_class(
     Args:
         values: finite.
         cost: squared image error per squared unit, per Gaussian.
-        classes: sensitivity class of each Gaussian, from 0.
-        rd_lambda: squared error per bit.
+        criterion: sensitivity classes and lambda.
         coarsest: largest step, per Gaussian.
 
     Returns:
@@ -108,8 +106,8 @@ def quantize_by_class(
     low32 = values.min(axis=0).astype(np.float32) + np.float32(0)
     low = low32.astype(np.float64)
     widest = float((values - low).max(initial=0))
-    optimal = np.array([step(float(cost[classes == c].mean()), rd_lambda) for c in range(int(classes.max()) + 1)])
-    steps = np.minimum(optimal[classes], coarsest)
+    optimal = np.array(criterion.class_steps(cost))
+    steps = np.minimum(optimal[criterion.classes], coarsest)
     finest = max(float(steps.min()), widest / 255, 1e-30)
     top = int(min(max(ceil(widest / finest - 1e-3), 1), 255))
     spacing = np.clip(np.rint(steps / finest), 1, 255)
@@ -126,9 +124,7 @@ def rdo_quantize_shapes(
     parts: tuple[Quantized, Quantized, Quantized],
     shapes: Float32[np.ndarray, "M 28"],
     forms: UInt8[np.ndarray, " M"],
-    costs: Costs,
-    classes: Int[np.ndarray, " M"],
-    rd_lambda: float,
+    criterion: RdCriterion,
     largest: dict[str, Float64[np.ndarray, " M"]],
     pool: Workers,
 ) -> tuple[Quantized, Quantized, Quantized]:
@@ -139,14 +135,13 @@ def rdo_quantize_shapes(
         parts: the rounded values: opacities, scales, quaternions.
         shapes: shape Hessians of :class:`kissgs.Sensitivity`.
         forms: form of each Gaussian, see :mod:`kissgs.planning.rotation_forms`.
-        costs: costs, whose smallest values are added to the Hessians' diagonals.
-        classes: sensitivity class of each Gaussian, from 0.
-        rd_lambda: squared error per bit.
+        criterion: sensitivity classes, lambda, and costs, whose smallest values are added to the Hessians' diagonals.
         largest: largest change of each attribute, see :func:`largest_changes`.
         pool: threads.
     """
     from kissgs.planning import rdo_kernels
 
+    costs, classes = criterion.costs, criterion.classes
     levels = np.concatenate([part.levels for part in parts], axis=1).astype(np.int64)
     low = np.concatenate([part.low for part in parts]).astype(np.float64)
     high = np.concatenate([part.high for part in parts]).astype(np.float64)
@@ -161,13 +156,21 @@ def rdo_quantize_shapes(
     floor = np.array([float(cost.min(initial=np.inf)) for cost in (costs.opacity, costs.scale, costs.rotation)])
 
     for _ in range(ROUNDS):
-        rate_table = rd_lambda * _bits(levels, classes)
+        rate_table = criterion.rd_lambda * _bits(levels, classes)
 
         def choose(first: int, rate_table: Float64[np.ndarray, "classes 8 256"] = rate_table) -> None:
             rows = slice(first, first + CHUNK)
             rdo_kernels.choose_levels(
-                *(values[rows], shapes[rows], forms[rows], PERMUTATIONS, AXIS_SIGNS),
-                *(classes[rows], low, steps, top, rate_table),
+                values[rows],
+                shapes[rows],
+                forms[rows],
+                PERMUTATIONS,
+                AXIS_SIGNS,
+                classes[rows],
+                low,
+                steps,
+                top,
+                rate_table,
                 np.stack([change[rows] for change in changes], axis=1),
                 floor,
                 SWEEPS,

@@ -74,11 +74,13 @@ def fit_codebook(
         weights,
         codebook_side(min(size, settings.sh_codebook_size)) ** 2,
         pool,
-        seed=settings.seed,
-        iterations=settings.sh_kmeans_iterations,
-        nprobe=settings.sh_nprobe,
-        tolerance=settings.sh_tolerance,
-        lattice=settings.sh_step if settings.shared_step_size else 0.0,
+        kmeans.KMeansOptions(
+            seed=settings.seed,
+            iterations=settings.sh_kmeans_iterations,
+            nprobe=settings.sh_nprobe,
+            tolerance=settings.sh_tolerance,
+            lattice=settings.sh_step if settings.shared_step_size else 0.0,
+        ),
         report=lambda fraction: progress("codebook", fraction),
     )
     # The smallest image that holds the entries; unused places repeat some of them.

@@ -8,15 +8,15 @@ from hypothesis import strategies as st
 from kissgs import sample_scene
 from kissgs.core.threads import blas_workers
 from kissgs.planning import kmeans
-from kissgs.planning.kmeans import MAX_COARSE, assign, fit
+from kissgs.planning.kmeans import MAX_COARSE, KMeansOptions, assign, fit
 from kissgs.planning.sh_codebook import codebook_side
 
 
-def run(vectors, size, weights=None, threads=1, **options):
+def run(vectors, size, weights=None, threads=1, report=lambda fraction: None, **options):
     weights = np.ones(len(vectors), np.float32) if weights is None else weights.astype(np.float32)
     given = {"seed": 0, "iterations": 6, "nprobe": MAX_COARSE, "tolerance": 0.0, "lattice": 0.0, **options}
     with blas_workers(threads) as pool:
-        return fit(vectors, weights, size, pool, **given)
+        return fit(vectors, weights, size, pool, KMeansOptions(**given), report=report)
 
 
 def blobs(count=3000, dimensions=6, seed=0):

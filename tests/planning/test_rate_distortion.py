@@ -14,7 +14,7 @@ from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import clean
 from kissgs.core.threads import Workers
 from kissgs.planning.quantize import quantize
-from kissgs.planning.rd_model import MIN_ERROR_RATIO, CodebookErrorModel, Costs, error_at, lambda_for, step
+from kissgs.planning.rd_model import MIN_ERROR_RATIO, CodebookErrorModel, Costs, RdCriterion, error_at, lambda_for, step
 from kissgs.planning.rdo_quantize import AXIS_SIGNS, CAPTURED, quantize_by_class, rdo_quantize_shapes
 from kissgs.planning.rotation_forms import ROTATIONS, apply_forms
 from kissgs.sogxt.encode import encode
@@ -94,7 +94,9 @@ def test_levels_of_a_class_are_multiples_of_its_step():
     rng = np.random.default_rng(0)
     values, classes = rng.normal(size=(3000, 3)), np.repeat([0, 1, 2], 1000)
     cost = np.repeat([1.0, 0.1, 0.004], 1000)
-    found = quantize_by_class(values, cost, classes, 1e-4, np.full(3000, 2.0))
+    splats = random_scene(3000, 0)
+    criterion = RdCriterion(Costs.of(random_sensitivity(splats), splats), classes, 1e-4)
+    found = quantize_by_class(values, cost, criterion, np.full(3000, 2.0))
     each = (found.high.astype(float) - found.low) / found.top
     errors = np.abs(found.low + found.levels * each - values)
     for c, wanted in enumerate((1, 3, 16)):
@@ -144,8 +146,13 @@ def test_without_a_rate_cost_levels_are_the_nearest_along_each_axis():
     costs = Costs.of(random_sensitivity(splats), splats)
     with Workers(1) as pool:
         found = rdo_quantize_shapes(
-            *(values, parts, np.tile(packed(np.diag([1.0] * 4 + [0] * 3)), (count, 1)), np.zeros(count, np.uint8)),
-            *(costs, np.zeros(count, np.int64), 1e-30, anything(count), pool),
+            values,
+            parts,
+            np.tile(packed(np.diag([1.0] * 4 + [0] * 3)), (count, 1)),
+            np.zeros(count, np.uint8),
+            RdCriterion(costs, np.zeros(count, np.int64), 1e-30),
+            anything(count),
+            pool,
         )
     for part, chosen, (a, b) in list(zip(parts, found, ((0, 1), (1, 4), (4, 8)), strict=True))[:2]:
         each = (part.high.astype(float) - part.low) / part.top
@@ -172,8 +179,13 @@ def test_rdo_quantisation_never_costs_more_than_the_nearest_level():
     )
     with Workers(1) as pool:
         found = rdo_quantize_shapes(
-            *(values, parts, np.tile(packed(form), (count, 1)), np.zeros(count, np.uint8), costs),
-            *(np.zeros(count, np.int64), rd_lambda, anything(count), pool),
+            values,
+            parts,
+            np.tile(packed(form), (count, 1)),
+            np.zeros(count, np.uint8),
+            RdCriterion(costs, np.zeros(count, np.int64), rd_lambda),
+            anything(count),
+            pool,
         )
 
     def decoded(chosen):
