@@ -114,7 +114,7 @@ def _one_view(
         for tensor in tensors.values():
             tensor.grad = None
         images, _ = rasterize(
-            **tensors, viewmats=viewmats, Ks=Ks, width=camera.width, height=camera.height, threads=threads
+            tensors, viewmats=viewmats, Ks=Ks, width=camera.width, height=camera.height, threads=threads
         )
         torch.autograd.backward(images, weights)
         return images.detach()

@@ -12,7 +12,8 @@ from kissgs.core.array_types import Float32, Float64, Int
 from kissgs.finetuning.quantized_scene import Plane, QuantizedScene
 from kissgs.planning.layout import Grid
 from kissgs.planning.rdo_quantize import UNUSED_COUNT
-from kissgs.training.loop import Parameters, TrainableScene
+from kissgs.rendering.tensors import Parameters
+from kissgs.training.loop import TrainableScene
 
 ENTROPY_FIELDS = ("opacities", "scales", "quaternions", "f_dc")
 """Fields whose bits are estimated from the histograms of their levels; positions have too many levels for that."""

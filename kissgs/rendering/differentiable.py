@@ -11,6 +11,7 @@ from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu.frame import Frame, differentiate, draw
+from kissgs.rendering.tensors import Parameters
 
 try:
     import torch
@@ -21,12 +22,7 @@ except ModuleNotFoundError as error:
 
 
 def rasterize(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    sh0: Tensor,
-    shN: Tensor,
+    parameters: Parameters,
     viewmats: Tensor,
     Ks: Tensor,
     width: int,
@@ -38,15 +34,18 @@ def rasterize(
     """Render images of a scene, with gradients by all of its parameters.
 
     On the CPU by kissgs' own kernels, on CUDA by gsplat (extra ``kissgs[cuda]``), both with the image model of
-    :mod:`kissgs.rendering.constants`. The parameters are those stored in a scene, float32 and finite.
+    :mod:`kissgs.rendering.constants`.
 
     Args:
-        means: ``(N, 3)`` world units.
-        quats: ``(N, 4)`` w, x, y, z of any length; a length below 1e-12 means no rotation, and gradient 0.
-        scales: ``(N, 3)`` natural logarithms of standard deviations.
-        opacities: ``(N,)`` logits.
-        sh0: ``(N, 3)`` constant SH coefficients.
-        shN: ``(N, K, 3)`` other SH coefficients, K one of 0, 3, 8, 15.
+        parameters: stored parameters of a scene, float32 and finite, all on one device; from
+            :func:`kissgs.rendering.tensors.tensors_of`, for example:
+
+            - means: ``(N, 3)`` world units.
+            - quats: ``(N, 4)`` w, x, y, z of any length; a length below 1e-12 means no rotation, and gradient 0.
+            - scales: ``(N, 3)`` natural logarithms of standard deviations.
+            - opacities: ``(N,)`` logits.
+            - sh0: ``(N, 3)`` constant SH coefficients.
+            - shN: ``(N, K, 3)`` other SH coefficients, K one of 0, 3, 8, 15.
         viewmats: ``(C, 4, 4)`` world to camera; x right, y down, z forward. No gradient.
         Ks: ``(C, 3, 3)`` intrinsics in pixels. No gradient.
         width: of the images, pixels.
@@ -63,21 +62,21 @@ def rasterize(
         InvalidSceneError: the shapes of the parameters do not fit together.
         InvalidViewsError: no camera; another number of backgrounds than of cameras; not a rigid pose, or not a pinhole.
     """
-    parameters = (means, quats, scales, opacities, sh0, shN)
+    tensors, device = [parameters[name] for name in ATTRIBUTES], parameters["means"].device
     if backgrounds is None:
         backgrounds = torch.zeros((len(viewmats), 3))
     _check_views(viewmats, Ks, backgrounds)
-    if any(tensor.dtype != torch.float32 or tensor.device != means.device for tensor in parameters):
+    if any(tensor.dtype != torch.float32 or tensor.device != device for tensor in tensors):
         raise UnsupportedError("the rasteriser takes float32 parameters on one device only; convert or move the others")
-    if means.device.type == "cuda":
+    if device.type == "cuda":
         from kissgs.rendering.gsplat_backend import rasterize_on_cuda
 
-        return rasterize_on_cuda(*parameters, viewmats, Ks, width, height, backgrounds)
-    if means.device.type != "cpu":
-        raise UnsupportedError(f"the rasteriser runs on cpu and cuda, not on {means.device.type}; move the parameters")
+        return rasterize_on_cuda(parameters, viewmats, Ks, width, height, backgrounds)
+    if device.type != "cpu":
+        raise UnsupportedError(f"the rasteriser runs on cpu and cuda, not on {device.type}; move the parameters")
     poses, pinholes, colours = (tensor.cpu().numpy() for tensor in (viewmats, Ks, backgrounds))
     cameras = [Camera(pose, K, width, height) for pose, K in zip(poses, pinholes, strict=True)]
-    images, alphas = _Rasterize.apply(*parameters, cameras, colours, threads)  # type: ignore[no-untyped-call]
+    images, alphas = _Rasterize.apply(*tensors, cameras, colours, threads)  # type: ignore[no-untyped-call]
     return images, alphas
 
 

@@ -17,6 +17,8 @@ from kissgs.rendering.camera import Camera
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from kissgs.rendering.tensors import Parameters
+
 
 RenderedImage = tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]
 """Colours and alphas of an image."""
@@ -28,12 +30,7 @@ GSPLAT_MISSING = "rendering on CUDA needs gsplat, which is not installed: pip in
 
 
 def rasterize_on_cuda(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    sh0: Tensor,
-    shN: Tensor,
+    parameters: Parameters,
     viewmats: Tensor,
     Ks: Tensor,
     width: int,
@@ -51,6 +48,7 @@ def rasterize_on_cuda(
         from gsplat import rasterization
     except ImportError as error:
         raise UnsupportedError(GSPLAT_MISSING) from error
+    means, shN = parameters["means"], parameters["shN"]
     device = means.device
     backgrounds = backgrounds.to(device, torch.float32)
     if not len(means):  # gsplat does not promise to render an empty scene
@@ -58,10 +56,10 @@ def rasterize_on_cuda(
         return empty.contiguous(), torch.zeros((len(viewmats), height, width), device=device)
     images, alphas, _ = rasterization(
         means=means,
-        quats=quats,
-        scales=torch.exp(scales),
-        opacities=torch.sigmoid(opacities),
-        colors=torch.cat([sh0[:, None], shN], dim=1),
+        quats=parameters["quats"],
+        scales=torch.exp(parameters["scales"]),
+        opacities=torch.sigmoid(parameters["opacities"]),
+        colors=torch.cat([parameters["sh0"][:, None], shN], dim=1),
         viewmats=viewmats.to(device, torch.float32),
         Ks=Ks.to(device, torch.float32),
         width=width,
@@ -121,7 +119,7 @@ def image_renderer(splats: Splats) -> ImageRenderer:
     def render(camera: Camera, background: Sequence[float]) -> RenderedImage:
         with torch.no_grad():
             images, alphas = rasterize_on_cuda(
-                **parameters,
+                parameters,
                 viewmats=torch.from_numpy(camera.viewmat[None]),
                 Ks=torch.from_numpy(camera.K[None]),
                 width=camera.width,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.splats import ATTRIBUTES, Splats
 
@@ -10,6 +12,9 @@ try:
     from torch import Tensor
 except ModuleNotFoundError as error:
     raise UnsupportedError("tensors need torch, which is not installed: pip install 'kissgs[train]'") from error
+
+Parameters = Mapping[str, Tensor]
+"""Stored parameters of a scene, by the names in :class:`kissgs.core.splats.Splats`."""
 
 
 def tensors_of(splats: Splats, device: str = "cpu") -> dict[str, Tensor]:

@@ -11,6 +11,7 @@ from typing import Protocol
 
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.progress import Progress, silent
+from kissgs.rendering import tensors
 from kissgs.rendering.differentiable import rasterize
 from kissgs.rendering.losses import photometric_loss
 from kissgs.training.targets import TrainingTargets
@@ -24,8 +25,8 @@ except ModuleNotFoundError as error:
 SMOOTHING = 0.98
 """Weight of the former value in the running means of loss and squared error."""
 
-Parameters = Mapping[str, Tensor]
-"""Stored parameters of a scene, by the names in :class:`kissgs.core.splats.Splats`."""
+Parameters = tensors.Parameters
+"""Stored parameters of a scene, by name; the type that regularizers receive."""
 
 LrSchedule = Callable[[float], Mapping[str, float]]
 """Function from the fraction of steps done, 0 to 1, to the learning rates by parameter."""
@@ -132,7 +133,7 @@ def image_loss(
     camera = targets.cameras[n]
     target = torch.from_numpy(targets.image(n))[None].to(parameters["means"].device)
     image, _ = rasterize(
-        **parameters,
+        parameters,
         viewmats=torch.from_numpy(camera.viewmat)[None],  # float64: poses far from the origin need it
         Ks=torch.from_numpy(camera.K)[None],
         width=camera.width,

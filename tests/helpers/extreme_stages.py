@@ -58,7 +58,7 @@ def gradient(name):
     weights = torch.from_numpy(rng.normal(0, 1, (view.height, view.width, 4)) * expected.sure[:, :, None])
     _weighted(expected.image, expected.alpha, weights).backward()
     found = {attribute: tensor.clone().requires_grad_() for attribute, tensor in tensors_of(splats).items()}
-    images, alphas = rasterize(**found, **_camera(view))
+    images, alphas = rasterize(found, **_camera(view))
     _weighted(images[0], alphas[0], weights).backward()
     return relative(*({key: tensor.grad for key, tensor in leaves.items()} for leaves in (found, wanted)), splats, view)
 

@@ -13,7 +13,7 @@ def render_tensors(splats, cameras, device="cpu", backgrounds=None, **parameters
     """Return images and alphas as tensors, and the parameters they were rendered from."""
     tensors = {name: tensor.clone().requires_grad_() for name, tensor in tensors_of(splats, device).items()}
     images, alphas = rasterize(
-        **tensors,
+        tensors,
         viewmats=torch.from_numpy(np.stack([c.viewmat for c in cameras])),
         Ks=torch.from_numpy(np.stack([c.K for c in cameras])),
         width=cameras[0].width,

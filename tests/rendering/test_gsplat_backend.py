@@ -26,12 +26,14 @@ def fake_rasterization(
     assert rest == CLASSIC
     assert colors.shape[1] == (sh_degree + 1) ** 2
     images, alphas = rasterize(
-        means,
-        quats,
-        torch.log(scales),
-        torch.logit(opacities.double()).float(),
-        colors[:, 0],
-        colors[:, 1:],
+        {
+            "means": means,
+            "quats": quats,
+            "scales": torch.log(scales),
+            "opacities": torch.logit(opacities.double()).float(),
+            "sh0": colors[:, 0],
+            "shN": colors[:, 1:],
+        },
         viewmats,
         Ks,
         width,
@@ -51,7 +53,7 @@ def gsplat(monkeypatch):
 def arguments(count, degree):
     views = [camera(seed=1), camera(seed=2)]
     return {
-        **tensors_of(blobs(count, degree)),
+        "parameters": tensors_of(blobs(count, degree)),
         "viewmats": torch.from_numpy(np.stack([view.viewmat for view in views])).float(),
         "Ks": torch.from_numpy(np.stack([view.K for view in views])).float(),
         "width": views[0].width,
@@ -62,16 +64,16 @@ def arguments(count, degree):
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_gsplat_gets_the_arguments_of_the_same_image(gsplat, degree):
-    tensors = arguments(30, degree)
-    images, alphas = rasterize_on_cuda(**tensors)
-    expected_images, expected_alphas = rasterize(**tensors)
+    given = arguments(30, degree)
+    images, alphas = rasterize_on_cuda(**given)
+    expected_images, expected_alphas = rasterize(**given)
     torch.testing.assert_close(images, expected_images, atol=2e-5, rtol=0)
     torch.testing.assert_close(alphas, expected_alphas, atol=2e-5, rtol=0)
 
 
 def test_an_empty_scene_is_its_background(gsplat):
-    tensors = arguments(0, 1)
-    for found, expected in zip(rasterize_on_cuda(**tensors), rasterize(**tensors), strict=True):
+    given = arguments(0, 1)
+    for found, expected in zip(rasterize_on_cuda(**given), rasterize(**given), strict=True):
         assert torch.equal(found, expected)
 
 

@@ -214,7 +214,7 @@ def test_tensors_need_not_be_contiguous():
     expected, _, _ = render_tensors(splats, [view])
     tensors = {name: tensor.repeat_interleave(2, 0)[::2] for name, tensor in tensors_of(splats).items()}
     viewmats, Ks = torch.from_numpy(view.viewmat[None]), torch.from_numpy(view.K[None])
-    images, _ = rasterize(**tensors, viewmats=viewmats, Ks=Ks, width=view.width, height=view.height)
+    images, _ = rasterize(tensors, viewmats=viewmats, Ks=Ks, width=view.width, height=view.height)
     assert torch.equal(images, expected)
 
 
@@ -238,9 +238,12 @@ def test_tensors_need_not_be_contiguous():
     ],
 )
 def test_invalid_arguments_are_refused(change, error, message):
-    arguments = {**tensors_of(blobs(5)), "viewmats": torch.eye(4)[None], "Ks": torch.eye(3)[None], "width": 8}
+    parameters = tensors_of(blobs(5))
+    views = {"viewmats": torch.eye(4)[None], "Ks": torch.eye(3)[None], "width": 8, "height": 8}
+    for name, value in change.items():
+        (parameters if name in parameters else views)[name] = value
     with pytest.raises(error, match=message):
-        rasterize(**{**arguments, **change}, height=8)
+        rasterize(parameters, **views)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device here")
@@ -260,7 +263,7 @@ def test_cameras_may_have_any_dtype_and_layout():
     expected, _, _ = render_tensors(splats, [view, view])
     viewmats = torch.linalg.inv(torch.linalg.inv(torch.from_numpy(view.viewmat)))[None].expand(2, 4, 4)
     Ks = torch.from_numpy(view.K).expand(2, 3, 3)
-    images, _ = rasterize(**tensors_of(splats), viewmats=viewmats, Ks=Ks, width=view.width, height=view.height)
+    images, _ = rasterize(tensors_of(splats), viewmats=viewmats, Ks=Ks, width=view.width, height=view.height)
     torch.testing.assert_close(images, expected, atol=1e-4, rtol=0)
     fortran = np.asfortranarray(view.viewmat.astype(np.float32))
     fortran.setflags(write=False)
