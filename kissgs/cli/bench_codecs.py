@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -19,20 +19,33 @@ if TYPE_CHECKING:
     from kissgs.settings import Settings
 
 
+@dataclass(frozen=True, slots=True)
+class ExternalCodecs:
+    """External codecs to measure.
+
+    Attributes:
+        formats: formats of :data:`kissgs.benchmark.external_codecs.EXTERNAL_FORMATS`.
+        splat_transform: command line that starts splat-transform, their tool.
+        sog_iterations: k-means iterations over the SH of ``.sog``; None for the tool's default.
+    """
+
+    formats: list[str]
+    splat_transform: str
+    sog_iterations: int | None
+
+
 def codecs(
     inputs: BenchInputs,
     *,
     presets: list[str] | None,
     changes: list[str] | None,
-    external_codecs: list[str],
-    splat_transform: str,
-    sog_iterations: int | None,
+    external: ExternalCodecs,
     quality_offsets: list[float],
     repeats: int,
     evaluate: bool,
 ) -> BenchOutput:
     """Measure presets, points of their quality curves and external codecs."""
-    if sog_iterations is not None and "sog" not in external_codecs:
+    if external.sog_iterations is not None and "sog" not in external.formats:
         raise UnsupportedError("--sog-iterations needs --external sog")
     from kissgs.benchmark.comparison import BenchmarkPlan, compare
     from kissgs.benchmark.comparison_plots import comparison_plot
@@ -47,9 +60,9 @@ def codecs(
         presets=settings,
         curve_presets=curve_presets,
         quality_offsets=quality_offsets,
-        external_codecs=external_codecs,
-        splat_transform=_command(splat_transform),
-        sog_iterations=sog_iterations,
+        external_codecs=external.formats,
+        splat_transform=_command(external.splat_transform),
+        sog_iterations=external.sog_iterations,
         repeats=repeats,
         evaluate=evaluate or inputs.views is not None or bool(quality_offsets),
         views=inputs.views,
