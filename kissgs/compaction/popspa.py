@@ -230,17 +230,17 @@ class _Recipe:
 
     def _train(self, phases: list[_Phase], number: int, done: int, state: State, targets: TrainingTargets) -> None:
         """One phase from a step of it on, and the pruning after it."""
-        from kissgs.compaction.regularizers import Shape
-        from kissgs.compaction.sparsify import Sparsity
+        from kissgs.compaction.regularizers import ShapeRegularizer
+        from kissgs.compaction.sparsify import AdmmSparsifier
         from kissgs.training.loop import Regularizer, TrainingPlan, train
 
         phase, chosen, wishes = phases[number], self.settings, list[Regularizer]()
         progress = self._within(phases, number)
         if chosen.erank_weight or chosen.min_scale_weight:
-            wishes.append(Shape(chosen.erank_weight, chosen.min_scale_weight, self._extent(targets)))
+            wishes.append(ShapeRegularizer(chosen.erank_weight, chosen.min_scale_weight, self._extent(targets)))
         sparsity = None
         if phase.name == "sparsify" and chosen.admm_rho:
-            sparsity = Sparsity(self.model.parameters["opacities"], phase.count, chosen.admm_rho, chosen.admm_interval)
+            sparsity = AdmmSparsifier(self.model.parameters["opacities"], phase.count, chosen.admm_rho, chosen.admm_interval)
             wishes.append(sparsity)
             if "z" in state:  # not where the phase had not begun
                 sparsity.restore(state)
