@@ -12,7 +12,7 @@ import numpy as np
 from kissgs.cameras.views import TargetSource, Views
 from kissgs.compaction.evaluate import evaluate_scene
 from kissgs.compaction.popspa import popspa
-from kissgs.compaction.scoring import highest
+from kissgs.compaction.scoring import highest_indices
 from kissgs.core.array_types import Int
 from kissgs.core.errors import InvalidSceneError
 from kissgs.core.progress import Progress, silent
@@ -59,7 +59,7 @@ def random_subset(splats: Splats, count: int) -> Int[np.ndarray, " M"]:
 
 def most_opaque(splats: Splats, count: int) -> Int[np.ndarray, " M"]:
     """Return the indices of the ``count`` most opaque Gaussians, ascending."""
-    return highest(splats.opacities, count)
+    return highest_indices(splats.opacities, count)
 
 
 @dataclass(frozen=True, slots=True)

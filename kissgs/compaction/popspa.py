@@ -18,7 +18,7 @@ from kissgs.cameras.captures.files import open_file
 from kissgs.cameras.virtual.scene_bounds import scene_bounds
 from kissgs.compaction.evaluate import evaluate_scene
 from kissgs.compaction.result import Compacted, CompactionReport, CompactionStep
-from kissgs.compaction.scoring import show_most
+from kissgs.compaction.scoring import prune_by_score
 from kissgs.core.array_types import Float32, Int
 from kissgs.core.errors import OutputError
 from kissgs.core.progress import Progress, silent
@@ -215,13 +215,13 @@ class _Recipe:
 
     def _prune(self, scene: Splats, count: int, progress: Progress) -> Int[np.ndarray, " M"]:
         """Which to keep."""
-        chosen = show_most(
+        chosen = prune_by_score(
             scene,
             self.supervision.score,
             self.supervision.background,
             count,
-            share=self.settings.min_keep_per_scoring,
-            least=UNSEEN[self.supervision.captured],
+            min_keep_per_scoring=self.settings.min_keep_per_scoring,
+            min_score=UNSEEN[self.supervision.captured],
             threads=self.threads,
             progress=progress,
         )

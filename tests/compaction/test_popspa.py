@@ -14,7 +14,7 @@ from kissgs import CompactSettings, OutputError, UnsupportedError
 from kissgs.cameras.views import View, Views, black
 from kissgs.compaction.budget import compact_scene
 from kissgs.compaction.popspa import popspa
-from kissgs.compaction.scoring import highest, show_most
+from kissgs.compaction.scoring import highest_indices, prune_by_score
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.rendering.camera import look_at
 from kissgs.rendering.coverage import Coverage
@@ -75,7 +75,7 @@ def test_without_training_it_is_pruning_alone(captured, least):
     """What no camera shows counts little where people said from where they look, and more where nobody did."""
     scene, target_source = cloud(60), replace(taught(), captured=captured)
     result = popspa(scene, 20, settings(sparsify_steps=0, refine_steps=0), target_source)
-    kept = show_most(scene, target_source.train, black(), 20, share=0.6, least=least)
+    kept = prune_by_score(scene, target_source.train, black(), 20, min_keep_per_scoring=0.6, min_score=least)
     assert (result.index == kept).all()
     assert same(result.splats, scene.select(kept))
     assert result.report.target_source == "nothing"
@@ -319,7 +319,7 @@ def test_nothing_is_seen():
     scene = cloud(30)
     far = replace(scene, means=scene.means + np.float32(500))
     pruned = popspa(far, 10, settings(sparsify_steps=0, refine_steps=0), taught())
-    assert pruned.index.tolist() == highest(Coverage(far).close_up, 10).tolist()
+    assert pruned.index.tolist() == highest_indices(Coverage(far).close_up, 10).tolist()
     result = popspa(far, 10, settings(admm_rho=0), taught())
     large = np.exp(np.sort(far.scales, axis=1)[:, 1:].sum(axis=1)) / (1 + np.exp(-far.opacities)) ** 2
     assert np.median(large[result.index]) > 2 * np.median(np.delete(large, result.index))
