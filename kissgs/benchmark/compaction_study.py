@@ -11,7 +11,7 @@ import numpy as np
 
 from kissgs.cameras.views import TargetSource, Views
 from kissgs.compaction.evaluate import evaluate_scene
-from kissgs.compaction.popspa import popspa
+from kissgs.compaction.popspa import Popspa
 from kissgs.compaction.scoring import highest_indices
 from kissgs.core.array_types import Int
 from kissgs.core.errors import InvalidSceneError
@@ -152,9 +152,8 @@ def compare_strategies(
             count = max(1, round(len(splats) * ratio))
             wall, cpu = time.perf_counter(), time.process_time()
             scene = splats if strategy.start is None else splats.select(strategy.start(splats, count))
-            found = popspa(
+            task = Popspa(
                 scene,
-                count,
                 strategy.apply(settings),
                 supervised,
                 reference=splats,
@@ -162,6 +161,7 @@ def compare_strategies(
                 threads=threads,
                 progress=progress,
             )
+            found = task(count)
             wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
             metrics, size = evaluate_scene(found.splats, splats, supervised, threads, progress)
             points.append(_point(strategy.name, found.splats, metrics, size, wall, cpu))

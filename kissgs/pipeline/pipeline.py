@@ -106,8 +106,10 @@ def compact(
     clock = StageTimer(progress)
     splats, cleaned, _ = open_scene(source, threads, clock)
     result = compact_scene(
-        *(splats, settings.compact, views),
-        judges=evaluate,
+        splats,
+        settings.compact,
+        views,
+        evaluate=evaluate,
         checkpoint=Path(checkpoint) if checkpoint is not None else None,
         threads=threads,
         device=device,
