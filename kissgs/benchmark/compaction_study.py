@@ -11,8 +11,8 @@ import numpy as np
 
 from kissgs.cameras.views import TargetSource, Views
 from kissgs.compaction.evaluate import evaluate_scene
-from kissgs.compaction.popspa import popspa
-from kissgs.compaction.scoring import highest
+from kissgs.compaction.popspa import Popspa
+from kissgs.compaction.scoring import highest_indices
 from kissgs.core.array_types import Int
 from kissgs.core.errors import InvalidSceneError
 from kissgs.core.progress import Progress, silent
@@ -59,7 +59,7 @@ def random_subset(splats: Splats, count: int) -> Int[np.ndarray, " M"]:
 
 def most_opaque(splats: Splats, count: int) -> Int[np.ndarray, " M"]:
     """Return the indices of the ``count`` most opaque Gaussians, ascending."""
-    return highest(splats.opacities, count)
+    return highest_indices(splats.opacities, count)
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,9 +152,8 @@ def compare_strategies(
             count = max(1, round(len(splats) * ratio))
             wall, cpu = time.perf_counter(), time.process_time()
             scene = splats if strategy.start is None else splats.select(strategy.start(splats, count))
-            found = popspa(
+            task = Popspa(
                 scene,
-                count,
                 strategy.apply(settings),
                 supervised,
                 reference=splats,
@@ -162,6 +161,7 @@ def compare_strategies(
                 threads=threads,
                 progress=progress,
             )
+            found = task(count)
             wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
             metrics, size = evaluate_scene(found.splats, splats, supervised, threads, progress)
             points.append(_point(strategy.name, found.splats, metrics, size, wall, cpu))

@@ -1,1 +1,5 @@
-"""Fewer Gaussians for the same pictures (POPSpa): a stage of its own, from a scene to a scene."""
+"""Compaction: a scene, its views and a budget -> a scene with fewer Gaussians and a report of every step.
+
+Gaussians are scored and pruned, and the remaining ones are trained to show the same images (POPSpa, KISS-GS 3.1).
+Takes and returns :class:`kissgs.Splats`; writes no files but checkpoints, and knows nothing of the encoder's plans.
+"""

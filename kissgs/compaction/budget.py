@@ -1,9 +1,9 @@
-"""How many Gaussians to keep: a count, a share, or as few as a loss of picture quality allows."""
+"""Number of Gaussians to keep: a count, a share, or as few as a drop of PSNR allows."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from kissgs.cameras.views import Views
-from kissgs.compaction.popspa import popspa
+from kissgs.compaction.popspa import Popspa
 from kissgs.compaction.result import Compacted, CompactionReport
 from kissgs.core.errors import StopSearch, UnsupportedError
 from kissgs.core.progress import Progress, as_stage, silent
@@ -29,14 +29,17 @@ if TYPE_CHECKING:
     from kissgs.evaluation.results import Evaluation
     from kissgs.training.targets import TrainingTargets
 
-START, SLOPE, LARGEST = -2.0, 0.4, -0.1
-"""First share that is tried, decibels that doubling it is about worth, and the largest share; powers of 2."""
+START_LOG2, MAX_LOG2 = -2.0, -0.1
+"""log2 of the first share of the Gaussians that a search tries, and of the largest one."""
 
-GRAIN = 1 / 64
-"""Of shares, the same: counts that are nearer to each other than 1 % are not told apart."""
+DROP_PER_HALVING = 0.4
+"""Drop of PSNR, decibels, that a search expects from half as many Gaussians; only for its first steps."""
 
-NEAR = 0.02
-"""Decibels to spare that are near enough."""
+GRAIN_LOG2 = 1 / 64
+"""Shares are multiples of this, as log2: counts that differ by less than 1 % are not tried both."""
+
+TOLERANCE_DB = 0.02
+"""A search ends once the drop is at most this far below the allowed one, decibels."""
 
 NO_CHECKPOINT = "a search for a {} keeps no checkpoint; give a count or a ratio with it"
 
@@ -46,51 +49,52 @@ def compact_scene(
     settings: CompactSettings,
     views: Views | None = None,
     *,
-    judges: bool = False,
+    evaluate: bool = False,
     checkpoint: Path | None = None,
     threads: int = 0,
     device: Device = "cpu",
     progress: Progress = silent,
 ) -> Compacted:
-    """Fewer Gaussians for the same pictures, as the settings ask.
+    """Reduce the number of Gaussians to the budget of the settings.
 
     Args:
-        splats: clean.
-        settings: with a budget.
-        views: a capture: its views for training are learned from, those that are held out judge. By default virtual
-            ones teach, by pictures of the scene itself, and cameras drawn over the whole scene judge.
-        judges: measure PSNR, SSIM and bytes after every step, unless several compactions are tried.
-        checkpoint: see :func:`kissgs.compaction.popspa.popspa`.
-        threads: 0 means one per processor; the result does not depend on it.
-        device: see the same.
-        progress: receives "cameras" and the stages of that.
+        splats: the scene, clean.
+        settings: settings with a budget; a scene with no more Gaussians than that is returned unchanged.
+        views: a capture: its training views train and score, its held-out views evaluate. By default, virtual views
+            train and score with renderings of the scene as targets, and cameras drawn over the whole scene evaluate.
+        evaluate: measure PSNR, SSIM and compressed bytes after every step. Ignored with ``max_psnr_drop``.
+        checkpoint: file for the state of the training, see :class:`kissgs.compaction.popspa.Popspa`.
+        threads: number of threads; 0 means one per processor. The result does not depend on it.
+        device: device of the training, see :class:`kissgs.compaction.popspa.Popspa`.
+        progress: receives the stages "cameras" and those of :class:`kissgs.compaction.popspa.Popspa`.
 
     Raises:
         InvalidViewsError: a photograph cannot be read.
-        OutputError: ``checkpoint`` is of other work, or cannot be written.
-        UnsupportedError: no budget is given; no torch or no GPU to train with; too little memory.
+        OutputError: ``checkpoint`` belongs to other work, or cannot be written.
+        UnsupportedError: the settings have no budget; torch or a GPU is missing for the training; an image would take
+            too much memory.
     """
     if not settings.enabled:
-        raise UnsupportedError("how many Gaussians to keep is not said; give count, ratio or max_psnr_drop")
+        raise UnsupportedError("missing the number of Gaussians to keep: give count, ratio or max_psnr_drop")
     if settings.auto_count:
         raise UnsupportedError(
-            "a goal is that of a container: kissgs compress; here give count, ratio or max_psnr_drop"
+            "auto_count needs a container: use kissgs compress, or give count, ratio or max_psnr_drop"
         )
     if settings.max_psnr_drop is not None and checkpoint is not None:
         raise UnsupportedError(NO_CHECKPOINT.format("drop of PSNR"))
     count = settings.count or max(1, round(len(splats) * (settings.ratio or 0.0)))
     if count >= len(splats):
-        return unchanged(splats, "no more than asked for")
+        return unchanged(splats, "no more than requested")
     compactor = Compactor.of(splats, settings, views, threads=threads, device=device, progress=progress)
     if settings.max_psnr_drop is None:
-        return compactor(count, judges=judges, checkpoint=checkpoint)
-    return _Search(compactor).run(settings.max_psnr_drop)
+        return compactor(count, evaluate=evaluate, checkpoint=checkpoint)
+    return _DropSearch(compactor).run(settings.max_psnr_drop)
 
 
-def unchanged(splats: Splats, why: str) -> Compacted:
-    """All of them."""
+def unchanged(splats: Splats, reason: str) -> Compacted:
+    """Return the scene with all its Gaussians and a report whose note gives the reason."""
     count = f"{len(splats):,} Gaussian{'' if len(splats) == 1 else 's'}"
-    note = f"the scene has {count}, {why}: it stays as it is"
+    note = f"the scene has {count}, {reason}: it is unchanged"
     report = CompactionReport(
         source_count=len(splats), count=len(splats), target_source="nothing", source="", steps=(), note=note
     )
@@ -99,16 +103,16 @@ def unchanged(splats: Splats, why: str) -> Compacted:
 
 @dataclass(slots=True, eq=False)
 class Compactor:
-    """Compacts one scene, to several counts if need be: what is learned from is drawn or read once.
+    """Compacts one scene to any number of counts; views and training targets are prepared once.
 
     Attributes:
-        splats: clean.
-        settings: of the recipe.
-        supervision: views to learn from.
-        threads: see :func:`compact_scene`.
-        device: see the same.
-        progress: see the same.
-        judges: views to judge by; None: cameras drawn over the whole scene.
+        splats: the scene, clean.
+        settings: settings of pruning and training.
+        supervision: views that score and train.
+        threads: number of threads; 0 means one per processor.
+        device: device of the training.
+        progress: receives events, see :func:`compact_scene`.
+        eval_views: views that :meth:`evaluate` uses; None until cameras are drawn over the whole scene.
     """
 
     splats: Splats
@@ -117,9 +121,9 @@ class Compactor:
     threads: int
     device: Device
     progress: Progress
-    judges: Views | None = None
-    _taken: dict[str, Rendering] | None = None
-    _targets: TrainingTargets | None = None
+    eval_views: Views | None = None
+    _reference_images: dict[str, Rendering] | None = field(init=False, default=None)
+    _targets: TrainingTargets | None = field(init=False, default=None)
 
     @classmethod
     def of(
@@ -132,62 +136,77 @@ class Compactor:
         device: Device = "cpu",
         progress: Progress = silent,
     ) -> Compactor:
-        """See :func:`compact_scene` for arguments and errors."""
+        """Choose the views. Arguments and errors are those of :func:`compact_scene`."""
         if settings.trains and find_spec("torch") is None:
             raise UnsupportedError(
-                "training is done with torch, which is missing: pip install 'kissgs[train]' (a CPU build will do); the "
-                "preset fast only prunes, and needs none"
+                "training needs torch, which is missing: pip install 'kissgs[train]' (a CPU build is enough); the "
+                "preset fast only prunes and does not need it"
             )
         if settings.trains and device == "cuda":
             need_cuda()
-        scored = SCORING_STRIDE if settings.trains else 1
-        taught = supervision_views(splats, views, settings, scoring_stride=scored, threads=threads, progress=progress)
-        return cls(splats, settings, taught, threads, device, progress, None if views is None else taught.eval_views)
+        stride = SCORING_STRIDE if settings.trains else 1
+        supervision = supervision_views(
+            splats, views, settings, scoring_stride=stride, threads=threads, progress=progress
+        )
+        eval_views = None if views is None else supervision.eval_views
+        return cls(splats, settings, supervision, threads, device, progress, eval_views)
 
-    def __call__(self, count: int, *, judges: bool = False, checkpoint: Path | None = None) -> Compacted:
-        """Down to ``count``, which is less than the scene has."""
+    def __call__(self, count: int, *, evaluate: bool = False, checkpoint: Path | None = None) -> Compacted:
+        """Return the scene with exactly ``count`` Gaussians, from 1 to fewer than it has.
+
+        ``evaluate`` and ``checkpoint`` are those of :func:`compact_scene`.
+        """
         if self._targets is None and self.settings.trains:
             from kissgs.training.targets import training_targets
 
             self._targets = training_targets(
-                *(self.splats, self.supervision.train, self.supervision.background),
+                self.splats,
+                self.supervision.train,
+                self.supervision.background,
                 threads=self.threads,
                 device=self.device,
                 progress=self.progress,
             )
-        return popspa(
-            *(self.splats, count, self.settings, self.supervision),
+        task = Popspa(
+            self.splats,
+            self.settings,
+            self.supervision,
             targets=self._targets,
-            judges=judges,
-            checkpoint=checkpoint,
             threads=self.threads,
             device=self.device,
             progress=self.progress,
         )
+        return task(count, evaluate=evaluate, checkpoint=checkpoint)
 
-    def pictures(self, found: Compacted) -> Evaluation:
-        """From views that were not learned from, beside those of the scene."""
+    def evaluate(self, compacted: Compacted) -> Evaluation:
+        """Compare a result with the scene in views that no training used; reports the stage "evaluate"."""
         progress = as_stage("evaluate", self.progress)
-        if self.judges is None:
+        if self.eval_views is None:
             drawn = evaluation_views(self.splats, seed=SEARCH_SEED, threads=self.threads, progress=progress)
-            self.judges, self._taken = drawn, {}
+            self.eval_views, self._reference_images = drawn, {}
         return compare_images(
             self.splats,
-            found.splats,
-            self.judges,
+            compacted.splats,
+            self.eval_views,
             threads=self.threads,
-            reference_images=self._taken,
+            reference_images=self._reference_images,
             progress=progress,
         )
 
     @property
     def note(self) -> str:
-        """How a drop is told, where that needs to be said."""
+        """Note that drops of PSNR are estimates; empty if photographs measure them."""
         return "" if any(view.photo for view in self.supervision.test) else ESTIMATED_DROP
 
 
-class _Search:
-    """For the fewest Gaussians whose pictures lose no more than is allowed."""
+class _DropSearch:
+    """Search for the fewest Gaussians whose renderings lose no more PSNR than allowed.
+
+    Attributes:
+        compactor: compactor of the scene.
+        trials: drop of PSNR by count, decibels, in the order of the trials.
+        best: the smallest result that loses no more than allowed.
+    """
 
     def __init__(self, compactor: Compactor) -> None:
         self.compactor = compactor
@@ -195,32 +214,33 @@ class _Search:
         self.best: Compacted | None = None
 
     def run(self, allowed: float) -> Compacted:
-        """All attempts; the scene as it was where none loses so little."""
+        """Return the smallest result that loses at most ``allowed`` decibels; the unchanged scene if there is none."""
         splats = self.compactor.splats
-        least = -math.log2(len(splats))
+        min_log2 = -math.log2(len(splats))
         try:
             find_root(
-                lambda share: allowed - self._drop(share, allowed),
-                max(START, least),
-                SLOPE,
-                NEAR,
-                (least, LARGEST),
-                GRAIN,
+                lambda log2_share: allowed - self._drop(log2_share, allowed),
+                max(START_LOG2, min_log2),
+                DROP_PER_HALVING,
+                TOLERANCE_DB,
+                (min_log2, MAX_LOG2),
+                GRAIN_LOG2,
             )
         except StopSearch:
             if self.best is None:
                 raise
-        best = self.best or unchanged(splats, f"and every smaller one that was tried loses more than {allowed:g} dB")
+        best = self.best or unchanged(splats, f"and every smaller count that was tried loses more than {allowed:g} dB")
         note = "; ".join(filter(None, [best.report.note, self.compactor.note]))
         return replace(best, report=replace(best.report, trials=tuple(self.trials.items()), note=note))
 
-    def _drop(self, share: float, allowed: float) -> float:
-        everything = len(self.compactor.splats)
-        count = min(max(1, round(everything * 2**share)), everything - 1)
+    def _drop(self, log2_share: float, allowed: float) -> float:
+        """Compact to this share of the Gaussians and return the drop of PSNR, decibels."""
+        total = len(self.compactor.splats)
+        count = min(max(1, round(total * 2**log2_share)), total - 1)
         if count in self.trials:
             return self.trials[count]
-        found = self.compactor(count)
-        drop = self.trials[count] = drop_of(self.compactor.pictures(found))
+        compacted = self.compactor(count)
+        drop = self.trials[count] = drop_of(self.compactor.evaluate(compacted))
         if drop <= allowed and (self.best is None or count < len(self.best.splats)):
-            self.best = found
+            self.best = compacted
         return drop

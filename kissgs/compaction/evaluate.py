@@ -1,4 +1,4 @@
-"""How good a smaller scene is: its pictures from views that it has not learned from, and the bytes it will take."""
+"""Evaluation of a compacted scene: image quality in views that no training used, and the size of its container."""
 
 from __future__ import annotations
 
@@ -14,22 +14,35 @@ from kissgs.sogxt.encode import encode
 from kissgs.training.supervision import SupervisionViews
 
 
-def exam(reference: Splats, supervision: SupervisionViews, threads: int = 0, progress: Progress = silent) -> Views:
-    """Views to judge by: a capture's held-out photographs, or else cameras drawn over the whole scene."""
-    if any(view.photo is not None for view in supervision.test):
-        return supervision.eval_views
-    return evaluation_views(reference, threads=threads, progress=progress)
-
-
 def evaluate_scene(
     scene: Splats, reference: Splats, supervision: SupervisionViews, threads: int = 0, progress: Progress = silent
 ) -> tuple[ImageMetrics, int]:
-    """How alike its pictures are to the photographs, or to those of ``reference`` where there are none; and its bytes.
+    """Return the image metrics of a scene and its compressed size.
 
-    The bytes are those of its container with the preset ``fast``. ``progress`` receives the stage ``"evaluate"``.
+    Args:
+        scene: the scene to evaluate, clean.
+        reference: the original scene; its renderings are compared with if there are no photographs.
+        supervision: its evaluation views are used if they have photographs, else cameras drawn over all of
+            ``reference``.
+        threads: number of threads; 0 means one per processor. The result does not depend on it.
+        progress: receives the stage ``"evaluate"``.
+
+    Returns:
+        PSNR (decibels) and SSIM, means over the views, and the bytes of a container with the preset ``fast``, as a zip.
+
+    Raises:
+        InvalidViewsError: a photograph cannot be read.
+        UnsupportedError: an image would take too much memory.
     """
-    receive = as_stage("evaluate", progress)
-    views = exam(reference, supervision, threads, receive)
-    compared = compare_images(reference, scene, views, threads=threads, progress=receive)
-    encoded = encode(scene, Settings(preset=Preset.FAST).encode, threads=threads, progress=receive)
-    return compared.mean.candidate, len(zip_bytes(encoded.files))
+    as_evaluate = as_stage("evaluate", progress)
+    views = _views(reference, supervision, threads, as_evaluate)
+    evaluation = compare_images(reference, scene, views, threads=threads, progress=as_evaluate)
+    encoded = encode(scene, Settings(preset=Preset.FAST).encode, threads=threads, progress=as_evaluate)
+    return evaluation.mean.candidate, len(zip_bytes(encoded.files))
+
+
+def _views(reference: Splats, supervision: SupervisionViews, threads: int, progress: Progress) -> Views:
+    """Return the evaluation views of a capture with photographs, else cameras drawn over the whole scene."""
+    if any(view.photo is not None for view in supervision.test):
+        return supervision.eval_views
+    return evaluation_views(reference, threads=threads, progress=progress)

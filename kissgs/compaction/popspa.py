@@ -1,343 +1,293 @@
-"""POPSpa: score and prune, fit while opacities are made sparse, score and prune again, fit (KISS-GS, section 3.1)."""
+"""``Popspa``: score and prune, train while pruning further, refine (POPSpa, KISS-GS, section 3.1)."""
 
 from __future__ import annotations
 
-import hashlib
-import itertools
-import json
-import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kissgs._version import __version__
-from kissgs.cameras.captures.files import open_file
 from kissgs.cameras.virtual.scene_bounds import scene_bounds
+from kissgs.compaction.checkpoint_state import State, Status, work_key
 from kissgs.compaction.evaluate import evaluate_scene
-from kissgs.compaction.result import Compacted, CompactionReport, CompactionStep
-from kissgs.compaction.scoring import show_most
+from kissgs.compaction.result import Compacted, CompactionReport
+from kissgs.compaction.schedule import Phase, first_pruning_count, lr_schedule, stage_progress, training_phases
+from kissgs.compaction.scoring import prune_by_score
+from kissgs.compaction.step_log import StepLog
 from kissgs.core.array_types import Float32, Int
 from kissgs.core.errors import OutputError
 from kissgs.core.progress import Progress, silent
-from kissgs.core.splats import ATTRIBUTES, Splats
+from kissgs.core.splats import Splats
 from kissgs.rendering.rasterizer import Device, load_kernels
 from kissgs.settings import CompactSettings
 from kissgs.training.checkpoint import Checkpoint
 from kissgs.training.supervision import SupervisionViews
 
 if TYPE_CHECKING:
-    from kissgs.training.loop import LrSchedule
+    from kissgs.compaction.regularizers import ShapeRegularizer
+    from kissgs.compaction.sparsify import AdmmSparsifier
     from kissgs.training.model import GaussianModel
     from kissgs.training.targets import TrainingTargets
 
-MEANS_RATE = 1.6e-4
-RATES = {"scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 1.25e-4}
-"""Learning rates of 3DGS; that of a mean is in units of the extent of the cameras about it."""
+MIN_RELATIVE_EXTENT = 1e-4
+"""Extent of the cameras, in radii of the scene, up to which they count as being at one position: a rotating camera,
+whose extent is 0 except for rounding."""
 
-ONE_PLACE = 1e-4
-"""Extent of cameras, in radii of the scene, that tells of rounding, or of a camera that only turned."""
-
-UNSEEN = {True: 0.05, False: 0.3}
-"""Least score, in units of what a camera nearby would find: where a capture says who looks from where, and where none
-does."""
-
-State = Mapping[str, np.ndarray]
+MIN_SCORE = {True: 0.05, False: 0.3}
+"""Lowest score, in units of the score that an unobstructed camera nearby would find: True with a capture, whose cameras
+show what matters, False for virtual views."""
 
 
-def popspa(
-    splats: Splats,
-    count: int,
-    settings: CompactSettings,
-    supervision: SupervisionViews,
-    *,
-    reference: Splats | None = None,
-    targets: TrainingTargets | None = None,
-    judges: bool = False,
-    checkpoint: Path | None = None,
-    threads: int = 0,
-    device: Device = "cpu",
-    progress: Progress = silent,
-) -> Compacted:
-    """Bring a clean scene down to exactly ``count`` Gaussians.
+@dataclass(frozen=True, slots=True, eq=False)
+class Popspa:
+    """Compacts one scene by POPSpa.
 
-    Args:
-        splats: the scene.
-        count: at least 1, and no more than it has.
-        settings: of the recipe; their budget is not looked at.
-        supervision: views to score by, to learn from and to judge by.
-        reference: what the pictures should show where there are no photographs; by default the scene itself.
-        targets: pictures from the school's views for training, if they are at hand.
-        judges: measure PSNR, SSIM and bytes after every step.
-        checkpoint: file to keep the state in, every half minute of training. If there is one of this very work, it is
-            taken up where it was left, and ends (on the processor) as if it had never been interrupted. It stays when
-            all is done: whoever has written the result elsewhere may delete it.
-        threads: 0 means one per processor; the result does not depend on it.
-        device: where it is trained; ``"cuda"`` needs the extra ``kissgs[cuda]``, and adds up in an order of chance: no
-            two results are quite the same. Scores are always the processor's.
-        progress: receives "kernels", "score", "targets", "sparsify", "refine" and "evaluate".
-
-    Raises:
-        InvalidViewsError: a photograph cannot be read.
-        OutputError: ``checkpoint`` is of other work, or cannot be written.
-        UnsupportedError: there is no torch to train with; a picture would take too much memory.
+    Attributes:
+        splats: the scene, clean.
+        settings: settings of pruning and training; their budget is ignored.
+        supervision: views that score, train and evaluate.
+        reference: the original scene, if ``splats`` is already pruned: its renderings are the targets where there are
+            no photographs. By default ``splats``.
+        targets: target images of the training views; by default they are loaded or rendered when needed.
+        threads: number of threads; 0 means one per processor. The result does not depend on it.
+        device: device of the training. ``"cuda"`` needs the extra ``kissgs[cuda]`` and adds in no fixed order, so that
+            results vary slightly. Scores are always computed on the CPU.
+        progress: receives the stages "kernels", "score", "targets", "sparsify", "refine" and "evaluate".
     """
-    reference = reference or splats
-    key = "" if checkpoint is None else _key((splats, reference), count, settings, supervision, judges, device)
-    kept = Checkpoint(checkpoint, key)
-    found = _Recipe(
-        splats, count, settings, supervision, reference, targets, judges, kept, threads, device, progress
-    ).run()
-    return replace(found, checkpoint=checkpoint) if settings.trains else found
 
+    splats: Splats
+    settings: CompactSettings
+    supervision: SupervisionViews
+    reference: Splats | None = None
+    targets: TrainingTargets | None = None
+    threads: int = 0
+    device: Device = "cpu"
+    progress: Progress = silent
 
-def _key(
-    scenes: Sequence[Splats],
-    count: int,
-    settings: CompactSettings,
-    supervision: SupervisionViews,
-    judges: bool,
-    device: Device,
-) -> str:
-    """Of the work: equal only where the result is equal."""
-    told = f"{__version__} {count} {judges} {device} {settings.model_dump_json()} {supervision.background}"
-    key = hashlib.sha256(told.encode())
-    for view in (*supervision.train, *supervision.score, *supervision.test):
-        camera = view.camera
-        key.update(camera.viewmat.tobytes() + camera.K.tobytes() + f"{camera.width} {camera.height}".encode())
-        key.update(f"{view.background} {view.undistortion}".encode())
-        if view.photo is not None:
-            with open_file(view.photo) as (file, _):
-                key.update(file.read())
-    for scene, name in itertools.product(scenes, ATTRIBUTES):
-        key.update(getattr(scene, name).tobytes())
-    return key.hexdigest()
+    def __call__(self, count: int, *, evaluate: bool = False, checkpoint: Path | None = None) -> Compacted:
+        """Return the scene with exactly ``count`` Gaussians.
 
+        Args:
+            count: number of Gaussians to keep, from 1 to that of the scene.
+            evaluate: measure PSNR, SSIM and compressed bytes after every step.
+            checkpoint: file for the state of the training, saved every half minute. If it exists and belongs to this
+                work, training continues from it, on the CPU with the same result as without an interruption. It stays
+                at the end; delete it once the result is saved.
 
-@dataclass(frozen=True, slots=True)
-class _Phase:
-    """Of training: so many steps, after which all but ``count`` Gaussians go."""
+        Raises:
+            InvalidViewsError: a photograph cannot be read.
+            OutputError: ``checkpoint`` belongs to other work, or cannot be written.
+            UnsupportedError: torch is missing for the training; an image would take too much memory.
+        """
+        scenes = (self.splats, self.original)
+        key = ""
+        if checkpoint is not None:
+            key = work_key(scenes, count, self.settings, self.supervision, evaluate, self.device)
+        compacted = _Run(self, count, Checkpoint(checkpoint, key), self._step_log(evaluate)).run()
+        return replace(compacted, checkpoint=checkpoint) if self.settings.trains else compacted
 
-    name: str
-    steps: int
-    count: int
+    @property
+    def original(self) -> Splats:
+        """The original scene: the reference, or else the scene itself."""
+        return self.reference or self.splats
+
+    def _step_log(self, evaluate: bool) -> StepLog:
+        if not evaluate:
+            return StepLog(None)
+        return StepLog(
+            partial(
+                evaluate_scene,
+                reference=self.original,
+                supervision=self.supervision,
+                threads=self.threads,
+                progress=self.progress,
+            )
+        )
 
 
 @dataclass(slots=True, eq=False)
-class _Recipe:
-    """One compaction: where it stands is in ``model``, ``index`` and ``steps``."""
+class _Run:
+    """One compaction and its state, which a checkpoint saves.
 
-    splats: Splats
+    Attributes:
+        task: scene, views and settings.
+        count: number of Gaussians to keep.
+        checkpoint: where the state is saved.
+        log: steps for the report.
+        index: index in the scene of each Gaussian that is left, ascending.
+        model: the trainable scene; set when training begins.
+        checkpoint_note: note for the user if a checkpoint could not be saved.
+    """
+
+    task: Popspa
     count: int
-    settings: CompactSettings
-    supervision: SupervisionViews
-    reference: Splats
-    targets: TrainingTargets | None
-    judges: bool
     checkpoint: Checkpoint
-    threads: int
-    device: Device
-    progress: Progress
+    log: StepLog
     index: Int[np.ndarray, " M"] = field(init=False)
     model: GaussianModel = field(init=False)
-    steps: list[CompactionStep] = field(init=False, default_factory=list)
-    since: float = field(init=False, default_factory=time.perf_counter)
-    note: str = field(init=False, default="")
+    checkpoint_note: str = field(init=False, default="")
 
     def __post_init__(self) -> None:
-        self.index = np.arange(len(self.splats))
+        self.index = np.arange(len(self.task.splats))
 
     def run(self) -> Compacted:
-        """All steps, or those that a checkpoint has left."""
-        load_kernels(self.progress)
-        phases = list(self._phases())
+        """Do all steps, or those that remain after the checkpoint."""
+        task = self.task
+        load_kernels(task.progress)
+        phases = training_phases(task.settings, len(task.splats), self.count)
         if not phases:
-            self._done("input", self.splats)
-            scene = self.splats.select(self._prune(self.splats, self.count, self.progress))
-            self._done("prune", scene)
-            return self._result(scene, "nothing")
-        targets = self.targets or self._look()
-        begun, done, state = self._begin(targets)
-        for number in range(begun, len(phases)):
+            return self._result(self._first_pruning(self.count), "nothing")
+        targets = task.targets or self._load_targets()
+        first, done, state = self._start(targets)
+        for number in range(first, len(phases)):
             self._train(phases, number, done, state, targets)
             done, state = 0, {}
         self._save(len(phases), 0, {})
         return self._result(self.model.splats(), targets.target_source)
 
-    def _phases(self) -> Iterator[_Phase]:
-        chosen = self.settings
-        if chosen.sparsify_steps:
-            rounds = min(chosen.prune_rounds, chosen.sparsify_steps)
-            first, shares = self._first_count(), np.arange(1, rounds + 1) / rounds
-            counts = np.rint(first * (self.count / first) ** shares).astype(int)
-            edges = np.rint(chosen.sparsify_steps * np.concatenate([[0], shares])).astype(int)
-            for steps, count in zip(np.diff(edges), counts, strict=True):
-                yield _Phase("sparsify", int(steps), int(count))
-        if chosen.refine_steps:
-            yield _Phase("refine", chosen.refine_steps, self.count)
-
-    def _first_count(self) -> int:
-        """How many the first pruning leaves."""
-        share = self.settings.initial_prune_fraction if self.settings.sparsify_steps else 1.0
-        return round(len(self.splats) * (self.count / len(self.splats)) ** share)
-
-    def _look(self) -> TrainingTargets:
+    def _load_targets(self) -> TrainingTargets:
         from kissgs.training.targets import training_targets
 
-        supervision = self.supervision
+        task = self.task
         return training_targets(
-            *(self.reference, supervision.train, supervision.background),
-            threads=self.threads,
-            device=self.device,
-            progress=self.progress,
+            task.original,
+            task.supervision.train,
+            task.supervision.background,
+            threads=task.threads,
+            device=task.device,
+            progress=task.progress,
         )
 
-    def _begin(self, targets: TrainingTargets) -> tuple[int, int, State]:
-        """Prune for a start, or take up what was left: number of the phase, steps of it that are done, its state."""
+    def _start(self, targets: TrainingTargets) -> tuple[int, int, State]:
+        """Do the first pruning, or load the checkpoint; return the current phase, its steps done, and the state."""
         from kissgs.training.model import GaussianModel
 
+        task = self.task
         state = self.checkpoint.load()
         if state is not None:
-            told = json.loads(state["told"].tobytes())
+            status = Status.from_state(state)
             self.index = state["index"]
-            self.model = GaussianModel.restored(state, self.device, self._reach(targets))
-            self.steps = [CompactionStep(**step) for step in told["steps"]]
-            self.since -= told["seconds"]
-            return told["phase"], told["done"], state
-        self._done("input", self.splats)
-        scene = self.splats.select(self._prune(self.splats, self._first_count(), self.progress))
-        self._done("prune", scene)
-        self.model = GaussianModel(scene, self.device, self._reach(targets))
-        self._save(0, 0, {})  # if that cannot be, it is better known before the work than after
+            self.model = GaussianModel.restored(state, task.device, self._position_extents(targets))
+            self.log.restore(status.steps, status.seconds)
+            return status.phase, status.done, state
+        scene = self._first_pruning(first_pruning_count(task.settings, len(task.splats), self.count))
+        self.model = GaussianModel(scene, task.device, self._position_extents(targets))
+        self._save(0, 0, {})  # a file that cannot be written must be reported before the training
         return 0, 0, {}
 
+    def _first_pruning(self, count: int) -> Splats:
+        """Prune the input to ``count`` Gaussians."""
+        self.log.record("input", self.task.splats)
+        scene = self.task.splats.select(self._prune(self.task.splats, count, self.task.progress))
+        self.log.record("prune", scene)
+        return scene
+
     def _prune(self, scene: Splats, count: int, progress: Progress) -> Int[np.ndarray, " M"]:
-        """Which to keep."""
-        chosen = show_most(
+        """Return the indices in ``scene`` of the ``count`` Gaussians to keep, and update :attr:`index`."""
+        task = self.task
+        kept = prune_by_score(
             scene,
-            self.supervision.score,
-            self.supervision.background,
+            task.supervision.score,
+            task.supervision.background,
             count,
-            share=self.settings.min_keep_per_scoring,
-            least=UNSEEN[self.supervision.captured],
-            threads=self.threads,
+            min_keep_per_scoring=task.settings.min_keep_per_scoring,
+            min_score=MIN_SCORE[task.supervision.captured],
+            threads=task.threads,
             progress=progress,
         )
-        self.index = self.index[chosen]
-        return chosen
+        self.index = self.index[kept]
+        return kept
 
-    def _train(self, phases: list[_Phase], number: int, done: int, state: State, targets: TrainingTargets) -> None:
-        """One phase from a step of it on, and the pruning after it."""
-        from kissgs.compaction.regularizers import Shape
-        from kissgs.compaction.sparsify import Sparsity
-        from kissgs.training.loop import Regularizer, TrainingPlan, train
+    def _train(self, phases: Sequence[Phase], number: int, done: int, state: State, targets: TrainingTargets) -> None:
+        """Train phase ``number`` from step ``done`` on, then prune; ``state`` is that of the checkpoint, or empty."""
+        from kissgs.training.loop import TrainingPlan, train
 
-        phase, chosen, wishes = phases[number], self.settings, list[Regularizer]()
-        progress = self._within(phases, number)
-        if chosen.erank_weight or chosen.min_scale_weight:
-            wishes.append(Shape(chosen.erank_weight, chosen.min_scale_weight, self._extent(targets)))
-        sparsity = None
-        if phase.name == "sparsify" and chosen.admm_rho:
-            sparsity = Sparsity(self.model.parameters["opacities"], phase.count, chosen.admm_rho, chosen.admm_interval)
-            wishes.append(sparsity)
-            if "z" in state:  # not where the phase had not begun
-                sparsity.restore(state)
+        phase, settings = phases[number], self.task.settings
+        shape, sparsifier = self._shape_regularizer(targets), self._sparsifier(phase, state)
 
-        def after(step: int) -> None:
+        def save_if_due(step: int) -> None:
             if self.checkpoint.due:
-                self._save(number, step, {} if sparsity is None else sparsity.state())
+                self._save(number, step, {} if sparsifier is None else sparsifier.state())
 
         plan = TrainingPlan(
             stage=phase.name,
             steps=phase.steps,
-            rates=self._rates(phase, targets),
-            ssim_weight=chosen.ssim_weight,
-            seed=(chosen.seed, number),
-            regularizers=tuple(wishes),
+            rates=lr_schedule(settings, phase, targets.target_source),
+            ssim_weight=settings.ssim_weight,
+            seed=(settings.seed, number),
+            regularizers=tuple(term for term in (shape, sparsifier) if term is not None),
         )
-        train(self.model, targets, plan, first=done, after=after, threads=self.threads, progress=progress)
+        progress = stage_progress(self.task.progress, phases, number)
+        train(
+            self.model,
+            targets,
+            plan,
+            first=done,
+            after=save_if_due,
+            threads=self.task.threads,
+            progress=progress,
+        )
         scene = self.model.splats()
-        self._done(phase.name, scene)
+        self.log.record(phase.name, scene)
         if len(scene) > phase.count:
             self.model.keep(self._prune(scene, phase.count, progress))
-            self._done("prune", self.model.splats())
+            self.log.record("prune", self.model.splats())
 
-    def _extent(self, targets: TrainingTargets) -> float:
-        """By which lengths are measured: the cameras', or the scene's where all cameras stand in one place, about."""
-        radius = scene_bounds(self.splats).radius
-        return targets.extent if targets.extent > ONE_PLACE * radius else radius
+    def _shape_regularizer(self, targets: TrainingTargets) -> ShapeRegularizer | None:
+        from kissgs.compaction.regularizers import ShapeRegularizer
 
-    def _reach(self, targets: TrainingTargets) -> Float32[np.ndarray, " M"]:
-        """How far apart the cameras about each Gaussian that is left stand, by where the scene has it."""
-        return targets.local_extents(self.splats.means[self.index], self._extent(targets))
+        settings = self.task.settings
+        if not (settings.erank_weight or settings.min_scale_weight):
+            return None
+        return ShapeRegularizer(settings.erank_weight, settings.min_scale_weight, self._camera_extent(targets))
 
-    def _within(self, phases: list[_Phase], number: int) -> Progress:
-        """Tells of all phases of one name as of one stage, with the prunings between them."""
-        name = phases[number].name
-        before = sum(phase.steps for phase in phases[:number] if phase.name == name)
-        total = sum(phase.steps for phase in phases if phase.name == name)
+    def _sparsifier(self, phase: Phase, state: State) -> AdmmSparsifier | None:
+        from kissgs.compaction.sparsify import AdmmSparsifier
 
-        def receive(stage: str, fraction: float, note: str = "") -> None:
-            done = phases[number].steps * (fraction if stage == name else 1.0)
-            self.progress(name, (before + done) / total, note)
+        settings = self.task.settings
+        if phase.name != "sparsify" or not settings.admm_rho:
+            return None
+        opacities = self.model.parameters["opacities"]
+        sparsifier = AdmmSparsifier(opacities, phase.count, settings.admm_rho, settings.admm_interval)
+        if "z" in state:  # a checkpoint from before the first step of a phase has none
+            sparsifier.restore(state)
+        return sparsifier
 
-        return receive
+    def _camera_extent(self, targets: TrainingTargets) -> float:
+        """Return the extent of the cameras, world units; the scene's radius if they are nearly at one position."""
+        radius = scene_bounds(self.task.splats).radius
+        return targets.extent if targets.extent > MIN_RELATIVE_EXTENT * radius else radius
 
-    def _rates(self, phase: _Phase, targets: TrainingTargets) -> LrSchedule:
-        """Rates stay while Gaussians go, and fall exponentially, as 3DGS has it for the means, in the refinement."""
-        from kissgs.training.loop import exponential_lr
+    def _position_extents(self, targets: TrainingTargets) -> Float32[np.ndarray, " M"]:
+        """Return the unit of the position learning rate of each Gaussian left, from its position in the input."""
+        return targets.local_extents(self.task.splats.means[self.index], self._camera_extent(targets))
 
-        chosen = self.settings
-        base = {"means": MEANS_RATE, **RATES}
-        if targets.target_source == "renderings":
-            base = {name: rate * chosen.synthetic_lr_scale for name, rate in base.items()}
-        begin = {name: chosen.means_lr_scale if name == "means" else chosen.lr_scale for name in base}
-        end = {name: chosen.final_means_lr_scale if name == "means" else chosen.final_lr_scale for name in base}
-        return exponential_lr(base, begin, end if phase.name == "refine" else begin)
+    def _save(self, number: int, done: int, sparsifier_state: State) -> None:
+        """Save the state in phase ``number`` after ``done`` of its steps.
 
-    def _save(self, number: int, done: int, extra: State) -> None:
-        told = {
-            "phase": number,
-            "done": done,
-            "seconds": time.perf_counter() - self.since,
-            "steps": [asdict(step) for step in self.steps],
-        }
-        words = np.frombuffer(json.dumps(told).encode(), np.uint8)
-        state = {**self.model.state(), **extra, "index": self.index, "told": words}
+        Raises:
+            OutputError: the first checkpoint cannot be written. Later, the work continues without one.
+        """
+        status = Status(number, done, self.log.seconds, self.log.steps)
+        state = {**self.model.state(), **sparsifier_state, "index": self.index, **status.as_state()}
         try:
             self.checkpoint.save(state)
         except OutputError as error:
             if not (number or done):
                 raise
-            self.note = f"the work went on without a checkpoint: {error}"
-
-    def _done(self, name: str, scene: Splats) -> None:
-        """Note a step: what it took, and if asked for, what it gave."""
-        seconds = time.perf_counter() - self.since
-        likeness, size = None, None
-        if self.judges:
-            likeness, size = evaluate_scene(scene, self.reference, self.supervision, self.threads, self.progress)
-        self.steps.append(
-            CompactionStep(
-                name=name,
-                count=len(scene),
-                seconds=seconds,
-                psnr=None if likeness is None else likeness.psnr,
-                ssim=None if likeness is None else likeness.ssim,
-                bytes=size,
-            )
-        )
-        self.since = time.perf_counter()
+            self.checkpoint_note = f"the work went on without a checkpoint: {error}"
 
     def _result(self, scene: Splats, target_source: str) -> Compacted:
+        supervision = self.task.supervision
         report = CompactionReport(
-            source_count=len(self.splats),
+            source_count=len(self.task.splats),
             count=len(scene),
             target_source=target_source,
-            source=self.supervision.source,
-            steps=tuple(self.steps),
-            note="; ".join(filter(None, [self.supervision.note, self.note])),
+            source=supervision.source,
+            steps=tuple(self.log.steps),
+            note="; ".join(filter(None, [supervision.note, self.checkpoint_note])),
         )
         return Compacted(scene, self.index, report)

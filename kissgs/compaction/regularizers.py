@@ -1,4 +1,4 @@
-"""What keeps Gaussians in shape while they are fitted to pictures: neither needles nor blobs."""
+"""Regularization of the shapes of Gaussians during training: neither needles nor balls."""
 
 from __future__ import annotations
 
@@ -12,40 +12,47 @@ EPSILON = 1e-7
 """Added to effective rank - 1: the loss of a perfect needle is 16.1."""
 
 
-def needle_loss(scales: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
-    """How far each Gaussian is from a disc towards a needle: max(-ln(erank - 1), 0); 0 for discs and rounder ones.
+def erank_loss(scales: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
+    """Return the effective-rank loss max(-ln(erank - 1 + EPSILON), 0): 0 for discs and balls, 16.1 for needles.
 
     Hyung et al., "Effective Rank Analysis and Regularization for Enhanced 3D Gaussian Splatting" (NeurIPS 2024),
-    equation 9. The effective rank e^H, from 1 to 3, has the entropy H of the shares s² / Σ s². All is computed from
-    logarithms, relative to the widest: nothing under- or overflows whatever the scales, and erank - 1 = expm1(H) keeps
-    its digits at needles.
+    equation 9. The effective rank is e^H, from 1 to 3, with the entropy H of the shares s² / Σ s². It is computed from
+    logarithms relative to the largest scale: nothing under- or overflows whatever the scales, and erank - 1 = expm1(H)
+    keeps its digits for needles.
 
     Args:
-        scales: natural logarithms, any finite values. The gradient is bounded by 2.
+        scales: ``(N, 3)`` natural logarithms of standard deviations, any finite values. Each component of the gradient
+            is at most 2 in absolute value.
+
+    Returns:
+        ``(N,)`` losses, 0 or more.
     """
-    widest_first = scales.sort(dim=1, descending=True).values
-    below = 2 * (widest_first[:, 1:] - widest_first[:, :1])  # logarithms of the other two s², the widest being 1
-    total = torch.log1p(below.exp().sum(dim=1))
-    entropy = total - ((below - total[:, None]).exp() * below).sum(dim=1)  # all terms positive: no digit is lost
+    descending = scales.sort(dim=1, descending=True).values
+    log_ratios = 2 * (descending[:, 1:] - descending[:, :1])  # logarithms of the other two s², the largest being 1
+    log_total = torch.log1p(log_ratios.exp().sum(dim=1))
+    # all terms are positive, so that no digit is lost
+    entropy = log_total - ((log_ratios - log_total[:, None]).exp() * log_ratios).sum(dim=1)
     return (-torch.log(torch.expm1(entropy) + EPSILON)).clamp_min(0)
 
 
-class Shape:
-    """The loss of effective-rank regularisation: the mean of :func:`needle_loss`, and that of the smallest scale.
+class ShapeRegularizer:
+    """Regularizer: weighted mean of :func:`erank_loss`, plus weighted mean of each Gaussian's smallest scale.
 
-    The second flattens what is round. It is measured in units of ``extent``, so that a scene's size does not matter.
+    The second term flattens Gaussians. It is in units of ``extent``, so that the loss does not depend on the size of
+    the scene.
     """
 
     def __init__(self, erank_weight: float, min_scale_weight: float, extent: float) -> None:
-        self._needle_weight, self._flat_weight = erank_weight, min_scale_weight / extent
+        """Set the weights, 0 or more; ``extent`` is that of the cameras, world units, above 0."""
+        self._erank_weight, self._min_scale_weight = erank_weight, min_scale_weight / extent
 
     def penalty(self, step: int, parameters: Parameters) -> Tensor | None:
-        """Of all Gaussians, seen or not."""
+        """Return the loss over all Gaussians, visible or not; None for an empty scene."""
         scales = parameters["scales"]
         if len(scales) == 0:
             return None
-        loss = self._needle_weight * needle_loss(scales).mean()
-        return loss + self._flat_weight * scales.amin(dim=1).exp().mean()
+        loss = self._erank_weight * erank_loss(scales).mean()
+        return loss + self._min_scale_weight * scales.amin(dim=1).exp().mean()
 
     def update(self, step: int, scene: TrainableScene) -> None:
-        """Nothing is remembered."""
+        """Do nothing: the loss has no state."""

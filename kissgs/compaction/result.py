@@ -1,4 +1,4 @@
-"""``Compacted``: fewer Gaussians, and what each step of getting there took and gave."""
+"""``Compacted``: a scene with fewer Gaussians, and the report of its compaction."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from kissgs.core.splats import NOTHING_CLEANED, Cleaned, Splats
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CompactionStep:
-    """One of the steps of a compaction, and the scene after it.
+    """One step of a compaction, and the scene after it.
 
     Attributes:
         name: "input", "prune", "sparsify" or "refine".
-        count: Gaussians.
-        seconds: wall time, without what judging it took.
-        psnr: decibels, mean over held-out views: to their photographs, or to the input's renderings where there are
-            none; infinite for the input itself then. None where it was not asked for.
-        ssim: the same.
-        bytes: of its container as the preset ``fast`` makes it. None where it was not asked for.
+        count: number of Gaussians after the step.
+        seconds: wall time, evaluation excluded.
+        psnr: decibels, mean over held-out views, to their photographs; without photographs, over cameras drawn over the
+            whole scene, to renderings of the input, so that the input itself has infinity. None if not requested.
+        ssim: SSIM of the same images, mean over views. None if not requested.
+        bytes: size of its container with the preset ``fast``. None if not requested.
     """
 
     name: str
@@ -36,19 +36,19 @@ class CompactionStep:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CompactionReport:
-    """What a compaction took and gave.
+    """Effort and results of a compaction.
 
     Attributes:
-        source_count: Gaussians before.
-        count: Gaussians after.
-        target_source: what it was fitted to: "photos" or "renderings" of the input; "nothing" where it was only pruned.
-        source: of the views, for people.
-        steps: in their order, the input first.
-        trials: where a drop of PSNR was given instead of a count: counts that were tried, and the drop of each, dB.
-        cleaned: what was wrong with the input, which counts are without.
-        cpu_seconds: processor time, over all threads.
-        peak_memory: bytes, the largest this process has ever had resident.
-        note: a sentence for people about what they may not have expected, without a capital and a full stop; or none.
+        source_count: number of Gaussians before, cleaned.
+        count: number of Gaussians after.
+        target_source: training targets: "photos", or "renderings" of the input; "nothing" if it was only pruned.
+        source: description of the training views.
+        steps: all steps in order, the input first; empty if the scene is unchanged.
+        trials: counts that a search tried, and the drop of PSNR of each, decibels; empty if the count was given.
+        cleaned: invalid values of the input that cleaning removed or replaced.
+        cpu_seconds: CPU time of all threads.
+        peak_memory: largest resident memory of the process so far, bytes.
+        note: note for the user, a sentence without capital and full stop; may be empty.
     """
 
     source_count: int
@@ -63,22 +63,23 @@ class CompactionReport:
     note: str = ""
 
     def as_dict(self) -> dict[str, Any]:
-        """For machines; what is infinite is null."""
-        told = asdict(self)
-        for step in told["steps"]:
+        """Return the report for JSON; an infinite PSNR is None (null)."""
+        values = asdict(self)
+        for step in values["steps"]:
             step["psnr"] = None if step["psnr"] == float("inf") else step["psnr"]
-        return told
+        return values
 
 
 @dataclass(frozen=True, slots=True)
 class Compacted:
-    """A smaller scene.
+    """A compacted scene.
 
     Attributes:
-        splats: clean.
-        index: ``(M,)`` for each of its Gaussians, which one of the cleaned input it was; rising.
-        report: what it took and gave.
-        checkpoint: the file that holds all this, if there is one: to be deleted when it is kept elsewhere.
+        splats: the scene, clean.
+        index: ``(M,)`` index in the cleaned input of each of its Gaussians, ascending.
+        report: effort and results.
+        checkpoint: file with the final state of the training; to be deleted once the scene is saved. None if there is
+            no such file.
     """
 
     splats: Splats

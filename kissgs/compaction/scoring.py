@@ -1,4 +1,4 @@
-"""Which Gaussians show least: the score of GaussianPOP, and pruning by it."""
+"""Pruning by the scores of GaussianPOP: the squared image error that the removal of one Gaussian would cause."""
 
 from __future__ import annotations
 
@@ -17,84 +17,94 @@ from kissgs.rendering.coverage import Coverage
 from kissgs.rendering.rasterizer import removal_scores
 
 
-def highest(scores: Float[np.ndarray, " N"], count: int) -> Int[np.ndarray, " M"]:
-    """Where the ``count`` highest scores stand, exactly so many, in their order; of equal ones, the first."""
-    chosen = np.argsort(-scores, kind="stable")[:count]
-    return np.sort(chosen)
+def highest_indices(scores: Float[np.ndarray, " N"], count: int) -> Int[np.ndarray, " M"]:
+    """Return the indices of the ``count`` highest scores, ascending; of equal scores the first are selected."""
+    selected = np.argsort(-scores, kind="stable")[:count]
+    return np.sort(selected)
 
 
-def show_most(
+def prune_by_score(
     splats: Splats,
     views: Sequence[View],
     background: Float32[np.ndarray, "3"],
     count: int,
     *,
-    share: float = 0.0,
-    least: float = 0.0,
+    min_keep_per_scoring: float = 0.0,
+    min_score: float = 0.0,
     threads: int = 0,
     progress: Progress = silent,
 ) -> Int[np.ndarray, " M"]:
-    """Which ``count`` Gaussians to keep: those whose removal would change the pictures most.
+    """Return the indices of the ``count`` Gaussians to keep: those whose removal would change the images most.
 
-    GaussianPOP, section 3, every picture counting the same whatever its size, in as many rounds as ``share`` asks for.
-    A score is the error of one removal alone: of two Gaussians, one behind the other, each may be superfluous only as
-    long as the other is there. So a part is removed, by the same factor in each round, and the rest is scored anew.
+    GaussianPOP, section 3, with mean squared errors, so that every image has the same weight whatever its size. A score
+    is the error of a single removal: of two Gaussians, one behind the other, each may be superfluous only while the
+    other is there. So deep pruning is done in rounds that remove the same share each, and the remaining Gaussians are
+    scored anew after each.
 
     Args:
-        splats: finite.
-        views: pictures to take.
-        background: of those that have none of their own.
-        count: at least 1.
-        share: the smallest that one scoring may leave, from 0 (one scoring will do) to less than 1.
-        least: lowest score of any Gaussian, seen or not, in units of what a camera nearby would probably find.
-        threads: 0 means one per processor; the choice does not depend on it.
+        splats: the scene, finite.
+        views: views to render.
+        background: ``(3,)`` RGB from 0 to 1 of the views that have no background of their own.
+        count: number of Gaussians to keep, at least 1. A smaller scene is kept whole.
+        min_keep_per_scoring: smallest share of the Gaussians that one round may leave, below 1; 0: a single round.
+        min_score: lowest score of any Gaussian, seen or not, in units of the score that an unobstructed camera nearby
+            would find, see :func:`_nearby_scores`.
+        threads: number of threads; 0 means one per processor. The result does not depend on it.
         progress: receives the stage ``"score"``.
 
     Returns:
-        Their numbers, rising.
+        ``(M,)`` indices, ascending.
+
+    Raises:
+        UnsupportedError: an image would take too much memory.
     """
     kept = np.arange(len(splats))
-    nearby = Coverage(splats).close_up
+    close_up = Coverage(splats).close_up
+    share = min_keep_per_scoring
     rounds = max(1, math.ceil(math.log(count / max(len(splats), count)) / math.log(share) - 1e-9)) if share > 0 else 1
     shrink = (count / max(len(splats), 1)) ** (1 / rounds)
     for round_ in range(rounds):
         if len(kept) <= count:
             break
 
-        def part(stage: str, fraction: float, note: str = "", done: int = round_) -> None:
+        def report(stage: str, fraction: float, note: str = "", done: int = round_) -> None:
             progress(stage, (done + fraction) / rounds, note)
 
         scene = splats.select(kept)
-        scores = _scores(scene, views, background, threads, part)
-        scores = np.maximum(scores, least * _prior(scores, nearby[kept]))
+        scores = _mean_scores(scene, views, background, threads, report)
+        scores = np.maximum(scores, min_score * _nearby_scores(scores, close_up[kept]))
         left = count if round_ == rounds - 1 else max(count, round(len(splats) * shrink ** (round_ + 1)))
-        kept = kept[highest(scores, left)]
+        kept = kept[highest_indices(scores, left)]
     progress("score", 1.0)
     return kept
 
 
-def _scores(
+def _mean_scores(
     scene: Splats, views: Sequence[View], background: Float32[np.ndarray, "3"], threads: int, progress: Progress
 ) -> Float64[np.ndarray, " N"]:
-    """Sum of mean squared errors over all views, each before its own background."""
+    """Return the sum over views of the mean squared error that each removal causes, each view on its background."""
     groups = defaultdict[tuple[int, tuple[float, ...]], list[Camera]](list)
     for view in views:
-        behind = background if view.background is None else view.background
-        groups[view.camera.width * view.camera.height, tuple(behind.tolist())].append(view.camera)
+        view_background = background if view.background is None else view.background
+        groups[view.camera.width * view.camera.height, tuple(view_background.tolist())].append(view.camera)
     scores, done = np.zeros(len(scene)), 0
     for (pixels, colour), cameras in groups.items():
 
-        def part(stage: str, fraction: float, note: str = "", done: int = done, count: int = len(cameras)) -> None:
+        def report(stage: str, fraction: float, note: str = "", done: int = done, count: int = len(cameras)) -> None:
             progress(stage, (done + fraction * count) / len(views), note)
 
-        scores += removal_scores(scene, cameras, background=colour, threads=threads, progress=part) / (3 * pixels)
+        scores += removal_scores(scene, cameras, background=colour, threads=threads, progress=report) / (3 * pixels)
         done += len(cameras)
     return scores
 
 
-def _prior(scores: Float[np.ndarray, " N"], nearby: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
-    """Scores that cameras near each Gaussian would find, with nothing in front of it."""
-    known = (scores > 0) & (nearby > 0)
-    if not known.any():
-        return nearby
-    return np.asarray(np.median(scores[known] / nearby[known]) * nearby)
+def _nearby_scores(scores: Float[np.ndarray, " N"], close_up: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+    """Estimate the score that an unobstructed camera near each Gaussian would find.
+
+    It is taken as proportional to ``close_up``, see :attr:`kissgs.rendering.coverage.Coverage.close_up`; the factor is
+    the median over the Gaussians that were seen, or 1 if none was.
+    """
+    seen = (scores > 0) & (close_up > 0)
+    if not seen.any():
+        return close_up
+    return np.asarray(np.median(scores[seen] / close_up[seen]) * close_up)

@@ -137,7 +137,7 @@ class CountSearch:
             return self._candidates[count].cost
         self.encoding.progress.note = f"{count:,} Gaussians"
         compacted = self.compactor(count)
-        evaluation = self.compactor.pictures(compacted)
+        evaluation = self.compactor.evaluate(compacted)
         self._drops[count] = drop_of(evaluation)
         encode = self.encoding.settings.encode
         infeasible = encode.max_psnr_drop is not None and self._drops[count] > encode.max_psnr_drop

@@ -109,7 +109,7 @@ def compact(
         splats,
         settings.compact,
         views,
-        judges=evaluate,
+        evaluate=evaluate,
         checkpoint=Path(checkpoint) if checkpoint is not None else None,
         threads=threads,
         device=device,

@@ -171,7 +171,7 @@ def test_missing_torch_is_reported(folder: Path, tmp_path: Path) -> None:
     python = [KISSGS.with_name("python"), "-c", program]
     done = subprocess.run([*python, *map(str, words)], capture_output=True, timeout=120, check=False)
     assert done.returncode == 2
-    assert done.stderr.startswith(b"kissgs: training is done with torch, which is missing: pip install 'kissgs[train]'")
+    assert done.stderr.startswith(b"kissgs: training needs torch, which is missing: pip install 'kissgs[train]'")
     fast = subprocess.run([*python, *map(str, words), "-p", "fast"], capture_output=True, timeout=120, check=False)
     assert fast.returncode == 0, fast.stderr
 

@@ -1,4 +1,4 @@
-"""Oracle: the formula of effective rank with 50 digits, and finite differences of it in float64."""
+"""Shape regularization. Oracle: the formula of effective rank with 50 digits, and finite differences in float64."""
 
 import math
 from decimal import Decimal, getcontext
@@ -9,14 +9,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kissgs.compaction.regularizers import EPSILON, Shape, needle_loss
+from kissgs.compaction.regularizers import EPSILON, ShapeRegularizer, erank_loss
 
 getcontext().prec = 50
 LOG_SCALES = st.floats(-30, 30, width=32)
 
 
 def exact(scales):
-    """max(-ln(erank - 1 + eps), 0), from standard deviations; a share of 0 has no entropy."""
+    """Return max(-ln(erank - 1 + eps), 0) of log-scales; a share of 0 has no entropy."""
     squares = [(2 * Decimal(float(scale))).exp() for scale in scales]
     shares = [square / sum(squares) for square in squares]
     entropy = -sum(share * share.ln() for share in shares if share > 0)
@@ -24,11 +24,11 @@ def exact(scales):
 
 
 def found(scales, dtype=torch.float32):
-    return float(needle_loss(torch.tensor([scales], dtype=dtype))[0])
+    return float(erank_loss(torch.tensor([scales], dtype=dtype))[0])
 
 
 @given(st.tuples(LOG_SCALES, LOG_SCALES, LOG_SCALES))
-def test_it_is_the_papers_loss_whatever_the_scales(scales):
+def test_the_loss_is_the_papers_for_any_scales(scales):
     assert found(scales) == pytest.approx(exact(scales), rel=1e-5, abs=1e-5)
     assert found(scales, torch.float64) == pytest.approx(exact(scales), rel=1e-12, abs=1e-12)
 
@@ -48,9 +48,9 @@ def test_known_shapes(scales, loss):
 
 
 @given(st.tuples(LOG_SCALES, LOG_SCALES, LOG_SCALES))
-def test_its_gradient_is_bounded_and_a_number(scales):
+def test_the_gradient_is_finite_and_at_most_2(scales):
     leaf = torch.tensor([scales], requires_grad=True)
-    needle_loss(leaf).sum().backward()
+    erank_loss(leaf).sum().backward()
     assert torch.isfinite(leaf.grad).all()
     assert leaf.grad.abs().max() <= 2
 
@@ -59,24 +59,24 @@ def test_gradients_match_finite_differences():
     rng = np.random.default_rng(0)
     for _ in range(50):
         scales = torch.tensor([[rng.uniform(0, 1), rng.uniform(-5, -1), rng.uniform(-6, -1)]], dtype=torch.float64)
-        if float(needle_loss(scales)[0]) > 0:
-            assert torch.autograd.gradcheck(needle_loss, scales.requires_grad_(), eps=1e-6, atol=1e-6)
+        if float(erank_loss(scales)[0]) > 0:
+            assert torch.autograd.gradcheck(erank_loss, scales.requires_grad_(), eps=1e-6, atol=1e-6)
 
 
-def test_needles_become_wider_and_others_flatter():
+def test_needles_become_wider_and_balls_flatter():
     scales = torch.tensor([[1.0, -5, -5], [0, 0, 0]], requires_grad=True)
-    Shape(1.0, 0.5, extent=4.0).penalty(0, {"scales": scales}).backward()
+    ShapeRegularizer(1.0, 0.5, extent=4.0).penalty(0, {"scales": scales}).backward()
     needle, ball = -scales.grad
     assert needle[0] < 0 < needle[1]
-    assert float(ball.sum()) == pytest.approx(-0.5 / 4 / 2), "of equal scales one counts, or all of them a part"
+    assert float(ball.sum()) == pytest.approx(-0.5 / 4 / 2), "equal smallest scales share the gradient"
 
 
-def test_the_size_of_the_world_does_not_matter():
+def test_the_loss_does_not_depend_on_the_size_of_the_scene():
     scales = torch.randn(20, 3)
-    small = Shape(0.1, 1.0, extent=2.0).penalty(0, {"scales": scales})
-    large = Shape(0.1, 1.0, extent=2e3).penalty(0, {"scales": scales + math.log(1e3)})
+    small = ShapeRegularizer(0.1, 1.0, extent=2.0).penalty(0, {"scales": scales})
+    large = ShapeRegularizer(0.1, 1.0, extent=2e3).penalty(0, {"scales": scales + math.log(1e3)})
     assert float(small) == pytest.approx(float(large), rel=1e-4)
 
 
-def test_nobody_has_no_shape():
-    assert Shape(1, 1, 1.0).penalty(0, {"scales": torch.empty(0, 3)}) is None
+def test_an_empty_scene_has_no_loss():
+    assert ShapeRegularizer(1, 1, 1.0).penalty(0, {"scales": torch.empty(0, 3)}) is None

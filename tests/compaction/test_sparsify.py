@@ -1,4 +1,4 @@
-"""Oracle: ADMM as its equations stand, in NumPy, sorted out one by one."""
+"""Sparsification. Oracle: the equations of ADMM in NumPy, float64."""
 
 import numpy as np
 import pytest
@@ -6,19 +6,19 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kissgs.compaction.sparsify import Sparsity, sparsest
+from kissgs.compaction.sparsify import AdmmSparsifier, keep_largest
 
 
 @given(st.lists(st.sampled_from([-1.0, 0.0, 0.25, 0.5, 2.0]), min_size=1, max_size=12), st.integers(1, 12))
-def test_exactly_so_many_are_left_whatever_the_ties(values, count):
-    """The published code keeps what is strictly above the value at the limit: ties are lost, and sometimes all."""
-    found = sparsest(torch.tensor(values), count).numpy()
+def test_exactly_the_requested_count_is_kept_despite_ties(values, count):
+    """The published code keeps values strictly above the threshold, and so loses ties, sometimes all values."""
+    found = keep_largest(torch.tensor(values), count).numpy()
     order = sorted(range(len(values)), key=lambda n: (-values[n], n))[:count]
     assert all(found[n] == (values[n] if n in order else 0) for n in range(len(values)))
 
 
-class Shown:
-    """A learner with these opacities."""
+class FixedOpacities:
+    """A trainable scene with these opacities."""
 
     def __init__(self, logits):
         self.logits = logits
@@ -27,10 +27,10 @@ class Shown:
         return {"opacities": self.logits}
 
 
-def naive(opacity_steps, count, rho, interval):
-    """Penalties and the last z, u; ``opacity_steps`` are opacities at each step, before and after it."""
+def naive_admm(opacity_steps, count, rho, interval):
+    """Return the penalties, and z and u at the end, for opacities before each step and after the last one."""
     o = opacity_steps[0]
-    z, u = keep(o, count), np.zeros_like(o)
+    z, u = naive_keep_largest(o, count), np.zeros_like(o)
     penalties = []
     for step in range(len(opacity_steps) - 1):
         if (step + 1) % interval:
@@ -38,12 +38,12 @@ def naive(opacity_steps, count, rho, interval):
             continue
         penalties.append(rho / 2 * np.sum((opacity_steps[step] - z + u) ** 2))
         after = opacity_steps[step + 1]
-        z = keep(after + u, count)
+        z = naive_keep_largest(after + u, count)
         u = u + after - z
     return penalties, z, u
 
 
-def keep(values, count):
+def naive_keep_largest(values, count):
     sparse = np.zeros_like(values)
     index = np.argsort(-values, kind="stable")[:count]
     sparse[index] = values[index]
@@ -51,52 +51,52 @@ def keep(values, count):
 
 
 @pytest.mark.parametrize("interval", [1, 3])
-def test_it_is_admm(interval):
+def test_penalties_and_updates_are_those_of_admm(interval):
     logits = np.random.default_rng(0).normal(size=(10, 30))
     logits = np.cumsum(0.3 * logits, axis=0).astype(np.float32)
-    sparsity = Sparsity(torch.tensor(logits[0]), 8, 0.01, interval)
+    sparsifier = AdmmSparsifier(torch.tensor(logits[0]), 8, 0.01, interval)
     penalties = []
     for step in range(9):
-        penalty = sparsity.penalty(step, {"opacities": torch.tensor(logits[step])})
+        penalty = sparsifier.penalty(step, {"opacities": torch.tensor(logits[step])})
         penalties.append(0.0 if penalty is None else float(penalty))
-        sparsity.update(step, Shown(torch.tensor(logits[step + 1])))
-    expected, z, u = naive(1 / (1 + np.exp(-logits.astype(np.float64))), 8, 0.01, interval)
+        sparsifier.update(step, FixedOpacities(torch.tensor(logits[step + 1])))
+    expected, z, u = naive_admm(1 / (1 + np.exp(-logits.astype(np.float64))), 8, 0.01, interval)
     np.testing.assert_allclose(penalties, expected, rtol=1e-5)
-    np.testing.assert_allclose(sparsity.z.numpy(), z, atol=1e-5)
-    np.testing.assert_allclose(sparsity.u.numpy(), u, atol=1e-5)
+    np.testing.assert_allclose(sparsifier.z.numpy(), z, atol=1e-5)
+    np.testing.assert_allclose(sparsifier.u.numpy(), u, atol=1e-5)
 
 
-def test_it_pulls_those_that_shall_go_down_and_leaves_the_others():
+def test_only_the_opacities_to_prune_are_pulled_down():
     logits = torch.tensor([3.0, -1.0, 2.0, 0.0], requires_grad=True)
-    Sparsity(logits, 2, 0.1, 1).penalty(0, {"opacities": logits}).backward()
+    AdmmSparsifier(logits, 2, 0.1, 1).penalty(0, {"opacities": logits}).backward()
     assert logits.grad[1] > 0
     assert logits.grad[3] > 0
     assert (logits.grad[[0, 2]] == 0).all()
 
 
-def test_its_state_goes_on():
+def test_a_restored_state_continues_exactly():
     logits = torch.randn(20)
-    one, other = Sparsity(logits, 5, 0.1, 1), Sparsity(torch.zeros(20), 5, 0.1, 1)
+    one, other = AdmmSparsifier(logits, 5, 0.1, 1), AdmmSparsifier(torch.zeros(20), 5, 0.1, 1)
     for step in range(3):
-        one.update(step, Shown(logits + step))
+        one.update(step, FixedOpacities(logits + step))
     other.restore(one.state())
-    for sparsity in (one, other):
-        sparsity.update(3, Shown(-logits))
+    for sparsifier in (one, other):
+        sparsifier.update(3, FixedOpacities(-logits))
     assert torch.equal(one.z, other.z)
     assert torch.equal(one.u, other.u)
 
 
 def test_threads_change_no_bit():
-    """torch's sigmoid does, of more than 32,768 numbers."""
+    """They do in torch's sigmoid, for more than 32,768 numbers."""
     logits = torch.linspace(-9, 9, 33_001)
     states, before = [], torch.get_num_threads()
     for threads in (1, 2, 3):
         torch.set_num_threads(threads)
         leaf = logits.clone().requires_grad_()
-        sparsity = Sparsity(leaf, 9000, 1e-3, 1)
-        sparsity.penalty(0, {"opacities": leaf}).backward()
-        sparsity.update(0, Shown(leaf))
-        states.append([leaf.grad.numpy(), *sparsity.state().values()])
+        sparsifier = AdmmSparsifier(leaf, 9000, 1e-3, 1)
+        sparsifier.penalty(0, {"opacities": leaf}).backward()
+        sparsifier.update(0, FixedOpacities(leaf))
+        states.append([leaf.grad.numpy(), *sparsifier.state().values()])
     torch.set_num_threads(before)
     for other in states[1:]:
         assert all(np.array_equal(a, b) for a, b in zip(states[0], other, strict=True))

@@ -140,7 +140,7 @@ def test_effective_rank_by_the_book_is_noticed(monkeypatch):
         entropy = -(share * share.log()).sum(dim=1)
         return (-torch.log(entropy.exp() - 1 + regularizers.EPSILON)).clamp_min(0)
 
-    monkeypatch.setattr(extreme_stages, "needle_loss", by_the_book)
+    monkeypatch.setattr(extreme_stages, "erank_loss", by_the_book)
     assert broken("rank") >= {"needles", "cauchy"}
 
 

@@ -8,7 +8,7 @@ from helpers.training_scenes import around, cloud
 import kissgs
 from kissgs import CompactSettings
 from kissgs.cameras.views import View, black
-from kissgs.compaction.popspa import popspa
+from kissgs.compaction.popspa import Popspa
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.rendering.rasterizer import render
 from kissgs.training.supervision import SupervisionViews
@@ -38,13 +38,13 @@ def error(scene, original, supervision):
 
 
 def check(scene, count, supervision, seen=True, **changes):
-    fitted = popspa(scene, count, CompactSettings(**{**STEPS, **changes}), supervision).splats
+    fitted = Popspa(scene, CompactSettings(**{**STEPS, **changes}), supervision)(count).splats
     assert len(fitted) == count
     for name in ATTRIBUTES:
         assert np.isfinite(getattr(fitted, name)).all(), name
     if not seen:
         return fitted
-    pruned = popspa(scene, count, CompactSettings(sparsify_steps=0, refine_steps=0), supervision).splats
+    pruned = Popspa(scene, CompactSettings(sparsify_steps=0, refine_steps=0), supervision)(count).splats
     assert error(fitted, scene, supervision) <= 1.1 * error(pruned, scene, supervision) + 2e-3
     return fitted
 

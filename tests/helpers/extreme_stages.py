@@ -12,7 +12,7 @@ from helpers import reference_float64, reference_rasterizer
 from helpers.extreme_containers import BACKGROUND, BY_NAME, balanced, browser, decode, fast, largest, levels, scene
 from helpers.reference_training import trained
 from helpers.render_scenes import in_float64
-from kissgs.compaction.regularizers import needle_loss
+from kissgs.compaction.regularizers import erank_loss
 from kissgs.rendering.differentiable import rasterize
 from kissgs.rendering.rasterizer import removal_scores, render
 from kissgs.rendering.tensors import tensors_of
@@ -106,9 +106,9 @@ def score(name):
 def rank(name):
     """Return the largest error of the effective-rank loss (relative above 1) and of its gradient, at most 2."""
     scales = torch.from_numpy(scene(name)[0].scales).clone().requires_grad_()
-    loss = needle_loss(scales)
+    loss = erank_loss(scales)
     loss.sum().backward()
-    wanted, slope = reference_float64.needle_loss(scales.detach())
+    wanted, slope = reference_float64.erank_loss(scales.detach())
     off = np.abs(scales.grad.numpy() - slope).max(axis=1, initial=0)
     at_kink = wanted < 1e-5  # at a disc, both one-sided gradients are correct
     off = np.where(at_kink & (scales.grad.numpy() == 0).all(axis=1), 0, off)

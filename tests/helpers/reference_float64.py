@@ -157,7 +157,7 @@ def removed(rendering, count, background):
     return scores
 
 
-def needle_loss(scales):
+def erank_loss(scales):
     """Return the paper's loss max(-ln(erank - 1 + 1e-7), 0), ``(N,)``, and its gradient ``(N, 3)``."""
     scales = np.asarray(scales, np.float64)
     squares = np.exp(2 * scales)

@@ -250,7 +250,7 @@ def test_no_checkpoint_of_a_search(tmp_path):
 
 
 def test_compact_without_a_container_has_no_goal():
-    with pytest.raises(UnsupportedError, match="a goal is that of a container: kissgs compress"):
+    with pytest.raises(UnsupportedError, match="auto_count needs a container: use kissgs compress"):
         kissgs.compact(SCENE, settings=settings(target_size="20kB"))
 
 
