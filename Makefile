@@ -26,6 +26,7 @@ lint: setup-dev
 	@.venv/bin/ruff check .
 	@.venv/bin/mypy
 	@.venv/bin/lint-imports
+	@.venv/bin/python scripts/lint_language.py
 	@PATH="$(CURDIR)/.venv/bin:$$PATH" npm --prefix web_decoder run --silent check
 
 bench: setup
