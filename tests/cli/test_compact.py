@@ -165,10 +165,10 @@ def test_missing_torch_is_reported(folder: Path, tmp_path: Path) -> None:
     program = "import sys; sys.modules['torch'] = None; from kissgs.cli.main import main; main()"
     words = ["compact", folder / "a.ply", "-n", "99", "-o", tmp_path / "b.ply", "--set", "views=24"]
     python = [KISSGS.with_name("python"), "-c", program]
-    done = subprocess.run([*python, *map(str, words)], capture_output=True, timeout=120, check=False)
+    done = subprocess.run([*python, *map(str, words)], capture_output=True, timeout=300, check=False)
     assert done.returncode == 2
     assert done.stderr.startswith(b"kissgs: training is done with torch, which is missing: pip install 'kissgs[train]'")
-    fast = subprocess.run([*python, *map(str, words), "-p", "fast"], capture_output=True, timeout=120, check=False)
+    fast = subprocess.run([*python, *map(str, words), "-p", "fast"], capture_output=True, timeout=300, check=False)
     assert fast.returncode == 0, fast.stderr
 
 

@@ -228,7 +228,7 @@ except kissgs.InvalidContainerError as error:
         env=os.environ | {"PYTHONPATH": home},
         input=HOSTILE[bomb].encode(),
         capture_output=True,
-        timeout=10,
+        timeout=300,
         check=False,
     )
     assert (run.returncode, run.stderr) == (0, b"")
