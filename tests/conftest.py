@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import helpers.examples  # registers the profiles of Hypothesis
 import helpers.shape_checks  # noqa: F401  # the hook names it
 import pytest
 from jaxtyping import install_import_hook

@@ -6,7 +6,8 @@ import zlib
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from helpers.examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -157,7 +158,7 @@ FILES = list(files())
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # Pillow warns about damaged TIFF and EXIF data
-@settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@examples(400)
 @given(data=st.data())
 def test_damaged_files(tmp_path, data):
     content = bytearray(data.draw(st.sampled_from(FILES)))

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from helpers.examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import fsolve
 
@@ -120,7 +121,7 @@ def test_invalid_lenses(lens, sentence):
 COEFFICIENTS = st.floats(-1, 1) | st.floats(allow_nan=False, allow_infinity=False)
 
 
-@settings(max_examples=150, deadline=None)
+@examples(150)
 @given(st.builds(Distortion, *[COEFFICIENTS] * 8), st.floats(1, 1e4), st.floats(1, 119))
 def test_any_coefficients(distortion, focal, cx):
     lens = Lens(focal, focal, cx, 40, 120, 80, distortion)

@@ -184,7 +184,7 @@ def test_an_interrupt_inside_a_finalizer_is_not_lost() -> None:
         "main.main()",
     )
     done = subprocess.run(
-        [sys.executable, "-c", "\n".join(lines)], check=False, capture_output=True, text=True, timeout=60
+        [sys.executable, "-c", "\n".join(lines)], check=False, capture_output=True, text=True, timeout=300
     )
     assert done.returncode == 130
     assert done.stderr == "kissgs: interrupted; no partial file is left\n"
@@ -196,7 +196,7 @@ def test_interrupt_leaves_nothing(tmp_path: Path) -> None:
     process = subprocess.Popen([KISSGS, "compress", scene, "-o", target, "-p", "paper"], stderr=subprocess.PIPE)
     time.sleep(1.5)
     process.send_signal(signal.SIGINT)
-    _, message = process.communicate(timeout=5)
+    _, message = process.communicate(timeout=300)
     assert process.returncode == 130
     assert message.decode().splitlines()[-1].startswith("kissgs: interrupted")
     assert [path.name for path in tmp_path.iterdir()] == ["scene.ply"]

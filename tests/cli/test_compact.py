@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.captured_scene import SCENE, write_capture
 from helpers.command_line import KISSGS, failure, run
+from helpers.held_training import HeldTraining
 from helpers.training_scenes import same
 
 import kissgs
@@ -91,27 +91,23 @@ def test_the_order_of_the_container_leads_to_the_scene() -> None:
     np.testing.assert_allclose(found.means, SCENE.means[result.order], rtol=0.01, atol=0.05)
 
 
-def test_ctrl_c_leaves_a_checkpoint_to_resume_from(folder: Path, tmp_path: Path) -> None:
-    scene, target = tmp_path / "a.ply", tmp_path / "b.ply"
+def test_ctrl_c_leaves_a_checkpoint_to_resume_from(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    scene, target, kept = tmp_path / "a.ply", tmp_path / "b.ply", tmp_path / "a.checkpoint.npz"
     kissgs.save(SCENE, scene)
-    longer = ["--set", "sparsify_steps=300", "--set", "refine_steps=300", "--set", "views=24", "--set", "view_size=48"]
-    words = ["compact", scene, "-n", "300", "-o", target, "--checkpoint", "--quiet", *longer]
-    program = "import kissgs.training.checkpoint as c; c.SAVE_INTERVAL = 0; from kissgs.cli.main import main; main()"
+    words = ["compact", scene, "-n", "300", "-o", target, "--checkpoint", "--quiet", *OPTIONS]
+    training = HeldTraining(tmp_path_factory.mktemp("hold"), saves=4)
+    program = f"{training.program}\nfrom kissgs.cli.main import main; main()"
     process = subprocess.Popen([KISSGS.with_name("python"), "-c", program, *map(str, words)], stderr=subprocess.PIPE)
-    kept = tmp_path / "a.checkpoint.npz"
-    deadline = time.monotonic() + 90
-    while not kept.exists() and time.monotonic() < deadline:
-        time.sleep(0.05)
+    training.wait()
     process.send_signal(signal.SIGINT)
     assert process.communicate()[1] == b"kissgs: interrupted; no partial file is left\n"
     assert process.returncode == 130
-    assert not target.exists()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.checkpoint.npz", "a.ply"]
-    assert "other work" in failure("compact", scene, "-n", "301", "-o", target, "--checkpoint", *longer)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [kept.name, "a.ply"]
+    assert "other work" in failure("compact", scene, "-n", "301", "-o", target, "--checkpoint", *OPTIONS)
+    training.release()
     assert run(*words).returncode == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.ply", "b.ply"]
-    settings = {"sparsify_steps": 300, "refine_steps": 300, "views": 24, "view_size": 48, "count": 300}
-    whole = kissgs.compact(SCENE, settings=kissgs.Settings.from_preset("balanced", compact=settings))
+    whole = kissgs.compact(SCENE, settings=kissgs.Settings.from_preset("balanced", compact={**SHORT, "count": 300}))
     assert same(kissgs.load(target), kissgs.clean(whole.splats)[0])
 
 
@@ -169,10 +165,10 @@ def test_missing_torch_is_reported(folder: Path, tmp_path: Path) -> None:
     program = "import sys; sys.modules['torch'] = None; from kissgs.cli.main import main; main()"
     words = ["compact", folder / "a.ply", "-n", "99", "-o", tmp_path / "b.ply", "--set", "views=24"]
     python = [KISSGS.with_name("python"), "-c", program]
-    done = subprocess.run([*python, *map(str, words)], capture_output=True, timeout=120, check=False)
+    done = subprocess.run([*python, *map(str, words)], capture_output=True, timeout=300, check=False)
     assert done.returncode == 2
     assert done.stderr.startswith(b"kissgs: training needs torch, which is missing: pip install 'kissgs[train]'")
-    fast = subprocess.run([*python, *map(str, words), "-p", "fast"], capture_output=True, timeout=120, check=False)
+    fast = subprocess.run([*python, *map(str, words), "-p", "fast"], capture_output=True, timeout=300, check=False)
     assert fast.returncode == 0, fast.stderr
 
 

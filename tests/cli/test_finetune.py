@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
-import time
 from pathlib import Path
 
 import pytest
 from helpers.captured_scene import SCENE, write_capture
 from helpers.command_line import KISSGS, failure, run
+from helpers.held_training import HeldTraining
 
 import kissgs
 from kissgs.cli.options import with_finetune_value
@@ -61,25 +61,24 @@ def test_the_default_number_of_steps_is_that_of_the_preset() -> None:
         assert kissgs.Settings.from_preset(preset, finetune={"enabled": True}).finetune.steps == steps
 
 
-def test_ctrl_c_leaves_a_checkpoint_to_resume_from(tmp_path: Path) -> None:
-    scene, target = tmp_path / "a.ply", tmp_path / "b.zip"
+def test_ctrl_c_leaves_a_checkpoint_to_resume_from(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    scene, target, kept = tmp_path / "a.ply", tmp_path / "b.zip", tmp_path / "a.checkpoint-finetune.npz"
     kissgs.save(SCENE, scene)
-    words = ["compress", scene, "-o", target, "--finetune", "300", "--checkpoint", "--quiet", *OPTIONS]
-    program = "import kissgs.training.checkpoint as c; c.SAVE_INTERVAL = 0; from kissgs.cli.main import main; main()"
+    words = ["compress", scene, "-o", target, "--finetune", "6", "--checkpoint", "--quiet", *OPTIONS]
+    training = HeldTraining(tmp_path_factory.mktemp("hold"), saves=4)
+    program = f"{training.program}\nfrom kissgs.cli.main import main; main()"
     process = subprocess.Popen([KISSGS.with_name("python"), "-c", program, *map(str, words)], stderr=subprocess.PIPE)
-    kept = tmp_path / "a.checkpoint-finetune.npz"
-    deadline = time.monotonic() + 90
-    while not kept.exists() and time.monotonic() < deadline:
-        time.sleep(0.05)
+    training.wait()
     process.send_signal(signal.SIGINT)
     assert process.communicate()[1] == b"kissgs: interrupted; no partial file is left\n"
     assert process.returncode == 130
     assert sorted(path.name for path in tmp_path.iterdir()) == [kept.name, "a.ply"]
-    other = ["compress", scene, "-o", target, "--finetune", "301", "--checkpoint", *OPTIONS]
+    other = ["compress", scene, "-o", target, "--finetune", "7", "--checkpoint", *OPTIONS]
     assert "other work" in failure(*other)
+    training.release()
     assert run(*words).returncode == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.ply", "b.zip"]
-    assert target.read_bytes() == kissgs.compress(SCENE, settings=settings(steps=300)).to_zip()
+    assert target.read_bytes() == kissgs.compress(SCENE, settings=settings(steps=6)).to_zip()
 
 
 @pytest.mark.parametrize(

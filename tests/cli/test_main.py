@@ -42,7 +42,7 @@ def start(left: int, *words: str, number: int = signal.SIGINT) -> subprocess.Com
         env=os.environ | {"PYTHONPATH": HOME},
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=300,
         check=False,
     )
 
@@ -104,6 +104,6 @@ def _python(program: str) -> subprocess.CompletedProcess[str]:
         env=os.environ | {"PYTHONPATH": HOME},
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=300,
         check=False,
     )

@@ -202,7 +202,7 @@ def test_an_interrupted_animation_leaves_no_file(folder: Path, tmp_path: Path) -
     with subprocess.Popen([KISSGS, *map(str, words)], stderr=subprocess.PIPE) as process:
         time.sleep(4)
         process.send_signal(signal.SIGINT)
-        _, message = process.communicate(timeout=20)
+        _, message = process.communicate(timeout=300)
     assert process.returncode == 130
     assert message.decode() == "kissgs: interrupted; no partial file is left\n"
     assert list(tmp_path.iterdir()) == []
@@ -241,5 +241,5 @@ def test_warmup_loads_the_kernels_of_encoder_and_rasteriser() -> None:
         "import sys; from kissgs.cli.app import warmup; warmup(); "
         "print(*(name in sys.modules for name in ('kissgs.planning.kernels', 'kissgs.rendering.cpu.frame')))"
     )
-    done = subprocess.run([sys.executable, "-c", lines], capture_output=True, timeout=120, check=True)
+    done = subprocess.run([sys.executable, "-c", lines], capture_output=True, timeout=300, check=True)
     assert done.stdout.split() == [b"True", b"True"]

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from helpers.examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as stnp
 
@@ -162,7 +163,7 @@ def anything(*shape):
     return stnp.arrays(np.float32, shape, elements=st.floats(width=32), fill=st.floats(width=32))
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
+@examples(100)
 @given(st.data(), st.integers(0, 5), st.sampled_from(SH_REST_COUNTS))
 def test_whatever_the_numbers_cleaning_gives_a_canonical_scene(data, count, coefficients):
     shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (3,), "shN": (coefficients, 3)}

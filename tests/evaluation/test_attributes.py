@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from helpers.examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -31,7 +32,7 @@ def test_equal_scenes_have_no_errors():
     assert [band.energy_kept for band in errors.bands] == [1, 1, 1]
 
 
-@settings(deadline=None, max_examples=30)
+@examples(30)
 @given(seed=seeds)
 def test_equivalent_forms_have_no_errors(seed):
     scene = sample_scene(60, sh_degree=0, seed=seed)
@@ -41,7 +42,7 @@ def test_equivalent_forms_have_no_errors(seed):
     assert errors.covariance_relative_max < 1e-5
 
 
-@settings(deadline=None, max_examples=30)
+@examples(30)
 @given(seed=seeds, degrees=st.floats(0.01, 15))
 def test_a_known_rotation_is_measured_in_any_form(seed, degrees):
     rng = np.random.default_rng(seed)
@@ -56,7 +57,7 @@ def test_a_known_rotation_is_measured_in_any_form(seed, degrees):
     assert errors.scales.max == 0
 
 
-@settings(deadline=None, max_examples=20)
+@examples(20)
 @given(seed=seeds)
 def test_the_nearest_form_equals_an_exhaustive_search(seed):
     rng = np.random.default_rng(seed)
@@ -80,7 +81,7 @@ def test_the_nearest_form_equals_an_exhaustive_search(seed):
     assert errors.scales.rmse == pytest.approx(np.sqrt(np.mean(np.square(differences))), rel=1e-9)
 
 
-@settings(deadline=None, max_examples=20)
+@examples(20)
 @given(seed=seeds)
 def test_covariance_errors_equal_those_of_the_matrices(seed):
     reference, candidate = sample_scene(15, sh_degree=0, seed=seed), sample_scene(15, sh_degree=0, seed=seed + 1)

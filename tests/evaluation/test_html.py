@@ -7,7 +7,8 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from helpers.captured_scene import SCENE, camera, cameras, damaged, rendered_view, write_capture
-from hypothesis import given, settings
+from helpers.examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -201,7 +202,7 @@ def test_the_full_scale_is_a_round_number_near_four_times_the_error(psnr):
         assert full == 1 or full <= 12 * mean_error
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(st.integers(1, 90), st.integers(1, 90), st.integers(1, 60), st.integers(0, 2**32 - 1))
 def test_the_worst_crop_is_centred_on_the_largest_error(height, width, side, seed):
     rng = np.random.default_rng(seed)

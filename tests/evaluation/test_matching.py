@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from helpers.examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
@@ -60,7 +61,7 @@ def test_colours_of_invisible_gaussians_are_ignored():
     assert (match_gaussians(replace(scene, opacities=opacities), candidate) == np.arange(2000)).mean() > 0.999
 
 
-@settings(deadline=None, max_examples=50)
+@examples(50)
 @given(references=st.integers(1, 8), candidates=st.integers(0, 8), seed=st.integers(0, 2**32))
 def test_few_gaussians_are_matched_one_to_one(references, candidates, seed):
     found = match_gaussians(sample_scene(references, seed=seed), sample_scene(candidates, seed=seed + 1))

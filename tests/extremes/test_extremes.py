@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from helpers import reference_decoder
 from helpers.codec_scenes import GLANCE, assert_round_trip, assert_within, constant_scene, random_scene, replaced
-from hypothesis import given, settings
+from helpers.examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as stnp
 
@@ -193,7 +194,7 @@ def any_scene(draw):
     )
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@examples(60)
 @given(any_scene(), st.booleans())
 def test_any_numbers_at_all(splats, prune_invisible):
     found, result = check(splats, prune_invisible=prune_invisible)

@@ -96,7 +96,7 @@ def command(folder, **settings):
     chosen = {"PYTHONPATH": str(ROOT), "KISSGS_PORT": "0", "KISSGS_DATA_DIR": str(folder), **settings}
     return subprocess.run(
         [sys.executable, "-P", "-m", "service"],
-        env={**kept, **chosen}, capture_output=True, text=True, timeout=30, check=False,
+        env={**kept, **chosen}, capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
 
 

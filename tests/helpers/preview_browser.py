@@ -63,7 +63,7 @@ class Preview:
     def __init__(self, browser, **options):
         self.context = browser.new_context(**{"viewport": {"width": 820, "height": 400}, **options})
         self.page = self.context.new_page()
-        self.page.set_default_timeout(20_000)
+        self.page.set_default_timeout(120_000)
         self.page.add_init_script(COUNT_RESOURCES)
         self.requests, self.errors, self.origin = [], [], ""
         self.page.on("request", self._request)
@@ -115,7 +115,7 @@ class Preview:
         screenshot = self.page.locator("#stage").screenshot(animations="disabled")
         return np.asarray(Image.open(io.BytesIO(screenshot)).convert("RGB")).astype(int)
 
-    def still_image(self, seconds=20, still=3):
+    def still_image(self, seconds=300, still=3):
         """Return a screenshot when ``still`` of them, 0.2 s apart, are equal, so that Spark has finished sorting."""
         end = time.monotonic() + seconds
         seen = [self.pixels()]

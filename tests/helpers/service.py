@@ -64,12 +64,12 @@ class Service:
                 stdout=log,
                 stderr=log,
             )
-        for _ in range(600):
+        for _ in range(6000):
             output = self.log.read_bytes()[begin:].decode(errors="replace")
             found = re.search(r"listening on (http://127\.0\.0\.1:([0-9]+))", output)
             if found:
                 self.url, self.port = found[1], int(found[2])
-                self.http = httpx.Client(base_url=self.url, timeout=60, trust_env=False)
+                self.http = httpx.Client(base_url=self.url, timeout=300, trust_env=False)
                 return self
             if self.process.poll() is not None:
                 break
@@ -80,7 +80,7 @@ class Service:
         """Send a signal, wait for the end, and return the exit status."""
         if self.process.poll() is None:
             self.process.send_signal(number)
-        return self.process.wait(timeout=60)
+        return self.process.wait(timeout=300)
 
     def restart(self) -> Service:
         self.http.close()
@@ -100,7 +100,7 @@ class Service:
         assert answer.status_code == 200, answer.text
         return answer.json()
 
-    def ended(self, job: dict, seconds: float = 60) -> dict:
+    def ended(self, job: dict, seconds: float = 600) -> dict:
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             status = self.status(job, wait=5)
@@ -108,7 +108,7 @@ class Service:
                 return status
         raise AssertionError(f"job {job['id']} has not ended: {status}")
 
-    def running(self, job: dict, stage: str | None = None, seconds: float = 30) -> dict:
+    def running(self, job: dict, stage: str | None = None, seconds: float = 300) -> dict:
         """Wait until the job's process runs, in ``stage`` if given; return the status."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -140,7 +140,7 @@ class Service:
 
     def raw(self, data: bytes) -> socket.socket:
         """Open a connection and send these bytes."""
-        connection = socket.create_connection(("127.0.0.1", self.port), timeout=30)
+        connection = socket.create_connection(("127.0.0.1", self.port), timeout=300)
         connection.sendall(data)
         return connection
 

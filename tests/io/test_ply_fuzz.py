@@ -3,10 +3,11 @@
 import io
 
 import pytest
+from helpers.examples import examples
 from helpers.memory import takes_less_than
 from helpers.reference_compressed_ply import header_bytes as compressed_header
 from helpers.reference_ply import ENCODINGS, STRUCT_CODES, assert_identical, ply_bytes, random_columns
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from kissgs.core.errors import KissgsError
@@ -84,19 +85,19 @@ def outcome(data):
     return outcomes[0]
 
 
-@settings(max_examples=300, deadline=None)
+@examples(300)
 @given(mutated())
 def test_mutated_files(data):
     check(data)
 
 
-@settings(max_examples=300, deadline=None)
+@examples(300)
 @given(mutated_header())
 def test_mutated_headers(data):
     check(data)
 
 
-@settings(max_examples=100, deadline=None)
+@examples(100)
 @given(st.binary(max_size=200) | st.lists(LINES, max_size=20).map(lambda lines: "\n".join(["ply", *lines]).encode()))
 @example(b"ply\nformat ascii 1.0\nelement vertex " + b"9" * 5000 + b"\nend_header\n")
 def test_any_bytes(data):

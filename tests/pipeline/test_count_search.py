@@ -279,7 +279,7 @@ main()
     words = ["compress", scene, "-o", target, "--max-psnr-drop", "3", "--json", "--set", "quality_offset_db=8"]
     words += [word for name, value in FEW_VIEWS.items() for word in ("--set", f"{name}={value}")]
     command = [sys.executable, "-c", program, *map(str, words)]
-    done = subprocess.run(command, check=False, capture_output=True, timeout=200)
+    done = subprocess.run(command, check=False, capture_output=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert b"kissgs: stopping" in done.stderr
     trials = json.loads(done.stdout)["trials"]

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from helpers.examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from kissgs import sample_scene
@@ -46,7 +47,7 @@ def lloyd(vectors, size, iterations=15, seed=0):
     return squared_distances(vectors, centroids).min(axis=1).mean()
 
 
-@settings(max_examples=50, deadline=None, derandomize=True)
+@examples(50)
 @given(st.integers(1, 3000), st.integers(1, 50), st.integers(1, 8), st.integers(0, 1000))
 def test_assign_finds_the_nearest_centroid(count, size, dimensions, seed):
     rng = np.random.default_rng(seed)
@@ -200,7 +201,7 @@ def test_progress_runs_upwards_to_one():
     assert fractions[-1] == 1
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
+@examples(100)
 @given(st.integers(0, 10**8), st.sampled_from([1, 8, 20]))
 def test_codebook_sides_follow_the_formula(count, ratio):
     side = codebook_side(count / ratio)

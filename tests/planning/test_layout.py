@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 from helpers.codec_scenes import random_scene
-from hypothesis import given, settings
+from helpers.examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from kissgs.core.errors import UnsupportedError
@@ -55,7 +56,7 @@ def test_gaussians_in_one_cell_keep_their_order():
     assert hilbert_order(np.empty((0, 3), np.uint16)).shape == (0,)
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@examples(200)
 @given(st.integers(0, MAX_GRID_SIDE**2))
 def test_the_grid_is_the_smallest_multiple_of_eight_that_holds_all(count):
     side = grid_side(count)

@@ -4,7 +4,8 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from helpers.examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from kissgs.core.threads import blas_workers
@@ -88,7 +89,7 @@ def test_what_progress_raises_stops_the_work():
         sort(np.zeros((64, 1), np.float32), report=stop)
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
+@examples(100)
 @given(st.integers(0, 10**6), st.integers(1, 6))
 def test_groups_of_four_get_the_cheapest_of_24_permutations(seed, channels):
     rng = np.random.default_rng(seed)

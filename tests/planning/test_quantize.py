@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 from helpers.codec_scenes import random_scene, replaced
-from hypothesis import given, settings
+from helpers.examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as stnp
 
@@ -19,7 +20,7 @@ from kissgs.planning.quantize import (
     quantize_means,
 )
 
-quick = settings(max_examples=60, deadline=None, derandomize=True)
+quick = examples(60)
 
 
 NUMBERS = st.floats(-1e3, 1e3, width=32)

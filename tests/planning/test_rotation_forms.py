@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 from helpers.codec_scenes import covariances, equivalents, product, random_scene, unit
-from hypothesis import given, settings
+from helpers.examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -88,7 +89,7 @@ def test_upright_twice_is_upright_once(gaussians):
     assert (canonical_forms(np.array([[1.0, 0, 0, 0], [-1, 0, 0, 0]])) == [0, 24]).all()
 
 
-@settings(max_examples=50, deadline=None, derandomize=True)
+@examples(50)
 @given(st.lists(st.sampled_from([-1.0, -0.5, 0.0, 0.5, 1.0]), min_size=4, max_size=4).filter(any))
 def test_ties_are_broken_the_same_way_on_every_machine(numbers):
     """Rotations by 45 or 90 degrees have several forms of equal w; the last bits must not decide."""

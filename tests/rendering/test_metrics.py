@@ -6,7 +6,8 @@ import sys
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from helpers.examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -112,7 +113,7 @@ def test_arrays_need_not_be_contiguous():
 sizes = st.tuples(st.integers(1, 14), st.integers(1, 14), st.just(3))
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(data=st.data(), shape=sizes, limit=st.sampled_from([1.0, 100.0, 1e6, 2.0**127]))
 def test_properties_of_the_metrics(data, shape, limit):
     """SSIM is exactly symmetric, in [-1, 1], and 1 for equal images, for any values that a renderer may produce."""

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 from helpers import reference_rasterizer
+from helpers.examples import examples
 from helpers.rasterized import render_tensors
 from helpers.render_scenes import blobs, camera, in_float64, one, together
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from kissgs.core.errors import InvalidSceneError, InvalidViewsError, KissgsError, UnsupportedError
@@ -56,7 +57,7 @@ def test_images_agree_with_the_reference(count, degree, device):
     check_image(blobs(count, degree, seed=count), camera(seed=count), (0.2, 0.5, 0.9), device)
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(
     seed=st.integers(0, 2**31),
     size=st.tuples(st.integers(1, 50), st.integers(1, 50)),

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.examples import examples
 from helpers.rasterized import all_is_finite, render_tensors
 from helpers.render_scenes import blobs, camera, one, together
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from kissgs.core.splats import Splats
@@ -33,13 +34,13 @@ gaussian = st.builds(
 sizes = st.sampled_from([(1, 1), (1, 4096), (4096, 1), (16, 16), (17, 15)])
 
 
-@settings(max_examples=150, deadline=None)
+@examples(150)
 @given(gaussians=st.lists(gaussian, min_size=1, max_size=9), size=sizes, seed=st.integers(0, 99))
 def test_images_gradients_and_scores_are_finite(gaussians, size, seed):
     all_is_finite(together(*gaussians), camera(*size, seed=seed))
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(depth=st.sampled_from([0.0, 1e-9, -1e-9, 0.0099, 0.01, 0.0101, 1.0]), scale=log_scale, side=anywhere)
 def test_gaussians_on_and_behind_the_camera_plane(depth, scale, side):
     view = camera(33, 17)

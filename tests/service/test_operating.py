@@ -21,7 +21,7 @@ def command(*arguments, **settings):
     environment = {name: value for name, value in os.environ.items() if not name.startswith("KISSGS_")}
     environment |= settings
     return subprocess.run(
-        [*COMMAND, *arguments], env=environment, capture_output=True, text=True, timeout=60, check=False
+        [*COMMAND, *arguments], env=environment, capture_output=True, text=True, timeout=300, check=False
     )
 
 

@@ -188,7 +188,7 @@ def kissgs_command(*arguments, **settings):
     environment = {name: value for name, value in os.environ.items() if not name.startswith("KISSGS_")}
     return subprocess.run(
         [sys.executable, "-P", "-c", "from kissgs.cli.main import main; main()", "remote", *map(str, arguments)],
-        env={**environment, **settings}, capture_output=True, text=True, timeout=120, check=False,
+        env={**environment, **settings}, capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
 
 

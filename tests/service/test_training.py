@@ -4,11 +4,11 @@ import json
 import os
 import re
 import signal
-import time
 from dataclasses import asdict
 
 import numpy as np
 import pytest
+from helpers.held_training import HeldTraining
 from helpers.service import ROOT, SMALL, events, problem
 
 import kissgs
@@ -26,35 +26,35 @@ def options(steps):
     return {"preset": "fast", "compact": changes}
 
 
-BRIEF, LONG = options(4), options(600)
+STEPS = 8
+BRIEF = options(STEPS)
+DONE = 3
+"""Steps of its stage after which training waits."""
+
+SAVES = {"sparsify": 1 + DONE, "refine": 1 + STEPS + DONE, "finetune": DONE}
+"""Number of the checkpoint after these steps; fine-tuning saves none before the first."""
 
 
 @pytest.fixture(scope="module")
 def expected():
-    """Container of LONG, from the library."""
-    return kissgs.compress(SMALL, settings=kissgs.Settings.model_validate(LONG)).to_zip()
+    """Container of BRIEF, from the library."""
+    return kissgs.compress(SMALL, settings=kissgs.Settings.model_validate(BRIEF)).to_zip()
 
 
 @pytest.fixture
-def start_saving(start, tmp_path):
-    """Start a service whose jobs save checkpoints every 0.05 s instead of every half minute."""
-    (tmp_path / "sitecustomize.py").write_text(
-        "from kissgs.training import checkpoint\ncheckpoint.SAVE_INTERVAL = 0.05\n"
-    )
-    return lambda **settings: start(PYTHONPATH=f"{ROOT}{os.pathsep}{tmp_path}", **settings)
+def start_held(start, tmp_path):
+    """Start a service and return it with the training of its jobs, which waits after so many checkpoints."""
+
+    def begin(stage, pause=0.0, **settings):
+        training = HeldTraining(tmp_path, SAVES[stage], pause=pause)
+        (tmp_path / "sitecustomize.py").write_text(training.program)
+        return start(PYTHONPATH=f"{ROOT}{os.pathsep}{tmp_path}", **settings), training
+
+    return begin
 
 
 def folder_of(service, job):
     return service.folder / "jobs" / job["id"]
-
-
-def training(service, job, stage="sparsify", fraction=0.0):
-    """Wait until training has reached a stage and fraction and a checkpoint exists; return the progress."""
-    while True:
-        progress = service.running(job, stage)["progress"]
-        if progress["fraction"] >= fraction and (folder_of(service, job) / "checkpoint.npz").exists():
-            return progress
-        time.sleep(0.02)
 
 
 def training_events(service, job):
@@ -68,36 +68,41 @@ def training_events(service, job):
     return starts
 
 
-def kill_the_service(service):
+def kill_the_service(service, training):
     service.kill(signal.SIGKILL)
     for folder in (service.folder / "jobs").iterdir():
         (folder / ".kissgs.half.part").write_bytes(b"PK half")  # an incomplete checkpoint
+    training.release()
     service.restart()
 
 
-def stop_the_service(service):
+def stop_the_service(service, training):
     assert service.kill(signal.SIGTERM) == 0
+    training.release()
     service.restart()
 
 
-def kill_the_job(service):
-    os.kill(service.children()[0], signal.SIGKILL)
+def kill_the_job(service, training):
+    (job,) = service.children()
+    training.release()  # the next process must not wait; this one may go on for some steps
+    os.kill(job, signal.SIGKILL)
 
 
 @pytest.mark.parametrize(
     ("stage", "interrupt"), [("sparsify", kill_the_service), ("refine", stop_the_service), ("refine", kill_the_job)]
 )
-def test_training_continues_after_an_interruption(start_saving, expected, stage, interrupt):
-    service = start_saving(KISSGS_DRAIN_SECONDS=0)
-    job = service.submit(options=json.dumps(LONG))
-    training(service, job, stage, 0.4)
-    interrupt(service)
+def test_training_continues_after_an_interruption(start_held, expected, stage, interrupt):
+    service, training = start_held(stage, KISSGS_DRAIN_SECONDS=0)
+    job = service.submit(options=json.dumps(BRIEF))
+    training.wait()
+    service.running(job, stage)
+    interrupt(service, training)
     status = service.ended(job)
     assert status["state"] == "succeeded", status
     assert service.http.get(status["links"]["result"]).content == expected
     before, after = training_events(service, job)
     assert before[0] == ("sparsify", 0.0)
-    assert after[0] != before[0]  # the progress of the last checkpoint depends on the machine
+    assert after[0] == (stage, DONE / STEPS)
     assert sorted(path.name for path in folder_of(service, job).iterdir()) == ["result", "scene.ply"]
 
 
@@ -158,10 +163,11 @@ def test_a_full_disk_disables_checkpoints(tmp_path, monkeypatch, saved):
     assert str(tmp_path) not in report
 
 
-def test_disk_space_for_checkpoints_is_reserved_until_the_job_ends(start_saving):
-    service = start_saving(KISSGS_MAX_DISK_BYTES=4 * len(SMALL))
-    job = service.submit(options=json.dumps(LONG))
-    training(service, job)
+def test_disk_space_for_checkpoints_is_reserved_until_the_job_ends(start_held):
+    service, training = start_held("sparsify", KISSGS_MAX_DISK_BYTES=4 * len(SMALL))
+    job = service.submit(options=json.dumps(BRIEF))
+    training.wait()
+    training.release()
     kept = folder_of(service, job) / "checkpoint.npz"
     assert 2 * kept.stat().st_size <= checkpoint_bytes(300, 1)
     problem(service.http.post("/v1/jobs", content=SMALL), 507, "disk-full")
@@ -177,28 +183,29 @@ def test_the_largest_record_of_steps():
     assert len(json.dumps([step] * (2 * most + 3))) < STEPS_BYTES
 
 
-def test_training_notes(service):
-    job = service.submit(options=json.dumps(LONG))
-    note = ""
-    while "loss" not in note:  # not before the first step, nor while Gaussians are pruned
-        note = training(service, job).get("note", "")
+def test_training_notes(start_held):
+    service, training = start_held("refine", pause=0.4)  # progress is sent a few times per second
+    job = service.submit(options=json.dumps(BRIEF))
+    training.wait()
+    note = service.running(job, "refine")["progress"]["note"]
     assert re.fullmatch(r"1\d\d Gaussians, loss 0\.\d{4}, PSNR \d\d\.\d\d", note)
+    training.release()
+    assert service.ended(job)["state"] == "succeeded"
     sent = [data for _, kind, data in events(service.http.get(job["links"]["events"]).text) if kind == "progress"]
     assert {data["stage"] for data in sent if "note" in data} == {"sparsify", "refine"}
     assert any(data.get("note") == note for data in sent)
 
 
-FINETUNED = {"preset": "fast", "finetune": {"enabled": True, "steps": 300, "views": 24, "view_size": 48}}
+FINETUNED = {"preset": "fast", "finetune": {"enabled": True, "steps": STEPS, "views": 24, "view_size": 48}}
 
 
-def test_fine_tuning_continues_and_its_gain_is_reported(start_saving):
-    service = start_saving(KISSGS_DRAIN_SECONDS=0)
+def test_fine_tuning_continues_and_its_gain_is_reported(start_held):
+    service, training = start_held("finetune", KISSGS_DRAIN_SECONDS=0)
     job = service.submit(options=json.dumps(FINETUNED))
+    training.wait()
     kept = folder_of(service, job) / "checkpoint-finetune.npz"
-    while not (kept.exists() and service.running(job, "finetune")["progress"]["fraction"] > 0.3):
-        time.sleep(0.02)
     assert 2 * kept.stat().st_size <= checkpoint_bytes(300, 1, compact=False, finetune=True)
-    kill_the_service(service)
+    kill_the_service(service, training)
     status = service.ended(job)
     assert status["state"] == "succeeded", status
     expected = kissgs.compress(SMALL, settings=kissgs.Settings.model_validate(FINETUNED))
@@ -206,5 +213,5 @@ def test_fine_tuning_continues_and_its_gain_is_reported(start_saving):
     gain = expected.report.finetuning.as_dict()
     assert {**status["finetuning"], "seconds": 0} == {**gain, "seconds": 0}
     _, after = training_events(service, job)
-    assert after[0][1] > 0.2
+    assert after[0] == ("finetune", DONE / STEPS)
     assert sorted(path.name for path in folder_of(service, job).iterdir()) == ["result", "scene.ply"]

@@ -65,7 +65,7 @@ def vendor(tree, npm="11.6.0", **environment):
     environment |= {"PATH": str(tree / "bin") if npm else "", "PYTHONPATH": str(tree)}
     environment |= {"NPM_VERSION": npm or "", "CALLS": str(calls), "HOME": str(tree)}
     command = [sys.executable, tree / "scripts" / "vendor"]
-    done = subprocess.run(command, check=False, capture_output=True, text=True, env=environment, timeout=60)
+    done = subprocess.run(command, check=False, capture_output=True, text=True, env=environment, timeout=300)
     assert "Traceback" not in done.stderr
     assert [path.name for path in (tree / "web_decoder").glob(".*")] == []
     return done, calls.read_text().splitlines()

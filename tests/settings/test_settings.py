@@ -1,7 +1,8 @@
 """Oracle: the bounds that the descriptions name, and pydantic's own round trip."""
 
 import pytest
-from hypothesis import given, settings
+from helpers.examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
@@ -120,7 +121,7 @@ JSON = st.recursive(
 )
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@examples(200)
 @given(JSON)
 def test_any_json_is_valid_or_refused(value):
     """A client of the service may send any JSON."""

@@ -20,7 +20,8 @@ from helpers.codec_scenes import (
     replaced,
     unit,
 )
-from hypothesis import given, settings
+from helpers.examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -45,7 +46,7 @@ def test_round_trip_is_within_the_half_steps_that_are_reported(count, preset):
     assert sorted(result.order) == list(range(count))
 
 
-@settings(max_examples=25, deadline=None, derandomize=True)
+@examples(25)
 @given(
     st.integers(1, 40),
     st.integers(0, 1000),

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import yaml
 from helpers.codec_scenes import random_scene
+from helpers.examples import examples
 from helpers.memory import takes_less_than
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from kissgs import KissgsError, Settings, compress, decompress
@@ -78,20 +79,20 @@ def mutated(draw, data):
     return bytes(data)
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@examples(150)
 @given(mutated(ZIP))
 def test_mutated_zips(data):
     check(data)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@examples(60)
 @given(mutated(ZIP[ZIP.index(b"PK\x01\x02") :]))
 def test_mutated_zip_directories(directory):
     """Return the positions of names, sizes and offsets."""
     check(ZIP[: ZIP.index(b"PK\x01\x02")] + directory)
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@examples(150)
 @given(st.data(), st.sampled_from([name for name in FILES if name != "scene.json"]))
 def test_mutated_files(data, name):
     files = {**FILES, name: data.draw(mutated(FILES[name]))}
@@ -100,7 +101,7 @@ def test_mutated_files(data, name):
     check(files)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@examples(60)
 @given(st.integers(12, 60), st.sampled_from([name for name in FILES if name.endswith(".webp")]), st.binary(max_size=12))
 def test_mutated_webp_headers(start, name, new):
     """Sizes, chunk names and lengths, the transforms: what is trusted before the pixels."""
@@ -108,7 +109,7 @@ def test_mutated_webp_headers(start, name, new):
     check({**FILES, name: data[:start] + new + data[start + len(new) :]})
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@examples(60)
 @given(
     st.dictionaries(st.sampled_from([*FILES, "other"]), st.binary(max_size=300) | st.sampled_from([*FILES.values()]))
 )
@@ -116,7 +117,7 @@ def test_files_in_the_wrong_places(files):
     check(files)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@examples(60)
 @given(st.sampled_from(["grid_side", "f_rest_centroids_side"]), st.integers(-(2**40), 2**40) | st.integers(0, 300))
 def test_any_side(key, side):
     document = yaml.safe_load(FILES["container_meta.yaml"])
@@ -131,7 +132,7 @@ JSON = st.recursive(
 )
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@examples(60)
 @given(JSON, st.sampled_from(["meta", "ops", "kissgs", None]))
 def test_any_yaml_of_the_right_outline(value, key):
     document = yaml.safe_load(FILES["container_meta.yaml"])
@@ -139,7 +140,7 @@ def test_any_yaml_of_the_right_outline(value, key):
     check({**FILES, "container_meta.yaml": yaml.safe_dump(document).encode()})
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@examples(60)
 @given(JSON, st.sampled_from([*json.loads(FILES["meta.json"]), None]), st.booleans())
 def test_any_json_of_the_right_outline(value, key, inside):
     document = json.loads(FILES["meta.json"])

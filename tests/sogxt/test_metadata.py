@@ -8,8 +8,9 @@ import pytest
 import yaml
 from helpers import reference_decoder
 from helpers.codec_scenes import GLANCE, PRESETS, random_scene, replaced
+from helpers.examples import examples
 from helpers.metadata_files import FILES, assert_same, document, quantize_of, with_document, with_json, with_yaml
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from kissgs import Settings, compress, decompress
@@ -41,7 +42,7 @@ def test_the_schema_can_fail(broken):
 float32s = st.floats(width=32, allow_nan=False, allow_infinity=False, max_value=2.0**127, min_value=-(2.0**127))
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@examples(60)
 @given(st.lists(float32s, min_size=56, max_size=56), st.floats(-88, 88, width=32))
 def test_every_float32_survives_both_spellings(numbers, mean):
     """YAML 1.1 reads 1e-05 as a string and 1.0e-05 as a number; PyYAML and json must both see the same float32."""

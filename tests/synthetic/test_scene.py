@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from helpers.examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -19,7 +20,7 @@ def scene():
     return sample_scene(20_000)
 
 
-@settings(deadline=None, max_examples=30)
+@examples(30)
 @given(count=st.integers(0, 400), sh_degree=st.integers(0, 3), seed=st.integers(0, 2**64))
 def test_every_scene_is_canonical_and_of_the_size_asked_for(count, sh_degree, seed):
     splats = sample_scene(count, sh_degree=sh_degree, seed=seed)

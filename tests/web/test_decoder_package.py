@@ -58,7 +58,7 @@ def compiler():
 
 
 def compile_types(*arguments):
-    done = subprocess.run([*compiler(), *arguments], capture_output=True, text=True, check=False, timeout=120)
+    done = subprocess.run([*compiler(), *arguments], capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -92,7 +92,7 @@ def test_exports():
             capture_output=True,
             text=True,
             check=True,
-            timeout=60,
+            timeout=300,
         ).stdout
         assert json.loads(output) == expected
 
@@ -113,7 +113,7 @@ def test_package():
         capture_output=True,
         text=True,
         check=True,
-        timeout=60,
+        timeout=300,
     )
     found = {entry["path"] for entry in json.loads(done.stdout)[0]["files"]}
     package = json.loads((DECODER / "package.json").read_text())

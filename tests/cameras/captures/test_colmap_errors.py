@@ -3,9 +3,10 @@
 import struct
 
 import pytest
+from helpers.examples import examples
 from helpers.memory import takes_less_than
 from helpers.reference_cameras import PINHOLE, camera_bytes, image_bytes, poses, write_binary, write_text
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from kissgs.cameras.captures import colmap_records
@@ -182,7 +183,7 @@ def mutated(draw, data):
     return bytes(data)
 
 
-FUZZ = settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+FUZZ = examples(200)
 
 
 @FUZZ

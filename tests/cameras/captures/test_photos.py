@@ -3,7 +3,8 @@
 import os
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from helpers.examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from kissgs.cameras.captures.photos import FoundPhoto, find_photos, searched_folders
@@ -189,7 +190,7 @@ def test_names_that_are_too_long(tmp_path):
     assert message(tmp_path, f"images/{'a' * 500}/a.jpg").endswith(": file name too long")
 
 
-@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@examples(200)
 @given(st.lists(st.text(st.sampled_from("ab./\\: \0é\ud800"), max_size=8), min_size=1, max_size=3), st.booleans())
 def test_any_names(tmp_path, names, named):
     touch(tmp_path, "a/b.png")

@@ -5,8 +5,9 @@ import math
 
 import numpy as np
 import pytest
+from helpers.examples import examples
 from helpers.reference_cameras import PINHOLE, assert_camera, frames, poses, write_binary, write_json, write_photo
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from kissgs.cameras.captures import transforms_json
@@ -277,7 +278,7 @@ def changes(keys):
     return st.dictionaries(st.sampled_from(keys), VALUES | st.lists(VALUES, max_size=3), max_size=2)
 
 
-@settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@examples(400)
 @given(top=changes(TOP), frame=changes([*TOP, "file_path", "transform_matrix"]), row=changes(["0", "1", "2", "3"]))
 def test_mutated_documents(tmp_path, top, frame, row):
     """Any document gives views or a KissgsError."""
@@ -291,7 +292,7 @@ def test_mutated_documents(tmp_path, top, frame, row):
     check(path)
 
 
-@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@examples(200)
 @given(start=st.integers(0, 3000), length=st.integers(0, 40), new=st.binary(max_size=8))
 def test_mutated_bytes(tmp_path, start, length, new):
     data = json.dumps(document()).encode()

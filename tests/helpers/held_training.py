@@ -1,0 +1,53 @@
+"""Training that waits at a checkpoint until it is interrupted, so that no test depends on how fast it trains."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+PROGRAM = """
+import time
+from pathlib import Path
+
+from kissgs.training.checkpoint import Checkpoint
+
+folder, saved, save = Path({folder!r}), [], Checkpoint.save
+
+
+def save_and_wait(self, state):
+    save(self, state)
+    saved.append(len(saved))
+    time.sleep({pause})
+    while len(saved) == {saves} and (folder / "hold").exists():
+        (folder / "waiting").touch()
+        time.sleep(0.01)
+
+
+Checkpoint.save = save_and_wait
+Checkpoint.due = property(lambda self: True)  # after every step
+"""
+
+
+class HeldTraining:
+    """Training that saves a checkpoint after every step (compaction: and before the first), and waits after one.
+
+    Attributes:
+        program: Python code to run in the process that trains, before anything else.
+    """
+
+    def __init__(self, folder: Path, saves: int, *, pause: float = 0.0) -> None:
+        """Let it wait after so many ``saves``, and ``pause`` seconds after each; ``folder`` belongs to it."""
+        self._folder = folder
+        (folder / "hold").touch()
+        self.program = PROGRAM.format(folder=str(folder), saves=saves, pause=pause)
+
+    def wait(self, seconds: float = 300) -> None:
+        """Wait until training waits."""
+        end = time.monotonic() + seconds
+        while not (self._folder / "waiting").exists():
+            assert time.monotonic() < end, "training has not come so far"
+            time.sleep(0.02)
+
+    def release(self) -> None:
+        """Let training run to its end, in its process or in the next one."""
+        (self._folder / "hold").unlink()
