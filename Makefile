@@ -1,7 +1,8 @@
 # make demo               a service is started, compresses a sample scene, and is stopped; the result is compared
 # make demo SCENE=x.ply   the same with your own
 # make serve              the service, with its page, on http://127.0.0.1:8000 (KISSGS_PORT=… and others: docs/guide/service.md)
-# make test               all tests
+# make test               tests of everything, some minutes
+# make test-all           the same with all examples, parameters, trainings and faults; half an hour
 # make lint               format, lint, types, import contract; of the JavaScript, format and types
 # make bench              bytes, time, memory and errors of all presets (SCENE=x.ply for your own)
 # make docs               what is generated in docs/
@@ -10,7 +11,7 @@ SCENE ?=
 PRESET ?= balanced
 KISSGS = .venv/bin/kissgs
 
-.PHONY: demo serve test lint bench docs setup setup-dev clean
+.PHONY: demo serve test test-all lint bench docs setup setup-dev clean
 
 demo: setup
 	@scripts/demo "$(SCENE)" $(PRESET)
@@ -19,7 +20,10 @@ serve: setup
 	@.venv/bin/kissgs-serve
 
 test: setup-dev
-	@.venv/bin/pytest -q -n auto
+	@.venv/bin/pytest -q -n auto -m "not exhaustive"
+
+test-all: setup-dev
+	@.venv/bin/pytest -q -n auto --hypothesis-profile=thorough
 
 lint: setup-dev
 	@.venv/bin/ruff format --check .

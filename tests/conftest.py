@@ -1,5 +1,6 @@
-"""Fixtures and shape checks for all tests."""
+"""Fixtures and shape checks for all tests, and which tests ``make test`` runs."""
 
+from collections import defaultdict
 from pathlib import Path
 
 import helpers.examples  # registers the profiles of Hypothesis
@@ -54,3 +55,18 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip("the real scenes (shared/data beside the repository) are not here")
     return folder
+
+
+@pytest.hookimpl(tryfirst=True)  # before -m selects
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark as exhaustive what ``@pytest.mark.quick(n)`` leaves out: all but n parameter sets of a test."""
+    sets = defaultdict[str, list[pytest.Item]](list)
+    for item in items:
+        if item.get_closest_marker("quick"):
+            sets[item.nodeid.partition("[")[0]].append(item)
+    for group in sets.values():
+        (count,) = group[0].get_closest_marker("quick").args
+        kept = {round(n * (len(group) - 1) / max(count - 1, 1)) for n in range(count)}  # from the first to the last
+        for n, item in enumerate(group):
+            if n not in kept:
+                item.add_marker("exhaustive")

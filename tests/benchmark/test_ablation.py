@@ -45,6 +45,7 @@ def in_this_process(monkeypatch):
 
 
 @pytest.mark.usefixtures("in_this_process")
+@pytest.mark.quick(0)
 def test_rows_agree_with_compress_and_evaluate(tmp_path, monkeypatch):
     path = tmp_path / "scene.ply"
     kissgs.save(SCENE.select(slice(0, 400)), path)

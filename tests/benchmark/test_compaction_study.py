@@ -24,6 +24,7 @@ def points():
     return compare_strategies(cloud(80), SHORT, Views(around(5), around(3), black(), "five views"), ratios=[0.5, 0.2])
 
 
+@pytest.mark.quick(0)
 def test_all_strategies_at_all_ratios(points):
     first, *others = points
     assert (first.strategy, first.count, first.psnr) == ("input", 80, math.inf)
@@ -65,6 +66,7 @@ def test_evaluation_views_do_not_depend_on_the_supervision(tmp_path, supervision
     assert (after.psnr > pruned.psnr + 1) == (supervision == "photos")
 
 
+@pytest.mark.quick(0)
 def test_settings_that_a_strategy_fixes_have_no_effect():
     """Without training steps, strategies that train are left out."""
     scene, views = cloud(80), Views(around(5), around(3), black(), "five views")

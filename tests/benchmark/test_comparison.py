@@ -78,6 +78,7 @@ def test_tables_fit_into_120_columns(rows):
     assert max(map(len, map(str.rstrip, lines))) <= 120
 
 
+@pytest.mark.quick(0)
 def test_measurements_agree_with_compress_and_evaluate(scene, monkeypatch):
     """Two fake external codecs take their part: a fast one, and one that is too slow to be repeated."""
     calls = []

@@ -24,6 +24,7 @@ SCALING = [
     ("kind", "draw", "rows"),
     [("png", comparison_plot, many(photo=True)), ("svg", comparison_plot, many()), ("pdf", scaling_plot, SCALING)],
 )
+@pytest.mark.quick(1)
 def test_a_plot_has_the_same_bytes_each_time(tmp_path, kind, draw, rows):
     path = tmp_path / f"plot.{kind}"
     draw(rows, path)

@@ -45,6 +45,7 @@ def test_curves_that_do_not_overlap_cannot_be_compared():
     )
 
 
+@pytest.mark.quick(0)
 def test_points_agree_with_compress_and_evaluate():
     scene, views = cloud(300, 1), Views(around(8), around(6)[1:3], black(), "circle")
     settings = Settings.from_preset("balanced", finetune=QUICK, sensitivity_views=4, sensitivity_view_size=60)
@@ -80,6 +81,7 @@ def test_supervision_by_the_scene_does_not_use_the_capture():
     assert tuned.bytes > 0
 
 
+@pytest.mark.quick(0)
 def test_the_scene_is_compacted_to_each_ratio_first():
     scene, views = cloud(120, 0), Views(around(8), around(6)[1:3], black(), "circle")
     few = {"sparsify_steps": 0, "refine_steps": 0, "min_keep_per_scoring": 0.6}

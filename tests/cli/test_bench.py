@@ -18,6 +18,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.quick(0)
 def test_each_preset_is_measured(scene: Path) -> None:
     rows = json.loads(run("bench", "codecs", scene, "-p", "fast", "-p", "paper", "--repeats", 2, "--json").stdout)
     assert [(row["codec"], len(row["runs"])) for row in rows] == [("fast", 2), ("paper", 2)]
@@ -91,6 +92,7 @@ def test_a_plot_of_two_scenes_is_refused(scene: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("words", [["ablation", "-p", "paper"], ["rendering"], ["codecs", "-p", "fast"]])
+@pytest.mark.quick(1)
 def test_the_results_of_other_scenes_are_printed_if_one_fails(scene: Path, words: list[str]) -> None:
     done = run("bench", *words, scene, scene.with_name("none.ply"), "--json")
     assert done.returncode == 2

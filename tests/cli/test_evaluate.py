@@ -154,6 +154,7 @@ def test_compressing_can_evaluate(folder: Path, tmp_path: Path) -> None:
     assert (tmp_path / "a.zip").read_bytes() == kissgs.compress(folder / "a.ply", views=views).to_zip()
 
 
+@pytest.mark.quick(0)
 def test_compressing_evaluates_on_drawn_cameras_by_default(tmp_path: Path) -> None:
     stages: list[str] = []
     result = kissgs.compress(
@@ -180,6 +181,7 @@ def test_cancelling_the_evaluation_writes_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("preset", ["fast", "balanced", "small", "paper"])
+@pytest.mark.quick(1)
 def test_every_preset_accepts_views(folder: Path, tmp_path: Path, preset: str) -> None:
     """A loop over presets needs no exception: presets that render no images use the views for evaluation only."""
     few_views = "--set", "sensitivity_views=4", "--set", "sensitivity_view_size=48"

@@ -61,6 +61,7 @@ def test_the_default_number_of_steps_is_that_of_the_preset() -> None:
         assert kissgs.Settings.from_preset(preset, finetune={"enabled": True}).finetune.steps == steps
 
 
+@pytest.mark.quick(0)
 def test_ctrl_c_leaves_a_checkpoint_to_resume_from(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     scene, target, kept = tmp_path / "a.ply", tmp_path / "b.zip", tmp_path / "a.checkpoint-finetune.npz"
     kissgs.save(SCENE, scene)

@@ -48,6 +48,7 @@ def start(left: int, *words: str, number: int = signal.SIGINT) -> subprocess.Com
 
 
 @pytest.mark.parametrize("words", [["--version"], ["compress", "none.ply"]])
+@pytest.mark.quick(1)
 def test_interrupts_at_every_stage_of_loading(words: list[str]) -> None:
     imports = int(start(0, *words).stderr.rsplit("\n", 1)[-1])
     assert imports > 100

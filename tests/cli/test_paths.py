@@ -129,6 +129,7 @@ def takes(place: str, kind: str) -> bool:
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.usefixtures("process")
+@pytest.mark.quick(2)
 def test_invalid_paths_give_one_line(
     kind: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -148,6 +149,7 @@ def test_invalid_paths_give_one_line(
 @pytest.mark.parametrize("words", ["compress BAD", "compress BAD other.ply -o out", "decompress BAD", "render BAD"])
 @pytest.mark.parametrize("kind", ["too long", "a folder that is too long", "within a file", "missing/inner"])
 @pytest.mark.usefixtures("process")
+@pytest.mark.quick(4)
 def test_the_error_names_the_input(
     words: str, kind: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -159,6 +161,7 @@ def test_the_error_names_the_input(
         shutil.rmtree(folder / "out")
 
 
+@pytest.mark.quick(0)
 def test_a_name_that_is_too_long_with_another_ending(folder: Path, tmp_path: Path) -> None:
     """The files next to the scene have longer names than the scene."""
     scene = tmp_path / ("a" * 251 + ".ply")
@@ -169,6 +172,7 @@ def test_a_name_that_is_too_long_with_another_ending(folder: Path, tmp_path: Pat
 
 
 @pytest.mark.parametrize("name", ["a\0b", "a" * 300, "\0.zip", "loop"])
+@pytest.mark.quick(1)
 def test_the_library_raises_its_own_errors(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     kept = "loop/x" if name == "loop" else name  # a link is replaced, wherever it leads

@@ -57,6 +57,7 @@ def error(scene, original, views):
     ],
 )
 @pytest.mark.parametrize("count", [1, 13, 59])
+@pytest.mark.quick(8)
 def test_the_result_has_exactly_the_requested_count_and_its_indices(count, changes):
     scene = cloud(60)
     result = Popspa(scene, settings(**changes), five_views())(count)
@@ -124,6 +125,7 @@ def stopping_after(steps):
 
 
 @pytest.mark.parametrize("steps", [0, 3, 4, 7])
+@pytest.mark.quick(1)
 def test_the_state_of_admm_is_resumed(tmp_path, monkeypatch, steps):
     """The checkpoint before the first step has no z and u."""
     monkeypatch.setattr(Checkpoint, "due", True)
@@ -136,6 +138,7 @@ def test_the_state_of_admm_is_resumed(tmp_path, monkeypatch, steps):
 
 
 @pytest.mark.parametrize("steps", [0, 2, 4, 5, 9, 10, 13, 15])
+@pytest.mark.quick(2)
 def test_interrupted_work_resumes_to_the_same_result(tmp_path, monkeypatch, steps):
     monkeypatch.setattr(Checkpoint, "due", True)
     task = Popspa(cloud(80), settings(), five_views())

@@ -173,6 +173,7 @@ def test_the_loss_of_an_object_is_detected():
     assert found.shown > 0.7
 
 
+@pytest.mark.quick(0)
 def test_fox_has_the_metrics_of_its_readme(shared_data):
     scene = kissgs.load(shared_data / "fox" / "point_cloud.ply")
     found = evaluate(scene, scene, load_views(shared_data / "fox", scale=4))

@@ -50,11 +50,13 @@ def check(scene, count, supervision, seen=True, **changes):
 
 
 @pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.__name__)
+@pytest.mark.quick(3)
 def test_degenerate_scenes_train_without_nan(scene):
     check(scene(), 20, targets_of(), seen=scene is not loud)  # no image from 0 to 1 has colours of a million
 
 
 @pytest.mark.parametrize("size", [1e-1, 1e3, 1e6])
+@pytest.mark.quick(1)
 def test_worlds_of_any_size_train_alike(size):
     """Learning rates of positions are in units of the cameras' extent; scales are logarithms."""
     scene = cloud(60)
@@ -67,5 +69,6 @@ def test_worlds_of_any_size_train_alike(size):
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("count", [2, 7, 8, 9])
+@pytest.mark.quick(4)
 def test_few_gaussians_of_any_degree(count, degree):
     check(cloud(count, degree, seed=count), count - 1, targets_of(), sparsify_steps=10, refine_steps=5)

@@ -27,6 +27,7 @@ def decoded_by(work):
 
 @pytest.mark.parametrize("number", range(len(choices())))
 @pytest.mark.parametrize("moved", [False, True])
+@pytest.mark.quick(12)
 def test_written_levels_and_decoded_values_equal_those_of_training(number, moved):
     scene, preset = choices()[number]
     plan = chosen(scene, preset)
@@ -167,6 +168,7 @@ def test_frozen_levels_stay_and_no_level_leaves_its_range():
                 assert (work.latents[name] == plane.min_latent).all(), name
 
 
+@pytest.mark.quick(0)
 def test_latents_converge_to_the_level_nearest_to_the_best_value():
     """The loss is quadratic around a value between two levels; the gradient is evaluated at the levels only."""
     work = QuantizedScene(chosen(cloud(300, 1), "fast"), 1)

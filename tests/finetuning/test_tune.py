@@ -49,6 +49,7 @@ def tuned(scene, *, checkpoint=None, progress=None, preset="fast", encode=COARSE
 
 
 @pytest.mark.parametrize("degree", [0, 2])
+@pytest.mark.quick(1)
 def test_fine_tuning_raises_the_psnr_to_the_original_scene(degree):
     scene = cloud(150, degree)
     encoded, report = tuned(scene, steps=150)
@@ -59,6 +60,7 @@ def test_fine_tuning_raises_the_psnr_to_the_original_scene(degree):
     assert len(decompress(encoded.files)) == 150
 
 
+@pytest.mark.quick(0)
 def test_a_larger_rate_weight_gives_fewer_bytes():
     scene = cloud(400, 1)
     found = [tuned(scene, rate_weight=weight, steps=60)[1] for weight in (0.0, 3.0, 30.0)]
@@ -77,6 +79,7 @@ def test_a_worse_container_is_not_kept():
 
 
 @pytest.mark.parametrize("batch", [1, 3])
+@pytest.mark.quick(0)
 def test_the_result_depends_on_the_seed_but_not_on_threads(batch):
     scene = cloud(200, 1)
     found = []
@@ -107,6 +110,7 @@ def stopping_after(steps):
 
 
 @pytest.mark.parametrize("steps", [0, 1, 5, 11, 12])
+@pytest.mark.quick(1)
 def test_interrupted_work_resumes_to_the_same_bytes(tmp_path, monkeypatch, steps):
     monkeypatch.setattr(Checkpoint, "due", True)
     scene, path = cloud(150, 1), tmp_path / "c.npz"
@@ -168,6 +172,7 @@ def test_compress_fine_tunes_and_reports_it(tmp_path):
 @pytest.mark.parametrize(
     ("encode", "finetune", "fewer"), [(10, 80, True), (10, 10, False), (90, 80, False), (0, 80, False)]
 )
+@pytest.mark.quick(1)
 def test_more_gaussians_are_pruned_before_fine_tuning(monkeypatch, encode, finetune, fewer):
     """The number is that of the threshold without fine-tuning, and 0 if pruning is off."""
     scene = cloud(600, 1)
@@ -191,6 +196,7 @@ def test_more_gaussians_are_pruned_before_fine_tuning(monkeypatch, encode, finet
     assert f"prune_threshold_bits: {threshold}\n".encode() in found.files[YAML_NAME]
 
 
+@pytest.mark.quick(0)
 def test_the_fine_tuned_container_meets_a_target_size():
     scene = cloud(600, 1)
     plain = kissgs.compress(scene, settings=Settings(encode={"sensitivity_views": 4, "sensitivity_view_size": 60}))
@@ -204,6 +210,7 @@ def test_the_fine_tuned_container_meets_a_target_size():
     assert len(found.report.trials) >= 2
 
 
+@pytest.mark.quick(0)
 def test_a_target_size_is_met_if_fine_tuned_containers_are_too_large(monkeypatch):
     """The container without fine-tuning is kept."""
 
@@ -219,6 +226,7 @@ def test_a_target_size_is_met_if_fine_tuned_containers_are_too_large(monkeypatch
     assert "as it was without" in found.report.finetuning.note
 
 
+@pytest.mark.quick(0)
 def test_a_search_does_not_change_existing_checkpoints(tmp_path):
     (tmp_path / "c-finetune.npz").write_bytes(b"mine")
     settings = Settings.from_preset(
@@ -254,6 +262,7 @@ def test_a_psnr_goal_is_rejected_if_photographs_are_the_targets(tmp_path):
 
 
 @pytest.mark.parametrize("count", [0, 1])
+@pytest.mark.quick(1)
 def test_scenes_of_no_or_one_gaussian(count):
     scene = cloud(9).select(np.arange(count))
     for preset in ("fast", "balanced"):

@@ -35,6 +35,7 @@ def test_it_is_measured_once(tmp_path):
 
 
 @pytest.mark.parametrize("change", ["scene", "cameras", "view_uncertainty", "capture"])
+@pytest.mark.quick(1)
 def test_it_is_measured_anew_when_anything_has_changed(tmp_path, change):
     file = tmp_path / "a.npz"
     compressed(file)

@@ -83,6 +83,7 @@ def test_the_note_of_a_search_precedes_that_of_its_work():
 
 
 @pytest.mark.parametrize("allowed", [0.1, 1.0])  # 256 levels per value already lose 0.07 dB here
+@pytest.mark.quick(1)
 def test_a_drop_is_met(allowed):
     chosen = Settings.from_preset("balanced", max_psnr_drop=allowed, **FEW_VIEWS)
     found = kissgs.compress(SCENE, settings=chosen, evaluate=True)
@@ -117,6 +118,7 @@ def test_an_unreachable_drop_is_refused():
         kissgs.compress(SCENE, settings=Settings.from_preset("balanced", max_psnr_drop=1e-9, **FEW_VIEWS))
 
 
+@pytest.mark.quick(0)
 def test_max_encodes_limits_the_trials():
     plain = len(kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **FEW_VIEWS)).to_zip())
     chosen = Settings.from_preset("balanced", target_size=int(0.9 * plain), max_encodes=1, **FEW_VIEWS)
@@ -131,6 +133,7 @@ def test_max_encodes_limits_the_trials():
 
 
 @pytest.mark.parametrize("share", [0.45, 0.8])
+@pytest.mark.quick(1)
 def test_fewer_gaussians_for_a_size(share):
     """Either all Gaussians do not fit, or fewer have a higher PSNR at that size in the evaluation views."""
     plain = len(kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **FEW_VIEWS)).to_zip())
@@ -159,6 +162,7 @@ def test_all_gaussians_stay_if_they_fit():
 
 
 @pytest.mark.parametrize("goal", [{"max_psnr_drop": 0.4}, {"psnr": 35.0}])
+@pytest.mark.quick(0)
 def test_fewer_gaussians_for_a_quality(goal):
     found = kissgs.compress(SCENE, settings=settings(**goal), evaluate=True)
     whole = kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **goal, **FEW_VIEWS))
@@ -169,6 +173,7 @@ def test_fewer_gaussians_for_a_quality(goal):
     assert drop_of(evaluation) <= 0.8 if "psnr" not in goal else evaluation.mean.candidate_vs_reference.psnr >= 33.0
 
 
+@pytest.mark.quick(0)
 def test_the_result_does_not_depend_on_threads():
     one, other = (kissgs.compress(SCENE, settings=settings(target_size="13kB"), threads=n) for n in (1, 2))
     assert one.files == other.files
@@ -178,6 +183,7 @@ def test_the_result_does_not_depend_on_threads():
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7])
+@pytest.mark.quick(2)
 def test_scenes_of_few_gaussians(count):
     few = SCENE.select(range(count))
     found = kissgs.compress(few, settings=settings(target_size="9kB"))
@@ -185,6 +191,7 @@ def test_scenes_of_few_gaussians(count):
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.quick(1)
 def test_a_stopped_search_returns_its_best(count):
     """Stopped while the ``count``-th container is made: the best before it, or StopSearch if none meets the goal."""
     made, stopped = 0, []
@@ -254,6 +261,7 @@ def test_compact_without_a_container_has_no_goal():
         kissgs.compact(SCENE, settings=settings(target_size="20kB"))
 
 
+@pytest.mark.quick(0)
 def test_ctrl_c_ends_a_search_with_its_best(tmp_path):
     """Pressed after the first container that meets the goal, which is far better than necessary."""
     scene, target = tmp_path / "a.ply", tmp_path / "a.zip"

@@ -17,6 +17,7 @@ def kept(scene: Splats, preset: str, **settings: object) -> Splats:
 
 
 @pytest.mark.parametrize("name", SCENES)
+@pytest.mark.quick(2)
 def test_no_view_is_much_worse_than_with_uniform_steps(name: str):
     """One view in 24 may be worse: if two large Gaussians have nearly equal depth, rounding may swap their order."""
     scene = clean(SCENES[name]())[0]
@@ -36,6 +37,7 @@ def test_most_of_two_distant_objects_is_kept():
     assert compressed.report.note == ""
 
 
+@pytest.mark.quick(0)
 def test_half_of_two_objects_is_half_of_each():
     scene = clean(two(1000))[0]
     from kissgs import compact

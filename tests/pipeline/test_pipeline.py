@@ -226,6 +226,7 @@ def test_cancelling_keeps_the_existing_file(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["scene.zip", "folder", "back.ply"])
+@pytest.mark.quick(1)
 def test_a_full_disk_is_an_output_error_and_leaves_nothing(tmp_path, name):
     """A limit of 3 kB per file simulates a full disk; the error contains the message of the system."""
     program = """

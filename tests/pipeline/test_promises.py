@@ -4,6 +4,7 @@ import functools
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import kissgs
 from kissgs.pipeline.pipeline import Compressed
@@ -34,6 +35,7 @@ def bare_fox(folder: Path) -> Compressed:
     return kissgs.compress(fox(folder)[0])
 
 
+@pytest.mark.quick(0)
 def test_fox_is_small_and_keeps_its_view_dependent_colour(shared_data: Path) -> None:
     scene, result = fox(shared_data)[0], bare_fox(shared_data)
     assert len(result.to_zip()) <= 0.73 * PAPER_FOX
@@ -41,6 +43,7 @@ def test_fox_is_small_and_keeps_its_view_dependent_colour(shared_data: Path) -> 
     assert np.sqrt(np.mean(errors**2)) < 0.7 * SPZ_SHN_RMSE
 
 
+@pytest.mark.quick(0)
 def test_fox_keeps_its_psnr(shared_data: Path) -> None:
     """Held-out photographs; splat-transform's .spz of the same file loses 2.07 dB, at 1.6 times the bytes."""
     scene, views = fox(shared_data)
@@ -53,6 +56,7 @@ def test_fox_keeps_its_psnr(shared_data: Path) -> None:
     assert min(view.comparison.candidate_vs_reference.psnr for view in result.views) > PAPER_FOX_WORST - 0.3
 
 
+@pytest.mark.quick(0)
 def test_fox_with_its_capture_has_half_the_bytes_of_the_paper(shared_data: Path) -> None:
     scene, views = fox(shared_data)
     result = kissgs.compress(scene, views=views, evaluate=True)
@@ -65,6 +69,7 @@ def test_fox_with_its_capture_has_half_the_bytes_of_the_paper(shared_data: Path)
     assert min(view.comparison.candidate_vs_reference.psnr for view in seen.views) > PAPER_FOX_WORST + 0.5
 
 
+@pytest.mark.quick(0)
 def test_guitar_at_lower_quality_is_smaller_than_with_other_encoders(shared_data: Path) -> None:
     """The default quality equals that of the paper's settings; this one is at most 1.5 dB below."""
     source, settings = (
@@ -79,6 +84,7 @@ def test_guitar_at_lower_quality_is_smaller_than_with_other_encoders(shared_data
     assert seen.worst.comparison.candidate_vs_reference.psnr > PAPER_GUITAR_WORST - 1.5
 
 
+@pytest.mark.quick(0)
 def test_guitar_by_default_equals_the_paper_in_three_quarters_of_its_bytes(shared_data: Path) -> None:
     result = kissgs.compress(shared_data / "guitar" / "guitar.ply", evaluate=True)
     assert result.report.container_bytes <= 0.72 * PAPER_GUITAR

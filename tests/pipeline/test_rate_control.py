@@ -67,6 +67,7 @@ def test_stopping_while_a_count_is_evaluated_keeps_it():
 
 
 @pytest.mark.parametrize("auto_count", [False, True])
+@pytest.mark.quick(1)
 def test_stopping_before_fine_tuning_keeps_the_result(auto_count):
     """Stopped when sensitivity is measured again for fine-tuning, or when the first training target is rendered."""
     compact = {**PRUNE, "auto_count": True, "max_compactions": 1} if auto_count else None
@@ -77,6 +78,7 @@ def test_stopping_before_fine_tuning_keeps_the_result(auto_count):
 
 
 @pytest.mark.parametrize("quality_offset_db", [8, -8])
+@pytest.mark.quick(0)
 def test_a_drop_is_met_from_far_away(quality_offset_db):
     found = kissgs.compress(SCENE, settings=settings(max_psnr_drop=3, quality_offset_db=quality_offset_db))
     lost = [trial.drop for trial in found.report.trials if trial.drop <= 3]
@@ -160,6 +162,7 @@ def test_the_highest_psnr_is_best_if_the_goal_is_a_size(worse):
 
 
 @pytest.mark.parametrize("goal", [{"max_psnr_drop": 0.3}, {"max_psnr_drop": 0.2, "max_encodes": 3}, {"psnr": 36.0}])
+@pytest.mark.quick(1)
 def test_the_reported_settings_reproduce_the_container(goal):
     found = kissgs.compress(SCENE, settings=settings(**goal))
     report = found.report.settings["encode"]
@@ -191,6 +194,7 @@ def test_without_a_search_stopping_cancels(tmp_path, stage):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.quick(0)
 def test_stopping_ends_the_search_for_a_count_only():
     """The result is encoded, although a later stage asks to stop again."""
     receivers = [stop_at("score", 3), stop_at("images")]

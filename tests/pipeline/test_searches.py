@@ -131,6 +131,7 @@ def test_bounds_limit_the_search():
 
 
 @pytest.mark.parametrize("share", [0.7, 1.15])
+@pytest.mark.quick(1)
 def test_a_target_size_is_met(share):
     plain = kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **FEW_VIEWS))
     wanted = round(share * len(plain.to_zip()))
@@ -141,6 +142,7 @@ def test_a_target_size_is_met(share):
 
 
 @pytest.mark.parametrize("change", [-2.5, 2.0])
+@pytest.mark.quick(1)
 def test_a_psnr_is_met(change):
     """The search has other cameras than the evaluation, so that their PSNR may differ."""
     plain = kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **FEW_VIEWS), evaluate=True)
@@ -158,6 +160,7 @@ def test_a_psnr_is_met(change):
     assert (len(found.to_zip()) > len(plain.to_zip())) == (change > 0)
 
 
+@pytest.mark.quick(0)
 def test_the_reported_lambda_and_codebook_reproduce_the_container():
     found = kissgs.compress(SCENE, settings=Settings.from_preset("small", target_size="40 kB", **FEW_VIEWS))
     made = found.report.settings["encode"]
@@ -178,6 +181,7 @@ def test_a_size_is_met_between_two_sides_of_the_codebook():
     assert 0.97 * 61_500 <= len(found.to_zip()) <= 61_500
 
 
+@pytest.mark.quick(0)
 def test_the_codebook_grows_for_a_large_target_size():
     """The finest container of this scene with seven Gaussians per entry has 96 kB."""
     found = kissgs.compress(FIXED, settings=Settings.from_preset("balanced", target_size=140_000))
@@ -186,6 +190,7 @@ def test_the_codebook_grows_for_a_large_target_size():
 
 
 @pytest.mark.parametrize("degree", [0, 1])
+@pytest.mark.quick(1)
 def test_a_target_size_above_every_container_takes_two_encodings(degree):
     """Regression: it searched seven sizes, up to the same finest container."""
     scene = kissgs.sample_scene(600, sh_degree=degree, seed=5)
@@ -213,6 +218,7 @@ def test_a_target_size_just_above_the_finest_container_is_searched_for():
     assert "is above the finest container" in found.report.note
 
 
+@pytest.mark.quick(0)
 def test_the_psnr_in_the_error_message_can_be_met():
     few = kissgs.sample_scene(1000, sh_degree=1, seed=2)
 
@@ -246,6 +252,7 @@ def test_equal_gaussians_can_meet_a_psnr():
         ),
     ],
 )
+@pytest.mark.quick(1)
 def test_unreachable_goals_are_refused_and_nothing_is_written(tmp_path, goal, message):
     with pytest.raises(UnsupportedError, match=message):
         kissgs.compress(SCENE, tmp_path / "a.zip", settings=Settings.from_preset("balanced", **goal, **FEW_VIEWS))

@@ -206,6 +206,7 @@ def test_rdo_quantisation_never_costs_more_than_the_nearest_level():
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
 @pytest.mark.parametrize("count", [1, 7, 8, 9, 65, 2000])
+@pytest.mark.quick(6)
 def test_round_trips(count, degree):
     splats = clean(random_scene(count, degree, seed=count))[0]
     result = compress(
@@ -281,6 +282,7 @@ def torture():
 
 @pytest.mark.parametrize(("splats", "sensitivity"), torture())
 @pytest.mark.parametrize("preset", RD_PRESETS)
+@pytest.mark.quick(4)
 def test_scenes_that_break_weights(splats, sensitivity, preset):
     once, again = (encode(splats, Settings.from_preset(preset).encode, sensitivity=sensitivity) for _ in range(2))
     assert once.files == again.files

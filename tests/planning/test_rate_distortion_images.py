@@ -30,6 +30,7 @@ def psnrs(scene, found, views, background=(0, 0, 0)):
 
 @pytest.mark.parametrize("background", [(0, 0, 0), (1, 1, 1), (0.2, 0.9, 0.5)])
 @pytest.mark.parametrize("preset", ["balanced", "small"])
+@pytest.mark.quick(2)
 def test_fewer_bytes_than_the_papers_and_better_before_any_background(preset, background):
     """The default quality is that of ``fast`` if the paper's levels are too coarse for the scene's ranges. Here that is
     more than 2 dB, and takes some of the saved bytes."""
@@ -41,6 +42,7 @@ def test_fewer_bytes_than_the_papers_and_better_before_any_background(preset, ba
 
 
 @pytest.mark.parametrize("background", [(0, 0, 0), (1, 1, 1), (0.2, 0.9, 0.5)])
+@pytest.mark.quick(1)
 def test_two_thirds_of_the_papers_bytes_are_as_good_before_any_background(background):
     """A quality offset of -2 dB gives about the paper's quality."""
     paper, ours = compressed("paper"), compressed("balanced", quality_offset_db=-2)
@@ -63,6 +65,7 @@ def test_what_is_dark_is_kept_for_bright_backgrounds():
 
 
 @pytest.mark.parametrize("logit", [4.0, 5.0, 8.0, 13.0])
+@pytest.mark.quick(1)
 def test_a_wall_is_kept_however_opaque(logit):
     """A Gaussian that fills most images, and is clamped to the largest alpha in them."""
     radius = np.quantile(np.linalg.norm(SCENE.means - SCENE.means.mean(axis=0), axis=1), 0.95)

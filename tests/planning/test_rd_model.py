@@ -147,6 +147,7 @@ def test_many_gaussians_that_were_dropped_are_noted_in_the_report(superfluous, m
         assert report.note.startswith(f"{report.pruned_by_rd:,} of {drawn:,} Gaussians were pruned")
 
 
+@pytest.mark.quick(0)
 def test_an_enormous_coefficient_does_not_change_what_is_kept():
     """Brighter than a display shows is no reason to give up on others: a Gaussian in a hundred at most is chosen
     otherwise, at the border of what is worth its bytes."""

@@ -70,6 +70,7 @@ def test_the_gradient_agrees_with_finite_differences(weight):
 
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
 @pytest.mark.parametrize(("height", "width"), SIZES)
+@pytest.mark.quick(8)
 def test_the_gradient_agrees_with_autograd_in_float64(height, width, weight):
     """Sizes include several tiles and images smaller than the window."""
     image, target = pair(height, width, 3)

@@ -100,6 +100,7 @@ def test_off_axis_principal_points_and_unequal_focal_lengths():
 
 
 @devices
+@pytest.mark.quick(1)
 def test_gradients_agree_with_finite_differences(device):
     for seed, degree in enumerate([0, 1, 2, 3]):
         check_gradients(blobs(10, degree, seed=seed), camera(25, 19, seed=seed), device, seed)
@@ -126,6 +127,7 @@ def test_gradients_agree_with_finite_differences(device):
     }.values(),
     ids=lambda value: "",
 )
+@pytest.mark.quick(4)
 def test_gradients_of_difficult_scenes_agree_with_finite_differences(splats, view):
     check_gradients(splats, view, "cpu", seed=1)
 

@@ -50,6 +50,7 @@ def test_the_formula_agrees_with_removal(seed):
     np.testing.assert_allclose(backward_scores(whole, 25, np.array([0.3, 0.6, 0.1])), expected, rtol=1e-6, atol=1e-15)
 
 
+@pytest.mark.quick(0)
 def test_scores_of_a_real_scene_have_the_ranks_of_removals(shared_data):
     """Each of 150 Gaussians of fox is removed, and two views of the capture are rendered without it."""
     scene = kissgs.load(shared_data / "fox" / "point_cloud.ply")

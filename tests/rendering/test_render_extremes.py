@@ -92,6 +92,7 @@ for degree, size in enumerate(((1, 1), (33, 50), (1, 4096), (300, 7))):
 """
 
 
+@pytest.mark.quick(0)
 def test_kernels_stay_within_their_arrays(tmp_path):
     """Bounds checks of numba are enabled in a separate process with a separate cache."""
     environment = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path)}

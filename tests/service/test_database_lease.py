@@ -43,6 +43,7 @@ def lease_rows(url):
     return found
 
 
+@pytest.mark.quick(1)
 def test_a_copied_data_folder_on_the_same_database(tmp_path, url):
     """The copy has the folder's numbers, too; the second service once marked all jobs of the first as failed."""
     with Service(tmp_path / "first", KISSGS_DATABASE_URL=url) as first:
@@ -64,6 +65,7 @@ def test_a_copied_data_folder_on_the_same_database(tmp_path, url):
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.quick(1)
 def test_a_restart_does_not_wait(tmp_path, url, number):
     with Service(tmp_path / "data", KISSGS_DATABASE_URL=url) as it:
         job = it.ended(it.submit())
@@ -127,6 +129,7 @@ def test_a_service_that_runs_on_another_machine(tmp_path, url, on_machine, ends)
     assert names(tmp_path / "copy" / "jobs") == {job}
 
 
+@pytest.mark.quick(1)
 def test_a_service_whose_lease_was_taken_over(tmp_path, url):
     """A service may be suspended with its machine; afterwards it neither starts nor records jobs."""
     with Service(tmp_path / "data", KISSGS_DATABASE_URL=url) as it:

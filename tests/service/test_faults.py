@@ -42,6 +42,7 @@ def result_of(service, job):
     return content
 
 
+@pytest.mark.quick(0)
 def test_the_server_is_killed_while_a_job_is_queued(start):
     service = start()
     running, waiting = service.submit(BIG, SLOW), service.submit()
@@ -65,6 +66,7 @@ def test_the_server_is_killed_while_a_job_runs(start):
     assert result_of(service, job) == kissgs.compress(MEDIUM, settings=kissgs.Settings(preset="fast")).to_zip()
 
 
+@pytest.mark.quick(0)
 def test_the_server_is_killed_during_an_upload(start):
     service = start()
     with service.raw(b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9000000\r\n\r\n" + BIG[:2_000_000]):
@@ -79,6 +81,7 @@ def test_the_server_is_killed_during_an_upload(start):
 
 
 @pytest.mark.parametrize("seed", range(2))
+@pytest.mark.quick(0)
 def test_the_server_is_killed_at_any_time(start, seed):
     """The job succeeds although the server is killed several times."""
     service = start(KISSGS_JOB_STARTS=1000)
@@ -91,6 +94,7 @@ def test_the_server_is_killed_at_any_time(start, seed):
     assert result_of(service, job) == EXPECTED
 
 
+@pytest.mark.quick(0)
 def test_a_job_that_crashes_the_server_fails_after_its_last_start(start):
     service = start(KISSGS_JOB_STARTS=2)
     job = service.submit(BIG, SLOW)
@@ -115,6 +119,7 @@ def test_a_complete_result_is_recovered(tmp_path):
         assert result_of(service, job) == EXPECTED
 
 
+@pytest.mark.quick(0)
 def test_an_incomplete_result_is_not_recovered(tmp_path):
     with Service(tmp_path / "data") as service:
         job = service.ended(service.submit())
@@ -129,6 +134,7 @@ def test_an_incomplete_result_is_not_recovered(tmp_path):
         assert service.status(job)["starts"] == 2
 
 
+@pytest.mark.quick(0)
 def test_a_missing_upload_fails_its_job(tmp_path):
     with Service(tmp_path / "data") as service:
         job = service.ended(service.submit())
@@ -150,6 +156,7 @@ def test_a_missing_upload_fails_its_job(tmp_path):
         assert f"were moved to {service.folder}/jobs/.orphaned: 1\n" in service.log.read_text()
 
 
+@pytest.mark.quick(0)
 def test_the_server_is_killed_while_the_result_is_written(start):
     service = start()
     job = service.submit(MEDIUM)
@@ -161,6 +168,7 @@ def test_the_server_is_killed_while_the_result_is_written(start):
     assert result_of(service, job) == kissgs.compress(MEDIUM, settings=kissgs.Settings(preset="fast")).to_zip()
 
 
+@pytest.mark.quick(0)
 def test_jobs_in_postgresql_survive(start, postgresql):
     service = start(KISSGS_DATABASE_URL=postgresql)
     done, running, waiting = service.ended(service.submit()), service.submit(MEDIUM), service.submit()
@@ -195,6 +203,7 @@ def test_the_job_process_is_killed_once(start):
     assert service.leftovers() == []
 
 
+@pytest.mark.quick(0)
 def test_the_job_process_is_killed_twice(start):
     service = start()
     job, next_one = service.submit(BIG, SLOW), service.submit()
@@ -209,6 +218,7 @@ def test_the_job_process_is_killed_twice(start):
     assert result_of(service, next_one) == EXPECTED
 
 
+@pytest.mark.quick(0)
 def test_a_job_beyond_the_memory_limit(start):
     service = start(KISSGS_JOB_MEMORY="256MiB")
     job = service.ended(service.submit(scene_bytes(120_000, 3), '{"preset": "balanced"}'), seconds=120)
@@ -253,6 +263,7 @@ def test_a_crash_without_a_message_near_the_memory_limit(tmp_path, status, used,
     assert outcome.data.get("code", outcome.kind) == expected
 
 
+@pytest.mark.quick(0)
 def test_a_job_beyond_the_time_limit(start):
     service = start(KISSGS_JOB_SECONDS=1.5)
     job, next_one = service.submit(BIG, SLOW), service.submit()
@@ -311,6 +322,7 @@ def test_a_short_job_ends_before_the_service_stops(start):
     assert (status["state"], status["starts"]) == ("succeeded", 1)
 
 
+@pytest.mark.quick(0)
 def test_a_long_job_is_requeued_when_the_service_stops(start):
     service = start(KISSGS_DRAIN_SECONDS=0.5)
     job = service.submit(BIG, SLOW)
@@ -338,6 +350,7 @@ def test_a_long_job_is_requeued_when_the_service_stops(start):
     assert len(seen["jobs"]) == 1
 
 
+@pytest.mark.quick(0)
 def test_many_simultaneous_jobs(start):
     """No job of 200 is lost or runs twice, and the server's memory hardly grows."""
     service = start(KISSGS_MAX_QUEUE=500, KISSGS_MAX_UPLOADS=32, KISSGS_WORKERS=2, KISSGS_JOB_THREADS=1)
@@ -383,6 +396,7 @@ def test_simultaneous_requests_with_one_idempotency_key(start):
     assert service.leftovers() == []
 
 
+@pytest.mark.quick(0)
 def test_expiry(start):
     service = start(KISSGS_KEEP_SECONDS=3, KISSGS_SWEEP_SECONDS=0.2)
     job = service.ended(service.submit())

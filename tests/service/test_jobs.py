@@ -44,6 +44,7 @@ def test_submitting_a_raw_body(service):
 
 
 @pytest.mark.parametrize("first", ["file", "options"])
+@pytest.mark.quick(1)
 def test_submitting_a_form(service, first):
     parts = {"file": ("Schloß.ply", SMALL), "options": (None, '{"preset": "small", "encode": {"seed": 3}}')}
     parts = dict(sorted(parts.items(), reverse=first == "options"))

@@ -28,6 +28,7 @@ def slowest(service, count=60):
     return max(spent)
 
 
+@pytest.mark.quick(0)
 def test_idle_connections_do_not_fail_jobs(start):
     """Idle connections once used up all file descriptors, so that jobs could not open their files."""
     service = start()
@@ -45,6 +46,7 @@ def test_idle_connections_do_not_fail_jobs(start):
         assert status["state"] == "succeeded", status
 
 
+@pytest.mark.quick(0)
 def test_abandoned_long_polls_cost_nothing(start):
     service = start(KISSGS_DRAIN_SECONDS=1)
     job = service.submit(BIG, SLOW)
@@ -58,6 +60,7 @@ def test_abandoned_long_polls_cost_nothing(start):
     assert time.monotonic() - begun < 25  # it waits for the job only
 
 
+@pytest.mark.quick(0)
 def test_many_event_streams_are_equal(start):
     service = start()
     job = service.submit(scene_bytes(4_000, 1))
@@ -113,6 +116,7 @@ def test_announced_bodies_reserve_no_disk_space(start):
     assert service.http.get(job["links"]["source"]).status_code == 200
 
 
+@pytest.mark.quick(0)
 def test_decoded_scenes_are_reclaimable(start):
     service = start(KISSGS_MAX_DISK_BYTES=5 * len(SMALL), KISSGS_KEEP_UPLOADS="false")
     jobs = [service.ended(service.submit(scene_bytes(300, 1, seed))) for seed in range(2)]
@@ -136,6 +140,7 @@ def test_a_form_reserves_only_its_size(start):
     assert service.http.post("/v1/jobs", files={"file": ("x.ply", SMALL)}).status_code == 202
 
 
+@pytest.mark.quick(0)
 def test_a_decoding_ends_with_its_job(start):
     service = start()
     job = service.ended(service.submit(scene_bytes(120_000, 3)))
@@ -154,6 +159,7 @@ def test_a_decoding_ends_with_its_job(start):
     assert service.http.get("/readyz").status_code == 200
 
 
+@pytest.mark.quick(0)
 def test_simultaneous_requests_decode_once(start):
     service = start()
     job = service.ended(service.submit())
@@ -183,6 +189,7 @@ def test_an_error_in_the_job_process_is_internal(tmp_path):
     assert (outcome.kind, outcome.data["code"]) == ("error", "internal")
 
 
+@pytest.mark.quick(0)
 def test_a_signal_to_the_process_group_requeues_the_job(start):
     """Some supervisors signal the job process, too."""
     service = start(KISSGS_DRAIN_SECONDS=0.5)
@@ -200,6 +207,7 @@ def test_a_signal_to_the_process_group_requeues_the_job(start):
     assert (status["state"] in ("queued", "running"), status["starts"] <= 1) == (True, True)
 
 
+@pytest.mark.quick(0)
 def test_a_second_signal_stops_the_service_at_once(start):
     service = start(KISSGS_DRAIN_SECONDS=600)
     job = service.submit(BIG, SLOW)
@@ -290,6 +298,7 @@ def test_refused_methods_list_the_allowed_ones(service):
         assert (answer.headers["allow"], allowed in answer.json()["detail"]) == (allowed, True)
 
 
+@pytest.mark.quick(0)
 def test_another_data_folder_is_refused(tmp_path):
     from helpers.service import Service
 
@@ -301,6 +310,7 @@ def test_another_data_folder_is_refused(tmp_path):
         assert service.status(job)["state"] == "succeeded"
 
 
+@pytest.mark.quick(0)
 def test_events_continue_after_a_restart(start):
     service = start()
     job = service.submit(scene_bytes(6_000, 2))
@@ -320,6 +330,7 @@ def test_events_continue_after_a_restart(start):
     assert '"succeeded"' in rest
 
 
+@pytest.mark.quick(0)
 def test_the_bench_command(monkeypatch, capsys, tmp_path):
     from service.cli import bench
 

@@ -46,6 +46,7 @@ def assert_orphaned(folder, change, elsewhere, before):
 
 
 @pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.quick(1)
 def test_deleting(start, change, tmp_path):
     it = start()
     job = it.ended(it.submit())
@@ -165,6 +166,7 @@ def test_permanent_errors(tmp_path, monkeypatch, error):
 
 @pytest.mark.parametrize("name", ["jobs", "incoming"])
 @pytest.mark.parametrize("change", ["moved away", "a file", "another folder"])
+@pytest.mark.quick(2)
 def test_readiness(start, name, change):
     it = start()
     folder = it.folder / name
@@ -195,6 +197,7 @@ def test_a_folder_that_cannot_be_written_to(start):
     assert ready.json()["checks"]["disk"].endswith("its folder incoming is not writable; change its permissions")
 
 
+@pytest.mark.quick(0)
 def test_no_job_fails_while_the_folder_of_jobs_is_missing(start):
     """Running and queued jobs succeed once the folder is back."""
     it = start()

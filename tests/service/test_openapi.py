@@ -39,6 +39,7 @@ def test_keys_are_documented(start):
 
 
 @pytest.mark.parametrize("seed", [1])
+@pytest.mark.quick(0)
 def test_schemathesis(tmp_path, seed):
     """Run its examples, boundary values, fuzzing and stateful tests along the links between responses and requests."""
     with Service(tmp_path / "data") as service:

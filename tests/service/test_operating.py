@@ -65,6 +65,7 @@ def test_all_invalid_settings_are_reported_at_once(environment):
     assert "secret" not in str(caught.value)
 
 
+@pytest.mark.quick(0)
 def test_invalid_settings_end_in_a_message(tmp_path):
     ended = command(KISSGS_PROT="80", KISSGS_WORKERS="none")
     assert ended.returncode == 2

@@ -209,6 +209,7 @@ def test_key_form(visit, start):
 
 @pytest.mark.parametrize("width", [360, 768, 1400])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.quick(2)
 def test_no_horizontal_overflow(visit, service, width, scheme):
     job = service.ended(service.submit())
     page = visit(viewport={"width": width, "height": 800}, color_scheme=scheme)

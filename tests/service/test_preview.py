@@ -118,6 +118,7 @@ def test_served_files(ask, name, media_type):
 
 
 @pytest.mark.parametrize("name", [*UNSERVED, "none.js", "0a" * 15, "0A" * 16, "0a" * 16 + "/", "preview"])
+@pytest.mark.quick(6)
 def test_other_paths_are_not_served(ask, name):
     for written in {name, name.replace("..", "%2e%2e"), name.replace("/", "%2F")}:
         answer = ask(f"/preview/{written}")

@@ -70,6 +70,7 @@ def test_dropping_files(preview, service):
         ("mesh.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n", [".ply"]),
     ],
 )
+@pytest.mark.quick(2)
 def test_unsuitable_files(preview, service, name, data, words):
     """They are rejected with a message, and a scene that is shown stays."""
     tab = preview().open(service)
@@ -85,6 +86,7 @@ def test_unsuitable_files(preview, service, name, data, words):
     assert psnr(tab.shown(OTHERS), before) > 60
 
 
+@pytest.mark.quick(0)
 def test_one_scene_after_the_other_releases_the_first(preview, service):
     """Browsers limit the number of WebGL contexts to 16."""
     tab = preview().open(service)
@@ -197,6 +199,7 @@ def test_every_control_gets_a_visible_focus(preview, service):
 
 
 @pytest.mark.parametrize("width", [360, 768, 1400])
+@pytest.mark.quick(1)
 def test_no_horizontal_overflow_of_the_preview(preview, service, width):
     tab = preview(viewport={"width": width, "height": 500}).open(service)
     assert tab.page.evaluate("document.documentElement.scrollWidth") <= width

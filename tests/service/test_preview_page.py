@@ -68,6 +68,7 @@ def in_bytes(text):
     return float(number.replace(",", "")) * {"byte": 1, "bytes": 1, "kB": 1e3, "MB": 1e6}[unit]
 
 
+@pytest.mark.quick(0)
 def test_keys_and_mouse_move_the_camera(preview, service, job, decoded):
     tab = preview().open(service, job["id"])
     page, press = tab.page, tab.page.keyboard.press
@@ -196,6 +197,7 @@ def numbers(text):
     return [float(part) for part in text.replace("−", "-").replace(",", "").split()]
 
 
+@pytest.mark.quick(0)
 def test_hovering_over_a_plane(preview, service, job, container, decoded):
     tab = preview(viewport={"width": 820, "height": 760}).open(service, job["id"])
     page = tab.page
@@ -267,6 +269,7 @@ def flipped(body):
         ("meta.json", None),
     ],
 )
+@pytest.mark.quick(2)
 def test_the_message_names_a_damaged_file(preview, service, job, file, damage):
     tab = preview()
 
@@ -286,6 +289,7 @@ def test_the_message_names_a_damaged_file(preview, service, job, file, damage):
     assert not tab.page.locator("#problem").is_visible()
 
 
+@pytest.mark.quick(0)
 def test_the_scene_is_drawn_without_damaged_planes(preview, service, job, decoded):
     tab = preview(viewport={"width": 820, "height": 760})
 
@@ -378,6 +382,7 @@ def test_with_keys(start, preview):
     assert not any("secret" in url for _, url in tab.requests)
 
 
+@pytest.mark.quick(0)
 def test_one_finger_orbits(preview, service, job, decoded):
     tab = preview(viewport={"width": 390, "height": 780}, has_touch=True, is_mobile=True).open(service, job["id"])
     before = tab.shown(len(decoded))

@@ -67,6 +67,7 @@ def test_a_result_of_a_queued_job_is_recovered(two_jobs, upload, caplog):
     assert "after -" not in caplog.text
 
 
+@pytest.mark.quick(0)
 def test_a_restored_database_with_a_running_service(tmp_path):
     """Both jobs are queued in the copy, but have succeeded since; one has lost its upload, the other has kept it."""
     with Service(tmp_path / "data", KISSGS_KEEP_UPLOADS="false") as it:
@@ -94,6 +95,7 @@ def test_a_restored_database_with_a_running_service(tmp_path):
 
 
 @pytest.mark.parametrize("change", ["emptied", "moved away", "of other jobs"])
+@pytest.mark.quick(1)
 def test_folders_of_all_active_jobs_are_missing(two_jobs, change):
     folder, waiting, running = two_jobs
     (folder / "jobs").rename(folder / "away")
@@ -177,6 +179,7 @@ DAMAGES = {
 
 @pytest.mark.parametrize("damage", DAMAGES)
 @pytest.mark.parametrize("state", ["waiting", "running"])
+@pytest.mark.quick(4)
 def test_a_damaged_result(two_jobs, damage, state, caplog):
     """The job runs again, and its new result replaces the damaged one."""
     folder, waiting, running = two_jobs

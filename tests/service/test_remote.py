@@ -204,6 +204,7 @@ def test_the_command(service, scene, tmp_path):
     assert json.loads(as_json.stdout)["state"] == "succeeded"
 
 
+@pytest.mark.quick(0)
 def test_the_command_with_a_goal(service, scene, tmp_path):
     words = ("--server", service.url, "--target-size", "14.5kB", "--set", "sensitivity_views=4", "-f", "-q")
     done = kissgs_command("compress", scene, *words)
@@ -211,6 +212,7 @@ def test_the_command_with_a_goal(service, scene, tmp_path):
     assert (tmp_path / "Schloß 1.zip").stat().st_size <= 14_500
 
 
+@pytest.mark.quick(0)
 def test_the_command_with_keys(start, scene):
     service = start(KISSGS_KEYS=f"alice:{hashlib.sha256(b'secret').hexdigest()}")
     without = kissgs_command("compress", scene, "--server", service.url)

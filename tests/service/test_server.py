@@ -60,6 +60,7 @@ REQUEST = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"
 @pytest.mark.parametrize(
     "sent", [b"", b"GET / HTTP/1.1\r\nHost", REQUEST + b"GET / HTT", REQUEST + REQUEST + b"G"], ids=repr
 )
+@pytest.mark.quick(1)
 def test_incomplete_requests(port, sent):
     with socket.create_connection(("127.0.0.1", port)) as connection:
         connection.sendall(sent)

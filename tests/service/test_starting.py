@@ -28,6 +28,7 @@ def test_repeated_starts(tmp_path):
 
 @pytest.mark.parametrize("lost", [["database"], ["identity"], ["identity", "database"]])
 @pytest.mark.parametrize("numbered", [True, False])
+@pytest.mark.quick(2)
 def test_a_folder_of_a_development_version(jobs_folder, lost, numbered):
     """Missing numbers are restored, because folder and database have common jobs."""
     for name in lost:

@@ -161,6 +161,7 @@ def test_a_refused_start_removes_nothing(jobs_folder, change):
         of_a_newer_version,
     ],
 )
+@pytest.mark.quick(2)
 def test_a_refused_command_prints_one_line(jobs_folder, change):
     url = change(jobs_folder)
     before = listing(jobs_folder)

@@ -44,6 +44,7 @@ def set_state(store, number, state):
 
 
 @pytest.mark.parametrize(("before", "after"), list(itertools.product(State, State)))
+@pytest.mark.quick(36)
 def test_state_transitions(store, before, after):
     number = add(store).number
     set_state(store, number, before)

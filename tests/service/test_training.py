@@ -91,6 +91,7 @@ def kill_the_job(service, training):
 @pytest.mark.parametrize(
     ("stage", "interrupt"), [("sparsify", kill_the_service), ("refine", stop_the_service), ("refine", kill_the_job)]
 )
+@pytest.mark.quick(1)
 def test_training_continues_after_an_interruption(start_held, expected, stage, interrupt):
     service, training = start_held(stage, KISSGS_DRAIN_SECONDS=0)
     job = service.submit(options=json.dumps(BRIEF))
@@ -115,6 +116,7 @@ def of_another_version(path):
 
 
 @pytest.mark.parametrize("damage", [damaged, of_another_version])
+@pytest.mark.quick(0)
 def test_unusable_checkpoints_are_replaced(start, damage):
     service = start()
     job = service.submit(options=json.dumps(BRIEF))
@@ -129,6 +131,7 @@ def test_unusable_checkpoints_are_replaced(start, damage):
 
 
 @pytest.mark.parametrize("saved", [0, 1])
+@pytest.mark.quick(1)
 def test_a_full_disk_disables_checkpoints(tmp_path, monkeypatch, saved):
     """The job succeeds without them, and its report does not reveal paths of the server."""
     from kissgs.training import checkpoint
@@ -183,6 +186,7 @@ def test_the_largest_record_of_steps():
     assert len(json.dumps([step] * (2 * most + 3))) < STEPS_BYTES
 
 
+@pytest.mark.quick(0)
 def test_training_notes(start_held):
     service, training = start_held("refine", pause=0.4)  # progress is sent a few times per second
     job = service.submit(options=json.dumps(BRIEF))
@@ -199,6 +203,7 @@ def test_training_notes(start_held):
 FINETUNED = {"preset": "fast", "finetune": {"enabled": True, "steps": STEPS, "views": 24, "view_size": 48}}
 
 
+@pytest.mark.quick(0)
 def test_fine_tuning_continues_and_its_gain_is_reported(start_held):
     service, training = start_held("finetune", KISSGS_DRAIN_SECONDS=0)
     job = service.submit(options=json.dumps(FINETUNED))

@@ -78,6 +78,7 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("kind", CHANGES)
+@pytest.mark.quick(3)
 def test_changes_are_detected_before_an_upload_is_read(start, kind):
     service = start()
     job = service.ended(service.submit())
@@ -195,6 +196,7 @@ def all_jobs(service):
         cursor = {"cursor": page["next"]}
 
 
+@pytest.mark.quick(0)
 def test_a_restored_database(start):
     """After the database is moved away and back, the running job is recorded and the queued one succeeds."""
     service = start()

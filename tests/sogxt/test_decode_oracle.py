@@ -38,6 +38,7 @@ def check(files):
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.quick(4)
 def test_every_degree_and_preset(degree, preset):
     count = 64 if preset == "paper" else 1000
     ours = check(encoded(random_scene(count, degree, seed=degree), preset))
@@ -46,6 +47,7 @@ def test_every_degree_and_preset(degree, preset):
 
 @pytest.mark.parametrize("preset", ["balanced", "paper"])
 @pytest.mark.parametrize("count", COUNTS)
+@pytest.mark.quick(6)
 def test_every_count(count, preset):
     files = encoded(
         random_scene(count, 3 if count in (8, 64) else 0, seed=count),
@@ -97,6 +99,7 @@ def real_scene(path):
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("name", ["fox/point_cloud.ply", "guitar/guitar.ply"])
+@pytest.mark.quick(0)
 def test_real_scenes(shared_data, name, preset):
     splats = real_scene(shared_data / name)
     if preset != "fast":  # all of it once; a part of it in the slower presets

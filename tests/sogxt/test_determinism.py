@@ -32,6 +32,7 @@ def digests(files):
 
 
 @pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.quick(2)
 def test_threads_and_repetition_do_not_change_a_byte(scene, preset):
     # PLAS is slow: the paper's preset gets a part of the scene, still of several blocks per pass.
     splats = scene.select(slice(0, 550)) if preset == "paper" else scene

@@ -47,6 +47,7 @@ def changed_everywhere(text, change, step=1, first=0):
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize(("name", "step"), [(YAML_NAME, STEP), (JSON_NAME, 1)])
+@pytest.mark.quick(6)
 def test_no_changed_byte_makes_another_scene(name, step, way):
     """Every byte, in every way; of the YAML, which takes longer to read, one in eleven, and others in each way."""
     text = FILES[name]

@@ -32,6 +32,7 @@ def dimmed(scene):
     )
 
 
+@pytest.mark.quick(0)
 def test_a_changed_scene_converges_to_the_targets():
     scene = cloud(40)
     targets, start = targets_of(scene), dimmed(scene)

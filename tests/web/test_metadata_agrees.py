@@ -44,6 +44,7 @@ def odd(change):
 
 
 @pytest.mark.parametrize("accepted", [True, False])
+@pytest.mark.quick(1)
 def test_odd_metadata(accepted):
     rows = [row for row in ODD if row.accepted == accepted]
     messages = check_agreement([odd(row.change) for row in rows])

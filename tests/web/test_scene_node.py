@@ -38,6 +38,7 @@ def site():
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("degree", range(4))
+@pytest.mark.quick(4)
 def test_every_preset_degree_and_count(preset, degree):
     files = [container(preset, degree, count) for count in COUNTS]
     found = in_node(*(job(some, options={"keepPlanes": True}) for some in files))
@@ -202,6 +203,7 @@ def test_intact_images_are_decoded_beside_damaged_ones():
 
 
 @pytest.mark.parametrize("preset", ["balanced"])
+@pytest.mark.quick(0)
 def test_a_real_scene(shared_data, preset):
     files = dict(
         kissgs.compress(next((shared_data / "fox").glob("*.ply")), settings=kissgs.Settings(preset=preset)).files

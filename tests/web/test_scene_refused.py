@@ -274,6 +274,7 @@ def test_the_most_entries_and_the_longest_comment():
         assert assert_scene(report, FILES) <= 1
 
 
+@pytest.mark.quick(0)
 def test_damage_anywhere_in_a_zip():
     """Any changed byte gives the same scene or an error of one sentence."""
     rng = np.random.default_rng(0)

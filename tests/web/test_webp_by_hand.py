@@ -118,6 +118,7 @@ def test_transforms_in_any_order(order, tmp_path):
 @pytest.mark.parametrize("others", [(), (SUBTRACT_GREEN,), (PREDICTOR,), (CROSS_COLOUR, PREDICTOR)])
 @pytest.mark.parametrize("before", [True, False])
 @pytest.mark.parametrize("size", [1, 2, 3, 4, 5, 15, 16, 17, 200, 256])
+@pytest.mark.quick(16)
 def test_palettes_with_indices_beyond_their_end(size, before, others, tmp_path):
     """Transforms after a palette apply to packed pixels."""
     width, height = 29, 11

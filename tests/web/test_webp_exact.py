@@ -192,6 +192,7 @@ def assert_exact(folder, cases):
 
 
 @pytest.mark.parametrize("content", CONTENTS, ids=lambda content: content.__name__)
+@pytest.mark.quick(10)
 def test_every_effort_and_size(content, tmp_path):
     """All methods and qualities at one size, all sizes with one method, ``exact`` or not."""
     cases = []

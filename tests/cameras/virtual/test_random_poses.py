@@ -69,6 +69,7 @@ def test_a_room_is_seen_from_inside_in_all_directions():
         assert alpha.mean() > (0.8 if inside else 0.01)
 
 
+@pytest.mark.quick(0)
 def test_poses_of_photographs_are_among_them(shared_data):
     """A random camera is near the position of each held-out photograph and looks in a similar direction."""
     splats, _ = clean(read_ply(shared_data / "fox" / "point_cloud.ply"))
