@@ -1,17 +1,24 @@
 # make demo               a service is started, compresses a sample scene, and is stopped; the result is compared
 # make demo SCENE=x.ply   the same with your own
 # make serve              the service, with its page, on http://127.0.0.1:8000 (KISSGS_PORT=… and others: docs/guide/service.md)
+# make bench              bytes, time, memory and errors of all presets (SCENE=x.ply for your own)
 # make test               tests of everything, some minutes
 # make test-all           the same with all examples, parameters, trainings and faults; half an hour
 # make lint               format, lint, types, import contract; of the JavaScript, format and types
-# make bench              bytes, time, memory and errors of all presets (SCENE=x.ply for your own)
 # make docs               what is generated in docs/
+# make setup              .venv alone, which the others make too (PYTHON=… for another Python than python3)
+# make setup-dev          the same, with what tests and checks need (TORCH_INDEX=… for another build of torch)
+# make clean              removes all that make has made; the data of a service, kissgs-data, stays
+# make help               this list
 
 SCENE ?=
 PRESET ?= balanced
 KISSGS = .venv/bin/kissgs
 
-.PHONY: demo serve test test-all lint bench docs setup setup-dev clean
+.PHONY: help demo serve test test-all lint bench docs setup setup-dev clean
+
+help:
+	@sed -n '/^#/!q; s/^# //p' Makefile
 
 demo: setup
 	@scripts/demo "$(SCENE)" $(PRESET)
@@ -48,4 +55,6 @@ setup-dev:
 	@scripts/setup dev
 
 clean:
-	@rm -rf .venv demo-out build dist web_decoder/vendor
+	@rm -rf .venv demo-out build dist web_decoder/vendor web_decoder/.vendor-* web_decoder/node_modules
+	@rm -rf .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache .schemathesis
+	@find kissgs service tests docs scripts -name __pycache__ -prune -exec rm -rf {} +

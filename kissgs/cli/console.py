@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import threading
 from collections.abc import Iterator
 from datetime import timedelta
 
@@ -13,9 +12,6 @@ from rich.text import Text
 
 from kissgs.core.progress import Progress as Receiver
 from kissgs.core.progress import silent
-
-SLOW_START_SECONDS = 1.5
-"""Loading kernels from numba's cache takes less; if it takes longer, they are being compiled."""
 
 
 def output() -> Console:
@@ -41,7 +37,6 @@ def progress_bar(quiet: bool) -> Iterator[Receiver]:
     if quiet:
         yield silent
         return
-    notice: threading.Timer | None = None
     columns = (
         TextColumn("{task.description:>14}"),
         BarColumn(),
@@ -49,28 +44,20 @@ def progress_bar(quiet: bool) -> Iterator[Receiver]:
         _ElapsedColumn(),
         TextColumn("{task.fields[note]}"),
     )
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with (
+        Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar,
+        contextlib.ExitStack() as watch,
+    ):
         task = bar.add_task("", total=1.0, note="")
+        watched = False
 
         def receive(stage: str, fraction: float, note: str = "") -> None:
-            nonlocal notice
-            if notice is not None:  # any further event means that the kernels are ready
-                notice.cancel()
-                notice = None
-            if stage == "kernels" and fraction == 0:  # may be reported several times; a timer can start only once
-                notice = _notice(console)
-                notice.start()
+            nonlocal watched
+            if stage == "kernels" and not watched:  # numba is about to be needed, and not before
+                from kissgs.core.numba_kernels import report_compilation
+
+                watched = True
+                watch.enter_context(report_compilation(console.print))
             bar.update(task, description=stage, completed=fraction, note=note)
 
-        try:
-            yield receive
-        finally:
-            if notice is not None:
-                notice.cancel()
-
-
-def _notice(console: Console) -> threading.Timer:
-    message = "compiling kernels (once; cached from then on) …"
-    timer = threading.Timer(SLOW_START_SECONDS, console.print, [message])
-    timer.daemon = True
-    return timer
+        yield receive

@@ -17,7 +17,8 @@ from pathlib import Path
 import httpx
 
 import kissgs
-from service.core.settings import SettingsError
+
+from ..core.settings import SettingsError
 
 UPLOAD_BYTES = 500_000_000
 POLLS = 600
@@ -142,7 +143,9 @@ def _service(folder: Path) -> Iterator[Running]:
     environment = {**kept, "KISSGS_PORT": "0", "KISSGS_DATA_DIR": str(folder)}
     log = folder.with_suffix(".log")
     with log.open("wb") as errors:
-        process = subprocess.Popen([sys.executable, "-m", "service"], env=environment, stderr=errors)
+        process = subprocess.Popen(
+            [sys.executable, "-m", __package__.partition(".")[0]], env=environment, stderr=errors
+        )
     try:
         yield Running(_address(process, log), process.pid)
     finally:

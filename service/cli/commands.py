@@ -8,12 +8,15 @@ import logging
 import re
 import secrets
 import signal
+import subprocess
 import sys
 from pathlib import Path
 from typing import NoReturn
 
 import kissgs
-from service.core.settings import OWNER, ServiceSettings, SettingsError
+
+from ..core.paths import VENDOR_SCRIPT
+from ..core.settings import OWNER, ServiceSettings, SettingsError
 
 EPILOG = """\
 Settings are environment variables; `kissgs-serve settings` lists them all. The first ones to know:
@@ -37,6 +40,7 @@ def run() -> None:
     commands.add_parser("run", help="serve (what happens without a command, too)")
     commands.add_parser("health", help="exit 0 if the service on this machine is ready, 1 if not")
     commands.add_parser("settings", help="list all settings")
+    commands.add_parser("viewer", help="fetch what the preview page draws with, if it is not there yet")
     key = commands.add_parser("key", help="make a key for an owner")
     key.add_argument("owner", help="a name, such as that of a person or a program")
     measure = commands.add_parser("bench", help="measure what the service costs beyond the compression itself")
@@ -45,6 +49,8 @@ def run() -> None:
     match given.command:
         case "health":
             sys.exit(_health())
+        case "viewer":
+            sys.exit(subprocess.run([sys.executable, VENDOR_SCRIPT], check=False).returncode)
         case "bench":
             _bench(given.scene)
         case "key":
@@ -66,8 +72,8 @@ def _run(settings: ServiceSettings) -> None:
     logging.basicConfig(
         level=settings.log_level.upper(), format="%(asctime)s %(levelname)s %(name)s %(message)s", stream=sys.stderr
     )
-    from service.http.app import create_app
-    from service.http.server import Server, allow_connections, listen
+    from ..http.app import create_app
+    from ..http.server import Server, allow_connections, listen
 
     allow_connections()
     try:
@@ -107,7 +113,7 @@ def _health() -> int:
 
 
 def _bench(scene: Path | None) -> None:
-    from service.cli.bench import bench
+    from .bench import bench
 
     try:
         if scene is not None:

@@ -8,7 +8,7 @@ import sys
 def main() -> None:
     """Entry point."""
     try:
-        from service.cli.commands import run
+        from .commands import run
     except ModuleNotFoundError as error:
         sys.stderr.write(f"kissgs-serve: the package {error.name} is missing; install kissgs[service]\n")
         sys.exit(2)

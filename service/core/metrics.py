@@ -6,7 +6,8 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info
 from prometheus_client.openmetrics.exposition import CONTENT_TYPE_LATEST, generate_latest
 
 import kissgs
-from service.core.models import Job, State
+
+from .models import Job, State
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from importlib.util import find_spec
 
 import kissgs
-from service.core.schemas import COMPACTED, FINETUNED, SEARCHED, PresetFacts, Presets
+
+from .schemas import COMPACTED, FINETUNED, SEARCHED, PresetFacts, Presets
 
 MEASURED_ON = "fox, 79,451 Gaussians of SH degree 3, seven held-out photographs"
 MEASURED_BY = "kissgs compress fox.ply, kissgs evaluate fox.ply fox.zip --views fox"

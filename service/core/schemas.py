@@ -8,8 +8,9 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field
 
 import kissgs
-from service.core.models import NOTE_CHARS, State
-from service.core.problems import Problem
+
+from .models import NOTE_CHARS, State
+from .problems import Problem
 
 COMPACTED = "+compact"
 FINETUNED = "+finetune"

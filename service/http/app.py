@@ -17,25 +17,26 @@ from starlette.exceptions import HTTPException
 from starlette.middleware.cors import CORSMiddleware
 
 import kissgs
-from service.core.clock import Clock
-from service.core.metrics import Metrics
-from service.core.notifier import JobNotifier
-from service.core.problems import ProblemError, answer, field_errors, unusable_database
-from service.core.settings import ServiceSettings, SettingsError
-from service.http.middleware import RequestMiddleware
-from service.http.openapi import describe
-from service.http.routes import facts, jobs, page, preview, results
-from service.jobs.admission import Admission
-from service.jobs.completion import JobCompletion
-from service.jobs.container import ServiceContainer
-from service.jobs.decoding import Decoder
-from service.jobs.event_stream import EventStream
-from service.jobs.expiry import ExpiryTask
-from service.jobs.recovery import recover
-from service.jobs.worker import Worker
-from service.storage.database_health import error_text
-from service.storage.folder_binding import open_store
-from service.storage.job_storage import JobStorage
+
+from ..core.clock import Clock
+from ..core.metrics import Metrics
+from ..core.notifier import JobNotifier
+from ..core.problems import ProblemError, answer, field_errors, unusable_database
+from ..core.settings import ServiceSettings, SettingsError
+from ..jobs.admission import Admission
+from ..jobs.completion import JobCompletion
+from ..jobs.container import ServiceContainer
+from ..jobs.decoding import Decoder
+from ..jobs.event_stream import EventStream
+from ..jobs.expiry import ExpiryTask
+from ..jobs.recovery import recover
+from ..jobs.worker import Worker
+from ..storage.database_health import error_text
+from ..storage.folder_binding import open_store
+from ..storage.job_storage import JobStorage
+from .middleware import RequestMiddleware
+from .openapi import describe
+from .routes import facts, jobs, page, preview, results
 
 ROUTERS = (jobs.router, results.router, facts.router, page.router, preview.router)
 

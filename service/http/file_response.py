@@ -13,7 +13,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import FileResponse, Response
 from starlette.types import Message, Receive, Scope, Send
 
-from service.core.problems import ProblemError
+from ..core.problems import ProblemError
 
 
 class StoredFile(FileResponse):

@@ -11,9 +11,9 @@ from urllib.parse import urlsplit
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.core.metrics import Metrics
-from service.core.problems import ProblemError, answer
-from service.core.settings import ServiceSettings
+from ..core.metrics import Metrics
+from ..core.problems import ProblemError, answer
+from ..core.settings import ServiceSettings
 
 log = logging.getLogger("kissgs.access")
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
-from service.core.problems import ProblemError
+from ..core.problems import ProblemError
 
 MAX_PART_HEADER_BYTES = 8192
 

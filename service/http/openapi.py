@@ -6,8 +6,8 @@ from typing import Any
 
 from fastapi import FastAPI
 
-from service.core.problems import Problem
-from service.core.schemas import JobOptions
+from ..core.problems import Problem
+from ..core.schemas import JobOptions
 
 DESCRIPTION = """\
 Upload a 3D Gaussian Splatting scene (`.ply`), follow the job, download a SOG-XT container of a few megabytes.

@@ -16,9 +16,9 @@ import h11
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from service.core.problems import MEDIA_TYPE, problem
-from service.core.settings import ServiceSettings, SettingsError
-from service.jobs.container import ServiceContainer
+from ..core.problems import MEDIA_TYPE, problem
+from ..core.settings import ServiceSettings, SettingsError
+from ..jobs.container import ServiceContainer
 
 log = logging.getLogger("kissgs.service")
 

@@ -13,17 +13,17 @@ from anyio.to_thread import run_sync
 from pydantic import ValidationError
 from starlette.requests import Request
 
-from service.core.disk_estimates import checkpoint_bytes
-from service.core.models import Job
-from service.core.presets import can_train
-from service.core.problems import ProblemError, field_errors, unusable_database
-from service.core.schemas import JobOptions
-from service.http.multipart import PartBegin, PartData, parts
-from service.http.uploads import Received, Spool, scene_name, timed
-from service.jobs.admission import FULL_SECONDS
-from service.jobs.container import ServiceContainer
-from service.jobs.worker import QUEUE
-from service.storage.job_store import LimitExceeded
+from ..core.disk_estimates import checkpoint_bytes
+from ..core.models import Job
+from ..core.presets import can_train
+from ..core.problems import ProblemError, field_errors, unusable_database
+from ..core.schemas import JobOptions
+from ..jobs.admission import FULL_SECONDS
+from ..jobs.container import ServiceContainer
+from ..jobs.worker import QUEUE
+from ..storage.job_store import LimitExceeded
+from .multipart import PartBegin, PartData, parts
+from .uploads import Received, Spool, scene_name, timed
 
 RAW_TYPES = ("", "application/octet-stream", "application/ply", "application/x-ply", "model/ply")
 FORM_TYPE = "multipart/form-data"

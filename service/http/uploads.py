@@ -17,9 +17,10 @@ from anyio.to_thread import run_sync
 from starlette.requests import ClientDisconnect, Request
 
 import kissgs
-from service.core.problems import ProblemError
-from service.core.settings import ServiceSettings
-from service.jobs.admission import FULL_SECONDS, Admission
+
+from ..core.problems import ProblemError
+from ..core.settings import ServiceSettings
+from ..jobs.admission import FULL_SECONDS, Admission
 
 BLOCK_BYTES = 1 << 20
 """Bytes per write. Each write is one call to a thread; memory holds one or two blocks per upload."""

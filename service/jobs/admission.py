@@ -7,12 +7,12 @@ import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from service.core.models import Job
-from service.core.problems import ProblemError
-from service.core.settings import ServiceSettings
-from service.jobs.status import QueueEstimator
-from service.storage.job_storage import JobStorage
-from service.storage.job_store import LimitExceeded, Store
+from ..core.models import Job
+from ..core.problems import ProblemError
+from ..core.settings import ServiceSettings
+from ..storage.job_storage import JobStorage
+from ..storage.job_store import LimitExceeded, Store
+from .status import QueueEstimator
 
 BUSY_SECONDS = 5.0
 """``Retry-After`` of refusals because of simultaneous uploads, seconds."""

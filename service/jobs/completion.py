@@ -6,13 +6,13 @@ import logging
 from dataclasses import dataclass
 from typing import Any
 
-from service.core.clock import Clock
-from service.core.metrics import Metrics
-from service.core.models import Job, State
-from service.core.problems import PROBLEM_TYPES, problem
-from service.core.settings import ServiceSettings
-from service.storage.job_storage import JobStorage
-from service.storage.job_store import Store
+from ..core.clock import Clock
+from ..core.metrics import Metrics
+from ..core.models import Job, State
+from ..core.problems import PROBLEM_TYPES, problem
+from ..core.settings import ServiceSettings
+from ..storage.job_storage import JobStorage
+from ..storage.job_store import Store
 
 log = logging.getLogger("kissgs.service")
 

@@ -10,17 +10,17 @@ from typing import Annotated
 from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
-from service.core.clock import Clock
-from service.core.metrics import Metrics
-from service.core.notifier import JobNotifier
-from service.core.problems import ProblemError
-from service.core.settings import ServiceSettings
-from service.jobs.admission import Admission
-from service.jobs.decoding import Decoder
-from service.jobs.event_stream import EventStream
-from service.jobs.worker import Worker
-from service.storage.job_storage import JobStorage
-from service.storage.job_store import Store
+from ..core.clock import Clock
+from ..core.metrics import Metrics
+from ..core.notifier import JobNotifier
+from ..core.problems import ProblemError
+from ..core.settings import ServiceSettings
+from ..storage.job_storage import JobStorage
+from ..storage.job_store import Store
+from .admission import Admission
+from .decoding import Decoder
+from .event_stream import EventStream
+from .worker import Worker
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,14 +10,14 @@ from typing import Any
 
 from anyio.to_thread import run_sync
 
-from service.core.disk_estimates import BYTES_PER_GAUSSIAN
-from service.core.models import Job, State
-from service.core.problems import PROBLEM_TYPES, ProblemError
-from service.core.settings import ServiceSettings
-from service.jobs.admission import Admission
-from service.jobs.runner import JobProcess
-from service.storage.job_storage import JobStorage
-from service.storage.job_store import Store
+from ..core.disk_estimates import BYTES_PER_GAUSSIAN
+from ..core.models import Job, State
+from ..core.problems import PROBLEM_TYPES, ProblemError
+from ..core.settings import ServiceSettings
+from ..storage.job_storage import JobStorage
+from ..storage.job_store import Store
+from .admission import Admission
+from .runner import JobProcess
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,10 @@ from weakref import WeakValueDictionary
 
 from anyio.to_thread import run_sync
 
-from service.core.models import ACTIVE, Event, Job
-from service.core.notifier import JobNotifier, wait
-from service.jobs.status import QueueEstimator, job_status
-from service.storage.job_store import Store
+from ..core.models import ACTIVE, Event, Job
+from ..core.notifier import JobNotifier, wait
+from ..storage.job_store import Store
+from .status import QueueEstimator, job_status
 
 KEEPALIVE_SECONDS = 15.0
 """Seconds without an event after which a comment is sent, so that the connection is not taken for dead."""

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from anyio.to_thread import run_sync
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.core.models import ENDED, State
-from service.core.notifier import ended
-from service.jobs.container import ServiceContainer
-from service.storage.database_lease import HEARTBEAT_SECONDS
+from ..core.models import ENDED, State
+from ..core.notifier import ended
+from ..storage.database_lease import HEARTBEAT_SECONDS
+from .container import ServiceContainer
 
 log = logging.getLogger("kissgs.service")
 

@@ -10,9 +10,9 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from service.core.models import Job, State
-from service.jobs.container import ServiceContainer
-from service.storage.job_storage import JobStorage
+from ..core.models import Job, State
+from ..storage.job_storage import JobStorage
+from .container import ServiceContainer
 
 log = logging.getLogger("kissgs.service")
 

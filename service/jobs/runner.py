@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from service.jobs.job_process import MEMORY_DETAIL
+from .job_process import MEMORY_DETAIL
 
 log = logging.getLogger("kissgs.service")
 
@@ -97,7 +97,7 @@ class JobProcess:
                 sys.executable,
                 "-P",
                 "-m",
-                "service.jobs.job_process",
+                f"{__package__}.job_process",
                 stdin=asyncio.subprocess.PIPE,
                 stdout=asyncio.subprocess.PIPE,
                 stderr=errors,

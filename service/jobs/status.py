@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import statistics
 
-from service.core.clock import as_datetime
-from service.core.models import ACTIVE, Job, State
-from service.core.presets import usual_seconds
-from service.core.schemas import Estimate, JobOptions, JobStatus, Links, Progress, Sizes, Timings
-from service.storage.job_store import Store
+from ..core.clock import as_datetime
+from ..core.models import ACTIVE, Job, State
+from ..core.presets import usual_seconds
+from ..core.schemas import Estimate, JobOptions, JobStatus, Links, Progress, Sizes, Timings
+from ..storage.job_store import Store
 
 
 class QueueEstimator:

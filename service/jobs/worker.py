@@ -10,16 +10,16 @@ from dataclasses import dataclass, field
 from anyio.to_thread import run_sync
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.core.metrics import Metrics
-from service.core.models import Job, State
-from service.core.notifier import JobNotifier, ended, wait
-from service.core.schemas import JobOptions
-from service.core.settings import ServiceSettings
-from service.jobs.completion import JobCompletion
-from service.jobs.runner import JobProcess, Outcome
-from service.storage.database_health import error_text
-from service.storage.job_storage import JobStorage
-from service.storage.job_store import Store
+from ..core.metrics import Metrics
+from ..core.models import Job, State
+from ..core.notifier import JobNotifier, ended, wait
+from ..core.schemas import JobOptions
+from ..core.settings import ServiceSettings
+from ..storage.database_health import error_text
+from ..storage.job_storage import JobStorage
+from ..storage.job_store import Store
+from .completion import JobCompletion
+from .runner import JobProcess, Outcome
 
 log = logging.getLogger("kissgs.service")
 

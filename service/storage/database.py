@@ -12,9 +12,9 @@ import sqlalchemy as sa
 from sqlalchemy.exc import ArgumentError, NoSuchModuleError
 from sqlalchemy.orm import Session, sessionmaker
 
-from service.core.models import SCHEMA_VERSION, Base, Job, Meta
-from service.core.settings import SettingsError
-from service.storage.database_health import (
+from ..core.models import SCHEMA_VERSION, Base, Job, Meta
+from ..core.settings import SettingsError
+from .database_health import (
     IDENTITY,
     IDENTITY_BITS,
     check_pages,

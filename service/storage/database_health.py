@@ -16,7 +16,7 @@ import sqlalchemy as sa
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
-from service.core.models import Base, Meta
+from ..core.models import Base, Meta
 
 WAIT_SECONDS = 2.0
 """Maximum wait for a lock during a check, seconds."""

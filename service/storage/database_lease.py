@@ -17,10 +17,10 @@ from pathlib import Path
 import sqlalchemy as sa
 from sqlalchemy.orm import Session
 
-from service.core.models import Meta
-from service.core.settings import SettingsError
-from service.storage.database import Sessions
-from service.storage.database_health import IDENTITY, IDENTITY_BITS, OWNER
+from ..core.models import Meta
+from ..core.settings import SettingsError
+from .database import Sessions
+from .database_health import IDENTITY, IDENTITY_BITS, OWNER
 
 log = logging.getLogger("kissgs.service")
 

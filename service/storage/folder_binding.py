@@ -13,12 +13,12 @@ from pathlib import Path
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.core.models import ACTIVE
-from service.core.settings import ServiceSettings, SettingsError
-from service.storage.database import NewDatabaseError
-from service.storage.database_health import IDENTITY, IDENTITY_BITS, error_text
-from service.storage.job_storage import JobStorage, sync_folder
-from service.storage.job_store import Store
+from ..core.models import ACTIVE
+from ..core.settings import ServiceSettings, SettingsError
+from .database import NewDatabaseError
+from .database_health import IDENTITY, IDENTITY_BITS, error_text
+from .job_storage import JobStorage, sync_folder
+from .job_store import Store
 
 NEARLY_FULL_BYTES = 1 << 20
 """Free disk space below which a database may fail to open, bytes."""

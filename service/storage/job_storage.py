@@ -28,7 +28,7 @@ import time
 from pathlib import Path
 from typing import IO
 
-from service.core.settings import SettingsError
+from ..core.settings import SettingsError
 
 log = logging.getLogger("kissgs.service")
 

@@ -14,10 +14,10 @@ import sqlalchemy as sa
 from sqlalchemy.exc import IntegrityError, SQLAlchemyError
 from sqlalchemy.orm import Session, load_only
 
-from service.core.models import ACTIVE, ENDED, NOTE_CHARS, Event, Job, Meta, State
-from service.storage import database_lease
-from service.storage.database import connect
-from service.storage.database_health import IDENTITY, DatabaseMonitor, DatabaseReplacedError
+from ..core.models import ACTIVE, ENDED, NOTE_CHARS, Event, Job, Meta, State
+from . import database_lease
+from .database import connect
+from .database_health import IDENTITY, DatabaseMonitor, DatabaseReplacedError
 
 _PREDECESSORS: dict[State, tuple[State, ...]] = {
     State.RUNNING: (State.QUEUED,),

@@ -20,7 +20,7 @@ async function modules() {
     return await Promise.all([import("./viewer.js"), import("./navigation.js"), import("./compare.js")]);
   } catch {
     throw new UserError(
-      "The viewer is not installed, so the scene cannot be drawn; `make setup` or `scripts/vendor` installs it.",
+      "The viewer is not installed, so the scene cannot be drawn; `kissgs-serve viewer` or `scripts/vendor` installs it.",
     );
   }
 }

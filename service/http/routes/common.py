@@ -10,12 +10,12 @@ from typing import Annotated, Any
 from anyio.to_thread import run_sync
 from fastapi import Depends, Path, Request
 
-from service.core.models import ACTIVE, Job
-from service.core.notifier import ended
-from service.core.problems import MEDIA_TYPE, PROBLEM_TYPES, ProblemError
-from service.core.schemas import JobStatus
-from service.jobs.container import Owner, Service, ServiceContainer
-from service.jobs.status import QueueEstimator, job_status
+from ...core.models import ACTIVE, Job
+from ...core.notifier import ended
+from ...core.problems import MEDIA_TYPE, PROBLEM_TYPES, ProblemError
+from ...core.schemas import JobStatus
+from ...jobs.container import Owner, Service, ServiceContainer
+from ...jobs.status import QueueEstimator, job_status
 
 MAX_WAIT_SECONDS = 30.0
 """Maximum duration of a long poll, shorter than typical idle time-outs of proxies."""

@@ -9,14 +9,15 @@ from fastapi import APIRouter, Path, Response
 from sqlalchemy.exc import SQLAlchemyError
 
 import kissgs
-from service.core.metrics import CONTENT_TYPE
-from service.core.presets import can_train, presets
-from service.core.problems import PROBLEM_TYPES, ProblemError
-from service.core.schemas import Health, Limits, Presets, ProblemKind, Version
-from service.http.routes.common import MAX_WAIT_SECONDS, NO_STORE, problems
-from service.jobs.container import Service, ServiceContainer
-from service.storage.database_health import error_text
-from service.storage.job_storage import ORPHANED
+
+from ...core.metrics import CONTENT_TYPE
+from ...core.presets import can_train, presets
+from ...core.problems import PROBLEM_TYPES, ProblemError
+from ...core.schemas import Health, Limits, Presets, ProblemKind, Version
+from ...jobs.container import Service, ServiceContainer
+from ...storage.database_health import error_text
+from ...storage.job_storage import ORPHANED
+from .common import MAX_WAIT_SECONDS, NO_STORE, problems
 
 router = APIRouter()
 

@@ -9,11 +9,13 @@ from anyio.to_thread import run_sync
 from fastapi import APIRouter, Header, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from service.core.models import ACTIVE, Job, State
-from service.core.notifier import ended
-from service.core.problems import ProblemError
-from service.core.schemas import JobPage, JobStatus
-from service.http.routes.common import (
+from ...core.models import ACTIVE, Job, State
+from ...core.notifier import ended
+from ...core.problems import ProblemError
+from ...core.schemas import JobPage, JobStatus
+from ...jobs.container import Owner, Service, ServiceContainer
+from ..submission import RAW_TYPES, submit
+from .common import (
     MAX_WAIT_SECONDS,
     NO_STORE,
     RequestedJob,
@@ -23,9 +25,7 @@ from service.http.routes.common import (
     statuses,
     wait_for_end,
 )
-from service.http.routes.results import container
-from service.http.submission import RAW_TYPES, submit
-from service.jobs.container import Owner, Service, ServiceContainer
+from .results import container
 
 log = logging.getLogger("kissgs.service")
 

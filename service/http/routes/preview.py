@@ -12,12 +12,11 @@ from fastapi import APIRouter, Request
 from fastapi.responses import RedirectResponse
 from starlette.responses import Response
 
-from service.core.problems import ProblemError
-from service.http.routes.page import REVALIDATE, RevalidatedFiles
+from ...core.paths import WEB_DECODER
+from ...core.problems import ProblemError
+from .page import REVALIDATE, RevalidatedFiles
 
 router = APIRouter(include_in_schema=False)
-
-FOLDER = Path(__file__).parents[3] / "web_decoder"
 
 POLICY = (
     "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'{hashes}; worker-src 'self' blob:; style-src 'self'; "
@@ -57,7 +56,7 @@ async def get_preview(request: Request, path: str) -> Response:
         return await run_sync(_page)
     if not _FILE.fullmatch(path):
         raise ProblemError("not-found", f"{request.url.path[:200]} does not exist")
-    response = await RevalidatedFiles(directory=FOLDER, check_dir=False).get_response(path, request.scope)
+    response = await RevalidatedFiles(directory=WEB_DECODER, check_dir=False).get_response(path, request.scope)
     if "content-type" in response.headers:
         response.headers["Content-Type"] = _TYPES[Path(path).suffix]
     return response
@@ -66,7 +65,7 @@ async def get_preview(request: Request, path: str) -> Response:
 def _page() -> Response:
     """Return the page, read anew each time, so that the policy always fits it."""
     try:
-        page = (FOLDER / "preview.html").read_bytes()
+        page = (WEB_DECODER / "preview.html").read_bytes()
     except OSError as error:
         raise ProblemError("not-found", "this service was installed without its preview page") from error
     maps = re.findall(rb'<script type="importmap">(.*?)</script>', page.replace(b"\r\n", b"\n"), re.DOTALL)

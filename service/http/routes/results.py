@@ -7,11 +7,11 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Response
 
-from service.core.models import Job, State
-from service.core.problems import ProblemError
-from service.http.file_response import StoredFile, described
-from service.http.routes.common import RequestedJob, problems
-from service.jobs.container import Service, ServiceContainer
+from ...core.models import Job, State
+from ...core.problems import ProblemError
+from ...jobs.container import Service, ServiceContainer
+from ..file_response import StoredFile, described
+from .common import RequestedJob, problems
 
 router = APIRouter(prefix="/v1/jobs/{id}", tags=["results"])
 
