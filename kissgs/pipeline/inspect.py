@@ -11,13 +11,13 @@ import numpy as np
 from kissgs.core.errors import InvalidContainerError
 from kissgs.core.signed_log import signed_exp
 from kissgs.core.splats import ATTRIBUTES, clean
+from kissgs.io.packed_files import Source, open_source
 from kissgs.io.ply import read_ply, read_ply_info
+from kissgs.io.webp import decode_plane
 from kissgs.pipeline.scene_files import is_container
-from kissgs.sogxt.container import Source, open_source
 from kissgs.sogxt.metadata import CHANNELS, Layout
 from kissgs.sogxt.metadata_reader import read_layout
 from kissgs.sogxt.names import FILES, PLANES
-from kissgs.sogxt.planes import decode_plane
 
 NAMES = {"quaternions": "quats", "f_dc": "sh0", "f_rest_centroids": "shN"}
 MAX_PLANE_BYTES = 1 << 30

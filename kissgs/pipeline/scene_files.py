@@ -10,8 +10,9 @@ from kissgs.core.errors import InvalidContainerError, OutputError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Cleaned, Splats, clean
 from kissgs.io.atomic import atomic_file, reason_of, refuse_existing
+from kissgs.io.packed_files import sniff_format
 from kissgs.io.ply import read_ply, write_ply
-from kissgs.sogxt.container import is_packed, sniff_format
+from kissgs.sogxt.container import is_packed
 from kissgs.sogxt.decode import MAX_GAUSSIANS, decode
 
 AnyPath = str | PathLike[str]

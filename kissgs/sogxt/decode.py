@@ -18,10 +18,10 @@ from kissgs.core.progress import Progress, silent
 from kissgs.core.signed_log import signed_exp
 from kissgs.core.splats import SH_REST_COUNTS, Splats
 from kissgs.core.threads import Workers
-from kissgs.sogxt.container import Source, open_source
+from kissgs.io.packed_files import Source, open_source
+from kissgs.io.webp import decode_plane
 from kissgs.sogxt.metadata import TILE_COLUMNS, TILE_ROWS, Layout
 from kissgs.sogxt.metadata_reader import read_layout
-from kissgs.sogxt.planes import decode_plane
 
 CHUNK = 1 << 14
 """Gaussians per task."""
