@@ -15,6 +15,8 @@ from kissgs.io.atomic import reason_of
 MAX_ZIP_ENTRIES = 1000
 """Largest number of entries: a container has 12 files, to which users may add notes and previews."""
 
+MAX_TREE_ENTRIES = 100_000
+"""Largest number of entries of a zip of many containers, each of which has up to eight files."""
 
 ZIP_MAGICS = (b"PK\x03\x04", b"PK\x05\x06")
 """First bytes of a zip file, and of an empty one."""
@@ -55,7 +57,7 @@ class MemorySource:
 
 
 class DirectorySource:
-    """Files in a folder."""
+    """Files in a folder. :meth:`names` lists those directly in it; :meth:`read` also takes paths below it."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -75,30 +77,37 @@ class DirectorySource:
     def read(self, name: str, limit: int) -> bytes:
         """See :class:`Source`."""
         try:
-            _check(name, name in self._names, self.size(name) if name in self._names else 0, limit)
+            present = is_below(name) and (self._folder / name).is_file()
+            _check(name, present, self.size(name) if present else 0, limit)
             return (self._folder / name).read_bytes()
-        except OSError as error:
+        except (OSError, ValueError) as error:
             raise InvalidContainerError(f"cannot read {self._folder / name}: {reason_of(error)}") from error
 
 
 class ZipSource:
-    """Files in a zip, at its top or together in a folder. Nothing is extracted to disk."""
+    """Files in a zip. Nothing is extracted to disk.
 
-    def __init__(self, file: io.BufferedIOBase, label: str) -> None:
+    Without ``root`` they are known by their names alone, wherever in the zip they are. With ``root``, the name of a
+    file that must be there once, they are known by their paths from its folder.
+    """
+
+    def __init__(self, file: io.BufferedIOBase, label: str, root: str | None = None) -> None:
         if sniff_format(file) == "ply":
             raise InvalidContainerError(f"{label} is a .ply, not a container; compress it first")
-        try:
-            self._zip = zipfile.ZipFile(file)
-            entries = self._zip.infolist()
-        except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, EOFError) as error:
-            raise InvalidContainerError(f"{label} is not a readable zip file") from error
-        if len(entries) > MAX_ZIP_ENTRIES:
-            raise InvalidContainerError(f"{label} has {len(entries)} entries; a container has 12 files")
+        self._zip, entries = _open_zip(file, label, MAX_TREE_ENTRIES if root else MAX_ZIP_ENTRIES)
+        self._flat = root is None
+        paths = [(entry.filename.replace("\\", "/"), entry) for entry in entries]
+        folder = ""
+        if root is not None:
+            above = [path[: -len(root)] for path, _ in paths if path.rsplit("/", 1)[-1] == root]
+            if len(above) != 1:
+                raise InvalidContainerError(f"{label} holds {len(above)} files named {root!r}; one is needed")
+            folder = above[0]
         self._entries: dict[str, zipfile.ZipInfo] = {}
-        for entry in entries:
-            if not entry.filename or entry.is_dir():
+        for path, entry in paths:
+            if not path.startswith(folder):
                 continue
-            name = entry.filename.replace("\\", "/").rsplit("/", 1)[-1]
+            name = path.rsplit("/", 1)[-1] if self._flat else path[len(folder) :]
             if name in self._entries:
                 raise InvalidContainerError(f"{label} holds two files named {name!r}")
             self._entries[name] = entry
@@ -109,11 +118,11 @@ class ZipSource:
 
     def size(self, name: str) -> int:
         """See :class:`Source`."""
-        return self._entries[name].compress_size
+        return self._entries[self._key(name)].compress_size
 
     def read(self, name: str, limit: int) -> bytes:
         """See :class:`Source`."""
-        entry = self._entries.get(name)
+        entry = self._entries.get(self._key(name))
         _check(name, entry is not None, entry.file_size if entry else 0, limit)
         try:
             with self._zip.open(entry or name) as file:
@@ -122,6 +131,35 @@ class ZipSource:
             raise InvalidContainerError(f"{name} cannot be read from the zip: it is damaged or encrypted") from error
         _check(name, True, len(data), limit)
         return data
+
+    def _key(self, name: str) -> str:
+        return name.rsplit("/", 1)[-1] if self._flat else name
+
+
+def _open_zip(file: io.BufferedIOBase, label: str, most: int) -> tuple[zipfile.ZipFile, list[zipfile.ZipInfo]]:
+    """Open a zip; return it and its files."""
+    try:
+        archive = zipfile.ZipFile(file)
+        entries = archive.infolist()
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, EOFError) as error:
+        raise InvalidContainerError(f"{label} is not a readable zip file") from error
+    if len(entries) > most:
+        raise InvalidContainerError(f"{label} has {len(entries)} entries; a container has 12 files")
+    return archive, [entry for entry in entries if entry.filename and not entry.is_dir()]
+
+
+def zip_names(file: io.BufferedIOBase) -> list[str]:
+    """Return the names of all entries of a zip, folders included; none if it cannot be read."""
+    try:
+        return zipfile.ZipFile(file).namelist()
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, EOFError):
+        return []
+
+
+def is_below(name: str) -> bool:
+    """Whether a file name from inside a file is a relative path that does not leave its folder."""
+    parts = name.replace("\\", "/").split("/")
+    return bool(name) and ".." not in parts and parts[0] != "" and ":" not in parts[0] and "\0" not in name
 
 
 def sniff_format(file: io.BufferedIOBase) -> Literal["ply", "zip"] | None:
@@ -135,14 +173,16 @@ def sniff_format(file: io.BufferedIOBase) -> Literal["ply", "zip"] | None:
 
 
 @contextlib.contextmanager
-def open_source(source: Path | bytes | Mapping[str, bytes]) -> Iterator[Source]:
+def open_source(source: Path | bytes | Mapping[str, bytes], root: str | None = None) -> Iterator[Source]:
     """Open a container for reading: a folder, a zip file, the bytes of one, or files in memory.
+
+    ``root`` is that of :class:`ZipSource`.
 
     Raises:
         InvalidContainerError: ``source`` cannot be read or is not a zip file.
     """
     if isinstance(source, bytes):
-        yield ZipSource(io.BytesIO(source), "the input")
+        yield ZipSource(io.BytesIO(source), "the input", root)
     elif not isinstance(source, Path):
         yield MemorySource(source)
     else:
@@ -156,7 +196,7 @@ def open_source(source: Path | bytes | Mapping[str, bytes]) -> Iterator[Source]:
             yield DirectorySource(source)
             return
         with file:
-            yield ZipSource(file, str(source))
+            yield ZipSource(file, str(source), root)
 
 
 def _check(name: str, present: bool, size: int, limit: int) -> None:
