@@ -17,6 +17,7 @@ def axis_signs(frame: str) -> Signs:
     return (1 if frame[0] == "R" else -1), (1 if frame[1] == "D" else -1), (1 if frame[2] == "F" else -1)
 
 
+@np.errstate(all="ignore")  # values may be any floats; they are not cleaned here
 def mirror(splats: Splats, signs: Signs) -> None:
     """Mirror a scene in place: multiply the axes by ``signs``. Any number of them may be negative."""
     x, y, z = signs
@@ -24,10 +25,12 @@ def mirror(splats: Splats, signs: Signs) -> None:
     flat = [sign for band in bands for sign in band][: splats.shN.shape[1]]
     # An axis of rotation turns over with the two other axes.
     for array, factors in ((splats.means, (x, y, z)), (splats.quats, (1, y * z, x * z, x * y))):
-        np.multiply(array, np.float32(factors), out=array)  # numpy.negative in place is wrong for columns of four
-    np.multiply(splats.shN, np.float32(flat)[:, None], out=splats.shN)
+        # Not numpy.negative of columns in place: with four columns, NumPy 2.4 gives wrong numbers.
+        np.multiply(array, np.array(factors, np.float32), out=array)
+    np.multiply(splats.shN, np.array(flat, np.float32)[:, None], out=splats.shN)
 
 
+@np.errstate(all="ignore")
 def move(splats: Splats, rotation: Float64[np.ndarray, "3 3"], scale: float, shift: Float64[np.ndarray, " 3"]) -> None:
     """Scale a scene about the origin, rotate and then shift it, in place."""
     for start in range(0, len(splats), 1 << 16):

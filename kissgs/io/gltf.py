@@ -95,21 +95,21 @@ def read_gltf(source: Path | bytes, *, max_gaussians: int | None = None, progres
     """
     with open_scene_file(source, ".glb") as opened:
         document = Document(opened, None if isinstance(source, bytes) else source.parent)
-    found = list(_primitives(document))
-    count = sum(primitive.count for primitive in found)
-    refuse_more_than(max_gaussians, count, document.name)
-    progress("read", 0.0)
-    splats = empty_splats(count, SH_REST_COUNTS[max(primitive.degree for primitive in found)])
-    start = 0
-    for primitive in found:
-        part = splats.select(slice(start, start + primitive.count))
-        if primitive.spz is None:
-            _read_attributes(document, primitive, part)
-        else:
-            _read_spz(document, primitive.spz, part)
-        _apply(document, primitive.matrix, part)
-        start += primitive.count
-        progress("read", start / max(count, 1))
+        found = list(_primitives(document))
+        count = sum(primitive.count for primitive in found)
+        refuse_more_than(max_gaussians, count, document.name)
+        progress("read", 0.0)
+        splats = empty_splats(count, SH_REST_COUNTS[max(primitive.degree for primitive in found)])
+        start = 0
+        for primitive in found:
+            part = splats.select(slice(start, start + primitive.count))
+            if primitive.spz is None:
+                _read_attributes(document, primitive, part)
+            else:
+                _read_spz(document, primitive.spz, part)
+            _apply(document, primitive.matrix, part)
+            start += primitive.count
+            progress("read", start / max(count, 1))
     _turn_to_ply(splats)
     return splats
 
@@ -146,7 +146,8 @@ def _instances(document: Document) -> Iterator[tuple[dict[str, Any], Float64[np.
             return
         index, above = waiting.pop(0)
         node = document.item("nodes", index)
-        matrix = above @ node_matrix(document, node)
+        with np.errstate(all="ignore"):  # numbers that overflow are refused where they are used
+            matrix = above @ node_matrix(document, node)
         if "mesh" in node:
             yield document.item("meshes", node["mesh"]), matrix
         waiting += [(child, matrix) for child in _indices(document, node, "children")]
@@ -178,7 +179,7 @@ def _primitive(
     for name in compressions:
         if name in SPZ_EXTENSIONS:
             view = document.whole(document.child(compressions, name), "bufferView", -1)
-            header = read_spz_info(bytes(document.view(view)[0]))
+            header = read_spz_info(bytes(document.view(view, 512)[0]))
             if "POSITION" in attributes and document.count(attributes["POSITION"]) != header.count:
                 raise document.invalid(f"its .spz has {header.count:,} Gaussians, its accessors another number")
             return _Primitive(attributes, matrix, header.count, header.sh_degree, view)
@@ -246,6 +247,7 @@ def _read_spz(document: Document, view: int, out: Splats) -> None:
     out.shN[:, coefficients:] = 0
 
 
+@np.errstate(all="ignore")  # numbers that overflow are refused
 def _apply(document: Document, matrix: Float64[np.ndarray, "4 4"], out: Splats) -> None:
     """Move Gaussians by the transform of their node."""
     if np.array_equal(matrix, np.eye(4)):

@@ -19,7 +19,7 @@ from kissgs.io.scene_file import SceneFile, open_scene_file
 
 GLB_MAGIC = b"glTF"
 
-MAX_JSON_BYTES = 1 << 26
+MAX_JSON_BYTES = 1 << 22
 """Largest size of the JSON in a GLB; a primitive of a scene takes some kilobytes."""
 
 MAX_GLTF_BYTES = 1 << 30
@@ -33,11 +33,15 @@ _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
 class Document:
-    """Parsed glTF file. Its methods raise InvalidSceneError for whatever contradicts the format."""
+    """Parsed glTF file. Its methods raise InvalidSceneError for whatever contradicts the format.
+
+    The binary part of a GLB is read when it is needed, one buffer view at a time: the file must still be open.
+    """
 
     def __init__(self, opened: SceneFile, folder: Path | None) -> None:
         self.name, self._folder = opened.name, folder
         text, self._binary = _split(opened)
+        self._opened = opened
         try:
             self.root = json.loads(text.decode("utf-8-sig"), parse_constant=_refuse_constant)
         except (ValueError, RecursionError) as error:
@@ -47,6 +51,7 @@ class Document:
         if not isinstance(self.root, dict):
             raise self.invalid("its JSON is no object")
         self._buffers: dict[int, bytes] = {}
+        self._last: tuple[tuple[int, int], bytes] = ((0, 0), b"")
 
     def invalid(self, problem: str) -> InvalidSceneError:
         """Return the error of a file that contradicts the format."""
@@ -113,38 +118,38 @@ class Document:
             raise self.invalid(f"{what} is normalised, but not of 8 or 16 bits")
         return np.maximum(values.astype(np.float32) / np.float32(np.iinfo(values.dtype).max), np.float32(-1))
 
-    def view(self, index: object) -> tuple[memoryview, int]:
-        """Return the bytes of a buffer view, and its stride; 0: rows stand one after another."""
+    def view(self, index: object, limit: int | None = None) -> tuple[memoryview, int]:
+        """Return the bytes of a buffer view, at most ``limit``, and its stride; 0: rows stand one after another."""
         view = self.item("bufferViews", index)
-        data = self._buffer(view.get("buffer"))
+        buffer, number = self.item("buffers", view.get("buffer")), int(str(view.get("buffer")))
         offset, length = self.whole(view, "byteOffset"), self.whole(view, "byteLength", -1)
-        if offset + length > len(data):
+        stride = self.whole(view, "byteStride")
+        uri = buffer.get("uri")
+        if uri is None and self._binary is not None and number == 0:
+            start, size = self._binary
+        else:
+            if number not in self._buffers:
+                self._buffers[number] = self._load(uri, number)
+            start, size = 0, len(self._buffers[number])
+        if offset + length > size:
             raise self.invalid("a buffer view reaches beyond its buffer")
-        return memoryview(data)[offset : offset + length], self.whole(view, "byteStride")
-
-    def _buffer(self, index: object) -> bytes:
-        buffer = self.item("buffers", index)
-        number = int(str(index))
-        if number not in self._buffers:
-            self._buffers[number] = self._load(buffer.get("uri"), number)
-        return self._buffers[number]
+        length = length if limit is None else min(length, limit)
+        if start == 0:
+            return memoryview(self._buffers[number])[offset : offset + length], stride
+        part = (start + offset, length)
+        if self._last[0] != part:  # rows with a stride have several attributes in one view
+            self._last = (part, self._opened.read(*part))
+        return memoryview(self._last[1]), stride
 
     def _load(self, uri: object, index: int) -> bytes:
-        """Return the bytes of a buffer: inside a GLB, as text in the JSON, or of a file beside the scene."""
-        if uri is None:
-            if self._binary is None or index:
-                raise self.invalid(f"buffers[{index}] has no data")
-            return self._binary
+        """Return the bytes of a buffer: text in the JSON, or a file beside the scene."""
         if not isinstance(uri, str):
-            raise self.invalid(f"buffers[{index}].uri is no text")
+            raise self.invalid(f"buffers[{index}] has no data")
         if uri.startswith("data:"):
             head, _, body = uri.partition(",")
             try:
-                return (
-                    base64.b64decode(body, validate=True)
-                    if head.endswith(";base64")
-                    else urllib.parse.unquote_to_bytes(body)
-                )
+                encoded = head.endswith(";base64")
+                return base64.b64decode(body, validate=True) if encoded else urllib.parse.unquote_to_bytes(body)
             except (binascii.Error, ValueError) as error:
                 raise self.invalid(f"buffers[{index}].uri is not base64") from error
         path = urllib.parse.unquote(uri)
@@ -156,8 +161,8 @@ class Document:
             return opened.read(0, opened.size)
 
 
-def _split(opened: SceneFile) -> tuple[bytes, bytes | None]:
-    """Return the JSON, and the binary chunk of a GLB."""
+def _split(opened: SceneFile) -> tuple[bytes, tuple[int, int] | None]:
+    """Return the JSON, and where the binary part of a GLB begins and how long it is."""
     if opened.size < _GLB_HEADER.size or opened.read(0, 4) != GLB_MAGIC:
         if opened.size > MAX_GLTF_BYTES:
             raise UnsupportedError(f"{opened.name} has {opened.size:,} bytes of text; export it as .glb")
@@ -167,19 +172,22 @@ def _split(opened: SceneFile) -> tuple[bytes, bytes | None]:
         raise UnsupportedError(f"{opened.name} is GLB of version {version}; version 2 is read")
     if length > opened.size:
         raise opened.cut_short(length)
-    chunks: dict[bytes, bytes] = {}
-    offset = _GLB_HEADER.size
-    while offset + _CHUNK_HEADER.size <= length and len(chunks) < 2:
+    text, offset = None, _GLB_HEADER.size
+    while offset + _CHUNK_HEADER.size <= length:
         size, kind = _CHUNK_HEADER.unpack(opened.read(offset, _CHUNK_HEADER.size))
         offset += _CHUNK_HEADER.size
-        if not chunks and (kind != b"JSON" or size > MAX_JSON_BYTES):
-            raise InvalidSceneError(f"{opened.name} is not valid GLB: its first chunk is not JSON; export it again")
-        if kind in (b"JSON", b"BIN\0"):
-            chunks[kind] = opened.read(offset, size)
+        if text is None:
+            if kind != b"JSON" or size > MAX_JSON_BYTES:
+                raise InvalidSceneError(f"{opened.name} is not valid GLB: its first chunk is not JSON; export it again")
+            text = opened.read(offset, size)
+        elif kind == b"BIN\0":
+            if offset + size > opened.size:
+                raise opened.cut_short(offset + size)
+            return text, (offset, size)
         offset += size
-    if not chunks:
+    if text is None:
         raise opened.cut_short(offset + _CHUNK_HEADER.size)
-    return chunks[b"JSON"], chunks.get(b"BIN\0")
+    return text, None
 
 
 def _refuse_constant(name: str) -> NoReturn:

@@ -184,6 +184,7 @@ def _record(level: int, rest: int) -> np.dtype:
     return np.dtype([*fields, ("rgba", "u1", 4), ("rest", _SH[level], rest)])
 
 
+@np.errstate(all="ignore")  # values may be any floats; they are not cleaned here
 def _read_section(opened: SceneFile, headers: _Headers, section: _Section, out: Splats) -> None:
     """Decode the records of a section, some thousand at a time, into ``out``."""
     ends, centres = _read_buckets(opened, section) if headers.level and section.count else (None, None)
@@ -193,15 +194,14 @@ def _read_section(opened: SceneFile, headers: _Headers, section: _Section, out: 
         rows = block[: section.count - start]
         opened.read_into(section.offset + start * section.dtype.itemsize, rows)
         part = out.select(slice(start, start + len(rows)))
-        with np.errstate(all="ignore"):  # values may be any floats; they are not cleaned here
-            if ends is None or centres is None:
-                part.means[:] = rows["means"]
-            else:
-                bucket = np.searchsorted(ends, np.arange(start, start + len(rows)), side="right")
-                part.means[:] = (rows["means"].astype(np.float64) - section.middle) * section.step + centres[bucket]
-            part.quats[:] = rows["quats"]
-            part.scales[:] = log_scales(rows["scales"])
-            _decode_rest(rows, order, headers, part.shN)
+        if ends is None or centres is None:
+            part.means[:] = rows["means"]
+        else:
+            bucket = np.searchsorted(ends, np.arange(start, start + len(rows)), side="right")
+            part.means[:] = (rows["means"].astype(np.float64) - section.middle) * section.step + centres[bucket]
+        part.quats[:] = rows["quats"]
+        part.scales[:] = log_scales(rows["scales"])
+        _decode_rest(rows, order, headers, part.shN)
         part.sh0[:] = SH0_OF_BYTE[rows["rgba"][:, :3]]
         part.opacities[:] = OPACITY_OF_BYTE[rows["rgba"][:, 3]]
 

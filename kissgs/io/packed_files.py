@@ -18,7 +18,12 @@ MAX_ZIP_ENTRIES = 1000
 MAX_TREE_ENTRIES = 100_000
 """Largest number of entries of a zip of many containers, each of which has up to eight files."""
 
-ZIP_MAGICS = (b"PK\x03\x04", b"PK\x05\x06")
+MAX_DIRECTORY_BYTES = 1 << 25
+"""Largest list of entries in a zip, which is read whole."""
+
+_END, _END64 = b"PK\x05\x06", b"PK\x06\x07"
+
+ZIP_MAGICS = (b"PK\x03\x04", _END)
 """First bytes of a zip file, and of an empty one."""
 
 
@@ -139,6 +144,7 @@ class ZipSource:
 def _open_zip(file: io.BufferedIOBase, label: str, most: int) -> tuple[zipfile.ZipFile, list[zipfile.ZipInfo]]:
     """Open a zip; return it and its files."""
     try:
+        _check_directory(file, label)
         archive = zipfile.ZipFile(file)
         entries = archive.infolist()
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, EOFError) as error:
@@ -148,11 +154,28 @@ def _open_zip(file: io.BufferedIOBase, label: str, most: int) -> tuple[zipfile.Z
     return archive, [entry for entry in entries if entry.filename and not entry.is_dir()]
 
 
+def _check_directory(file: io.BufferedIOBase, label: str) -> None:
+    """Refuse zips whose list of entries is too large to be read whole, or of a kind that no reader of SOG knows."""
+    end = file.seek(0, io.SEEK_END)
+    file.seek(max(0, end - (1 << 16) - 42))
+    tail = file.read()
+    file.seek(0)
+    at = tail.rfind(_END)
+    if at >= 0 and len(tail) >= at + 22:
+        if int.from_bytes(tail[at + 12 : at + 16], "little") > MAX_DIRECTORY_BYTES:
+            raise InvalidContainerError(
+                f"{label} has a list of entries above {MAX_DIRECTORY_BYTES} bytes; pack it again"
+            )
+        if tail[max(0, at - 20) : at].startswith(_END64):
+            raise InvalidContainerError(f"{label} is a zip64 file; pack it as an ordinary zip")
+
+
 def zip_names(file: io.BufferedIOBase) -> list[str]:
     """Return the names of all entries of a zip, folders included; none if it cannot be read."""
     try:
+        _check_directory(file, "the file")
         return zipfile.ZipFile(file).namelist()
-    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, EOFError):
+    except (InvalidContainerError, zipfile.BadZipFile, OSError, ValueError, NotImplementedError, EOFError):
         return []
 
 

@@ -21,7 +21,8 @@ SH_OF_BYTE = ((_BYTE - 128) / 128).astype(np.float32)
 
 def decode_half_positions(codes: UInt8[np.ndarray, "N 6"], out: Float32[np.ndarray, "N 3"]) -> None:
     """Decode positions of version 1: half floats."""
-    out[:] = codes.view("<f2")
+    with np.errstate(all="ignore"):  # values may be any floats; they are not cleaned here
+        out[:] = codes.view("<f2")
 
 
 def decode_positions(codes: UInt8[np.ndarray, "N 9"], fractional_bits: int, out: Float32[np.ndarray, "N 3"]) -> None:

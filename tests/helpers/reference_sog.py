@@ -108,7 +108,7 @@ def _rest(splats, codebook, files, plane, names, version):
     labels = [[(count - 1 - i) % 256, (count - 1 - i) // 256, 0] for i in range(count)]
     both = [names("shN_centroids.webp"), plane("shN_labels", labels, 3)]
     if version == 2:
-        return {"count": count, "bands": BANDS[k], "codebook": codebook, "files": both}
+        return {"count": max(count, 1), "bands": BANDS[k], "codebook": codebook, "files": both}
     return {"shape": [count, 3 * k], "mins": codebook[0], "maxs": codebook[255], "files": both}
 
 

@@ -73,7 +73,7 @@ def test_json_with_a_buffer_inside_or_beside(tmp_path):
 
 @pytest.mark.parametrize("version", [2, 3, 4])
 def test_spz_inside(version):
-    """The same Gaussians as the .spz alone; a rotation may differ by half a turn about an axis of the ellipsoid."""
+    """Equal Gaussians to those of the .spz alone; a rotation may differ by half a turn about an axis of the ellipsoid."""
     spz = spz_bytes(made_scene(65, 2, extremes=False), version)
     data = glb_bytes(*spz_document(spz, 65))
     assert read_gltf_info(data) == GltfInfo(count=65, sh_degree=2, primitives=1, binary=True, spz=True)
@@ -100,7 +100,7 @@ def covariances(splats):
 
 TURN = matrices(np.array([[0.5, 0.1, -0.7, 0.3]]))[0]
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
-"""From glTF's axes to those of a .ply."""
+"""Matrix from the axes of glTF to those of a .ply."""
 
 
 def test_nodes_move_scale_and_rotate():

@@ -146,7 +146,7 @@ def test_damaged_ksplat(data, message):
 @needs_splat_transform
 @pytest.mark.parametrize("count", [1, 65])
 def test_splat_agrees_with_splat_transform(count, tmp_path):
-    """That tool takes b / 255 * 2 - 1 for the bytes of rotations, of which 128 is not 0."""
+    """The tool takes b / 255 * 2 - 1 for the bytes of rotations, of which 128 is not 0."""
     path = tmp_path / "a.splat"
     path.write_bytes(splat_bytes(made_scene(count, 0)))
     theirs = read_ply(convert(path, tmp_path / "a.ply"))

@@ -206,7 +206,7 @@ def test_more_gaussians_than_the_limit_take_no_memory():
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("version", ["3", "4"])
 def test_splat_transform_writes_what_we_read(version, degree, count, tmp_path):
-    """That tool stores the axes of a .ply without saying so."""
+    """The tool stores the axes of a .ply without saying so."""
     with (tmp_path / "a.ply").open("wb") as file:
         write_ply(file, made_scene(count, degree))
     packed = convert(tmp_path / "a.ply", tmp_path / "a.spz", "--spz-version", version)
