@@ -15,10 +15,10 @@ from kissgs.io.atomic import reason_of
 MAX_ZIP_ENTRIES = 1000
 """Largest number of entries: a container has 12 files, to which users may add notes and previews."""
 
-MAX_TREE_ENTRIES = 100_000
+MAX_TREE_ENTRIES = 20_000
 """Largest number of entries of a zip of many containers, each of which has up to eight files."""
 
-MAX_DIRECTORY_BYTES = 1 << 25
+MAX_DIRECTORY_BYTES = 1 << 21
 """Largest list of entries in a zip, which is read whole."""
 
 _END, _END64 = b"PK\x05\x06", b"PK\x06\x07"

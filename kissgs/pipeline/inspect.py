@@ -11,13 +11,14 @@ import numpy as np
 from kissgs.core.errors import InvalidContainerError
 from kissgs.core.signed_log import signed_exp
 from kissgs.core.splats import ATTRIBUTES, clean
-from kissgs.io.gltf import read_gltf_info
-from kissgs.io.ksplat import read_ksplat_info
+from kissgs.io.gltf import GltfInfo, read_gltf_info
+from kissgs.io.ksplat import KsplatInfo, read_ksplat_info
 from kissgs.io.packed_files import Source, open_source
-from kissgs.io.ply import read_ply_info
-from kissgs.io.spz import read_spz_info
+from kissgs.io.ply import PlyInfo, read_ply_info
+from kissgs.io.splat import count_splat
+from kissgs.io.spz import SpzInfo, read_spz_info
 from kissgs.io.webp import decode_plane
-from kissgs.pipeline.inspect_sog import sog_facts, streamed_facts
+from kissgs.pipeline.inspect_sog import SogFacts, sog_facts, streamed_facts
 from kissgs.pipeline.scene_files import read_scene, stored_bytes
 from kissgs.pipeline.scene_formats import SceneFormat, recognise, scene_root
 from kissgs.sogxt.metadata import CHANNELS, Layout
@@ -67,6 +68,52 @@ class Info:
     def as_dict(self) -> dict[str, Any]:
         """Return all fields and derived figures for JSON."""
         return {**asdict(self), "bits_per_gaussian": self.bits_per_gaussian}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SceneInfo:
+    """Properties of a scene that its headers and metadata state.
+
+    Attributes:
+        format: format of the scene.
+        count: Gaussians.
+        sh_degree: 0 to 3.
+    """
+
+    format: SceneFormat
+    count: int
+    sh_degree: int
+
+
+def read_scene_info(path: Path, *, name: str | None = None) -> SceneInfo:
+    """Read the headers and metadata of a scene, without decoding it; errors in the rest are not found.
+
+    Args:
+        path: the file or folder.
+        name: name of the file, if ``path`` has another one; the ending tells ``.splat``.
+
+    Raises:
+        KissgsError: the file is not a scene.
+    """
+    kind = recognise(path, name=name)
+    if kind == "splat":
+        return SceneInfo(format=kind, count=count_splat(path), sh_degree=0)
+    found: PlyInfo | SpzInfo | KsplatInfo | GltfInfo | SogFacts | Info
+    if kind == "sog-xt":
+        found = _describe_sogxt(path)
+    elif kind == "sog":
+        found = sog_facts(scene_root(path))
+    elif kind == "streamed-sog":
+        found = streamed_facts(scene_root(path))
+    elif kind == "spz":
+        found = read_spz_info(path)
+    elif kind == "ksplat":
+        found = read_ksplat_info(path)
+    elif kind == "gltf":
+        found = read_gltf_info(path)
+    else:
+        found = read_ply_info(path)
+    return SceneInfo(format=kind, count=found.count, sh_degree=found.sh_degree)
 
 
 def describe(path: Path) -> Info:

@@ -29,26 +29,33 @@ _ENDINGS: dict[str, SceneFormat] = {".spz": "spz", ".glb": "gltf", ".gltf": "glt
 """Format of files whose content is not recognised: damaged ones, about which the reader says more."""
 
 
-def recognise(source: Path | bytes | Mapping[str, bytes]) -> SceneFormat:
+def recognise(
+    source: Path | bytes | Mapping[str, bytes], *, name: str | None = None, size: int | None = None
+) -> SceneFormat:
     """Return the format of a scene: a file, a folder, the bytes of a file, or a container's files in memory.
 
-    The metadata file of a SOG container stands for its folder. Bytes have no name, so that ``.splat`` among them is not
-    recognised.
+    The metadata file of a SOG container stands for its folder. ``.splat`` is recognised by its name only.
+
+    Args:
+        source: the scene, or the first 512 bytes of a file, of which every zip then counts as "sog-xt".
+        name: name of the file, if ``source`` has none or another one.
+        size: bytes of the whole file, if ``source`` is only its beginning.
     """
     if isinstance(source, Mapping):
         return _container_format(MemorySource(source))
-    name = "" if isinstance(source, bytes) else source.name.lower()
+    name = ("" if isinstance(source, bytes) else source.name) if name is None else name
+    name = name.lower()
     ending = Path(name).suffix
     if isinstance(source, Path) and (_is_folder(source) or scene_root(source) != source):
         return "streamed-sog" if name == LOD_NAME else _packed_format(scene_root(source), "sog-xt")
-    head, size = _beginning(source)
-    if found := _by_mark(head):
-        return found
+    head, found_size = _beginning(source)
+    if marked := _by_mark(head):
+        return marked
     if ending in _WITHOUT_MARK and head[:4] not in ZIP_MAGICS:
         return _WITHOUT_MARK[ending]
     if is_container(source):
         return _packed_format(source, "sog" if ending == ".sog" else "sog-xt")
-    if is_ksplat(head, size):
+    if is_ksplat(head, found_size if size is None else size):
         return "ksplat"
     if ending not in _ENDINGS and _is_json(head):
         return "gltf"

@@ -73,7 +73,7 @@ def test_json_with_a_buffer_inside_or_beside(tmp_path):
 
 @pytest.mark.parametrize("version", [2, 3, 4])
 def test_spz_inside(version):
-    """Equal Gaussians to those of the .spz alone; a rotation may differ by half a turn about an axis of the ellipsoid."""
+    """Equal Gaussians to those of the .spz alone; a rotation may differ by half a turn about its own axis."""
     spz = spz_bytes(made_scene(65, 2, extremes=False), version)
     data = glb_bytes(*spz_document(spz, 65))
     assert read_gltf_info(data) == GltfInfo(count=65, sh_degree=2, primitives=1, binary=True, spz=True)
