@@ -34,9 +34,11 @@ if TYPE_CHECKING:
     from kissgs.evaluation.results import Evaluation
     from kissgs.finetuning.result import FinetuneReport
     from kissgs.io.ply import PlyInfo, read_ply_info
+    from kissgs.pipeline.inspect import SceneInfo, read_scene_info
     from kissgs.pipeline.pipeline import Compressed, compact, compress, decompress
     from kissgs.pipeline.report import Report
     from kissgs.pipeline.scene_files import load, save
+    from kissgs.pipeline.scene_formats import recognise
     from kissgs.rendering.camera import Camera
     from kissgs.rendering.rasterizer import render
     from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
@@ -67,6 +69,7 @@ _HOMES = {
     "Remote": "client.remote",
     "RemoteError": "core.errors",
     "Report": "pipeline.report",
+    "SceneInfo": "pipeline.inspect",
     "Settings": "settings",
     "Splats": "core.splats",
     "UnsupportedError": "core.errors",
@@ -82,6 +85,8 @@ _HOMES = {
     "load_views": "cameras.captures.load",
     "measure_sensitivity": "rendering.sensitivity",
     "read_ply_info": "io.ply",
+    "read_scene_info": "pipeline.inspect",
+    "recognise": "pipeline.scene_formats",
     "render": "rendering.rasterizer",
     "sample_scene": "synthetic.scene",
     "save": "pipeline.scene_files",
@@ -110,6 +115,7 @@ __all__ = [
     "Remote",
     "RemoteError",
     "Report",
+    "SceneInfo",
     "Sensitivity",
     "Settings",
     "Splats",
@@ -128,6 +134,8 @@ __all__ = [
     "load_views",
     "measure_sensitivity",
     "read_ply_info",
+    "read_scene_info",
+    "recognise",
     "render",
     "sample_scene",
     "save",

@@ -44,8 +44,8 @@ CHECKED = [
     "rendering/metrics",
     "rendering/rasterizer",
     "rendering/sensitivity",
+    "sog",
     "sogxt/decode",
-    "sogxt/planes",
     "synthetic/scene",
 ]
 

@@ -28,7 +28,8 @@ from kissgs.core.errors import KissgsError, UnsupportedError
 
 app = typer.Typer(
     name="kissgs",
-    help="Compress 3D Gaussian Splatting scenes (.ply) into SOG-XT containers, which any browser can decode.",
+    help="Compress 3D Gaussian Splatting scenes (.ply, .sog, .spz and others) into SOG-XT containers, which any "
+    "browser can decode.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

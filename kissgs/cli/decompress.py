@@ -1,4 +1,4 @@
-"""``kissgs decompress``: decode containers into ``.ply`` files."""
+"""``kissgs decompress``: decode containers and scenes of other formats into ``.ply`` files."""
 
 from __future__ import annotations
 
@@ -31,17 +31,27 @@ def decompress(
         ),
     ] = None,
     max_gaussians: Annotated[
-        int | None, typer.Option(min=0, help="Refuse containers with more Gaussians. Default: 20 million.")
+        int | None, typer.Option(min=0, help="Refuse compressed files with more Gaussians. Default: 20 million.")
     ] = None,
+    level: Annotated[
+        int, typer.Option(min=0, help="Level of detail of a streamed SOG scene; 0 is the finest.", show_default=True)
+    ] = 0,
+    raw_axes: Annotated[
+        bool,
+        typer.Option(
+            "--raw-axes",
+            help="Take the axes of .spz as those of a .ply, as splat-transform writes them. Default: y up.",
+        ),
+    ] = False,
     threads: ThreadsOption = 0,
     force: ForceOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Decode containers into .ply files."""
+    """Decode containers, and .sog, .spz, .splat, .ksplat, .glb and .gltf scenes, into .ply files."""
+    from kissgs.core.limits import MAX_GAUSSIANS
     from kissgs.io.ply import write_ply
     from kissgs.pipeline.pipeline import decompress as run
-    from kissgs.sogxt.decode import MAX_GAUSSIANS
 
     def work(container: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"
@@ -50,6 +60,8 @@ def decompress(
                 source(container),
                 None if piped else target,
                 max_gaussians=MAX_GAUSSIANS if max_gaussians is None else max_gaussians,
+                level=level,
+                raw_axes=raw_axes,
                 overwrite=force,
                 threads=threads,
                 progress=progress,

@@ -23,8 +23,12 @@ from kissgs.cli.options import choice, device_of, open_views
 
 
 def evaluate(
-    reference: Annotated[Path, typer.Argument(metavar="REFERENCE", help="Original scene: .ply or container.")],
-    candidate: Annotated[Path, typer.Argument(metavar="CANDIDATE", help="Scene to evaluate: .ply or container.")],
+    reference: Annotated[
+        Path, typer.Argument(metavar="REFERENCE", help="Original scene, of any format that kissgs reads.")
+    ],
+    candidate: Annotated[
+        Path, typer.Argument(metavar="CANDIDATE", help="Scene to evaluate, of any format that kissgs reads.")
+    ],
     views: ViewsOption = None,
     scale: ScaleOption = None,
     images: ImagesOption = None,

@@ -13,7 +13,7 @@ from kissgs.cli.files import for_each_input, show
 
 
 def info(files: FilesArgument, as_json: JsonOption = False) -> None:
-    """Describe .ply files and containers: Gaussians, SH degree, bytes per file, value ranges."""
+    """Describe scenes of any format and containers: Gaussians, SH degree, bytes per file, value ranges."""
     from kissgs.cli.tables import info_table
     from kissgs.pipeline.inspect import describe
 

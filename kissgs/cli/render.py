@@ -89,7 +89,7 @@ SaveCameraOption = Annotated[
 
 
 def render(
-    file: Annotated[str, typer.Argument(metavar="FILE", help="Scene to render: .ply or container.")],
+    file: Annotated[str, typer.Argument(metavar="FILE", help="Scene to render, of any format that kissgs reads.")],
     output: OutputOption = None,
     view: ViewOption = None,
     orbit: OrbitOption = False,

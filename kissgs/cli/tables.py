@@ -153,12 +153,10 @@ def parts_table(parts: Mapping[str, int], count: int) -> Table:
 
 def info_table(info: Info) -> RenderableType:
     """Format the output of ``kissgs info``."""
-    kind = {"ply": "3DGS scene", "sog-xt": "SOG-XT container"}[info.kind]
-    if info.kind == "ply":
-        kind += f" ({info.details['encoding']}{', compressed' if info.details['compressed'] else ''})"
-    head = Text.assemble((info.path, "bold"), f"  {kind}, {size(info.bytes)}")
+    head = Text.assemble((info.path, "bold"), f"  {_kind(info)}, {size(info.bytes)}")
     body = f"{info.count:,} Gaussians, SH degree {info.sh_degree}, {info.bits_per_gaussian:.1f} bits per Gaussian"
-    of = "{} value" if info.kind == "ply" else "value of {} level"  # channels share a step, so few reach the highest
+    stored = info.kind in ("sog-xt", "sog", "streamed-sog")
+    of = "value of {} level" if stored else "{} value"  # channels share a step, so few reach the highest
     ends = [_right(of.format(end)) for end in ("lowest", "highest")]
     ranges = Table("attribute", *ends, box=None, pad_edge=False)
     for name, (low, high) in info.ranges.items():
@@ -166,13 +164,45 @@ def info_table(info: Info) -> RenderableType:
     blocks: list[RenderableType] = [head, Text(body), ranges]
     if info.parts:
         blocks.insert(2, parts_table(info.parts, info.count))
+    details = info.details
     if info.kind == "sog-xt":
-        details, origin = info.details, "unknown"
+        origin = "unknown"
         if details["version"]:
             origin = f"kissgs {details['version']} from {details['source_count']:,} Gaussians"
         grid, codebook = details["grid_side"], details["codebook_side"]
         blocks.append(Text(f"grid {grid} x {grid}, codebook {codebook} x {codebook}; encoder: {origin}"))
+    if info.kind == "streamed-sog":
+        levels = ", ".join(f"{count:,}" for count in details["levels"])
+        blocks.append(Text(f"Gaussians by level, finest first: {levels}; environment: {details['environment']:,}"))
     return Group(*blocks, *_changes(info.changed))
+
+
+def _kind(info: Info) -> str:
+    """Name the format, with what its header states."""
+    details = info.details
+    name = {
+        "ply": "3DGS scene",
+        "sog-xt": "SOG-XT container",
+        "sog": "SOG container",
+        "streamed-sog": "streamed SOG scene",
+        "spz": "SPZ scene",
+        "splat": ".splat scene",
+        "ksplat": ".ksplat scene",
+        "gltf": "glTF scene",
+    }[info.kind]
+    found = []
+    if info.kind == "ply":
+        found = [details["encoding"], "compressed" if details["compressed"] else ""]
+    elif info.kind == "sog":
+        found = [f"version {details['version']}", details["model"] or "", details["generator"] or ""]
+    elif info.kind == "spz":
+        found = [f"version {details['version']}", "antialiased" if details["antialiased"] else ""]
+    elif info.kind == "ksplat":
+        found = [f"compression level {details['compression_level']}"]
+    elif info.kind == "gltf":
+        found = ["GLB" if details["binary"] else "JSON", "compressed as SPZ" if details["spz"] else ""]
+    facts = ", ".join(filter(None, found))
+    return f"{name} ({facts})" if facts else name
 
 
 def _changes(changed: Mapping[str, int]) -> list[Text]:

@@ -85,10 +85,10 @@ class Remote:
         overwrite: bool = False,
         progress: Progress = silent,
     ) -> dict[str, Any]:
-        """Compress a ``.ply`` file on the service, and write the container to a local file.
+        """Compress a scene on the service, and write the container to a local file.
 
         Args:
-            source: the ``.ply`` file.
+            source: the scene: ``.ply``, ``.sog``, ``.spz``, ``.splat``, ``.ksplat`` or ``.glb``.
             destination: the ``.zip`` file to write, atomically.
             settings: None for the preset ``balanced``.
             evaluate: whether the service also compares rendered images.
@@ -100,7 +100,7 @@ class Remote:
             The status of the job: sizes, times and so on, see the API of the service.
 
         Raises:
-            InvalidSceneError: the ``.ply`` cannot be read, or is not a scene.
+            InvalidSceneError: the file cannot be read, or is not a scene.
             UnsupportedError: a limit is exceeded, or a setting is invalid.
             RemoteError: the service cannot be reached, refuses the job or fails.
             OutputError: ``destination`` cannot be written.
@@ -132,10 +132,10 @@ class Remote:
         evaluate: bool = False,
         progress: Progress = silent,
     ) -> dict[str, Any]:
-        """Upload a ``.ply`` file; retry if the connection breaks or the service is overloaded, without a second job.
+        """Upload a scene; retry if the connection breaks or the service is overloaded, without a second job.
 
         Args:
-            source: the ``.ply`` file.
+            source: the scene: ``.ply``, ``.sog``, ``.spz``, ``.splat``, ``.ksplat`` or ``.glb``.
             settings: None for the preset ``balanced``.
             evaluate: whether the service also compares rendered images.
             progress: receives "upload" and "wait for server".
@@ -303,7 +303,7 @@ def _size(path: Path) -> int:
     try:
         if not path.is_file():
             reason = "it is a folder or a device" if path.exists() else "there is no such file"
-            raise InvalidSceneError(f"cannot read {path}: {reason}; name a .ply file")
+            raise InvalidSceneError(f"cannot read {path}: {reason}; name a scene file")
         return path.stat().st_size
     except OSError as error:
         raise InvalidSceneError(f"cannot read {path}: {reason_of(error)}") from error

@@ -2,7 +2,7 @@
 
 KissgsError
 ├─ InvalidSceneError        a scene file, or the given arrays, are not a usable Gaussian scene
-├─ InvalidContainerError    the bytes are not a valid SOG-XT container
+├─ InvalidContainerError    the bytes are not a valid SOG-XT or SOG container
 ├─ InvalidViewsError        cameras or photographs that cannot be used: COLMAP, transforms.json, images
 ├─ UnsupportedError         valid input beyond a limit or a feature that kissgs does not have
 ├─ RemoteError              a kissgs service cannot be reached, or refuses the request
@@ -29,7 +29,7 @@ class InvalidSceneError(KissgsError):
 
 
 class InvalidContainerError(KissgsError):
-    """The bytes are not a valid SOG-XT container."""
+    """The bytes are not a valid SOG-XT or SOG container."""
 
     code = "invalid-container"
 

@@ -88,6 +88,18 @@ class Splats:
         return Splats(**{name: getattr(self, name)[index] for name in ATTRIBUTES})
 
 
+def empty_splats(count: int, coefficients: int) -> Splats:
+    """Return a scene of uninitialised arrays; ``coefficients`` is K, the number of SH coefficients in ``shN``."""
+    return Splats(
+        means=np.empty((count, 3), np.float32),
+        quats=np.empty((count, 4), np.float32),
+        scales=np.empty((count, 3), np.float32),
+        opacities=np.empty(count, np.float32),
+        sh0=np.empty((count, 3), np.float32),
+        shN=np.empty((count, coefficients, 3), np.float32),
+    )
+
+
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 

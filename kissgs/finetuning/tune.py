@@ -15,6 +15,7 @@ import torch
 from kissgs._version import __version__
 from kissgs.cameras.views import Views
 from kissgs.core.errors import OutputError
+from kissgs.core.limits import MAX_GAUSSIANS
 from kissgs.core.progress import Progress, as_stage, silent
 from kissgs.core.splats import ATTRIBUTES, Splats, clean
 from kissgs.evaluation.evaluate import evaluate
@@ -28,7 +29,7 @@ from kissgs.rendering.rasterizer import Device
 from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
 from kissgs.settings import FinetuneSettings
 from kissgs.sogxt.container import zip_bytes
-from kissgs.sogxt.decode import MAX_GAUSSIANS, decode
+from kissgs.sogxt.decode import decode
 from kissgs.sogxt.encode import Encoded
 from kissgs.training.checkpoint import Checkpoint
 from kissgs.training.loop import LrSchedule, TrainingPlan, exponential_lr, image_loss, torch_threads, train

@@ -11,7 +11,8 @@ import numpy as np
 from kissgs.core.array_types import Float32, Float64, Shaped, UInt32
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.progress import Progress
-from kissgs.core.splats import SH_C0, SH_REST_COUNTS, Splats
+from kissgs.core.splats import SH_C0, SH_REST_COUNTS, Splats, empty_splats
+from kissgs.io.activations import insert_largest
 from kissgs.io.ply_body import BLOCK_ALIGNMENT, check_complete, rows
 from kissgs.io.ply_header import Element, Header, PlyFile, sh_degree
 
@@ -19,9 +20,6 @@ _CHUNK = BLOCK_ALIGNMENT
 """Gaussians per row of element ``chunk``, given by the format; blocks of rows are multiples of it."""
 
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
-
-_QUAT_ORDER = np.array([[0, 1, 2, 3], [1, 0, 2, 3], [1, 2, 0, 3], [1, 2, 3, 0]])
-"""Indices of w, x, y, z in (largest, first, second, third of the others), by the index of the largest component."""
 
 
 def is_compressed(header: Header) -> bool:
@@ -72,14 +70,7 @@ def read_compressed(ply: PlyFile, degree: int, progress: Progress) -> Splats:
     """
     vertex = ply.header.elements["vertex"]
     n, k = vertex.count, SH_REST_COUNTS[degree]
-    splats = Splats(
-        means=np.empty((n, 3), np.float32),
-        quats=np.empty((n, 4), np.float32),
-        scales=np.empty((n, 3), np.float32),
-        opacities=np.empty(n, np.float32),
-        sh0=np.empty((n, 3), np.float32),
-        shN=np.empty((n, k, 3), np.float32),
-    )
+    splats = empty_splats(n, k)
     with np.errstate(all="ignore"):  # bounds may be any floats; values are not cleaned, as for any .ply
         _decode_vertices(ply, splats)
         progress("read", 1.0 if k == 0 else 0.5)
@@ -130,11 +121,7 @@ def _unpack_11_10_11(packed: UInt32[np.ndarray, " B"]) -> Float64[np.ndarray, "B
 def _unpack_quats(packed: UInt32[np.ndarray, " B"]) -> Float64[np.ndarray, "B 4"]:
     """Unpack smallest-three quaternions: two bits for the index of the largest component, 10 for each of the others."""
     small = (np.stack([packed >> shift & 1023 for shift in (20, 10, 0)], axis=1) / 1023 - 0.5) * np.sqrt(2)
-    largest = np.sqrt(np.maximum(0, 1 - (small * small).sum(axis=1, keepdims=True)))
-    parts = np.concatenate([largest, small], axis=1)
-    order = _QUAT_ORDER[packed >> 30]
-    quats: Float64[np.ndarray, "B 4"] = np.take_along_axis(parts, order, axis=1)
-    return quats
+    return insert_largest(small, (packed >> 30).astype(np.int64))
 
 
 def _lerp(

@@ -15,6 +15,7 @@ import numpy as np
 
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.splats import SH_REST_COUNTS
+from kissgs.io.scene_file import open_scene_file
 
 Encoding = Literal["ascii", "binary_little_endian", "binary_big_endian"]
 
@@ -110,17 +111,9 @@ def open_ply(source: Path | bytes, *, size: int | None = None) -> Iterator[PlyFi
     Raises:
         InvalidSceneError: the file cannot be read, or it has no valid PLY header.
     """
-    if isinstance(source, bytes):
-        yield _opened("the data", io.BytesIO(source), size)
-        return
-    try:
-        if not source.is_file():  # before opening, because opening a named pipe would wait for its writer
-            reason = "it is a folder or a device" if source.exists() else "there is no such file"
-            raise InvalidSceneError(f"cannot read {source}: {reason}; name a .ply file")
-        with source.open("rb") as file:
-            yield _opened(source.name, file, size)
-    except OSError as error:
-        raise InvalidSceneError(f"cannot read {source}: {(error.strerror or str(error)).lower()}") from error
+    with open_scene_file(source, ".ply") as opened:
+        header = _read_header(opened.file, opened.name)
+        yield PlyFile(opened.name, opened.file, opened.size if size is None else size, header)
 
 
 def sh_degree(element: Element, name: str) -> int:
@@ -141,12 +134,6 @@ def sh_degree(element: Element, name: str) -> int:
     if degree > 3 and 3 * ((degree + 1) ** 2 - 1) == count:
         raise UnsupportedError(f"{name} has SH degree {degree}; export it with degree 3 or lower")
     raise InvalidSceneError(f"{name} has {count} f_rest properties; SH degrees 0 to 3 have 0, 9, 24 or 45")
-
-
-def _opened(name: str, file: io.BufferedIOBase, size: int | None) -> PlyFile:
-    present = file.seek(0, io.SEEK_END)
-    file.seek(0)
-    return PlyFile(name, file, present if size is None else size, _read_header(file, name))
 
 
 def _read_header(file: io.BufferedIOBase, name: str) -> Header:

@@ -11,13 +11,19 @@ import numpy as np
 from kissgs.core.errors import InvalidContainerError
 from kissgs.core.signed_log import signed_exp
 from kissgs.core.splats import ATTRIBUTES, clean
-from kissgs.io.ply import read_ply, read_ply_info
-from kissgs.pipeline.scene_files import is_container
-from kissgs.sogxt.container import Source, open_source
+from kissgs.io.gltf import GltfInfo, read_gltf_info
+from kissgs.io.ksplat import KsplatInfo, read_ksplat_info
+from kissgs.io.packed_files import Source, open_source
+from kissgs.io.ply import PlyInfo, read_ply_info
+from kissgs.io.splat import count_splat
+from kissgs.io.spz import SpzInfo, read_spz_info
+from kissgs.io.webp import decode_plane
+from kissgs.pipeline.inspect_sog import SogFacts, sog_facts, streamed_facts
+from kissgs.pipeline.scene_files import read_scene, stored_bytes
+from kissgs.pipeline.scene_formats import SceneFormat, recognise, scene_root
 from kissgs.sogxt.metadata import CHANNELS, Layout
 from kissgs.sogxt.metadata_reader import read_layout
 from kissgs.sogxt.names import FILES, PLANES
-from kissgs.sogxt.planes import decode_plane
 
 NAMES = {"quaternions": "quats", "f_dc": "sh0", "f_rest_centroids": "shN"}
 MAX_PLANE_BYTES = 1 << 30
@@ -25,25 +31,27 @@ MAX_PLANE_BYTES = 1 << 30
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Info:
-    """Contents of a ``.ply`` or a container.
+    """Contents of a scene file or a container.
 
     Attributes:
         path: path of the file or folder.
-        kind: "ply" or "sog-xt".
-        count: Gaussians.
+        kind: format of the scene.
+        count: Gaussians; of a streamed scene, those of its finest level and the environment.
         sh_degree: 0 to 3.
         bytes: size of the file or the folder.
-        parts: bytes per file of a container; empty for a ``.ply``.
-        ranges: per attribute, over all channels, the smallest and largest finite value (``.ply``), or the values of the
-            lowest and highest level (container; where channels share a step, few reach the highest).
-        changed: Gaussians that cleaning would remove or correct (``.ply``), or that the encoder removed or corrected
-            (container), by reason.
+        parts: bytes per file of a container, per container of a streamed scene; empty for other files.
+        ranges: per attribute, over all channels, the smallest and largest finite value, or the values of the lowest and
+            highest level (containers; where channels share a step, few reach the highest).
+        changed: Gaussians that cleaning would remove or correct, or that the encoder removed or corrected (SOG-XT), by
+            reason; empty for SOG, whose images are not decoded for this.
         details: encoding and whether it is PlayCanvas' compressed layout (``.ply``); side of grid and codebook, version
-            and settings of the encoder (container).
+            and settings of the encoder (SOG-XT); version, variant of the renderer, generator and size of the codebook
+            (SOG); Gaussians per level and of the environment (streamed SOG); version, antialiasing and precision of
+            positions (``.spz``); compression level and sections (``.ksplat``); primitives and compression (glTF).
     """
 
     path: str
-    kind: Literal["ply", "sog-xt"]
+    kind: SceneFormat
     count: int
     sh_degree: int
     bytes: int
@@ -62,30 +70,114 @@ class Info:
         return {**asdict(self), "bits_per_gaussian": self.bits_per_gaussian}
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SceneInfo:
+    """Properties of a scene that its headers and metadata state.
+
+    Attributes:
+        format: format of the scene.
+        count: Gaussians.
+        sh_degree: 0 to 3.
+    """
+
+    format: SceneFormat
+    count: int
+    sh_degree: int
+
+
+def read_scene_info(path: Path, *, name: str | None = None) -> SceneInfo:
+    """Read the headers and metadata of a scene, without decoding it; errors in the rest are not found.
+
+    Args:
+        path: the file or folder.
+        name: name of the file, if ``path`` has another one; the ending tells ``.splat``.
+
+    Raises:
+        KissgsError: the file is not a scene.
+    """
+    kind = recognise(path, name=name)
+    if kind == "splat":
+        return SceneInfo(format=kind, count=count_splat(path), sh_degree=0)
+    found: PlyInfo | SpzInfo | KsplatInfo | GltfInfo | SogFacts | Info
+    if kind == "sog-xt":
+        found = _describe_sogxt(path)
+    elif kind == "sog":
+        found = sog_facts(scene_root(path))
+    elif kind == "streamed-sog":
+        found = streamed_facts(scene_root(path))
+    elif kind == "spz":
+        found = read_spz_info(path)
+    elif kind == "ksplat":
+        found = read_ksplat_info(path)
+    elif kind == "gltf":
+        found = read_gltf_info(path)
+    else:
+        found = read_ply_info(path)
+    return SceneInfo(format=kind, count=found.count, sh_degree=found.sh_degree)
+
+
 def describe(path: Path) -> Info:
     """Describe a scene file.
 
-    No image of a container is decoded, except the mask if the metadata does not state the number of Gaussians.
+    No image of a container is decoded, except SOG-XT's mask if the metadata does not state the number of Gaussians.
 
     Raises:
         KissgsError: the file is not a usable scene or container.
     """
-    return _describe_container(path) if is_container(path) else _describe_ply(path)
+    kind = recognise(path)
+    if kind == "sog-xt":
+        return _describe_sogxt(path)
+    if kind == "sog" or kind == "streamed-sog":
+        return _describe_sog(path, kind)
+    return _describe_file(path, kind)
 
 
-def _describe_ply(path: Path) -> Info:
-    header, splats = read_ply_info(path), read_ply(path)
+def _describe_sog(path: Path, kind: Literal["sog", "streamed-sog"]) -> Info:
+    root = scene_root(path)
+    facts = sog_facts(root) if kind == "sog" else streamed_facts(root)
     return Info(
         path=str(path),
-        kind="ply",
+        kind=kind,
+        count=facts.count,
+        sh_degree=facts.sh_degree,
+        bytes=stored_bytes(path),
+        parts=facts.parts,
+        ranges=facts.ranges,
+        changed={},
+        details=facts.details,
+    )
+
+
+def _describe_file(path: Path, kind: SceneFormat) -> Info:
+    details, splats = _details(path, kind), read_scene(path)
+    return Info(
+        path=str(path),
+        kind=kind,
         count=len(splats),
         sh_degree=splats.sh_degree,
         bytes=path.stat().st_size,
         parts={},
         ranges={name: _extremes(getattr(splats, name)) for name in ATTRIBUTES if getattr(splats, name).size},
         changed=clean(splats)[1].as_dict(),
-        details={"encoding": header.encoding, "compressed": header.compressed},
+        details=details,
     )
+
+
+def _details(path: Path, kind: SceneFormat) -> dict[str, Any]:
+    """Return what the header of a file states besides count and SH degree."""
+    if kind == "ply":
+        header = read_ply_info(path)
+        return {"encoding": header.encoding, "compressed": header.compressed}
+    if kind == "spz":
+        spz = read_spz_info(path)
+        return {"version": spz.version, "antialiased": spz.antialiased, "fractional_bits": spz.fractional_bits}
+    if kind == "ksplat":
+        ksplat = read_ksplat_info(path)
+        return {"compression_level": ksplat.level, "sections": ksplat.sections}
+    if kind == "gltf":
+        gltf = read_gltf_info(path)
+        return {"binary": gltf.binary, "primitives": gltf.primitives, "spz": gltf.spz}
+    return {}
 
 
 def _extremes(values: np.ndarray) -> tuple[float, float]:
@@ -96,8 +188,9 @@ def _extremes(values: np.ndarray) -> tuple[float, float]:
     return low, high
 
 
-def _describe_container(path: Path) -> Info:
-    with open_source(path) as files:
+def _describe_sogxt(path: Path) -> Info:
+    root = scene_root(path)
+    with open_source(root) as files:
         layout = read_layout(files)
         present = files.names()
         missing = [name for name in PLANES if name not in present]
@@ -111,7 +204,7 @@ def _describe_container(path: Path) -> Info:
         kind="sog-xt",
         count=count,
         sh_degree=layout.sh_degree,
-        bytes=sum(parts.values()) if path.is_dir() else path.stat().st_size,
+        bytes=sum(parts.values()) if root.is_dir() else path.stat().st_size,
         parts=parts,
         ranges=_stored_ranges(layout),
         changed=made.changed if made else {},

@@ -12,17 +12,18 @@ import numpy as np
 from kissgs.compaction.result import Compacted
 from kissgs.core.array_types import Int
 from kissgs.core.errors import UnsupportedError
+from kissgs.core.limits import MAX_GAUSSIANS
 from kissgs.core.progress import Progress, SearchNote, as_stage, ignore_stop_search, silent
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats
 from kissgs.core.timing import StageTimer, peak_memory
 from kissgs.pipeline.report import Report
-from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, save
+from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, save
 from kissgs.rendering.rasterizer import Device
 from kissgs.settings import EncodeSettings, Settings
 from kissgs.settings.encode import GOALS
 from kissgs.sogxt.container import check_destination, is_packed, stored_sizes, write_container, zip_bytes
-from kissgs.sogxt.decode import MAX_GAUSSIANS, decode
+from kissgs.sogxt.decode import decode
 from kissgs.training.checkpoint import delete_checkpoints, finetune_checkpoint_path
 
 if TYPE_CHECKING:
@@ -78,7 +79,7 @@ def compact(
     """Reduce the number of Gaussians of a scene while keeping its renderings: score, prune, train.
 
     Args:
-        source: a scene, or the path or the bytes of a ``.ply`` or a container.
+        source: a scene, or the path or the bytes of a file of any format that :func:`kissgs.load` reads.
         destination: ``.ply`` to write; by default nothing is written.
         settings: their group ``compact`` says how many Gaussians to keep, and how: for example
             ``Settings.from_preset("balanced", compact={"ratio": 0.2})``.
@@ -146,7 +147,8 @@ def compress(
     """Compress a scene into a SOG-XT container.
 
     Args:
-        source: a scene, or the path or the bytes of a ``.ply`` or a container (which is decoded and encoded again).
+        source: a scene, or the path or the bytes of a file of any format that :func:`kissgs.load` reads (a container is
+            decoded and encoded again).
         destination: ``.zip`` or folder to write; by default nothing is written.
         settings: by default those of the preset ``balanced``. If their group ``compact`` has a budget, the scene is
             compacted first, see :func:`kissgs.compact`; if their group ``finetune`` is ``enabled``, the levels are then
@@ -256,16 +258,21 @@ def decompress(
     destination: AnyPath | None = None,
     *,
     max_gaussians: int = MAX_GAUSSIANS,
+    level: int = 0,
+    raw_axes: bool = False,
     overwrite: bool = False,
     threads: int = 0,
     progress: Progress = silent,
 ) -> Splats:
-    """Decode a SOG-XT container.
+    """Decode a SOG-XT container, or a scene of another compressed format.
 
     Args:
-        source: path of a zip or a folder, the bytes of a zip, or the files in memory.
+        source: path of a zip or a folder, the bytes of a zip, or the files in memory; or any other file that
+            :func:`kissgs.load` reads, except a ``.ply``.
         destination: ``.ply`` to write; by default nothing is written.
-        max_gaussians: refuse a container that holds more, before memory is allocated for them.
+        max_gaussians: refuse a compressed file that holds more, before memory is allocated for them.
+        level: level of detail of a streamed SOG scene; 0 is the finest.
+        raw_axes: read ``.spz`` that stores the axes of a ``.ply`` without saying so.
         overwrite: replace ``destination`` if it exists.
         threads: number of threads; 0 means one per processor.
         progress: receives events.
@@ -275,13 +282,21 @@ def decompress(
 
     Raises:
         InvalidContainerError: the container is damaged.
-        UnsupportedError: the container has a feature that kissgs does not read.
+        InvalidSceneError: a file of another format is damaged.
+        UnsupportedError: the file has a feature that kissgs does not read.
         OutputError: ``destination`` cannot be written.
     """
     if destination is not None:
         check_ply(Path(destination), overwrite=overwrite)
-    scene = source if isinstance(source, bytes | Mapping) else Path(source)
-    splats = decode(scene, max_gaussians=max_gaussians, threads=threads, progress=progress)
+    splats = read_scene(
+        source if isinstance(source, bytes | Mapping) else Path(source),
+        max_gaussians=max_gaussians,
+        level=level,
+        raw_axes=raw_axes,
+        threads=threads,
+        progress=progress,
+        only_containers=True,
+    )
     if destination is not None:
         save(splats, destination, overwrite=overwrite, progress=progress)
     return splats

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from kissgs.cameras.views import Views
 from kissgs.core.errors import StopSearch, UnsupportedError
+from kissgs.core.limits import MAX_GAUSSIANS
 from kissgs.core.progress import SearchNote
 from kissgs.core.root_finding import StopRule, find_root
 from kissgs.core.splats import Splats
@@ -20,7 +21,7 @@ from kissgs.planning.sh_codebook import COEFFICIENTS, codebook_side
 from kissgs.settings import EncodeSettings
 from kissgs.settings.encode import GOALS
 from kissgs.sogxt.container import stored_sizes
-from kissgs.sogxt.decode import MAX_GAUSSIANS, decode
+from kissgs.sogxt.decode import decode
 from kissgs.sogxt.encode import Encoded
 
 if TYPE_CHECKING:

@@ -1,33 +1,58 @@
-"""Scenes in files: read a ``.ply`` or a container, write a ``.ply``."""
+"""Scenes in files: read every format, write a ``.ply``."""
 
 from __future__ import annotations
 
-import io
+from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
 
 from kissgs.core.errors import InvalidContainerError, OutputError
+from kissgs.core.limits import MAX_GAUSSIANS
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Cleaned, Splats, clean
 from kissgs.io.atomic import atomic_file, reason_of, refuse_existing
+from kissgs.io.gltf import read_gltf
+from kissgs.io.ksplat import read_ksplat
 from kissgs.io.ply import read_ply, write_ply
-from kissgs.sogxt.container import is_packed, sniff_format
-from kissgs.sogxt.decode import MAX_GAUSSIANS, decode
+from kissgs.io.splat import read_splat
+from kissgs.io.spz import read_spz
+from kissgs.pipeline.scene_formats import recognise, scene_root
+from kissgs.sog import streamed
+from kissgs.sog.decode import decode as decode_sog
+from kissgs.sogxt.decode import decode as decode_sogxt
 
 AnyPath = str | PathLike[str]
 
 
-def load(path: AnyPath, *, max_gaussians: int = MAX_GAUSSIANS, threads: int = 0, progress: Progress = silent) -> Splats:
-    """Read and clean a scene: a ``.ply`` of any common 3DGS tool, or a SOG-XT container (zip or folder).
+def load(
+    path: AnyPath,
+    *,
+    max_gaussians: int = MAX_GAUSSIANS,
+    level: int = 0,
+    raw_axes: bool = False,
+    threads: int = 0,
+    progress: Progress = silent,
+) -> Splats:
+    """Read and clean a scene of any format: see docs/reference/formats.md.
 
-    A container with more than ``max_gaussians`` is refused before memory is allocated for them.
+    Args:
+        path: ``.ply``, ``.spz``, ``.splat``, ``.ksplat``, ``.glb`` or ``.gltf``; a SOG-XT or SOG container (zip,
+            folder, or its ``meta.json``); a streamed SOG scene (zip, folder, or its ``lod-meta.json``).
+        max_gaussians: largest number of Gaussians of a compressed file; more are refused before memory is allocated.
+        level: level of detail of a streamed scene; 0 is the finest.
+        raw_axes: read ``.spz`` that stores the axes of a ``.ply`` without saying so, as some tools write it.
+        threads: number of threads; 0 means one per processor.
+        progress: receives events.
 
     Raises:
-        InvalidSceneError: the ``.ply`` is not a usable scene.
+        InvalidSceneError: the file is not a usable scene.
         InvalidContainerError: the container is damaged.
         UnsupportedError: the file is valid, but uses a feature that kissgs does not read.
     """
-    return clean(_read(Path(path), threads, progress, max_gaussians))[0]
+    splats = read_scene(
+        Path(path), max_gaussians=max_gaussians, level=level, raw_axes=raw_axes, threads=threads, progress=progress
+    )
+    return clean(splats)[0]
 
 
 def save(splats: Splats, path: AnyPath, *, overwrite: bool = False, progress: Progress = silent) -> None:
@@ -42,25 +67,6 @@ def save(splats: Splats, path: AnyPath, *, overwrite: bool = False, progress: Pr
     check_ply(path, overwrite=overwrite)
     with atomic_file(path, overwrite=overwrite) as file:
         write_ply(file, splats, progress=progress)
-
-
-def is_container(source: Path | bytes) -> bool:
-    """Whether a source is a container rather than a ``.ply``; every command decides by this function.
-
-    A folder is a container, and so is a zip under any name, also with a prefix such as a self-extractor. If the file
-    cannot be opened, the ending ``.zip`` decides.
-    """
-    if isinstance(source, bytes):
-        return sniff_format(io.BytesIO(source)) == "zip"
-    try:
-        if source.is_dir():
-            return True
-        if source.is_file():  # opening a named pipe would block
-            with source.open("rb") as file:
-                return sniff_format(file) == "zip"
-    except (OSError, ValueError):
-        pass
-    return is_packed(source)
 
 
 def check_ply(path: Path, *, overwrite: bool) -> None:
@@ -85,24 +91,54 @@ def open_scene(source: Splats | AnyPath | bytes, threads: int, progress: Progres
         return splats, cleaned, source.nbytes
     progress("read", 0.0)
     scene = source if isinstance(source, bytes) else Path(source)
-    splats, cleaned = clean(_read(scene, threads, progress))
+    splats, cleaned = clean(read_scene(scene, threads=threads, progress=progress))
     return splats, cleaned, len(scene) if isinstance(scene, bytes) else stored_bytes(scene)
 
 
-def _read(source: Path | bytes, threads: int, progress: Progress, max_gaussians: int = MAX_GAUSSIANS) -> Splats:
-    """Read a scene without cleaning; the limit is for containers, whose decoded size can be far above their bytes."""
-    if is_container(source):
-        return decode(source, max_gaussians=max_gaussians, threads=threads, progress=progress)
-    return read_ply(source, progress=progress)
+def read_scene(
+    source: Path | bytes | Mapping[str, bytes],
+    *,
+    max_gaussians: int = MAX_GAUSSIANS,
+    level: int = 0,
+    raw_axes: bool = False,
+    threads: int = 0,
+    progress: Progress = silent,
+    only_containers: bool = False,
+) -> Splats:
+    """Read a scene without cleaning; the parameters are those of :func:`load`.
+
+    ``max_gaussians`` is for formats whose decoded size can be far above their bytes. With ``only_containers``, a
+    ``.ply`` is refused.
+
+    Raises:
+        KissgsError: the scene cannot be read.
+    """
+    found = recognise(source)
+    root = scene_root(source) if isinstance(source, Path) else source
+    if found == "streamed-sog":
+        return streamed.decode(root, level=level, max_gaussians=max_gaussians, threads=threads, progress=progress)
+    if found == "sog":
+        return decode_sog(root, max_gaussians=max_gaussians, threads=threads, progress=progress)
+    if found == "sog-xt" or (only_containers and found == "ply") or isinstance(source, Mapping):
+        return decode_sogxt(root, max_gaussians=max_gaussians, threads=threads, progress=progress)
+    if found == "spz":
+        return read_spz(source, max_gaussians=max_gaussians, raw_axes=raw_axes, progress=progress)
+    if found == "gltf":
+        return read_gltf(source, max_gaussians=max_gaussians, progress=progress)
+    reader = {"splat": read_splat, "ksplat": read_ksplat, "ply": read_ply}[found]
+    return reader(source, progress=progress)
 
 
 def stored_bytes(path: Path) -> int:
-    """Return the size of a file, or of all files in a folder, in bytes.
+    """Return the size of a file, or of all files in a folder and below it, in bytes.
 
     Raises:
         InvalidContainerError: the path cannot be read.
     """
     try:
-        return sum(entry.stat().st_size for entry in path.iterdir()) if path.is_dir() else path.stat().st_size
+        root = scene_root(path)
+        if not root.is_dir():
+            return root.stat().st_size
+        return sum(entry.stat().st_size for entry in root.rglob("*") if entry.is_file())
     except OSError as error:
         raise InvalidContainerError(f"cannot read {path}: {reason_of(error)}") from error

@@ -14,24 +14,21 @@ import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Int, UInt8, UInt16
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
+from kissgs.core.limits import MAX_GAUSSIANS
 from kissgs.core.progress import Progress, silent
 from kissgs.core.signed_log import signed_exp
-from kissgs.core.splats import SH_REST_COUNTS, Splats
+from kissgs.core.splats import SH_REST_COUNTS, Splats, empty_splats
 from kissgs.core.threads import Workers
-from kissgs.sogxt.container import Source, open_source
+from kissgs.io.packed_files import Source, open_source
+from kissgs.io.webp import decode_plane
 from kissgs.sogxt.metadata import TILE_COLUMNS, TILE_ROWS, Layout
 from kissgs.sogxt.metadata_reader import read_layout
-from kissgs.sogxt.planes import decode_plane
 
 CHUNK = 1 << 14
 """Gaussians per task."""
 
 CHANNELS_OF_PLAIN = {"quaternions": 4, "scales": 3, "f_dc": 3, "opacities": 1}
 """Number of channels of the attributes that are one image of 8-bit levels each."""
-
-
-MAX_GAUSSIANS = 20_000_000
-"""Default limit: 5 GB of arrays. A container of a few kilobytes can declare more than any machine's memory holds."""
 
 
 def decode(
@@ -162,7 +159,7 @@ class _Planes:
         self.refuse_more_than(self.max_gaussians, count, "Gaussians")
         # No cell indices are needed if all padding is at the end.
         cells = None if mask[:count].all() else np.flatnonzero(mask)
-        splats = _empty(count, self.coefficients)
+        splats = empty_splats(count, self.coefficients)
         outputs = (splats.quats, splats.scales, splats.sh0, splats.opacities[:, None])
         plain = [(*self.plain[field], out) for field, out in zip(CHANNELS_OF_PLAIN, outputs, strict=True)]
         shN = splats.shN.reshape(count, 3 * self.coefficients)
@@ -184,18 +181,6 @@ class _Planes:
 def _entry(labels: UInt8[np.ndarray, "N C"], side: int) -> Int[np.ndarray, " N"]:
     """Return the index of the codebook entry: row (green) × S + column (red)."""
     return labels[:, 1].astype(np.int64) * side + labels[:, 0]
-
-
-def _empty(count: int, coefficients: int) -> Splats:
-    """Return a scene of uninitialised arrays."""
-    return Splats(
-        means=np.empty((count, 3), np.float32),
-        quats=np.empty((count, 4), np.float32),
-        scales=np.empty((count, 3), np.float32),
-        opacities=np.empty(count, np.float32),
-        sh0=np.empty((count, 3), np.float32),
-        shN=np.empty((count, coefficients, 3), np.float32),
-    )
 
 
 class _Lookup:

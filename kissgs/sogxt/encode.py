@@ -15,6 +15,7 @@ from kissgs.core.progress import Progress, silent
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import NOTHING_CLEANED, Cleaned, Splats
 from kissgs.core.threads import blas_workers
+from kissgs.io.webp import pixels_crc32
 from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.planner import plan_encoding, visible_gaussians
 from kissgs.planning.quantize import Quantized, observed_range
@@ -23,7 +24,7 @@ from kissgs.planning.sh_codebook import Codebook
 from kissgs.settings import EncodeSettings
 from kissgs.settings.encode import GOALS
 from kissgs.sogxt import metadata, names
-from kissgs.sogxt.planes import compress_images, pixels_crc32
+from kissgs.sogxt.planes import compress_images
 
 
 @dataclass(frozen=True, slots=True)

@@ -110,7 +110,7 @@ class Layout(BaseModel):
     count: int | None = Field(None, ge=0)
     provenance: Provenance | None = None
     crc32: dict[str, Annotated[int, Field(ge=0, lt=1 << 32)]] = Field(default_factory=dict)
-    """CRC-32 of each image's pixels (:func:`kissgs.sogxt.planes.pixels_crc32`); in ``meta.json`` only."""
+    """CRC-32 of each image's pixels (:func:`kissgs.io.webp.pixels_crc32`); in ``meta.json`` only."""
 
     def limits(self, field: str) -> tuple[np.ndarray, np.ndarray]:
         """Return ``low`` and ``high`` of a field, one number per channel: float32 numbers, as float64."""

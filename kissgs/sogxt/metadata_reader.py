@@ -11,7 +11,7 @@ import yaml
 from pydantic import ValidationError
 
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
-from kissgs.sogxt.container import Source
+from kissgs.io.packed_files import Source
 from kissgs.sogxt.metadata import CHANNELS, TILE_COLUMNS, TILE_ROWS, Layout
 from kissgs.sogxt.names import CHECKSUM, JSON_NAME, YAML_NAME
 

@@ -1,18 +1,14 @@
-"""Image planes <-> lossless WebP bytes."""
+"""Compression of all planes of a container, in parallel."""
 
 from __future__ import annotations
 
-import io
-import struct
-import zlib
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from PIL import Image, WebPImagePlugin
 
 from kissgs.core.array_types import UInt8
-from kissgs.core.errors import InvalidContainerError
 from kissgs.core.threads import Workers
+from kissgs.io.webp import encode_plane
 from kissgs.settings import EncodeSettings
 
 HIGHEST_EFFORT = (100, 6)
@@ -35,88 +31,3 @@ def compress_images(
     names = sorted(images, key=lambda name: (not name.startswith("f_rest_centroids"), -images[name].size))
     files = dict(zip(names, pool.map(work, names, report), strict=True))
     return {name: files[name] for name in images}
-
-
-def encode_plane(image: UInt8[np.ndarray, "H W C"], *, quality: int, method: int) -> bytes:
-    """Compress one image of 1, 3 or 4 channels losslessly; ``quality`` and ``method`` set libwebp's effort.
-
-    Without ``exact``, libwebp would blacken the colour of pixels whose fourth channel is 0.
-    """
-    image_file = Image.fromarray(image[:, :, 0] if image.shape[2] == 1 else image)
-    buffer = io.BytesIO()
-    image_file.save(buffer, "WEBP", lossless=True, exact=True, quality=quality, method=method)
-    return buffer.getvalue()
-
-
-def pixels_crc32(image: UInt8[np.ndarray, "H W C"]) -> int:
-    """Return the CRC-32 of an image of 1, 3 or 4 channels as a browser decodes it, to RGBA.
-
-    Some browsers' decoders are fast but not exact, or add noise; with this checksum the web decoder detects it.
-    """
-    rgba = np.full((*image.shape[:2], 4), 255, dtype=np.uint8)
-    rgba[:, :, : max(image.shape[2], 3)] = image
-    return zlib.crc32(rgba.data)
-
-
-def decode_plane(
-    data: bytes, name: str, *, width: int, height: int, channels: int, crc32: int | None = None
-) -> UInt8[np.ndarray, "pixels C"]:
-    """Decompress one image to rows of pixels.
-
-    Args:
-        data: a WebP file.
-        name: name of the file, for error messages.
-        width: required width, pixels; checked before memory is allocated.
-        height: required height, pixels; checked before memory is allocated.
-        channels: number of channels to return: 1 (the first), 3, or 4 (the fourth is 255 if the file has none).
-        crc32: required checksum of the pixels (:func:`pixels_crc32`); None if unknown.
-
-    Raises:
-        InvalidContainerError: not a lossless WebP, of a wrong size, or damaged.
-    """
-    found = probe_webp(data, name)
-    if found != (width, height):
-        raise InvalidContainerError(
-            f"{name} is {found[0]} x {found[1]} pixels; the metadata asks for {width} x {height}"
-        )
-    try:
-        # Image.open would first import the plugins of all other formats.
-        with WebPImagePlugin.WebPImageFile(io.BytesIO(data)) as image_file:
-            image_file.load()
-            pixels = np.asarray(image_file)
-    except (OSError, ValueError, SyntaxError, EOFError, MemoryError) as error:
-        raise InvalidContainerError(f"{name} is damaged: its WebP data cannot be decoded") from error
-    if crc32 is not None and pixels_crc32(pixels) != crc32:
-        raise InvalidContainerError(f"{name} is damaged: its pixels are not those that were stored")
-    if channels == 4 and pixels.shape[2] == 3:
-        pixels = np.concatenate([pixels, np.full((height, width, 1), 255, dtype=np.uint8)], axis=2)
-    return pixels.reshape(width * height, -1)[:, :channels]
-
-
-def probe_webp(data: bytes, name: str) -> tuple[int, int]:
-    """Return width and height in pixels, from the header alone.
-
-    Raises:
-        InvalidContainerError: not a WebP file, or lossy, animated or cut off.
-    """
-    if len(data) < 30 or data[:4] != b"RIFF" or data[8:12] != b"WEBP":
-        raise InvalidContainerError(f"{name} is not a WebP image")
-    if struct.unpack_from("<I", data, 4)[0] + 8 > len(data):
-        raise InvalidContainerError(f"{name} is cut off: its header announces more bytes than there are")
-    position, size = 12, None
-    while position + 8 <= len(data):
-        kind, length = data[position : position + 4], struct.unpack_from("<I", data, position + 4)[0]
-        body = position + 8
-        if kind == b"VP8L" and body + 5 <= len(data) and data[body] == 0x2F:
-            bits = struct.unpack_from("<I", data, body + 1)[0]
-            found = (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
-            if size not in (None, found):
-                break
-            return found
-        if kind == b"VP8X" and body + 10 <= len(data):
-            wide, high = data[body + 4 : body + 7] + b"\0", data[body + 7 : body + 10] + b"\0"
-            size = struct.unpack("<I", wide)[0] + 1, struct.unpack("<I", high)[0] + 1
-        if kind in (b"VP8 ", b"ANIM", b"ANMF"):
-            raise InvalidContainerError(f"{name} is a lossy or animated WebP; planes must be lossless")
-        position = body + length + (length & 1)
-    raise InvalidContainerError(f"{name} is damaged: it has no lossless WebP image inside")

@@ -139,6 +139,7 @@ class JobStatus(ApiModel):
     estimate: Estimate | None = None
     options: JobOptions
     upload_bytes: int = Field(description="Size of the upload in bytes.")
+    source_format: str | None = Field(None, description="Format of the upload, once the job has succeeded.")
     gaussians: int = Field(description="Number of Gaussians in the upload.")
     sh_degree: int = Field(ge=0, le=3)
     kept: int | None = Field(None, description="Number of Gaussians in the container.")

@@ -10,7 +10,8 @@ from ..core.problems import Problem
 from ..core.schemas import JobOptions
 
 DESCRIPTION = """\
-Upload a 3D Gaussian Splatting scene (`.ply`), follow the job, download a SOG-XT container of a few megabytes.
+Upload a 3D Gaussian Splatting scene (`.ply`, `.sog`, `.spz`, `.splat`, `.ksplat`, `.glb`), follow the job, download a
+SOG-XT container of a few megabytes.
 
     curl -F file=@scene.ply -F 'options={"preset": "balanced"}' localhost:8000/v1/jobs
     curl 'localhost:8000/v1/jobs/ID?wait=30'

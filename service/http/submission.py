@@ -84,6 +84,7 @@ async def submit(
             path,
             at_most=_scene_bytes(request, kind, context.settings.max_upload_bytes),
         )
+        spool.name = name or ""
         async with spool:
             if kind == FORM_TYPE:
                 submission = await _receive_form(context, request, spool, parsed, name, key)
@@ -129,13 +130,13 @@ def _check_headers(request: Request, kind: str) -> None:
     encoding = request.headers.get("content-encoding", "identity").strip().lower()
     if encoding != "identity":
         raise ProblemError(
-            "media-type", f"the content encoding {encoding[:40]!r} is not supported; send the .ply without it"
+            "media-type", f"the content encoding {encoding[:40]!r} is not supported; send the scene without it"
         )
     if kind != FORM_TYPE and kind not in RAW_TYPES:
         raise ProblemError(
             "media-type",
             f"the media type {kind[:80]!r} is not supported; send a form with the field 'file' (curl -F file=@x.ply) "
-            "or the .ply itself as application/octet-stream",
+            "or the scene itself as application/octet-stream",
         )
 
 
@@ -192,6 +193,7 @@ async def _receive_form(
                     )
                 seen.append(field)
                 name = name or filename if field == "file" else name
+                spool.name = filename or name or "" if field == "file" else spool.name
             case PartData(data) if seen[-1] == "file":
                 await spool.write(data)
             case PartData(data):
@@ -241,7 +243,7 @@ def _queue(context: ServiceContainer, submission: Submission, owner: str) -> tup
         idempotency_key=submission.key,
     )
     try:
-        context.storage.adopt(received.path, job.id)
+        context.storage.adopt(received.path, job.id, received.file_name)
         return context.admission.add(job), True
     except LimitExceeded:  # a concurrent request with the same key was faster
         context.storage.remove_job(job.id)

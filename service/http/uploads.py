@@ -28,6 +28,12 @@ BLOCK_BYTES = 1 << 20
 LAST_LINE = re.compile(rb"\nend_header[ \t\r]*\n")
 """Last line of a header, matched as a whole because a comment may end with ``end_header``."""
 
+UPLOAD_ENDINGS = {"ply": "ply", "sog": "sog", "spz": "spz", "splat": "splat", "ksplat": "ksplat", "gltf": "glb"}
+"""Formats of uploads, and their file endings: all that are one file."""
+
+HEAD_BYTES = 512
+"""Bytes from which a format is recognised."""
+
 CLOSE = {"Connection": "close"}
 
 STEP_BYTES = 16 << 20
@@ -36,24 +42,35 @@ STEP_BYTES = 16 << 20
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """Complete upload: path, size, SHA-256 and header."""
+    """Complete upload: path, size, SHA-256 and what its headers state."""
 
     path: Path
     size: int
     sha256: str
-    info: kissgs.PlyInfo
+    info: kissgs.SceneInfo
+
+    @property
+    def file_name(self) -> str:
+        """Name of the upload in the folder of its job."""
+        return f"scene.{UPLOAD_ENDINGS[self.info.format]}"
 
 
 class Spool:
-    """Writes one ``.ply`` to disk. As a context manager, removes it unless :meth:`finish` has succeeded.
+    """Writes one scene to disk. As a context manager, removes it unless :meth:`finish` has succeeded.
+
+    The header of a ``.ply`` is checked while it arrives; other formats when they are complete.
 
     Args:
         at_most: maximum number of bytes according to the client; None if unknown.
+
+    Attributes:
+        name: file name of the scene according to the client; set it before the first :meth:`write`.
     """
 
     def __init__(self, settings: ServiceSettings, admission: Admission, path: Path, at_most: int | None = None) -> None:
         self._settings, self._admission, self._path = settings, admission, path
         self._at_most = at_most
+        self.name = ""
         self._pending = bytearray()
         self._size, self._reserved, self._written = 0, 0, 0
         self._hash = hashlib.sha256()
@@ -108,10 +125,7 @@ class Spool:
             file.flush()
             os.fsync(file.fileno())
             file.close()
-        try:
-            info = kissgs.read_ply_info(self._path)
-        except kissgs.KissgsError as error:
-            raise self._named(error) from error
+        info = self._read_info()
         self._refuse_count(info)
         self._kept = True
         return Received(self._path, self._size, self._hash.hexdigest(), info)
@@ -147,11 +161,30 @@ class Spool:
             text = f"the upload cannot be written: {reason}; try again later"
             raise ProblemError("disk-full", text, retry_after=FULL_SECONDS) from error
 
+    def _read_info(self) -> kissgs.SceneInfo:
+        """Read the headers of the complete upload; refuse formats that are not one binary file."""
+        name = f"upload{Path(self.name).suffix}"
+        with self._path.open("rb") as file:
+            if _is_text(file.read(HEAD_BYTES)):  # as large as the upload, and would be parsed in this process
+                raise ProblemError("unsupported", "the upload is JSON; send glTF as .glb")
+        try:
+            if kissgs.recognise(self._path, name=name) not in UPLOAD_ENDINGS:
+                raise ProblemError(
+                    "unsupported",
+                    "the upload is a zip file, but not a .sog; send a .ply, .sog, .spz, .splat, .ksplat or .glb",
+                )
+            return kissgs.read_scene_info(self._path, name=name)
+        except kissgs.KissgsError as error:
+            raise self._named(error) from error
+
     def _check_header(self) -> None:
         """Validate the header as soon as it has arrived, long before the last byte of an invalid file."""
         head, limit = bytes(self._pending), self._settings.max_header_bytes
         self._checked = True
         whole = self._at_most if self._at_most is not None else self._settings.max_upload_bytes
+        name, start = f"upload{Path(self.name).suffix}", head[:HEAD_BYTES]
+        if _is_text(start) or kissgs.recognise(start, name=name, size=whole) != "ply":
+            return
         try:
             info = kissgs.read_ply_info(head[:limit], size=max(whole, self._size))
         except kissgs.KissgsError as error:
@@ -166,7 +199,7 @@ class Spool:
                 "prune the scene first, or compress it with the command line",
             )
 
-    def _refuse_count(self, info: kissgs.PlyInfo) -> None:
+    def _refuse_count(self, info: kissgs.SceneInfo | kissgs.PlyInfo) -> None:
         if info.count > self._settings.max_gaussians:
             raise ProblemError(
                 "unsupported",
@@ -177,7 +210,14 @@ class Spool:
     def _named(self, error: kissgs.KissgsError) -> ProblemError:
         """Convert an error of the library to a problem that names the upload instead of a path of the server."""
         text = str(error).replace(str(self._path), self._path.name).replace(self._path.name, "the upload")
-        return ProblemError(error.code, text.replace("the data", "the upload"))
+        text = text.replace("the data", "the upload").replace("the input", "the upload")
+        if "the upload" not in text:
+            text = f"the upload cannot be read: {text}"
+        return ProblemError("invalid-scene" if error.code == "invalid-container" else error.code, text)
+
+
+def _is_text(head: bytes) -> bool:
+    return head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{") and b"\0" not in head
 
 
 async def timed(request: Request, settings: ServiceSettings, stopping: asyncio.Event) -> AsyncIterator[bytes]:
@@ -229,7 +269,7 @@ def scene_name(given: str | None) -> str:
     """Return a scene name that is safe in listings and downloads: no path, no control characters, never empty."""
     name = re.split(r"[/\\]", unicodedata.normalize("NFC", given or ""))[-1]
     name = "".join(c for c in name if unicodedata.category(c)[0] != "C" and c not in '"<>|:*?')
-    if name.lower().endswith(".ply"):
-        name = name[:-4]
+    for ending in UPLOAD_ENDINGS.values():
+        name = name[: -len(ending) - 1] if name.lower().endswith(f".{ending}") else name
     name = name.strip(" .")
     return name[:100] or "scene"

@@ -55,6 +55,8 @@ def main() -> None:
 
 
 def _compress(task: dict[str, Any], send: Send) -> dict[str, Any]:
+    import kissgs
+
     result = _run_compression(task, send)
     folder = Path(task["work"]) / "result"
     folder.mkdir()
@@ -73,6 +75,7 @@ def _compress(task: dict[str, Any], send: Send) -> dict[str, Any]:
         "container": _size_and_hash(folder / "scene.zip"),
         "report": _size_and_hash(folder / "report.json"),
         "files": files,
+        "source_format": kissgs.recognise(Path(task["source"])),
         "count": report["count"],
         "compacted": result.report.compacted,
         "finetuning": report["finetuning"],

@@ -71,6 +71,7 @@ def job_status(job: Job, queue: QueueEstimator) -> JobStatus:
         estimate=_estimate(job, queue) if waits or runs else None,
         options=JobOptions.model_validate(job.options),
         upload_bytes=job.upload_bytes,
+        source_format=result.get("source_format"),
         gaussians=job.gaussians,
         sh_degree=job.sh_degree,
         kept=result.get("count"),

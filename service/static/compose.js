@@ -68,7 +68,7 @@ export function composer(limits, presets, submit) {
     const [compact, finetune] = [budget(byId("keep").value), byId("finetune").checked && { enabled: true }];
     const optional = { ...(encode && { encode }), ...(compact && { compact }), ...(finetune && { finetune }) };
     if (chosen) return submit({ file: chosen, options: { preset, evaluate, ...optional } });
-    showError("Choose a .ply first.");
+    showError("Choose a scene first.");
     input.focus();
   });
 
@@ -110,7 +110,8 @@ function showError(text) {
  */
 function show(file, facts) {
   const kind = facts.packed ? "compressed .ply" : facts.shDegree === null ? null : `SH degree ${facts.shDegree}`;
-  const text = [bytes(file.size), `${count(facts.gaussians)} Gaussians`, kind].filter(Boolean).join(" · ");
+  const gaussians = facts.gaussians === null ? null : `${count(facts.gaussians)} Gaussians`;
+  const text = [bytes(file.size), gaussians, kind].filter(Boolean).join(" · ");
   byId("file-title").replaceChildren(file.name);
   byId("file-facts").textContent = text;
   setChosen(true);
@@ -118,7 +119,7 @@ function show(file, facts) {
 }
 
 function clear() {
-  byId("file-title").replaceChildren(el("u", {}, "Choose a .ply"), " or drop it anywhere on this page");
+  byId("file-title").replaceChildren(el("u", {}, "Choose a scene"), " or drop it anywhere on this page");
   setChosen(false);
 }
 

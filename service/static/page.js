@@ -62,7 +62,7 @@ function run(limits, presets) {
     home();
     compose.prefer(status.options);
     if (submission && !upload.busy()) upload.send(submission);
-    else compose.showError(`Choose ${status.name}.ply again: this page no longer has the file.`);
+    else compose.showError(`Choose the file of ${status.name} again: this page no longer has the file.`);
   }
 
   window.addEventListener("hashchange", () => show(true));

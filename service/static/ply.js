@@ -1,10 +1,10 @@
-/** Check of a file's header before the upload, for errors that the service would report after it. */
+/** Check of a file's beginning before the upload, for errors that the service would report after it. */
 
 import { bytes, count } from "./format.js";
 
 /**
- * @typedef {{gaussians: number, shDegree: number | null, packed: boolean}} PlyFacts
- *   shDegree is null if unknown; packed means `.compressed.ply`
+ * @typedef {{gaussians: number | null, shDegree: number | null, packed: boolean}} PlyFacts
+ *   gaussians and shDegree are null if unknown; packed means `.compressed.ply`
  */
 
 /** The service would refuse a file; the message is one sentence. */
@@ -25,8 +25,9 @@ export async function inspect(file, limits) {
     const [size, most] = [bytes(file.size), bytes(limits.max_upload_bytes)];
     throw new UnsuitableFile(`${file.name} has ${size}; the limit of this service is ${most}.`);
   }
-  const facts = parse(await head(file, limits.max_header_bytes), file.name);
-  if (facts.gaussians > limits.max_gaussians) {
+  const start = await head(file, limits.max_header_bytes);
+  const facts = otherFormat(start, file) ?? parse(new TextDecoder("latin1").decode(start), file.name);
+  if (facts.gaussians !== null && facts.gaussians > limits.max_gaussians) {
     const [number, most] = [count(facts.gaussians), count(limits.max_gaussians)];
     throw new UnsuitableFile(`${file.name} has ${number} Gaussians; the limit of this service is ${most}.`);
   }
@@ -39,11 +40,38 @@ export async function inspect(file, limits) {
  */
 async function head(file, size) {
   try {
-    return new TextDecoder("latin1").decode(await file.slice(0, size).arrayBuffer());
+    return new Uint8Array(await file.slice(0, size).arrayBuffer());
   } catch {
     throw new UnsuitableFile(`${file.name} cannot be read: it is a folder, or it has changed since it was chosen.`);
   }
 }
+
+/** Beginnings of formats other than .ply: zip (.sog), gzip and its plain successor (.spz), GLB. */
+const MARKS = ["PK\x03\x04", "\x1f\x8b", "NGSP", "glTF"];
+
+/**
+ * Return what can be seen of a file that is not a .ply; null for a .ply and for anything unknown.
+ * @param {Uint8Array} head
+ * @param {File} file
+ * @returns {PlyFacts | null}
+ */
+function otherFormat(head, file) {
+  const unknown = { gaussians: null, shDegree: null, packed: false };
+  const start = String.fromCharCode(...head.subarray(0, 24)); // not a TextDecoder: its latin1 is windows-1252
+  const mark = MARKS.find((each) => start.startsWith(each));
+  if (mark === "NGSP") return { ...unknown, gaussians: numberAt(start, 8) };
+  if (mark) return unknown;
+  if (/\.splat$/i.test(file.name) && !start.startsWith("ply") && file.size % 32 === 0)
+    return { gaussians: file.size / 32, shDegree: 0, packed: false };
+  return start.startsWith("\0\x01\0\0") && file.size >= 4096 ? { ...unknown, gaussians: numberAt(start, 16) } : null;
+}
+
+/**
+ * Return an unsigned number of four bytes, little-endian.
+ * @param {string} text
+ * @param {number} at
+ */
+const numberAt = (text, at) => [3, 2, 1, 0].reduce((sum, i) => sum * 256 + (text.charCodeAt(at + i) || 0), 0);
 
 /**
  * @param {string} text
@@ -51,7 +79,8 @@ async function head(file, size) {
  * @returns {PlyFacts}
  */
 function parse(text, name) {
-  if (!/^ply\s*\n/.test(text)) throw new UnsuitableFile(`${name} is not a .ply: it does not begin with "ply".`);
+  if (!/^ply\s*\n/.test(text))
+    throw new UnsuitableFile(`${name} is not a scene: send a .ply, .sog, .spz, .splat, .ksplat or .glb.`);
   const end = text.search(/^end_header\s*$/m);
   if (end < 0) throw new UnsuitableFile(`${name} is not a valid .ply: its header has no end.`);
   const header = text.slice(0, end);

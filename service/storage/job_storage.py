@@ -1,7 +1,7 @@
 """``JobStorage``: the data folder, with uploads in progress and one folder per job; clients choose no file names.
 
     incoming/TOKEN.part          an upload in progress
-    jobs/ID/scene.ply            the complete upload
+    jobs/ID/scene.ENDING         the complete upload: ply, sog, spz, splat, ksplat or glb
     jobs/ID/work-TOKEN/          files of a running job process
     jobs/ID/checkpoint*.npz      checkpoints of training, kept until the job ends
     jobs/ID/result/              the result, renamed to this when it is complete and on the disk
@@ -38,7 +38,10 @@ ORPHANED = ".orphaned"
 UNFINISHED = ("work-*", ".*.part")
 """Patterns of incomplete files in a job's folder: work folders, and checkpoints that are being written."""
 
-JOB_FILES = (*UNFINISHED, "scene.ply", "result", "checkpoint*.npz", "decoded.ply", "decoded.json")
+UPLOAD_FILES = ("scene.ply", "scene.sog", "scene.spz", "scene.splat", "scene.ksplat", "scene.glb")
+"""Names of a job's upload, of which it has one: the ending tells formats that are not recognised by their content."""
+
+JOB_FILES = (*UNFINISHED, *UPLOAD_FILES, "result", "checkpoint*.npz", "decoded.ply", "decoded.json")
 """Patterns of all files that the service creates in a job's folder."""
 
 _JOB, _UPLOAD = re.compile("[0-9a-f]{32}"), re.compile(r"[0-9a-f]{16}\.part")
@@ -87,17 +90,18 @@ class JobStorage:
         """Return a new path for an upload."""
         return self.incoming / f"{secrets.token_hex(8)}.part"
 
-    def adopt(self, upload: Path, job_id: str) -> None:
-        """Move a complete upload to the folder of a job."""
+    def adopt(self, upload: Path, job_id: str, name: str = UPLOAD_FILES[0]) -> None:
+        """Move a complete upload to the folder of a job; ``name`` is one of :data:`UPLOAD_FILES`."""
         folder = self.jobs / job_id
         folder.mkdir()
-        upload.rename(folder / "scene.ply")
+        upload.rename(folder / name)
         sync_folder(folder)
         sync_folder(self.jobs)
 
     def upload(self, job_id: str) -> Path:
         """Return the path of the job's upload."""
-        return self.jobs / job_id / "scene.ply"
+        paths = [self.jobs / job_id / name for name in UPLOAD_FILES]
+        return next((path for path in paths if path.exists()), paths[0])
 
     def result(self, job_id: str) -> Path:
         """Return the path of the job's result, a folder that exists only if the result is complete."""

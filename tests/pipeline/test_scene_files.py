@@ -13,7 +13,8 @@ from helpers.command_line import run
 import kissgs
 from kissgs import InvalidContainerError, KissgsError, Settings, decompress, sample_scene
 from kissgs.pipeline.inspect import describe
-from kissgs.pipeline.scene_files import is_container, open_scene
+from kissgs.pipeline.scene_files import open_scene
+from kissgs.pipeline.scene_formats import is_container
 
 
 def zips() -> dict[str, bytes]:

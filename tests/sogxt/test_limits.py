@@ -9,11 +9,11 @@ from helpers.memory import takes_less_than
 
 import kissgs
 from kissgs.core.errors import OutputError, UnsupportedError
+from kissgs.io.webp import encode_plane
 from kissgs.settings import EncodeSettings
 from kissgs.sogxt import container
 from kissgs.sogxt.encode import encode
 from kissgs.sogxt.names import PLANES
-from kissgs.sogxt.planes import encode_plane
 
 
 def bomb(side):

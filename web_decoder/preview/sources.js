@@ -68,10 +68,16 @@ async function ofJob(id, signal) {
     container: new URL(`${job}/files/`, window.location.href).href,
     bytes: status.sizes.container,
     request,
-    original: status.links.source ? { url: `${job}/source`, bytes: status.upload_bytes } : null,
+    original: hasPly(status) ? { url: `${job}/source`, bytes: status.upload_bytes } : null,
     originalBytes: status.upload_bytes,
   };
 }
+
+/**
+ * Whether the upload is still there, as a .ply, which is what this page reads for comparisons.
+ * @param {{links: {source?: string}, source_format?: string}} status
+ */
+const hasPly = (status) => Boolean(status.links.source) && (status.source_format ?? "ply") === "ply";
 
 /**
  * @param {string} url

@@ -30,7 +30,7 @@ async def get_limits(context: Service) -> Limits:
     """Limits of uploads and jobs; requests beyond them are refused."""
     settings = context.settings
     return Limits(
-        formats=["ply", "compressed.ply"],
+        formats=["ply", "compressed.ply", "sog", "spz", "splat", "ksplat", "glb"],
         max_upload_bytes=settings.max_upload_bytes,
         max_header_bytes=settings.max_header_bytes,
         max_gaussians=settings.max_gaussians,

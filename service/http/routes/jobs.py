@@ -76,7 +76,7 @@ _BODY: dict[str, Any] = {
                     "required": ["file"],
                     "additionalProperties": False,
                     "properties": {
-                        "file": {"type": "string", "format": "binary", "description": "The `.ply`."},
+                        "file": {"type": "string", "format": "binary", "description": "The scene."},
                         "options": {"$ref": "#/components/schemas/JobOptions"},
                     },
                 },
@@ -132,10 +132,10 @@ async def submit_job(
     name: Name = None,
     idempotency_key: IdempotencyKey = None,
 ) -> JobStatus:
-    """Upload a `.ply` and create a job that compresses it.
+    """Upload a scene and create a job that compresses it.
 
-    The header and the limits are checked during the upload. After the response, the job is stored on disk and survives
-    a crash of the service.
+    The header of a `.ply` and the limits are checked during the upload, headers of other formats after it. After the
+    response, the job is stored on disk and survives a crash of the service.
     """
     job, _ = await submit(context, request, owner, options=options, name=name, key=idempotency_key)
     return await _accepted(context, response, job)
@@ -164,7 +164,7 @@ async def compress_now(
     name: Name = None,
     idempotency_key: IdempotencyKey = None,
 ) -> Response:
-    """Submit a `.ply` and answer with its container, if the job succeeds within `sync_seconds` of `/v1/limits`.
+    """Submit a scene and answer with its container, if the job succeeds within `sync_seconds` of `/v1/limits`.
 
     After that time the job continues, and the answer is 202 with its status as JSON. A client whose `Accept` header
     excludes JSON gets a 409 problem instead (`not-finished`), with `Location`, so that a program that saves every

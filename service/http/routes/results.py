@@ -74,12 +74,12 @@ async def get_decoded(context: Service, job: RequestedJob) -> Response:
 
 
 async def get_source(context: Service, job: RequestedJob) -> Response:
-    """The uploaded `.ply`, for comparisons, unless it was removed to free disk space."""
+    """The uploaded scene, for comparisons, unless it was removed to free disk space."""
     _ready(job)
     path = context.storage.upload(job.id)
     if not job.upload_kept:
         raise ProblemError("gone", "the upload was removed to free disk space; the result is still available")
-    media_type, download = "application/octet-stream", f"{job.name}.ply"
+    media_type, download = "application/octet-stream", f"{job.name}{path.suffix}"
     return StoredFile(path, sha256=job.upload_sha256, media_type=media_type, download=download, headers=_PRIVATE)
 
 

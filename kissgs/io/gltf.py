@@ -1,0 +1,275 @@
+"""glTF with ``KHR_gaussian_splatting``: GLB or JSON; also with the attributes in ``.spz`` inside it.
+
+All primitives of the scene's nodes are read, moved by the nodes' transforms, and turned from glTF's axes (x left, y up,
+z forward) to those of a ``.ply``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kissgs.core.array_types import Float64
+from kissgs.core.errors import InvalidSceneError, UnsupportedError
+from kissgs.core.progress import Progress, silent
+from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats, empty_splats
+from kissgs.io.activations import log_scales, opacity_logits, steps
+from kissgs.io.frames import Signs, mirror, move
+from kissgs.io.gltf_document import GLB_MAGIC, Document, node_matrix
+from kissgs.io.scene_file import open_scene_file, refuse_more_than
+from kissgs.io.spz import read_spz_frame, read_spz_info
+
+EXTENSION = "KHR_gaussian_splatting"
+SPZ_EXTENSIONS = ("KHR_gaussian_splatting_compression_spz_2", "KHR_gaussian_splatting_compression_spz")
+
+_MAX_INSTANCES = 10_000
+"""Largest number of primitives, each counted at every node that shows it."""
+
+_TO_PLY: Signs = (-1, -1, 1)
+"""Signs from glTF's axes to those of a ``.ply``."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GltfInfo:
+    """Properties of a scene that its JSON states."""
+
+    count: int
+    """Number of Gaussians."""
+    sh_degree: int
+    """SH degree, 0 to 3; the highest of all primitives."""
+    primitives: int
+    """Number of primitives, each counted at every node that shows it."""
+    binary: bool
+    """Whether it is GLB."""
+    spz: bool
+    """Whether attributes are compressed as ``.spz``."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Primitive:
+    """Primitive and where it stands: ``matrix`` is its node's transform. ``spz`` is the buffer view of its ``.spz``."""
+
+    attributes: dict[str, Any]
+    matrix: Float64[np.ndarray, "4 4"]
+    count: int
+    degree: int
+    spz: int | None
+
+
+def read_gltf_info(source: Path | bytes) -> GltfInfo:
+    """Read the JSON, and the headers of ``.spz`` inside.
+
+    Raises:
+        InvalidSceneError: as for :func:`read_gltf`.
+        UnsupportedError: as for :func:`read_gltf`.
+    """
+    with open_scene_file(source, ".glb") as opened:
+        binary = opened.file.read(4) == GLB_MAGIC
+        document = Document(opened, None if isinstance(source, bytes) else source.parent)
+        found = list(_primitives(document))
+    return GltfInfo(
+        count=sum(primitive.count for primitive in found),
+        sh_degree=max(primitive.degree for primitive in found),
+        primitives=len(found),
+        binary=binary,
+        spz=any(primitive.spz is not None for primitive in found),
+    )
+
+
+def read_gltf(source: Path | bytes, *, max_gaussians: int | None = None, progress: Progress = silent) -> Splats:
+    """Read a scene without cleaning it. Primitives of a lower SH degree get zeros for the coefficients above it.
+
+    Args:
+        source: A ``.glb`` or ``.gltf`` file, or the bytes of one. Buffers in other files must be below its folder.
+        max_gaussians: Largest number of Gaussians; more are refused before memory is allocated. None: no limit.
+        progress: Receives events of stage ``read``.
+
+    Raises:
+        InvalidSceneError: the file cannot be read, is not valid glTF, or has no Gaussians.
+        UnsupportedError: another kernel or colour space, an unknown compression, a node that stretches or mirrors, or
+            more Gaussians than ``max_gaussians``.
+    """
+    with open_scene_file(source, ".glb") as opened:
+        document = Document(opened, None if isinstance(source, bytes) else source.parent)
+        found = list(_primitives(document))
+        count = sum(primitive.count for primitive in found)
+        refuse_more_than(max_gaussians, count, document.name)
+        progress("read", 0.0)
+        splats = empty_splats(count, SH_REST_COUNTS[max(primitive.degree for primitive in found)])
+        start = 0
+        for primitive in found:
+            part = splats.select(slice(start, start + primitive.count))
+            if primitive.spz is None:
+                _read_attributes(document, primitive, part)
+            else:
+                _read_spz(document, primitive.spz, part)
+            _apply(document, primitive.matrix, part)
+            start += primitive.count
+            progress("read", start / max(count, 1))
+    _turn_to_ply(splats)
+    return splats
+
+
+def _primitives(document: Document) -> Iterator[_Primitive]:
+    """Yield the primitives that hold Gaussians.
+
+    Raises:
+        InvalidSceneError: there is none.
+    """
+    number = 0
+    for mesh, matrix in _instances(document):
+        for primitive in document.items("primitives", mesh):
+            splatting = document.child(document.child(primitive, "extensions"), EXTENSION)
+            if EXTENSION in document.child(primitive, "extensions"):
+                number += 1
+                yield _primitive(document, primitive, splatting, matrix)
+    if not number:
+        raise InvalidSceneError(
+            f"{document.name} has no Gaussians: none of its meshes uses {EXTENSION}; name a 3DGS scene"
+        )
+
+
+def _instances(document: Document) -> Iterator[tuple[dict[str, Any], Float64[np.ndarray, "4 4"]]]:
+    """Yield every mesh that the scene's nodes show, with its transform; without scenes, all meshes as they are."""
+    scenes = document.items("scenes")
+    if not scenes:
+        yield from ((mesh, np.eye(4)) for mesh in document.items("meshes"))
+        return
+    scene = document.item("scenes", document.root.get("scene", 0))
+    waiting = [(index, np.eye(4)) for index in _indices(document, scene, "nodes")]
+    for visited in range(_MAX_INSTANCES):
+        if not waiting:
+            return
+        index, above = waiting.pop(0)
+        node = document.item("nodes", index)
+        with np.errstate(all="ignore"):  # numbers that overflow are refused where they are used
+            matrix = above @ node_matrix(document, node)
+        if "mesh" in node:
+            yield document.item("meshes", node["mesh"]), matrix
+        waiting += [(child, matrix) for child in _indices(document, node, "children")]
+        if len(waiting) > _MAX_INSTANCES - visited:
+            break
+    raise document.invalid(f"its nodes form a circle or are more than {_MAX_INSTANCES}")
+
+
+def _indices(document: Document, parent: dict[str, Any], key: str) -> list[Any]:
+    found = parent.get(key, [])
+    if not isinstance(found, list):
+        raise document.invalid(f"{key} is not a list")
+    return found
+
+
+def _primitive(
+    document: Document, primitive: dict[str, Any], splatting: dict[str, Any], matrix: Float64[np.ndarray, "4 4"]
+) -> _Primitive:
+    """Check a primitive's extension and attributes."""
+    kernel, space = splatting.get("kernel", "ellipse"), splatting.get("colorSpace", "srgb_rec709_display")
+    if kernel != "ellipse":
+        raise UnsupportedError(f"{document.name} has the kernel {str(kernel)[:40]!r}; only 'ellipse' is read")
+    if space != "srgb_rec709_display":
+        raise UnsupportedError(
+            f"{document.name} has the colour space {str(space)[:40]!r}; export it with 'srgb_rec709_display'"
+        )
+    attributes = document.child(primitive, "attributes")
+    compressions = document.child(splatting, "extensions")
+    for name in compressions:
+        if name in SPZ_EXTENSIONS:
+            view = document.whole(document.child(compressions, name), "bufferView", -1)
+            header = read_spz_info(bytes(document.view(view, 512)[0]))
+            if "POSITION" in attributes and document.count(attributes["POSITION"]) != header.count:
+                raise document.invalid(f"its .spz has {header.count:,} Gaussians, its accessors another number")
+            return _Primitive(attributes, matrix, header.count, header.sh_degree, view)
+        raise UnsupportedError(f"{document.name} is compressed by {str(name)[:60]!r}; export it without or with .spz")
+    if "POSITION" not in attributes:
+        raise document.invalid("a primitive has no POSITION")
+    return _Primitive(attributes, matrix, document.count(attributes["POSITION"]), _degree(document, attributes), None)
+
+
+def _degree(document: Document, attributes: dict[str, Any]) -> int:
+    """Return the SH degree, all of whose coefficients must be there."""
+    prefix = f"{EXTENSION}:SH_DEGREE_"
+    present = {name.removeprefix(prefix) for name in attributes if name.startswith(prefix)}
+    degree = 0
+    for band in range(4):
+        wanted = {f"{band}_COEF_{i}" for i in range(2 * band + 1)}
+        if band == 0 or present & wanted:
+            missing = sorted(wanted - present)
+            if missing or degree < band - 1:
+                raise document.invalid(f"it lacks {prefix}{missing[0] if missing else f'{band - 1}_COEF_0'}")
+            degree = band
+    if any(name.startswith("4_") for name in present):
+        raise UnsupportedError(f"{document.name} has an SH degree above 3; export it with degree 3 or lower")
+    return degree
+
+
+def _read_attributes(document: Document, primitive: _Primitive, out: Splats) -> None:
+    """Read the accessors of a primitive into ``out``, in glTF's axes."""
+
+    def column(name: str, width: int) -> np.ndarray:
+        key = name if name == "POSITION" else f"{EXTENSION}:{name}"
+        if key not in primitive.attributes:
+            raise document.invalid(f"a primitive has no {key}")
+        values = document.numbers(primitive.attributes[key], width, key)
+        if len(values) != len(out):
+            raise document.invalid(f"{key} has {len(values):,} values for {len(out):,} Gaussians")
+        return values
+
+    with np.errstate(all="ignore"):  # values may be any floats; they are not cleaned here
+        out.means[:] = column("POSITION", 3)
+        out.quats[:] = np.roll(column("ROTATION", 4), 1, axis=1)  # x, y, z, w
+        scales = column("SCALE", 3)
+        if scales.size and float(scales.min()) < 0:
+            raise document.invalid("it has negative scales, as drafts of the extension had them")
+        opacities = column("OPACITY", 1)[:, 0]
+        for part in steps(len(out)):
+            out.scales[part] = log_scales(scales[part].astype(np.float64))
+            out.opacities[part] = opacity_logits(opacities[part].astype(np.float64))
+        out.sh0[:] = column("SH_DEGREE_0_COEF_0", 3)
+        bands = [f"SH_DEGREE_{band}_COEF_{i}" for band in range(1, primitive.degree + 1) for i in range(2 * band + 1)]
+        for i, name in enumerate(bands):
+            out.shN[:, i] = column(name, 3)
+        out.shN[:, len(bands) :] = 0
+
+
+def _read_spz(document: Document, view: int, out: Splats) -> None:
+    """Read a ``.spz`` inside the file into ``out``, in glTF's axes, which differ from its own (x right, z back)."""
+    stored, _ = read_spz_frame(bytes(document.view(view)[0]), max_gaussians=len(out))
+    mirror(stored, (-1, 1, -1))
+    for name in ATTRIBUTES:
+        if name != "shN":
+            getattr(out, name)[:] = getattr(stored, name)
+    coefficients = stored.shN.shape[1]
+    out.shN[:, :coefficients] = stored.shN
+    out.shN[:, coefficients:] = 0
+
+
+@np.errstate(all="ignore")  # numbers that overflow are refused
+def _apply(document: Document, matrix: Float64[np.ndarray, "4 4"], out: Splats) -> None:
+    """Move Gaussians by the transform of their node."""
+    if np.array_equal(matrix, np.eye(4)):
+        return
+    linear = matrix[:3, :3]
+    determinant = float(np.linalg.det(linear))
+    scale = abs(determinant) ** (1 / 3)
+    rotation = linear / scale if scale > 0 else linear
+    if not determinant > 0 or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4):
+        raise UnsupportedError(
+            f"{document.name} has a node that mirrors or stretches its Gaussians; apply the transform before the export"
+        )
+    move(out, rotation, scale, matrix[:3, 3])
+
+
+def _turn_to_ply(splats: Splats) -> None:
+    """Turn a scene from glTF's axes to those of a ``.ply``, half a turn about z.
+
+    The rotation of each Gaussian follows by half a turn of its own about the same axis, which its ellipsoid does not
+    show, so that files that were a ``.ply`` get back the same numbers.
+    """
+    mirror(splats, _TO_PLY)
+    w, x, y, z = (splats.quats[:, i].copy() for i in range(4))
+    for i, values in enumerate((z, -y, x, -w)):
+        splats.quats[:, i] = values

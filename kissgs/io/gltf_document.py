@@ -1,0 +1,223 @@
+"""glTF files as documents: GLB and JSON, their buffers, and accessors as arrays, checked before memory is taken."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import struct
+import urllib.parse
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from kissgs.core.array_types import Float64, Shaped
+from kissgs.core.errors import InvalidSceneError, UnsupportedError
+from kissgs.io.packed_files import is_below
+from kissgs.io.scene_file import SceneFile, open_scene_file
+
+GLB_MAGIC = b"glTF"
+
+MAX_JSON_BYTES = 1 << 22
+"""Largest size of the JSON in a GLB; a primitive of a scene takes some kilobytes."""
+
+MAX_GLTF_BYTES = 1 << 30
+"""Largest size of a ``.gltf``, whose buffers may be text inside it."""
+
+_GLB_HEADER = struct.Struct("<4sII")
+_CHUNK_HEADER = struct.Struct("<I4s")
+
+_DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+
+
+class Document:
+    """Parsed glTF file. Its methods raise InvalidSceneError for whatever contradicts the format.
+
+    The binary part of a GLB is read when it is needed, one buffer view at a time: the file must still be open.
+    """
+
+    def __init__(self, opened: SceneFile, folder: Path | None) -> None:
+        self.name, self._folder = opened.name, folder
+        text, self._binary = _split(opened)
+        self._opened = opened
+        try:
+            self.root = json.loads(text.decode("utf-8-sig"), parse_constant=_refuse_constant)
+        except (ValueError, RecursionError) as error:
+            raise InvalidSceneError(
+                f"{self.name} is not readable glTF: its JSON is damaged; export it again"
+            ) from error
+        if not isinstance(self.root, dict):
+            raise self.invalid("its JSON is no object")
+        self._buffers: dict[int, bytes] = {}
+        self._last: tuple[tuple[int, int], bytes] = ((0, 0), b"")
+
+    def invalid(self, problem: str) -> InvalidSceneError:
+        """Return the error of a file that contradicts the format."""
+        return InvalidSceneError(f"{self.name} is not valid glTF: {problem}; export it again")
+
+    def items(self, key: str, parent: dict[str, Any] | None = None) -> list[dict[str, Any]]:
+        """Return a list of objects, empty if the document has none."""
+        found = (self.root if parent is None else parent).get(key, [])
+        if not isinstance(found, list) or not all(isinstance(item, dict) for item in found):
+            raise self.invalid(f"{key} is not a list of objects")
+        return found
+
+    def item(self, key: str, index: object) -> dict[str, Any]:
+        """Return one object of a list by its index."""
+        found = self.items(key)
+        if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(found):
+            raise self.invalid(f"it names {key}[{str(index)[:20]!r}] of {len(found)}")
+        return found[index]
+
+    def child(self, parent: dict[str, Any], key: str) -> dict[str, Any]:
+        """Return an object inside an object, empty if there is none."""
+        found = parent.get(key, {})
+        if not isinstance(found, dict):
+            raise self.invalid(f"{key} is not an object")
+        return found
+
+    def whole(self, parent: dict[str, Any], key: str, default: int = 0) -> int:
+        """Return a whole number that is not negative."""
+        found = parent.get(key, default)
+        if isinstance(found, float) and found.is_integer():
+            found = int(found)
+        if not isinstance(found, int) or isinstance(found, bool) or not 0 <= found < 1 << 53:
+            raise self.invalid(f"{key} is not a whole number")
+        return found
+
+    def count(self, index: object) -> int:
+        """Return the number of elements of an accessor."""
+        return self.whole(self.item("accessors", index), "count", -1)
+
+    def accessor(self, index: object, width: int, what: str) -> Shaped[np.ndarray, "N C"]:
+        """Return an accessor as a view of its buffer, ``width`` columns of the type in the file."""
+        accessor = self.item("accessors", index)
+        if "sparse" in accessor or "bufferView" not in accessor:
+            raise UnsupportedError(f"{self.name} has sparse or empty data for {what}; export it without")
+        kind, code = accessor.get("type"), accessor.get("componentType")
+        if not isinstance(kind, str) or _WIDTHS.get(kind) != width or not isinstance(code, int) or code not in _DTYPES:
+            raise self.invalid(f"{what} is {str(kind)[:20]!r} of component type {str(code)[:20]!r}")
+        data, stride = self.view(accessor["bufferView"])
+        dtype, count = np.dtype(_DTYPES[code]), self.whole(accessor, "count", -1)
+        offset, row = self.whole(accessor, "byteOffset"), dtype.itemsize * width
+        stride = stride or row
+        if count and (stride < row or offset + stride * (count - 1) + row > len(data)):
+            raise self.invalid(f"{what} needs more bytes than its buffer has")
+        if not count:
+            return np.empty((0, width), dtype)
+        return np.ndarray((count, width), dtype, data, offset, (stride, dtype.itemsize))
+
+    def numbers(self, index: object, width: int, what: str) -> Shaped[np.ndarray, "N C"]:
+        """Return an accessor as floats; normalised integers become fractions of their largest value."""
+        values = self.accessor(index, width, what)
+        if values.dtype.kind == "f" or not self.item("accessors", index).get("normalized", False):
+            return values
+        if values.dtype.itemsize > 2:
+            raise self.invalid(f"{what} is normalised, but not of 8 or 16 bits")
+        return np.maximum(values.astype(np.float32) / np.float32(np.iinfo(values.dtype).max), np.float32(-1))
+
+    def view(self, index: object, limit: int | None = None) -> tuple[memoryview, int]:
+        """Return the bytes of a buffer view, at most ``limit``, and its stride; 0: rows stand one after another."""
+        view = self.item("bufferViews", index)
+        buffer, number = self.item("buffers", view.get("buffer")), int(str(view.get("buffer")))
+        offset, length = self.whole(view, "byteOffset"), self.whole(view, "byteLength", -1)
+        stride = self.whole(view, "byteStride")
+        uri = buffer.get("uri")
+        if uri is None and self._binary is not None and number == 0:
+            start, size = self._binary
+        else:
+            if number not in self._buffers:
+                self._buffers[number] = self._load(uri, number)
+            start, size = 0, len(self._buffers[number])
+        if offset + length > size:
+            raise self.invalid("a buffer view reaches beyond its buffer")
+        length = length if limit is None else min(length, limit)
+        if start == 0:
+            return memoryview(self._buffers[number])[offset : offset + length], stride
+        part = (start + offset, length)
+        if self._last[0] != part:  # rows with a stride have several attributes in one view
+            self._last = (part, self._opened.read(*part))
+        return memoryview(self._last[1]), stride
+
+    def _load(self, uri: object, index: int) -> bytes:
+        """Return the bytes of a buffer: text in the JSON, or a file beside the scene."""
+        if not isinstance(uri, str):
+            raise self.invalid(f"buffers[{index}] has no data")
+        if uri.startswith("data:"):
+            head, _, body = uri.partition(",")
+            try:
+                encoded = head.endswith(";base64")
+                return base64.b64decode(body, validate=True) if encoded else urllib.parse.unquote_to_bytes(body)
+            except (binascii.Error, ValueError) as error:
+                raise self.invalid(f"buffers[{index}].uri is not base64") from error
+        path = urllib.parse.unquote(uri)
+        if not is_below(path) or not path.isprintable():
+            raise UnsupportedError(f"{self.name} names a buffer outside its folder; put the file beside it")
+        if self._folder is None:
+            raise UnsupportedError(f"{self.name} needs the file {path[:80]!r} beside it; give the path, or a .glb")
+        with open_scene_file(self._folder / path, "buffer") as opened:
+            return opened.read(0, opened.size)
+
+
+def _split(opened: SceneFile) -> tuple[bytes, tuple[int, int] | None]:
+    """Return the JSON, and where the binary part of a GLB begins and how long it is."""
+    if opened.size < _GLB_HEADER.size or opened.read(0, 4) != GLB_MAGIC:
+        if opened.size > MAX_GLTF_BYTES:
+            raise UnsupportedError(f"{opened.name} has {opened.size:,} bytes of text; export it as .glb")
+        return opened.read(0, opened.size), None
+    _, version, length = _GLB_HEADER.unpack(opened.read(0, _GLB_HEADER.size))
+    if version != 2:
+        raise UnsupportedError(f"{opened.name} is GLB of version {version}; version 2 is read")
+    if length > opened.size:
+        raise opened.cut_short(length)
+    text, offset = None, _GLB_HEADER.size
+    while offset + _CHUNK_HEADER.size <= length:
+        size, kind = _CHUNK_HEADER.unpack(opened.read(offset, _CHUNK_HEADER.size))
+        offset += _CHUNK_HEADER.size
+        if text is None:
+            if kind != b"JSON" or size > MAX_JSON_BYTES:
+                raise InvalidSceneError(f"{opened.name} is not valid GLB: its first chunk is not JSON; export it again")
+            text = opened.read(offset, size)
+        elif kind == b"BIN\0":
+            if offset + size > opened.size:
+                raise opened.cut_short(offset + size)
+            return text, (offset, size)
+        offset += size
+    if text is None:
+        raise opened.cut_short(offset + _CHUNK_HEADER.size)
+    return text, None
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not JSON")
+
+
+def node_matrix(document: Document, node: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
+    """Return the transform of a node, from its matrix or its translation, rotation and scale."""
+    if "matrix" in node:
+        return _vector(document, node, "matrix", 16, None).reshape(4, 4).T
+    shift = _vector(document, node, "translation", 3, (0, 0, 0))
+    x, y, z, w = _vector(document, node, "rotation", 4, (0, 0, 0, 1))
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    matrix[:3, :3] *= _vector(document, node, "scale", 3, (1, 1, 1))
+    matrix[:3, 3] = shift
+    return matrix
+
+
+def _vector(
+    document: Document, node: dict[str, Any], key: str, count: int, default: tuple[int, ...] | None
+) -> Float64[np.ndarray, " count"]:
+    values = node.get(key, default)
+    valid = isinstance(values, list | tuple) and len(values) == count
+    if not valid or not all(
+        isinstance(v, int | float) and not isinstance(v, bool) and abs(v) < 1e30 for v in values or ()
+    ):
+        raise document.invalid(f"a node's {key} is not {count} numbers")
+    return np.array(values, dtype=np.float64)

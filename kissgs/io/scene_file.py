@@ -1,0 +1,84 @@
+"""Opening of a scene file: a path or bytes, its name for messages, its size, and reading with a check of both."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from kissgs.core.array_types import UInt8
+from kissgs.core.errors import InvalidSceneError, UnsupportedError
+
+
+@dataclass(frozen=True, slots=True)
+class SceneFile:
+    """Open file: ``name`` for messages, the seekable ``file``, and its ``size`` in bytes."""
+
+    name: str
+    file: io.BufferedIOBase
+    size: int
+
+    def read(self, offset: int, count: int) -> bytes:
+        """Return ``count`` bytes at ``offset``.
+
+        Raises:
+            InvalidSceneError: the file ends before.
+        """
+        if offset + count > self.size:
+            raise self.cut_short(offset + count)
+        self.file.seek(offset)
+        data = self.file.read(count)
+        if len(data) < count:
+            raise self.cut_short(offset + count)
+        return data
+
+    def read_into(self, offset: int, array: np.ndarray) -> None:
+        """Fill ``array``, which is contiguous, with the bytes at ``offset``.
+
+        Raises:
+            InvalidSceneError: the file ends before.
+        """
+        target: UInt8[np.ndarray, " bytes"] = array.view(np.uint8).reshape(-1)
+        self.file.seek(offset)
+        if self.file.readinto(target.data) < target.size:
+            raise self.cut_short(offset + target.size)
+
+    def cut_short(self, needed: int) -> InvalidSceneError:
+        """Return the error of a file that should have ``needed`` bytes or more."""
+        return InvalidSceneError(
+            f"{self.name} is cut short: it needs {needed:,} bytes but has {self.size:,}; export or download it again"
+        )
+
+
+@contextlib.contextmanager
+def open_scene_file(source: Path | bytes, ending: str) -> Iterator[SceneFile]:
+    """Open a file, or the bytes of one; ``ending`` is that of its format, for messages.
+
+    Raises:
+        InvalidSceneError: the file cannot be read.
+    """
+    if isinstance(source, bytes):
+        yield SceneFile("the data", io.BytesIO(source), len(source))
+        return
+    try:
+        if not source.is_file():  # before opening, because opening a named pipe would wait for its writer
+            reason = "it is a folder or a device" if source.exists() else "there is no such file"
+            raise InvalidSceneError(f"cannot read {source}: {reason}; name a {ending} file")
+        with source.open("rb") as file:
+            size = file.seek(0, io.SEEK_END)
+            file.seek(0)
+            yield SceneFile(source.name, file, size)
+    except OSError as error:
+        raise InvalidSceneError(f"cannot read {source}: {(error.strerror or str(error)).lower()}") from error
+
+
+def refuse_more_than(limit: int | None, count: int, name: str) -> None:
+    """Raise UnsupportedError if ``count`` Gaussians are more than ``limit``; None: no limit."""
+    if limit is not None and count > limit:
+        raise UnsupportedError(
+            f"{name} has {count:,} Gaussians; the limit is {limit:,}: raise it (--max-gaussians) if you trust the file"
+        )

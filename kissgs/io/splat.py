@@ -1,0 +1,77 @@
+"""The ``.splat`` format: 32 bytes per Gaussian, without a header, without view-dependent colour.
+
+Position and linear standard deviations are floats; colour and opacity, after their activations, and the rotation w, x,
+y, z are bytes. The axes are those of a ``.ply``. Nothing in a file says that it is one: its name's ending must.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from kissgs.core.array_types import Shaped
+from kissgs.core.errors import InvalidSceneError
+from kissgs.core.progress import Progress, silent
+from kissgs.core.splats import Splats, empty_splats
+from kissgs.io.activations import OPACITY_OF_BYTE, SH0_OF_BYTE, byte_quats, log_scales
+from kissgs.io.scene_file import SceneFile, open_scene_file, refuse_more_than
+
+ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
+"""One Gaussian."""
+
+_BLOCK = 1 << 14
+
+
+def count_splat(source: Path | bytes) -> int:
+    """Return the number of Gaussians, from the size of the file.
+
+    Raises:
+        InvalidSceneError: the file cannot be read, or its size is not a multiple of 32 bytes.
+    """
+    with open_scene_file(source, ".splat") as opened:
+        return _count(opened)
+
+
+def read_splat(source: Path | bytes, *, max_gaussians: int | None = None, progress: Progress = silent) -> Splats:
+    """Read a scene without cleaning it.
+
+    Args:
+        source: A file, or the bytes of one.
+        max_gaussians: Largest number of Gaussians; more are refused before memory is allocated. None: no limit.
+        progress: Receives events of stage ``read``.
+
+    Raises:
+        InvalidSceneError: the file cannot be read, or its size is not a multiple of 32 bytes.
+        UnsupportedError: more Gaussians than ``max_gaussians``.
+    """
+    with open_scene_file(source, ".splat") as opened:
+        count = _count(opened)
+        refuse_more_than(max_gaussians, count, opened.name)
+        progress("read", 0.0)
+        splats = empty_splats(count, 0)
+        block = np.empty(min(_BLOCK, count), ROW)
+        for start in range(0, count, _BLOCK):
+            rows = block[: count - start]
+            opened.read_into(start * ROW.itemsize, rows)
+            _decode(rows, splats.select(slice(start, start + len(rows))))
+            progress("read", (start + len(rows)) / count)
+        return splats
+
+
+def _count(opened: SceneFile) -> int:
+    if opened.size % ROW.itemsize:
+        raise InvalidSceneError(
+            f"{opened.name} is not a .splat file or is cut short: its {opened.size:,} bytes are not a multiple of 32; "
+            "export or download it again"
+        )
+    return opened.size // ROW.itemsize
+
+
+def _decode(rows: Shaped[np.ndarray, " B"], out: Splats) -> None:
+    """Decode rows into the arrays of ``out``, which has as many Gaussians."""
+    out.means[:] = rows["means"]
+    out.scales[:] = log_scales(rows["scales"])
+    out.quats[:] = byte_quats(rows["quats"])
+    out.sh0[:] = SH0_OF_BYTE[rows["rgba"][:, :3]]
+    out.opacities[:] = OPACITY_OF_BYTE[rows["rgba"][:, 3]]

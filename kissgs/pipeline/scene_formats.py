@@ -1,0 +1,151 @@
+"""Recognition of scene formats: by content where a format has a mark, else by the ending of the name."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+from kissgs.core.errors import InvalidContainerError
+from kissgs.io.gltf_document import GLB_MAGIC
+from kissgs.io.ksplat import is_ksplat
+from kissgs.io.packed_files import ZIP_MAGICS, MemorySource, Source, open_source, sniff_format, zip_names
+from kissgs.io.spz import is_spz
+from kissgs.sog.metadata import LOD_NAME, MAX_METADATA_BYTES, META_NAME
+from kissgs.sogxt.container import is_packed
+from kissgs.sogxt.names import YAML_NAME
+
+SceneFormat = Literal["ply", "sog-xt", "sog", "streamed-sog", "spz", "splat", "ksplat", "gltf"]
+"""All formats that are read. "ply" stands for unknown content too, about which its reader has the best messages."""
+
+HEAD_BYTES = 512
+"""Bytes at the beginning of a file that recognition needs."""
+
+_WITHOUT_MARK: dict[str, SceneFormat] = {".splat": "splat", ".ksplat": "ksplat"}
+
+_ENDINGS: dict[str, SceneFormat] = {".spz": "spz", ".glb": "gltf", ".gltf": "gltf", ".sog": "sog"}
+"""Format of files whose content is not recognised: damaged ones, about which the reader says more."""
+
+
+def recognise(
+    source: Path | bytes | Mapping[str, bytes], *, name: str | None = None, size: int | None = None
+) -> SceneFormat:
+    """Return the format of a scene: a file, a folder, the bytes of a file, or a container's files in memory.
+
+    The metadata file of a SOG container stands for its folder. ``.splat`` is recognised by its name only.
+
+    Args:
+        source: the scene, or the first 512 bytes of a file, of which every zip then counts as "sog-xt".
+        name: name of the file, if ``source`` has none or another one.
+        size: bytes of the whole file, if ``source`` is only its beginning.
+    """
+    if isinstance(source, Mapping):
+        return _container_format(MemorySource(source))
+    name = ("" if isinstance(source, bytes) else source.name) if name is None else name
+    name = name.lower()
+    ending = Path(name).suffix
+    if isinstance(source, Path) and (_is_folder(source) or scene_root(source) != source):
+        return "streamed-sog" if name == LOD_NAME else _packed_format(scene_root(source), "sog-xt")
+    head, found_size = _beginning(source)
+    if marked := _by_mark(head):
+        return marked
+    if ending in _WITHOUT_MARK and head[:4] not in ZIP_MAGICS:
+        return _WITHOUT_MARK[ending]
+    if is_container(source):
+        return _packed_format(source, "sog" if ending == ".sog" else "sog-xt")
+    if is_ksplat(head, found_size if size is None else size):
+        return "ksplat"
+    if ending not in _ENDINGS and _is_json(head):
+        return "gltf"
+    return _ENDINGS.get(ending, "ply")
+
+
+def scene_root(path: Path) -> Path:
+    """Return the folder of a SOG container if ``path`` is its metadata file, else ``path``."""
+    return path.parent if path.name in (META_NAME, LOD_NAME) and path.is_file() else path
+
+
+def is_container(source: Path | bytes) -> bool:
+    """Whether a source is a folder or a zip, rather than another file.
+
+    A zip may have any name, and a prefix such as a self-extractor. If the file cannot be opened, the ending ``.zip``
+    decides.
+    """
+    if isinstance(source, bytes):
+        return sniff_format(io.BytesIO(source)) == "zip"
+    try:
+        if source.is_dir():
+            return True
+        if source.is_file():  # opening a named pipe would block
+            with source.open("rb") as file:
+                return sniff_format(file) == "zip"
+    except (OSError, ValueError):
+        pass
+    return is_packed(source)
+
+
+def _is_folder(path: Path) -> bool:
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):
+        return False
+
+
+def _beginning(source: Path | bytes) -> tuple[bytes, int]:
+    """Return the first bytes and the size of a file; nothing of what cannot be read."""
+    if isinstance(source, bytes):
+        return source[:HEAD_BYTES], len(source)
+    try:
+        if source.is_file():  # opening a named pipe would block
+            with source.open("rb") as file:
+                return file.read(HEAD_BYTES), source.stat().st_size
+    except (OSError, ValueError):
+        pass
+    return b"", 0
+
+
+def _by_mark(head: bytes) -> SceneFormat | None:
+    if head[:3] == b"ply" and head[3:4].isspace():
+        return "ply"
+    if head.startswith(GLB_MAGIC):
+        return "gltf"
+    return "spz" if is_spz(head) else None
+
+
+def _is_json(head: bytes) -> bool:
+    start = head.removeprefix(b"\xef\xbb\xbf").lstrip()
+    return start.startswith(b"{") and not any(byte < 32 and byte not in b"\t\r\n" for byte in start)
+
+
+def _packed_format(source: Path | bytes, damaged: SceneFormat) -> SceneFormat:
+    """Return the format of a folder or a zip; ``damaged`` if it cannot be read, whose reader then says why."""
+    try:
+        if isinstance(source, bytes) or not _is_folder(source):
+            with _opened(source) as file:
+                if any(name.replace("\\", "/").rsplit("/", 1)[-1] == LOD_NAME for name in zip_names(file)):
+                    return "streamed-sog"
+        with open_source(source) as files:
+            return _container_format(files, damaged)
+    except (InvalidContainerError, OSError, ValueError):
+        return damaged
+
+
+def _opened(source: Path | bytes) -> io.BufferedIOBase:
+    return io.BytesIO(source) if isinstance(source, bytes) else source.open("rb")
+
+
+def _container_format(files: Source, unknown: SceneFormat = "sog-xt") -> SceneFormat:
+    """Tell the containers apart: only SOG-XT has a YAML file, and a mask in ``meta.json``."""
+    names = files.names()
+    if LOD_NAME in names:
+        return "streamed-sog"
+    if YAML_NAME in names or META_NAME not in names:
+        return "sog-xt" if YAML_NAME in names else unknown
+    try:
+        document = json.loads(files.read(META_NAME, MAX_METADATA_BYTES).decode("utf-8-sig"))
+    except (ValueError, RecursionError, InvalidContainerError):
+        return unknown
+    plain = isinstance(document, dict) and "means" in document and document.keys().isdisjoint({"mask", "gridSide"})
+    return "sog" if plain else unknown

@@ -1,0 +1,194 @@
+"""SOG files -> ``Splats``: one lookup table per channel, smallest-three rotations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from kissgs.core.array_types import Float32, UInt8
+from kissgs.core.errors import InvalidContainerError
+from kissgs.core.limits import MAX_GAUSSIANS
+from kissgs.core.progress import Progress, silent
+from kissgs.core.signed_log import signed_exp
+from kissgs.core.splats import Splats, empty_splats
+from kissgs.core.threads import Workers
+from kissgs.io.activations import insert_largest, look_up, steps
+from kissgs.io.packed_files import Source, open_source
+from kissgs.io.scene_file import refuse_more_than
+from kissgs.io.webp import decode_plane, probe_webp
+from kissgs.sog.metadata import MAX_SH_ENTRIES, Rest, SogLayout, read_layout
+
+_FREE_PIXELS = 1 << 20
+"""Pixels that images may have beyond four per Gaussian: encoders may round sides up to powers of two."""
+
+_ENTRIES_PER_ROW = 64
+"""Entries of the SH codebook in a row of its image."""
+
+_FIRST_TAG = 252
+"""Alpha of a rotation whose largest component is w; 253 to 255 are x, y, z."""
+
+
+def decode(
+    source: Path | bytes | Mapping[str, bytes],
+    *,
+    max_gaussians: int = MAX_GAUSSIANS,
+    threads: int = 0,
+    progress: Progress = silent,
+) -> Splats:
+    """Decode a container of version 1 or 2.
+
+    Args:
+        source: a folder, a zip file, the bytes of a zip, or files in memory.
+        max_gaussians: largest number of Gaussians; more are refused before memory is allocated.
+        threads: number of threads; 0 means one per processor.
+        progress: receives "decode" events.
+
+    Returns:
+        The Gaussians in the order of the file.
+
+    Raises:
+        InvalidContainerError: a part of the container is missing, damaged or invalid.
+        UnsupportedError: another version, or more Gaussians than ``max_gaussians``.
+    """
+    with open_source(source) as files, Workers(threads) as pool:
+        layout = read_layout(files)
+        refuse_more_than(max_gaussians, layout.count, "the container")
+        progress("decode", 0.0)
+        splats = empty_splats(layout.count, layout.rest.coefficients if layout.rest else 0)
+        decode_files(files, layout, splats, pool)
+        progress("decode", 1.0)
+        return splats
+
+
+def decode_files(files: Source, layout: SogLayout, out: Splats, pool: Workers, folder: str = "") -> None:
+    """Decode all images in parallel into ``out``, which has the container's number of Gaussians.
+
+    ``out`` may have more SH coefficients than the container; they become zero. ``folder`` is the prefix of file names.
+    """
+    images = _Images(files, layout, folder)
+
+    def decode_rest() -> None:
+        rest = layout.rest
+        out.shN[:, rest.coefficients if rest else 0 :] = 0
+        if rest:
+            _decode_rest(images, rest, out.shN[:, : rest.coefficients])
+
+    jobs: list[Callable[[], None]] = [
+        lambda: _decode_quats(images, out.quats),
+        lambda: _decode_means(images, out.means),
+        decode_rest,
+        lambda: _decode_scales(images, out.scales),
+        lambda: _decode_colors(images, out),
+    ]
+    pool.map(lambda job: job(), jobs)
+
+
+class _Images:
+    """Images of one container: read, checked, decompressed."""
+
+    def __init__(self, files: Source, layout: SogLayout, folder: str) -> None:
+        self.layout = layout
+        self._files, self._folder = files, folder
+
+    def plane(self, name: str, channels: int) -> UInt8[np.ndarray, "N C"]:
+        """Return the image of a per-Gaussian attribute as one row per Gaussian."""
+        count = self.layout.count
+        most = 4 * count + _FREE_PIXELS
+        data, width, height = self._open(name, most)
+        if not count <= width * height <= most:
+            raise InvalidContainerError(
+                f"{name} is {width} x {height} pixels, which does not fit {count:,} Gaussians; export the scene again"
+            )
+        return decode_plane(data, name, width=width, height=height, channels=channels)[:count]
+
+    def codebook(self, rest: Rest) -> UInt8[np.ndarray, "entries D"]:
+        """Return the SH codebook's levels, one row per entry."""
+        name, most = rest.centroids, MAX_SH_ENTRIES * rest.coefficients
+        data, width, height = self._open(name, most)
+        entries = rest.entries or height * _ENTRIES_PER_ROW
+        rows = -(-entries // _ENTRIES_PER_ROW)
+        if width != _ENTRIES_PER_ROW * rest.coefficients or not rows <= height <= MAX_SH_ENTRIES // _ENTRIES_PER_ROW:
+            raise InvalidContainerError(
+                f"{name} is {width} x {height} pixels; {entries:,} entries of {rest.coefficients} coefficients need "
+                f"{_ENTRIES_PER_ROW * rest.coefficients} x {rows}: export the scene again"
+            )
+        image = decode_plane(data, name, width=width, height=height, channels=3)
+        return image.reshape(height * _ENTRIES_PER_ROW, rest.coefficients * 3)[:entries]
+
+    def _open(self, name: str, most_pixels: int) -> tuple[bytes, int, int]:
+        # Lossless WebP never needs more than 4 bytes a pixel.
+        data = self._files.read(self._folder + name, 4096 + 5 * most_pixels)
+        return data, *probe_webp(data, name)
+
+
+def _decode_means(images: _Images, out: Float32[np.ndarray, "N 3"]) -> None:
+    layout = images.layout
+    levels = images.plane(layout.files["means_high"], 3).astype(np.uint16)
+    levels <<= 8
+    levels |= images.plane(layout.files["means_low"], 3)
+    position = np.arange(65536) / 65535
+    for axis in range(3):
+        logs = layout.low[axis] + (layout.high[axis] - layout.low[axis]) * position
+        table = signed_exp(logs).astype(np.float32)
+        for part in steps(len(out)):
+            out[part, axis] = table[levels[part, axis]]
+
+
+def _decode_quats(images: _Images, out: Float32[np.ndarray, "N 4"]) -> None:
+    name = images.layout.files["quats"]
+    pixels = images.plane(name, 4)
+    if len(pixels) and int(pixels[:, 3].min()) < _FIRST_TAG:
+        raise InvalidContainerError(
+            f"{name} has a rotation whose alpha is {pixels[:, 3].min()}; {_FIRST_TAG} to 255 are valid: "
+            "export the scene again"
+        )
+    for part in steps(len(out)):
+        small = (pixels[part, :3] / 255 - 0.5) * np.sqrt(2)
+        out[part] = insert_largest(small, pixels[part, 3].astype(np.int64) - _FIRST_TAG)
+
+
+def _decode_scales(images: _Images, out: Float32[np.ndarray, "N 3"]) -> None:
+    name = images.layout.files["scales"]
+    _decode_levels(name, images.plane(name, 3), images.layout.scales, out)
+
+
+def _decode_colors(images: _Images, out: Splats) -> None:
+    name = images.layout.files["sh0"]
+    pixels = images.plane(name, 4)
+    _decode_levels(name, pixels[:, :3], images.layout.sh0, out.sh0)
+    look_up(images.layout.opacities, pixels[:, 3], out.opacities)
+
+
+def _decode_levels(
+    name: str,
+    levels: UInt8[np.ndarray, "N 3"],
+    table: Float32[np.ndarray, "3 256"],
+    out: Float32[np.ndarray, "N 3"],
+) -> None:
+    for channel in range(3):
+        _check_levels(name, levels[:, channel], table[channel])
+        for part in steps(len(out)):
+            out[part, channel] = table[channel][levels[part, channel]]
+
+
+def _decode_rest(images: _Images, rest: Rest, out: Float32[np.ndarray, "N K 3"]) -> None:
+    codes = images.codebook(rest)
+    _check_levels(rest.centroids, codes, rest.table)
+    codebook = rest.table[codes].reshape(len(codes), rest.coefficients, 3)
+    labels = images.plane(rest.labels, 3)
+    for part in steps(len(out)):
+        entry = labels[part, 0] | labels[part, 1].astype(np.int64) << 8
+        if int(entry.max()) >= len(codebook):
+            raise InvalidContainerError(
+                f"{rest.labels} points outside the codebook of {len(codebook):,} entries; export the scene again"
+            )
+        np.take(codebook, entry, axis=0, out=out[part], mode="clip")
+
+
+def _check_levels(name: str, levels: UInt8[np.ndarray, "..."], table: Float32[np.ndarray, " 256"]) -> None:
+    """Refuse levels for which the codebook has no value."""
+    missing = np.isnan(table)
+    if missing.any() and missing[levels].any():
+        raise InvalidContainerError(f"{name} uses a level for which its codebook has no number; export the scene again")

@@ -1,0 +1,280 @@
+"""Metadata of a SOG container, ``meta.json``, of versions 1 and 2, checked before any image is opened."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+import numpy as np
+
+from kissgs.core.array_types import Float32, Float64
+from kissgs.core.errors import InvalidContainerError, UnsupportedError
+from kissgs.core.splats import SH_REST_COUNTS
+from kissgs.io.activations import OPACITY_OF_BYTE
+from kissgs.io.packed_files import Source, is_below
+
+META_NAME, LOD_NAME = "meta.json", "lod-meta.json"
+
+MAX_METADATA_BYTES = 1 << 20
+"""Largest size of ``meta.json``, bytes; four codebooks in full digits take 15 kB."""
+
+MAX_SH_ENTRIES = 1 << 16
+"""Largest number of entries of the SH codebook: labels have two bytes."""
+
+_MAX_SIGNED_LOG = 88.7
+"""Largest signed logarithm of a position: exp of more exceeds float32."""
+
+_LEVELS = 256
+
+
+@dataclass(frozen=True, slots=True)
+class Rest:
+    """View-dependent colour: a codebook of ``entries`` entries, and its values in ``table``.
+
+    Attributes:
+        entries: number of entries; None: as many as the image has (version 1).
+        coefficients: 3, 8 or 15.
+        table: ``(256,)``, value of each level; NaN where the file gives none.
+        centroids: file of the entries.
+        labels: file of each Gaussian's entry.
+    """
+
+    entries: int | None
+    coefficients: int
+    table: Float32[np.ndarray, " 256"]
+    centroids: str
+    labels: str
+
+
+@dataclass(frozen=True, slots=True)
+class SogLayout:
+    """Contents of ``meta.json``. Tables have one row per channel; NaN stands for a level without a value.
+
+    Attributes:
+        version: 1 or 2.
+        count: number of Gaussians.
+        sh_degree: 0 to 3.
+        low: smallest signed logarithm of the positions, per axis.
+        high: largest signed logarithm of the positions, per axis.
+        scales: ``(3, 256)``, natural logarithms of standard deviations.
+        sh0: ``(3, 256)``, constant SH coefficients.
+        opacities: ``(256,)``, opacity logits.
+        files: names of the images ``means_low``, ``means_high``, ``scales``, ``quats``, ``sh0``.
+        rest: the view-dependent colour; None at degree 0.
+        model: variant of the renderer that the scene was made for, such as "antialiased"; None if not stated.
+        generator: program that wrote the file; None if not stated.
+    """
+
+    version: int
+    count: int
+    low: Float64[np.ndarray, " 3"]
+    high: Float64[np.ndarray, " 3"]
+    scales: Float32[np.ndarray, "3 256"]
+    sh0: Float32[np.ndarray, "3 256"]
+    opacities: Float32[np.ndarray, " 256"]
+    files: dict[str, str]
+    rest: Rest | None
+    model: str | None
+    generator: str | None
+
+    @property
+    def sh_degree(self) -> int:
+        """SH degree, 0 to 3."""
+        return SH_REST_COUNTS.index(self.rest.coefficients) if self.rest else 0
+
+
+def read_layout(source: Source, name: str = META_NAME) -> SogLayout:
+    """Read and check the metadata of a container.
+
+    Raises:
+        InvalidContainerError: the metadata is missing, damaged or invalid.
+        UnsupportedError: another version.
+    """
+    document = parse_json(source.read(name, MAX_METADATA_BYTES), name)
+    if not isinstance(document, dict):
+        raise InvalidContainerError(f"{name} is not the metadata of a SOG container: it is no JSON object")
+    version = document.get("version", 1)
+    if version not in (1, 2) or isinstance(version, bool):
+        raise UnsupportedError(f"{name} is of version {str(version)[:40]!r}; SOG versions 1 and 2 are read")
+    try:
+        return _read_v1(document) if version == 1 else _read_v2(document)
+    except _MetadataError as error:
+        raise InvalidContainerError(f"{name}: {error}") from error
+
+
+def parse_json(data: bytes, name: str) -> Any:  # noqa: ANN401
+    """Parse JSON; NaN and Infinity are refused, as browsers refuse them.
+
+    Raises:
+        InvalidContainerError: it is not JSON.
+    """
+    try:
+        return json.loads(data.decode("utf-8-sig"), parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        raise InvalidContainerError(f"{name} is not readable JSON; export the scene again") from error
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not JSON")
+
+
+class _MetadataError(Exception):
+    """Problem at a place in the document, as the end of a sentence."""
+
+
+def _read_v2(document: dict[str, Any]) -> SogLayout:
+    asset = document.get("asset")
+    rest = _part(document, "shN") if document.get("shN") is not None else None
+    return SogLayout(
+        version=2,
+        count=_whole(document, "count", "", 0, 1 << 32),
+        **_means(document),
+        scales=_codebook(document, "scales", 3),
+        sh0=_codebook(document, "sh0", 3),
+        opacities=OPACITY_OF_BYTE,
+        files=_files(document),
+        rest=None if rest is None else _rest_v2(document, rest),
+        model=_text(document.get("model")) or (_text(asset.get("model")) if isinstance(asset, dict) else None),
+        generator=_text(asset.get("generator")) if isinstance(asset, dict) else None,
+    )
+
+
+def _rest_v2(document: dict[str, Any], rest: dict[str, Any]) -> Rest:
+    centroids, labels = _names(rest, "shN", 2)
+    return Rest(
+        entries=_whole(rest, "count", "shN.", 1, MAX_SH_ENTRIES),
+        coefficients=SH_REST_COUNTS[_whole(rest, "bands", "shN.", 1, 3)],
+        table=_codebook(document, "shN", 1)[0],
+        centroids=centroids,
+        labels=labels,
+    )
+
+
+def _read_v1(document: dict[str, Any]) -> SogLayout:
+    shape = _part(document, "means").get("shape")
+    if not isinstance(shape, list) or not shape:
+        raise _MetadataError("means.shape does not give the number of Gaussians; export the scene again")
+    encoding = _part(document, "quats").get("encoding", "quaternion_packed")
+    if encoding != "quaternion_packed":
+        raise _MetadataError(f"quats.encoding is {str(encoding)[:40]!r}; only 'quaternion_packed' is read")
+    colors = _ranges(document, "sh0", 4)
+    opacities = _clamped_logits(colors[3])
+    rest = _part(document, "shN") if document.get("shN") is not None else None
+    return SogLayout(
+        version=1,
+        count=_whole({"count": shape[0]}, "count", "means.shape: ", 0, 1 << 32),
+        **_means(document),
+        scales=_ranges(document, "scales", 3),
+        sh0=colors[:3],
+        opacities=opacities,
+        files=_files(document),
+        rest=None if rest is None else _rest_v1(document, rest),
+        model=None,
+        generator=None,
+    )
+
+
+def _rest_v1(document: dict[str, Any], rest: dict[str, Any]) -> Rest:
+    shape = rest.get("shape")
+    width = shape[1] if isinstance(shape, list) and len(shape) == 2 else None
+    if width not in (9, 24, 45) or isinstance(width, bool):
+        raise _MetadataError("shN.shape does not have 9, 24 or 45 values per Gaussian; export the scene again")
+    centroids, labels = _names(rest, "shN", 2)
+    return Rest(
+        entries=None,
+        coefficients=int(width) // 3,
+        table=_ranges(document, "shN", 1)[0],
+        centroids=centroids,
+        labels=labels,
+    )
+
+
+def _clamped_logits(logits: Float32[np.ndarray, " 256"]) -> Float32[np.ndarray, " 256"]:
+    return np.clip(logits, OPACITY_OF_BYTE[0], OPACITY_OF_BYTE[-1])
+
+
+def _part(document: dict[str, Any], key: str) -> dict[str, Any]:
+    part = document.get(key)
+    if not isinstance(part, dict):
+        raise _MetadataError(f"it lacks {key!r}, which a SOG container has; export the scene again")
+    return part
+
+
+def _means(document: dict[str, Any]) -> dict[str, Float64[np.ndarray, " 3"]]:
+    low, high = (_numbers(_part(document, "means"), key, "means.", 3) for key in ("mins", "maxs"))
+    if max(np.abs(low).max(), np.abs(high).max()) > _MAX_SIGNED_LOG:
+        raise _MetadataError(f"the range of means ends beyond ±{_MAX_SIGNED_LOG}, which float32 cannot hold")
+    return {"low": low, "high": high}
+
+
+def _numbers(part: dict[str, Any], key: str, where: str, count: int) -> Float64[np.ndarray, " count"]:
+    values = part.get(key)
+    values = values if isinstance(values, list) else [values]
+    if len(values) != count or not all(map(_is_number, values)):
+        raise _MetadataError(f"{where}{key} is not a list of {count} finite numbers; export the scene again")
+    return np.array(values, dtype=np.float64)
+
+
+def _is_number(value: object) -> bool:
+    """Whether a value is a number that float32 can hold."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 3e38
+
+
+def _ranges(document: dict[str, Any], key: str, channels: int) -> Float32[np.ndarray, "channels 256"]:
+    """Return the values of version 1: levels evenly spaced between the smallest and the largest."""
+    low, high = (_numbers(_part(document, key), end, f"{key}.", channels) for end in ("mins", "maxs"))
+    levels = np.arange(_LEVELS) / (_LEVELS - 1)
+    return (low[:, None] + (high - low)[:, None] * levels).astype(np.float32)
+
+
+def _codebook(document: dict[str, Any], key: str, channels: int) -> Float32[np.ndarray, "channels 256"]:
+    """Return the codebook of version 2, once per channel.
+
+    Old encoders wrote null for the first value, which is then extrapolated by the mean step; other missing values are
+    refused only if an image uses them.
+    """
+    values = _part(document, key).get("codebook")
+    if not isinstance(values, list) or not 1 <= len(values) <= _LEVELS:
+        raise _MetadataError(f"{key}.codebook is not a list of up to {_LEVELS} numbers; export the scene again")
+    if not all(value is None or _is_number(value) for value in values):
+        raise _MetadataError(f"{key}.codebook has something else than finite numbers; export the scene again")
+    table = np.full(_LEVELS, np.nan)
+    table[: len(values)] = [math.nan if value is None else value for value in values]
+    if values[0] is None:
+        table[0] = table[1] + (table[1] - table[_LEVELS - 1]) / (_LEVELS - 1)
+    return np.tile(table.astype(np.float32), (channels, 1))
+
+
+def _files(document: dict[str, Any]) -> dict[str, str]:
+    low, high = _names(_part(document, "means"), "means", 2)
+    files = {"means_low": low, "means_high": high}
+    return files | {key: _names(_part(document, key), key, 1)[0] for key in ("scales", "quats", "sh0")}
+
+
+def _names(part: dict[str, Any], key: str, count: int) -> list[str]:
+    names = part.get("files")
+    if not isinstance(names, list) or len(names) != count or not all(map(is_file_name, names)):
+        raise _MetadataError(
+            f"{key}.files does not name {count} image{'s' if count > 1 else ''}; export the scene again"
+        )
+    return names
+
+
+def is_file_name(name: object) -> bool:
+    """Whether a value is the relative path of a file below its folder, fit for a message."""
+    return isinstance(name, str) and len(name) <= 255 and name.isprintable() and is_below(name)
+
+
+def _whole(part: dict[str, Any], key: str, where: str, least: int, most: int) -> int:
+    value = part.get(key)
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
+        raise _MetadataError(f"{where}{key} is not a whole number from {least} to {most}; export the scene again")
+    return value
+
+
+def _text(value: object) -> str | None:
+    return value[:100] if isinstance(value, str) else None

@@ -1,0 +1,223 @@
+"""Oracle: a naive writer (helpers/reference_spz.py), bytes decoded by hand, and splat-transform both ways."""
+
+import gzip
+import struct
+
+import numpy as np
+import pytest
+from helpers.format_scenes import assert_alike, made_scene
+from helpers.memory import takes_less_than
+from helpers.reference_spz import FLIPS, frame, spz_bytes, streams, v4_file
+from helpers.splat_transform import convert, needs_splat_transform
+
+from kissgs.core.errors import InvalidSceneError, UnsupportedError
+from kissgs.io.ply import read_ply, write_ply
+from kissgs.io.spz import SpzInfo, is_spz, read_spz, read_spz_info
+
+
+def one(version, *, position=bytes(9), alpha=b"\0", color=bytes(3), scale=bytes(3), rotation=None, sh=b"", bits=12):
+    """Return a file of one Gaussian of these bytes."""
+    rotation = bytes(3 if version < 3 else 4) if rotation is None else rotation
+    degree = {0: 0, 9: 1, 24: 2, 45: 3}[len(sh)]
+    header = struct.pack("<4sIIBBBB", b"NGSP", version, 1, degree, bits, 0, 0)
+    parts = [position, alpha, color, scale, rotation, sh]
+    return v4_file(header, [p for p in parts if p]) if version == 4 else gzip.compress(header + b"".join(parts))
+
+
+def test_positions_by_hand():
+    data = one(2, position=bytes.fromhex("00f0ff 000800 ffff7f"))
+    np.testing.assert_array_equal(read_spz(data, raw_axes=True).means, [[-1, 0.5, 2048 - 2**-12]])
+    np.testing.assert_array_equal(read_spz(data).means, [[-1, -0.5, -(2048 - 2**-12)]])
+
+
+@pytest.mark.parametrize(
+    ("version", "rotation", "xyzw"),
+    [
+        (2, "8c66a6", (0.0980392, -0.2, 0.3019608, 0.9269347)),
+        (3, "d9448ac4", (0.0996315, -0.2006467, 0.3002782, 0.9271717)),
+        (4, "d9448ac4", (0.0996315, -0.2006467, 0.3002782, 0.9271717)),
+    ],
+)
+def test_rotations_by_hand(version, rotation, xyzw):
+    x, y, z, w = xyzw
+    data = one(version, rotation=bytes.fromhex(rotation))
+    np.testing.assert_allclose(read_spz(data, raw_axes=True).quats, [[w, x, y, z]], atol=1e-7)
+    np.testing.assert_allclose(read_spz(data).quats, [[w, x, -y, -z]], atol=1e-7)
+
+
+@pytest.mark.parametrize("largest", range(4))
+def test_each_largest_component(largest):
+    word = largest << 30 | 511 << 20
+    quat = np.zeros(4)
+    others = [i for i in range(4) if i != largest]
+    quat[largest] = quat[others[0]] = np.sqrt(0.5)
+    found = read_spz(one(3, rotation=struct.pack("<I", word)), raw_axes=True).quats[0]
+    np.testing.assert_allclose(np.roll(found, -1), quat, atol=1e-7)
+
+
+def test_bytes_by_hand():
+    splats = read_spz(one(3, alpha=b"\xc8", color=bytes([0, 128, 255]), scale=bytes([0, 96, 255]), sh=bytes([120] * 9)))
+    np.testing.assert_allclose(splats.sh0, [[-3.333333, 0.0130719, 3.333333]], rtol=1e-5)
+    np.testing.assert_array_equal(splats.scales, [[-10, -4, 5.9375]])
+    assert splats.opacities[0] == pytest.approx(1.2909842)
+    np.testing.assert_array_equal(np.abs(splats.shN), np.full((1, 3, 3), 0.0625))
+    for alpha, logit in ((0, -13.8155), (255, 13.8023)):
+        assert read_spz(one(2, alpha=bytes([alpha]))).opacities[0] == pytest.approx(logit, abs=1e-4)
+
+
+def storable(scene):
+    """Return the scene with attributes that the format can hold, so that only rounding remains."""
+    np.clip(scene.means, -2000, 2000, out=scene.means)
+    np.clip(scene.scales, -10, 5.9, out=scene.scales)
+    np.clip(scene.sh0, -3.3, 3.3, out=scene.sh0)
+    np.clip(scene.shN, -0.99, 0.99, out=scene.shN)
+    return scene
+
+
+@pytest.mark.parametrize("version", [1, 2, 3, 4])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("count", [1, 65])
+def test_within_half_a_step(version, degree, count):
+    scene = storable(made_scene(count, degree))
+    data = spz_bytes(scene, version, flags=1)
+    found = read_spz(data)
+    assert read_spz_info(data) == SpzInfo(
+        version=version, count=count, sh_degree=degree, fractional_bits=12, antialiased=True, extensions=False
+    )
+    assert is_spz(data[:512])
+    np.testing.assert_allclose(found.means, scene.means, rtol=1e-3 if version == 1 else 0, atol=2**-13 * 1.01)
+    np.testing.assert_allclose(found.scales, scene.scales, atol=1 / 32 * 1.01)
+    np.testing.assert_allclose(found.sh0, scene.sh0, atol=0.5 / 255 / 0.15 * 1.01)
+    np.testing.assert_allclose(found.shN, scene.shN, atol=0.5 / 128 * 1.01)
+    angle = 2 * np.arccos(np.clip(np.abs((found.quats.astype(float) * scene.quats).sum(axis=1)), 0, 1))
+    # Close to half a turn, w of three bytes is the root of a small difference.
+    assert angle.max() < (0.3 if version < 3 else 0.01)
+
+
+def test_no_gaussians():
+    for version in (1, 2, 3, 4):
+        assert len(read_spz(spz_bytes(made_scene(0, 2), version))) == 0
+
+
+def test_fewer_fractional_bits():
+    scene = storable(made_scene(30, 0))
+    scene.means[:] *= 100
+    found = read_spz(spz_bytes(scene, 3, bits=5))
+    np.testing.assert_allclose(found.means, scene.means, atol=2**-6 * 1.01)
+
+
+def extension(kind, payload):
+    return struct.pack("<II", kind, len(payload)) + payload
+
+
+@pytest.mark.parametrize("version", [2, 3, 4])
+def test_an_extension_names_the_axes(version):
+    scene = storable(made_scene(65, 3))
+    orbit = extension(0xADBE0002, bytes(12))
+    for value, y_up in ((0, True), (4, True), (6, False)):
+        more = orbit + extension(0xADBE0003, struct.pack("<I", value))
+        found = read_spz(spz_bytes(scene, version, y_up=y_up, extensions=more))
+        np.testing.assert_allclose(found.means, scene.means, atol=2**-13 * 1.01)
+        np.testing.assert_allclose(found.shN, scene.shN, atol=0.5 / 128 * 1.01)
+
+
+def test_flips_turn_the_axes_half_about_x():
+    raw, turned = (read_spz(spz_bytes(storable(made_scene(65, 3)), 3), raw_axes=raw) for raw in (True, False))
+    np.testing.assert_array_equal(turned.means, raw.means * [1, -1, -1])
+    np.testing.assert_array_equal(turned.quats, raw.quats * [1, 1, -1, -1])
+    signs = np.array([sign for band in FLIPS for sign in band])
+    np.testing.assert_array_equal(turned.shN, raw.shN * signs[None, :, None])
+
+
+SCENE = made_scene(20, 1)
+V3, V4 = spz_bytes(SCENE, 3), spz_bytes(SCENE, 4)
+HEADER = gzip.decompress(V3)[:16]
+
+
+def with_header(offset, value):
+    data = gzip.decompress(V3)
+    return gzip.compress(data[:offset] + value + data[offset + len(value) :])
+
+
+DAMAGED = {
+    b"": "is not an .spz file: its header is missing; export or download it again",
+    gzip.compress(b"hello"): "is not an .spz file: its header is missing; export or download it again",
+    with_header(4, b"\5"): "is .spz of version 5 in gzip; versions 1 to 3 in gzip and 4 without are read",
+    with_header(4, b"\4"): "is .spz of version 4 in gzip; versions 1 to 3 in gzip and 4 without are read",
+    gzip.decompress(V3): "is .spz of version 3; versions 1 to 3 in gzip and 4 without are read",
+    with_header(12, b"\4"): "has SH degree 4; export it with degree 3 or lower",
+    with_header(13, b"\x20"): "declares 32 fractional bits of positions, where 31 is the largest number; it is damaged",
+    V3[:-30]: "is cut short: it unpacks to",
+    V3[:60] + bytes(40) + V3[100:]: "is damaged: gzip cannot unpack it; download it again",
+    with_header(8, b"\x15"): "is cut short: it unpacks to 596 bytes of 625; download it again",
+    with_header(8, b"\0\0\0\x10"): "bytes cannot hold what its header declares; download it again",
+    gzip.compress(
+        gzip.decompress(V3) + bytes(1 << 21)
+    ): "unpacks to more bytes than its header declares; it is damaged",
+    V4[:40]: "is cut short: it needs",
+    V4[:-1]: "is cut short or damaged: its streams do not end at its last byte; download it again",
+    V4[:15] + b"\5" + V4[16:]: "has 5 streams; SH degree 1 needs 6: export it again",
+    V4[:8] + b"\x15" + V4[9:]: "declares 180 bytes of positions for 21 Gaussians; export it again",
+    V4[:16] + b"\xff\xff\xff\xff" + V4[20:]: "has its table of streams at byte 4,294,967,295; it is damaged",
+    V4[:-300] + bytes(300): "is damaged: zstd cannot unpack it; download the file again",
+}
+
+
+@pytest.mark.parametrize(("data", "message"), list(DAMAGED.items()), ids=list(DAMAGED.values()))
+def test_damaged(data, message):
+    with pytest.raises((InvalidSceneError, UnsupportedError)) as error:
+        read_spz(data)
+    assert message in str(error.value)
+
+
+def test_streams_of_a_wrong_size():
+    parts = streams(SCENE, 4)
+    for part in (parts[0] + b"\0", parts[0][:-1], b""):
+        frames = [frame(part), *map(frame, parts[1:])]
+        table = b"".join(struct.pack("<QQ", len(f), len(p)) for f, p in zip(frames, parts, strict=True))
+        data = HEADER[:4] + b"\4\0\0\0" + HEADER[8:15] + b"\6" + struct.pack("<I", 32) + bytes(12)
+        with pytest.raises(InvalidSceneError, match=r"stream of positions is damaged"):
+            read_spz(data + table + b"".join(frames))
+
+
+def test_an_extension_that_is_cut_short():
+    for damaged in (extension(0xADBE0003, b"")[:4] + b"\xff\0\0\0", struct.pack("<II", 7, 100)):
+        with pytest.raises(InvalidSceneError, match=r"has an extension record that is cut short"):
+            read_spz(spz_bytes(SCENE, 3, extensions=damaged))
+    with pytest.raises(UnsupportedError, match=r"names a coordinate system 9; 0 to 8 are known"):
+        read_spz(spz_bytes(SCENE, 4, extensions=extension(0xADBE0003, struct.pack("<I", 9))))
+
+
+def test_more_gaussians_than_the_limit_take_no_memory():
+    """Five million Gaussians of zeros are a few kilobytes of gzip, and fewer of zstd."""
+    count = 5_000_000
+    header = struct.pack("<4sIIBBBB", b"NGSP", 3, count, 0, 12, 0, 0)
+    bomb = gzip.compress(header + bytes(count * 20))
+
+    def refused():
+        with pytest.raises(UnsupportedError, match=r"has 5,000,000 Gaussians; the limit is 1,000,000"):
+            read_spz(bomb, max_gaussians=1_000_000)
+
+    assert takes_less_than(1e6, refused)
+
+
+@needs_splat_transform
+@pytest.mark.parametrize("count", [1, 65])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("version", ["3", "4"])
+def test_splat_transform_writes_what_we_read(version, degree, count, tmp_path):
+    """The tool stores the axes of a .ply without saying so."""
+    with (tmp_path / "a.ply").open("wb") as file:
+        write_ply(file, made_scene(count, degree))
+    packed = convert(tmp_path / "a.ply", tmp_path / "a.spz", "--spz-version", version)
+    theirs = read_ply(convert(packed, tmp_path / "b.ply"))
+    assert_alike(read_spz(packed, raw_axes=True), theirs, atol=1e-6)
+
+
+@needs_splat_transform
+@pytest.mark.parametrize("version", [2, 3, 4])
+def test_splat_transform_reads_the_reference_files_as_we_do(version, tmp_path):
+    path = tmp_path / "a.spz"
+    path.write_bytes(spz_bytes(storable(made_scene(65, 2)), version))
+    theirs = read_ply(convert(path, tmp_path / "b.ply"))
+    assert_alike(read_spz(path, raw_axes=True), theirs, atol=1e-6)

@@ -1,0 +1,170 @@
+"""Every format under its own name, another name or none: all functions and commands read the same scene."""
+
+import json
+
+import numpy as np
+import pytest
+from helpers.command_line import run
+from helpers.format_scenes import made_scene
+from helpers.reference_gltf import attributes, data_uri, document, glb_bytes
+from helpers.reference_ply import assert_identical
+from helpers.reference_sog import sog_files, streamed_files, write_folder, zip_of
+from helpers.reference_splat import ksplat_bytes, splat_bytes
+from helpers.reference_spz import spz_bytes
+
+import kissgs
+from kissgs import InvalidContainerError, InvalidSceneError, KissgsError, Settings
+from kissgs.core.splats import clean
+from kissgs.pipeline.inspect import describe
+from kissgs.pipeline.scene_files import open_scene, read_scene, stored_bytes
+from kissgs.pipeline.scene_formats import recognise
+
+SCENE = made_scene(30, 1, extremes=False)
+ROOT, BUFFER = document(attributes(SCENE))
+TEXT = {**ROOT, "buffers": [{"byteLength": len(BUFFER), "uri": data_uri(BUFFER)}]}
+STREAMED = streamed_files([[SCENE], [made_scene(5, 1)]], environment=made_scene(2, 0))
+
+FILES = {
+    "a.splat": ("splat", splat_bytes(SCENE)),
+    "a.ksplat": ("ksplat", ksplat_bytes([SCENE], 1)),
+    "a2.spz": ("spz", spz_bytes(SCENE, 2)),
+    "a4.spz": ("spz", spz_bytes(SCENE, 4, flags=1)),
+    "a.glb": ("gltf", glb_bytes(ROOT, BUFFER)),
+    "a.gltf": ("gltf", json.dumps(TEXT, indent=1).encode()),
+    "a.sog": ("sog", zip_of(sog_files(SCENE))),
+    "a1.sog": ("sog", zip_of(sog_files(SCENE, version=1))),
+    "a.zip": ("streamed-sog", zip_of(STREAMED, folder="x/")),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_files_are_recognised_and_read_by_all(name, tmp_path):
+    kind, data = FILES[name]
+    path = tmp_path / name
+    path.write_bytes(data)
+    assert recognise(path) == kind
+    wanted = read_scene(path)
+    assert_identical(kissgs.decompress(path), wanted)
+    assert_identical(kissgs.load(path), clean(wanted)[0])
+    opened, _, size = open_scene(path, 1, lambda *_: None)
+    assert_identical(opened, clean(wanted)[0])
+    assert size == len(data) == stored_bytes(path)
+    found = describe(path)
+    assert (found.kind, found.count, found.sh_degree, found.bytes) == (kind, len(wanted), wanted.sh_degree, len(data))
+    assert set(found.ranges) == {"means", "quats", "scales", "opacities", "sh0", "shN"} - (
+        {"quats"} if "sog" in kind else set()
+    ) - ({"shN"} if kind == "splat" else set())
+    low, high = found.ranges["means"]
+    assert low == pytest.approx(wanted.means.min(), rel=1e-4)
+    assert high == pytest.approx(wanted.means.max(), rel=1e-4)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_content_decides_before_the_ending(name, tmp_path):
+    """A .splat, which nothing marks, needs its ending; the others are known even as bytes."""
+    kind, data = FILES[name]
+    for ending in ("", ".ply", ".bin", ".splat"):
+        path = tmp_path / f"other{ending}"
+        path.write_bytes(data)
+        if kind == "splat":
+            assert recognise(path) == ("splat" if ending == ".splat" else "ply")
+        elif ending != ".splat" or kind not in ("ksplat", "gltf"):
+            assert recognise(path) == kind
+    assert recognise(data) == ("ply" if kind == "splat" else kind)
+
+
+def test_a_ply_under_other_names_is_a_ply(tmp_path):
+    kissgs.save(SCENE, tmp_path / "a.ply")
+    data = (tmp_path / "a.ply").read_bytes()
+    for name in ("a.splat", "a.spz", "a.sog", "a.glb", "a.ksplat"):
+        (tmp_path / name).write_bytes(data)
+        assert recognise(tmp_path / name) == "ply"
+        assert len(kissgs.load(tmp_path / name)) == len(SCENE)
+
+
+@pytest.mark.parametrize("files", [sog_files(SCENE), STREAMED], ids=["sog", "streamed-sog"])
+def test_folders_and_their_metadata_file(files, tmp_path):
+    folder = write_folder(files, tmp_path / "scene")
+    kind = "streamed-sog" if "lod-meta.json" in files else "sog"
+    meta = folder / ("lod-meta.json" if kind == "streamed-sog" else "meta.json")
+    wanted = read_scene(folder)
+    for path in (folder, meta):
+        assert recognise(path) == kind
+        assert_identical(read_scene(path), wanted)
+        assert describe(path).bytes == stored_bytes(path) == sum(map(len, files.values()))
+    assert recognise(files) == kind
+    assert_identical(kissgs.decompress(files), wanted)
+
+
+def test_folders_of_sog_xt_stay_what_they_are(tmp_path):
+    packed = kissgs.compress(SCENE, settings=Settings.from_preset("fast"))
+    packed.save(tmp_path / "folder")
+    only_json = {name: data for name, data in packed.files.items() if not name.endswith(".yaml")}
+    for source in (tmp_path / "folder", packed.to_zip(), packed.files, only_json, zip_of(only_json)):
+        assert recognise(source) == "sog-xt"
+    assert recognise(tmp_path / "folder/meta.json") == "sog-xt"
+    assert len(kissgs.load(tmp_path / "folder/meta.json")) == len(kissgs.decompress(only_json))
+
+
+def test_levels_of_a_streamed_scene(tmp_path):
+    folder = write_folder(STREAMED, tmp_path / "scene")
+    assert [len(kissgs.load(folder, level=level)) for level in (0, 1)] == [32, 7]
+    found = describe(folder)
+    assert found.details == {"levels": [30, 5], "environment": 2, "files": 2}
+    assert set(found.parts) == {"lod-meta.json", "0_0/", "env/"}
+    with pytest.raises(KissgsError, match=r"there is no level 2; this scene has levels 0 \(the finest\) to 1"):
+        kissgs.load(folder, level=2)
+
+
+def test_raw_axes(tmp_path):
+    path = tmp_path / "a.spz"
+    path.write_bytes(spz_bytes(SCENE, 3))
+    raw, turned = kissgs.load(path, raw_axes=True), kissgs.load(path)
+    np.testing.assert_array_equal(raw.means, turned.means * [1, -1, -1])
+    assert_identical(kissgs.decompress(path, raw_axes=True), read_scene(path, raw_axes=True))
+
+
+def test_details(tmp_path):
+    wanted = {
+        "a4.spz": {"version": 4, "antialiased": True, "fractional_bits": 12},
+        "a.ksplat": {"compression_level": 1, "sections": 1},
+        "a.glb": {"binary": True, "primitives": 1, "spz": False},
+        "a.splat": {},
+        "a.sog": {
+            "version": 2, "antialiased": False, "model": None, "generator": "by hand", "codebook_entries": 30,
+        },
+    }  # fmt: skip
+    for name, details in wanted.items():
+        (tmp_path / name).write_bytes(FILES[name][1])
+        assert describe(tmp_path / name).details == details
+
+
+def test_damaged_files_are_explained_by_the_reader_of_their_ending(tmp_path):
+    for name, message in {
+        "a.spz": "is not an .spz file",
+        "a.glb": "is not readable glTF",
+        "a.gltf": "is not readable glTF",
+        "a.sog": "is not a readable zip file",
+        "a.splat": "is not a .splat file",
+        "a.ksplat": "is cut short",
+    }.items():
+        (tmp_path / name).write_bytes(b"nothing here")
+        with pytest.raises((InvalidSceneError, InvalidContainerError)) as error:
+            kissgs.load(tmp_path / name)
+        assert message in str(error.value)
+        with pytest.raises((InvalidSceneError, InvalidContainerError), match="cannot read"):
+            kissgs.load(tmp_path / f"absent-{name}")
+
+
+def test_the_command_line_reads_them(tmp_path):
+    for name in ("a.sog", "a2.spz", "a.zip"):
+        (tmp_path / name).write_bytes(FILES[name][1])
+    done = run("compress", tmp_path / "a.sog", "-o", tmp_path / "out.zip", "-p", "fast", "--json")
+    assert json.loads(done.stdout)["source_bytes"] == len(FILES["a.sog"][1])
+    assert run("decompress", tmp_path / "a2.spz", "-o", tmp_path / "b.ply", "--raw-axes").returncode == 0
+    assert_identical(kissgs.load(tmp_path / "b.ply"), kissgs.load(tmp_path / "a2.spz", raw_axes=True))
+    assert run("decompress", tmp_path / "a.zip", "-o", tmp_path / "c.ply", "--level", "1").returncode == 0
+    assert len(kissgs.load(tmp_path / "c.ply")) == 7
+    said = run("info", tmp_path / "a.sog", tmp_path / "a2.spz", tmp_path / "a.zip").stdout.decode()
+    for text in ("SOG container (version 2, by hand)", "SPZ scene (version 2)", "finest first: 30, 5; environment: 2"):
+        assert text in said

@@ -1,0 +1,93 @@
+"""Uploads of other formats; oracle: the library's own compression of the same file."""
+
+import io
+import json
+import zipfile
+
+import pytest
+from helpers.format_scenes import made_scene
+from helpers.reference_gltf import attributes, data_uri, document, glb_bytes
+from helpers.reference_sog import sog_files, streamed_files, zip_of
+from helpers.reference_splat import ksplat_bytes, splat_bytes
+from helpers.reference_spz import spz_bytes
+from helpers.service import FAST, problem
+
+import kissgs
+from kissgs import Settings
+
+SCENE = made_scene(40, 1, extremes=False)
+FILES = {
+    "a.sog": ("sog", zip_of(sog_files(SCENE))),
+    "a3.spz": ("spz", spz_bytes(SCENE, 3)),
+    "a4.spz": ("spz", spz_bytes(SCENE, 4)),
+    "a.splat": ("splat", splat_bytes(SCENE)),
+    "a.ksplat": ("ksplat", ksplat_bytes([SCENE], 1)),
+    "a.glb": ("gltf", glb_bytes(*document(attributes(SCENE)))),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("form", [False, True])
+def test_uploads_of_every_format(service, name, form, tmp_path):
+    kind, data = FILES[name]
+    if form:
+        answer = service.http.post("/v1/jobs", files={"file": (name, data)}, data={"options": FAST})
+    else:
+        answer = service.http.post("/v1/jobs", content=data, params={"options": FAST, "name": name})
+    assert answer.status_code == 202, answer.text
+    status = service.ended(answer.json())
+    assert status["state"] == "succeeded", status
+    assert (status["gaussians"], status["sh_degree"]) == (40, 0 if kind == "splat" else 1)
+    assert (status["name"], status["source_format"]) == (name.split(".")[0], kind)
+    (tmp_path / name).write_bytes(data)
+    local = kissgs.compress(tmp_path / name, settings=Settings.from_preset("fast"))
+    assert service.http.get(status["links"]["result"]).content == local.to_zip()
+    source = service.http.get(status["links"]["source"])
+    assert source.content == data
+    assert f'filename="{name}"' in source.headers["content-disposition"]
+
+
+ROOT, BUFFER = document(attributes(SCENE))
+TEXT = json.dumps({**ROOT, "buffers": [{"byteLength": len(BUFFER), "uri": data_uri(BUFFER)}]}).encode()
+
+REFUSED = {
+    "a zip of levels": ("a.zip", zip_of(streamed_files([[SCENE]]))),
+    "a container": ("a.zip", kissgs.compress(SCENE, settings=Settings.from_preset("fast")).to_zip()),
+    "another zip": ("a.sog", zip_of({"notes.txt": b"hello"})),
+    "text": ("a.gltf", TEXT),
+    "a .splat without its name": ("a.bin", splat_bytes(SCENE)),
+    "half a .splat": ("a.splat", splat_bytes(SCENE)[:-1]),
+    "half a .ksplat": ("a.ksplat", FILES["a.ksplat"][1][:-1]),
+    "half a .glb": ("a.glb", FILES["a.glb"][1][:-1]),
+    "half a .sog": ("a.sog", FILES["a.sog"][1][:-40]),
+    "too many": ("a.spz", FILES["a4.spz"][1][:8] + (30_000).to_bytes(4, "little") + FILES["a4.spz"][1][12:]),
+}
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_refused_files_get_one_sentence(service, kind):
+    name, data = REFUSED[kind]
+    answer = service.http.post("/v1/jobs", files={"file": (name, data)}, data={"options": FAST})
+    found = problem(answer, 422, answer.json()["code"])
+    assert found["code"] in ("invalid-scene", "unsupported")
+    assert "the upload" in found["detail"] or "the scene has 30,000 Gaussians" in found["detail"]
+    assert ".part" not in found["detail"]
+    assert "\n" not in found["detail"]
+
+
+def test_damage_behind_the_headers_fails_the_job(service):
+    """Headers are checked on arrival, the rest by the job."""
+    data = FILES["a3.spz"][1]
+    answer = service.http.post("/v1/jobs", files={"file": ("a.spz", data[:-60])}, data={"options": FAST})
+    status = service.ended(answer.json())
+    assert status["state"] == "failed"
+    assert status["problem"]["code"] == "invalid-scene"
+    assert "is cut short" in status["problem"]["detail"]
+
+
+def test_the_limits_name_the_formats(service):
+    assert service.http.get("/v1/limits").json()["formats"] == [
+        "ply", "compressed.ply", "sog", "spz", "splat", "ksplat", "glb",
+    ]  # fmt: skip
+    with zipfile.ZipFile(io.BytesIO(FILES["a.sog"][1])) as archive:
+        assert "meta.json" in archive.namelist()
