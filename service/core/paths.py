@@ -1,4 +1,4 @@
-"""Where the files lie that do not belong to a Python package of the service."""
+"""Paths of files that do not belong to a Python package of the service."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 _PACKAGE = Path(__file__).parents[1]
 
 ROOT = _PACKAGE if (_PACKAGE / "web_decoder").is_dir() else _PACKAGE.parent
-"""In a wheel they lie in the package, in a checkout beside it."""
+"""Folder of these files: the package itself in a wheel, the folder around it in a checkout."""
 
 WEB_DECODER = ROOT / "web_decoder"
 VENDOR_SCRIPT = ROOT / "scripts" / "vendor"

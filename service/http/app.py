@@ -33,7 +33,7 @@ from ..jobs.recovery import recover
 from ..jobs.worker import Worker
 from ..storage.database_health import error_text
 from ..storage.folder_binding import open_store
-from ..storage.job_storage import JobStorage
+from ..storage.job_files import JobStorage
 from .middleware import RequestMiddleware
 from .openapi import describe
 from .routes import facts, jobs, page, preview, results

@@ -21,7 +21,7 @@ from ..core.schemas import JobOptions
 from ..jobs.admission import FULL_SECONDS
 from ..jobs.container import ServiceContainer
 from ..jobs.worker import QUEUE
-from ..storage.job_store import LimitExceeded
+from ..storage.job_records import LimitExceeded
 from .multipart import PartBegin, PartData, parts
 from .uploads import Received, Spool, scene_name, timed
 

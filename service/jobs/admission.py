@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from ..core.models import Job
 from ..core.problems import ProblemError
 from ..core.settings import ServiceSettings
-from ..storage.job_storage import JobStorage
-from ..storage.job_store import LimitExceeded, Store
+from ..storage.job_files import JobStorage
+from ..storage.job_records import LimitExceeded, Store
 from .status import QueueEstimator
 
 BUSY_SECONDS = 5.0

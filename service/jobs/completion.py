@@ -11,8 +11,8 @@ from ..core.metrics import Metrics
 from ..core.models import Job, State
 from ..core.problems import PROBLEM_TYPES, problem
 from ..core.settings import ServiceSettings
-from ..storage.job_storage import JobStorage
-from ..storage.job_store import Store
+from ..storage.job_files import JobStorage
+from ..storage.job_records import Store
 
 log = logging.getLogger("kissgs.service")
 

@@ -14,8 +14,8 @@ from ..core.disk_estimates import BYTES_PER_GAUSSIAN
 from ..core.models import Job, State
 from ..core.problems import PROBLEM_TYPES, ProblemError
 from ..core.settings import ServiceSettings
-from ..storage.job_storage import JobStorage
-from ..storage.job_store import Store
+from ..storage.job_files import JobStorage
+from ..storage.job_records import Store
 from .admission import Admission
 from .runner import JobProcess
 

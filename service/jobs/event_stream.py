@@ -12,7 +12,7 @@ from anyio.to_thread import run_sync
 
 from ..core.models import ACTIVE, Event, Job
 from ..core.notifier import JobNotifier, wait
-from ..storage.job_store import Store
+from ..storage.job_records import Store
 from .status import QueueEstimator, job_status
 
 KEEPALIVE_SECONDS = 15.0

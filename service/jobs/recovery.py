@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.models import Job, State
-from ..storage.job_storage import JobStorage
+from ..storage.job_files import JobStorage
 from .container import ServiceContainer
 
 log = logging.getLogger("kissgs.service")

@@ -8,7 +8,7 @@ from ..core.clock import as_datetime
 from ..core.models import ACTIVE, Job, State
 from ..core.presets import usual_seconds
 from ..core.schemas import Estimate, JobOptions, JobStatus, Links, Progress, Sizes, Timings
-from ..storage.job_store import Store
+from ..storage.job_records import Store
 
 
 class QueueEstimator:

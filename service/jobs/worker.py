@@ -16,8 +16,8 @@ from ..core.notifier import JobNotifier, ended, wait
 from ..core.schemas import JobOptions
 from ..core.settings import ServiceSettings
 from ..storage.database_health import error_text
-from ..storage.job_storage import JobStorage
-from ..storage.job_store import Store
+from ..storage.job_files import JobStorage
+from ..storage.job_records import Store
 from .completion import JobCompletion
 from .runner import JobProcess, Outcome
 

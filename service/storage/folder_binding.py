@@ -17,8 +17,8 @@ from ..core.models import ACTIVE
 from ..core.settings import ServiceSettings, SettingsError
 from .database import NewDatabaseError
 from .database_health import IDENTITY, IDENTITY_BITS, error_text
-from .job_storage import JobStorage, sync_folder
-from .job_store import Store
+from .job_files import JobStorage, sync_folder
+from .job_records import Store
 
 NEARLY_FULL_BYTES = 1 << 20
 """Free disk space below which a database may fail to open, bytes."""

@@ -16,7 +16,7 @@ from service.core.models import State
 from service.core.settings import SettingsError
 from service.storage import database_lease
 from service.storage.database_health import DatabaseReplacedError
-from service.storage.job_store import Store
+from service.storage.job_records import Store
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
@@ -148,7 +148,7 @@ def test_a_service_whose_lease_was_taken_over(tmp_path, url):
 
 ACQUIRE = """
 import sys, time
-from service.storage.job_store import Store
+from service.storage.job_records import Store
 store = Store(sys.argv[1], time.time)
 print("ready", flush=True)
 sys.stdin.readline()

@@ -9,7 +9,7 @@ from helpers.data_folders import database, finish_a_job, listing, names, opened,
 from service.core.models import SCHEMA_VERSION, State
 from service.core.settings import SettingsError
 from service.storage import folder_binding
-from service.storage.job_store import Store
+from service.storage.job_records import Store
 
 pytestmark = pytest.mark.usefixtures("no_variables")
 

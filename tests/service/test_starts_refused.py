@@ -12,7 +12,7 @@ from helpers.data_folders import command, database, finish_a_job, listing, opene
 
 from service.core.models import SCHEMA_VERSION
 from service.core.settings import SettingsError
-from service.storage.job_store import Store
+from service.storage.job_records import Store
 
 pytestmark = pytest.mark.usefixtures("no_variables")
 

@@ -8,7 +8,7 @@ import pytest
 from helpers.job_rows import add
 
 from service.core.models import ENDED, State
-from service.storage.job_store import LimitExceeded, Store
+from service.storage.job_records import LimitExceeded, Store
 
 ALLOWED = {
     *itertools.product([State.QUEUED], [State.RUNNING, State.FAILED, State.CANCELLED]),

@@ -17,7 +17,7 @@ from helpers.service import SLOW, SMALL, Service, problem, read_response, scene_
 from service.core.models import State
 from service.storage import database_health
 from service.storage.database_health import DatabaseReplacedError
-from service.storage.job_store import Store
+from service.storage.job_records import Store
 
 HEAD = b"POST /v1/jobs HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\n\r\n"
 
@@ -301,7 +301,7 @@ def test_a_transaction_during_the_removal_fails(tmp_path, monkeypatch):
     from helpers.job_rows import add
 
     store = Store(f"sqlite:///{tmp_path / 'jobs.sqlite'}", time.time)
-    monkeypatch.setattr("service.storage.job_store._add_event", lambda *arguments: remove(tmp_path))
+    monkeypatch.setattr("service.storage.job_records._add_event", lambda *arguments: remove(tmp_path))
     with pytest.raises(DatabaseReplacedError):
         add(store)
     store.close()

@@ -16,7 +16,7 @@ from ...core.problems import PROBLEM_TYPES, ProblemError
 from ...core.schemas import Health, Limits, Presets, ProblemKind, Version
 from ...jobs.container import Service, ServiceContainer
 from ...storage.database_health import error_text
-from ...storage.job_storage import ORPHANED
+from ...storage.job_files import ORPHANED
 from .common import MAX_WAIT_SECONDS, NO_STORE, problems
 
 router = APIRouter()
