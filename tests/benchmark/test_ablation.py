@@ -84,6 +84,7 @@ def test_rows_agree_with_compress_and_evaluate(tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("in_this_process")
+@pytest.mark.quick(0)
 def test_the_command_lists_parts_and_changed_settings(tmp_path, monkeypatch):
     monkeypatch.setattr(ablation, "PAPER_VARIANTS", PAPER_VARIANTS[:2])
     scene = tmp_path / "scene.ply"

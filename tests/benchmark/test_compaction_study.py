@@ -34,6 +34,7 @@ def test_all_strategies_at_all_ratios(points):
     assert all(0 < point.psnr < 100 and 0 < point.bytes < first.bytes for point in others)
 
 
+@pytest.mark.quick(0)
 def test_scores_are_better_than_chance_and_training_better_than_none(points):
     psnr = {point.strategy: point.psnr for point in points if point.count == 16}
     assert psnr["random"] < psnr["POP in rounds"] < psnr["POP in rounds + refine"]
@@ -41,6 +42,7 @@ def test_scores_are_better_than_chance_and_training_better_than_none(points):
 
 
 @pytest.mark.parametrize("supervision", ["photos", "cameras", "scene"])
+@pytest.mark.quick(1)
 def test_evaluation_views_do_not_depend_on_the_supervision(tmp_path, supervision):
     """Photographs are black here, so that only training with them improves the PSNR to them."""
     black_photo = tmp_path / "black.png"

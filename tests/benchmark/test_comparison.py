@@ -148,6 +148,7 @@ def test_measurements_go_on_after_an_external_codec_fails(scene, monkeypatch):
         compare(scene, plan)
 
 
+@pytest.mark.quick(0)
 def test_a_resampled_scene_is_measured_at_each_count(scene):
     rows = compare_at_counts(scene, [100, 500], BenchmarkPlan(presets=[Settings.from_preset("fast")]))
     assert [(row.scene, row.gaussians) for row in rows] == [("tiny.ply", 100), ("tiny.ply", 500)]

@@ -69,6 +69,7 @@ def test_points_agree_with_compress_and_evaluate():
         rate_curves(scene, Settings.from_preset("fast"), views)
 
 
+@pytest.mark.quick(0)
 def test_supervision_by_the_scene_does_not_use_the_capture():
     scene, settings = (
         cloud(200, 0),

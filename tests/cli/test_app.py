@@ -77,6 +77,7 @@ def test_info_of_both_kinds(scene: Path, tmp_path: Path) -> None:
     assert "bits per Gaussian" in table
 
 
+@pytest.mark.quick(0)
 def test_goals_and_cached_sensitivity(scene: Path, tmp_path: Path) -> None:
     few_views = "--set", "sensitivity_views=4", "--set", "sensitivity_view_size=48"
     copy = tmp_path / "scene.ply"

@@ -49,6 +49,7 @@ def test_other_sizes_are_measured_and_plotted(scene: Path, tmp_path: Path) -> No
     assert (tmp_path / "p.png").stat().st_size > 10_000
 
 
+@pytest.mark.quick(0)
 def test_images_are_compared_and_the_rasteriser_is_measured(scene: Path) -> None:
     rows = json.loads(run("bench", "codecs", scene, "-p", "fast", "--evaluate", "--json").stdout)
     assert rows[0]["evaluation"]["mean"]["candidate_vs_reference"]["psnr"] > 20
@@ -92,7 +93,7 @@ def test_a_plot_of_two_scenes_is_refused(scene: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("words", [["ablation", "-p", "paper"], ["rendering"], ["codecs", "-p", "fast"]])
-@pytest.mark.quick(1)
+@pytest.mark.quick(0)
 def test_the_results_of_other_scenes_are_printed_if_one_fails(scene: Path, words: list[str]) -> None:
     done = run("bench", *words, scene, scene.with_name("none.ply"), "--json")
     assert done.returncode == 2

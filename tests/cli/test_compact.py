@@ -57,6 +57,7 @@ def test_the_preset_fast_only_prunes(folder: Path, tmp_path: Path) -> None:
     assert len(found) == 99
 
 
+@pytest.mark.quick(0)
 def test_a_search_prints_its_trials(folder: Path, tmp_path: Path) -> None:
     words = ["-p", "fast", "--set", "views=96", "--set", "view_size=48", "-o", tmp_path / "b.ply"]
     done = run("compact", folder / "a.ply", "--max-psnr-drop", "1", *words)

@@ -140,6 +140,7 @@ def test_json_errors_have_a_code(folder: Path, tmp_path: Path) -> None:
     assert json.loads(done.stdout)["error"]["code"] == "invalid-views"
 
 
+@pytest.mark.quick(0)
 def test_compressing_can_evaluate(folder: Path, tmp_path: Path) -> None:
     words = ["compress", folder / "a.ply", "-o", tmp_path / "a.zip", "--evaluate", "--views", folder / "capture"]
     report = json.loads(run(*words, "--json").stdout)["evaluation"]

@@ -46,6 +46,7 @@ def test_output_and_report_are_those_of_the_library(folder: Path, tmp_path: Path
     assert "fine-tuned on renderings of the scene" in done.stdout.decode()
 
 
+@pytest.mark.quick(0)
 def test_photographs_are_training_targets(folder: Path, tmp_path: Path) -> None:
     words = ["compress", folder / "a.ply", "-o", tmp_path / "b.zip", "--finetune", "4", "--views", folder / "capture"]
     report = json.loads(run(*words, *OPTIONS, "--json").stdout)["finetuning"]

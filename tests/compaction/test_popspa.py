@@ -138,7 +138,7 @@ def test_the_state_of_admm_is_resumed(tmp_path, monkeypatch, steps):
 
 
 @pytest.mark.parametrize("steps", [0, 2, 4, 5, 9, 10, 13, 15])
-@pytest.mark.quick(2)
+@pytest.mark.quick(1)
 def test_interrupted_work_resumes_to_the_same_result(tmp_path, monkeypatch, steps):
     monkeypatch.setattr(Checkpoint, "due", True)
     task = Popspa(cloud(80), settings(), five_views())
@@ -258,6 +258,7 @@ def test_a_checkpoint_that_cannot_be_written_is_reported_first(tmp_path, monkeyp
         Popspa(cloud(80), settings(), five_views())(20, checkpoint=tmp_path / "nowhere" / "c.npz")
 
 
+@pytest.mark.quick(0)
 def test_virtual_views_train_without_a_capture():
     scene = kissgs.sample_scene(400, sh_degree=0)
     found = supervision_views(scene, None, settings(views=64, view_size=50))
@@ -292,6 +293,7 @@ def test_a_capture_is_mixed_with_virtual_views(share, virtual):
 
 
 @pytest.mark.parametrize("photos", [0, 2, 4])
+@pytest.mark.quick(1)
 def test_a_capture_without_held_out_views_is_evaluated_in_training_views(tmp_path, photos):
     """The note says so; all evaluation views have photographs, or none has."""
     train = list(around(4))

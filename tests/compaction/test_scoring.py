@@ -53,6 +53,7 @@ def test_no_score_is_below_a_share_of_that_of_a_camera_nearby(min_score):
 
 @pytest.mark.parametrize("min_keep", [0.0, 0.3, 0.8, 0.99])
 @pytest.mark.parametrize("count", [1, 7, 79])
+@pytest.mark.quick(4)
 def test_any_number_of_rounds_keeps_exactly_the_requested_count(min_keep, count):
     kept = prune_by_score(cloud(80), VIEWS, black(), count, min_keep_per_scoring=min_keep)
     assert len(kept) == count

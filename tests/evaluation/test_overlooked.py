@@ -125,6 +125,7 @@ def test_a_scene_without_separate_parts_gets_no_added_cameras():
     assert [view.added for view in views.test] == [False] * COUNT
 
 
+@pytest.mark.quick(0)
 def test_the_number_of_added_cameras_is_limited():
     scene, _ = objects(120, gaussians=40)
     assert sum(view.added for view in evaluation_views(scene).test) == MAX_ADDED

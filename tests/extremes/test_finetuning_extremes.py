@@ -26,7 +26,7 @@ def check(scene, preset="balanced", **changes):
 
 
 @pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.__name__)
-@pytest.mark.quick(3)
+@pytest.mark.quick(2)
 def test_degenerate_scenes_are_tuned_without_nan(scene):
     check(scene())
 

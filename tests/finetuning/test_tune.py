@@ -172,7 +172,7 @@ def test_compress_fine_tunes_and_reports_it(tmp_path):
 @pytest.mark.parametrize(
     ("encode", "finetune", "fewer"), [(10, 80, True), (10, 10, False), (90, 80, False), (0, 80, False)]
 )
-@pytest.mark.quick(1)
+@pytest.mark.quick(0)
 def test_more_gaussians_are_pruned_before_fine_tuning(monkeypatch, encode, finetune, fewer):
     """The number is that of the threshold without fine-tuning, and 0 if pruning is off."""
     scene = cloud(600, 1)

@@ -133,7 +133,7 @@ def test_max_encodes_limits_the_trials():
 
 
 @pytest.mark.parametrize("share", [0.45, 0.8])
-@pytest.mark.quick(1)
+@pytest.mark.quick(0)
 def test_fewer_gaussians_for_a_size(share):
     """Either all Gaussians do not fit, or fewer have a higher PSNR at that size in the evaluation views."""
     plain = len(kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **FEW_VIEWS)).to_zip())

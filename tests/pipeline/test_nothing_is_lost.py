@@ -28,6 +28,7 @@ def test_no_view_is_much_worse_than_with_uniform_steps(name: str):
     assert short.sum() <= 1, (balanced[short], fast[short])
 
 
+@pytest.mark.quick(0)
 def test_most_of_two_distant_objects_is_kept():
     compressed = compress(clean(two(1000))[0])
     places = decompress(compressed.to_zip()).means[:, 0]

@@ -49,6 +49,7 @@ def stop_at(wanted, number=1):
 
 
 @pytest.mark.parametrize("stage", ["write", "evaluate"])
+@pytest.mark.quick(1)
 def test_stopping_after_the_search_has_no_effect(tmp_path, stage):
     goal = settings(target_size=8000)
     expected = kissgs.compress(SCENE, settings=goal).to_zip()

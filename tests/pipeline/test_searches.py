@@ -175,6 +175,7 @@ def test_the_reported_lambda_and_codebook_reproduce_the_container():
 FIXED = kissgs.sample_scene(4000, sh_degree=3, seed=4)
 
 
+@pytest.mark.quick(0)
 def test_a_size_is_met_between_two_sides_of_the_codebook():
     """Sides are multiples of 8; one step of the side is some kB for this scene."""
     found = kissgs.compress(FIXED, settings=Settings.from_preset("balanced", target_size=61_500))

@@ -30,7 +30,7 @@ def psnrs(scene, found, views, background=(0, 0, 0)):
 
 @pytest.mark.parametrize("background", [(0, 0, 0), (1, 1, 1), (0.2, 0.9, 0.5)])
 @pytest.mark.parametrize("preset", ["balanced", "small"])
-@pytest.mark.quick(2)
+@pytest.mark.quick(1)
 def test_fewer_bytes_than_the_papers_and_better_before_any_background(preset, background):
     """The default quality is that of ``fast`` if the paper's levels are too coarse for the scene's ranges. Here that is
     more than 2 dB, and takes some of the saved bytes."""

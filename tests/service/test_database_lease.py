@@ -43,7 +43,7 @@ def lease_rows(url):
     return found
 
 
-@pytest.mark.quick(1)
+@pytest.mark.quick(0)
 def test_a_copied_data_folder_on_the_same_database(tmp_path, url):
     """The copy has the folder's numbers, too; the second service once marked all jobs of the first as failed."""
     with Service(tmp_path / "first", KISSGS_DATABASE_URL=url) as first:
@@ -103,6 +103,7 @@ def test_a_start_waits_for_a_service_that_crashed_on_another_machine(tmp_path, u
 
 @pytest.mark.usefixtures("no_variables")
 @pytest.mark.parametrize("ends", ["lives", "stops"])
+@pytest.mark.quick(1)
 def test_a_service_that_runs_on_another_machine(tmp_path, url, on_machine, ends):
     on_machine(1)
     first = opened(tmp_path / "data", url)

@@ -295,6 +295,7 @@ def test_a_disk_that_fills_up_during_an_upload(tiny_disk):
         assert result_of(service, service.submit()) == EXPECTED
 
 
+@pytest.mark.quick(0)
 def test_a_disk_that_fills_up_during_a_job(tiny_disk):
     with Service(tiny_disk / "data") as service:
         job = service.submit(MEDIUM)

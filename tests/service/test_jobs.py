@@ -101,6 +101,7 @@ def test_resumable_options(compact, resumable):
     assert not parse_options(json.dumps({"preset": "fast", "compact": compact})).resumable
 
 
+@pytest.mark.quick(0)
 def test_goals_and_count_search(service):
     prune = {
         "auto_count": True,

@@ -155,6 +155,7 @@ def test_reload_and_cancel(visit, start):
     assert service.status(job)["state"] == "cancelled"
 
 
+@pytest.mark.quick(0)
 def test_training_notes_are_shown(visit, start):
     service = start()
     page = visit(service)

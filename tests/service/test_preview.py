@@ -44,7 +44,7 @@ def folder(tmp_path, monkeypatch):
     for name in (*FILES, *UNSERVED):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(FILES.get(name, "secret"))
-    monkeypatch.setattr(preview, "FOLDER", folder)
+    monkeypatch.setattr(preview, "WEB_DECODER", folder)
     return folder
 
 

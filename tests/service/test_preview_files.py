@@ -41,6 +41,7 @@ def test_choosing_files(preview, service):
     assert not any("/v1/" in url for _, url in tab.requests)
 
 
+@pytest.mark.quick(0)
 def test_dropping_files(preview, service):
     tab = preview().open(service)
     page = tab.page
@@ -70,7 +71,7 @@ def test_dropping_files(preview, service):
         ("mesh.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n", [".ply"]),
     ],
 )
-@pytest.mark.quick(2)
+@pytest.mark.quick(1)
 def test_unsuitable_files(preview, service, name, data, words):
     """They are rejected with a message, and a scene that is shown stays."""
     tab = preview().open(service)
@@ -110,6 +111,7 @@ def test_one_scene_after_the_other_releases_the_first(preview, service):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.quick(1)
 def test_accessibility(preview, service, scheme):
     tab = preview(color_scheme=scheme, reduced_motion="reduce", viewport={"width": 820, "height": 700}).open(service)
     page = tab.page
@@ -224,6 +226,7 @@ def statistics(tab):
     return re.sub(r"Loaded in\s+\S+ \S+", "", tab.page.locator("#statistics").inner_text())
 
 
+@pytest.mark.quick(0)
 def test_an_address_and_a_file_have_the_same_statistics(preview, service):
     tab = served(preview(), service, ZIP)
     tab.shown(COUNT)
@@ -310,6 +313,7 @@ def levels_of(file):
         return np.asarray(Image.open(io.BytesIO(archive.read(file))).convert("RGBA"))
 
 
+@pytest.mark.quick(0)
 def test_touch_marks_a_gaussian(preview, service):
     tab = preview(viewport={"width": 390, "height": 780}, has_touch=True, is_mobile=True).open(service)
     tab.drop(("a.zip", ZIP))
@@ -345,6 +349,7 @@ window.pixelsOf = (canvas) => [...canvas.getContext("2d").getImageData(0, 0, can
 """
 
 
+@pytest.mark.quick(0)
 def test_thumbnails_are_painted_in_turn(preview, service):
     tab = preview()
     tab.page.add_init_script(IDLE)
@@ -363,6 +368,7 @@ def test_thumbnails_are_painted_in_turn(preview, service):
 
 
 @pytest.mark.parametrize("idle", [True, False])
+@pytest.mark.quick(1)
 def test_planes_show_their_levels(preview, service, idle):
     tab = preview()
     if not idle:
@@ -382,6 +388,7 @@ def test_planes_show_their_levels(preview, service, idle):
         assert tab.page.locator(".plane canvas").evaluate("(it) => pixelsOf(it)") == levels.ravel().tolist()
 
 
+@pytest.mark.quick(0)
 def test_a_scene_without_positions_hides_the_previous_one(preview, service):
     """The second scene has damaged positions, so the drawing of the first is hidden until a third is loaded."""
     tab = preview().open(service)

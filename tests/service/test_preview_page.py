@@ -109,6 +109,7 @@ def red(image):
     return ((image[..., 0] > 120) & (image[..., 1] < 80) & (image[..., 2] < 80)).sum()
 
 
+@pytest.mark.quick(0)
 def test_panels_and_help(preview, service, job, decoded):
     tab = preview().open(service, job["id"])
     page = tab.page
@@ -360,6 +361,7 @@ def test_jobs_without_a_result(start, preview):
     assert "cancelled" in tab.error_message("no container")
 
 
+@pytest.mark.quick(0)
 def test_with_keys(start, preview):
     service = start(KISSGS_KEYS=f"{KEYS} bob:{hashlib.sha256(b'other').hexdigest()}")
     service.http.headers["Authorization"] = "Bearer secret"

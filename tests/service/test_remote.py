@@ -43,6 +43,7 @@ def test_remote_compression_equals_local_compression(service, scene, tmp_path):
     assert received[-1] == ("download", 1.0)
 
 
+@pytest.mark.quick(0)
 def test_training_notes_are_received(service, scene, tmp_path):
     changes = {"count": 100, "sparsify_steps": 4, "refine_steps": 4, "views": 24, "view_size": 48}
     received = []
@@ -90,6 +91,7 @@ def test_local_errors(service, scene, tmp_path):
             kissgs.Remote(address)
 
 
+@pytest.mark.quick(0)
 def test_an_unreachable_service(scene, tmp_path, monkeypatch):
     from kissgs.client import remote
 
@@ -131,6 +133,7 @@ def test_a_job_cancelled_on_the_server(start, tmp_path):
         remote.compress(scene, tmp_path / "x.zip", settings=kissgs.Settings(preset="paper"), progress=cancel)
 
 
+@pytest.mark.quick(0)
 def test_the_service_restarts_during_a_job(tmp_path):
     """The client continues when a killed service is back at its address."""
     with socket.socket() as probe:
@@ -155,6 +158,7 @@ def test_the_service_restarts_during_a_job(tmp_path):
     assert (tmp_path / "x.zip").read_bytes() == kissgs.compress(scene, settings=FAST).to_zip()
 
 
+@pytest.mark.quick(0)
 def test_a_full_queue_is_retried(start, scene, tmp_path):
     service = start(KISSGS_MAX_QUEUE=1)
 

@@ -173,6 +173,7 @@ def test_a_refused_command_prints_one_line(jobs_folder, change):
     assert listing(jobs_folder).items() >= before.items()
 
 
+@pytest.mark.quick(0)
 def test_a_locked_database(jobs_folder):
     before = listing(jobs_folder)
     with contextlib.closing(sqlite3.connect(jobs_folder / "jobs.sqlite")) as other:

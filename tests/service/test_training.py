@@ -131,7 +131,7 @@ def test_unusable_checkpoints_are_replaced(start, damage):
 
 
 @pytest.mark.parametrize("saved", [0, 1])
-@pytest.mark.quick(1)
+@pytest.mark.quick(0)
 def test_a_full_disk_disables_checkpoints(tmp_path, monkeypatch, saved):
     """The job succeeds without them, and its report does not reveal paths of the server."""
     from kissgs.training import checkpoint
@@ -166,6 +166,7 @@ def test_a_full_disk_disables_checkpoints(tmp_path, monkeypatch, saved):
     assert str(tmp_path) not in report
 
 
+@pytest.mark.quick(0)
 def test_disk_space_for_checkpoints_is_reserved_until_the_job_ends(start_held):
     service, training = start_held("sparsify", KISSGS_MAX_DISK_BYTES=4 * len(SMALL))
     job = service.submit(options=json.dumps(BRIEF))

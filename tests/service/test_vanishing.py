@@ -78,7 +78,7 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("kind", CHANGES)
-@pytest.mark.quick(3)
+@pytest.mark.quick(1)
 def test_changes_are_detected_before_an_upload_is_read(start, kind):
     service = start()
     job = service.ended(service.submit())
@@ -141,6 +141,7 @@ def test_an_upload_during_the_removal_is_not_accepted(start):
     assert list((service.folder / "jobs").iterdir()) == []
 
 
+@pytest.mark.quick(0)
 def test_no_accepted_job_is_lost(start):
     """Jobs accepted with 202 keep their uploads if the database is removed during submissions, and a restart without
     the database is refused."""
@@ -225,6 +226,7 @@ def test_a_restored_database(start):
     assert service.leftovers() == []
 
 
+@pytest.mark.quick(0)
 def test_files_of_a_replacement_stay_unchanged(tmp_path):
     """A backup with its own journal replaces the database while that is open."""
     with Service(tmp_path / "data") as service:

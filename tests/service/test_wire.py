@@ -27,6 +27,7 @@ def test_invalid_origins_are_foreign(service, origin):
 
 
 @pytest.mark.parametrize("host", ["[x", "[::1", "]", "[x]:80:80"])
+@pytest.mark.quick(1)
 def test_invalid_hosts(start, host):
     service = start(KISSGS_KEYS=f"a:{'0' * 64}")  # with keys, all host names are allowed
     for path in ("nothing", "livez", "readyz", "preview/x"):
@@ -69,6 +70,7 @@ async def receive_scene(folder, *packets, complete=True):
 
 
 @pytest.mark.parametrize("end", [b"\n", b"\r\n"])
+@pytest.mark.quick(1)
 def test_comments_that_look_like_the_end_of_the_header(tmp_path, end):
     """The header may be split anywhere; a packet that ended after such a comment was once refused."""
     comments = b"comment see end_header\ncomment end_header \ncomment x, end_header\n"

@@ -60,6 +60,7 @@ def test_every_count(count, preset):
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("count", [1, 9, 100])
+@pytest.mark.quick(4)
 def test_constant_scenes_decode_exactly(count, preset):
     """Every channel is constant: no image may lose it to a division by zero, or give it another channel's level."""
     splats = constant_scene(count, degree=2)

@@ -44,6 +44,7 @@ def test_threads_and_repetition_do_not_change_a_byte(scene, preset):
     assert list(once.files) == list(threaded.files)
 
 
+@pytest.mark.quick(0)
 def test_another_process_gives_the_same_bytes(scene):
     """Nothing may hang on the order of sets, on addresses, or on the number of BLAS threads."""
     program = (

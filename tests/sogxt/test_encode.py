@@ -39,6 +39,7 @@ def encoded(splats, preset="fast", **changes):
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("count", [1, 9, 300])
+@pytest.mark.quick(4)
 def test_round_trip_is_within_the_half_steps_that_are_reported(count, preset):
     splats = random_scene(count, 1, seed=count)
     result = encoded(splats, preset, prune_threshold_bits=0)
@@ -144,6 +145,7 @@ def test_ranges_are_those_of_the_data_to_the_last_bit(preset):
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("count", [1, 9, 65, 300])
+@pytest.mark.quick(4)
 def test_every_image_spans_its_levels(count, preset):
     """A decoder takes the levels that it sees for the ends of the ranges: no range may end where no level lies."""
     files = encoded(random_scene(count, 1, seed=3), preset).files
@@ -167,6 +169,7 @@ def test_every_image_spans_its_levels(count, preset):
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("count", [1, 9, 100])
+@pytest.mark.quick(4)
 def test_padding_repeats_cells_that_are_active(count, preset):
     """PRAS may give padding another form of its Gaussian, to be similar to its neighbours."""
     files = encoded(random_scene(count, 2), preset, prune_threshold_bits=0).files

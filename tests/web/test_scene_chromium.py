@@ -124,7 +124,7 @@ MODES = [{}, {"native": True}, {"native": False}, {"workers": 0}, {"workers": 0,
 
 @pytest.mark.parametrize("within", [IN_PAGE, IN_WORKER], ids=["page", "worker"])
 @pytest.mark.parametrize("options", MODES, ids=str)
-@pytest.mark.quick(3)
+@pytest.mark.quick(1)
 def test_all_options_of_decoding(do, site, options, within, large):
     small = container("paper", 3, 65)
     for files, source, keep in (
@@ -139,7 +139,7 @@ def test_all_options_of_decoding(do, site, options, within, large):
 
 @pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 64, 65])
 @pytest.mark.parametrize("preset", ["fast", "paper"])
-@pytest.mark.quick(4)
+@pytest.mark.quick(2)
 def test_small_scenes(do, preset, count):
     for degree in (0, 1, 3):
         files = container(preset, degree, count)

@@ -38,7 +38,7 @@ def site():
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("degree", range(4))
-@pytest.mark.quick(4)
+@pytest.mark.quick(2)
 def test_every_preset_degree_and_count(preset, degree):
     files = [container(preset, degree, count) for count in COUNTS]
     found = in_node(*(job(some, options={"keepPlanes": True}) for some in files))

@@ -157,6 +157,7 @@ SIDE = skewed(seen_from((-4.5, -2.6, 2.0)))
 
 
 @pytest.mark.parametrize("degree", [0, 3])
+@pytest.mark.quick(1)
 def test_images_agree_with_the_rasteriser(page, degree):
     splats = kissgs.sample_scene(5000, sh_degree=degree)
     for camera, drawn in zip((FRONT, SIDE), draw(page, splats, [FRONT, SIDE]), strict=True):

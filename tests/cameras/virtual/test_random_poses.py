@@ -33,11 +33,13 @@ def test_views_are_split_named_square_and_of_several_fields_of_view(tall_box):
     assert np.ptp(angles) > 0.2
 
 
+@pytest.mark.quick(0)
 def test_a_scene_of_several_objects_gets_more_views():
     views = random_poses(five(), side=16, count=24)
     assert 48 <= len(views.all) <= 4 * 24
 
 
+@pytest.mark.quick(0)
 def test_the_same_seed_gives_the_same_views_for_any_number_of_threads(tall_box):
     one, same = (random_poses(tall_box, side=32, count=9, seed=3, threads=threads) for threads in (1, 3))
     assert np.array_equal(positions_of(one), positions_of(same))

@@ -22,6 +22,7 @@ def cameras_of(splats: Splats, count: int = 24) -> list[Camera]:
 
 
 @pytest.mark.parametrize("distance", [100, 10_000])
+@pytest.mark.quick(1)
 def test_two_distant_objects_both_have_cameras(distance: float):
     cameras = cameras_of(two(distance))
     assert count_near(cameras, (0, 0, 0), 30) >= 6
@@ -34,6 +35,7 @@ def test_a_small_object_has_cameras_at_its_own_scale():
     assert count_near(cameras, (0, 0, 0), 8) >= 4
 
 
+@pytest.mark.quick(0)
 def test_each_of_five_objects_has_cameras():
     cameras = cameras_of(SCENES["five of different density"](), count=48)
     for position in ((0, 0, 0), (150, 0, 0), (0, 0, 150), (-150, 20, 0), (300, 0, 300)):
