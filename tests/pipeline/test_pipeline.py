@@ -186,9 +186,9 @@ def test_a_folder_of_other_things_is_refused_before_the_work(tmp_path):
     assert events.events == []
 
 
-def test_only_ply_is_saved(tmp_path):
+def test_only_ply_is_decompressed(tmp_path):
     with pytest.raises(OutputError, match=r"a scene is written as \.ply; use compress to write a container"):
-        kissgs.save(SCENE, tmp_path / "scene.zip")
+        kissgs.decompress(b"", tmp_path / "scene.zip")
     assert names(tmp_path) == []
 
 
