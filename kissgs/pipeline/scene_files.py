@@ -79,10 +79,20 @@ def save(
         OutputError: the file exists and ``overwrite`` is false, its ending is of no such format, or writing fails.
         UnsupportedError: the format cannot hold the scene, such as ``.glb`` one without Gaussians.
     """
-    path = Path(path)
-    kind = output_format(path)
-    with atomic_file(path, overwrite=overwrite) as file:
+    kind = output_format(Path(path))
+    with atomic_file(Path(path), overwrite=overwrite) as file:
         return write_scene(file, splats, kind, raw_axes=raw_axes, progress=progress)
+
+
+def save_ply(splats: Splats, path: AnyPath, *, overwrite: bool = False, progress: Progress = silent) -> None:
+    """Write a scene atomically as an exact ``.ply``, also where its name ends in ``.compressed.ply``.
+
+    Raises:
+        OutputError: as for :func:`check_ply`, or writing fails.
+    """
+    check_ply(Path(path), overwrite=overwrite)
+    with atomic_file(Path(path), overwrite=overwrite) as file:
+        write_scene(file, splats, "ply", progress=progress)
 
 
 def check_ply(path: Path, *, overwrite: bool) -> None:

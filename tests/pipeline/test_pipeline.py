@@ -192,6 +192,15 @@ def test_only_ply_is_decompressed(tmp_path):
     assert names(tmp_path) == []
 
 
+def test_decompressed_numbers_are_exact_whatever_the_name(tmp_path):
+    """A container of a.compressed.ply has the name a.compressed.zip, and gives a.compressed.ply back."""
+    packed = compress(SCENE).to_zip()
+    path = tmp_path / "a.compressed.ply"
+    wanted = kissgs.decompress(packed, path)
+    assert not kissgs.read_ply_info(path).compressed
+    np.testing.assert_array_equal(kissgs.load(path).means, wanted.means)
+
+
 def count_of_events():
     events = Recorder()
     compress(SCENE, progress=events)
