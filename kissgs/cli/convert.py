@@ -94,7 +94,7 @@ def convert(
 
 def _output_format(output: str, to: str | None) -> OutputFormat:
     """Return the format of the outputs: ``--to``, or what the ending of the output stands for."""
-    from kissgs.pipeline.scene_output import OUTPUT_FORMATS, output_format
+    from kissgs.pipeline.scene_output import OUTPUT_FORMATS, SCENE_ENDINGS, output_format
 
     if to is None:
         if output == "-":
@@ -103,7 +103,7 @@ def _output_format(output: str, to: str | None) -> OutputFormat:
     wanted = next((kind for kind in OUTPUT_FORMATS if kind == to.lower().removeprefix(".")), None)
     if wanted is None:
         raise OutputError(f"--to {to[:40]} is no format that is written; choose {', '.join(OUTPUT_FORMATS)}")
-    if Path(output).suffix.lower() in {f".{kind.rpartition('.')[2]}" for kind in OUTPUT_FORMATS}:
+    if Path(output).suffix.lower() in SCENE_ENDINGS:
         found = output_format(Path(output))
         if found != wanted:
             raise OutputError(f"{output[:100]} has the ending of {found}, but --to asks for {wanted}; choose one")

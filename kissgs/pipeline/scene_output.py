@@ -21,6 +21,9 @@ OUTPUT_FORMATS: tuple[OutputFormat, ...] = ("ply", "compressed.ply", "spz", "spl
 
 _CONTAINERS = (".zip", ".sog")
 
+SCENE_ENDINGS = (".ply", ".spz", ".splat", ".glb", ".ksplat", ".gltf", *_CONTAINERS)
+"""Endings that a folder for outputs does not have."""
+
 
 def output_format(path: Path) -> OutputFormat:
     """Return the format that the ending of a name stands for.

@@ -95,6 +95,8 @@ def test_errors(scene: Path, tmp_path: Path) -> None:
     assert "has the ending of ply, but --to asks for spz" in failure(
         "convert", scene, tmp_path / "a.ply", "--to", "spz"
     )
+    assert "kissgs compress writes those" in failure("convert", scene, tmp_path / "a.sog", "--to", "spz")
+    assert "has no ending of a format" in failure("convert", scene, tmp_path / "a.gltf", "--to", "glb")
     assert "both write to standard output" in failure("convert", scene, "-", "--to", "spz", "--json")
     assert "no such file" in failure("convert", tmp_path / "none.ply", out)
     out.write_bytes(b"mine")
