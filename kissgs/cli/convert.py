@@ -114,9 +114,6 @@ def _removed(cleaned: Cleaned) -> list[str]:
     """Return what cleaning has left out of a scene."""
     if not cleaned.removed:
         return []
-    what = (
-        "Gaussian with NaN, infinite or huge values is"
-        if cleaned.removed == 1
-        else ("Gaussians with NaN, infinite or huge values are")
-    )
-    return [f"{cleaned.removed:,} {what} left out"]
+    several = cleaned.removed > 1
+    gaussians = f"{cleaned.removed:,} Gaussian{'s' if several else ''}"
+    return [f"{gaussians} with NaN, infinite or huge values {'are' if several else 'is'} left out"]

@@ -24,7 +24,6 @@ _CHUNK = BLOCK_ALIGNMENT
 
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
-
 _HALVES = (slice(0, 3), slice(3, 6))
 """Columns of minima and of maxima among the six bounds of an attribute."""
 
