@@ -14,6 +14,7 @@ from kissgs._version import __version__
 from kissgs.cli.bench import app as bench
 from kissgs.cli.compact import compact
 from kissgs.cli.compress import compress
+from kissgs.cli.convert import convert
 from kissgs.cli.decompress import decompress
 from kissgs.cli.evaluate import evaluate
 from kissgs.cli.files import write_stdout
@@ -54,7 +55,7 @@ def _run() -> None:
         _fail(UnsupportedError(f"cannot use {error.filename!s:.100}: {(error.strerror or str(error)).lower()}"))
 
 
-for command in (compress, decompress, compact, render, evaluate, info, sample, warmup):
+for command in (compress, decompress, convert, compact, render, evaluate, info, sample, warmup):
     app.command()(command)
 for group in (bench, remote):
     app.add_typer(group)

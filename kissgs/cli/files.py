@@ -88,7 +88,7 @@ def _targets(inputs: list[str], output: Path | None, suffix: str) -> list[Path]:
     """Return the output path of each input: next to it, in the folder ``output``, or the file ``output``."""
     if "-" in inputs and (len(inputs) > 1 or output is None):
         raise OutputError("standard input has no name and must be the only input; give the output with -o")
-    if output is not None and (str(output) == "-" or (suffix and output.suffix.lower() == suffix)):
+    if output is not None and (str(output) == "-" or _ends_with(output, suffix)):
         if len(inputs) > 1:
             raise OutputError(f"{len(inputs)} inputs cannot all become {output}; give a folder with -o")
         return [output]
@@ -107,6 +107,11 @@ def _targets(inputs: list[str], output: Path | None, suffix: str) -> list[Path]:
     if len(set(targets)) < len(targets):
         raise OutputError("two inputs have the same name and would become one file; process them one by one")
     return targets
+
+
+def _ends_with(path: Path, suffix: str) -> bool:
+    """Whether a path names a file with this ending, such as ".ply" or ".compressed.ply"."""
+    return bool(suffix) and path.name.lower().endswith(suffix) and len(path.name) > len(suffix)
 
 
 def source(name: str) -> Path | bytes:

@@ -13,7 +13,7 @@ from kissgs.cli.arguments import (
 
 
 def sample(
-    output: Annotated[Path, typer.Argument(help="Output NAME.ply.")],
+    output: Annotated[Path, typer.Argument(help="Output NAME.ply; other formats as for convert.")],
     gaussians: Annotated[int, typer.Option(min=0, help="Number of Gaussians.")] = 60_000,
     degree: Annotated[int, typer.Option(min=0, max=3, help="Degree of the spherical harmonics.")] = 3,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the scene.")] = 0,

@@ -8,18 +8,27 @@ from __future__ import annotations
 
 import numpy as np
 
-from kissgs.core.array_types import Float32, Float64, Shaped, UInt32
+from kissgs.core.array_types import Float, Float32, Float64, Int64, Shaped, UInt32
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
-from kissgs.core.progress import Progress
+from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import SH_C0, SH_REST_COUNTS, Splats, empty_splats
-from kissgs.io.activations import insert_largest
+from kissgs.io.activations import insert_largest, steps
+from kissgs.io.codes import colors_of, note_clamped, opacities_of, split_largest, to_codes
+from kissgs.io.morton import morton_order
 from kissgs.io.ply_body import BLOCK_ALIGNMENT, check_complete, rows
 from kissgs.io.ply_header import Element, Header, PlyFile, sh_degree
+from kissgs.io.scene_file import BinaryWriter
 
 _CHUNK = BLOCK_ALIGNMENT
 """Gaussians per row of element ``chunk``, given by the format; blocks of rows are multiples of it."""
 
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+
+_HALVES = (slice(0, 3), slice(3, 6))
+"""Columns of minima and of maxima among the six bounds of an attribute."""
+
+_MAX_SCALE = 20.0
+"""Bound of log-scales that a file holds, as the format's own tool has it."""
 
 
 def is_compressed(header: Header) -> bool:
@@ -153,3 +162,82 @@ def _require(ply: PlyFile, element: Element, names: tuple[str, ...], code: str) 
                 f"{ply.name} is a compressed .ply whose element {element.name!r} needs a property {name!r} of type "
                 f"{np.dtype(code).name}, but has {found}; export it again"
             )
+
+
+def write_compressed(file: BinaryWriter, splats: Splats, *, progress: Progress = silent) -> tuple[str, ...]:
+    """Write a clean scene in Morton order, so that the 256 Gaussians of a chunk are close to one another.
+
+    Args:
+        file: The stream; it is not flushed or closed, and its OSErrors are not caught.
+        splats: The scene, cleaned.
+        progress: Receives events of stage ``write``.
+
+    Returns:
+        What the format cannot hold, one phrase each.
+    """
+    n, k = len(splats), splats.shN.shape[1]
+    order = morton_order(splats.means)
+    chunks = np.empty((-(-n // _CHUNK), 18), "<f4")
+    words = np.empty((n, 4), "<u4")
+    for part in steps(n):  # each but the last has whole chunks
+        own = slice(part.start // _CHUNK, -(-part.stop // _CHUNK))
+        _encode_vertices(splats.select(order[part]), chunks[own], words[part])
+        progress("write", part.stop / n / (2 if k else 1))
+    file.write(_header(n, len(chunks), 3 * k))
+    file.write(chunks.tobytes())
+    file.write(words.data if n else b"")
+    for part in steps(n if k else 0):
+        # Truncated, not rounded: readers decode to the middle of a step.
+        codes = np.floor((splats.shN[order[part]].transpose(0, 2, 1).astype(np.float64) / 8 + 0.5) * 256)
+        file.write(np.clip(codes, 0, 255).astype(np.uint8).tobytes())
+        progress("write", 0.5 + part.stop / n / 2)
+    notes: list[str] = []
+    note_clamped(notes, "scales", splats.scales, -_MAX_SCALE, _MAX_SCALE, f"e^±{_MAX_SCALE:.0f}")
+    note_clamped(notes, "view-dependent colours", splats.shN, -4, 4, "coefficients of ±4")
+    return tuple(notes)
+
+
+def _header(count: int, chunks: int, rest: int) -> bytes:
+    bounds = [name for prefix, axes in (("", "xyz"), ("scale_", "xyz"), ("", "rgb")) for name in _bounds(prefix, axes)]
+    lines = ["ply", "format binary_little_endian 1.0", f"element chunk {chunks}"]
+    lines += [f"property float {name}" for name in bounds]
+    lines += [f"element vertex {count}", *(f"property uint {name}" for name in _PACKED)]
+    if rest:
+        lines += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(rest))]
+    return "\n".join([*lines, "end_header\n"]).encode("ascii")
+
+
+def _encode_vertices(
+    splats: Splats, chunks: Float32[np.ndarray, "chunks 18"], words: UInt32[np.ndarray, "B 4"]
+) -> None:
+    """Write the bounds of each chunk of these Gaussians, and their words."""
+    scales = np.clip(splats.scales, -_MAX_SCALE, _MAX_SCALE)
+    colors = colors_of(splats.sh0).astype(np.float32)
+    positions, sizes, rgb = (
+        _fractions(values, chunks[:, first : first + 6])
+        for values, first in ((splats.means, 0), (scales, 6), (colors, 12))
+    )
+    words[:, 0] = _pack_11_10_11(positions)
+    index, small = split_largest(splats.quats)
+    fields = to_codes((small * np.sqrt(0.5) + 0.5) * 1023, 1023)
+    words[:, 1] = index << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]
+    words[:, 2] = _pack_11_10_11(sizes)
+    alpha = to_codes(255 * opacities_of(splats.opacities))
+    r, g, b = to_codes(255 * rgb).T
+    words[:, 3] = r << 24 | g << 16 | b << 8 | alpha
+
+
+def _fractions(
+    values: Float32[np.ndarray, "B 3"], bounds: Float32[np.ndarray, "chunks 6"]
+) -> Float64[np.ndarray, "B 3"]:
+    """Write minima and maxima of each chunk to ``bounds``; return the values as fractions between them."""
+    starts = np.arange(0, len(values), _CHUNK)
+    bounds[:, :3] = np.minimum.reduceat(values, starts, axis=0)
+    bounds[:, 3:] = np.maximum.reduceat(values, starts, axis=0)
+    low, high = (np.repeat(bounds[:, half].astype(np.float64), _CHUNK, axis=0)[: len(values)] for half in _HALVES)
+    return (values - low) / np.where(high > low, high - low, 1)
+
+
+def _pack_11_10_11(fractions: Float[np.ndarray, "B 3"]) -> Int64[np.ndarray, " B"]:
+    x, y, z = to_codes(fractions * (2047, 1023, 2047), 2047).T
+    return x << 21 | y << 11 | z

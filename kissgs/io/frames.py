@@ -1,10 +1,10 @@
-"""Axes of other formats -> those of a ``.ply``: x right, y down, z forward."""
+"""Axes of other formats, and those of a ``.ply``: x right, y down, z forward."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from kissgs.core.array_types import Float64
+from kissgs.core.array_types import Float32, Float64
 from kissgs.core.spherical_harmonics import sh_basis
 from kissgs.core.splats import Splats
 
@@ -20,14 +20,23 @@ def axis_signs(frame: str) -> Signs:
 @np.errstate(all="ignore")  # values may be any floats; they are not cleaned here
 def mirror(splats: Splats, signs: Signs) -> None:
     """Mirror a scene in place: multiply the axes by ``signs``. Any number of them may be negative."""
-    x, y, z = signs
-    bands = (y, z, x), (x * y, y * z, 1, x * z, 1), (y, x * y * z, y, z, x, z, x)  # parity of each harmonic
-    flat = [sign for band in bands for sign in band][: splats.shN.shape[1]]
-    # An axis of rotation turns over with the two other axes.
-    for array, factors in ((splats.means, (x, y, z)), (splats.quats, (1, y * z, x * z, x * y))):
+    for array, factors in ((splats.means, signs), (splats.quats, quat_signs(signs))):
         # Not numpy.negative of columns in place: with four columns, NumPy 2.4 gives wrong numbers.
         np.multiply(array, np.array(factors, np.float32), out=array)
-    np.multiply(splats.shN, np.array(flat, np.float32)[:, None], out=splats.shN)
+    np.multiply(splats.shN, sh_signs(signs, splats.shN.shape[1])[:, None], out=splats.shN)
+
+
+def quat_signs(signs: Signs) -> tuple[int, int, int, int]:
+    """Return the signs of w, x, y, z when axes get ``signs``: an axis of rotation turns over with the two others."""
+    x, y, z = signs
+    return 1, y * z, x * z, x * y
+
+
+def sh_signs(signs: Signs, coefficients: int) -> Float32[np.ndarray, " K"]:
+    """Return the signs of the first SH coefficients in ``shN`` when axes get ``signs``: the parity of each harmonic."""
+    x, y, z = signs
+    bands = (y, z, x), (x * y, y * z, 1, x * z, 1), (y, x * y * z, y, z, x, z, x)
+    return np.array([sign for band in bands for sign in band][:coefficients], np.float32)
 
 
 @np.errstate(all="ignore")

@@ -29,7 +29,7 @@ SPZ_EXTENSIONS = ("KHR_gaussian_splatting_compression_spz_2", "KHR_gaussian_spla
 _MAX_INSTANCES = 10_000
 """Largest number of primitives, each counted at every node that shows it."""
 
-_TO_PLY: Signs = (-1, -1, 1)
+TO_PLY: Signs = (-1, -1, 1)
 """Signs from glTF's axes to those of a ``.ply``."""
 
 
@@ -269,7 +269,7 @@ def _turn_to_ply(splats: Splats) -> None:
     The rotation of each Gaussian follows by half a turn of its own about the same axis, which its ellipsoid does not
     show, so that files that were a ``.ply`` get back the same numbers.
     """
-    mirror(splats, _TO_PLY)
+    mirror(splats, TO_PLY)
     w, x, y, z = (splats.quats[:, i].copy() for i in range(4))
     for i, values in enumerate((z, -y, x, -w)):
         splats.quats[:, i] = values

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from kissgs.core.splats import SH_C0, SH_REST_COUNTS, Splats
 from kissgs.io.compressed_ply import check_compressed, is_compressed, read_compressed
 from kissgs.io.ply_body import check_complete, rows
 from kissgs.io.ply_header import Element, Encoding, PlyFile, open_ply, sh_degree
+from kissgs.io.scene_file import BinaryWriter
 
 _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
@@ -25,14 +25,6 @@ _COLOUR = ("f_dc_0", "f_dc_1", "f_dc_2")
 _RGB = ("red", "green", "blue")
 
 _WRITE_ROWS = 4096
-
-
-@runtime_checkable
-class BinaryWriter(Protocol):
-    """Binary stream; only its ``write`` is called."""
-
-    def write(self, data: bytes | memoryview, /) -> object:
-        """Write all of ``data``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

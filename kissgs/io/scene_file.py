@@ -1,4 +1,4 @@
-"""Opening of a scene file: a path or bytes, its name for messages, its size, and reading with a check of both."""
+"""Opening of a scene file: a path or bytes, its name for messages, its size, reading with a check of both; writing."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import io
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -52,6 +53,14 @@ class SceneFile:
         return InvalidSceneError(
             f"{self.name} is cut short: it needs {needed:,} bytes but has {self.size:,}; export or download it again"
         )
+
+
+@runtime_checkable
+class BinaryWriter(Protocol):
+    """Binary stream; only its ``write`` is called."""
+
+    def write(self, data: bytes | memoryview, /) -> object:
+        """Write all of ``data``."""
 
 
 @contextlib.contextmanager

@@ -74,6 +74,11 @@ class SpzInfo:
         }
 
 
+def header_bytes(count: int, sh_degree: int, fractional_bits: int) -> bytes:
+    """Return the header of a version 3 file without extension records."""
+    return _HEADER.pack(MAGIC, 3, count, sh_degree, fractional_bits, 0, 0)
+
+
 def is_spz(head: bytes) -> bool:
     """Whether a file begins like ``.spz``; ``head`` are its first 512 bytes, which are unpacked if they are gzip."""
     return (inflate_start(head) if head.startswith(GZIP_MAGIC) else head)[:4] == MAGIC

@@ -18,7 +18,7 @@ from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats
 from kissgs.core.timing import StageTimer, peak_memory
 from kissgs.pipeline.report import Report
-from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, save
+from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, save_ply
 from kissgs.rendering.rasterizer import Device
 from kissgs.settings import EncodeSettings, Settings
 from kissgs.settings.encode import GOALS
@@ -117,7 +117,7 @@ def compact(
         progress=clock,
     )
     if target is not None:
-        save(
+        save_ply(
             result.splats,
             target,
             overwrite=overwrite,
@@ -298,7 +298,7 @@ def decompress(
         only_containers=True,
     )
     if destination is not None:
-        save(splats, destination, overwrite=overwrite, progress=progress)
+        save_ply(splats, destination, overwrite=overwrite, progress=progress)
     return splats
 
 

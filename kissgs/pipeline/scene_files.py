@@ -1,4 +1,4 @@
-"""Scenes in files: read every format, write a ``.ply``."""
+"""Scenes in files: read every format, write those that are no containers."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from kissgs.core.splats import Cleaned, Splats, clean
 from kissgs.io.atomic import atomic_file, reason_of, refuse_existing
 from kissgs.io.gltf import read_gltf
 from kissgs.io.ksplat import read_ksplat
-from kissgs.io.ply import read_ply, write_ply
+from kissgs.io.ply import read_ply
 from kissgs.io.splat import read_splat
 from kissgs.io.spz import read_spz
 from kissgs.pipeline.scene_formats import recognise, scene_root
+from kissgs.pipeline.scene_output import output_format, write_scene
 from kissgs.sog import streamed
 from kissgs.sog.decode import decode as decode_sog
 from kissgs.sogxt.decode import decode as decode_sogxt
@@ -55,18 +56,43 @@ def load(
     return clean(splats)[0]
 
 
-def save(splats: Splats, path: AnyPath, *, overwrite: bool = False, progress: Progress = silent) -> None:
-    """Write a scene atomically as ``.ply`` (binary, INRIA layout, at the scene's own SH degree).
+def save(
+    splats: Splats, path: AnyPath, *, overwrite: bool = False, raw_axes: bool = False, progress: Progress = silent
+) -> tuple[str, ...]:
+    """Write a scene atomically, in the format that the ending of ``path`` names: see docs/reference/formats.md.
 
-    To write a container, use :func:`compress`.
+    ``.ply`` (binary, INRIA layout, at the scene's own SH degree) holds every number bit by bit. For the others,
+    ``.compressed.ply``, ``.spz``, ``.splat`` and ``.glb``, the scene is cleaned. Containers are written by
+    :func:`compress`.
+
+    Args:
+        splats: the scene; it is not changed.
+        path: file to write.
+        overwrite: replace the file if it exists.
+        raw_axes: write ``.spz`` with the axes of a ``.ply``, as some tools expect them.
+        progress: receives events.
+
+    Returns:
+        What the format cannot hold beyond its usual precision, one phrase each; nothing for ``.ply``.
 
     Raises:
-        OutputError: the file exists and ``overwrite`` is false, its name does not end in ``.ply``, or writing fails.
+        OutputError: the file exists and ``overwrite`` is false, its ending is of no such format, or writing fails.
+        UnsupportedError: the format cannot hold the scene, such as ``.glb`` one without Gaussians.
     """
-    path = Path(path)
-    check_ply(path, overwrite=overwrite)
-    with atomic_file(path, overwrite=overwrite) as file:
-        write_ply(file, splats, progress=progress)
+    kind = output_format(Path(path))
+    with atomic_file(Path(path), overwrite=overwrite) as file:
+        return write_scene(file, splats, kind, raw_axes=raw_axes, progress=progress)
+
+
+def save_ply(splats: Splats, path: AnyPath, *, overwrite: bool = False, progress: Progress = silent) -> None:
+    """Write a scene atomically as an exact ``.ply``, also where its name ends in ``.compressed.ply``.
+
+    Raises:
+        OutputError: as for :func:`check_ply`, or writing fails.
+    """
+    check_ply(Path(path), overwrite=overwrite)
+    with atomic_file(Path(path), overwrite=overwrite) as file:
+        write_scene(file, splats, "ply", progress=progress)
 
 
 def check_ply(path: Path, *, overwrite: bool) -> None:

@@ -1,4 +1,4 @@
-"""A naive writer of glTF with KHR_gaussian_splatting, number by number, without code of kissgs."""
+"""A naive writer and a naive parser of glTF with KHR_gaussian_splatting, number by number, without code of kissgs."""
 
 import base64
 import json
@@ -67,6 +67,39 @@ def glb_bytes(root, buffer):
     buffer += b"\0" * (-len(buffer) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(buffer), b"BIN\0") + buffer
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def parse_glb(data):
+    """Return the JSON, and name -> rows of numbers of the only primitive; the rules of GLB are asserted."""
+    magic, version, length = struct.unpack_from("<4sII", data)
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    size, kind = struct.unpack_from("<I4s", data, 12)
+    assert kind == b"JSON"
+    assert size % 4 == 0
+    root = json.loads(data[20 : 20 + size])
+    body_size, kind = struct.unpack_from("<I4s", data, 20 + size)
+    assert kind == b"BIN\0"
+    body = data[28 + size :]
+    assert len(body) == body_size == root["buffers"][0]["byteLength"]
+    (primitive,) = root["meshes"][0]["primitives"]
+    columns, used = {}, 0
+    for name, index in primitive["attributes"].items():
+        accessor = root["accessors"][index]
+        view = root["bufferViews"][accessor["bufferView"]]
+        code = {number: code for code, number in SIZES.items()}[accessor["componentType"]]
+        width = {text: width for width, text in TYPES.items()}[accessor["type"]]
+        row = struct.Struct(f"<{width}{code}")
+        assert view["byteOffset"] % 4 == 0
+        assert view["byteLength"] == row.size * accessor["count"]
+        used += view["byteLength"]
+        columns[name] = [
+            list(row.unpack_from(body, view["byteOffset"] + i * row.size)) for i in range(accessor["count"])
+        ]
+        for key, pick in (("min", min), ("max", max)):
+            if name == "POSITION":
+                assert accessor[key] == [pick(axis) for axis in zip(*columns[name], strict=True)]
+    assert used == body_size
+    return root, columns
 
 
 def data_uri(buffer):

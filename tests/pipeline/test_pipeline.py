@@ -186,10 +186,19 @@ def test_a_folder_of_other_things_is_refused_before_the_work(tmp_path):
     assert events.events == []
 
 
-def test_only_ply_is_saved(tmp_path):
+def test_only_ply_is_decompressed(tmp_path):
     with pytest.raises(OutputError, match=r"a scene is written as \.ply; use compress to write a container"):
-        kissgs.save(SCENE, tmp_path / "scene.zip")
+        kissgs.decompress(b"", tmp_path / "scene.zip")
     assert names(tmp_path) == []
+
+
+def test_decompressed_numbers_are_exact_whatever_the_name(tmp_path):
+    """A container of a.compressed.ply has the name a.compressed.zip, and gives a.compressed.ply back."""
+    packed = compress(SCENE).to_zip()
+    path = tmp_path / "a.compressed.ply"
+    wanted = kissgs.decompress(packed, path)
+    assert not kissgs.read_ply_info(path).compressed
+    np.testing.assert_array_equal(kissgs.load(path).means, wanted.means)
 
 
 def count_of_events():

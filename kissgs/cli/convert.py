@@ -1,0 +1,119 @@
+"""``kissgs convert``: write scenes of any format in a plain one."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from kissgs.cli.arguments import ForceOption, JsonOption, QuietOption, ThreadsOption
+from kissgs.cli.console import progress_bar
+from kissgs.cli.files import for_each_input, show, source, stdout
+from kissgs.core.errors import InvalidSceneError, OutputError
+
+if TYPE_CHECKING:
+    from kissgs.core.splats import Cleaned
+    from kissgs.pipeline.scene_output import OutputFormat
+
+
+def convert(
+    files: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="IN… OUT",
+            help="Scenes ('-' reads standard input), then the output: NAME.ply, .compressed.ply, .spz, .splat or .glb; "
+            "with --to also a folder, or '-' for standard output.",
+        ),
+    ],
+    to: Annotated[
+        str | None,
+        typer.Option("--to", help="Format where OUT has no ending: ply, compressed.ply, spz, splat or glb."),
+    ] = None,
+    max_gaussians: Annotated[
+        int | None, typer.Option(min=0, help="Refuse compressed files with more Gaussians. Default: 20 million.")
+    ] = None,
+    level: Annotated[
+        int, typer.Option(min=0, help="Level of detail of a streamed SOG scene; 0 is the finest.", show_default=True)
+    ] = 0,
+    raw_axes: Annotated[
+        bool,
+        typer.Option(
+            "--raw-axes",
+            help="Take the axes of .spz, read or written, as those of a .ply, as splat-transform does. Default: y up.",
+        ),
+    ] = False,
+    threads: ThreadsOption = 0,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Convert scenes and containers into .ply, .compressed.ply, .spz, .splat or .glb; the ending of OUT decides."""
+    from kissgs.core.limits import MAX_GAUSSIANS
+    from kissgs.core.splats import clean
+    from kissgs.io.atomic import atomic_file, refuse_existing
+    from kissgs.pipeline.scene_files import read_scene
+    from kissgs.pipeline.scene_output import write_scene
+
+    *inputs, output = files
+    if not inputs:
+        raise OutputError("convert needs an input and an output: kissgs convert IN OUT")
+    kind = _output_format(output, to)
+
+    def work(scene: str, target: Path) -> dict[str, Any]:
+        piped = str(target) == "-"
+        if not piped:
+            refuse_existing(target, overwrite=force)
+        with progress_bar(quiet or as_json) as progress:
+            read = read_scene(
+                source(scene),
+                max_gaussians=MAX_GAUSSIANS if max_gaussians is None else max_gaussians,
+                level=level,
+                raw_axes=raw_axes,
+                threads=threads,
+                progress=progress,
+            )
+            splats, cleaned = clean(read)
+            with stdout() if piped else atomic_file(target, overwrite=force) as file:
+                stream = sys.stdout.buffer if file is None else file
+                losses = write_scene(stream, splats, kind, raw_axes=raw_axes, progress=progress)
+        notes = [*_removed(cleaned), *losses]
+        if notes and not (quiet or as_json):
+            sys.stderr.write(f"kissgs: {target}: {'; '.join(notes)}\n")
+        if piped:
+            return {}
+        if not (quiet or as_json):
+            show(f"{target}  {len(splats):,} Gaussians, {target.stat().st_size:,} bytes")
+        degree = 0 if kind == "splat" else splats.sh_degree
+        size = target.stat().st_size
+        return {"format": kind, "count": len(splats), "sh_degree": degree, "bytes": size, "notes": notes}
+
+    for_each_input(inputs, Path(output), f".{kind}", as_json, work, unreadable=InvalidSceneError)
+
+
+def _output_format(output: str, to: str | None) -> OutputFormat:
+    """Return the format of the outputs: ``--to``, or what the ending of the output stands for."""
+    from kissgs.pipeline.scene_output import OUTPUT_FORMATS, SCENE_ENDINGS, output_format
+
+    if to is None:
+        if output == "-":
+            raise OutputError(f"standard output has no ending; give --to: {', '.join(OUTPUT_FORMATS)}")
+        return output_format(Path(output))
+    wanted = next((kind for kind in OUTPUT_FORMATS if kind == to.lower().removeprefix(".")), None)
+    if wanted is None:
+        raise OutputError(f"--to {to[:40]} is no format that is written; choose {', '.join(OUTPUT_FORMATS)}")
+    if Path(output).suffix.lower() in SCENE_ENDINGS:
+        found = output_format(Path(output))
+        if found != wanted:
+            raise OutputError(f"{output[:100]} has the ending of {found}, but --to asks for {wanted}; choose one")
+    return wanted
+
+
+def _removed(cleaned: Cleaned) -> list[str]:
+    """Return what cleaning has left out of a scene."""
+    if not cleaned.removed:
+        return []
+    several = cleaned.removed > 1
+    gaussians = f"{cleaned.removed:,} Gaussian{'s' if several else ''}"
+    return [f"{gaussians} with NaN, infinite or huge values {'are' if several else 'is'} left out"]

@@ -1,0 +1,145 @@
+"""Writing of ``.glb``: one primitive with ``KHR_gaussian_splatting``, all attributes as floats.
+
+Colours and opacities are also there as ``COLOR_0``, so that programs without the extension show coloured points.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from kissgs.core.array_types import Float32, Float64, Shaped
+from kissgs.core.errors import UnsupportedError
+from kissgs.core.progress import Progress, silent
+from kissgs.core.splats import Splats
+from kissgs.io.activations import steps
+from kissgs.io.codes import colors_of, opacities_of, to_bytes
+from kissgs.io.frames import sh_signs
+from kissgs.io.gltf import EXTENSION, TO_PLY
+from kissgs.io.gltf_document import GLB_MAGIC
+from kissgs.io.scene_file import BinaryWriter
+
+_FLOAT, _BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
+_TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+_MAX_BYTES = (1 << 32) - 1
+"""Largest GLB: its header has 32 bits for the size."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Attribute:
+    """Attribute of the primitive: its columns, and the values of some rows."""
+
+    name: str
+    width: int
+    values: Callable[[slice], Shaped[np.ndarray, "B width"]]
+    is_byte: bool = False
+
+    @property
+    def row_bytes(self) -> int:
+        return self.width if self.is_byte else 4 * self.width
+
+
+def write_glb(file: BinaryWriter, splats: Splats, *, progress: Progress = silent) -> tuple[str, ...]:
+    """Write a clean scene in glTF's axes (x left, y up, z forward); return that nothing is lost: no phrases.
+
+    Args:
+        file: The stream; it is not flushed or closed, and its OSErrors are not caught.
+        splats: The scene, cleaned.
+        progress: Receives events of stage ``write``.
+
+    Raises:
+        UnsupportedError: the scene has no Gaussians, which glTF does not allow, or takes 4 GiB or more.
+    """
+    count = len(splats)
+    if not count:
+        raise UnsupportedError("a scene without Gaussians cannot be written as .glb; write it as .ply")
+    attributes = list(_attributes(splats))
+    body = count * sum(attribute.row_bytes for attribute in attributes)
+    text = _json(splats, attributes, body)
+    size = 12 + 8 + len(text) + 8 + body
+    if size > _MAX_BYTES:
+        raise UnsupportedError(f"{count:,} Gaussians take {size:,} bytes, and .glb ends at 4 GiB; write .spz or .ply")
+    file.write(struct.pack("<4sII", GLB_MAGIC, 2, size) + struct.pack("<I4s", len(text), b"JSON") + text)
+    file.write(struct.pack("<I4s", body, b"BIN\0"))
+    for done, attribute in enumerate(attributes, 1):
+        dtype = np.uint8 if attribute.is_byte else "<f4"
+        for part in steps(count):
+            file.write(attribute.values(part).astype(dtype).tobytes())
+        progress("write", done / len(attributes))
+    return ()
+
+
+def _attributes(splats: Splats) -> Iterator[_Attribute]:
+    """Yield all attributes in glTF's axes, half a turn about z from those of a ``.ply``."""
+    axes = np.array(TO_PLY, np.float32)
+    yield _Attribute("POSITION", 3, lambda part: splats.means[part] * axes)
+    yield _Attribute("COLOR_0", 4, lambda part: _linear_colors(splats, part), is_byte=True)
+    # Half a turn of the Gaussian about its own axis precedes: the reader has the reason.
+    turned = np.array([-1, 1, 1, -1], np.float32)
+    yield _Attribute(f"{EXTENSION}:ROTATION", 4, lambda part: splats.quats[part][:, [2, 1, 0, 3]] * turned)
+    yield _Attribute(f"{EXTENSION}:SCALE", 3, lambda part: np.exp(splats.scales[part].astype(np.float64)))
+    yield _Attribute(f"{EXTENSION}:OPACITY", 1, lambda part: opacities_of(splats.opacities[part])[:, None])
+    yield _Attribute(f"{EXTENSION}:SH_DEGREE_0_COEF_0", 3, lambda part: splats.sh0[part])
+    bands = [(band, i) for band in range(1, splats.sh_degree + 1) for i in range(2 * band + 1)]
+    for k, (band, i) in enumerate(bands):
+        name = f"{EXTENSION}:SH_DEGREE_{band}_COEF_{i}"
+        yield _Attribute(name, 3, partial(_sh_values, splats, k))
+
+
+def _sh_values(splats: Splats, k: int, part: slice) -> Float32[np.ndarray, "B 3"]:
+    """Return one coefficient beyond the constant one."""
+    values: Float32[np.ndarray, "B 3"] = splats.shN[part, k] * sh_signs(TO_PLY, k + 1)[k]
+    return values
+
+
+def _linear_colors(splats: Splats, part: slice) -> Float64[np.ndarray, "B 4"]:
+    """Return linear colours and opacities as bytes; glTF's vertex colours are linear."""
+    srgb = np.clip(colors_of(splats.sh0[part]), 0, 1)
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    rgba = np.concatenate([linear, opacities_of(splats.opacities[part])[:, None]], axis=1)
+    return to_bytes(255 * rgba).astype(np.float64)
+
+
+def _json(splats: Splats, attributes: list[_Attribute], body: int) -> bytes:
+    """Return the JSON, filled up with spaces to a multiple of four bytes."""
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    start = 0
+    for i, attribute in enumerate(attributes):
+        length = len(splats) * attribute.row_bytes
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": length, "target": _ARRAY_BUFFER})
+        component = {"componentType": _BYTE, "normalized": True} if attribute.is_byte else {"componentType": _FLOAT}
+        accessors.append({"bufferView": i, **component, "count": len(splats), "type": _TYPES[attribute.width]})
+        start += length
+    ends = np.stack([splats.means.min(axis=0), splats.means.max(axis=0)]) * np.array(TO_PLY, np.float32)
+    accessors[0] |= {"min": ends.min(axis=0).tolist(), "max": ends.max(axis=0).tolist()}
+    splatting = {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+    }
+    primitive = {
+        "mode": _POINTS,
+        "attributes": {attribute.name: i for i, attribute in enumerate(attributes)},
+        "extensions": {EXTENSION: splatting},
+    }
+    root = {
+        "asset": {"version": "2.0", "generator": "kissgs"},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": body}],
+    }
+    text = json.dumps(root, separators=(",", ":")).encode("ascii")
+    return text + b" " * (-len(text) % 4)

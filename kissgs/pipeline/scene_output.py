@@ -1,0 +1,62 @@
+"""Formats in which a scene is written, by the ending of a name. Containers are written by ``compress``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from kissgs.core.errors import OutputError
+from kissgs.core.progress import Progress, silent
+from kissgs.core.splats import Splats, clean
+from kissgs.io.compressed_ply import write_compressed
+from kissgs.io.gltf_writer import write_glb
+from kissgs.io.ply import write_ply
+from kissgs.io.scene_file import BinaryWriter
+from kissgs.io.splat import write_splat
+from kissgs.io.spz_writer import write_spz
+
+OutputFormat = Literal["ply", "compressed.ply", "spz", "splat", "glb"]
+OUTPUT_FORMATS: tuple[OutputFormat, ...] = ("ply", "compressed.ply", "spz", "splat", "glb")
+"""Formats that are written; each is the ending of its files without the first dot."""
+
+_CONTAINERS = (".zip", ".sog")
+
+SCENE_ENDINGS = (".ply", ".spz", ".splat", ".glb", ".ksplat", ".gltf", *_CONTAINERS)
+"""Endings that a folder for outputs does not have."""
+
+
+def output_format(path: Path) -> OutputFormat:
+    """Return the format that the ending of a name stands for.
+
+    Raises:
+        OutputError: no format that is written has this ending.
+    """
+    name = path.name.lower()
+    found = [kind for kind in OUTPUT_FORMATS if name.endswith(f".{kind}")]
+    if found:
+        return max(found, key=len)
+    if path.suffix.lower() in _CONTAINERS:
+        raise OutputError(f"{path!s:.100} is the name of a container; kissgs compress writes those")
+    raise OutputError(
+        f"{path!s:.100} has no ending of a format that is written: .{', .'.join(OUTPUT_FORMATS)}; choose one of them"
+    )
+
+
+def write_scene(
+    file: BinaryWriter, splats: Splats, kind: OutputFormat, *, raw_axes: bool = False, progress: Progress = silent
+) -> tuple[str, ...]:
+    """Write a scene in a format, which all but ``ply`` need cleaned; return what the format cannot hold.
+
+    Each loss beyond the steps that the format always has is one phrase. ``raw_axes`` is for ``spz``.
+
+    Raises:
+        UnsupportedError: the format cannot hold the scene.
+    """
+    if kind == "ply":
+        write_ply(file, splats, progress=progress)
+        return ()
+    splats = clean(splats)[0]
+    if kind == "spz":
+        return write_spz(file, splats, raw_axes=raw_axes, progress=progress)
+    writer = {"compressed.ply": write_compressed, "splat": write_splat, "glb": write_glb}[kind]
+    return writer(file, splats, progress=progress)

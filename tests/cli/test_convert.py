@@ -1,0 +1,110 @@
+"""``kissgs convert`` as a user runs it. Oracle: the library's own functions."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.command_line import failure, run
+
+import kissgs
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("convert") / "scene.ply"
+    splats = kissgs.sample_scene(600, sh_degree=1)
+    splats.sh0[:] = splats.sh0.clip(-1.7, 1.7)  # all colours between 0 and 1
+    kissgs.save(splats, path)
+    return path
+
+
+def test_the_ending_decides(scene: Path, tmp_path: Path) -> None:
+    for ending in ("ply", "compressed.ply", "spz", "glb"):
+        done = run("convert", scene, tmp_path / f"a.{ending}")
+        assert (done.returncode, done.stderr) == (0, b"")
+        kissgs.save(kissgs.load(scene), tmp_path / f"b.{ending}")
+        assert (tmp_path / f"a.{ending}").read_bytes() == (tmp_path / f"b.{ending}").read_bytes()
+        assert f"a.{ending}  600 Gaussians" in done.stdout.decode()
+    assert run("convert", tmp_path / "a.glb", tmp_path / "c.spz", "-q").returncode == 0
+    assert (tmp_path / "c.spz").read_bytes() == (tmp_path / "a.spz").read_bytes()
+
+
+def test_losses_are_one_line(scene: Path, tmp_path: Path) -> None:
+    done = run("convert", scene, tmp_path / "a.splat")
+    assert done.stderr.decode() == f"kissgs: {tmp_path}/a.splat: view-dependent colour (SH degree 1) is left out\n"
+    report = json.loads(run("convert", scene, tmp_path / "a.splat", "--force", "--json").stdout)
+    size = (tmp_path / "a.splat").stat().st_size
+    assert report == {
+        "input": str(scene),
+        "output": str(tmp_path / "a.splat"),
+        "format": "splat",
+        "count": 600,
+        "sh_degree": 0,
+        "bytes": size,
+        "notes": ["view-dependent colour (SH degree 1) is left out"],
+    }
+    assert run("convert", scene, tmp_path / "a.splat", "-f", "-q").stderr == b""
+
+
+def test_gaussians_that_cleaning_removes_are_in_the_line(tmp_path: Path) -> None:
+    broken = kissgs.sample_scene(50, sh_degree=0)
+    broken.means[3] = np.inf
+    kissgs.save(broken, tmp_path / "a.ply")
+    done = run("convert", tmp_path / "a.ply", tmp_path / "b.ply")
+    assert b"b.ply: 1 Gaussian with NaN, infinite or huge values is left out\n" in done.stderr
+    assert len(kissgs.load(tmp_path / "b.ply")) == 49
+
+
+def test_pipes(scene: Path, tmp_path: Path) -> None:
+    piped = run("convert", "-", "-", "--to", "spz", stdin=scene.read_bytes())
+    assert run("convert", "-", tmp_path / "a.glb", stdin=piped.stdout).returncode == 0
+    kissgs.save(kissgs.load(scene), tmp_path / "b.spz")
+    assert piped.stdout == (tmp_path / "b.spz").read_bytes()
+    np.testing.assert_allclose(kissgs.load(tmp_path / "a.glb").means, kissgs.load(tmp_path / "b.spz").means)
+
+
+def test_several_files_into_a_folder(scene: Path, tmp_path: Path) -> None:
+    for name in ("one.ply", "two.ply"):
+        (tmp_path / name).write_bytes(scene.read_bytes())
+    done = run("convert", tmp_path / "*.ply", tmp_path / "out", "--to", "compressed.ply", "--json")
+    assert [Path(report["output"]).name for report in json.loads(done.stdout)] == [
+        "one.compressed.ply",
+        "two.compressed.ply",
+    ]
+    assert "cannot all become" in failure("convert", tmp_path / "*.ply", tmp_path / "a.spz")
+
+
+def test_raw_axes(scene: Path, tmp_path: Path) -> None:
+    assert run("convert", scene, tmp_path / "raw.spz", "--raw-axes").returncode == 0
+    assert run("convert", tmp_path / "raw.spz", tmp_path / "b.ply", "--raw-axes").returncode == 0
+    np.testing.assert_allclose(kissgs.load(tmp_path / "b.ply").means, kissgs.load(scene).means, atol=2**-12)
+
+
+def test_errors(scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "a.spz"
+    assert "kissgs compress writes those" in failure("convert", scene, tmp_path / "a.sog")
+    assert "kissgs compress writes those" in failure("convert", scene, tmp_path / "a.zip")
+    assert "has no ending of a format" in failure("convert", scene, tmp_path / "folder")
+    assert "has no ending of a format" in failure("convert", scene, tmp_path / "a.ksplat")
+    assert "needs an input and an output: kissgs convert IN OUT" in failure("convert", scene)
+    assert "standard output has no ending; give --to" in failure("convert", scene, "-")
+    assert "--to ksplat is no format that is written; choose ply," in failure("convert", scene, out, "--to", "ksplat")
+    assert "has the ending of ply, but --to asks for spz" in failure(
+        "convert", scene, tmp_path / "a.ply", "--to", "spz"
+    )
+    assert "kissgs compress writes those" in failure("convert", scene, tmp_path / "a.sog", "--to", "spz")
+    assert "has no ending of a format" in failure("convert", scene, tmp_path / "a.gltf", "--to", "glb")
+    assert "both write to standard output" in failure("convert", scene, "-", "--to", "spz", "--json")
+    assert "no such file" in failure("convert", tmp_path / "none.ply", out)
+    out.write_bytes(b"mine")
+    assert "exists already" in failure("convert", scene, out)
+    assert out.read_bytes() == b"mine"
+    assert [path.name for path in tmp_path.iterdir()] == ["a.spz"]
+    kissgs.save(kissgs.sample_scene(0), tmp_path / "empty.ply")
+    assert "without Gaussians cannot be written as .glb" in failure(
+        "convert", tmp_path / "empty.ply", tmp_path / "b.glb"
+    )
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.spz", "empty.ply"]
