@@ -24,24 +24,34 @@ ENDINGS: dict[str, ContainerName] = {".zip": "sog-xt", ".sog": "sog"}
 """Container of a file by its ending."""
 
 MODELS: dict[ContainerName, ContainerModel] = {"sog-xt": EVEN_LEVELS, "sog": SOG}
-"""What each container can hold."""
+"""Model of each container for the planner."""
 
 FILES: dict[ContainerName, tuple[str, ...]] = {"sog-xt": names.FILES, "sog": sog.FILES}
 """Names of all files that a container may have."""
 
 
-def container_of(destination: Path | None, requested: ContainerName | None) -> ContainerName:
+def ending_of(container: ContainerName) -> str:
+    """Return the ending of a container's files."""
+    return next(ending for ending, name in ENDINGS.items() if name == container)
+
+
+def named_container(requested: str | None, destination: Path | None) -> ContainerName:
     """Return the container to write: the requested one, else that of the destination's ending, else SOG-XT.
 
     Raises:
         UnsupportedError: there is no such container, or the ending asks for another one.
     """
-    if requested not in (None, *MODELS):
-        raise UnsupportedError(f"there is no container {requested!r}; choose one of {', '.join(MODELS)}")
-    named = None if destination is None else ENDINGS.get(destination.suffix.lower())
-    if requested == "sog-xt" and named == "sog":
-        raise UnsupportedError(f"{destination}: the ending .sog is for SOG; name a .zip or a folder for SOG-XT")
-    return requested or named or "sog-xt"
+    by_ending = None if destination is None else ENDINGS.get(destination.suffix.lower())
+    if requested is None:
+        return by_ending or "sog-xt"
+    for name in MODELS:
+        if requested == name:
+            if by_ending not in (None, name):
+                raise UnsupportedError(
+                    f"{destination} is not the name of a {name} container: end it in {ending_of(name)}"
+                )
+            return name
+    raise UnsupportedError(f"there is no container {requested!r}; choose one of {', '.join(MODELS)}")
 
 
 def check_container(container: ContainerName, settings: Settings) -> None:

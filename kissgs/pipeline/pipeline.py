@@ -17,7 +17,7 @@ from kissgs.core.progress import Progress, SearchNote, as_stage, ignore_stop_sea
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats
 from kissgs.core.timing import StageTimer, peak_memory
-from kissgs.pipeline.containers import FILES, ContainerName, check_container, container_of
+from kissgs.pipeline.containers import FILES, ContainerName, check_container, named_container
 from kissgs.pipeline.report import Report
 from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, save
 from kissgs.rendering.rasterizer import Device
@@ -43,12 +43,14 @@ class Compressed:
         order: ``(M,)`` index in the cleaned scene of each Gaussian of the container, in the container's order.
         report: sizes, counts, errors, times and settings.
         checkpoints: files of compaction and fine-tuning that still exist because no destination was given.
+        container: "sog-xt" or "sog".
     """
 
     files: Mapping[str, bytes]
     order: Int[np.ndarray, " M"]
     report: Report
     checkpoints: tuple[Path, ...] = ()
+    container: ContainerName = "sog-xt"
 
     def to_zip(self) -> bytes:
         """Return the container as the bytes of a zip."""
@@ -59,7 +61,9 @@ class Compressed:
 
         Raises:
             OutputError: the path exists and ``overwrite`` is false, or writing fails.
+            UnsupportedError: the ending is that of another container.
         """
+        named_container(self.container, Path(path))
         write_container(self.files, Path(path), overwrite=overwrite)
 
 
@@ -182,7 +186,7 @@ def compress(
 
     settings = settings or Settings()
     target = Path(destination) if destination is not None else None
-    kind = container_of(target, container)
+    kind = named_container(container, target)
     check_container(kind, settings)
     if target is not None:
         check_destination(target, overwrite=overwrite, names=FILES[kind])
@@ -250,7 +254,7 @@ def compress(
     )
     order = encoded.order if compacted is None else compacted.index[encoded.order]
     remaining = () if target is not None else tuple(path for path in checkpoints if path is not None)
-    return Compressed(encoded.files, order, report, remaining)
+    return Compressed(encoded.files, order, report, remaining, kind)
 
 
 def _settings_as_used(requested: Settings, used: EncodeSettings) -> dict[str, Any]:

@@ -30,7 +30,7 @@ class ByteTables:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ContainerModel:
-    """What a container can hold.
+    """Description of the values that a container can hold.
 
     Attributes:
         tables: tables of its levels; None for evenly spaced levels over a range per channel, and whole quaternions.

@@ -16,7 +16,7 @@ from kissgs.planning import kmeans
 from kissgs.planning.container_model import ContainerModel
 from kissgs.planning.plas import plas
 from kissgs.planning.quantize import Quantized, half_steps, quantize
-from kissgs.planning.value_table import fit_table, nearest_levels
+from kissgs.planning.value_table import fit_table, nearest_levels, table_field
 from kissgs.settings import EncodeSettings
 
 COEFFICIENTS = SH_REST_COUNTS[-1]
@@ -107,8 +107,7 @@ def fit_codebook(
         used = rows.reshape(-1, COEFFICIENTS)[:, : dimensions // 3]
         worth = np.bincount(clusters.labels, weights, minlength=len(placed))[placed]
         table = fit_table(used.ravel(), np.repeat(worth, dimensions), max(clusters.step, 1e-4), with_zero=True)
-        low, high = (np.full(3 * COEFFICIENTS, end, np.float32) for end in (table[0], table[-1]))
-        levels = Quantized(nearest_levels(table, rows), low, high, max(len(table) - 1, 1), table=table)
+        levels = table_field(table, nearest_levels(table, rows))
         lost = np.abs(levels.values() - rows).max(axis=0) + clusters.step / 2
         return Codebook(side, levels, position[clusters.labels], lost.tolist())
     if settings.shared_step_size:

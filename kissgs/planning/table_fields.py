@@ -12,7 +12,7 @@ from kissgs.planning.container_model import ByteTables
 from kissgs.planning.quantize import MEANS_TOP, Quantized
 from kissgs.planning.rd_model import RdCriterion
 from kissgs.planning.rdo_tables import ShapeLevels, ShapeValues, rdo_quantize_tables
-from kissgs.planning.value_table import fit_table, nearest_levels, without_unused
+from kissgs.planning.value_table import fit_table, nearest_levels, table_field, without_unused
 
 
 def shape_values(values: Float64[np.ndarray, "M 8"], tables: ByteTables) -> ShapeValues:
@@ -136,13 +136,6 @@ def means_field(means: Float32[np.ndarray, "M 3"], steps: float | Float64[np.nda
     every = np.exp2(np.clip(np.floor(exponents + 0.5), 0, 8))
     levels = np.clip(np.rint((logs - low) / unit / every) * every, 0, MEANS_TOP)
     return Quantized(levels.astype(np.uint16), low, high, MEANS_TOP)
-
-
-def table_field(table: Float32[np.ndarray, " levels"], levels: UInt8[np.ndarray, "M C"]) -> Quantized:
-    """Return levels that stand for the values of a table."""
-    channels = levels.shape[1]
-    low, high = (np.full(channels, end, np.float32) for end in (table[0], table[-1]))
-    return Quantized(levels, low, high, max(len(table) - 1, 1), table=table)
 
 
 def decoded_quats(fields: dict[str, Quantized]) -> Float64[np.ndarray, "M 4"]:

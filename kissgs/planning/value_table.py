@@ -11,12 +11,16 @@ import heapq
 import numpy as np
 
 from kissgs.core.array_types import Float, Float32, Float64, Int, UInt8
+from kissgs.planning.quantize import Quantized
 
 SIZE = 256
 """Largest number of values of a table."""
 
 WIDEST = 120
 """Joined points span at most this fraction of the whole range, which bounds the error where weights are small."""
+
+DIGITS = 6
+"""Significant digits of the values of a table, which its container stores as text."""
 
 MAX_POINTS = 1 << 14
 """Largest number of lattice points before joining; the lattice is coarser for values that occupy more."""
@@ -94,6 +98,14 @@ def nearest_levels(table: Float[np.ndarray, " levels"], values: Float[np.ndarray
     return np.asarray(np.searchsorted((wide[1:] + wide[:-1]) / 2, values, side="right").astype(np.uint8))
 
 
+def table_field(table: Float32[np.ndarray, " levels"], levels: UInt8[np.ndarray, "N C"]) -> Quantized:
+    """Return levels that stand for the values of a table, which are rounded to the digits that are stored."""
+    short = np.array([float(f"{value:.{DIGITS}g}") for value in table.tolist()], np.float32)
+    channels = levels.shape[1]
+    low, high = (np.full(channels, end, np.float32) for end in (short[0], short[-1]))
+    return Quantized(levels, low, high, max(len(short) - 1, 1), table=short)
+
+
 def refit_table(
     table: Float32[np.ndarray, " levels"],
     levels: Int[np.ndarray, "N C"],
@@ -123,7 +135,7 @@ def refit_table(
 
 
 def without_unused(
-    table: Float32[np.ndarray, " levels"], levels: Int[np.ndarray, "N C"]
+    table: Float32[np.ndarray, " levels"], levels: Int[np.ndarray, "N C"] | UInt8[np.ndarray, "N C"]
 ) -> tuple[Float32[np.ndarray, " used"], UInt8[np.ndarray, "N C"]]:
     """Return the table without the values that no level uses, and the levels in it."""
     used, index = np.unique(levels, return_inverse=True)

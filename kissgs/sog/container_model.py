@@ -1,4 +1,4 @@
-"""What a SOG container of version 2 can hold, for the planner."""
+"""Description of SOG 2 for the planner: its tables, and no mask for padding."""
 
 from __future__ import annotations
 

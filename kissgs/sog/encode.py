@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from kissgs._version import __version__
-from kissgs.core.array_types import Float32, UInt8
+from kissgs.core.array_types import UInt8
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import SH_REST_COUNTS, Splats
@@ -32,9 +32,6 @@ SHN = ("shN_centroids.webp", "shN_labels.webp")
 
 FILES = (META_NAME, *MEANS, QUATS, SCALES, SH0, *SHN)
 """Names of all files that a container may have."""
-
-TABLE_DIGITS = 6
-"""Significant digits of a table's values in the metadata."""
 
 
 def write_files(
@@ -127,7 +124,6 @@ def metadata(plan: EncodingPlan, sh_degree: int) -> bytes:
 
 
 def _table(field: Quantized) -> list[float]:
-    """Return 256 ascending values in few digits; the last is repeated."""
-    values: Float32[np.ndarray, " levels"] = np.zeros(1, np.float32) if field.table is None else field.table
-    short = [float(f"{value:.{TABLE_DIGITS}g}") for value in values.tolist()]
-    return short + short[-1:] * (256 - len(short))
+    """Return 256 ascending values; the last is repeated."""
+    values = [0.0] if field.table is None else [float(str(value)) for value in field.table]
+    return values + values[-1:] * (256 - len(values))
