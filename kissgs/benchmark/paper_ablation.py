@@ -15,6 +15,7 @@ import numpy as np
 from kissgs.core.array_types import Float32, UInt8
 from kissgs.core.splats import Splats
 from kissgs.core.threads import blas_workers
+from kissgs.io.planes import compress_images
 from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.planner import plan_encoding
 from kissgs.planning.quantize import MEANS_TOP, quantize
@@ -24,7 +25,6 @@ from kissgs.settings import EncodeSettings
 from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.decode import decode
 from kissgs.sogxt.encode import render_planes, write_files
-from kissgs.sogxt.planes import compress_images
 
 Images = Mapping[str, UInt8[np.ndarray, "H W C"]]
 

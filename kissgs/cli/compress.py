@@ -31,7 +31,16 @@ def compress(
     output: Annotated[
         Path | None,
         typer.Option(
-            "--output", "-o", help="Output NAME.zip, a folder, or '-' for standard output. Default: next to the scene."
+            "--output",
+            "-o",
+            help="Output NAME.zip, NAME.sog, a folder, or '-' for standard output. Default: next to the scene.",
+        ),
+    ] = None,
+    container: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Container: sog-xt, or sog for other viewers. Default: sog if --output ends in .sog, else sog-xt.",
         ),
     ] = None,
     preset: PresetOption = "balanced",
@@ -98,10 +107,12 @@ def compress(
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Compress each scene into a SOG-XT container."""
+    """Compress each scene into a SOG-XT container, or into SOG."""
+    from kissgs.pipeline.containers import ending_of, named_container
     from kissgs.pipeline.pipeline import compress as run
     from kissgs.training.checkpoint import delete_checkpoints
 
+    kind = named_container(container, output)
     budget = None if compact is None else budget_of(compact)
     settings = chosen(
         preset,
@@ -131,6 +142,7 @@ def compress(
                 source(scene),
                 None if piped else target,
                 settings=settings,
+                container=kind,
                 cache=sibling(scene, ".sensitivity.npz") if cache else None,
                 evaluate=evaluate,
                 views=capture,
@@ -149,4 +161,4 @@ def compress(
             show(report_table(result.report, str(target)))
         return result.report.as_dict()
 
-    for_each_input(scenes, output, "" if unpacked else ".zip", as_json, work)
+    for_each_input(scenes, output, "" if unpacked else ending_of(kind), as_json, work)

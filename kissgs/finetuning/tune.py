@@ -23,6 +23,7 @@ from kissgs.evaluation.results import Evaluation
 from kissgs.finetuning.losses import RateLoss, TotalVariationLoss
 from kissgs.finetuning.quantized_scene import FIELDS, QuantizedScene
 from kissgs.finetuning.result import FinetuneReport
+from kissgs.planning.encoded import Encoded
 from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.rd_model import Costs, implied_lambda
 from kissgs.rendering.rasterizer import Device
@@ -30,7 +31,6 @@ from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
 from kissgs.settings import FinetuneSettings
 from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.decode import decode
-from kissgs.sogxt.encode import Encoded
 from kissgs.training.checkpoint import Checkpoint
 from kissgs.training.loop import LrSchedule, TrainingPlan, exponential_lr, image_loss, torch_threads, train
 from kissgs.training.supervision import SupervisionViews, supervision_views

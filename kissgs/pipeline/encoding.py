@@ -20,8 +20,10 @@ from kissgs.core.progress import Progress, SearchNote, as_stage
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import ATTRIBUTES, Cleaned, Splats
 from kissgs.io.sensitivity_file import read_sensitivity, write_sensitivity
+from kissgs.pipeline.containers import MODELS, ContainerName, write_files
 from kissgs.pipeline.rate_control import Container, Encoder, RateControl
 from kissgs.pipeline.trial import Trial
+from kissgs.planning.encoded import Encoded
 from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.planner import load_kernels as load_encoder
 from kissgs.planning.planner import plan_encoding
@@ -29,7 +31,6 @@ from kissgs.planning.rate_distortion import ColorRefit
 from kissgs.rendering.gsplat_backend import need_cuda
 from kissgs.rendering.rasterizer import Device
 from kissgs.settings import EncodeSettings, Settings
-from kissgs.sogxt.encode import Encoded, write_files
 
 if TYPE_CHECKING:
     from kissgs.finetuning.tune import Tuner
@@ -62,6 +63,7 @@ class Encoding:
         cleaned: defects of the input that were corrected, for the metadata.
         checkpoint: file for the state of fine-tuning; unused in a search for a goal.
         device: device of fine-tuning.
+        container: the container to write.
         packed: whether the files become a zip, whose size then counts; False for a folder.
         threads: number of threads; 0 means one per processor.
         progress: receives the events of all stages; its note says how far a search has come.
@@ -76,6 +78,7 @@ class Encoding:
     cleaned: Cleaned
     checkpoint: Path | None
     device: Device
+    container: ContainerName
     packed: bool
     threads: int
     progress: SearchNote
@@ -132,6 +135,7 @@ class Encoding:
 
             def files(plan: EncodingPlan, finetune_steps: int, progress: Progress) -> Encoded:
                 return write_files(
+                    self.container,
                     plan,
                     self.splats,
                     pruned if finetune_steps else settings,
@@ -177,7 +181,9 @@ class Encoding:
         return self._rd_planner() if rate_distortion else self._plan_without_sensitivity
 
     def _plan_without_sensitivity(self, settings: EncodeSettings, progress: Progress) -> EncodingPlan:
-        return plan_encoding(self.splats, settings, threads=self.threads, progress=progress)
+        return plan_encoding(
+            self.splats, settings, container=MODELS[self.container], threads=self.threads, progress=progress
+        )
 
     def _rd_planner(self) -> Planner:
         """Measure the sensitivity once; return a planner that uses it for every plan."""
@@ -220,6 +226,7 @@ class Encoding:
                 chosen,
                 sensitivity=sensitivity,
                 recolor=recolor,
+                container=MODELS[self.container],
                 threads=self.threads,
                 progress=without_kernels,
             )

@@ -17,13 +17,13 @@ from kissgs.core.progress import Progress, SearchNote, as_stage, ignore_stop_sea
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats
 from kissgs.core.timing import StageTimer, peak_memory
+from kissgs.pipeline.containers import FILES, ContainerName, check_container, named_container
 from kissgs.pipeline.report import Report
 from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, save_ply
 from kissgs.rendering.rasterizer import Device
 from kissgs.settings import EncodeSettings, Settings
 from kissgs.settings.encode import GOALS
 from kissgs.sogxt.container import check_destination, is_packed, stored_sizes, write_container, zip_bytes
-from kissgs.sogxt.decode import decode
 from kissgs.training.checkpoint import delete_checkpoints, finetune_checkpoint_path
 
 if TYPE_CHECKING:
@@ -43,23 +43,27 @@ class Compressed:
         order: ``(M,)`` index in the cleaned scene of each Gaussian of the container, in the container's order.
         report: sizes, counts, errors, times and settings.
         checkpoints: files of compaction and fine-tuning that still exist because no destination was given.
+        container: "sog-xt" or "sog".
     """
 
     files: Mapping[str, bytes]
     order: Int[np.ndarray, " M"]
     report: Report
     checkpoints: tuple[Path, ...] = ()
+    container: ContainerName = "sog-xt"
 
     def to_zip(self) -> bytes:
         """Return the container as the bytes of a zip."""
         return zip_bytes(self.files)
 
     def save(self, path: AnyPath, *, overwrite: bool = False) -> None:
-        """Write a zip (if the name ends in ``.zip``) or a folder, atomically.
+        """Write a zip (if the name ends in ``.zip`` or ``.sog``) or a folder, atomically.
 
         Raises:
             OutputError: the path exists and ``overwrite`` is false, or writing fails.
+            UnsupportedError: the ending is that of another container.
         """
+        named_container(self.container, Path(path))
         write_container(self.files, Path(path), overwrite=overwrite)
 
 
@@ -134,6 +138,7 @@ def compress(
     destination: AnyPath | None = None,
     *,
     settings: Settings | None = None,
+    container: ContainerName | None = None,
     sensitivity: Sensitivity | None = None,
     cache: AnyPath | None = None,
     evaluate: bool = False,
@@ -144,15 +149,17 @@ def compress(
     device: Device = "cpu",
     progress: Progress = silent,
 ) -> Compressed:
-    """Compress a scene into a SOG-XT container.
+    """Compress a scene into a SOG-XT container, or into SOG.
 
     Args:
         source: a scene, or the path or the bytes of a file of any format that :func:`kissgs.load` reads (a container is
             decoded and encoded again).
-        destination: ``.zip`` or folder to write; by default nothing is written.
+        destination: ``.zip``, ``.sog`` or folder to write; by default nothing is written.
         settings: by default those of the preset ``balanced``. If their group ``compact`` has a budget, the scene is
             compacted first, see :func:`kissgs.compact`; if their group ``finetune`` is ``enabled``, the levels are then
             fine-tuned on the photographs of ``views``, or on renderings of the scene.
+        container: ``"sog-xt"``, or ``"sog"`` for the files of SOG 2, which other viewers open; by default SOG if
+            ``destination`` ends in ``.sog``, else SOG-XT.
         sensitivity: sensitivity of a clean ``source`` (:func:`kissgs.measure_sensitivity`); by default it is measured
             if the settings need it.
         cache: ``.npz`` file for the measured sensitivity. It is read if scene and cameras are unchanged since it was
@@ -179,8 +186,10 @@ def compress(
 
     settings = settings or Settings()
     target = Path(destination) if destination is not None else None
+    kind = named_container(container, target)
+    check_container(kind, settings)
     if target is not None:
-        check_destination(target, overwrite=overwrite)
+        check_destination(target, overwrite=overwrite, names=FILES[kind])
     finetune_checkpoint = None
     if settings.finetune.enabled:
         check_finetuning(settings, views, device)
@@ -198,6 +207,7 @@ def compress(
         cleaned=cleaned,
         checkpoint=finetune_checkpoint,
         device=device,
+        container=kind,
         packed=target is None or is_packed(target),
         threads=threads,
         progress=SearchNote(clock),
@@ -208,8 +218,8 @@ def compress(
     after_search = ignore_stop_search(clock) if settings.searches else clock
     if not settings.encode.has_goal:
         encoding = replace(encoding, progress=SearchNote(after_search))
-    container, more = encoding.run(search)
-    encoded = container.encoded
+    result, more = encoding.run(search)
+    encoded = result.encoded
     container_bytes, file_bytes = stored_sizes(encoded.files, packed=encoding.packed)
     evaluation = _evaluate(original, encoded.files, views, threads, after_search) if evaluate else None
     checkpoints = (None if compacted is None else compacted.checkpoint, finetune_checkpoint)
@@ -227,10 +237,10 @@ def compress(
         file_bytes=file_bytes,
         cleaned=cleaned,
         compaction=None if compacted is None else compacted.report,
-        finetuning=container.finetuning,
+        finetuning=result.finetuning,
         invisible=encoded.invisible,
         pruned_by_rd=encoded.pruned_by_rd,
-        note="; ".join(filter(None, [encoded.note, container.note])),
+        note="; ".join(filter(None, [encoded.note, result.note])),
         clipped_colors=encoded.clipped_colors,
         form_error=encoded.form_error,
         max_quantization_error=encoded.errors,
@@ -239,12 +249,12 @@ def compress(
         seconds=clock.seconds,
         cpu_seconds=clock.cpu_seconds,
         peak_memory=peak_memory(),
-        settings=_settings_as_used(settings, container.settings),
+        settings=_settings_as_used(settings, result.settings),
         evaluation=evaluation,
     )
     order = encoded.order if compacted is None else compacted.index[encoded.order]
     remaining = () if target is not None else tuple(path for path in checkpoints if path is not None)
-    return Compressed(encoded.files, order, report, remaining)
+    return Compressed(encoded.files, order, report, remaining, kind)
 
 
 def _settings_as_used(requested: Settings, used: EncodeSettings) -> dict[str, Any]:
@@ -337,6 +347,6 @@ def _evaluate(
     from kissgs.evaluation.evaluate import evaluate
 
     progress("evaluate", 0.0)
-    decoded = decode(container, max_gaussians=max(len(splats), MAX_GAUSSIANS), threads=threads)
+    decoded = read_scene(container, max_gaussians=max(len(splats), MAX_GAUSSIANS), threads=threads)
 
     return evaluate(splats, decoded, views, threads=threads, progress=as_stage("evaluate", progress))

@@ -16,13 +16,13 @@ from kissgs.core.splats import Splats
 from kissgs.evaluation.psnr_loss import SEARCH_SEED
 from kissgs.evaluation.results import MAX_VIEW_PSNR
 from kissgs.finetuning.result import FinetuneReport
+from kissgs.pipeline.scene_files import read_scene
 from kissgs.pipeline.trial import Trial
+from kissgs.planning.encoded import Encoded
 from kissgs.planning.sh_codebook import COEFFICIENTS, codebook_side
 from kissgs.settings import EncodeSettings
 from kissgs.settings.encode import GOALS
 from kissgs.sogxt.container import stored_sizes
-from kissgs.sogxt.decode import decode
-from kissgs.sogxt.encode import Encoded
 
 if TYPE_CHECKING:
     from kissgs.evaluation.evaluate import Rendering
@@ -400,7 +400,8 @@ class RateControl:
         if self.views is None:
             self.views = evaluation_views(self.original, seed=SEARCH_SEED, threads=self.threads)
             self._rendered = {}
-        decoded = decode(encoded.files, max_gaussians=max(len(self.original), MAX_GAUSSIANS), threads=self.threads)
+        most = max(len(self.original), MAX_GAUSSIANS)
+        decoded = read_scene(encoded.files, max_gaussians=most, threads=self.threads)
         return compare_images(self.original, decoded, self.views, threads=self.threads, reference_images=self._rendered)
 
 

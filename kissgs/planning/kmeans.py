@@ -43,6 +43,8 @@ class KMeansOptions:
         tolerance: root mean square error per dimension below which a cluster is not split further.
         lattice: step that centroids are rounded to, in units of the codebook's root mean square error; vectors are
             then assigned to the rounded centroids. 0 does not round.
+        from_zero: whether the lattice holds 0 in all dimensions, instead of each dimension's smallest value, and any
+            number of its points may be used, instead of 255 per dimension.
     """
 
     seed: int
@@ -50,6 +52,7 @@ class KMeansOptions:
     nprobe: int
     tolerance: float
     lattice: float
+    from_zero: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +99,7 @@ def fit(
         return Clusters(mean[None], np.zeros(len(vectors), dtype=np.int32), 0.0)
     if len(vectors) <= size:
         unique, labels = np.unique(vectors, axis=0, return_inverse=True)
-        step = _round_to_lattice(unique, 0.0, tolerance) if lattice else 0.0
+        step = _round_to_lattice(unique, 0.0, options) if lattice else 0.0
         return Clusters(unique, labels.reshape(-1).astype(np.int32), step)
 
     coarse, owners, errors = _coarse(vectors, weights, size, rng, pool)
@@ -118,7 +121,7 @@ def fit(
     step = 0.0
     if lattice:
         error = np.average(distances, weights=weights) / vectors.shape[1]
-        step = _round_to_lattice(centroids, lattice * float(error) ** 0.5, tolerance)
+        step = _round_to_lattice(centroids, lattice * float(error) ** 0.5, options)
         _reassign(vectors, centroids, labels, tree, near, pool)
 
     used, compact = np.unique(labels, return_inverse=True)
@@ -279,13 +282,18 @@ def _reseed_empty(centroids: np.ndarray, vectors: np.ndarray, errors: np.ndarray
     labels[worst] = empty
 
 
-def _round_to_lattice(centroids: np.ndarray, step: float, tolerance: float) -> float:
+def _round_to_lattice(centroids: np.ndarray, step: float, options: KMeansOptions) -> float:
     """Round in place to whole steps from each dimension's smallest value; a constant dimension keeps its value.
 
     Returns:
         The step: ``step``, or the one that 256 levels or the tolerance need if that is larger.
     """
+    tolerance = options.tolerance
     step = max(step, 2 * tolerance)
+    if options.from_zero:
+        if step > 0:
+            centroids[:] = np.rint(centroids.astype(np.float64) / step) * step
+        return step
     # An exact codebook, of few vectors, has no error that outliers could be compared with.
     wide = (clip_outliers(centroids, step=step, share=OUTLIERS) if step > 2 * tolerance else centroids).astype(
         np.float64

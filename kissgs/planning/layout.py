@@ -41,6 +41,17 @@ class Grid:
     mask: Bool[np.ndarray, " cells"]
     cell_to_gaussian: Int[np.ndarray, " cells"]
 
+    def with_padding_last(self) -> Grid:
+        """Move the last Gaussians into the padding before them, so that all padding is at the end."""
+        count = int(self.mask.sum())
+        holes = np.flatnonzero(~self.mask[:count])
+        if len(holes) == 0:
+            return self
+        cells, index = self.cells.copy(), np.arange(len(self.cells))
+        cells[holes] = cells[count + np.flatnonzero(self.mask[count:])]
+        cells[count:] = cells[count - 1]
+        return Grid(self.side, cells, index < count, np.minimum(index, count - 1))
+
 
 def layout_grid(
     means: Float32[np.ndarray, "N 3"],

@@ -9,6 +9,7 @@ from kissgs.core.progress import Progress, silent
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats
 from kissgs.core.threads import blas_workers
+from kissgs.planning.container_model import EVEN_LEVELS, ContainerModel
 from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.rate_distortion import ColorRefit, plan_rate_distortion
 from kissgs.planning.uniform import plan_uniform
@@ -24,6 +25,7 @@ def plan_encoding(
     *,
     sensitivity: Sensitivity | None = None,
     recolor: ColorRefit | None = None,
+    container: ContainerModel = EVEN_LEVELS,
     threads: int = 0,
     progress: Progress = silent,
 ) -> EncodingPlan:
@@ -36,6 +38,7 @@ def plan_encoding(
             camera saw any Gaussian, planning is uniform, with the steps of the settings.
         recolor: for rate-distortion planning: returns better ``sh0`` for the decoded Gaussians and their indices in
             the scene.
+        container: what the container can hold.
         threads: number of threads; 0 means one per processor.
         progress: receives "kernels", "rate_distortion", "order", "forms", "codebook", "sort codebook" and "rounding".
 
@@ -49,8 +52,8 @@ def plan_encoding(
     kept = visible_gaussians(splats, settings)
     with blas_workers(threads) as pool:
         if sensitivity is not None and (sensitivity.color_weight[kept] > 0).any():
-            return plan_rate_distortion(splats, kept, sensitivity, recolor, settings, pool, progress)
-        return plan_uniform(splats, kept, settings, pool, progress)
+            return plan_rate_distortion(splats, kept, sensitivity, recolor, settings, container, pool, progress)
+        return plan_uniform(splats, kept, settings, container, pool, progress)
 
 
 def visible_gaussians(splats: Splats, settings: EncodeSettings) -> Int[np.ndarray, " K"]:

@@ -24,6 +24,8 @@ MEANS_TOP = 65_535
 class Quantized:
     """Levels of one plane and the values they stand for: ``value = low + level / top * (high - low)``, per channel.
 
+    With a table, levels stand for its values instead, in all channels.
+
     Attributes:
         levels: ``(N, C)`` from 0 to ``top``.
         low: ``(C,)`` value of level 0.
@@ -32,6 +34,7 @@ class Quantized:
         level_stride: distance between the levels that a row uses, one for all rows or ``(N,)``: with ``level_offset``
             added, levels are multiples of it. Single levels may be exceptions.
         level_offset: offset added to levels before they are multiples of ``level_stride``.
+        table: ascending value of each level, for all channels; None for even levels.
     """
 
     levels: UInt8[np.ndarray, "N C"] | UInt16[np.ndarray, "N C"]
@@ -40,9 +43,12 @@ class Quantized:
     top: int
     level_stride: int | Int[np.ndarray, " N"] = 1
     level_offset: int = 0
+    table: Float32[np.ndarray, " table"] | None = None
 
     def values(self) -> Float64[np.ndarray, "N C"]:
         """Return the values that the levels stand for."""
+        if self.table is not None:
+            return self.table.astype(np.float64)[self.levels]
         low, high = self.low.astype(np.float64), self.high.astype(np.float64)
         return np.asarray(low + self.levels * ((high - low) / self.top))
 
@@ -146,6 +152,12 @@ def observed_range(quantized: Quantized) -> tuple[Float32[np.ndarray, " C"], Flo
     low, high = quantized.low.astype(np.float64), quantized.high.astype(np.float64)
     per_level = (high - low) / quantized.top
     return (low + first * per_level).astype(np.float32), (low + last * per_level).astype(np.float32)
+
+
+def half_steps(quantized: Quantized, stride: int = 1) -> list[float]:
+    """Return half the distance of levels that are multiples of ``stride``, per channel."""
+    extent = quantized.high.astype(np.float64) - quantized.low
+    return [float(step) for step in extent / quantized.top * stride / 2]
 
 
 def _range(wide: Float64[np.ndarray, "N C"]) -> tuple[Float32[np.ndarray, " C"], Float32[np.ndarray, " C"]]:

@@ -7,16 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kissgs.core.array_types import Bool, Float, Float32, Float64, Int
+from kissgs.core.array_types import Bool, Float32, Int
 from kissgs.core.progress import Progress
 from kissgs.core.sensitivity import Sensitivity
-from kissgs.core.signed_log import signed_exp, signed_log
 from kissgs.core.splats import SH_C0, Splats
 from kissgs.core.threads import Workers
 from kissgs.planning import kmeans
+from kissgs.planning.container_model import ContainerModel
 from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.layout import layout_grid
-from kissgs.planning.quantize import MEANS_TOP, Quantized, clip_outliers, means_bits, quantize_means
+from kissgs.planning.rd_fields import RdFields, decoded_scene, decoded_sh, largest_errors
 from kissgs.planning.rd_model import (
     SEEN,
     SH_MEAN_SQUARE,
@@ -26,9 +26,9 @@ from kissgs.planning.rd_model import (
     default_error,
     lambda_for,
 )
-from kissgs.planning.rdo_quantize import largest_changes, quantize_by_class, rdo_quantize_shapes
+from kissgs.planning.rdo_quantize import largest_changes
 from kissgs.planning.rotation_forms import canonicalize
-from kissgs.planning.sh_codebook import COEFFICIENTS, Codebook, bounded_weights, fit_codebook, size_weights
+from kissgs.planning.sh_codebook import bounded_weights, fit_codebook, size_weights
 from kissgs.settings import EncodeSettings
 
 ColorRefit = Callable[[Splats, Int[np.ndarray, " M"]], Float32[np.ndarray, "M 3"]]
@@ -50,9 +50,6 @@ times (opacity × cross-section) to the power of SIZE_POWER · view uncertainty 
 SH_WEIGHTS = (1e-2, 1e2)
 """Bounds of the codebook's weights, in units of their median."""
 
-OUTLIERS = 1e-4
-"""Share of base colours, at either end of a channel, that may be clipped so that the step of the others stays small."""
-
 MANY_PRUNED = 0.2
 """Share of pruned Gaussians above which the report explains why they were pruned."""
 
@@ -66,15 +63,14 @@ def plan_rate_distortion(
     sensitivity: Sensitivity,
     recolor: ColorRefit | None,
     settings: EncodeSettings,
+    container: ContainerModel,
     pool: Workers,
     progress: Progress,
 ) -> EncodingPlan:
-    """Plan the Gaussians ``kept``, at least one of which a camera has seen."""
+    """Plan the Gaussians ``kept``, at least one of which a camera has seen, for a container."""
     progress("rate_distortion", 0.0)
-    costs, sh_model = (
-        Costs.of(sensitivity, splats).take(kept),
-        _codebook_error_model(splats, kept, sensitivity, settings, pool),
-    )
+    costs = Costs.of(sensitivity, splats).take(kept)
+    sh_model = _codebook_error_model(splats, kept, sensitivity, settings, pool)
     threshold_bits = settings.prune_threshold_bits * (1 - sensitivity.view_uncertainty)
     lambdas = _LambdaEstimate(
         costs,
@@ -93,6 +89,7 @@ def plan_rate_distortion(
     classes = costs.classes(settings.step_classes, splats.means[kept])
     progress("order", 0.0)
     grid = layout_grid(splats.means, kept, 16, settings, pool, lambda fraction: progress("order", fraction), classes)
+    grid = grid.with_padding_last() if container.padding_last else grid
     order = grid.cells[grid.mask]
     rank = np.searchsorted(kept, order)
     classes, costs, ordered = classes[rank], costs.take(rank), splats.select(order)
@@ -104,40 +101,23 @@ def plan_rate_distortion(
     quats, scales, forms = quats[grid.mask], scales[grid.mask], forms[grid.mask]
     weights, size = (
         _sh_weights(sensitivity, order, splats),
-        sh_model.best_size(rd_lambda, len(order), settings.gaussians_per_codebook_entry),
+        sh_model.best_size(rd_lambda, len(order), settings.gaussians_per_codebook_entry, container.entry_bits),
     )
-    codebook = fit_codebook(ordered, np.arange(len(order)), weights, size, settings, pool, progress)
+    codebook = fit_codebook(ordered, np.arange(len(order)), weights, size, settings, container, pool, progress)
     progress("rounding", 0.0)
     values = np.concatenate([ordered.opacities[:, None], scales, quats], axis=1).astype(np.float64)
-    criterion = RdCriterion(costs, classes, rd_lambda)
     captured = sensitivity.captured[order]
     largest = largest_changes(sensitivity.coverage[order], captured, slack)
-    parts = (
-        quantize_by_class(values[:, :1], costs.opacity, criterion, largest["opacities"]),
-        quantize_by_class(values[:, 1:4], costs.scale, criterion, largest["scales"]),
-        quantize_by_class(values[:, 4:], 3 * costs.rotation, criterion, largest["quaternions"]),
-    )
-    if settings.rdo_quantization:
-        parts = rdo_quantize_shapes(values, parts, sensitivity.shape_hessian[order], forms, criterion, largest, pool)
-    fields = dict(zip(("opacities", "scales", "quaternions"), parts, strict=True))
-    coarser = np.rint(captured + np.log2(slack))
-    fields["means"] = _means(ordered, criterion, settings.means_tolerance, coarser)
+    quantizer = RdFields(container, settings, RdCriterion(costs, classes, rd_lambda), largest, pool)
+    fields = quantizer.shapes(values, sensitivity.shape_hessian[order], forms)
+    fields["means"] = quantizer.means(ordered, np.rint(captured + np.log2(slack)))
 
-    rest = _decoded_sh(codebook, ordered)
+    rest = decoded_sh(codebook, ordered)
     compensation = np.einsum("nk,nkc->nc", sensitivity.mean_sh_basis[order], ordered.shN - rest) / np.float32(SH_C0)
     base = ordered.sh0 + np.clip(compensation, -MAX_COMPENSATION, MAX_COMPENSATION)
     if recolor is not None:
-        base = recolor(_decoded(fields, base.astype(np.float32), rest), order)
-    fields["f_dc"], clipped = _colors(base.astype(np.float64), criterion, largest["f_dc"])
-    wanted = {
-        "means": signed_log(ordered.means),
-        "opacities": values[:, :1],
-        "scales": values[:, 1:4],
-        "quaternions": values[:, 4:],
-        "f_dc": ordered.sh0,
-    }
-    errors = {name: np.abs(fields[name].values() - wanted[name]).max(axis=0).tolist() for name in wanted}
-    half = (codebook.centroids.high - codebook.centroids.low).astype(np.float64) / codebook.centroids.top / 2
+        base = recolor(decoded_scene(fields, base.astype(np.float32), rest), order)
+    fields["f_dc"], clipped = quantizer.colors(base.astype(np.float64))
     return EncodingPlan(
         grid=grid,
         fields={
@@ -148,7 +128,7 @@ def plan_rate_distortion(
         classes=classes,
         form_error=form_error,
         clipped_colors=clipped,
-        errors={**errors, "f_rest_centroids": half.tolist()},
+        errors={**largest_errors(fields, values, ordered), "f_rest_centroids": codebook.errors},
         costs=costs,
         rd_lambda=rd_lambda,
         note=note,
@@ -230,57 +210,3 @@ def _sh_weights(sensitivity: Sensitivity, chosen: Int[np.ndarray, " M"], splats:
     power = np.float32(max(1 - SENSITIVITY_SHRINK * sensitivity.view_uncertainty, 0.0))
     sizes = size_weights(splats, SIZE_POWER * sensitivity.view_uncertainty)[chosen]
     return bounded_weights(sensitivity.color_weight[chosen] ** power * sizes, *SH_WEIGHTS)
-
-
-def _means(
-    ordered: Splats,
-    criterion: RdCriterion,
-    tolerance: float,
-    coarser: Float[np.ndarray, " M"],
-) -> Quantized:
-    """Quantise positions, with the bits that lambda asks for in each class.
-
-    A Gaussian has at most ``coarser`` bits less than :func:`means_bits` gives for ``tolerance``.
-    """
-    means = ordered.means
-    most = np.clip(16 - means_bits(ordered, np.arange(len(ordered)), tolerance) + coarser, 0, 8)
-    logs = signed_log(means)
-    unit = max(float(np.ptp(logs)), 1e-30) / MEANS_TOP
-    steps = criterion.class_steps(criterion.costs.position)
-    coarse = [max(np.floor(np.log2(step / unit) + 0.5), 0) for step in steps]
-    return quantize_means(means, bits=16 - np.minimum(np.array(coarse)[criterion.classes], most).astype(np.int64))
-
-
-def _colors(
-    base: Float64[np.ndarray, "M 3"],
-    criterion: RdCriterion,
-    coarsest: Float64[np.ndarray, " M"],
-) -> tuple[Quantized, int]:
-    """Quantise base colours; return them and the number of clipped outliers."""
-    finest = min(criterion.class_steps(criterion.costs.color))
-    clipped = clip_outliers(base, step=finest, share=OUTLIERS)
-    levels = quantize_by_class(clipped, criterion.costs.color, criterion, coarsest)
-    return levels, int((clipped != base).any(axis=1).sum())
-
-
-def _decoded_sh(codebook: Codebook, ordered: Splats) -> Float32[np.ndarray, "M K 3"]:
-    """Return the decoded shN coefficients."""
-    coefficients = ordered.shN.shape[1]
-    entries = codebook.centroids.values().reshape(-1, 3, COEFFICIENTS)[:, :, :coefficients].transpose(0, 2, 1)
-    return np.ascontiguousarray(entries.astype(np.float32)[codebook.labels[: len(ordered)]])
-
-
-def _decoded(
-    fields: dict[str, Quantized], sh0: Float32[np.ndarray, "M 3"], shN: Float32[np.ndarray, "M K 3"]
-) -> Splats:
-    """Return the decoded scene."""
-    quats = fields["quaternions"].values()
-    norms = np.linalg.norm(quats, axis=1, keepdims=True)
-    return Splats(
-        means=signed_exp(fields["means"].values()).astype(np.float32),
-        quats=(quats / np.where(norms > 0, norms, 1)).astype(np.float32),
-        scales=fields["scales"].values().astype(np.float32),
-        opacities=fields["opacities"].values()[:, 0].astype(np.float32),
-        sh0=sh0,
-        shN=shN,
-    )

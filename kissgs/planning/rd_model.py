@@ -181,8 +181,8 @@ class CodebookErrorModel:
         """Return the squared image error of a codebook with that number of entries."""
         return self.weighted * (self.entries / entries) ** SH_SHRINK
 
-    def best_size(self, rd_lambda: float, count: int, ratio: float) -> int:
-        """Return the optimal number of entries for ``count`` Gaussians.
+    def best_size(self, rd_lambda: float, count: int, ratio: float, entry_bits: float = ENTRY_BITS) -> int:
+        """Return the optimal number of entries, of ``entry_bits`` each, for ``count`` Gaussians.
 
         Beyond :data:`QUICK` entries, which would take long to find, there are at least ``ratio`` Gaussians per entry.
         """
@@ -190,7 +190,7 @@ class CodebookErrorModel:
         for _ in range(50):
             middle = 0.5 * (low + high)
             size = np.exp(middle)
-            worth = SH_SHRINK * self.error(size) > rd_lambda * (ENTRY_BITS * size + LABEL_SHARE * count / np.log(2))
+            worth = SH_SHRINK * self.error(size) > rd_lambda * (entry_bits * size + LABEL_SHARE * count / np.log(2))
             low, high = (middle, high) if worth else (low, middle)
         return round(float(np.exp(low)))
 

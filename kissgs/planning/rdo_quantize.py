@@ -156,7 +156,7 @@ def rdo_quantize_shapes(
     floor = np.array([float(cost.min(initial=np.inf)) for cost in (costs.opacity, costs.scale, costs.rotation)])
 
     for _ in range(ROUNDS):
-        rate_table = criterion.rd_lambda * _bits(levels, classes)
+        rate_table = criterion.rd_lambda * level_bits(levels, classes)
 
         def choose(first: int, rate_table: Float64[np.ndarray, "classes 8 256"] = rate_table) -> None:
             rows = slice(first, first + CHUNK)
@@ -195,7 +195,7 @@ def _from_zero(levels: Int[np.ndarray, "M C"], part: Quantized) -> Quantized:
     )
 
 
-def _bits(levels: Int[np.ndarray, "M 8"], classes: Int[np.ndarray, " M"]) -> Float64[np.ndarray, "classes 8 256"]:
+def level_bits(levels: Int[np.ndarray, "M C"], classes: Int[np.ndarray, " M"]) -> Float64[np.ndarray, "classes C 256"]:
     """Estimate the bits of every level of every channel in every class from the counts of ``levels``."""
     number = int(classes.max()) + 1
     counts = np.stack(

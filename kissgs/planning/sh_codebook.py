@@ -13,8 +13,10 @@ from kissgs.core.progress import Progress
 from kissgs.core.splats import SH_REST_COUNTS, Splats
 from kissgs.core.threads import Workers
 from kissgs.planning import kmeans
+from kissgs.planning.container_model import ContainerModel
 from kissgs.planning.plas import plas
-from kissgs.planning.quantize import Quantized, quantize
+from kissgs.planning.quantize import Quantized, half_steps, quantize
+from kissgs.planning.value_table import fit_table, nearest_levels, table_field
 from kissgs.settings import EncodeSettings
 
 COEFFICIENTS = SH_REST_COUNTS[-1]
@@ -33,13 +35,16 @@ class Codebook:
 
     Attributes:
         side: S.
-        centroids: ``(S*S, 45)`` levels, channel-major (15 of red, 15 of green, 15 of blue), entries row-major.
+        centroids: ``(S*S, 45)`` levels, channel-major (15 of red, 15 of green, 15 of blue), entries row-major; at most
+            S × S rows where the container's entries are a list.
         labels: ``(M,)`` entry of each Gaussian; a scene without Gaussians has one label, for padding.
+        errors: ``(45,)`` largest error of the entries by rounding, per channel.
     """
 
     side: int
     centroids: Quantized
     labels: Int[np.ndarray, " M"]
+    errors: list[float]
 
 
 def fit_codebook(
@@ -48,6 +53,7 @@ def fit_codebook(
     weights: Float32[np.ndarray, " M"],
     size: float,
     settings: EncodeSettings,
+    container: ContainerModel,
     pool: Workers,
     progress: Progress,
 ) -> Codebook:
@@ -61,13 +67,14 @@ def fit_codebook(
         weights: weight of each Gaussian's squared shN error.
         size: largest number of entries; the image's side is a multiple of 8, and unused entries repeat others.
         settings: settings of the encoder.
+        container: what the container can hold.
         pool: threads.
         progress: receives "codebook" and "sort codebook" events.
     """
     dimensions = splats.shN.shape[1] * 3
     if dimensions == 0 or len(chosen) == 0:
         nothing = quantize(np.zeros((MIN_SIDE**2, 3 * COEFFICIENTS)), step=1)
-        return Codebook(MIN_SIDE, nothing, np.zeros(max(len(chosen), 1), dtype=np.int32))
+        return Codebook(MIN_SIDE, nothing, np.zeros(max(len(chosen), 1), dtype=np.int32), half_steps(nothing))
     progress("codebook", 0.0)
     clusters = kmeans.fit(
         splats.shN[chosen].reshape(len(chosen), dimensions),
@@ -80,24 +87,42 @@ def fit_codebook(
             nprobe=settings.sh_nprobe,
             tolerance=settings.sh_tolerance,
             lattice=settings.sh_step if settings.shared_step_size else 0.0,
+            from_zero=container.tables is not None,
         ),
         report=lambda fraction: progress("codebook", fraction),
     )
-    # The smallest image that holds the entries; unused places repeat some of them.
+    # The smallest square that holds the entries; unused places repeat some of them.
     side = next(s for s in range(MIN_SIDE, MAX_CODEBOOK_SIDE + 1, 8) if s * s >= len(clusters.centroids))
     entries = clusters.centroids[np.arange(side * side) % len(clusters.centroids)]
     progress("sort codebook", 0.0)
     placed = _sort(entries, settings, pool, lambda fraction: progress("sort codebook", fraction))
-    position = np.empty(side * side, dtype=np.int32)
-    position[placed] = np.arange(side * side, dtype=np.int32)
-    full = np.zeros((side * side, 3, COEFFICIENTS), dtype=np.float32)
-    full[:, :, : dimensions // 3] = entries[placed].reshape(side * side, -1, 3).transpose(0, 2, 1)
-    rows = full.reshape(side * side, 3 * COEFFICIENTS)
+    if container.tables is not None:
+        placed = _without_repetition(placed, side, len(clusters.centroids))
+    position = np.empty(len(placed), dtype=np.int32)
+    position[placed] = np.arange(len(placed), dtype=np.int32)
+    full = np.zeros((len(placed), 3, COEFFICIENTS), dtype=np.float32)
+    full[:, :, : dimensions // 3] = entries[placed].reshape(len(placed), -1, 3).transpose(0, 2, 1)
+    rows = full.reshape(len(placed), 3 * COEFFICIENTS)
+    if container.tables is not None:
+        used = rows.reshape(-1, COEFFICIENTS)[:, : dimensions // 3]
+        worth = np.bincount(clusters.labels, weights, minlength=len(placed))[placed]
+        table = fit_table(used.ravel(), np.repeat(worth, dimensions), max(clusters.step, 1e-4), with_zero=True)
+        levels = table_field(table, nearest_levels(table, rows))
+        lost = np.abs(levels.values() - rows).max(axis=0) + clusters.step / 2
+        return Codebook(side, levels, position[clusters.labels], lost.tolist())
     if settings.shared_step_size:
         levels = quantize(rows, step=max(clusters.step, 1e-30))
     else:
         levels = quantize(rows, step=1, shared=False, max_top=PAPER_TOP)
-    return Codebook(side, levels, position[clusters.labels])
+    return Codebook(side, levels, position[clusters.labels], half_steps(levels))
+
+
+def _without_repetition(placed: Int[np.ndarray, " cells"], side: int, count: int) -> Int[np.ndarray, " entries"]:
+    """Return the ``count`` entries of a sorted square as one line: its columns, up and down in turn."""
+    square = placed.reshape(side, side).T.copy()
+    square[1::2] = square[1::2, ::-1]
+    line = square.ravel()
+    return np.asarray(line[line < count])
 
 
 def codebook_side(size: float) -> int:

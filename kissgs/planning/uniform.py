@@ -4,13 +4,25 @@ from __future__ import annotations
 
 import numpy as np
 
-from kissgs.core.array_types import Int
+from kissgs.core.array_types import Float64, Int
 from kissgs.core.progress import Progress
+from kissgs.core.signed_log import signed_log
 from kissgs.core.splats import SH_REST_COUNTS, Splats
 from kissgs.core.threads import Workers
+from kissgs.planning import table_fields
+from kissgs.planning.container_model import ByteTables, ContainerModel
 from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.layout import layout_grid
-from kissgs.planning.quantize import Quantized, clip_outliers, means_bits, quantize, quantize_means
+from kissgs.planning.quantize import (
+    MEANS_TOP,
+    Quantized,
+    clip_outliers,
+    half_steps,
+    means_bits,
+    quantize,
+    quantize_means,
+)
+from kissgs.planning.rd_fields import largest_errors
 from kissgs.planning.rotation_forms import canonicalize
 from kissgs.planning.sh_codebook import fit_codebook, size_weights
 from kissgs.settings import EncodeSettings
@@ -18,43 +30,85 @@ from kissgs.settings import EncodeSettings
 OUTLIERS = 1e-4
 """Share of base colours, at either end of a channel, that may be clipped so that the step of the others stays small."""
 
+FINEST = 1e-4
+"""Step of values that may take all levels of a table."""
+
 
 def plan_uniform(
-    splats: Splats, kept: Int[np.ndarray, " M"], settings: EncodeSettings, pool: Workers, progress: Progress
+    splats: Splats,
+    kept: Int[np.ndarray, " M"],
+    settings: EncodeSettings,
+    container: ContainerModel,
+    pool: Workers,
+    progress: Progress,
 ) -> EncodingPlan:
-    """Plan the Gaussians ``kept``, which may be none."""
+    """Plan the Gaussians ``kept``, which may be none, for a container."""
     progress("order", 0.0)
     bits = settings.means_bits or means_bits(splats, kept, settings.means_tolerance)
     grid = layout_grid(splats.means, kept, bits, settings, pool, lambda fraction: progress("order", fraction))
+    grid = grid.with_padding_last() if container.padding_last else grid
     # Padding repeats Gaussians of the scene; in a scene without any, padding is a neutral Gaussian.
     source, cells = (splats, grid.cells) if len(kept) else (_neutral(splats.sh_degree), grid.cells * 0)
-    sh0 = clip_outliers(source.sh0, step=settings.sh0_step, share=OUTLIERS) if settings.shared_step_size else source.sh0
+    clips = settings.shared_step_size and container.tables is None
+    sh0 = clip_outliers(source.sh0, step=settings.sh0_step, share=OUTLIERS) if clips else source.sh0
     progress("forms", 0.0)
     quats, scales, form_error, _ = canonicalize(
         source, cells, grid.side, settings, pool, lambda fraction: progress("forms", fraction)
     )
     chosen = cells[grid.mask]
     weights = size_weights(source, settings.sh_weight_power)[chosen]
-    codebook = fit_codebook(
-        source, chosen, weights, len(chosen) / settings.gaussians_per_codebook_entry, settings, pool, progress
-    )
-    fields = {
-        "means": quantize_means(source.means[cells], bits=bits),
-        "opacities": _quantize(source.opacities[cells, None], settings.opacity_step, settings),
-        "scales": _quantize(scales, settings.scale_step, settings),
-        "quaternions": _quantize(quats, settings.quat_step, settings, paper_top=99),
-        "f_dc": _quantize(sh0[cells], settings.sh0_step, settings),
-        "f_rest_centroids": codebook.centroids,
-    }
+    size = len(chosen) / settings.gaussians_per_codebook_entry
+    codebook = fit_codebook(source, chosen, weights, size, settings, container, pool, progress)
+    if container.tables is not None:
+        values = np.concatenate([source.opacities[cells, None], scales, quats], axis=1).astype(np.float64)
+        fields, errors = _table_fields(source.select(cells), values, bits, settings, container.tables)
+    else:
+        fields = {
+            "means": quantize_means(source.means[cells], bits=bits),
+            "opacities": _quantize(source.opacities[cells, None], settings.opacity_step, settings),
+            "scales": _quantize(scales, settings.scale_step, settings),
+            "quaternions": _quantize(quats, settings.quat_step, settings, paper_top=99),
+            "f_dc": _quantize(sh0[cells], settings.sh0_step, settings),
+        }
+        errors = {name: half_steps(field) for name, field in fields.items()}
+        errors["means"] = half_steps(fields["means"], 1 << (16 - bits))
     return EncodingPlan(
         grid=grid,
-        fields=fields,
+        fields={**fields, "f_rest_centroids": codebook.centroids},
         codebook=codebook,
         classes=np.zeros(len(chosen), np.int64),
         form_error=form_error,
         clipped_colors=int((sh0 != source.sh0).any(axis=1).sum()),
-        errors={name: _half_steps(field, bits if name == "means" else 16) for name, field in fields.items()},
+        errors={**errors, "f_rest_centroids": codebook.errors},
     )
+
+
+def _table_fields(
+    cells: Splats, values: Float64[np.ndarray, "cells 8"], bits: int, settings: EncodeSettings, tables: ByteTables
+) -> tuple[dict[str, Quantized], dict[str, list[float]]]:
+    """Return the levels by field, and the largest errors, for a container with tables.
+
+    Without ``shared_step_size``, every table has as many values as it may, and rotations have all their levels.
+
+    Args:
+        cells: the Gaussian of each cell.
+        values: its opacity logit, log-scales and unit quaternion, in the stored form.
+        bits: precision of positions.
+        settings: settings of the encoder.
+        tables: tables of the container.
+    """
+    equal = np.ones(len(cells))
+    steps = (settings.opacity_step, settings.scale_step, settings.quat_step, settings.sh0_step)
+    if not settings.shared_step_size:
+        steps = (FINEST, FINEST, FINEST, FINEST)
+    opacity, scale, rotation, color = (step * equal for step in steps)
+    unit = float(np.ptp(signed_log(cells.means))) / MEANS_TOP
+    fields = {
+        **table_fields.shape_fields(values, (opacity, scale, rotation), equal, tables),
+        "means": table_fields.means_field(cells.means, max(unit, 1e-30) * 2.0 ** (16 - bits)),
+        "f_dc": table_fields.color_field(cells.sh0.astype(np.float64), color, equal),
+    }
+    return fields, largest_errors(fields, values, cells)
 
 
 def _neutral(sh_degree: int) -> Splats:
@@ -73,9 +127,3 @@ def _quantize(values: np.ndarray, step: float, settings: EncodeSettings, *, pape
     if settings.shared_step_size:
         return quantize(values, step=step)
     return quantize(values, step=step, shared=False, max_top=paper_top)
-
-
-def _half_steps(field: Quantized, bits: int) -> list[float]:
-    spacing = 1 << (16 - bits)
-    extent = field.high.astype(np.float64) - field.low
-    return [float(step) for step in extent / field.top * spacing / 2]

@@ -41,11 +41,11 @@ def stored_sizes(files: Mapping[str, bytes], *, packed: bool) -> tuple[int, dict
 
 def is_packed(path: Path) -> bool:
     """Whether a container of that name is a zip, not a folder."""
-    return path.suffix.lower() == ".zip"
+    return path.suffix.lower() in (".zip", ".sog")
 
 
 def write_container(files: Mapping[str, bytes], path: Path, *, overwrite: bool = False) -> int:
-    """Write a container atomically: a zip if the name ends in ``.zip``, else a folder.
+    """Write a container atomically: a zip if the name ends in ``.zip`` or ``.sog``, else a folder.
 
     Returns:
         Bytes written.

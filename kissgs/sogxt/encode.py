@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from kissgs._version import __version__
-from kissgs.core.array_types import Float32, Int, UInt8
+from kissgs.core.array_types import Float32, UInt8
 from kissgs.core.limits import MAX_CODEBOOK_SIDE
 from kissgs.core.progress import Progress, silent
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import NOTHING_CLEANED, Cleaned, Splats
 from kissgs.core.threads import blas_workers
+from kissgs.io.planes import compress_images
 from kissgs.io.webp import pixels_crc32
+from kissgs.planning.encoded import Encoded
 from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.planner import plan_encoding, visible_gaussians
 from kissgs.planning.quantize import Quantized, observed_range
@@ -24,36 +25,6 @@ from kissgs.planning.sh_codebook import Codebook
 from kissgs.settings import EncodeSettings
 from kissgs.settings.encode import GOALS
 from kissgs.sogxt import metadata, names
-from kissgs.sogxt.planes import compress_images
-
-
-@dataclass(frozen=True, slots=True)
-class Encoded:
-    """A container in memory, and figures of its encoding.
-
-    Attributes:
-        files: name -> bytes, in the order in which they are best stored.
-        order: ``(M,)`` index in the encoded scene of every Gaussian of the container, in the container's order.
-        form_error: largest relative change of a covariance by the plan of its equivalent form.
-        invisible: number of Gaussians pruned because no renderer draws them.
-        pruned_by_rd: number of Gaussians pruned because removing them costs less than their bits.
-        clipped_colors: number of Gaussians with a clipped base colour (:func:`kissgs.planning.quantize.clip_outliers`).
-        errors: largest quantisation error by field and channel (:class:`kissgs.planning.encoding_plan.EncodingPlan`).
-        rd_lambda: squared error per bit; None for uniform planning.
-        codebook_side: S; the codebook has S × S entries.
-        note: a sentence for the user if many Gaussians were pruned; else empty.
-    """
-
-    files: dict[str, bytes]
-    order: Int[np.ndarray, " M"]
-    form_error: float
-    invisible: int
-    pruned_by_rd: int
-    clipped_colors: int
-    errors: dict[str, list[float]]
-    rd_lambda: float | None
-    codebook_side: int
-    note: str = ""
 
 
 def encode(
@@ -142,18 +113,8 @@ def write_files(
         crc32={name: pixels_crc32(image) for name, image in images.items()},
     )
     files = {names.JSON_NAME: layout.to_meta_json(), **files}
-    return Encoded(
-        files={names.YAML_NAME: layout.to_yaml(), names.SCENE_NAME: metadata.scene_json(files), **files},
-        order=plan.grid.cells[plan.grid.mask],
-        form_error=plan.form_error,
-        invisible=len(splats) - kept,
-        pruned_by_rd=kept - count,
-        clipped_colors=plan.clipped_colors,
-        errors=plan.errors,
-        rd_lambda=plan.rd_lambda,
-        codebook_side=plan.codebook.side,
-        note=plan.note,
-    )
+    files = {names.YAML_NAME: layout.to_yaml(), names.SCENE_NAME: metadata.scene_json(files), **files}
+    return Encoded.of(plan, splats, settings, files)
 
 
 def render_planes(plan: EncodingPlan) -> dict[str, UInt8[np.ndarray, "H W C"]]:

@@ -146,3 +146,48 @@ def streamed_files(levels, *, environment=None):
         files |= {f"env/{key}": data for key, data in sog_files(environment).items()}
         meta["environment"] = "env/meta.json"
     return {"lod-meta.json": json.dumps(meta).encode(), **files}
+
+
+def read_files(files):
+    """Read a container of version 2, number by number; return its arrays by name of the attribute."""
+    meta = json.loads(files["meta.json"])
+
+    def plane(name, mode):
+        image = Image.open(io.BytesIO(files[name])).convert(mode)
+        return [image.getpixel((x, y)) for y in range(image.height) for x in range(image.width)]
+
+    def decode_means(low, high):
+        ends = list(zip(meta["means"]["mins"], meta["means"]["maxs"], strict=True))
+        logs = [a + (b - a) * (less + 256 * more) / 65535 for less, more, (a, b) in zip(low, high, ends, strict=True)]
+        return [math.copysign(math.expm1(abs(v)), v) for v in logs]
+
+    def decode_quat(pixel):
+        small = [(v / 255 - 0.5) * math.sqrt(2) for v in pixel[:3]]
+        missing = math.sqrt(max(0, 1 - sum(v * v for v in small)))
+        return [*small[: pixel[3] - 252], missing, *small[pixel[3] - 252 :]]
+
+    count = meta["count"]
+    low, high = (plane(name, "RGB") for name in meta["means"]["files"])
+    colors = plane(meta["sh0"]["files"][0], "RGBA")[:count]
+    scales = plane(meta["scales"]["files"][0], "RGB")[:count]
+    alphas = [min(max(p[3] / 255, 1e-6), 1 - 1e-6) for p in colors]
+    return {
+        "means": [decode_means(*pair) for pair in list(zip(low, high, strict=True))[:count]],
+        "quats": [decode_quat(p) for p in plane(meta["quats"]["files"][0], "RGBA")[:count]],
+        "scales": [[meta["scales"]["codebook"][v] for v in p] for p in scales],
+        "opacities": [math.log(a / (1 - a)) for a in alphas],
+        "sh0": [[meta["sh0"]["codebook"][v] for v in p[:3]] for p in colors],
+        "shN": _read_rest(meta, plane, count),
+    }
+
+
+def _read_rest(meta, plane, count):
+    if "shN" not in meta:
+        return np.zeros((count, 0, 3))
+    k = (0, 3, 8, 15)[meta["shN"]["bands"]]
+    centroids, labels = meta["shN"]["files"]
+    entries, codebook = plane(centroids, "RGB"), meta["shN"]["codebook"]
+    numbers = [p[0] + 256 * p[1] for p in plane(labels, "RGB")[:count]]
+    assert max(numbers) < meta["shN"]["count"]
+    starts = [n // 64 * 64 * k + n % 64 * k for n in numbers]
+    return np.array([[[codebook[v] for v in entries[start + j]] for j in range(k)] for start in starts])

@@ -111,3 +111,18 @@ def test_neighbours_on_the_grid_are_near_in_space(order):
     table = splats.means[grid.cells].reshape(32, 32, 3)
     sideways = np.linalg.norm(np.diff(table, axis=1), axis=2).mean()
     assert sideways < 0.5 * 0.66, "two random points of a unit cube are 0.66 apart"
+
+
+@pytest.mark.parametrize("order", ["plas", "hilbert"])
+def test_padding_can_be_moved_to_the_end(order):
+    means = np.random.default_rng(5).normal(size=(150, 3)).astype(np.float32)
+    settings = EncodeSettings(order=order)
+    with blas_workers(1) as pool:
+        grid = layout_grid(means, np.arange(150), 16, settings, pool, lambda fraction: None)
+    moved = grid.with_padding_last()
+    assert (moved.mask == (np.arange(len(moved.mask)) < 150)).all()
+    assert sorted(moved.cells[:150]) == list(range(150))
+    assert (moved.cells[150:] == moved.cells[149]).all()
+    assert (moved.cells == moved.cells[:150][moved.cell_to_gaussian]).all()
+    unmoved = grid.mask[:150]
+    assert (moved.cells[:150][unmoved] == grid.cells[:150][unmoved]).all()

@@ -12,9 +12,9 @@ from PIL import Image
 
 from kissgs.core.errors import InvalidContainerError
 from kissgs.core.threads import blas_workers
+from kissgs.io.planes import compress_images
 from kissgs.io.webp import decode_plane, encode_plane, probe_webp
 from kissgs.settings import EncodeSettings
-from kissgs.sogxt.planes import compress_images
 
 
 def random_image(height, width, channels, seed=0):

@@ -16,18 +16,20 @@ HIGHEST_EFFORT = (100, 6)
 
 
 def compress_images(
-    images: Mapping[str, UInt8[np.ndarray, "H W C"]],
+    images: Mapping[str, UInt8[np.ndarray, "_ _ _"]],
     settings: EncodeSettings,
     pool: Workers,
     report: Callable[[float], None],
+    *,
+    codebook: str = "f_rest_centroids.webp",
 ) -> dict[str, bytes]:
-    """Compress all images of a container in parallel, the slowest first."""
+    """Compress all images of a container in parallel, the slowest first: the one called ``codebook``."""
 
     def work(name: str) -> bytes:
-        slow = settings.codebook_max_effort and name.startswith("f_rest_centroids")
+        slow = settings.codebook_max_effort and name == codebook
         quality, method = HIGHEST_EFFORT if slow else (settings.webp_quality, settings.webp_method)
         return encode_plane(images[name], quality=quality, method=method)
 
-    names = sorted(images, key=lambda name: (not name.startswith("f_rest_centroids"), -images[name].size))
+    names = sorted(images, key=lambda name: (name != codebook, -images[name].size))
     files = dict(zip(names, pool.map(work, names, report), strict=True))
     return {name: files[name] for name in images}

@@ -1,0 +1,47 @@
+"""``ContainerModel``: which values the levels of a container can stand for, as its package tells the planner."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kissgs.core.array_types import Float64
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ByteTables:
+    """Eight-bit levels that stand for the values of tables, as SOG has them.
+
+    Scales, base colours and SH coefficients have one free table of 256 values each, for all their channels. Rotations
+    are three of the quaternion's components, 255 steps from -1/sqrt(2) to 1/sqrt(2), and which one is left out.
+    Positions have 65,536 levels over a range of their own per axis.
+
+    Attributes:
+        opacity_logits: ``(256,)`` opacity logit of each level, ascending.
+        first_drawn: smallest level of opacity that renderers draw.
+        last_drawn: largest level of opacity to use.
+    """
+
+    opacity_logits: Float64[np.ndarray, " 256"]
+    first_drawn: int
+    last_drawn: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ContainerModel:
+    """Description of the values that a container can hold.
+
+    Attributes:
+        tables: tables of its levels; None for evenly spaced levels over a range per channel, and whole quaternions.
+        padding_last: whether cells without a Gaussian must follow all others.
+        entry_bits: typical size of an entry of the SH codebook, bits, at 45 dimensions.
+    """
+
+    tables: ByteTables | None = None
+    padding_last: bool = False
+    entry_bits: float = 112
+
+
+EVEN_LEVELS = ContainerModel()
+"""Evenly spaced levels, and a mask that says which cells hold a Gaussian: the default."""

@@ -1,0 +1,129 @@
+"""An encoding plan -> the files of a SOG container of version 2: seven lossless images at most, and ``meta.json``."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+
+from kissgs._version import __version__
+from kissgs.core.array_types import UInt8
+from kissgs.core.errors import UnsupportedError
+from kissgs.core.progress import Progress, silent
+from kissgs.core.splats import SH_REST_COUNTS, Splats
+from kissgs.core.threads import blas_workers
+from kissgs.io.planes import compress_images
+from kissgs.planning.encoded import Encoded
+from kissgs.planning.encoding_plan import EncodingPlan
+from kissgs.planning.quantize import Quantized
+from kissgs.planning.sh_codebook import COEFFICIENTS
+from kissgs.settings import EncodeSettings
+from kissgs.sog.metadata import META_NAME
+
+ENTRIES_PER_ROW = 64
+"""Entries of the SH codebook in a row of its image."""
+
+FIRST_TAG = 252
+"""Alpha of a rotation whose missing component is w."""
+
+MEANS, QUATS, SCALES, SH0 = ("means_l.webp", "means_u.webp"), "quats.webp", "scales.webp", "sh0.webp"
+SHN = ("shN_centroids.webp", "shN_labels.webp")
+
+FILES = (META_NAME, *MEANS, QUATS, SCALES, SH0, *SHN)
+"""Names of all files that a container may have."""
+
+
+def write_files(
+    plan: EncodingPlan,
+    splats: Splats,
+    settings: EncodeSettings,
+    *,
+    threads: int = 0,
+    progress: Progress = silent,
+) -> Encoded:
+    """Make the files of a plan.
+
+    Args:
+        plan: plan of :func:`~kissgs.planning.planner.plan_encoding` for :data:`kissgs.sog.container_model.SOG`.
+        splats: the scene that was planned.
+        settings: settings of the plan.
+        threads: number of threads; 0 means one per processor. The bytes do not depend on it.
+        progress: receives "images".
+
+    Raises:
+        UnsupportedError: the scene has no Gaussian to store.
+    """
+    if not plan.grid.mask.any():
+        raise UnsupportedError("a SOG file cannot hold a scene without visible Gaussians; write a .zip instead")
+
+    def report(fraction: float) -> None:
+        progress("images", fraction)
+
+    report(0.0)
+    images = render_planes(plan, splats.sh_degree)
+    with blas_workers(threads) as pool:
+        files = compress_images(images, settings, pool, report, codebook=SHN[0])
+    return Encoded.of(plan, splats, settings, {META_NAME: metadata(plan, splats.sh_degree), **files})
+
+
+def render_planes(plan: EncodingPlan, sh_degree: int) -> dict[str, UInt8[np.ndarray, "_ _ _"]]:
+    """Return the images of a plan, by file name; Gaussians are row-major, and the last one fills the last row."""
+    fields, side = plan.fields, plan.grid.side
+    rows = -(-int(plan.grid.mask.sum()) // side)
+
+    def image(*channels: np.ndarray) -> UInt8[np.ndarray, "H W C"]:
+        cells = np.concatenate([channel[: rows * side] for channel in channels], axis=1)
+        return np.ascontiguousarray(cells.astype(np.uint8).reshape(rows, side, -1))
+
+    means = fields["means"].levels
+    images = {
+        MEANS[0]: image(means & 255),
+        MEANS[1]: image(means >> 8),
+        QUATS: image(fields["quaternions"].levels, fields["omitted"].levels + np.uint8(FIRST_TAG)),
+        SCALES: image(fields["scales"].levels),
+        SH0: image(fields["f_dc"].levels, fields["opacities"].levels),
+    }
+    if sh_degree > 0:
+        labels = plan.codebook.labels[plan.grid.cell_to_gaussian][:, None]
+        images[SHN[0]] = codebook_image(plan.codebook.centroids, sh_degree)
+        images[SHN[1]] = image(labels & 255, labels >> 8, labels * 0)
+    return images
+
+
+def codebook_image(centroids: Quantized, sh_degree: int) -> UInt8[np.ndarray, "rows columns 3"]:
+    """Return the image of the SH codebook: 64 entries in a row, one pixel per coefficient; the last entry repeats."""
+    coefficients = SH_REST_COUNTS[sh_degree]
+    levels = centroids.levels.reshape(-1, 3, COEFFICIENTS)[:, :, :coefficients].transpose(0, 2, 1)
+    rows = -(-len(levels) // ENTRIES_PER_ROW)
+    full = levels[np.minimum(np.arange(rows * ENTRIES_PER_ROW), len(levels) - 1)]
+    return np.ascontiguousarray(full.reshape(rows, ENTRIES_PER_ROW * coefficients, 3).astype(np.uint8))
+
+
+def metadata(plan: EncodingPlan, sh_degree: int) -> bytes:
+    """Return ``meta.json``; numbers have the digits that readers need, and tables 256 values."""
+    fields = plan.fields
+    document: dict[str, Any] = {
+        "version": 2,
+        "asset": {"generator": f"kissgs {__version__}"},
+        "count": int(plan.grid.mask.sum()),
+        "means": {
+            "mins": [float(str(value)) for value in fields["means"].low],
+            "maxs": [float(str(value)) for value in fields["means"].high],
+            "files": list(MEANS),
+        },
+        "scales": {"codebook": _table(fields["scales"]), "files": [SCALES]},
+        "quats": {"files": [QUATS]},
+        "sh0": {"codebook": _table(fields["f_dc"]), "files": [SH0]},
+    }
+    if sh_degree > 0:
+        centroids = plan.codebook.centroids
+        codebook = {"count": len(centroids.levels), "bands": sh_degree, "codebook": _table(centroids)}
+        document["shN"] = {**codebook, "files": list(SHN)}
+    return json.dumps(document, separators=(",", ":")).encode()
+
+
+def _table(field: Quantized) -> list[float]:
+    """Return 256 ascending values; the last is repeated."""
+    values = [0.0] if field.table is None else [float(str(value)) for value in field.table]
+    return values + values[-1:] * (256 - len(values))
