@@ -93,11 +93,13 @@ def fit_codebook(
     )
     # The smallest square that holds the entries; unused places repeat some of them.
     side = next(s for s in range(MIN_SIDE, MAX_CODEBOOK_SIDE + 1, 8) if s * s >= len(clusters.centroids))
-    entries = clusters.centroids[np.arange(side * side) % len(clusters.centroids)]
     progress("sort codebook", 0.0)
-    placed = _sort(entries, settings, pool, lambda fraction: progress("sort codebook", fraction))
-    if container.tables is not None:
-        placed = _without_repetition(placed, side, len(clusters.centroids))
+    if container.tables is not None:  # in a list, similar neighbours save less than small labels of frequent entries
+        entries = clusters.centroids
+        placed = np.argsort(-np.bincount(clusters.labels), kind="stable")
+    else:
+        entries = clusters.centroids[np.arange(side * side) % len(clusters.centroids)]
+        placed = _sort(entries, settings, pool, lambda fraction: progress("sort codebook", fraction))
     position = np.empty(len(placed), dtype=np.int32)
     position[placed] = np.arange(len(placed), dtype=np.int32)
     full = np.zeros((len(placed), 3, COEFFICIENTS), dtype=np.float32)
@@ -115,14 +117,6 @@ def fit_codebook(
     else:
         levels = quantize(rows, step=1, shared=False, max_top=PAPER_TOP)
     return Codebook(side, levels, position[clusters.labels], half_steps(levels))
-
-
-def _without_repetition(placed: Int[np.ndarray, " cells"], side: int, count: int) -> Int[np.ndarray, " entries"]:
-    """Return the ``count`` entries of a sorted square as one line: its columns, up and down in turn."""
-    square = placed.reshape(side, side).T.copy()
-    square[1::2] = square[1::2, ::-1]
-    line = square.ravel()
-    return np.asarray(line[line < count])
 
 
 def codebook_side(size: float) -> int:

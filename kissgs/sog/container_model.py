@@ -18,5 +18,5 @@ SOG = ContainerModel(
         opacity_logits=OPACITY_OF_BYTE.astype(np.float64), first_drawn=FIRST_DRAWN, last_drawn=LAST_DRAWN
     ),
     padding_last=True,
-    entry_bits=150,
+    entry_bits=130,
 )
