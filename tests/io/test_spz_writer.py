@@ -38,7 +38,13 @@ def test_all_streams_but_sh_are_those_of_the_reference(degree, count, raw_axes):
     data, _ = written(scene, raw_axes=raw_axes)
     bits = fractional_bits_for(float(np.abs(scene.means).max()))
     assert read_spz_info(data) == SpzInfo(
-        version=3, count=count, sh_degree=degree, fractional_bits=bits, antialiased=False, extensions=False
+        version=3,
+        count=count,
+        sh_degree=degree,
+        stored_degree=degree,
+        fractional_bits=bits,
+        antialiased=False,
+        extensions=False,
     )
     body = gzip.decompress(data)[16:]
     for wanted in streams(clean(scene)[0], 3, bits, not raw_axes)[:5]:
