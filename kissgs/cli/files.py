@@ -59,7 +59,8 @@ def for_each_input(
         except KissgsError as error:
             failed = True
             reports.append({"input": name, "error": {"code": error.code, "message": str(error)}})
-            sys.stderr.write(f"kissgs: {error}\n")
+            where = "" if Path(name).name in str(error) else f"{name}: "  # files of a container have names of their own
+            sys.stderr.write(f"kissgs: {where}{error}\n")
     if as_json:
         print_json(reports)
     if failed:
