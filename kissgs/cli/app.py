@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
 import sys
 from typing import Annotated, NoReturn
@@ -41,6 +42,8 @@ app = typer.Typer(
 def run() -> None:
     """Run the command line."""
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # torch's idle threads would otherwise spin and slow ours down
+    if logging.lastResort is not None:  # prints the warnings of the library
+        logging.lastResort.setFormatter(logging.Formatter("kissgs: %(message)s"))
     unwinding(_run)
 
 

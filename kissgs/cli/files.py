@@ -59,7 +59,8 @@ def for_each_input(
         except KissgsError as error:
             failed = True
             reports.append({"input": name, "error": {"code": error.code, "message": str(error)}})
-            sys.stderr.write(f"kissgs: {error}\n")
+            where = "" if Path(name).name in str(error) else f"{name}: "  # files of a container have names of their own
+            sys.stderr.write(f"kissgs: {where}{error}\n")
     if as_json:
         print_json(reports)
     if failed:
@@ -98,8 +99,7 @@ def _targets(inputs: list[str], output: Path | None, suffix: str) -> list[Path]:
         make_folder(output)
     targets = []
     for name in inputs:
-        path = Path(name).absolute()
-        stem = path.name if is_folder(path) else path.stem
+        stem = _stem(name)
         if not stem:
             raise OutputError(f"{name} has no name to derive the output from; give the output with -o")
         folder = output if output is not None else Path(name).parent
@@ -127,8 +127,15 @@ def sibling(name: str, suffix: str) -> Path:
     """Return the path next to an input with another ending."""
     if name == "-":
         raise OutputError("standard input has no folder in which --cache or --checkpoint could keep a file")
+    return Path(name).absolute().parent / (_stem(name) + suffix)
+
+
+def _stem(name: str) -> str:
+    """Return the name of an input without its ending, of which ``.compressed.ply`` is one; folders have none."""
     path = Path(name).absolute()
-    return path.parent / ((path.name if is_folder(path) else path.stem) + suffix)
+    if is_folder(path):
+        return path.name
+    return path.stem[: -len(".compressed")] if path.name.lower().endswith(".compressed.ply") else path.stem
 
 
 def is_folder(path: Path) -> bool:

@@ -21,13 +21,16 @@ from kissgs.io.activations import log_scales, opacity_logits, steps
 from kissgs.io.frames import Signs, mirror, move
 from kissgs.io.gltf_document import GLB_MAGIC, Document, node_matrix
 from kissgs.io.scene_file import open_scene_file, refuse_more_than
-from kissgs.io.spz import read_spz_frame, read_spz_info
+from kissgs.io.spz import largest_spz, read_spz, read_spz_info
 
 EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSIONS = ("KHR_gaussian_splatting_compression_spz_2", "KHR_gaussian_splatting_compression_spz")
 
-_MAX_INSTANCES = 10_000
-"""Largest number of primitives, each counted at every node that shows it."""
+_MAX_INSTANCES = 1000
+"""Largest number of nodes, and of primitives, each counted at every node that shows it."""
+
+_MAX_ATTRIBUTES = 100
+"""Largest number of attributes of a primitive; a scene of SH degree 3 has 21."""
 
 TO_PLY: Signs = (-1, -1, 1)
 """Signs from glTF's axes to those of a ``.ply``."""
@@ -120,9 +123,13 @@ def _primitives(document: Document) -> Iterator[_Primitive]:
     Raises:
         InvalidSceneError: there is none.
     """
-    number = 0
+    seen, number = 0, 0
     for mesh, matrix in _instances(document):
-        for primitive in document.items("primitives", mesh):
+        primitives = document.items("primitives", mesh)
+        seen += len(primitives)
+        if seen > _MAX_INSTANCES:
+            raise document.invalid(f"its nodes show more than {_MAX_INSTANCES:,} primitives")
+        for primitive in primitives:
             splatting = document.child(document.child(primitive, "extensions"), EXTENSION)
             if EXTENSION in document.child(primitive, "extensions"):
                 number += 1
@@ -153,7 +160,7 @@ def _instances(document: Document) -> Iterator[tuple[dict[str, Any], Float64[np.
         waiting += [(child, matrix) for child in _indices(document, node, "children")]
         if len(waiting) > _MAX_INSTANCES - visited:
             break
-    raise document.invalid(f"its nodes form a circle or are more than {_MAX_INSTANCES}")
+    raise document.invalid(f"its nodes form a circle or are more than {_MAX_INSTANCES:,}")
 
 
 def _indices(document: Document, parent: dict[str, Any], key: str) -> list[Any]:
@@ -175,11 +182,13 @@ def _primitive(
             f"{document.name} has the colour space {str(space)[:40]!r}; export it with 'srgb_rec709_display'"
         )
     attributes = document.child(primitive, "attributes")
+    if len(attributes) > _MAX_ATTRIBUTES:
+        raise document.invalid(f"a primitive has {len(attributes):,} attributes")
     compressions = document.child(splatting, "extensions")
     for name in compressions:
         if name in SPZ_EXTENSIONS:
             view = document.whole(document.child(compressions, name), "bufferView", -1)
-            header = read_spz_info(bytes(document.view(view, 512)[0]))
+            header = read_spz_info(bytes(document.view(view, most=512)))
             if "POSITION" in attributes and document.count(attributes["POSITION"]) != header.count:
                 raise document.invalid(f"its .spz has {header.count:,} Gaussians, its accessors another number")
             return _Primitive(attributes, matrix, header.count, header.sh_degree, view)
@@ -236,9 +245,9 @@ def _read_attributes(document: Document, primitive: _Primitive, out: Splats) -> 
 
 
 def _read_spz(document: Document, view: int, out: Splats) -> None:
-    """Read a ``.spz`` inside the file into ``out``, in glTF's axes, which differ from its own (x right, z back)."""
-    stored, _ = read_spz_frame(bytes(document.view(view)[0]), max_gaussians=len(out))
-    mirror(stored, (-1, 1, -1))
+    """Read a ``.spz`` inside the file into ``out``, in glTF's axes (x left, y up, z forward)."""
+    stored = read_spz(bytes(document.view(view, most=largest_spz(len(out)))), max_gaussians=len(out))
+    mirror(stored, TO_PLY)
     for name in ATTRIBUTES:
         if name != "shN":
             getattr(out, name)[:] = getattr(stored, name)

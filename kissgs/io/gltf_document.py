@@ -29,6 +29,9 @@ _GLB_HEADER = struct.Struct("<4sII")
 _CHUNK_HEADER = struct.Struct("<I4s")
 
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_MAX_STRIDE = 252
+"""Largest distance of rows, given by the format."""
+
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
@@ -51,7 +54,7 @@ class Document:
         if not isinstance(self.root, dict):
             raise self.invalid("its JSON is no object")
         self._buffers: dict[int, bytes] = {}
-        self._last: tuple[tuple[int, int], bytes] = ((0, 0), b"")
+        self._lists: dict[str, list[dict[str, Any]]] = {}
 
     def invalid(self, problem: str) -> InvalidSceneError:
         """Return the error of a file that contradicts the format."""
@@ -59,9 +62,13 @@ class Document:
 
     def items(self, key: str, parent: dict[str, Any] | None = None) -> list[dict[str, Any]]:
         """Return a list of objects, empty if the document has none."""
+        if parent is None and key in self._lists:  # checked before; nodes and accessors are asked for one by one
+            return self._lists[key]
         found = (self.root if parent is None else parent).get(key, [])
         if not isinstance(found, list) or not all(isinstance(item, dict) for item in found):
             raise self.invalid(f"{key} is not a list of objects")
+        if parent is None:
+            self._lists[key] = found
         return found
 
     def item(self, key: str, index: object) -> dict[str, Any]:
@@ -99,15 +106,15 @@ class Document:
         kind, code = accessor.get("type"), accessor.get("componentType")
         if not isinstance(kind, str) or _WIDTHS.get(kind) != width or not isinstance(code, int) or code not in _DTYPES:
             raise self.invalid(f"{what} is {str(kind)[:20]!r} of component type {str(code)[:20]!r}")
-        data, stride = self.view(accessor["bufferView"])
         dtype, count = np.dtype(_DTYPES[code]), self.whole(accessor, "count", -1)
         offset, row = self.whole(accessor, "byteOffset"), dtype.itemsize * width
-        stride = stride or row
-        if count and (stride < row or offset + stride * (count - 1) + row > len(data)):
-            raise self.invalid(f"{what} needs more bytes than its buffer has")
+        stride = self.whole(self.item("bufferViews", accessor["bufferView"]), "byteStride") or row
+        if count and not row <= stride <= max(row, _MAX_STRIDE):
+            raise self.invalid(f"{what} has rows of {row} bytes every {stride:,}")
         if not count:
             return np.empty((0, width), dtype)
-        return np.ndarray((count, width), dtype, data, offset, (stride, dtype.itemsize))
+        data = self.view(accessor["bufferView"], offset, stride * (count - 1) + row)
+        return np.ndarray((count, width), dtype, data, 0, (stride, dtype.itemsize))
 
     def numbers(self, index: object, width: int, what: str) -> Shaped[np.ndarray, "N C"]:
         """Return an accessor as floats; normalised integers become fractions of their largest value."""
@@ -118,28 +125,24 @@ class Document:
             raise self.invalid(f"{what} is normalised, but not of 8 or 16 bits")
         return np.maximum(values.astype(np.float32) / np.float32(np.iinfo(values.dtype).max), np.float32(-1))
 
-    def view(self, index: object, limit: int | None = None) -> tuple[memoryview, int]:
-        """Return the bytes of a buffer view, at most ``limit``, and its stride; 0: rows stand one after another."""
+    def view(self, index: object, first: int = 0, length: int | None = None, *, most: int | None = None) -> memoryview:
+        """Return bytes of a buffer view: ``length`` from ``first``, or all, but at most ``most``."""
         view = self.item("bufferViews", index)
+        offset, size = self.whole(view, "byteOffset"), self.whole(view, "byteLength", -1)
+        wanted = size - first if length is None else length
+        if not 0 <= wanted <= size - first:
+            raise self.invalid("an accessor needs more bytes than its buffer view has")
+        wanted = wanted if most is None else min(wanted, most)
         buffer, number = self.item("buffers", view.get("buffer")), int(str(view.get("buffer")))
-        offset, length = self.whole(view, "byteOffset"), self.whole(view, "byteLength", -1)
-        stride = self.whole(view, "byteStride")
         uri = buffer.get("uri")
-        if uri is None and self._binary is not None and number == 0:
-            start, size = self._binary
-        else:
-            if number not in self._buffers:
-                self._buffers[number] = self._load(uri, number)
-            start, size = 0, len(self._buffers[number])
-        if offset + length > size:
+        inside = self._binary if uri is None and number == 0 else None
+        if inside is None and number not in self._buffers:
+            self._buffers[number] = self._load(uri, number)
+        if offset + size > (len(self._buffers[number]) if inside is None else inside[1]):
             raise self.invalid("a buffer view reaches beyond its buffer")
-        length = length if limit is None else min(length, limit)
-        if start == 0:
-            return memoryview(self._buffers[number])[offset : offset + length], stride
-        part = (start + offset, length)
-        if self._last[0] != part:  # rows with a stride have several attributes in one view
-            self._last = (part, self._opened.read(*part))
-        return memoryview(self._last[1]), stride
+        if inside is None:
+            return memoryview(self._buffers[number])[offset + first :][:wanted]
+        return memoryview(self._opened.read(inside[0] + offset + first, wanted))
 
     def _load(self, uri: object, index: int) -> bytes:
         """Return the bytes of a buffer: text in the JSON, or a file beside the scene."""

@@ -148,7 +148,7 @@ def _open_zip(file: io.BufferedIOBase, label: str, most: int) -> tuple[zipfile.Z
         archive = zipfile.ZipFile(file)
         entries = archive.infolist()
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, EOFError) as error:
-        raise InvalidContainerError(f"{label} is not a readable zip file") from error
+        raise InvalidContainerError(f"{label} is not a readable zip file; export or download it again") from error
     if len(entries) > most:
         raise InvalidContainerError(f"{label} has {len(entries)} entries; a container has 12 files")
     return archive, [entry for entry in entries if entry.filename and not entry.is_dir()]

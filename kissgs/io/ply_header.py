@@ -185,7 +185,10 @@ def _recognise(head: bytes, name: str) -> None:
         if start.startswith(magic):
             raise InvalidSceneError(f"{name} is not a PLY file: {hint}")
     if not re.match(rb"ply[ \t\r]*\n", head):
-        raise InvalidSceneError(f"{name} is not a PLY file: its first line is not 'ply'")
+        raise InvalidSceneError(
+            f"{name} is not a PLY file: its first line is not 'ply', and no other format is recognised; a .splat needs "
+            "this ending"
+        )
 
 
 def _header_lines(file: io.BufferedIOBase, name: str) -> Iterator[tuple[int, list[str]]]:

@@ -6,6 +6,7 @@ saying so; ``raw_axes`` reads their files.
 
 from __future__ import annotations
 
+import logging
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,8 @@ from kissgs.io.frames import axis_signs, mirror
 from kissgs.io.scene_file import SceneFile, open_scene_file, refuse_more_than
 from kissgs.io.spz_streams import inflate, inflate_start, unpack_frame
 
+_log = logging.getLogger(__name__)
+
 MAGIC = b"NGSP"
 GZIP_MAGIC = b"\x1f\x8b"
 
@@ -30,13 +33,19 @@ _TABLE_ENTRY = struct.Struct("<QQ")
 _HEADER_BYTES_V4 = 32
 _EXTENSION = struct.Struct("<II")
 
-_ANTIALIASED, _HAS_EXTENSIONS = 1, 2
+_ANTIALIASED, _HAS_EXTENSIONS, _SPARK_TREE = 1, 2, 0x80
+
+_COEFFICIENTS = (*SH_REST_COUNTS, 24)
+"""Number of SH coefficients beyond the constant one in a file of degree 0 to 4."""
 
 _COORDINATES = 0xADBE0003
 _FRAMES = ("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF")
 """Frame of each value of the extension for coordinate systems; the first is unspecified."""
 
 DEFAULT_FRAME, PLY_FRAME = "RUB", "RDF"
+
+_LARGEST_ROW = 20 + 3 * _COEFFICIENTS[-1]
+"""Bytes of a Gaussian before compression, with all SH coefficients."""
 
 _MAX_FRACTIONAL_BITS = 31
 
@@ -53,7 +62,9 @@ class SpzInfo:
     count: int
     """Number of Gaussians."""
     sh_degree: int
-    """SH degree, 0 to 3."""
+    """SH degree of the scene as it is read, 0 to 3."""
+    stored_degree: int
+    """SH degree of the file, up to 4; the highest band is left out when it is read."""
     fractional_bits: int
     """Bits of positions after the binary point."""
     antialiased: bool
@@ -70,7 +81,7 @@ class SpzInfo:
             "colors": 3,
             "scales": 3,
             "rotations": 3 if self.version < 3 else 4,
-            "sh": 3 * SH_REST_COUNTS[self.sh_degree],
+            "sh": 3 * _COEFFICIENTS[self.stored_degree],
         }
 
 
@@ -89,7 +100,7 @@ def read_spz_info(source: Path | bytes) -> SpzInfo:
 
     Raises:
         InvalidSceneError: the file cannot be read, is not ``.spz`` or is damaged.
-        UnsupportedError: another version, or an SH degree above 3.
+        UnsupportedError: another version, an SH degree above 4, or Spark's levels of detail.
     """
     with open_scene_file(source, ".spz") as opened:
         return _read_header(opened)
@@ -100,6 +111,8 @@ def read_spz(
 ) -> Splats:
     """Read a scene without cleaning it, and turn it to the axes of a ``.ply``.
 
+    Of SH degree 4 the highest band is left out, with a warning in the log.
+
     Args:
         source: A file, or the bytes of one.
         max_gaussians: Largest number of Gaussians; more are refused before memory is allocated. None: no limit.
@@ -108,22 +121,8 @@ def read_spz(
 
     Raises:
         InvalidSceneError: the file cannot be read, is damaged or cut short.
-        UnsupportedError: another version, an SH degree above 3, or more Gaussians than ``max_gaussians``.
-    """
-    splats, frame = read_spz_frame(source, max_gaussians=max_gaussians, progress=progress)
-    if not raw_axes:
-        mirror(splats, axis_signs(frame))
-    return splats
-
-
-def read_spz_frame(
-    source: Path | bytes, *, max_gaussians: int | None = None, progress: Progress = silent
-) -> tuple[Splats, str]:
-    """Read a scene as it is stored, and the frame of its axes, such as ``RUB``: x right, y up, z back.
-
-    Raises:
-        InvalidSceneError: as for :func:`read_spz`.
-        UnsupportedError: as for :func:`read_spz`.
+        UnsupportedError: another version, an SH degree above 4, Spark's levels of detail, or more Gaussians than
+            ``max_gaussians``.
     """
     with open_scene_file(source, ".spz") as opened:
         info = _read_header(opened)
@@ -132,8 +131,17 @@ def read_spz_frame(
         streams, extensions = _read_frames(opened, info) if info.version == 4 else _read_gzip(opened, info)
         progress("read", 0.5)
         splats = _decode(streams, info)
+        if not raw_axes:
+            mirror(splats, axis_signs(_frame(extensions, opened.name)))
         progress("read", 1.0)
-        return splats, _frame(extensions, opened.name)
+        if info.stored_degree > info.sh_degree:
+            _log.warning("%s has SH degree %d; it is read as %d", opened.name, info.stored_degree, info.sh_degree)
+        return splats
+
+
+def largest_spz(count: int) -> int:
+    """Return a size in bytes that no file of ``count`` Gaussians exceeds."""
+    return 2 * MAX_EXTENSION_BYTES + 2 * count * _LARGEST_ROW
 
 
 def _read_header(opened: SceneFile) -> SpzInfo:
@@ -150,8 +158,12 @@ def _read_header(opened: SceneFile) -> SpzInfo:
             f"{opened.name} is .spz of version {version}{' in gzip' if gzipped else ''}; versions 1 to 3 in gzip and 4 "
             "without are read"
         )
-    if degree > 3:
+    if degree >= len(_COEFFICIENTS):
         raise UnsupportedError(f"{opened.name} has SH degree {degree}; export it with degree 3 or lower")
+    if flags & _SPARK_TREE:
+        raise UnsupportedError(
+            f"{opened.name} holds Spark's levels of detail, coarse Gaussians among the fine ones; export it without"
+        )
     if fractional_bits > _MAX_FRACTIONAL_BITS:
         raise InvalidSceneError(
             f"{opened.name} declares {fractional_bits} fractional bits of positions, where "
@@ -160,7 +172,8 @@ def _read_header(opened: SceneFile) -> SpzInfo:
     return SpzInfo(
         version=version,
         count=count,
-        sh_degree=degree,
+        sh_degree=min(degree, 3),
+        stored_degree=degree,
         fractional_bits=fractional_bits,
         antialiased=bool(flags & _ANTIALIASED),
         extensions=bool(flags & _HAS_EXTENSIONS),
@@ -185,7 +198,7 @@ def _read_frames(opened: SceneFile, info: SpzInfo) -> tuple[dict[str, UInt8[np.n
     widths = {name: width for name, width in info.widths.items() if width}
     if number != len(widths):
         raise InvalidSceneError(
-            f"{opened.name} has {number} streams; SH degree {info.sh_degree} needs {len(widths)}: export it again"
+            f"{opened.name} has {number} streams; SH degree {info.stored_degree} needs {len(widths)}: export it again"
         )
     if not _HEADER_BYTES_V4 <= table <= _HEADER_BYTES_V4 + MAX_EXTENSION_BYTES:
         raise InvalidSceneError(f"{opened.name} has its table of streams at byte {table:,}; it is damaged")
@@ -226,8 +239,8 @@ def _decode(streams: dict[str, UInt8[np.ndarray, "N width"]], info: SpzInfo) -> 
     look_up(OPACITY_OF_BYTE, streams.pop("alphas")[:, 0], splats.opacities)
     look_up(spz_values.COLOR_OF_BYTE, streams.pop("colors"), splats.sh0)
     look_up(spz_values.SCALE_OF_BYTE, streams.pop("scales"), splats.scales)
-    rest = streams.pop("sh").reshape(info.count, coefficients, 3)
-    look_up(spz_values.SH_OF_BYTE, rest, splats.shN)
+    rest = streams.pop("sh").reshape(info.count, _COEFFICIENTS[info.stored_degree], 3)
+    look_up(spz_values.SH_OF_BYTE, rest[:, :coefficients], splats.shN)
     return splats
 
 

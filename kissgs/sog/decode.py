@@ -16,6 +16,7 @@ from kissgs.core.splats import Splats, empty_splats
 from kissgs.core.threads import Workers
 from kissgs.io.activations import insert_largest, look_up, steps
 from kissgs.io.packed_files import Source, open_source
+from kissgs.io.png import decode_png, is_png, probe_png
 from kissgs.io.scene_file import refuse_more_than
 from kissgs.io.webp import decode_plane, probe_webp
 from kissgs.sog.metadata import MAX_SH_ENTRIES, Rest, SogLayout, read_layout
@@ -101,7 +102,7 @@ class _Images:
             raise InvalidContainerError(
                 f"{name} is {width} x {height} pixels, which does not fit {count:,} Gaussians; export the scene again"
             )
-        return decode_plane(data, name, width=width, height=height, channels=channels)[:count]
+        return _decode_image(data, name, width, height, channels)[:count]
 
     def codebook(self, rest: Rest) -> UInt8[np.ndarray, "entries D"]:
         """Return the SH codebook's levels, one row per entry."""
@@ -114,13 +115,19 @@ class _Images:
                 f"{name} is {width} x {height} pixels; {entries:,} entries of {rest.coefficients} coefficients need "
                 f"{_ENTRIES_PER_ROW * rest.coefficients} x {rows}: export the scene again"
             )
-        image = decode_plane(data, name, width=width, height=height, channels=3)
+        image = _decode_image(data, name, width, height, 3)
         return image.reshape(height * _ENTRIES_PER_ROW, rest.coefficients * 3)[:entries]
 
     def _open(self, name: str, most_pixels: int) -> tuple[bytes, int, int]:
-        # Lossless WebP never needs more than 4 bytes a pixel.
+        # Lossless WebP and PNG never need more than 4 bytes a pixel, and some for headers.
         data = self._files.read(self._folder + name, 4096 + 5 * most_pixels)
-        return data, *probe_webp(data, name)
+        return data, *(probe_png if is_png(data) else probe_webp)(data, name)
+
+
+def _decode_image(data: bytes, name: str, width: int, height: int, channels: int) -> UInt8[np.ndarray, "pixels C"]:
+    if is_png(data):
+        return decode_png(data, name, channels)
+    return decode_plane(data, name, width=width, height=height, channels=channels)
 
 
 def _decode_means(images: _Images, out: Float32[np.ndarray, "N 3"]) -> None:

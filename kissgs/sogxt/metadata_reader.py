@@ -41,7 +41,9 @@ def read_layout(source: Source) -> Layout:
     names = source.names()
     name = next((name for name in (YAML_NAME, JSON_NAME) if name in names), None)
     if name is None:
-        raise InvalidContainerError(f"this is no SOG-XT container: it has neither {YAML_NAME} nor {JSON_NAME}")
+        raise InvalidContainerError(
+            f"this is no container: it has neither {YAML_NAME} nor {JSON_NAME}; name the folder or the zip that has one"
+        )
     read = _from_yaml if name == YAML_NAME else _from_json
     raw = read(source.read(name, MAX_METADATA_BYTES))
     checksum = raw.pop(CHECKSUM)

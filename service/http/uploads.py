@@ -164,18 +164,22 @@ class Spool:
     def _read_info(self) -> kissgs.SceneInfo:
         """Read the headers of the complete upload; refuse formats that are not one binary file."""
         name = f"upload{Path(self.name).suffix}"
-        with self._path.open("rb") as file:
-            if _is_text(file.read(HEAD_BYTES)):  # as large as the upload, and would be parsed in this process
-                raise ProblemError("unsupported", "the upload is JSON; send glTF as .glb")
         try:
-            if kissgs.recognise(self._path, name=name) not in UPLOAD_ENDINGS:
+            kind = kissgs.recognise(self._path, name=name)
+            if kind not in UPLOAD_ENDINGS:
                 raise ProblemError(
                     "unsupported",
                     "the upload is a zip file, but not a .sog; send a .ply, .sog, .spz, .splat, .ksplat or .glb",
                 )
+            if kind == "gltf" and not self._is_glb():  # as large as the upload, and would be parsed in this process
+                raise ProblemError("unsupported", "the upload is JSON; send glTF as .glb")
             return kissgs.read_scene_info(self._path, name=name)
         except kissgs.KissgsError as error:
             raise self._named(error) from error
+
+    def _is_glb(self) -> bool:
+        with self._path.open("rb") as file:
+            return file.read(4) == b"glTF"
 
     def _check_header(self) -> None:
         """Validate the header as soon as it has arrived, long before the last byte of an invalid file."""
@@ -183,7 +187,7 @@ class Spool:
         self._checked = True
         whole = self._at_most if self._at_most is not None else self._settings.max_upload_bytes
         name, start = f"upload{Path(self.name).suffix}", head[:HEAD_BYTES]
-        if _is_text(start) or kissgs.recognise(start, name=name, size=whole) != "ply":
+        if kissgs.recognise(start, name=name, size=whole) != "ply":
             return
         try:
             info = kissgs.read_ply_info(head[:limit], size=max(whole, self._size))
@@ -214,10 +218,6 @@ class Spool:
         if "the upload" not in text:
             text = f"the upload cannot be read: {text}"
         return ProblemError("invalid-scene" if error.code == "invalid-container" else error.code, text)
-
-
-def _is_text(head: bytes) -> bool:
-    return head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{") and b"\0" not in head
 
 
 async def timed(request: Request, settings: ServiceSettings, stopping: asyncio.Event) -> AsyncIterator[bytes]:

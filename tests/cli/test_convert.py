@@ -75,6 +75,21 @@ def test_several_files_into_a_folder(scene: Path, tmp_path: Path) -> None:
         "two.compressed.ply",
     ]
     assert "cannot all become" in failure("convert", tmp_path / "*.ply", tmp_path / "a.spz")
+    (tmp_path / "boxes").mkdir()
+    told = failure("convert", tmp_path / "boxes", tmp_path / "two.ply", tmp_path / "more", "--to", "spz")
+    assert told.startswith(f"kissgs: {tmp_path}/boxes: this is no container")
+
+
+def test_compressed_ply_is_an_ending(scene: Path, tmp_path: Path) -> None:
+    """An output beside the input never has its name, and a plain .ply is not named like a compressed one."""
+    packed = tmp_path / "a.compressed.ply"
+    assert run("convert", scene, packed).returncode == 0
+    for kind in ("ply", "compressed.ply", "spz"):
+        assert run("convert", packed, tmp_path / "out", "--to", kind, "-q").returncode == 0
+    assert not kissgs.read_ply_info(tmp_path / "out" / "a.ply").compressed
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.compressed.ply", "a.ply", "a.spz"]
+    assert run("compress", packed, "-p", "fast", "-q").returncode == 0
+    assert (tmp_path / "a.zip").exists()
 
 
 def test_raw_axes(scene: Path, tmp_path: Path) -> None:

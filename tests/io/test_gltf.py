@@ -2,6 +2,7 @@
 
 import copy
 import json
+import struct
 
 import numpy as np
 import pytest
@@ -81,6 +82,14 @@ def test_spz_inside(version):
     for name in ("means", "scales", "opacities", "sh0", "shN"):
         np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
     np.testing.assert_allclose(covariances(found), covariances(wanted), rtol=1e-4, atol=1e-5)
+
+
+def test_spz_inside_names_its_axes():
+    scene = made_scene(65, 2, extremes=False)
+    raw = spz_bytes(scene, 3, y_up=False, extensions=struct.pack("<III", 0xADBE0003, 4, 6))
+    found, wanted = (read_gltf(glb_bytes(*spz_document(data, 65))) for data in (raw, spz_bytes(scene, 3)))
+    np.testing.assert_allclose(found.means, wanted.means, atol=2**-12)
+    np.testing.assert_allclose(found.shN, wanted.shN, atol=1 / 128)
 
 
 def matrices(quats):
@@ -193,7 +202,9 @@ CHANGES = {
         lambda r: primitive(r)["attributes"].update({f"{NAME}:SH_DEGREE_4_COEF_0": 0})
     ),
     "has 3 values for 4 Gaussians": changed(lambda r: r["accessors"][1].update(count=3)),
-    "needs more bytes than its buffer has": changed(lambda r: r["accessors"][0].update(byteOffset=4)),
+    "POSITION has rows of 12 bytes every 8": changed(lambda r: r["bufferViews"][0].update(byteStride=8)),
+    "POSITION has rows of 12 bytes every 4,096": changed(lambda r: r["bufferViews"][0].update(byteStride=4096)),
+    "an accessor needs more bytes than its buffer view has": changed(lambda r: r["accessors"][0].update(byteOffset=4)),
     "a buffer view reaches beyond its buffer": changed(lambda r: r["bufferViews"][0].update(byteLength=1 << 40)),
     "has sparse or empty data for POSITION": changed(lambda r: r["accessors"][0].update(sparse={})),
     "POSITION is 'VEC2' of component type": changed(lambda r: r["accessors"][0].update(type="VEC2")),
@@ -201,6 +212,28 @@ CHANGES = {
     "has a node that mirrors or stretches its Gaussians": changed(lambda r: r["nodes"][0].update(scale=[1, 1, 2])),
     "a node's translation is not 3 numbers": changed(lambda r: r["nodes"][0].update(translation=[1, None, 2])),
     "its nodes form a circle": changed(lambda r: r["nodes"][0].update(children=[0])),
+}
+
+
+def many_accessors(root):
+    root["accessors"] += [{}] * 200_000
+    root["nodes"] = [{"mesh": 0}] * 900
+    root["scenes"] = [{"nodes": list(range(900))}]
+    root["accessors"][0]["count"] = 3
+
+
+def many_primitives(root):
+    root["meshes"][0]["primitives"] *= 50
+    root["nodes"] = [{"mesh": 0}] * 900
+    root["scenes"] = [{"nodes": list(range(900))}]
+
+
+CHANGES |= {
+    "has 4 values for 3 Gaussians": changed(many_accessors),
+    "its nodes show more than 1,000 primitives": changed(many_primitives),
+    "a primitive has 210 attributes": changed(
+        lambda r: primitive(r)["attributes"].update({f"_{i}": 0 for i in range(197)})
+    ),
 }
 
 

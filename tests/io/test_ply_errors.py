@@ -19,6 +19,9 @@ def with_rest(count):
     return header_bytes([*VERTEX, *(f"property float f_rest_{i}" for i in range(count))])
 
 
+NO_PLY = (
+    "is not a PLY file: its first line is not 'ply', and no other format is recognised; a .splat needs this ending"
+)
 NOT_A_PLY = {
     b"": "is empty; export or download it again",
     b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n": (
@@ -32,9 +35,9 @@ NOT_A_PLY = {
     b"PK\x03\x04\x14\x00": (
         "is not a PLY file: this is a ZIP archive, unpack it or name the scene by its real extension"
     ),
-    b"solid cube\n": "is not a PLY file: its first line is not 'ply'",
-    b"ply": "is not a PLY file: its first line is not 'ply'",
-    b"plywood\n": "is not a PLY file: its first line is not 'ply'",
+    b"solid cube\n": NO_PLY,
+    b"ply": NO_PLY,
+    b"plywood\n": NO_PLY,
     b"ply\nformat ascii 1.0\nelement ver": "has no end_header line; it is cut short or not a PLY file",
     b"ply\nformat ascii 1.0\n": "has no end_header line; it is cut short or not a PLY file",
     b"ply\ncomment " + b"x" * (1 << 20): "has no end_header line within 1048576 bytes; it is damaged",

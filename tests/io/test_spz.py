@@ -11,6 +11,7 @@ from helpers.reference_spz import FLIPS, frame, spz_bytes, streams, v4_file
 from helpers.splat_transform import convert, needs_splat_transform
 
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
+from kissgs.core.splats import ATTRIBUTES
 from kissgs.io.ply import read_ply, write_ply
 from kissgs.io.spz import SpzInfo, is_spz, read_spz, read_spz_info
 
@@ -82,7 +83,13 @@ def test_within_half_a_step(version, degree, count):
     data = spz_bytes(scene, version, flags=1)
     found = read_spz(data)
     assert read_spz_info(data) == SpzInfo(
-        version=version, count=count, sh_degree=degree, fractional_bits=12, antialiased=True, extensions=False
+        version=version,
+        count=count,
+        sh_degree=degree,
+        stored_degree=degree,
+        fractional_bits=12,
+        antialiased=True,
+        extensions=False,
     )
     assert is_spz(data[:512])
     np.testing.assert_allclose(found.means, scene.means, rtol=1e-3 if version == 1 else 0, atol=2**-13 * 1.01)
@@ -92,6 +99,21 @@ def test_within_half_a_step(version, degree, count):
     angle = 2 * np.arccos(np.clip(np.abs((found.quats.astype(float) * scene.quats).sum(axis=1)), 0, 1))
     # Close to half a turn, w of three bytes is the root of a small difference.
     assert angle.max() < (0.3 if version < 3 else 0.01)
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_band_4_is_left_out(version, caplog):
+    scene = storable(made_scene(65, 3))
+    parts = streams(scene, version)
+    parts[5] = b"".join(parts[5][45 * i : 45 * (i + 1)] + bytes(range(27)) for i in range(65))
+    header = struct.pack("<4sIIBBBB", b"NGSP", version, 65, 4, 12, 0, 0)
+    data = v4_file(header, parts) if version == 4 else gzip.compress(header + b"".join(parts))
+    found, wanted = read_spz(data), read_spz(spz_bytes(scene, version))
+    for name in ATTRIBUTES:
+        np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
+    info = read_spz_info(data)
+    assert (info.sh_degree, info.stored_degree) == (3, 4)
+    assert [record.getMessage() for record in caplog.records] == ["the data has SH degree 4; it is read as 3"]
 
 
 def test_no_gaussians():
@@ -145,7 +167,8 @@ DAMAGED = {
     with_header(4, b"\5"): "is .spz of version 5 in gzip; versions 1 to 3 in gzip and 4 without are read",
     with_header(4, b"\4"): "is .spz of version 4 in gzip; versions 1 to 3 in gzip and 4 without are read",
     gzip.decompress(V3): "is .spz of version 3; versions 1 to 3 in gzip and 4 without are read",
-    with_header(12, b"\4"): "has SH degree 4; export it with degree 3 or lower",
+    with_header(12, b"\5"): "has SH degree 5; export it with degree 3 or lower",
+    with_header(14, b"\x80"): "holds Spark's levels of detail, coarse Gaussians among the fine ones; export it without",
     with_header(13, b"\x20"): "declares 32 fractional bits of positions, where 31 is the largest number; it is damaged",
     V3[:-30]: "is cut short: it unpacks to",
     V3[:60] + bytes(40) + V3[100:]: "is damaged: gzip cannot unpack it; download it again",

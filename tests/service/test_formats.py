@@ -47,6 +47,16 @@ def test_uploads_of_every_format(service, name, form, tmp_path):
     assert f'filename="{name}"' in source.headers["content-disposition"]
 
 
+def test_a_splat_that_begins_like_json(service):
+    """Its first byte is a brace, and none of the first 512 is zero."""
+    data = b"{" + bytes(range(1, 32)) * 17
+    data = data[: 16 * 32]
+    assert b"\0" not in data
+    answer = service.http.post("/v1/jobs", files={"file": ("a.splat", data)}, data={"options": FAST})
+    assert answer.status_code == 202, answer.text
+    assert service.ended(answer.json())["source_format"] == "splat"
+
+
 ROOT, BUFFER = document(attributes(SCENE))
 TEXT = json.dumps({**ROOT, "buffers": [{"byteLength": len(BUFFER), "uri": data_uri(BUFFER)}]}).encode()
 
@@ -55,6 +65,8 @@ REFUSED = {
     "a container": ("a.zip", kissgs.compress(SCENE, settings=Settings.from_preset("fast")).to_zip()),
     "another zip": ("a.sog", zip_of({"notes.txt": b"hello"})),
     "text": ("a.gltf", TEXT),
+    "text with the name of a .glb": ("a.glb", TEXT),
+    "text without a name": ("a", TEXT),
     "a .splat without its name": ("a.bin", splat_bytes(SCENE)),
     "half a .splat": ("a.splat", splat_bytes(SCENE)[:-1]),
     "half a .ksplat": ("a.ksplat", FILES["a.ksplat"][1][:-1]),

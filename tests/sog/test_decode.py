@@ -1,5 +1,6 @@
 """Oracle: a naive writer (helpers/reference_sog.py), pixels decoded by hand, and splat-transform's files."""
 
+import io
 import json
 import zipfile
 
@@ -9,6 +10,7 @@ from helpers.format_scenes import assert_alike, made_scene
 from helpers.memory import takes_less_than
 from helpers.reference_sog import sog_files, webp, write_folder, zip_of
 from helpers.splat_transform import convert, needs_splat_transform
+from PIL import Image
 
 from kissgs.core.errors import InvalidContainerError, KissgsError, UnsupportedError
 from kissgs.core.splats import ATTRIBUTES
@@ -21,6 +23,20 @@ def edited(files, change):
     meta = json.loads(files["meta.json"])
     change(meta)
     return {**files, "meta.json": json.dumps(meta).encode()}
+
+
+def png(data, mode=None):
+    """Return a WebP as PNG, of another mode of Pillow if one is given."""
+    image, buffer = Image.open(io.BytesIO(data)), io.BytesIO()
+    if mode == "P":
+        image = image.quantize(256)
+        assert len(image.getcolors()) <= 4
+    elif mode == "I;16":
+        image = Image.fromarray(np.asarray(image)[:, :, 0].astype(np.uint16))
+    elif mode:
+        image = image.convert(mode)
+    image.save(buffer, "PNG")
+    return buffer.getvalue()
 
 
 ONE = sog_files(made_scene(1, 0))
@@ -155,10 +171,28 @@ def test_damaged_files():
         ("meta.json", b"[]", "meta.json is not the metadata of a SOG container"),
         ("meta.json", b'{"version": 2, "count": NaN}', "meta.json is not readable JSON"),
         ("quats.webp", b"\x89PNG" + bytes(40), "quats.webp is not a WebP image"),
+        ("quats.webp", b"\x89PNG\r\n\x1a\n" + bytes(40), "quats.webp is damaged: its PNG header is missing"),
+        ("quats.webp", png(GOOD["quats.webp"])[:60], "quats.webp is damaged: its PNG data cannot be decoded"),
+        ("quats.webp", png(GOOD["quats.webp"], "I;16"), "quats.webp has 16 bits per channel; planes have 8"),
         ("sh0.webp", GOOD["sh0.webp"][:-20], "sh0.webp is cut off"),
     ):
         with pytest.raises(InvalidContainerError, match=message):
             decode({**GOOD, name: data})
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_planes_may_be_png(degree):
+    """As they are, and as a tool for smaller PNG might turn them: grey where the channels are equal, with a palette."""
+    files = sog_files(made_scene(65, degree))
+    grey = files | {"scales.webp": webp([[i, i, i] for i in range(65)], 9, 8, 3)}
+    few = grey | {"means_l.webp": webp([[i % 3, 5, 6] for i in range(65)], 9, 8, 3)}
+    wanted = decode(few)
+    images = {name: png(data) for name, data in few.items() if name != "meta.json"}
+    images["scales.webp"] = png(few["scales.webp"], "L")
+    images["means_l.webp"] = png(few["means_l.webp"], "P")
+    found = decode({**few, **images})
+    for name in ATTRIBUTES:
+        np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
 
 
 def test_more_gaussians_than_the_limit_take_no_memory():

@@ -112,10 +112,10 @@ def test_missing_and_oversized_files_are_refused(kind, tmp_path):
 
 @pytest.mark.parametrize("data", [b"", b"PK\x05\x06", b"PK\x03\x04" + bytes(50), b"no zip", zip_bytes(FILES)[:-30]])
 def test_what_is_no_zip_is_refused(data, tmp_path):
-    assert refusal(data) == "the input is not a readable zip file"
+    assert refusal(data) == "the input is not a readable zip file; export or download it again"
     path = tmp_path / "file.zip"
     path.write_bytes(data)
-    assert refusal(path) == f"{path} is not a readable zip file"
+    assert refusal(path) == f"{path} is not a readable zip file; export or download it again"
 
 
 def test_no_such_file(tmp_path):
