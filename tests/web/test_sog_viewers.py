@@ -34,7 +34,7 @@ PAGE = f"""<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,"><
 <script type="module" src="/tests/web/NAME_viewer.mjs"></script>"""
 
 # To kissgs.render, dB. Spark rounds colours and sizes, and reaches 46. PlayCanvas draws exp(-x) less a constant, so
-# that every Gaussian ends at 2.8 standard deviations, and reaches 37, from a .ply too. One SH band of the wrong sign, or
+# that every Gaussian ends at 2.8 standard deviations, and reaches 37, from a .ply too. One SH band of wrong sign, or
 # the parts of quaternions in another order, give less than 28.
 TO_RASTERISER = {"spark": 44, "playcanvas": 35}
 TO_ITS_PLY = 46  # the same values from a .ply: other roundings within the viewer, and ties in its sorting
