@@ -50,7 +50,12 @@ function cameraOf({ viewmat, K, width, height }, background) {
 let files = 0;
 window.draw = async ({ file, ending, cameras, background }) => {
   const filename = `scene-${files++}.${ending}`;
-  const asset = new pc.Asset(filename, "gsplat", { url: filename, filename, contents: new Response(bytesOf(file)) }, { reorder: false });
+  const asset = new pc.Asset(
+    filename,
+    "gsplat",
+    { url: filename, filename, contents: new Response(bytesOf(file)) },
+    { reorder: false },
+  );
   app.assets.add(asset);
   await new Promise((resolve, reject) => {
     asset.on("load", resolve);
