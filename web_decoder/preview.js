@@ -8,7 +8,7 @@ import { help, listen, switchFullScreen, switchPanels } from "./preview/keys.js"
 import { planesView } from "./preview/planes.js";
 import { refiner } from "./preview/refine.js";
 import { STAGES, gaussianAt, lastStageOf, partsOf, stageOf } from "./preview/scene.js";
-import { addressed, download, jobIn, namesSource } from "./preview/sources.js";
+import { addressed, download, jobIn, namesSource, standsAlone } from "./preview/sources.js";
 import { stage } from "./preview/stage.js";
 import { plyStatisticsView, statisticsView } from "./preview/statistics.js";
 import { UserError, aborted, showProblem } from "./preview/problem.js";
@@ -108,18 +108,25 @@ function showFacts() {
   labelCompare();
 }
 
-/** @param {File} file @param {Load} load */
-async function openPly(file, load) {
-  const bytes = new Uint8Array(await file.arrayBuffer());
+/** @param {Load} load */
+async function openAddressed(load) {
+  const source = await addressed(location, load.signal);
+  if (typeof source.container !== "string" || !isPly(source)) return openContainer(source, load);
+  await openPly(source.name, await download({ url: source.container, bytes: 0 }, load), load);
+}
+
+/** @param {string} name @param {Uint8Array} bytes @param {Load} load */
+async function openPly(name, bytes, load) {
+  const size = bytes.length; // reading it may take the bytes away
   load.signal.throwIfAborted();
   const gaussians = await readable(view.showPly(bytes));
   shown = null;
-  setTitle(file.name);
-  byId("statistics").replaceChildren(...plyStatisticsView(gaussians, file.size));
+  setTitle(name);
+  byId("statistics").replaceChildren(...plyStatisticsView(gaussians, size));
   byId("planes").replaceChildren();
   byId("panel").hidden = false;
   byId("compare").hidden = true;
-  announce(`${file.name}: ${count(gaussians)} Gaussians.`);
+  announce(`${name}: ${count(gaussians)} Gaussians.`);
 }
 
 /** @param {Uint8Array} bytes */
@@ -162,12 +169,14 @@ async function take(files) {
     await during(`Opening ${container.name}`, (load) => openContainer(source, load));
   }
   if (!ply) return;
-  if (shown) await during(`Reading ${ply.name}`, async () => compareWith(new Uint8Array(await ply.arrayBuffer())));
-  else await during(`Reading ${ply.name}`, (load) => openPly(ply, load));
+  await during(`Reading ${ply.name}`, async (load) => {
+    const bytes = new Uint8Array(await ply.arrayBuffer());
+    await (shown ? compareWith(bytes) : openPly(ply.name, bytes, load));
+  });
 }
 
-/** @param {File} file */
-const isPly = (file) => /\.ply$/i.test(file.name);
+/** @param {{name: string}} file */
+const isPly = ({ name }) => /\.ply$/i.test(name);
 
 /** @param {string} accept */
 function pick(accept) {
@@ -201,6 +210,6 @@ listen({ viewport: byId("viewport"), home: view.home, move: view.press });
 
 const job = jobIn(location);
 if (job) byId("home").href = `../#${job}`;
-if (namesSource(location))
-  during("Opening the container", async (load) => openContainer(await addressed(location, load.signal), load));
+if (standsAlone) byId("home").removeAttribute("href");
+if (namesSource(location)) during("Opening the scene", openAddressed);
 else byId("empty").hidden = false;
