@@ -19,9 +19,7 @@ from kissgs.pipeline.scene_files import read_scene
 from kissgs.pipeline.scene_formats import recognise, scene_root
 from kissgs.sogxt.container import zip_bytes
 
-_CONTAINERS: tuple[ContainerName, ...] = ("sog-xt",)
-"""Containers that the page decodes."""
-
+_CONTAINERS: tuple[ContainerName, ...] = ("sog-xt", "sog")
 _MAX_FILE_BYTES = 1 << 30
 _FILE_ENDINGS = (".webp", ".json", ".yaml", ".yml")
 
@@ -52,10 +50,11 @@ def page_scene(source: Path | bytes, *, threads: int = 0, progress: Progress = s
     Raises:
         KissgsError: the scene cannot be read.
     """
+    read = read_scene(source, threads=threads, progress=progress)
     container = _as_container(source)
     if container is not None:
         return container
-    splats = clean(read_scene(source, threads=threads, progress=progress))[0]
+    splats = clean(read)[0]
     file = io.BytesIO()
     write_ply(file, splats, progress=progress)
     return PageScene(f"{_stem(source)}.ply", file.getvalue(), converted=recognise(source) != "ply")
@@ -68,6 +67,7 @@ def page_container(source: Path | bytes, *, threads: int = 0, progress: Progress
     """
     container = _as_container(source)
     if container is not None:
+        read_scene(source, threads=threads, progress=progress)  # whoever gets the page cannot mend a damaged one
         return container
     result = compress(source, threads=threads, progress=progress)
     return PageScene(f"{_stem(source)}.zip", result.to_zip(), converted=True)

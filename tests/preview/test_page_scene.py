@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import kissgs
-from kissgs.core.errors import InvalidSceneError
+from kissgs.core.errors import InvalidContainerError, InvalidSceneError
 from kissgs.preview.page_scene import page_container, page_scene
 
 FAST = kissgs.Settings(preset="fast")
@@ -18,12 +18,13 @@ def splats():
     return kissgs.sample_scene(65, sh_degree=2)
 
 
-def test_a_container_is_taken_as_it_is(tmp_path, splats):
-    path = tmp_path / "scene.zip"
+@pytest.mark.parametrize("name", ["scene.zip", "scene.sog"])
+def test_a_container_is_taken_as_it_is(tmp_path, splats, name):
+    path = tmp_path / name
     kissgs.compress(splats, path, settings=FAST)
     for prepare in (page_scene, page_container):
         found = prepare(path)
-        assert (found.name, found.data, found.converted) == ("scene.zip", path.read_bytes(), False)
+        assert (found.name, found.data, found.converted) == (name, path.read_bytes(), False)
         assert prepare(path.read_bytes()).data == path.read_bytes()
 
 
@@ -60,11 +61,16 @@ def test_other_formats_become_a_container(tmp_path, splats):
     assert found.data == kissgs.compress(path).to_zip()
 
 
-def test_unreadable_scenes(tmp_path):
+def test_unreadable_scenes(tmp_path, splats):
     (tmp_path / "text.ply").write_text("no scene")
+    damaged = bytearray(kissgs.compress(splats, container="sog", settings=FAST).to_zip())
+    damaged[100] ^= 255
+    (tmp_path / "damaged.sog").write_bytes(damaged)
     for prepare in (page_scene, page_container):
         with pytest.raises(InvalidSceneError):
             prepare(tmp_path / "text.ply")
+        with pytest.raises(InvalidContainerError):
+            prepare(tmp_path / "damaged.sog")
 
 
 def test_names_that_are_no_text(tmp_path, splats):

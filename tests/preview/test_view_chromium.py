@@ -62,6 +62,23 @@ def test_served_and_from_disk(tmp_path, container, shown, preview):  # noqa: F81
     assert [url for _, url in tab.requests if not url.startswith("blob:")] == [tab.origin]
 
 
+def test_a_sog(tmp_path, shown, preview):  # noqa: F811
+    scene, fast = kissgs.sample_scene(2000, sh_degree=3), kissgs.Settings(preset="fast")
+    sog = kissgs.compress(scene, container="sog", settings=fast).to_zip()
+    splats = kissgs.decompress(sog)
+    kissgs.save(splats, tmp_path / "scene.ply")
+    read = shown(page_scene(tmp_path / "scene.ply"), len(splats))
+    assert psnr(shown(page_scene(sog), len(splats)), read) > 45
+    path = tmp_path / "page.html"
+    path.write_bytes(standalone_page(page_scene(sog)))
+    tab = preview(offline=True)
+    tab.origin = path.as_uri()
+    tab.page.goto(tab.origin)
+    assert psnr(tab.shown(len(splats)), read) > 45
+    tab.choose(("half.sog", sog[: len(sog) // 2]))
+    tab.error_message("cannot be read")
+
+
 def test_a_page_from_disk_reaches_nothing(tmp_path, container, preview):  # noqa: F811
     path = tmp_path / "page.html"
     path.write_bytes(standalone_page(PageScene("scene.zip", container, converted=False)))
