@@ -8,9 +8,9 @@ import { help, listen, switchFullScreen, switchPanels } from "./preview/keys.js"
 import { planesView } from "./preview/planes.js";
 import { refiner } from "./preview/refine.js";
 import { STAGES, gaussianAt, lastStageOf, partsOf, stageOf } from "./preview/scene.js";
-import { addressed, download, jobIn, namesSource } from "./preview/sources.js";
+import { addressed, download, jobIn, namesSource, standsAlone } from "./preview/sources.js";
 import { stage } from "./preview/stage.js";
-import { plyStatisticsView, statisticsView } from "./preview/statistics.js";
+import { fileStatisticsView, statisticsView } from "./preview/statistics.js";
 import { UserError, aborted, showProblem } from "./preview/problem.js";
 
 /**
@@ -108,18 +108,27 @@ function showFacts() {
   labelCompare();
 }
 
-/** @param {File} file @param {Load} load */
-async function openPly(file, load) {
-  const bytes = new Uint8Array(await file.arrayBuffer());
+/** @param {Load} load */
+async function openAddressed(load) {
+  const source = await addressed(location, load.signal);
+  const { name, container } = source;
+  if (!isReadBySpark(source)) return openContainer(source, load);
+  if (typeof container === "string") await openFile(name, await download({ url: container, bytes: 0 }, load), load);
+  else await openFile(name, new Uint8Array(await container.arrayBuffer()), load);
+}
+
+/** @param {string} name @param {Uint8Array} bytes @param {Load} load */
+async function openFile(name, bytes, load) {
+  const size = bytes.length; // reading it may take the bytes away
   load.signal.throwIfAborted();
-  const gaussians = await readable(view.showPly(bytes));
+  const gaussians = await readable(view.showFile(name, bytes));
   shown = null;
-  setTitle(file.name);
-  byId("statistics").replaceChildren(...plyStatisticsView(gaussians, file.size));
+  setTitle(name);
+  byId("statistics").replaceChildren(...fileStatisticsView(gaussians, size));
   byId("planes").replaceChildren();
   byId("panel").hidden = false;
   byId("compare").hidden = true;
-  announce(`${file.name}: ${count(gaussians)} Gaussians.`);
+  announce(`${name}: ${count(gaussians)} Gaussians.`);
 }
 
 /** @param {Uint8Array} bytes */
@@ -132,12 +141,12 @@ async function compareWith(bytes) {
   announce("Original to the left, compressed to the right of the handle.");
 }
 
-/** Replace errors of reading a .ply by a message. @template T @param {Promise<T>} reading */
+/** Replace errors of reading a .ply or .sog by a message. @template T @param {Promise<T>} reading */
 const readable = (reading) =>
   reading.catch((error) => {
     throw error instanceof UserError
       ? error
-      : new UserError("This .ply cannot be read: it holds no Gaussians, or is damaged.");
+      : new UserError("This file cannot be read: it holds no Gaussians, or is damaged.");
   });
 
 function labelCompare() {
@@ -155,19 +164,21 @@ async function pressCompare() {
 
 /** @param {File[]} files */
 async function take(files) {
-  const container = files.find((file) => !isPly(file));
-  const ply = files.find(isPly);
+  const container = files.find((file) => !isReadBySpark(file));
+  const other = files.find(isReadBySpark);
   if (container) {
     const source = { name: container.name.replace(/\.zip$/i, ""), container, bytes: container.size };
     await during(`Opening ${container.name}`, (load) => openContainer(source, load));
   }
-  if (!ply) return;
-  if (shown) await during(`Reading ${ply.name}`, async () => compareWith(new Uint8Array(await ply.arrayBuffer())));
-  else await during(`Reading ${ply.name}`, (load) => openPly(ply, load));
+  if (!other) return;
+  await during(`Reading ${other.name}`, async (load) => {
+    const bytes = new Uint8Array(await other.arrayBuffer());
+    await (shown && /\.ply$/i.test(other.name) ? compareWith(bytes) : openFile(other.name, bytes, load));
+  });
 }
 
-/** @param {File} file */
-const isPly = (file) => /\.ply$/i.test(file.name);
+/** @param {{name: string}} file */
+const isReadBySpark = ({ name }) => /\.(ply|sog)$/i.test(name);
 
 /** @param {string} accept */
 function pick(accept) {
@@ -184,8 +195,8 @@ function setTitle(name) {
 /** @param {string} id @param {(button: any) => void} action */
 const onPress = (id, action) => byId(id).addEventListener("click", () => action(byId(id)));
 
-onPress("open", () => pick(".zip,.ply"));
-onPress("choose", () => pick(".zip,.ply"));
+onPress("open", () => pick(".zip,.sog,.ply"));
+onPress("choose", () => pick(".zip,.sog,.ply"));
 onPress("reset", view.home);
 onPress("compare", pressCompare);
 onPress("fullscreen", switchFullScreen);
@@ -201,6 +212,6 @@ listen({ viewport: byId("viewport"), home: view.home, move: view.press });
 
 const job = jobIn(location);
 if (job) byId("home").href = `../#${job}`;
-if (namesSource(location))
-  during("Opening the container", async (load) => openContainer(await addressed(location, load.signal), load));
+if (standsAlone) byId("home").removeAttribute("href");
+if (namesSource(location)) during("Opening the scene", openAddressed);
 else byId("empty").hidden = false;

@@ -25,6 +25,7 @@ from kissgs.cli.remote import app as remote
 from kissgs.cli.render import render
 from kissgs.cli.sample import sample
 from kissgs.cli.signals import unwinding
+from kissgs.cli.view import view
 from kissgs.cli.warmup import warmup
 from kissgs.core.errors import KissgsError, UnsupportedError
 
@@ -58,7 +59,7 @@ def _run() -> None:
         _fail(UnsupportedError(f"cannot use {error.filename!s:.100}: {(error.strerror or str(error)).lower()}"))
 
 
-for command in (compress, decompress, convert, compact, render, evaluate, info, sample, warmup):
+for command in (compress, decompress, convert, compact, render, view, evaluate, info, sample, warmup):
     app.command()(command)
 for group in (bench, remote):
     app.add_typer(group)

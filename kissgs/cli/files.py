@@ -46,7 +46,7 @@ def for_each_input(
         raise OutputError("--json and -o - both write to standard output; choose one")
     targets = _targets(inputs, output, suffix) if writes else [Path("-")] * len(inputs)
     if len(inputs) == 1:
-        _check_input(inputs[0], unreadable)
+        check_input(inputs[0], unreadable)
         report = work(inputs[0], targets[0])
         if as_json:
             print_json(_entry(inputs[0], targets[0], writes, report))
@@ -54,7 +54,7 @@ def for_each_input(
     reports, failed = [], False
     for name, target in zip(inputs, targets, strict=True):
         try:
-            _check_input(name, unreadable)
+            check_input(name, unreadable)
             reports.append(_entry(name, target, writes, work(name, target)))
         except KissgsError as error:
             failed = True
@@ -67,7 +67,7 @@ def for_each_input(
         raise typer.Exit(2)
 
 
-def _check_input(name: str, unreadable: type[KissgsError]) -> None:
+def check_input(name: str, unreadable: type[KissgsError]) -> None:
     """Check the path of an input, so that an error names it and not the output path derived from it."""
     from kissgs.io.atomic import reason_of
 

@@ -1,13 +1,15 @@
-"""Paths of files that do not belong to a Python package of the service."""
+"""Paths of files that belong to no Python package."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-_PACKAGE = Path(__file__).parents[1]
+import kissgs
+
+_PACKAGE = Path(kissgs.__file__).parent
 
 ROOT = _PACKAGE if (_PACKAGE / "web_decoder").is_dir() else _PACKAGE.parent
-"""Folder of these files: the package itself in a wheel, the folder around it in a checkout."""
+"""Folder of these files: the package ``kissgs`` in a wheel, the folder around it in a checkout."""
 
 WEB_DECODER = ROOT / "web_decoder"
 VENDOR_SCRIPT = ROOT / "scripts" / "vendor"

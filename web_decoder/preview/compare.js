@@ -56,7 +56,7 @@ export async function comparison(stage, compressed, bytes) {
 
   const original = new Viewer(canvas, { lost: compressed.lost });
   try {
-    await original.setPly(bytes, compressed);
+    await original.setFile("original.ply", bytes, compressed);
   } catch (error) {
     original.dispose();
     throw error;

@@ -1,4 +1,4 @@
-/** Sources of scenes: the page's address, or a file. */
+/** Sources of scenes: the page's address, the page itself, or a file. */
 
 import { UserError } from "./problem.js";
 
@@ -19,16 +19,32 @@ const key = () => sessionStorage.getItem("kissgs-key") ?? "";
 /** @returns {RequestInit} */
 const withKey = () => (key() ? { headers: { Authorization: `Bearer ${key()}` } } : {});
 
+/** The scene inside this page, as `kissgs view -o` writes it: base64, and its name. */
+const embedded = document.getElementById("embedded-scene");
+
+/** Whether this page holds its scene and all its files, and may stand anywhere. */
+export const standsAlone = embedded !== null;
+
 /**
- * Return the source that the page's address names.
+ * Return the source inside this page, or the one that its address names.
  * @param {Location} location
  * @param {AbortSignal} signal
  * @returns {Promise<Source>}
  */
 export async function addressed(location, signal) {
+  if (embedded) return ofElement(embedded);
   const job = jobIn(location);
   if (job) return ofJob(job, signal);
   return ofAddress(new URLSearchParams(location.search).get("src") ?? "", location.href);
+}
+
+/** @param {HTMLElement} element @returns {Source} */
+function ofElement(element) {
+  const text = atob(element.textContent);
+  element.textContent = "";
+  const bytes = new Uint8Array(text.length);
+  for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
+  return { name: element.dataset.name ?? "scene", container: new Blob([bytes]), bytes: bytes.length };
 }
 
 /**
@@ -51,7 +67,8 @@ function ofAddress(address, here) {
 export const jobIn = (location) => location.pathname.match(/\/preview\/([0-9a-f]{32})\/?$/)?.[1] ?? null;
 
 /** @param {Location} location */
-export const namesSource = (location) => jobIn(location) !== null || new URLSearchParams(location.search).has("src");
+export const namesSource = (location) =>
+  standsAlone || jobIn(location) !== null || new URLSearchParams(location.search).has("src");
 
 /**
  * @param {string} id
@@ -98,8 +115,8 @@ async function get(url, init) {
 }
 
 /**
- * Download the original .ply from the service, with progress.
- * @param {{url: string, bytes: number}} original
+ * Download a .ply, with progress.
+ * @param {{url: string, bytes: number}} ply address, and its size if that is known, else 0
  * @param {import("./loading.js").Load} load
  */
 export async function download({ url, bytes: total }, load) {

@@ -100,11 +100,11 @@ export function stage(failed) {
       live?.viewer.setScene(scene, parts, live.camera.moved);
       reveal(fresh);
     },
-    /** @param {Uint8Array} bytes */
-    async showPly(bytes) {
+    /** @param {string} name of a .ply or .sog @param {Uint8Array} bytes */
+    async showFile(name, bytes) {
       const { viewer } = await ready;
       endComparison();
-      const count = await viewer.setPly(bytes);
+      const count = await viewer.setFile(name, bytes);
       reveal(true);
       return count;
     },

@@ -42,11 +42,11 @@ export function statisticsView({ scene, bytes: known, originalBytes, seconds }) 
 const perGaussian = (size, gaussians) => (gaussians ? `${short((8 * size) / gaussians)} bits` : "none");
 
 /**
- * Return the statistics of a .ply that is shown without a container.
+ * Return the statistics of a .ply or .sog that Spark has read.
  * @param {number} gaussians
  * @param {number} size
  */
-export const plyStatisticsView = (gaussians, size) => [
+export const fileStatisticsView = (gaussians, size) => [
   el("h2", { id: "statistics-title" }, "Statistics"),
   list([
     ["Gaussians", count(gaussians)],

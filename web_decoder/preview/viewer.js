@@ -82,14 +82,16 @@ export class Viewer {
   }
 
   /**
-   * Show a .ply, read by Spark.
+   * Show a .ply or .sog, read by Spark.
+   * @param {string} name
    * @param {Uint8Array} bytes
    * @param {Viewer} [beside] viewer whose frame is used
    * @returns {Promise<number>} the number of Gaussians
    */
-  async setPly(bytes, beside) {
+  async setFile(name, bytes, beside) {
     const splatEncoding = beside?.encoding ?? WIDE_RANGES;
-    const mesh = new SplatMesh({ fileBytes: bytes, fileType: SplatFileType.PLY, splatEncoding });
+    const fileType = /\.sog$/i.test(name) ? SplatFileType.PCSOGSZIP : SplatFileType.PLY;
+    const mesh = new SplatMesh({ fileBytes: bytes, fileType, splatEncoding });
     await mesh.initialized;
     this.#shown = null;
     this.#extent = beside?.extent ?? extentOfMesh(mesh);

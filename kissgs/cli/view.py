@@ -1,0 +1,95 @@
+"""``kissgs view``: show a scene in the browser, or write a page that shows it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import threading
+import webbrowser
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from kissgs.cli.arguments import ForceOption, QuietOption, ThreadsOption
+from kissgs.cli.console import progress_bar
+from kissgs.cli.files import check_input, show, source
+from kissgs.cli.interrupts import Interrupted
+from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
+
+
+def view(
+    scene: Annotated[
+        str, typer.Argument(metavar="FILE", help="Scene of any format, or a container; '-' reads standard input.")
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="PAGE.html",
+            help="Write one HTML file with viewer and scene, which opens from disk without a network, and exit.",
+        ),
+    ] = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port of the server; 0 for a free one.")] = 0,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="Whether to open the browser, or to print the address only.")
+    ] = True,
+    fetch: Annotated[
+        bool, typer.Option("--fetch-viewer", help="Download Spark and three.js first, if they are not installed.")
+    ] = False,
+    threads: ThreadsOption = 0,
+    force: ForceOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Show a scene in the browser, from a server on this machine that Ctrl-C ends; -o writes a page instead."""
+    from kissgs.preview.page_files import fetch_viewer, page_files
+
+    check_input(scene, InvalidSceneError)
+    if fetch:
+        fetch_viewer()
+    page_files()  # before the work
+    if output is None:
+        _serve(scene, port, browser, threads, quiet)
+    elif port or not browser:
+        raise UnsupportedError("--port and --no-browser are for the server, which -o does not start")
+    else:
+        _write(scene, output, threads, force, quiet)
+
+
+def _write(scene: str, output: Path, threads: int, force: bool, quiet: bool) -> None:
+    from kissgs.io.atomic import atomic_file, refuse_existing
+    from kissgs.preview.page_scene import page_container
+    from kissgs.preview.standalone_page import standalone_page
+
+    if output.suffix.lower() not in (".html", ".htm"):
+        raise OutputError(f"{output!s:.100} is not the name of a page: end it in .html")
+    refuse_existing(output, overwrite=force)
+    with progress_bar(quiet) as progress:
+        container = page_container(source(scene), threads=threads, progress=progress)
+    page = standalone_page(container)
+    with atomic_file(output, overwrite=force) as file:
+        file.write(page)
+    if not quiet:
+        made = f", compressed by the preset balanced to {len(container.data):,} bytes" if container.converted else ""
+        show(f"{output}  {len(page):,} bytes, holds {container.name}{made}")
+
+
+def _serve(scene: str, port: int, browser: bool, threads: int, quiet: bool) -> None:
+    from kissgs.preview.page_scene import page_scene
+    from kissgs.preview.server import PageServer
+
+    with progress_bar(quiet) as progress:
+        prepared = page_scene(source(scene), threads=threads, progress=progress)
+    with PageServer(prepared, port) as server, contextlib.suppress(Interrupted):
+        sys.stdout.write(f"{server.url}  (Ctrl-C ends)\n")
+        sys.stdout.flush()
+        if browser and _has_display():
+            threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()
+        server.serve_forever()
+
+
+def _has_display() -> bool:
+    """Whether a browser with windows can open; one in the terminal would cover the address."""
+    return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -1,0 +1,89 @@
+"""``kissgs view``; reference: the scene and the page that it is given."""
+
+import os
+import re
+import signal
+import subprocess
+import urllib.request
+
+import pytest
+from helpers.command_line import KISSGS, failure, run
+
+import kissgs
+from kissgs.preview import page_files
+
+
+@pytest.fixture
+def scene(tmp_path):
+    path = tmp_path / "scene.zip"
+    kissgs.compress(kissgs.sample_scene(65, sh_degree=1), path, settings=kissgs.Settings(preset="fast"))
+    return path
+
+
+needs_viewer = pytest.mark.skipif(
+    not (page_files.ROOT / "web_decoder" / "vendor").exists(), reason="scripts/vendor has not run"
+)
+
+
+@needs_viewer
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.quick(1)
+def test_it_serves_until_a_signal(scene, number):
+    environment = {**os.environ, "DISPLAY": ""}
+    words = [KISSGS, "view", scene, "--no-browser"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment) as process:
+        address = re.fullmatch(
+            r"(http://127\.0\.0\.1:\d+/)\?src=(\S+)  \(Ctrl-C ends\)\n", process.stdout.readline().decode()
+        )
+        with urllib.request.urlopen(address[1] + address[2]) as answer:
+            assert answer.read() == scene.read_bytes()
+        process.send_signal(number)
+        assert process.communicate(timeout=30) == (b"", b"")
+        assert process.returncode == 0
+
+
+@needs_viewer
+def test_a_page(tmp_path, scene):
+    page = tmp_path / "page.html"
+    done = run("view", scene, "-o", page)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert done.stdout.decode().split() == [str(page), f"{page.stat().st_size:,}", "bytes,", "holds", "scene.zip"]
+    assert "exists already" in failure("view", scene, "-o", page)
+    before = page.read_bytes()
+    assert run("view", "-", "-o", page, "--force", "--quiet", stdin=scene.read_bytes()).stdout == b""
+    assert page.read_bytes() == before
+
+
+@needs_viewer
+def test_a_page_of_a_ply(tmp_path):
+    kissgs.save(kissgs.sample_scene(65, sh_degree=0), tmp_path / "scene.ply")
+    done = run("view", tmp_path / "scene.ply", "-o", tmp_path / "page.html")
+    assert re.search(r"holds scene\.zip, compressed by the preset balanced to [\d,]+\s+bytes", done.stdout.decode())
+
+
+@needs_viewer
+def test_errors(tmp_path, scene):
+    assert "cannot read" in failure("view", tmp_path / "none.ply")
+    assert "end it in .html" in failure("view", scene, "-o", tmp_path / "page.zip")
+    assert "there is no folder" in failure("view", scene, "-o", tmp_path / "none" / "page.html")
+    assert "for the server" in failure("view", scene, "-o", tmp_path / "page.html", "--no-browser")
+    (tmp_path / "text.ply").write_text("no scene")
+    assert "text.ply" in failure("view", tmp_path / "text.ply", "-o", tmp_path / "page.html")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["scene.zip", "text.ply"]
+
+
+def test_without_the_viewer(tmp_path, scene, monkeypatch):
+    (tmp_path / "web_decoder").mkdir()
+    (tmp_path / "web_decoder" / "preview.html").touch()
+    monkeypatch.setattr(page_files, "ROOT", tmp_path)
+    assert "add --fetch-viewer" in failure("view", scene, "--no-browser")
+
+
+def test_fetching_the_viewer(tmp_path, scene, monkeypatch):
+    """The script is run; if it fails, so does the command, after the script's own words."""
+    (tmp_path / "scripts").mkdir()
+    (tmp_path / "scripts" / "vendor").write_text("import sys; sys.exit('no network')")
+    monkeypatch.setattr(page_files, "ROOT", tmp_path)
+    done = run("view", scene, "--fetch-viewer")
+    assert done.returncode == 2
+    assert b"could not be downloaded; the reason is above" in done.stderr

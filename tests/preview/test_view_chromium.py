@@ -1,0 +1,104 @@
+"""``kissgs view`` in Chromium, served and from disk; reference: a ``.ply`` of equal values that Spark itself reads."""
+
+import json
+import threading
+
+import pytest
+from helpers.preview_browser import colours, preview, psnr, software_browser  # noqa: F401  fixtures
+
+import kissgs
+from kissgs.preview.page_scene import PageScene, page_scene
+from kissgs.preview.server import PageServer
+from kissgs.preview.standalone_page import standalone_page
+
+NAME = "a 'b' <i>&amp; 100%41 \N{SNOWMAN}"
+
+
+@pytest.fixture(scope="module")
+def container():
+    """Container with more pixels per image than the page decodes without a worker."""
+    scene = kissgs.sample_scene(17_000, sh_degree=1)
+    return kissgs.compress(scene, settings=kissgs.Settings(preset="fast")).to_zip()
+
+
+@pytest.fixture
+def shown(preview):  # noqa: F811
+    """``shown(scene, count)`` serves a scene and returns the page's image of it."""
+
+    def show(scene, count):
+        with PageServer(scene) as server:
+            thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+            thread.start()
+            tab = preview()
+            tab.origin = server.url.partition("?")[0]
+            tab.page.goto(server.url)
+            image = tab.shown(count)
+            assert tab.page.locator("#title").inner_text() == scene.name
+            server.shutdown()
+            thread.join()
+        return image
+
+    return show
+
+
+def test_served_and_from_disk(tmp_path, container, shown, preview):  # noqa: F811
+    splats = kissgs.decompress(container)
+    served = shown(PageScene(f"{NAME}.zip", container, converted=False), len(splats))
+    assert colours(served) > 1000
+    kissgs.save(splats, tmp_path / "scene.ply")
+    read = shown(page_scene(tmp_path / "scene.ply"), len(splats))
+    assert psnr(read[:-80], served[:-80]) > 40  # below are the buttons, which differ
+
+    path = tmp_path / "page # of.html"
+    path.write_bytes(standalone_page(PageScene(f"{NAME}.zip", container, converted=False)))
+    tab = preview(offline=True)
+    tab.origin = path.as_uri()
+    workers = []
+    tab.page.on("worker", lambda worker: workers.append(worker.url))
+    tab.page.goto(tab.origin)
+    assert psnr(tab.shown(len(splats)), served) > 60
+    assert tab.page.title() == f"{NAME}.zip · kissgs"
+    assert len(workers) > 1  # one that decodes, one that sorts
+    assert [url for _, url in tab.requests if not url.startswith("blob:")] == [tab.origin]
+
+
+def test_a_sog(tmp_path, shown, preview):  # noqa: F811
+    scene, fast = kissgs.sample_scene(2000, sh_degree=3), kissgs.Settings(preset="fast")
+    sog = kissgs.compress(scene, container="sog", settings=fast).to_zip()
+    splats = kissgs.decompress(sog)
+    kissgs.save(splats, tmp_path / "scene.ply")
+    read = shown(page_scene(tmp_path / "scene.ply"), len(splats))
+    assert psnr(shown(page_scene(sog), len(splats)), read) > 45
+    path = tmp_path / "page.html"
+    path.write_bytes(standalone_page(page_scene(sog)))
+    tab = preview(offline=True)
+    tab.origin = path.as_uri()
+    tab.page.goto(tab.origin)
+    assert psnr(tab.shown(len(splats)), read) > 45
+    tab.choose(("half.sog", sog[: len(sog) // 2]))
+    tab.error_message("cannot be read")
+
+
+def test_a_page_from_disk_reaches_nothing(tmp_path, container, preview):  # noqa: F811
+    path = tmp_path / "page.html"
+    path.write_bytes(standalone_page(PageScene("scene.zip", container, converted=False)))
+    tab = preview()
+    tab.origin = path.as_uri()
+    tab.page.goto(tab.origin)
+    tab.page.locator("#statistics .facts").wait_for()
+    blocked = tab.page.evaluate(
+        """async () => {
+          const reasons = [];
+          addEventListener("securitypolicyviolation", (event) => reasons.push(event.effectiveDirective));
+          await fetch("http://127.0.0.1:9/").catch(() => {});
+          const image = new Image();
+          await new Promise((done) => { image.onerror = done; image.src = "http://127.0.0.1:9/x.png"; });
+          const script = document.createElement("script");
+          script.textContent = "window.ran = true";
+          document.body.append(script);
+          await new Promise((done) => setTimeout(done));  // violations are reported later
+          return JSON.stringify([reasons, window.ran ?? false]);
+        }"""
+    )
+    assert json.loads(blocked) == [["connect-src", "img-src", "script-src-elem"], False]
+    tab.expect_errors("^Fetch API cannot load", "^other host: .*/x.png", "^failed: .*/x.png csp", "violates")
