@@ -65,7 +65,8 @@ def fit_codebook(
         splats: the scene.
         chosen: indices of the Gaussians.
         weights: weight of each Gaussian's squared shN error.
-        size: largest number of entries; the image's side is a multiple of 8, and unused entries repeat others.
+        size: largest number of entries. In SOG-XT the image's side is a multiple of 8 and unused entries repeat
+            others; in SOG any number will do.
         settings: settings of the encoder.
         container: what the container can hold.
         pool: threads.
@@ -76,10 +77,11 @@ def fit_codebook(
         nothing = quantize(np.zeros((MIN_SIDE**2, 3 * COEFFICIENTS)), step=1)
         return Codebook(MIN_SIDE, nothing, np.zeros(max(len(chosen), 1), dtype=np.int32), half_steps(nothing))
     progress("codebook", 0.0)
+    most = min(size, settings.sh_codebook_size)
     clusters = kmeans.fit(
         splats.shN[chosen].reshape(len(chosen), dimensions),
         weights,
-        codebook_side(min(size, settings.sh_codebook_size)) ** 2,
+        codebook_side(most) ** 2 if container.tables is None else max(round(most), 1),
         pool,
         kmeans.KMeansOptions(
             seed=settings.seed,

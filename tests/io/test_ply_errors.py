@@ -19,9 +19,7 @@ def with_rest(count):
     return header_bytes([*VERTEX, *(f"property float f_rest_{i}" for i in range(count))])
 
 
-NO_PLY = (
-    "is not a PLY file: its first line is not 'ply', and no other format is recognised; a .splat needs this ending"
-)
+NO_PLY = "is not a PLY file: its first line is not 'ply', and no other format is recognised; a .splat needs this ending"
 NOT_A_PLY = {
     b"": "is empty; export or download it again",
     b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n": (

@@ -62,6 +62,7 @@ def test_served_and_from_disk(tmp_path, container, shown, preview):  # noqa: F81
     assert [url for _, url in tab.requests if not url.startswith("blob:")] == [tab.origin]
 
 
+@pytest.mark.quick(0)
 def test_a_sog(tmp_path, shown, preview):  # noqa: F811
     scene, fast = kissgs.sample_scene(2000, sh_degree=3), kissgs.Settings(preset="fast")
     sog = kissgs.compress(scene, container="sog", settings=fast).to_zip()

@@ -48,7 +48,7 @@ def test_uploads_of_every_format(service, name, form, tmp_path):
 
 
 def test_a_splat_that_begins_like_json(service):
-    """Its first byte is a brace, and none of the first 512 is zero."""
+    """The first byte of the file is a brace, and none of its first 512 bytes is zero."""
     data = b"{" + bytes(range(1, 32)) * 17
     data = data[: 16 * 32]
     assert b"\0" not in data
