@@ -182,7 +182,7 @@ def test_damaged_files():
 
 @pytest.mark.parametrize("degree", [0, 2])
 def test_planes_may_be_png(degree):
-    """Planes of colours; grey ones, whose channels are equal; and with a palette, as tools for smaller PNG write them."""
+    """Planes of colours, grey ones (equal channels), and with a palette, as tools for smaller PNG write them."""
     files = sog_files(made_scene(65, degree))
     grey = files | {"scales.webp": webp([[i, i, i] for i in range(65)], 9, 8, 3)}
     few = grey | {"means_l.webp": webp([[i % 3, 5, 6] for i in range(65)], 9, 8, 3)}
