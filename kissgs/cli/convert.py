@@ -23,13 +23,13 @@ def convert(
         list[str],
         typer.Argument(
             metavar="IN… OUT",
-            help="Scenes ('-' reads standard input), then the output: NAME.ply, .compressed.ply, .spz, .splat or .glb; "
-            "with --to also a folder, or '-' for standard output.",
+            help="Scenes ('-' reads standard input), then the output: NAME.ply, .compressed.ply, .spz, .splat, .glb "
+            "or .spz.glb; with --to also a folder, or '-' for standard output.",
         ),
     ],
     to: Annotated[
         str | None,
-        typer.Option("--to", help="Format where OUT has no ending: ply, compressed.ply, spz, splat or glb."),
+        typer.Option("--to", help="Format where OUT has no ending: ply, compressed.ply, spz, splat, glb or spz.glb."),
     ] = None,
     max_gaussians: Annotated[
         int | None, typer.Option(min=0, help="Refuse compressed files with more Gaussians. Default: 20 million.")
@@ -49,7 +49,7 @@ def convert(
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Convert scenes and containers into .ply, .compressed.ply, .spz, .splat or .glb; the ending of OUT decides."""
+    """Convert scenes and containers into .ply, .compressed.ply, .spz, .splat, .glb or .spz.glb; the ending of OUT decides."""
     from kissgs.core.limits import MAX_GAUSSIANS
     from kissgs.core.splats import clean
     from kissgs.io.atomic import atomic_file, refuse_existing

@@ -62,7 +62,7 @@ def save(
     """Write a scene atomically, in the format that the ending of ``path`` names: see docs/reference/formats.md.
 
     ``.ply`` (binary, INRIA layout, at the scene's own SH degree) holds every number bit by bit. For the others,
-    ``.compressed.ply``, ``.spz``, ``.splat`` and ``.glb``, the scene is cleaned. Containers are written by
+    ``.compressed.ply``, ``.spz``, ``.splat``, ``.glb`` and ``.spz.glb``, the scene is cleaned. Containers are written by
     :func:`compress`.
 
     Args:
