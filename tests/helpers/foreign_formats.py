@@ -1,4 +1,4 @@
-"""Readers and writers of formats that others wrote, if scripts/setup dev has installed them (web/foreign_formats.mjs)."""
+"""Readers and writers of formats that others wrote (web/foreign_formats.mjs), if scripts/setup dev has run."""
 
 import json
 
@@ -62,7 +62,8 @@ def cloud_of_splats(splats):
 
 def splats_of_rows(rows, sh=()):
     """Return the scene of GaussianSplats3D: centre, scale, rotation, and a byte each for colour and opacity."""
-    table = np.array(rows, float).reshape(len(rows), -1)
+    count = len(rows)
+    table = np.array([row[:14] for row in rows], float).reshape(count, 14)
     with np.errstate(divide="ignore"):
         opacities = -np.log(255 / table[:, 13] - 1)
         scales = np.log(table[:, 3:6])
@@ -72,5 +73,5 @@ def splats_of_rows(rows, sh=()):
         scales=scales.astype(np.float32),
         opacities=bounded(opacities),
         sh0=((table[:, 10:13] / 255 - 0.5) / SH_C0).astype(np.float32),
-        shN=floats(sh, len(rows), len(sh) // (3 * len(rows)), 3),
+        shN=floats(sh, count, len(sh) // (3 * max(count, 1)), 3),
     )

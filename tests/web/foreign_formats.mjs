@@ -51,7 +51,8 @@ async function gaussianSplats3D() {
 
 async function writeKsplat(path, ply, level) {
   const { PlyParser, SplatBufferGenerator, three } = await gaussianSplats3D();
-  const scene = PlyParser.parseToUncompressedSplatArray(bufferOf(ply), 2);
+  const padded = new Uint8Array([...bytesOf(ply), ...new Uint8Array(4096)]); // it does not read short headers else
+  const scene = PlyParser.parseToUncompressedSplatArray(padded.buffer, 2);
   const generator = SplatBufferGenerator.getStandardGenerator(0, Number(level), 0, new three.Vector3(), 5, 256);
   writeFileSync(path, new Uint8Array(generator.generateFromUncompressedSplatArray(scene).bufferData));
 }
