@@ -102,7 +102,7 @@ def read_spz_info(source: Path | bytes) -> SpzInfo:
         InvalidSceneError: the file cannot be read, is not ``.spz`` or is damaged.
         UnsupportedError: another version, an SH degree above 4, or Spark's levels of detail.
     """
-    with open_scene_file(source, ".spz") as opened:
+    with open_scene_file(source) as opened:
         return _read_header(opened)
 
 
@@ -124,7 +124,7 @@ def read_spz(
         UnsupportedError: another version, an SH degree above 4, Spark's levels of detail, or more Gaussians than
             ``max_gaussians``.
     """
-    with open_scene_file(source, ".spz") as opened:
+    with open_scene_file(source) as opened:
         info = _read_header(opened)
         refuse_more_than(max_gaussians, info.count, opened.name)
         progress("read", 0.0)

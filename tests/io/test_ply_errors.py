@@ -216,7 +216,7 @@ def test_file_cut_while_it_is_read(encoding, tmp_path, monkeypatch):
 def test_missing_file(name, tmp_path):
     with pytest.raises(InvalidSceneError) as error:
         read_ply(tmp_path / name)
-    assert str(error.value) == f"cannot read {tmp_path / name}: there is no such file; name a .ply file"
+    assert str(error.value) == f"cannot read {tmp_path / name}: there is no such file; name a scene file"
 
 
 def test_folder_and_pipe(tmp_path):
@@ -224,7 +224,7 @@ def test_folder_and_pipe(tmp_path):
     for path in (tmp_path, tmp_path / "pipe.ply"):
         with pytest.raises(InvalidSceneError) as error:
             read_ply_info(path)
-        assert str(error.value) == f"cannot read {path}: it is a folder or a device; name a .ply file"
+        assert str(error.value) == f"cannot read {path}: it is a folder or a device; name a scene file"
 
 
 def test_no_permission(tmp_path, monkeypatch):
