@@ -170,9 +170,7 @@ def _linear_colors(splats: Splats, part: slice) -> Float64[np.ndarray, "B 4"]:
     return to_bytes(255 * rgba).astype(np.float64)
 
 
-def _accessors(
-    count: int, attributes: list[_Attribute], ends: Float32[np.ndarray, "2 3"]
-) -> list[dict[str, Any]]:
+def _accessors(count: int, attributes: list[_Attribute], ends: Float32[np.ndarray, "2 3"]) -> list[dict[str, Any]]:
     """Return the accessors without their buffer views; ``ends`` are opposite corners of all positions."""
     accessors: list[dict[str, Any]] = []
     for attribute in attributes:

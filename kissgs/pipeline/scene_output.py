@@ -58,5 +58,7 @@ def write_scene(
     splats = clean(splats)[0]
     if kind == "spz":
         return write_spz(file, splats, raw_axes=raw_axes, progress=progress)
-    writer = {"compressed.ply": write_compressed, "splat": write_splat, "glb": write_glb, "spz.glb": write_spz_glb}[kind]
+    writer = {"compressed.ply": write_compressed, "splat": write_splat, "glb": write_glb, "spz.glb": write_spz_glb}[
+        kind
+    ]
     return writer(file, splats, progress=progress)

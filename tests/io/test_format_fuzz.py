@@ -18,11 +18,13 @@ from kissgs.io.ksplat import read_ksplat
 from kissgs.io.ply import read_ply
 from kissgs.io.splat import read_splat
 from kissgs.io.spz import read_spz
+from kissgs.pipeline.read_options import ReadOptions
 from kissgs.pipeline.scene_files import read_scene
 from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.names import SCENE_NAME, YAML_NAME
 
 LIMIT = 100_000
+LIMITED = ReadOptions(max_gaussians=LIMIT)
 SCENE = made_scene(20, 1)
 EXTENSION = struct.pack("<III", 0xADBE0003, 4, 6)
 
@@ -73,7 +75,7 @@ def test_headers_of_ksplat():
 def test_damaged_files_without_a_name():
     """Formats are recognised in damaged bytes, or the reader of .ply refuses them."""
     for _, data in FILES.values():
-        check_all(data, lambda damaged: read_scene(damaged, max_gaussians=LIMIT), seed=1)
+        check_all(data, lambda damaged: read_scene(damaged, LIMITED), seed=1)
 
 
 @pytest.fixture(scope="module")
@@ -90,11 +92,11 @@ def test_damaged_files_of_sogxt(container, name):
     files = {key: data for key, data in container.items() if name != "meta.json" or key not in (YAML_NAME, SCENE_NAME)}
 
     def read(damaged):
-        return read_scene({**files, name: damaged}, max_gaussians=LIMIT, threads=1)
+        return read_scene({**files, name: damaged}, LIMITED, threads=1)
 
     assert len(read(files[name])) == 18
     check_all(files[name], read)
 
 
 def test_damaged_zip_of_sogxt(container):
-    check_all(zip_bytes(container), lambda damaged: read_scene(damaged, max_gaussians=LIMIT, threads=1))
+    check_all(zip_bytes(container), lambda damaged: read_scene(damaged, LIMITED, threads=1))

@@ -182,7 +182,7 @@ def test_a_line_without_end_is_not_collected(monkeypatch):
 def test_more_than_the_limit_is_refused_before_reading():
     data = ply_bytes(random_columns(3, 0))
     assert len(read_ply(data, max_gaussians=3)) == 3
-    with pytest.raises(UnsupportedError, match=r"^the data has 3 Gaussians; the limit is 2$"):
+    with pytest.raises(UnsupportedError, match=r"^the data has 3 Gaussians; the limit is 2: raise it"):
         read_ply(data, max_gaussians=2)
 
 

@@ -9,11 +9,13 @@ from helpers.hostile import check_all
 from helpers.reference_sog import sog_files, streamed_files, zip_of
 from PIL import Image
 
+from kissgs.pipeline.read_options import ReadOptions
 from kissgs.pipeline.scene_files import read_scene
 from kissgs.sog import streamed
 from kissgs.sog.decode import decode
 
 LIMIT = 100_000
+LIMITED = ReadOptions(max_gaussians=LIMIT)
 SOURCES = {version: sog_files(made_scene(20, 1), version=version) for version in (1, 2)}
 STREAMED = streamed_files([[made_scene(10, 1)], [made_scene(3, 0)]], environment=made_scene(2, 1))
 
@@ -58,7 +60,7 @@ def test_damage_inside_png():
 
 @pytest.mark.parametrize("source", [SOURCES[2], STREAMED], ids=["one scene", "streamed"])
 def test_damaged_zips(source):
-    check_all(zip_of(source), lambda damaged: read_scene(damaged, max_gaussians=LIMIT, threads=1))
+    check_all(zip_of(source), lambda damaged: read_scene(damaged, LIMITED, threads=1))
 
 
 @pytest.mark.parametrize("level", [0, 1])
