@@ -5,6 +5,7 @@ Oracles: splat-transform (``.ply``, ``.compressed.ply``, SOG), the library of ``
 """
 
 import csv
+import struct
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from helpers.foreign_formats import (
 from helpers.format_scenes import assert_alike, made_scene
 from helpers.reference_gltf import NAME, attributes
 from helpers.reference_splat import ksplat_bytes, splat_bytes
+from helpers.reference_spz import spz_bytes
 from helpers.splat_transform import convert, needs_splat_transform
 
 from kissgs.core.splats import ATTRIBUTES, Splats, clean
@@ -121,6 +123,18 @@ def test_spz_of_its_library(version, count, degree, tmp_path):
     assert_alike(read_spz(path), theirs, atol=2e-5 if version == 2 else 5e-7, opacities=1e-4)
     stored = splats_of_cloud(foreign("read-spz", path, "UNSPECIFIED"))
     assert_alike(read_spz(path, raw_axes=True), stored, atol=2e-5 if version == 2 else 5e-7, opacities=1e-4)
+
+
+@needs_foreign_formats
+@pytest.mark.parametrize("frame", range(9))
+@pytest.mark.quick(2)
+def test_axes_of_spz(frame, tmp_path):
+    """The extension for coordinate systems; the library finds it in version 4, and no records behind older ones."""
+    path = tmp_path / "a.spz"
+    record = struct.pack("<III", 0xADBE0003, 4, frame)
+    path.write_bytes(spz_bytes(made_scene(65, 3), 4, bits=11, y_up=False, extensions=record))
+    theirs = splats_of_cloud(foreign("read-spz", path, "RDF"))
+    assert_alike(read_spz(path), theirs, atol=5e-7, opacities=1e-4)
 
 
 @needs_foreign_formats

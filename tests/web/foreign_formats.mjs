@@ -2,8 +2,7 @@
  * Readers and writers that others wrote, for the tests of formats. Usage: foreign_formats.mjs WORK FILE [ARGUMENT…]
  *
  * - `read-spz FILE FRAME`: the format's own library; prints the scene in the axes of FRAME.
- * - `write-spz FILE FRAME VERSION [STORED]`: the same; writes the scene of standard input, which has the axes of FRAME,
- *   with an extension record and the axes STORED if they are given.
+ * - `write-spz FILE FRAME VERSION`: the same; writes the scene of standard input, which has the axes of FRAME.
  * - `read-ksplat FILE`, `write-ksplat FILE PLY LEVEL`, `read-splat FILE`: GaussianSplats3D, from which `.ksplat` is.
  * - `read-glb FILE`: three.js; prints the accessors of the only primitive, and its `.spz` (axes of glTF).
  * - `validate-glb FILE`: Khronos' validator; prints its messages.
@@ -30,16 +29,11 @@ async function readSpz(bytes, frame) {
   return { numPoints, shDegree, ...Object.fromEntries(FIELDS.map((name) => [name, cloud[name]])) };
 }
 
-async function writeSpz(path, frame, version, stored) {
+async function writeSpz(path, frame, version) {
   const spz = await spzLibrary();
   const scene = JSON.parse(readFileSync(0, "utf8"));
-  const extensions = [];
-  if (stored) {
-    extensions.push(new spz.SpzExtensionCoordinateSystemAdobe());
-    extensions[0].coordinateSystem = spz.CoordinateSystem[stored];
-  }
   const arrays = FIELDS.map((name) => [name, new Float32Array(scene[name])]);
-  const cloud = { ...scene, ...Object.fromEntries(arrays), antialiased: false, extensions };
+  const cloud = { ...scene, ...Object.fromEntries(arrays), antialiased: false, extensions: [] };
   const options = { version: Number(version), from: spz.CoordinateSystem[frame], sh1Bits: 8, shRestBits: 8 };
   writeFileSync(path, spz.saveSpzToBuffer(cloud, options));
 }
