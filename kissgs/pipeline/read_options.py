@@ -1,4 +1,4 @@
-"""What may be chosen when a scene is read from a file."""
+"""Options for reading a scene from a file."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from helpers.web_tools import DECODER, run_node
 from kissgs.core.splats import Splats
 
 SH_C0 = 0.28209479177387814
-PACKAGES = ("@adobe/spz", "@mkkellogg/gaussian-splats-3d", "gltf-validator", "three")
+PACKAGES = ("@adobe/spz", "@cesium/engine", "@mkkellogg/gaussian-splats-3d", "gltf-validator", "three")
 
 needs_foreign_formats = pytest.mark.skipif(
     not all((DECODER / "node_modules" / name).exists() for name in PACKAGES),

@@ -1,7 +1,8 @@
 """Agreement with readers and writers that others wrote (docs/reference/formats.md has the table of all such tests).
 
 Oracles: splat-transform (``.ply``, ``.compressed.ply``, SOG), the library of ``.spz``, GaussianSplats3D (``.ksplat``,
-``.splat``), three.js and Khronos' validator (``.glb``). Scenes have degrees 0 to 3, and the ends of every attribute.
+``.splat``), three.js, Cesium and Khronos' validator (``.glb``). Scenes have degrees 0 to 3 and the ends of every
+attribute.
 """
 
 import csv
@@ -10,6 +11,7 @@ import struct
 import numpy as np
 import pytest
 from helpers.foreign_formats import (
+    SH_C0,
     cloud_of_splats,
     floats,
     foreign,
@@ -260,6 +262,28 @@ def test_our_spz_inside_glb(count, degree, tmp_path):
     np.testing.assert_allclose(np.abs(cosines), 1, atol=5e-7)
     for k, name in enumerate(name for name in columns if "SH_" in name and "DEGREE_0" not in name):
         np.testing.assert_allclose(columns[name], theirs.shN[:, k], atol=5e-7)
+
+
+@needs_foreign_formats
+@pytest.mark.parametrize("degree", DEGREES)
+@pytest.mark.parametrize("count", COUNTS)
+@pytest.mark.quick(2)
+def test_our_spz_inside_glb_in_cesium(count, degree, tmp_path):
+    """Cesium takes the axes as they are stored, which is half a turn about the vertical axis from the extension's."""
+    scene = made_scene(count, degree)
+    found = foreign("read-glb-in-cesium", written(write_spz_glb, scene, tmp_path / "a.spz.glb"))
+    wanted = read_spz(written(write_spz, scene, tmp_path / "a.spz"), raw_axes=True)
+    np.testing.assert_array_equal(floats(found.pop("POSITION"), count, 3), wanted.means)
+    np.testing.assert_allclose(floats(found.pop(f"{NAME}:SCALE"), count, 3), np.exp(wanted.scales), rtol=1e-5)
+    quats = np.roll(floats(found.pop(f"{NAME}:ROTATION"), count, 4), 1, axis=1)
+    np.testing.assert_allclose(np.abs((quats * wanted.quats).sum(axis=1)), 1, atol=1e-6)
+    opacities = 1 / (1 + np.exp(-wanted.opacities[:, None].astype(float)))
+    colours = np.concatenate([SH_C0 * wanted.sh0 + 0.5, opacities], axis=1).clip(0, 1) * 255
+    np.testing.assert_allclose(floats(found.pop("COLOR_0"), count, 4), colours, atol=1)  # it rounds down
+    assert len(found) == wanted.shN.shape[1]
+    for name, values in found.items():
+        band, i = (int(part) for part in name.removeprefix(f"{NAME}:SH_DEGREE_").split("_COEF_"))
+        np.testing.assert_array_equal(floats(values, count, 3), wanted.shN[:, band * band - 1 + i])
 
 
 @needs_foreign_formats

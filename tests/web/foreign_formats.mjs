@@ -5,6 +5,7 @@
  * - `write-spz FILE FRAME VERSION`: the same; writes the scene of standard input, which has the axes of FRAME.
  * - `read-ksplat FILE`, `write-ksplat FILE PLY LEVEL`, `read-splat FILE`: GaussianSplats3D, from which `.ksplat` is.
  * - `read-glb FILE`: three.js; prints the accessors of the only primitive, and its `.spz` (axes of glTF).
+ * - `read-glb-in-cesium FILE`: Cesium, which knows the extension for `.spz`; prints the attributes that it will draw.
  * - `validate-glb FILE`: Khronos' validator; prints its messages.
  */
 
@@ -95,6 +96,26 @@ async function readGlb(path) {
   return { columns, spz: packed && (await readSpz(packed, "LUF")) };
 }
 
+async function readGlbInCesium(path) {
+  globalThis.Image = class {
+    set src(_address) {
+      queueMicrotask(() => this.onerror()); // it only asks whether there is WebP
+    }
+  };
+  const { GltfLoader, JobScheduler, Resource } = await load("@cesium/engine/index.js");
+  const [gltfResource, baseResource] = [new Resource({ url: "scene.glb" }), new Resource({ url: "." })];
+  const typedArray = bytesOf(path);
+  const loader = new GltfLoader({ gltfResource, baseResource, typedArray, loadAttributesAsTypedArray: true });
+  const { process } = globalThis;
+  delete globalThis.process; // as in a browser: its build of the library of .spz does not start in Node
+  await loader.load();
+  const frame = { context: {}, jobScheduler: new JobScheduler(), afterRender: [] };
+  while (!loader.process(frame)) await new Promise((resolve) => setTimeout(resolve, 1));
+  globalThis.process = process;
+  const { attributes } = loader.components.nodes[0].primitives[0];
+  return Object.fromEntries(attributes.map((item) => [item.name, item.typedArray]));
+}
+
 async function validateGlb(path) {
   const { default: validator } = await load("gltf-validator/index.js");
   return (await validator.validateBytes(bytesOf(path), { maxIssues: 0 })).issues.messages;
@@ -107,6 +128,7 @@ const WORKS = {
   "write-ksplat": writeKsplat,
   "read-splat": readSplat,
   "read-glb": readGlb,
+  "read-glb-in-cesium": readGlbInCesium,
   "validate-glb": validateGlb,
 };
 
