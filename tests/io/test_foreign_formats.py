@@ -128,6 +128,18 @@ def test_spz_of_its_library(version, count, degree, tmp_path):
 
 
 @needs_foreign_formats
+@pytest.mark.parametrize("degree", DEGREES)
+@pytest.mark.parametrize("count", COUNTS)
+@pytest.mark.quick(1)
+def test_spz_of_version_1(count, degree, tmp_path):
+    """The library reads it, but does not write it."""
+    path = tmp_path / "a.spz"
+    path.write_bytes(spz_bytes(made_scene(count, degree), 1))
+    theirs = splats_of_cloud(foreign("read-spz", path, "RDF"))
+    assert_alike(read_spz(path), theirs, atol=2e-5, opacities=1e-4)
+
+
+@needs_foreign_formats
 @pytest.mark.parametrize("frame", range(9))
 @pytest.mark.quick(2)
 def test_axes_of_spz(frame, tmp_path):
