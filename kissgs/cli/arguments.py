@@ -27,6 +27,24 @@ ForceOption = Annotated[bool, typer.Option("--force", "-f", help="Overwrite exis
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print a JSON report: an object for one file, a list for several.")
 ]
+MaxGaussiansOption = Annotated[
+    int | None,
+    typer.Option(
+        min=0,
+        help="Refuse files with more Gaussians. Default: 20 million in compressed formats, whose files can declare far "
+        "more than they hold.",
+    ),
+]
+LevelOption = Annotated[
+    int, typer.Option(min=0, help="Level of detail of a streamed SOG scene; 0 is the finest.", show_default=True)
+]
+RawAxesOption = Annotated[
+    bool,
+    typer.Option(
+        "--raw-axes",
+        help="Take the axes of .spz as those of a .ply, as splat-transform writes and reads them. Default: y up.",
+    ),
+]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")]
 ThreadsOption = Annotated[
     int, typer.Option(min=0, help="Number of threads; 0 for one per processor. The output does not depend on it.")

@@ -11,8 +11,11 @@ import typer
 from kissgs.cli.arguments import (
     ForceOption,
     JsonOption,
+    LevelOption,
+    MaxGaussiansOption,
     PresetOption,
     QuietOption,
+    RawAxesOption,
     ScenesArgument,
     SeedOption,
     SetOption,
@@ -101,6 +104,9 @@ def compress(
             "--checkpoint", help="Save the state of --compact and --finetune next to the scene, and resume from it."
         ),
     ] = False,
+    max_gaussians: MaxGaussiansOption = None,
+    level: LevelOption = 0,
+    raw_axes: RawAxesOption = False,
     device: Annotated[str, typer.Option(help="Device of --compact and --finetune: cpu or cuda.")] = "cpu",
     threads: ThreadsOption = 0,
     force: ForceOption = False,
@@ -110,9 +116,11 @@ def compress(
     """Compress each scene into a SOG-XT container, or into SOG."""
     from kissgs.pipeline.containers import ending_of, named_container
     from kissgs.pipeline.pipeline import compress as run
+    from kissgs.pipeline.read_options import ReadOptions
     from kissgs.training.checkpoint import delete_checkpoints
 
     kind = named_container(container, output)
+    reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes)
     budget = None if compact is None else budget_of(compact)
     settings = chosen(
         preset,
@@ -142,6 +150,7 @@ def compress(
                 source(scene),
                 None if piped else target,
                 settings=settings,
+                reading=reading,
                 container=kind,
                 cache=sibling(scene, ".sensitivity.npz") if cache else None,
                 evaluate=evaluate,

@@ -13,6 +13,7 @@ from helpers.command_line import run
 import kissgs
 from kissgs import InvalidContainerError, KissgsError, Settings, decompress, sample_scene
 from kissgs.pipeline.inspect import describe
+from kissgs.pipeline.read_options import ReadOptions
 from kissgs.pipeline.scene_files import open_scene
 from kissgs.pipeline.scene_formats import is_container
 
@@ -58,7 +59,7 @@ def test_all_commands_read_what_decompress_reads(name, tmp_path):
         np.testing.assert_array_equal(found.means, wanted.means)
     assert (described := describe(path)).kind == "sog-xt"
     assert described.count == len(wanted)
-    assert open_scene(FORMS[name], 1, lambda *_: None)[2] == len(FORMS[name])
+    assert open_scene(FORMS[name], ReadOptions(), 1, lambda *_: None)[2] == len(FORMS[name])
 
 
 def test_a_ply_with_a_zip_at_its_end_is_a_ply_to_all(tmp_path):
