@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from kissgs.core.array_types import Float32, Float64, Int
-from kissgs.finetuning.quantized_scene import Plane, QuantizedScene
+from kissgs.finetuning.planes import Plane
+from kissgs.finetuning.quantized_scene import QuantizedScene
 from kissgs.planning.layout import Grid
 from kissgs.planning.rdo_quantize import UNUSED_COUNT
 from kissgs.rendering.tensors import Parameters
