@@ -117,10 +117,11 @@ class TablePlane:
             place[inside] = np.searchsorted(levels, field.levels[inside])
         bounds = (np.where(frozen, 0, bound - place).astype(np.float32) for bound in (lowest, highest))
         first = (rows * longest)[:, None].astype(np.int64)
-        arrays = (place.astype(np.float64), *bounds, padded, first)
-        values = None if fixed is None else torch.from_numpy(fixed.astype(np.float64)).to(device)
-        tensors = [torch.from_numpy(np.ascontiguousarray(array)).to(device) for array in arrays]
-        return cls(field, *tensors, values)
+        arrays = (place.astype(np.float64), *bounds, padded, first, *(() if fixed is None else (fixed,)))
+        base, least, most, every, start, *values = (
+            torch.from_numpy(np.ascontiguousarray(array)).to(device) for array in arrays
+        )
+        return cls(field, base, least, most, every, start, values[0] if values else None)
 
     def levels(self, latents: Float32[Tensor, "R C"]) -> Float64[Tensor, "R C"]:
         """Return levels; their gradient is that of a line to the next level of the list."""
