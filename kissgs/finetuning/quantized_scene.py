@@ -43,6 +43,7 @@ class QuantizedScene:
 
     Attributes:
         planes: planes by field of the plan.
+        trained_tables: tables whose values are trained, by field; none for even levels.
         classes: ``(M,)`` sensitivity class of each Gaussian.
         grid: cell of each Gaussian.
     """
@@ -53,7 +54,7 @@ class QuantizedScene:
         """Start from a plan for ``container``; ``sh_degree`` is that of the decoded scene."""
         self._plan, self._sh_degree = plan, sh_degree
         count = int(plan.grid.mask.sum())
-        self.planes, self._tables = planes_of(plan, sh_degree, container.tables, device)
+        self.planes, self.trained_tables = planes_of(plan, sh_degree, container.tables, device)
         self.classes, self.grid = plan.classes, plan.grid
         self._labels = Labels(plan.codebook.labels[:count], len(plan.codebook.centroids.levels), device)
         self._omitted = None
@@ -61,7 +62,7 @@ class QuantizedScene:
             omitted = plan.fields["omitted"].take(plan.grid.mask).levels.astype(np.int64)
             self._omitted = torch.from_numpy(omitted).to(device)
         trained = {name: plane.min_latent for name, plane in self.planes.items()}
-        trained |= {table_name(name): table.min_latent for name, table in self._tables.items()}
+        trained |= {table_name(name): table.min_latent for name, table in self.trained_tables.items()}
         self._adam = PrunableAdam({name: torch.zeros_like(latent) for name, latent in trained.items()})
         self._weights: dict[str, Tensor] = {}
 
@@ -75,11 +76,11 @@ class QuantizedScene:
     def table_latents(self) -> dict[str, Tensor]:
         """Trained latents of the tables by field, ``(L,)`` float32 each; empty for even levels."""
         parameters = self._adam.parameters
-        return {name: parameters[table_name(name)] for name in self._tables}
+        return {name: parameters[table_name(name)] for name in self.trained_tables}
 
     def tables(self) -> dict[str, Tensor]:
         """Return the values of the trained tables by field, ``(L,)`` float64 each, differentiable."""
-        return {name: self._tables[name].values(latents) for name, latents in self.table_latents.items()}
+        return {name: self.trained_tables[name].values(latents) for name, latents in self.table_latents.items()}
 
     def set_curvature(self, costs: Costs, loss_per_error: float) -> None:
         """Set the curvature of the quadratic attraction, 0 before, to that of the loss.
@@ -134,7 +135,7 @@ class QuantizedScene:
             for name, latents in self.latents.items():
                 latents.clamp_(self.planes[name].min_latent, self.planes[name].max_latent)
             for name, latents in self.table_latents.items():
-                latents.clamp_(self._tables[name].min_latent, self._tables[name].max_latent)
+                latents.clamp_(self.trained_tables[name].min_latent, self.trained_tables[name].max_latent)
             if rotations is not None:
                 self._keep_unit_length(rotations)
 
