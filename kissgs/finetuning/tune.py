@@ -51,7 +51,7 @@ LOSS_VIEWS = 16
 ATTRACTION_START = 0.5
 """Fraction of the steps after which quadratic attraction starts; it grows linearly to 1 at the last step."""
 
-TABLE_LR = 0.3
+TABLE_LR = 1.0
 """Learning rate of tables in units of that of the levels: an error of a value is one of everything that uses it."""
 
 NOT_KEPT = "fine-tuning did not help; the container is as it was without it"
