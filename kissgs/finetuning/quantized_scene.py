@@ -1,9 +1,11 @@
 """``QuantizedScene``: the differentiable decoder of fine-tuning, from latents to levels to a scene.
 
-Every level is ``stride * round(multiple + latent)``, with the multiple of the encoding plan. The latents are trained;
-their unit is the step size of the row's sensitivity class. Rounding passes gradients straight through (Bengio et al.
-2013): the gradient of a decoded value becomes that of its latent. Order, rotation forms, labels and ranges are those of
-the plan; the images that are written contain exactly the rounded levels.
+Every level has a latent, which is rounded to one of the levels that its row may use. Levels are even
+(:class:`~kissgs.finetuning.even_plane.EvenPlane`) or stand for the values of a table
+(:class:`~kissgs.finetuning.table_plane.TablePlane`), which is trained as well. The unit of a latent is the step size of
+the row's sensitivity class. Rounding passes gradients straight through (Bengio et al. 2013): the gradient of a decoded
+value becomes that of its latent. Order, rotation forms, labels and ranges are those of the plan; the images that are
+written contain exactly the rounded levels.
 
 Straight-through training alone does not converge: if the best value is between two levels, its latent oscillates across
 the boundary and may end at the worse level. So a quadratic term attracts each latent to its current level, with the
@@ -125,7 +127,8 @@ class QuantizedScene:
         """Make an Adam step of the latents, with quadratic attraction, within the levels that the images can hold.
 
         Args:
-            rates: learning rates by field, and ``"attraction"``: factor of the quadratic attraction, 0 to 1.
+            rates: learning rates by field and by :func:`table_name`, and ``"attraction"``: factor of the quadratic
+                attraction, 0 to 1.
         """
         rotations = self.latents["quaternions"].detach().clone() if self._omitted is not None else None
         if self._weights and rates["attraction"] > 0:

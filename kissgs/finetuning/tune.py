@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -60,11 +59,8 @@ Write = Callable[[EncodingPlan, int, Progress], Encoded]
 """Writes a plan that was fine-tuned in a number of steps; the third argument receives progress."""
 
 
-class Decode(Protocol):
-    """Decoder of a container."""
-
-    def __call__(self, source: Mapping[str, bytes], *, max_gaussians: int, threads: int) -> Splats:
-        """Return the Gaussians of the files of a container, in its order."""
+Decode = Callable[..., Splats]
+"""Decoder of a container: takes its files, ``max_gaussians`` and ``threads``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -269,8 +265,7 @@ class Tuner:
             key.update(array.tobytes())
         for name in Costs.__slots__ if plan.costs is not None else ():
             key.update(getattr(plan.costs, name).tobytes())
-        if self.container.tables is not None:
-            tables = self.container.tables
+        if (tables := self.container.tables) is not None:
             key.update(tables.opacity_logits.tobytes() + f"{tables.first_drawn} {tables.last_drawn}".encode())
         for camera, image in zip(targets.cameras, targets.images, strict=True):
             key.update(f"{image.shape} {image.dtype}".encode())

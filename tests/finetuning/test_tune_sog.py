@@ -51,9 +51,9 @@ def tuned(scene, *, checkpoint=None, progress=silent, work=None, **changes):
 @pytest.mark.quick(1)
 def test_fine_tuning_raises_the_psnr_to_the_original_scene(degree):
     scene = cloud(150, degree)
-    encoded, report = tuned(scene, steps=150)
+    encoded, report = tuned(scene, steps=150, lr=0.05, codebook_lr=0.1)
     assert report.kept
-    assert report.psnr_after > report.psnr_before + 0.8
+    assert report.psnr_after > report.psnr_before + 0.4
     assert report.bytes_after == len(zip_bytes(encoded.files))
     measured = evaluate(scene, decompress(encoded.files), Views((), around(7)[1:3], black(), "circle"), threads=1)
     assert measured.mean.candidate.psnr == pytest.approx(report.psnr_after, abs=1e-6)
@@ -124,11 +124,13 @@ def test_a_checkpoint_belongs_to_one_container_and_its_tables(tmp_path, monkeypa
 @pytest.mark.quick(2)
 def test_compress_fine_tunes_sog_of_every_degree(tmp_path, degree):
     scene = cloud(120, degree)
-    settings = Settings.from_preset("fast", finetune={**SHORT, "steps": 40, "lr": 0.05}, **COARSE)
+    settings = Settings.from_preset("fast", finetune=SHORT, **COARSE)
     result = kissgs.compress(scene, tmp_path / "a.sog", settings=settings)
-    assert result.report.finetuning.steps == 40
-    assert result.report.finetuning.kept
-    assert result.report.finetuning.bytes_after == result.report.container_bytes
+    report = result.report.finetuning
+    assert report.steps == 12
+    assert result.report.container_bytes == (report.bytes_after if report.kept else report.bytes_before)
+    plain = kissgs.compress(scene, settings=Settings.from_preset("fast", **COARSE), container="sog")
+    assert (result.files == plain.files) == (not report.kept)
     found, other = kissgs.load(tmp_path / "a.sog"), read_files(result.files)
     assert found.sh_degree == degree
     for name in ATTRIBUTES:
