@@ -9,14 +9,20 @@ import torch
 from torch import Tensor
 
 from kissgs.core.array_types import Float32, Float64, Int
-from kissgs.finetuning.quantized_scene import Plane, QuantizedScene
+from kissgs.finetuning.planes import Plane
+from kissgs.finetuning.quantized_scene import QuantizedScene
+from kissgs.finetuning.table_plane import TablePlane
 from kissgs.planning.layout import Grid
 from kissgs.planning.rdo_quantize import UNUSED_COUNT
+from kissgs.planning.sh_codebook import COEFFICIENTS
 from kissgs.rendering.tensors import Parameters
 from kissgs.training.loop import TrainableScene
 
 ENTROPY_FIELDS = ("opacities", "scales", "quaternions", "f_dc")
-"""Fields whose bits are estimated from the histograms of their levels; positions have too many levels for that."""
+"""Fields whose bits are estimated from the histograms of their levels; positions have too many levels for that.
+
+Entries of the SH codebook are added where they are a list, sorted by frequency: neighbours then predict nothing.
+"""
 
 RECOUNT_STEPS = 25
 """Number of steps between two updates of the histograms."""
@@ -33,7 +39,16 @@ class RateLoss:
     def __init__(self, scene: QuantizedScene, weight: float) -> None:
         """Prepare the loss of ``scene``; ``weight`` is the weight of one bit."""
         self._scene, self._weight = scene, weight
-        self._rates = {name: _LevelRate(scene.planes[name], scene.classes) for name in ENTROPY_FIELDS}
+        self._rates = {}
+        for name in ENTROPY_FIELDS:
+            plane = scene.planes[name]
+            self._rates[name] = _LevelRate(plane, scene.classes, np.arange(plane.base_multiples.shape[1]))
+        codebook = scene.planes["f_rest_centroids"]
+        if isinstance(codebook, TablePlane):
+            used = (codebook.min_latent < codebook.max_latent).any(dim=0).cpu().numpy()
+            # An image has one code per colour, for all coefficients; those that are not stored get one of their own.
+            colors = np.where(used, np.arange(len(used)) // COEFFICIENTS, 3)
+            self._rates["f_rest_centroids"] = _LevelRate(codebook, np.zeros(len(codebook.first), np.int64), colors)
 
     def penalty(self, step: int, parameters: Parameters) -> Tensor | None:
         """Return the weighted bits of the current levels; ``parameters`` are not used."""
@@ -122,20 +137,21 @@ class _LevelRate:
     """Rate of the levels of one field.
 
     Attributes:
-        table: ``(classes, C, symbols + 1)`` float32, bits of each level; the last entry is repeated.
+        table: ``(classes, channels, symbols + 1)`` float32, bits of each level; the last entry is repeated.
     """
 
-    table: Float32[np.ndarray, "classes C symbols"]
+    table: Float32[np.ndarray, "classes channels symbols"]
 
-    def __init__(self, plane: Plane, classes: Int[np.ndarray, " M"]) -> None:
+    def __init__(self, plane: Plane, classes: Int[np.ndarray, " M"], channels: Int[np.ndarray, " C"]) -> None:
+        """Prepare the rate of ``plane``; rows of one of ``classes`` and columns of one of ``channels`` share a code."""
         multiples = plane.base_multiples.cpu().numpy()
         first = int(np.floor(multiples + plane.min_latent.cpu().numpy()).min(initial=0))
         self._symbols = int(np.ceil(multiples + plane.max_latent.cpu().numpy()).max(initial=0)) - first + 1
-        channels = multiples.shape[1]
-        rows = (classes[:, None] * channels + np.arange(channels)) * (self._symbols + 1)
+        number = int(channels.max(initial=-1)) + 1
+        rows = (classes[:, None] * number + channels) * (self._symbols + 1)
         self._rows = torch.from_numpy(rows).to(plane.base_multiples.device)
         self._base: Float64[Tensor, "M C"] = plane.base_multiples - first
-        self.table = np.zeros((int(classes.max(initial=0)) + 1, channels, self._symbols + 1), np.float32)
+        self.table = np.zeros((int(classes.max(initial=0)) + 1, number, self._symbols + 1), np.float32)
 
     def count(self, latents: Float32[Tensor, "M C"]) -> None:
         """Set the table from the histograms of the current levels."""

@@ -21,8 +21,10 @@ from kissgs.core.splats import ATTRIBUTES, Splats, clean
 from kissgs.evaluation.evaluate import evaluate
 from kissgs.evaluation.results import Evaluation
 from kissgs.finetuning.losses import RateLoss, TotalVariationLoss
-from kissgs.finetuning.quantized_scene import FIELDS, QuantizedScene
+from kissgs.finetuning.planes import FIELDS, TABLES
+from kissgs.finetuning.quantized_scene import QuantizedScene, table_name
 from kissgs.finetuning.result import FinetuneReport
+from kissgs.planning.container_model import EVEN_LEVELS, ContainerModel
 from kissgs.planning.encoded import Encoded
 from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.rd_model import Costs, implied_lambda
@@ -30,7 +32,7 @@ from kissgs.rendering.rasterizer import Device
 from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
 from kissgs.settings import FinetuneSettings
 from kissgs.sogxt.container import zip_bytes
-from kissgs.sogxt.decode import decode
+from kissgs.sogxt.decode import decode as decode_sogxt
 from kissgs.training.checkpoint import Checkpoint
 from kissgs.training.loop import LrSchedule, TrainingPlan, exponential_lr, image_loss, torch_threads, train
 from kissgs.training.supervision import SupervisionViews, supervision_views
@@ -48,10 +50,17 @@ LOSS_VIEWS = 16
 ATTRACTION_START = 0.5
 """Fraction of the steps after which quadratic attraction starts; it grows linearly to 1 at the last step."""
 
+TABLE_LR = 1.0
+"""Learning rate of tables in units of that of the levels: an error of a value is one of everything that uses it."""
+
 NOT_KEPT = "fine-tuning did not help; the container is as it was without it"
 
 Write = Callable[[EncodingPlan, int, Progress], Encoded]
 """Writes a plan that was fine-tuned in a number of steps; the third argument receives progress."""
+
+
+Decode = Callable[..., Splats]
+"""Decoder of a container: takes its files, ``max_gaussians`` and ``threads``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,6 +75,8 @@ class Tuner:
         device: device that trains.
         threads: number of threads; 0 means one per processor. The result does not depend on it.
         progress: receives the stage "finetune", and then those of writing.
+        container: what the container can hold.
+        decode: decoder of the container.
     """
 
     original: Splats
@@ -75,6 +86,8 @@ class Tuner:
     device: Device
     threads: int
     progress: Progress
+    container: ContainerModel = EVEN_LEVELS
+    decode: Decode = decode_sogxt
 
     @classmethod
     def of(
@@ -86,6 +99,8 @@ class Tuner:
         device: Device = "cpu",
         threads: int = 0,
         progress: Progress = silent,
+        container: ContainerModel = EVEN_LEVELS,
+        decode: Decode = decode_sogxt,
     ) -> Tuner:
         """Prepare the targets: photographs of ``views``, or renderings of the original from virtual cameras.
 
@@ -97,7 +112,7 @@ class Tuner:
         targets = training_targets(
             original, supervision.train, supervision.background, threads=threads, device=device, progress=progress
         )
-        return cls(original, settings, supervision, targets, device, threads, progress)
+        return cls(original, settings, supervision, targets, device, threads, progress, container, decode)
 
     def __call__(
         self, plan: EncodingPlan, start: EncodingPlan, scene: Splats, write: Write, checkpoint: Path | None = None
@@ -159,7 +174,7 @@ class Tuner:
         return float(np.mean([_squared_error(view.comparison.candidate_vs_reference.psnr) for view in views]))
 
     def _compare(self, reference: Splats, encoded: Encoded, progress: Progress) -> Evaluation:
-        decoded = decode(encoded.files, max_gaussians=max(len(reference), MAX_GAUSSIANS), threads=self.threads)
+        decoded = self.decode(encoded.files, max_gaussians=max(len(reference), MAX_GAUSSIANS), threads=self.threads)
         return evaluate(
             reference,
             decoded,
@@ -173,7 +188,7 @@ class Tuner:
         self, plan: EncodingPlan, sh_degree: int, rd_lambda: float, path: Path | None
     ) -> tuple[EncodingPlan, str]:
         """Return the fine-tuned plan, and a note if the checkpoint could not be saved."""
-        settings, scene = self.settings, QuantizedScene(plan, sh_degree, self.device)
+        settings, scene = self.settings, QuantizedScene(plan, sh_degree, self.device, self.container)
         checkpoint = Checkpoint(path, "" if path is None else self._key(plan, sh_degree))
         done, checkpoint_note = 0, ""
         loss_per_error = self._loss_per_error(scene)
@@ -243,12 +258,15 @@ class Tuner:
         key = hashlib.sha256(f"{settings}{targets.background}".encode())
         for name, field in plan.fields.items():
             key.update(f"{name} {field.top} {field.level_offset} {field.levels.shape}".encode())
-            for array in (field.levels, field.low, field.high, np.asarray(field.level_stride)):
+            table = np.zeros(0) if field.table is None else field.table
+            for array in (field.levels, field.low, field.high, np.asarray(field.level_stride), table):
                 key.update(array.tobytes())
         for array in (plan.codebook.labels, plan.classes, plan.grid.mask):
             key.update(array.tobytes())
         for name in Costs.__slots__ if plan.costs is not None else ():
             key.update(getattr(plan.costs, name).tobytes())
+        if (tables := self.container.tables) is not None:
+            key.update(tables.opacity_logits.tobytes() + f"{tables.first_drawn} {tables.last_drawn}".encode())
         for camera, image in zip(targets.cameras, targets.images, strict=True):
             key.update(f"{image.shape} {image.dtype}".encode())
             key.update(camera.viewmat.tobytes() + camera.K.tobytes() + image.tobytes())
@@ -261,7 +279,8 @@ def _lr_schedule(settings: FinetuneSettings, targets: TrainingTargets) -> LrSche
     """Return exponentially falling learning rates, and quadratic attraction that grows in the second half."""
     scale = 1.0 if targets.target_source == "photos" else settings.synthetic_lr_scale
     base = {name: scale * (settings.codebook_lr if name == "f_rest_centroids" else settings.lr) for name in FIELDS}
-    learning_rates = exponential_lr(base, dict.fromkeys(FIELDS, 1.0), dict.fromkeys(FIELDS, settings.final_lr_scale))
+    base |= {table_name(name): TABLE_LR * scale * settings.lr for name in TABLES}
+    learning_rates = exponential_lr(base, dict.fromkeys(base, 1.0), dict.fromkeys(base, settings.final_lr_scale))
 
     def rates(done: float) -> dict[str, float]:
         return {**learning_rates(done), "attraction": max(done - ATTRACTION_START, 0.0) / (1 - ATTRACTION_START)}

@@ -11,11 +11,13 @@ from kissgs.core.splats import Cleaned, Splats
 from kissgs.planning.container_model import EVEN_LEVELS, ContainerModel
 from kissgs.planning.encoded import Encoded
 from kissgs.planning.encoding_plan import EncodingPlan
-from kissgs.settings import EncodeSettings, Settings
+from kissgs.settings import EncodeSettings
 from kissgs.sog import encode as sog
 from kissgs.sog.container_model import SOG
+from kissgs.sog.decode import decode as decode_sog
 from kissgs.sogxt import encode as sogxt
 from kissgs.sogxt import names
+from kissgs.sogxt.decode import decode as decode_sogxt
 
 ContainerName = Literal["sog-xt", "sog"]
 """SOG-XT, the default, or SOG of version 2, which other viewers open."""
@@ -25,6 +27,9 @@ ENDINGS: dict[str, ContainerName] = {".zip": "sog-xt", ".sog": "sog"}
 
 MODELS: dict[ContainerName, ContainerModel] = {"sog-xt": EVEN_LEVELS, "sog": SOG}
 """Model of each container for the planner."""
+
+DECODERS = {"sog-xt": decode_sogxt, "sog": decode_sog}
+"""Decoder of each container."""
 
 FILES: dict[ContainerName, tuple[str, ...]] = {"sog-xt": names.FILES, "sog": sog.FILES}
 """Names of all files that a container may have."""
@@ -52,16 +57,6 @@ def named_container(requested: str | None, destination: Path | None) -> Containe
                 )
             return name
     raise UnsupportedError(f"there is no container {requested!r}; choose one of {', '.join(MODELS)}")
-
-
-def check_container(container: ContainerName, settings: Settings) -> None:
-    """Check that the settings can be met in a container, before any other work.
-
-    Raises:
-        UnsupportedError: they cannot.
-    """
-    if container == "sog" and settings.finetune.enabled:
-        raise UnsupportedError("fine-tuning is only for SOG-XT containers: leave it out, or write a .zip")
 
 
 def write_files(

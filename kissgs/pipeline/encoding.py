@@ -20,7 +20,7 @@ from kissgs.core.progress import Progress, SearchNote, as_stage
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import ATTRIBUTES, Cleaned, Splats
 from kissgs.io.sensitivity_file import read_sensitivity, write_sensitivity
-from kissgs.pipeline.containers import MODELS, ContainerName, write_files
+from kissgs.pipeline.containers import DECODERS, MODELS, ContainerName, write_files
 from kissgs.pipeline.rate_control import Container, Encoder, RateControl
 from kissgs.pipeline.trial import Trial
 from kissgs.planning.encoded import Encoded
@@ -174,6 +174,8 @@ class Encoding:
             device=self.device,
             threads=self.threads,
             progress=self.progress,
+            container=MODELS[self.container],
+            decode=DECODERS[self.container],
         )
 
     def _planner(self) -> Planner:

@@ -17,7 +17,7 @@ from kissgs.core.progress import Progress, SearchNote, as_stage, ignore_stop_sea
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats
 from kissgs.core.timing import StageTimer, peak_memory
-from kissgs.pipeline.containers import FILES, ContainerName, check_container, named_container
+from kissgs.pipeline.containers import FILES, ContainerName, named_container
 from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.report import Report
 from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, save_ply
@@ -192,7 +192,6 @@ def compress(
     settings = settings or Settings()
     target = Path(destination) if destination is not None else None
     kind = named_container(container, target)
-    check_container(kind, settings)
     if target is not None:
         check_destination(target, overwrite=overwrite, names=FILES[kind])
     finetune_checkpoint = None

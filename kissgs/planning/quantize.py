@@ -31,8 +31,8 @@ class Quantized:
         low: ``(C,)`` value of level 0.
         high: ``(C,)`` value of level ``top``.
         top: the level of ``high``, whether it occurs or not.
-        level_stride: distance between the levels that a row uses, one for all rows or ``(N,)``: with ``level_offset``
-            added, levels are multiples of it. Single levels may be exceptions.
+        level_stride: distance between the levels that a row uses, one for all rows, ``(N,)`` or ``(N, C)``: with
+            ``level_offset`` added, levels are multiples of it. Single levels may be exceptions.
         level_offset: offset added to levels before they are multiples of ``level_stride``.
         table: ascending value of each level, for all channels; None for even levels.
     """
@@ -41,7 +41,7 @@ class Quantized:
     low: Float32[np.ndarray, " C"]
     high: Float32[np.ndarray, " C"]
     top: int
-    level_stride: int | Int[np.ndarray, " N"] = 1
+    level_stride: int | Int[np.ndarray, " N"] | Int[np.ndarray, "N C"] = 1
     level_offset: int = 0
     table: Float32[np.ndarray, " table"] | None = None
 

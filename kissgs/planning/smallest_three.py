@@ -56,8 +56,14 @@ def fits(levels: Int[np.ndarray, "N 3"]) -> np.ndarray:
 
 def quaternions(levels: UInt8[np.ndarray, "N 3"], omitted: UInt8[np.ndarray, " N"]) -> Float64[np.ndarray, "N 4"]:
     """Return the quaternions that a decoder makes of the levels."""
-    small = TABLE[levels]
-    quats = np.empty((len(levels), 4))
+    return whole(TABLE[levels], omitted)
+
+
+def whole(
+    small: Float64[np.ndarray, "N 3"], omitted: Int[np.ndarray, " N"] | UInt8[np.ndarray, " N"]
+) -> Float64[np.ndarray, "N 4"]:
+    """Return the quaternions of length 1 with these components, and one that is not negative."""
+    quats = np.empty((len(small), 4))
     np.put_along_axis(quats, KEPT[omitted], small, axis=1)
     missing = np.sqrt(np.maximum(0, 1 - np.square(small).sum(axis=1, keepdims=True)))
     np.put_along_axis(quats, omitted[:, None].astype(np.int64), missing, axis=1)

@@ -135,7 +135,8 @@ def means_field(means: Float32[np.ndarray, "M 3"], steps: float | Float64[np.nda
     exponents = np.log2(np.maximum(np.reshape(steps, (-1, 1)) / unit, 1))
     every = np.exp2(np.clip(np.floor(exponents + 0.5), 0, 8))
     levels = np.clip(np.rint((logs - low) / unit / every) * every, 0, MEANS_TOP)
-    return Quantized(levels.astype(np.uint16), low, high, MEANS_TOP)
+    stride = np.broadcast_to(every, levels.shape).astype(np.int64)
+    return Quantized(levels.astype(np.uint16), low, high, MEANS_TOP, stride)
 
 
 def decoded_quats(fields: dict[str, Quantized]) -> Float64[np.ndarray, "M 4"]:

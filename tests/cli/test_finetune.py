@@ -46,6 +46,15 @@ def test_output_and_report_are_those_of_the_library(folder: Path, tmp_path: Path
     assert "fine-tuned on renderings of the scene" in done.stdout.decode()
 
 
+def test_sog_is_fine_tuned_too(folder: Path, tmp_path: Path) -> None:
+    done = run("compress", "--finetune", "6", folder / "a.ply", "-o", tmp_path / "b.sog", *OPTIONS, "--json")
+    assert done.returncode == 0, done.stderr
+    found = kissgs.compress(SCENE, settings=settings(steps=6), container="sog")
+    assert (tmp_path / "b.sog").read_bytes() == found.to_zip()
+    assert json.loads(done.stdout)["finetuning"]["steps"] == 6
+    assert len(kissgs.load(tmp_path / "b.sog")) == len(found.order)
+
+
 @pytest.mark.quick(0)
 def test_photographs_are_training_targets(folder: Path, tmp_path: Path) -> None:
     words = ["compress", folder / "a.ply", "-o", tmp_path / "b.zip", "--finetune", "4", "--views", folder / "capture"]

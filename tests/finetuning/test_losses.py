@@ -11,6 +11,7 @@ from helpers.tuning_scenes import chosen, shuffled
 
 from kissgs.finetuning.losses import ENTROPY_FIELDS, PAPER_TV_WEIGHTS, RateLoss, TotalVariationLoss
 from kissgs.finetuning.quantized_scene import QuantizedScene
+from kissgs.sog.container_model import SOG
 
 
 def quantized(count=400, degree=1, preset="balanced"):
@@ -43,6 +44,30 @@ def test_bits_are_the_entropy_of_levels_per_class(preset):
                 bits += sum(-times * math.log2(times / len(column)) for times in Counter(column).values())
     found = value(RateLoss(scene, 0.5).penalty(0, {}))
     assert found == pytest.approx(0.5 * bits, rel=0.03)  # unused levels have a small probability
+
+
+def test_bits_of_a_sog_codebook_have_one_code_per_colour():
+    scene = QuantizedScene(chosen(cloud(300, 2), "fast", SOG), 2, container=SOG)
+    round_latents(scene)
+    latents = scene.latents["f_rest_centroids"]
+    loss = RateLoss(scene, 1.0)
+    before = value(loss.penalty(0, {}))
+    rng = np.random.default_rng(0)
+    rows = symbols(scene, "f_rest_centroids").reshape(-1, 3, 15)[:, :, :8]
+
+    def entropy(rows):
+        bits = 0.0
+        for color in range(3):
+            seen = rows[:, color].reshape(-1).tolist()
+            bits += sum(-times * math.log2(times / len(seen)) for times in Counter(seen).values())
+        return bits
+
+    first = entropy(rows)
+    latents.data += latents.new_tensor(rng.integers(-2, 3, latents.shape))
+    latents.data.clamp_(scene.planes["f_rest_centroids"].min_latent, scene.planes["f_rest_centroids"].max_latent)
+    second = entropy(symbols(scene, "f_rest_centroids").reshape(-1, 3, 15)[:, :, :8])
+    assert abs(second - first) > 100
+    assert value(loss.penalty(25, {})) - before == pytest.approx(second - first, rel=0.05)
 
 
 def test_bits_are_interpolated_between_levels():

@@ -5,13 +5,14 @@ import numpy as np
 from helpers.training_scenes import around, cloud
 from kissgs import Settings
 from kissgs.cameras.views import black
+from kissgs.planning.container_model import EVEN_LEVELS
 from kissgs.planning.planner import plan_encoding
 from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
 
 FIELDS = ("means", "opacities", "scales", "quaternions", "f_dc", "f_rest_centroids")
 
 
-def chosen(scene, preset="balanced", **changes):
+def chosen(scene, preset="balanced", container=EVEN_LEVELS, **changes):
     """Return the plan that ``compress`` makes."""
     settings = Settings.from_preset(preset, **changes).encode
     sensitivity = None
@@ -20,7 +21,7 @@ def chosen(scene, preset="balanced", **changes):
         sensitivity = measure_sensitivity(
             scene, WeightedCameras(cameras, [1.0] * len(cameras), black()), view_uncertainty=0.3
         )
-    return plan_encoding(scene, settings, sensitivity=sensitivity, threads=1)
+    return plan_encoding(scene, settings, sensitivity=sensitivity, container=container, threads=1)
 
 
 def choices():
@@ -37,3 +38,9 @@ def shuffled(work, seed=0, far=3.0):
     for name, latents in work.latents.items():
         latents.data += latents.new_tensor(rng.normal(0, far, latents.shape))
         latents.data.clamp_(work.planes[name].min_latent, work.planes[name].max_latent)
+    for name, latents in work.table_latents.items():
+        latents.data += latents.new_tensor(rng.normal(0, 0.3, latents.shape))
+        latents.data.clamp_(work.trained_tables[name].min_latent, work.trained_tables[name].max_latent)
+    turned = work.latents["quaternions"].data
+    if turned.shape[1] == 3:  # three components of a rotation must leave room for the fourth
+        turned[work.planes["quaternions"].values(turned).square().sum(dim=1) > 1] = 0

@@ -210,10 +210,6 @@ def test_what_cannot_be_written_is_refused(tmp_path):
         (lambda: compress(scene, tmp_path / "a.zip", container="sog"), r"end it in \.sog"),
         (lambda: compress(scene, settings=fast).save(tmp_path / "a.sog"), r"end it in \.zip"),
         (lambda: compress(scene.select([]), settings=fast, container="sog"), "without visible Gaussians"),
-        (
-            lambda: compress(scene, tmp_path / "a.sog", settings=Settings(finetune={"enabled": True})),
-            "fine-tuning is only for SOG-XT containers",
-        ),
     ):
         with pytest.raises(UnsupportedError, match=message):
             call()
