@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from kissgs.evaluation.results import Evaluation
     from kissgs.finetuning.result import FinetuneReport
     from kissgs.io.ply import PlyInfo, read_ply_info
+    from kissgs.pipeline.containers import check_container
     from kissgs.pipeline.inspect import SceneInfo, read_scene_info
     from kissgs.pipeline.pipeline import Compressed, compact, compress, decompress
     from kissgs.pipeline.report import Report
@@ -76,6 +77,7 @@ _HOMES = {
     "View": "cameras.views",
     "Views": "cameras.views",
     "WeightedCameras": "rendering.sensitivity",
+    "check_container": "pipeline.containers",
     "clean": "core.splats",
     "compact": "pipeline.pipeline",
     "compress": "pipeline.pipeline",
@@ -125,6 +127,7 @@ __all__ = [
     "Views",
     "WeightedCameras",
     "__version__",
+    "check_container",
     "clean",
     "compact",
     "compress",

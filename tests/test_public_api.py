@@ -42,6 +42,7 @@ PUBLIC = [
     "Views",
     "WeightedCameras",
     "__version__",
+    "check_container",
     "clean",
     "compact",
     "compress",

@@ -17,7 +17,8 @@ from kissgs.core.progress import Progress, SearchNote, as_stage, ignore_stop_sea
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats
 from kissgs.core.timing import StageTimer, peak_memory
-from kissgs.pipeline.containers import FILES, ContainerName, check_container, named_container
+from kissgs.io.container_names import ContainerName, named_container
+from kissgs.pipeline.containers import FILES, check_container
 from kissgs.pipeline.report import Report
 from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, save_ply
 from kissgs.rendering.rasterizer import Device

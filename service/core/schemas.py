@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 import kissgs
 
+from .formats import DEFAULT, Format
 from .models import NOTE_CHARS, State
 from .problems import Problem
 
@@ -29,10 +30,15 @@ class JobOptions(kissgs.Settings):
                 {"preset": "small", "encode": {"seed": 7}},
                 {"compact": {"ratio": 0.2}},
                 {"finetune": {"enabled": True}},
+                {"format": "sog"},
             ]
         },
     )
 
+    format: Format = Field(
+        DEFAULT,
+        description="Format of the container: sog-xt (.zip), or sog, which other viewers open (.sog, SOG version 2).",
+    )
     evaluate: bool = Field(
         False, description="Also render both scenes and compare the images (PSNR, SSIM), which takes longer."
     )

@@ -13,6 +13,8 @@ from anyio.to_thread import run_sync
 from pydantic import ValidationError
 from starlette.requests import Request
 
+import kissgs
+
 from ..core.disk_estimates import checkpoint_bytes
 from ..core.models import Job
 from ..core.presets import can_train
@@ -108,7 +110,8 @@ def parse_options(text: str | bytes) -> JobOptions:
     """Parse options from JSON.
 
     Raises:
-        ProblemError: they are invalid; the problem lists every invalid field.
+        ProblemError: they are invalid; the problem lists every invalid field. Or they cannot be met in this format, or
+            on this server.
     """
     try:
         options = JobOptions.model_validate_json(text)
@@ -117,6 +120,10 @@ def parse_options(text: str | bytes) -> JobOptions:
         raise ProblemError(
             "invalid-request", f"the options are invalid: {named}; GET /v1/presets lists all settings", errors=found
         ) from error
+    try:
+        kissgs.check_container(options.format, options)
+    except kissgs.KissgsError as error:
+        raise ProblemError(error.code, str(error)) from error
     if options.trains and not can_train():
         raise ProblemError(
             "invalid-request",
