@@ -121,7 +121,7 @@ async function openAddressed(load) {
 async function openFile(name, bytes, load) {
   const size = bytes.length; // reading it may take the bytes away
   load.signal.throwIfAborted();
-  const gaussians = await readable(view.showFile(name, bytes));
+  const gaussians = await readable(name, view.showFile(name, bytes));
   shown = null;
   setTitle(name);
   byId("statistics").replaceChildren(...fileStatisticsView(gaussians, size));
@@ -131,22 +131,25 @@ async function openFile(name, bytes, load) {
   announce(`${name}: ${count(gaussians)} Gaussians.`);
 }
 
-/** @param {Uint8Array} bytes */
-async function compareWith(bytes) {
+/** @param {string} name @param {Uint8Array} bytes */
+async function compareWith(name, bytes) {
   if (!shown) return;
-  await readable(view.compare(bytes));
+  await readable(name, view.compare(bytes));
   shown.source.originalBytes ??= bytes.length;
   byId("statistics").replaceChildren(...statisticsView({ ...shown.source, ...shown }));
   labelCompare();
   announce("Original to the left, compressed to the right of the handle.");
 }
 
-/** Replace errors of reading a .ply or .sog by a message. @template T @param {Promise<T>} reading */
-const readable = (reading) =>
+/**
+ * Replace errors of reading a .ply or .sog by a message.
+ * @template T @param {string} name @param {Promise<T>} reading
+ */
+const readable = (name, reading) =>
   reading.catch((error) => {
     throw error instanceof UserError
       ? error
-      : new UserError("This file cannot be read: it holds no Gaussians, or is damaged.");
+      : new UserError(`${name} cannot be read: it holds no Gaussians, or is damaged.`);
   });
 
 function labelCompare() {
@@ -157,7 +160,8 @@ function labelCompare() {
 async function pressCompare() {
   const original = shown?.source.original;
   if (view.comparing) view.endComparison();
-  else if (original) await during("Loading the original", async (load) => compareWith(await download(original, load)));
+  else if (original)
+    await during("Loading the original", async (load) => compareWith("The original", await download(original, load)));
   else pick(".ply");
   labelCompare();
 }
@@ -173,7 +177,7 @@ async function take(files) {
   if (!other) return;
   await during(`Reading ${other.name}`, async (load) => {
     const bytes = new Uint8Array(await other.arrayBuffer());
-    await (shown && /\.ply$/i.test(other.name) ? compareWith(bytes) : openFile(other.name, bytes, load));
+    await (shown && /\.ply$/i.test(other.name) ? compareWith(other.name, bytes) : openFile(other.name, bytes, load));
   });
 }
 

@@ -59,7 +59,8 @@ def for_each_input(
         except KissgsError as error:
             failed = True
             reports.append({"input": name, "error": {"code": error.code, "message": str(error)}})
-            where = "" if Path(name).name in str(error) else f"{name}: "  # files of a container have names of their own
+            named = name[:100] in str(error) or Path(name).name in str(error)
+            where = "" if named else f"{name}: "  # files of a container have names of their own
             sys.stderr.write(f"kissgs: {where}{error}\n")
     if as_json:
         print_json(reports)
