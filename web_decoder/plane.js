@@ -8,15 +8,18 @@ import { crc32 } from "./zip.js";
 /** Offset of the size in a lossless WebP file whose only chunk is the image, and bits per side; alpha is the next bit. */
 const [SIZE_OFFSET, SIDE_BITS] = [21, 14];
 
+/** First byte of a PNG. */
+const PNG = 0x89;
+
 /**
  * Decode an image in JavaScript, and check its size and checksum.
  * @param {Task} task
- * @returns {Plane}
+ * @returns {Promise<Plane>}
  */
-export function decodePlane({ file, bytes, width, height, checksum }) {
+export async function decodePlane({ file, bytes, pixels, width, height, png, checksum }) {
   try {
-    const plane = decodeWebP(bytes, { maxPixels: width * height });
-    if (plane.width !== width || plane.height !== height) {
+    const plane = png && bytes[0] === PNG ? await decodePng(bytes, pixels) : decodeWebP(bytes, { maxPixels: pixels });
+    if (width !== undefined && (plane.width !== width || plane.height !== height)) {
       throw new Error(`${plane.width} x ${plane.height} pixels, not ${width} x ${height}`);
     }
     if (checksum !== undefined && crc32(plane.rgba) !== checksum) {
@@ -28,6 +31,13 @@ export function decodePlane({ file, bytes, width, height, checksum }) {
   }
 }
 
+/** Load the decoder of PNG, which few containers need. @type {(bytes: Uint8Array, maxPixels: number) => Promise<Plane>} */
+async function decodePng(bytes, maxPixels) {
+  const png = await import("./png.js");
+  if (!png.isPng(bytes)) throw new Error("not a WebP file");
+  return png.decodePng(bytes, maxPixels);
+}
+
 /**
  * Decode an image by the browser, if it has a checksum that verifies the result and no alpha, which browsers would
  * premultiply; undefined if that is not possible.
@@ -35,8 +45,8 @@ export function decodePlane({ file, bytes, width, height, checksum }) {
  * @returns {Promise<Plane | undefined>}
  */
 export async function decodeNatively({ bytes, width, height, checksum, native }) {
-  if (!native || checksum === undefined || !("ImageDecoder" in globalThis) || bytes.length < SIZE_OFFSET + 4)
-    return undefined;
+  if (!native || checksum === undefined || !width || !height) return undefined;
+  if (!("ImageDecoder" in globalThis) || bytes.length < SIZE_OFFSET + 4) return undefined;
   const header = new DataView(bytes.buffer, bytes.byteOffset).getInt32(SIZE_OFFSET, true);
   if (header !== ((width - 1) | ((height - 1) << SIDE_BITS))) return undefined;
   const data = /** @type {Uint8Array<ArrayBuffer>} */ (bytes);
