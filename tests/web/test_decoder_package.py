@@ -139,7 +139,7 @@ def test_package():
 
 
 def test_imports_of_the_installed_package(tmp_path):
-    """The installed package exports ``kissgs``, ``kissgs/sog`` and ``kissgs/webp``; internal files cannot be imported."""
+    """The package exports ``kissgs``, ``kissgs/sog`` and ``kissgs/webp``; internal files cannot be imported."""
     package = tmp_path / "node_modules" / "kissgs"
     package.mkdir(parents=True)
     for name in [*json.loads((DECODER / "package.json").read_text())["files"], "package.json"]:
