@@ -3,7 +3,7 @@
 import { Pool } from "./pool.js";
 import { collect, openZip } from "./zip.js";
 
-/** @import { Options, Plane, Scene } from "./types.js" */
+/** @import { Options, Plane, Scene, Task } from "./types.js" */
 /** @typedef {(file: string, limit: number) => Promise<Uint8Array>} Read */
 /** @typedef {(received: number, total: number) => void} Count */
 
@@ -13,7 +13,8 @@ import { collect, openZip } from "./zip.js";
  * @property {Scene} scene
  * @property {string[]} files images in the order of decoding
  * @property {number} coarse number of images of a coarse rendering, which are downloaded before the others
- * @property {(file: string) => {pixels: number, width?: number, height?: number, png?: boolean, checksum?: number}} expect
+ * @property {(file: string) => {pixels: number, width?: number, height?: number, checksum?: number}} expect
+ * @property {(task: Task) => Promise<Plane> | undefined} [decode] decodes images of another kind than WebP
  * @property {(file: string, plane: Plane) => void} put
  */
 
@@ -75,7 +76,8 @@ export async function load(source, options, { name, images, Failure, assemble })
       if (i >= coarse) await Promise.all(arriving.slice(0, coarse)).catch(() => {});
       arriving[i] = read(file, 4096 + 5 * expected.pixels); // lossless images take at most 4 bytes per pixel
       const bytes = await arriving[i];
-      const plane = await pool.decode({ file, bytes, native, ...expected });
+      const task = { file, bytes, native, ...expected };
+      const plane = await (assembly.decode?.(task) ?? pool.decode(task));
       if (i) await loads[0];
       aborting.throwIfAborted();
       scene.sizes[file] = bytes.length;

@@ -8,17 +8,14 @@ import { crc32 } from "./zip.js";
 /** Offset of the size in a lossless WebP file whose only chunk is the image, and bits per side; alpha is the next bit. */
 const [SIZE_OFFSET, SIDE_BITS] = [21, 14];
 
-/** First byte of a PNG. */
-const PNG = 0x89;
-
 /**
  * Decode an image in JavaScript, and check its size and checksum.
  * @param {Task} task
- * @returns {Promise<Plane>}
+ * @returns {Plane}
  */
-export async function decodePlane({ file, bytes, pixels, width, height, png, checksum }) {
+export function decodePlane({ file, bytes, pixels, width, height, checksum }) {
   try {
-    const plane = png && bytes[0] === PNG ? await decodePng(bytes, pixels) : decodeWebP(bytes, { maxPixels: pixels });
+    const plane = decodeWebP(bytes, { maxPixels: pixels });
     if (width !== undefined && (plane.width !== width || plane.height !== height)) {
       throw new Error(`${plane.width} x ${plane.height} pixels, not ${width} x ${height}`);
     }
@@ -29,13 +26,6 @@ export async function decodePlane({ file, bytes, pixels, width, height, png, che
   } catch (error) {
     throw new Error(`${file}: ${error instanceof Error ? error.message : error}`, { cause: error });
   }
-}
-
-/** Load the decoder of PNG, which few containers need. @type {(bytes: Uint8Array, maxPixels: number) => Promise<Plane>} */
-async function decodePng(bytes, maxPixels) {
-  const png = await import("./png.js");
-  if (!png.isPng(bytes)) throw new Error("not a WebP file");
-  return png.decodePng(bytes, maxPixels);
 }
 
 /**

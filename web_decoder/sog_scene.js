@@ -1,8 +1,9 @@
 /** Conversion of the decoded images of a SOG container to the arrays of a scene, see docs/reference/formats.md of kissgs. */
 
 import { COEFFICIENTS, MAX_SIGNED_LOG, META, parseMeta, positionOf } from "./container.js";
+import { decodePng, isPng } from "./png.js";
 
-/** @import { Attribute, Plane, Scene } from "./types.js" */
+/** @import { Attribute, Plane, Scene, Task } from "./types.js" */
 
 /** @type {(why: string) => never} */
 const fail = (why) => {
@@ -160,7 +161,12 @@ export class SogAssembly {
   expect(file) {
     const { contents, count, degree } = this.scene;
     const most = contents[file][0] === "centroids" ? MAX_ENTRIES * COEFFICIENTS[degree] : 4 * count + FREE_PIXELS;
-    return { pixels: most, png: true };
+    return { pixels: most };
+  }
+
+  /** Decode a PNG, which few containers have, in the caller's thread. @param {Task} task */
+  decode({ file, bytes, pixels }) {
+    return isPng(bytes) ? decodePng(bytes, pixels).catch((error) => fail(`${file}: ${error.message}`)) : undefined;
   }
 
   /**

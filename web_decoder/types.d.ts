@@ -104,8 +104,6 @@ export interface Task {
   pixels: number;
   width?: number;
   height?: number;
-  /** Whether it may be a PNG. */
-  png?: boolean;
   /** CRC-32 of the pixels. */
   checksum?: number;
   native: boolean;

@@ -2,9 +2,9 @@
 
 import { decodePlane } from "./plane.js";
 
-addEventListener("message", async ({ data: { task, port } }) => {
+addEventListener("message", ({ data: { task, port } }) => {
   try {
-    const plane = await decodePlane(task);
+    const plane = decodePlane(task);
     port.postMessage({ plane }, [plane.rgba.buffer]);
   } catch (error) {
     port.postMessage({ error: error instanceof Error ? error.message : String(error) });

@@ -182,6 +182,7 @@ class Limits(ApiModel):
     """Limits of the service; null means no limit."""
 
     formats: list[str] = Field(description="Supported formats of uploads.")
+    containers: list[Format] = Field(description="Formats of containers, for the option `format`.")
     max_upload_bytes: int
     max_header_bytes: int
     max_gaussians: int
@@ -237,7 +238,7 @@ class ProblemKind(ApiModel):
 
 
 class Version(ApiModel):
-    """Versions of the library and of the interface, and the container format."""
+    """Versions of the library and of the interface, and the default container format."""
 
     kissgs: str
     api: str

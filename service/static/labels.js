@@ -50,7 +50,7 @@ const PLANES = [
   [/^quat(ernion)?s\b/, "Rotations"],
   [/^scales\b/, "Scales"],
   [/^f_dc\b/, "Base colours"],
-  [/^sh0\b/, "Base colours and opacities"],
+  [/^sh0\b/, "Colours, opacities"],
   [/^opacities\b/, "Opacities"],
   [/^(f_rest|shN)_centroids\b/, "SH codebook"],
   [/^(f_rest|shN)_labels\b/, "SH labels"],

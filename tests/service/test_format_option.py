@@ -41,6 +41,10 @@ def test_the_names_are_those_of_the_library():
     assert JobOptions().format == "sog-xt"
 
 
+def test_the_limits_name_the_containers(service):
+    assert service.http.get("/v1/limits").json()["containers"] == ["sog-xt", "sog"]
+
+
 def test_the_result_is_the_library_s(service, job, local):
     assert job["options"]["format"] == "sog"
     answer = service.http.get(job["links"]["result"])

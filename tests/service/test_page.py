@@ -98,7 +98,7 @@ def test_the_choice_of_the_format(visit, service, tmp_path):
     assert newest(service)["options"]["format"] == "sog"
     assert page.locator(".facts > div", has_text="Format").inner_text().split("\n")[-1] == "SOG (.sog)"
     rows = page.locator("table.planes tbody th").all_inner_texts()
-    assert {"Base colours and opacities", "Rotations", "SH codebook", "SH labels", "Metadata"} <= set(rows)
+    assert {"Colours, opacities", "Rotations", "SH codebook", "SH labels", "Metadata"} <= set(rows)
     assert not [row for row in rows if "webp" in row]
     with page.expect_download() as download:
         page.get_by_role("link", name="Download container (.sog)").click()

@@ -47,7 +47,7 @@ def test_a_job(preview, service, job, container, decoded, tmp_path):
     assert f"{job['sizes']['container']:,}" in facts
     assert f"{job['sizes']['ratio']:.3g}×" in facts
     rows = page.locator(".bytes tbody th").all_inner_texts()
-    assert {"Base colours and opacities", "Rotations", "SH codebook", "SH labels", "Metadata"} <= set(rows)
+    assert {"Colours, opacities", "Rotations", "SH codebook", "SH labels", "Metadata"} <= set(rows)
     thumbs = page.locator(".thumb span").all_inner_texts()
     assert len(thumbs) == 7
     assert "Positions, high bytes" in thumbs
@@ -115,7 +115,7 @@ def test_pointing_at_planes(preview, service, job, decoded):
 @pytest.mark.parametrize("damaged", ["shN_centroids.webp", "quats.webp", "sh0.webp", "meta.json"])
 @pytest.mark.quick(1)
 def test_the_message_names_a_damaged_file(preview, service, job, decoded, damaged):
-    """What is intact is drawn, if there are positions."""
+    """The rest of the scene is drawn, if there are positions."""
     tab = preview()
 
     def respond(route):
@@ -151,14 +151,14 @@ def as_png(files):
 def test_files_of_other_encoders(preview, service):
     """Version 1, and PNG under other names, give the same picture as version 2 does."""
     tab = preview().open(service)
-    pictures = []
+    images = []
     for name, files in (("two", FILES), ("png", as_png(FILES)), ("one", FILES_V1)):
         tab.drop((f"{name}.sog", zip_of(files)))
         tab.page.get_by_role("heading", name=name, exact=True).wait_for()
-        pictures.append(tab.shown(65))
-    assert colours(pictures[0]) > 500
-    assert psnr(pictures[1], pictures[0]) > 60
-    assert psnr(pictures[2], pictures[0]) > 35  # other levels
+        images.append(tab.shown(65))
+    assert colours(images[0]) > 500
+    assert psnr(images[1], images[0]) > 60
+    assert psnr(images[2], images[0]) > 35  # other levels
 
 
 def test_an_unsuitable_file(preview, service):

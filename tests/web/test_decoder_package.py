@@ -12,7 +12,7 @@ from helpers.web_tools import DECODER, node, run_node
 import kissgs
 
 PARTS = ("webp.js", "sogxt.js", "container.js", "zip.js")
-MAX_BYTES = 12_000
+MAX_BYTES = 12_500
 
 AGREE = """
 import * as main from "./web_decoder/sogxt.js";

@@ -6,7 +6,7 @@ const NAMES = [
   [/^means_(bytes_1|u)\b/, "Positions, high bytes"],
   [/^means_(bytes_0|l)\b/, "Positions, low bytes"],
   [/^f_dc\b/, "Base colours"],
-  [/^sh0\b/, "Base colours and opacities"],
+  [/^sh0\b/, "Colours, opacities"],
   [/^opacities\b/, "Opacities"],
   [/^scales\b/, "Scales"],
   [/^quat(ernion)?s\b/, "Rotations"],
