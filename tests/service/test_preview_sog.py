@@ -149,7 +149,7 @@ def as_png(files):
 
 
 def test_files_of_other_encoders(preview, service):
-    """Version 1, and PNG under other names, give the same picture as version 2 does."""
+    """Version 1, and PNG under other names, give the same image as version 2 does."""
     tab = preview().open(service)
     images = []
     for name, files in (("two", FILES), ("png", as_png(FILES)), ("one", FILES_V1)):
