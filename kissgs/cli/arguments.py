@@ -11,6 +11,13 @@ ScenesArgument = Annotated[
     list[str], typer.Argument(metavar="FILE…", help="Files or glob patterns; '-' reads standard input.")
 ]
 FilesArgument = Annotated[list[str], typer.Argument(metavar="FILE…", help="Files or glob patterns.")]
+ContainerOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help="Container: sog-xt, or sog for other viewers. Default: sog if --output ends in .sog, else sog-xt.",
+    ),
+]
 PresetOption = Annotated[
     str, typer.Option("--preset", "-p", help="Trade-off of speed, size and quality: fast, balanced, small or paper.")
 ]

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from kissgs.cli.arguments import (
+    ContainerOption,
     ForceOption,
     JsonOption,
     LevelOption,
@@ -39,13 +40,7 @@ def compress(
             help="Output NAME.zip, NAME.sog, a folder, or '-' for standard output. Default: next to the scene.",
         ),
     ] = None,
-    container: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help="Container: sog-xt, or sog for other viewers. Default: sog if --output ends in .sog, else sog-xt.",
-        ),
-    ] = None,
+    container: ContainerOption = None,
     preset: PresetOption = "balanced",
     changes: SetOption = None,
     psnr: Annotated[
@@ -114,7 +109,7 @@ def compress(
     quiet: QuietOption = False,
 ) -> None:
     """Compress each scene into a SOG-XT container, or into SOG."""
-    from kissgs.pipeline.containers import ending_of, named_container
+    from kissgs.io.container_names import ending_of, named_container
     from kissgs.pipeline.pipeline import compress as run
     from kissgs.pipeline.read_options import ReadOptions
     from kissgs.training.checkpoint import delete_checkpoints

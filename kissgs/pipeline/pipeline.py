@@ -17,7 +17,8 @@ from kissgs.core.progress import Progress, SearchNote, as_stage, ignore_stop_sea
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats
 from kissgs.core.timing import StageTimer, peak_memory
-from kissgs.pipeline.containers import FILES, ContainerName, named_container
+from kissgs.io.container_names import ContainerName, named_container
+from kissgs.pipeline.containers import FILES
 from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.report import Report
 from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, save_ply

@@ -11,16 +11,15 @@ from kissgs.core.errors import InvalidSceneError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import clean
 from kissgs.io.atomic import reason_of
+from kissgs.io.container_names import CONTAINERS, ending_of
 from kissgs.io.packed_files import open_source
 from kissgs.io.ply import write_ply
-from kissgs.pipeline.containers import ContainerName, ending_of
 from kissgs.pipeline.pipeline import compress
 from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.scene_files import read_scene
 from kissgs.pipeline.scene_formats import recognise, scene_root
 from kissgs.sogxt.container import zip_bytes
 
-_CONTAINERS: tuple[ContainerName, ...] = ("sog-xt", "sog")
 _MAX_FILE_BYTES = 1 << 30
 _FILE_ENDINGS = (".webp", ".json", ".yaml", ".yml")
 
@@ -84,7 +83,7 @@ def page_container(
 def _as_container(source: Path | bytes) -> PageScene | None:
     """Return the zip of a container, None for other formats. The files of a folder are packed."""
     found = recognise(source)
-    kind = next((kind for kind in _CONTAINERS if kind == found), None)
+    kind = next((kind for kind in CONTAINERS if kind == found), None)
     if kind is None:
         return None
     root = scene_root(source) if isinstance(source, Path) else source
