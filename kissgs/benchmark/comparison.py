@@ -17,7 +17,7 @@ from kissgs.benchmark.roundtrip import isolated_roundtrip
 from kissgs.cameras.views import Views
 from kissgs.core.errors import KissgsError
 from kissgs.core.progress import Progress, silent
-from kissgs.pipeline.containers import ContainerName
+from kissgs.io.container_names import ContainerName
 from kissgs.pipeline.scene_files import load, save
 from kissgs.settings import Settings
 

@@ -14,7 +14,7 @@ from kissgs.benchmark.external_codecs import ExternalResult
 from kissgs.benchmark.roundtrip import RoundTrip
 from kissgs.evaluation.attributes import AttributeErrors
 from kissgs.evaluation.results import Evaluation
-from kissgs.pipeline.containers import ContainerName, ending_of
+from kissgs.io.container_names import ContainerName, ending_of
 
 PsnrTarget = Literal["original", "photographs"]
 """The images that a PSNR compares with: renderings of the original scene, or photographs."""

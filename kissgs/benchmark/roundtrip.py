@@ -20,7 +20,7 @@ from kissgs.evaluation.attributes import AttributeErrors, attribute_errors
 from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.evaluate import compare_images
 from kissgs.evaluation.results import Evaluation
-from kissgs.pipeline.containers import ContainerName
+from kissgs.io.container_names import ContainerName
 from kissgs.pipeline.pipeline import compress, decompress
 from kissgs.pipeline.report import Report
 from kissgs.pipeline.scene_files import load

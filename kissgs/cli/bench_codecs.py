@@ -52,7 +52,7 @@ def codecs(
     from kissgs.benchmark.comparison_plots import comparison_plot
     from kissgs.benchmark.results import at_equal_psnr
     from kissgs.cli.bench_tables import bench_tables
-    from kissgs.pipeline.containers import named_container
+    from kissgs.io.container_names import named_container
 
     settings = _all_settings(presets, changes)
     curve_presets = _curve_presets(settings, only_balanced=not presets)
