@@ -45,7 +45,7 @@ class BenchmarkPlan:
     """
 
     presets: Sequence[Settings]
-    containers: Sequence[ContainerName] = ("sog-xt",)
+    containers: Sequence[ContainerName] = ("sogxt",)
     curve_presets: Sequence[Settings] = ()
     quality_offsets: Sequence[float] = ()
     external_codecs: Sequence[str] = ()

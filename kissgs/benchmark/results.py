@@ -93,7 +93,7 @@ class Measurement:
 
     scene: str
     codec: str
-    container: ContainerName | None = "sog-xt"
+    container: ContainerName | None = "sogxt"
     quality_offset_db: float | None = None
     gaussians: int
     file_bytes: Mapping[str, int]
@@ -220,7 +220,7 @@ def curves(rows: Iterable[Measurement]) -> list[tuple[str, ContainerName]]:
 
 def curve_name(preset: str, container: ContainerName) -> str:
     """Return the name of a preset in a container: only containers other than SOG-XT are named."""
-    return preset if container == "sog-xt" else f"{preset} {ending_of(container)}"
+    return preset if container == "sogxt" else f"{preset} {ending_of(container)}"
 
 
 def rate_curve(rows: Sequence[Measurement], preset: str, container: ContainerName, target: PsnrTarget) -> RateCurve:

@@ -15,7 +15,7 @@ ContainerOption = Annotated[
     str | None,
     typer.Option(
         metavar="NAME",
-        help="Container: sog-xt, or sog for other viewers. Default: sog if --output ends in .sog, else sog-xt.",
+        help="Container: sogxt, or sog for other viewers. Default: sog if --output ends in .sog, else sogxt.",
     ),
 ]
 PresetOption = Annotated[

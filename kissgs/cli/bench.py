@@ -33,7 +33,7 @@ def codecs(
     changes: SetAllOption = None,
     containers: Annotated[
         list[str] | None,
-        typer.Option("--container", help="Container of the presets, sog-xt or sog; repeatable. Default: sog-xt."),
+        typer.Option("--container", help="Container of the presets, sogxt or sog; repeatable. Default: sogxt."),
     ] = None,
     external_codecs: Annotated[
         list[str] | None,

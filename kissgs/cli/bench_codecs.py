@@ -60,7 +60,7 @@ def codecs(
         raise UnsupportedError("--quality-offset needs a preset with rate-distortion planning: balanced or small")
     plan = BenchmarkPlan(
         presets=settings,
-        containers=list(dict.fromkeys(named_container(name, None) for name in containers)) or ["sog-xt"],
+        containers=list(dict.fromkeys(named_container(name, None) for name in containers)) or ["sogxt"],
         curve_presets=curve_presets,
         quality_offsets=quality_offsets,
         external_codecs=external.formats,

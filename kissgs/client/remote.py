@@ -93,7 +93,7 @@ class Remote:
             source: the scene: ``.ply``, ``.sog``, ``.spz``, ``.splat``, ``.ksplat`` or ``.glb``.
             destination: the ``.zip`` or ``.sog`` file to write, atomically.
             settings: None for the preset ``balanced``.
-            container: ``"sog-xt"`` or ``"sog"``; by default SOG if ``destination`` ends in ``.sog``, else SOG-XT.
+            container: ``"sogxt"`` or ``"sog"``; by default SOG if ``destination`` ends in ``.sog``, else SOG-XT.
             evaluate: whether the service also compares rendered images.
             overwrite: whether to replace ``destination`` if it exists.
             progress: receives "upload", "queue", the stages of the service, "download", and "wait for server". An
@@ -133,7 +133,7 @@ class Remote:
         source: str | PathLike[str],
         *,
         settings: Settings | None = None,
-        container: ContainerName = "sog-xt",
+        container: ContainerName = "sogxt",
         evaluate: bool = False,
         progress: Progress = silent,
     ) -> dict[str, Any]:
@@ -142,7 +142,7 @@ class Remote:
         Args:
             source: the scene: ``.ply``, ``.sog``, ``.spz``, ``.splat``, ``.ksplat`` or ``.glb``.
             settings: None for the preset ``balanced``.
-            container: ``"sog-xt"`` or ``"sog"``.
+            container: ``"sogxt"`` or ``"sog"``.
             evaluate: whether the service also compares rendered images.
             progress: receives "upload" and "wait for server".
 

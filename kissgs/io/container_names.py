@@ -7,12 +7,12 @@ from typing import Literal, get_args
 
 from kissgs.core.errors import UnsupportedError
 
-ContainerName = Literal["sog-xt", "sog"]
+ContainerName = Literal["sogxt", "sog"]
 """SOG-XT, the default, or SOG of version 2, which other viewers open."""
 
 CONTAINERS: tuple[ContainerName, ...] = get_args(ContainerName)
 
-ENDINGS: dict[str, ContainerName] = {".zip": "sog-xt", ".sog": "sog"}
+ENDINGS: dict[str, ContainerName] = {".zip": "sogxt", ".sog": "sog"}
 """Container of a file by its ending."""
 
 
@@ -29,7 +29,7 @@ def named_container(requested: str | None, destination: Path | None) -> Containe
     """
     by_ending = None if destination is None else ENDINGS.get(destination.suffix.lower())
     if requested is None:
-        return by_ending or "sog-xt"
+        return by_ending or "sogxt"
     for name in CONTAINERS:
         if requested == name:
             if by_ending not in (None, name):

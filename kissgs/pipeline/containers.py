@@ -16,13 +16,13 @@ from kissgs.sogxt import encode as sogxt
 from kissgs.sogxt import names
 from kissgs.sogxt.decode import decode as decode_sogxt
 
-MODELS: dict[ContainerName, ContainerModel] = {"sog-xt": EVEN_LEVELS, "sog": SOG}
+MODELS: dict[ContainerName, ContainerModel] = {"sogxt": EVEN_LEVELS, "sog": SOG}
 """Model of each container for the planner."""
 
-DECODERS = {"sog-xt": decode_sogxt, "sog": decode_sog}
+DECODERS = {"sogxt": decode_sogxt, "sog": decode_sog}
 """Decoder of each container."""
 
-FILES: dict[ContainerName, tuple[str, ...]] = {"sog-xt": names.FILES, "sog": sog.FILES}
+FILES: dict[ContainerName, tuple[str, ...]] = {"sogxt": names.FILES, "sog": sog.FILES}
 """Names of all files that a container may have."""
 
 

@@ -100,7 +100,7 @@ def read_scene_info(path: Path, *, name: str | None = None) -> SceneInfo:
     if kind == "splat":
         return SceneInfo(format=kind, count=count_splat(path), sh_degree=0)
     found: PlyInfo | SpzInfo | KsplatInfo | GltfInfo | SogFacts | Info
-    if kind == "sog-xt":
+    if kind == "sogxt":
         found = _describe_sogxt(path)
     elif kind == "sog":
         found = sog_facts(scene_root(path))
@@ -126,7 +126,7 @@ def describe(path: Path, reading: ReadOptions = DEFAULT_READ_OPTIONS) -> Info:
         KissgsError: the file is not a usable scene or container.
     """
     kind = recognise(path)
-    if kind == "sog-xt":
+    if kind == "sogxt":
         return _describe_sogxt(path)
     if kind == "sog" or kind == "streamed-sog":
         return _describe_sog(path, kind, reading.level)
@@ -202,7 +202,7 @@ def _describe_sogxt(path: Path) -> Info:
     made = layout.provenance
     return Info(
         path=str(path),
-        kind="sog-xt",
+        kind="sogxt",
         count=count,
         sh_degree=layout.sh_degree,
         bytes=sum(parts.values()) if root.is_dir() else path.stat().st_size,

@@ -45,14 +45,14 @@ class Compressed:
         order: ``(M,)`` index in the cleaned scene of each Gaussian of the container, in the container's order.
         report: sizes, counts, errors, times and settings.
         checkpoints: files of compaction and fine-tuning that still exist because no destination was given.
-        container: "sog-xt" or "sog".
+        container: "sogxt" or "sog".
     """
 
     files: Mapping[str, bytes]
     order: Int[np.ndarray, " M"]
     report: Report
     checkpoints: tuple[Path, ...] = ()
-    container: ContainerName = "sog-xt"
+    container: ContainerName = "sogxt"
 
     def to_zip(self) -> bytes:
         """Return the container as the bytes of a zip."""
@@ -164,7 +164,7 @@ def compress(
             compacted first, see :func:`kissgs.compact`; if their group ``finetune`` is ``enabled``, the levels are then
             fine-tuned on the photographs of ``views``, or on renderings of the scene.
         reading: options for a ``source`` that is a file.
-        container: ``"sog-xt"``, or ``"sog"`` for the files of SOG 2, which other viewers open; by default SOG if
+        container: ``"sogxt"``, or ``"sog"`` for the files of SOG 2, which other viewers open; by default SOG if
             ``destination`` ends in ``.sog``, else SOG-XT.
         sensitivity: sensitivity of a clean ``source`` (:func:`kissgs.measure_sensitivity`); by default it is measured
             if the settings need it.

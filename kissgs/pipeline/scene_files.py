@@ -141,7 +141,7 @@ def read_scene(
         return streamed.decode(root, level=reading.level, max_gaussians=most, threads=threads, progress=progress)
     if found == "sog":
         return decode_sog(root, max_gaussians=most, threads=threads, progress=progress)
-    if found == "sog-xt" or (only_containers and found == "ply") or isinstance(source, Mapping):
+    if found == "sogxt" or (only_containers and found == "ply") or isinstance(source, Mapping):
         return decode_sogxt(root, max_gaussians=most, threads=threads, progress=progress)
     if found == "spz":
         return read_spz(source, max_gaussians=most, raw_axes=reading.raw_axes, progress=progress)

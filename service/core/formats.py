@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-Format = Literal["sog-xt", "sog"]
+Format = Literal["sogxt", "sog"]
 """Names of the library's containers."""
 
-DEFAULT: Format = "sog-xt"
+DEFAULT: Format = "sogxt"
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class ContainerFile:
 
 
 CONTAINER_FILES: dict[Format, ContainerFile] = {
-    "sog-xt": ContainerFile(".zip", "application/zip"),
+    "sogxt": ContainerFile(".zip", "application/zip"),
     "sog": ContainerFile(".sog", "application/octet-stream"),
 }
 

@@ -37,7 +37,7 @@ class JobOptions(kissgs.Settings):
 
     format: Format = Field(
         DEFAULT,
-        description="Format of the container: sog-xt (.zip), or sog, which other viewers open (.sog, SOG version 2).",
+        description="Format of the container: sogxt (.zip), or sog, which other viewers open (.sog, SOG version 2).",
     )
     evaluate: bool = Field(
         False, description="Also render both scenes and compare the images (PSNR, SSIM), which takes longer."

@@ -6,7 +6,7 @@ import { byId } from "./dom.js";
 
 /** Formats by the service's names of them, the default first. @type {Record<string, Format>} */
 const FORMATS = {
-  "sog-xt": {
+  sogxt: {
     title: "SOG-XT",
     ending: ".zip",
     note: "The container of kissgs, for its viewer and its decoder.",

@@ -47,7 +47,7 @@ def measured(
     *,
     photo=None,
     quality_offset_db=None,
-    container="sog-xt",
+    container="sogxt",
     external=False,
     runs=None,
     gaussians=30,

@@ -57,7 +57,7 @@ def test_all_commands_read_what_decompress_reads(name, tmp_path):
     wanted = decompress(FORMS["plain.zip"])
     for found in (decompress(path), decompress(FORMS[name]), kissgs.load(path)):
         np.testing.assert_array_equal(found.means, wanted.means)
-    assert (described := describe(path)).kind == "sog-xt"
+    assert (described := describe(path)).kind == "sogxt"
     assert described.count == len(wanted)
     assert open_scene(FORMS[name], ReadOptions(), 1, lambda *_: None)[2] == len(FORMS[name])
 
@@ -85,7 +85,7 @@ def test_evaluate_and_render_read_what_decompress_reads(tmp_path):
     program = tmp_path / "program.exe"
     program.write_bytes(FORMS["program.exe"])
     assert run("decompress", program, "-o", tmp_path / "a.ply").returncode == 0
-    assert json.loads(run("info", program, "--json").stdout)["kind"] == "sog-xt"
+    assert json.loads(run("info", program, "--json").stdout)["kind"] == "sogxt"
     done = run("evaluate", tmp_path / "a.ply", program, "--json")
     assert json.loads(done.stdout)["bytes"]["candidate"] == len(FORMS["program.exe"])
     assert run("render", program, "-o", tmp_path / "a.png", "--size", "64x48").returncode == 0

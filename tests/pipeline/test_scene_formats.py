@@ -103,8 +103,8 @@ def test_folders_of_sog_xt_stay_what_they_are(tmp_path):
     packed.save(tmp_path / "folder")
     only_json = {name: data for name, data in packed.files.items() if not name.endswith(".yaml")}
     for source in (tmp_path / "folder", packed.to_zip(), packed.files, only_json, zip_of(only_json)):
-        assert recognise(source) == "sog-xt"
-    assert recognise(tmp_path / "folder/meta.json") == "sog-xt"
+        assert recognise(source) == "sogxt"
+    assert recognise(tmp_path / "folder/meta.json") == "sogxt"
     assert len(kissgs.load(tmp_path / "folder/meta.json")) == len(kissgs.decompress(only_json))
 
 

@@ -35,11 +35,11 @@ def job(service):
 def test_the_names_are_those_of_the_library():
     assert get_args(Format) == CONTAINERS == tuple(CONTAINER_FILES)
     assert {file.ending: name for name, file in CONTAINER_FILES.items()} == ENDINGS
-    assert JobOptions().format == "sog-xt"
+    assert JobOptions().format == "sogxt"
 
 
 def test_the_limits_name_the_containers(service):
-    assert service.http.get("/v1/limits").json()["containers"] == ["sog-xt", "sog"]
+    assert service.http.get("/v1/limits").json()["containers"] == ["sogxt", "sog"]
 
 
 def test_the_result_is_the_library_s(service, job, local):
@@ -71,7 +71,7 @@ def test_the_files_and_the_decoded_scene(service, job, local, tmp_path):
     ("options", "ending", "media_type"),
     [
         (FAST, ".zip", "application/zip"),
-        (json.dumps({"preset": "fast", "format": "sog-xt"}), ".zip", "application/zip"),
+        (json.dumps({"preset": "fast", "format": "sogxt"}), ".zip", "application/zip"),
         (SOG, ".sog", "application/octet-stream"),
     ],
 )
@@ -91,7 +91,7 @@ def test_a_key_belongs_to_one_format(service):
     )
     problem(answer, 422, "key-reused")
     default = service.submit(**{"Idempotency-Key": "format-2"})
-    explicit = json.dumps({"preset": "fast", "format": "sog-xt"})
+    explicit = json.dumps({"preset": "fast", "format": "sogxt"})
     assert service.submit(options=explicit, **{"Idempotency-Key": "format-2"})["id"] == default["id"]
 
 
@@ -101,12 +101,12 @@ def test_fingerprints_include_the_format():
     assert len(fingerprints) == len(CONTAINERS)
 
 
-@pytest.mark.parametrize("value", ["spz", "sogxt", "SOG", "", None, 3, ["sog"]])
+@pytest.mark.parametrize("value", ["spz", "sog-xt", "SOG", "", None, 3, ["sog"]])
 def test_other_formats_are_refused(service, value):
     answer = service.http.post("/v1/jobs", content=SMALL, params={"options": json.dumps({"format": value})})
     found = problem(answer, 422, "invalid-request")
     assert "format" in found["detail"]
-    assert "'sog-xt' or 'sog'" in str(found["errors"])
+    assert "'sogxt' or 'sog'" in str(found["errors"])
 
 
 def test_jobs_of_both_formats_survive_a_restart(start):

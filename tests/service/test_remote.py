@@ -273,5 +273,5 @@ def test_the_ending_chooses_the_container(service, scene, tmp_path):
     with kissgs.Remote(service.url) as remote:
         assert remote.compress(scene, tmp_path / "b.sog", settings=FAST)["options"]["format"] == "sog"
         with pytest.raises(kissgs.UnsupportedError, match=r"end it in \.zip"):
-            remote.compress(scene, tmp_path / "c.sog", settings=FAST, container="sog-xt")
+            remote.compress(scene, tmp_path / "c.sog", settings=FAST, container="sogxt")
     assert (tmp_path / "b.sog").read_bytes() == expected

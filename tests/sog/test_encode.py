@@ -206,7 +206,7 @@ def test_a_folder_holds_the_same_files(tmp_path):
 def test_what_cannot_be_written_is_refused(tmp_path):
     scene, fast = random_scene(5), Settings(preset="fast")
     for call, message in (
-        (lambda: compress(scene, container="ply"), "there is no container 'ply'; choose one of sog-xt, sog"),
+        (lambda: compress(scene, container="ply"), "there is no container 'ply'; choose one of sogxt, sog"),
         (lambda: compress(scene, tmp_path / "a.zip", container="sog"), r"end it in \.sog"),
         (lambda: compress(scene, settings=fast).save(tmp_path / "a.sog"), r"end it in \.zip"),
         (lambda: compress(scene.select([]), settings=fast, container="sog"), "without visible Gaussians"),
@@ -227,4 +227,4 @@ def test_the_command_line_writes_sog_by_ending_or_by_name(tmp_path):
     piped = run("compress", tmp_path / "a.ply", "-p", "fast", "-q", "--container", "sog", "-o", "-").stdout
     assert piped == (tmp_path / "one.sog").read_bytes()
     wrong = run("compress", tmp_path / "a.ply", "--container", "spz")
-    assert (wrong.returncode, b"choose one of sog-xt, sog" in wrong.stderr) == (2, True)
+    assert (wrong.returncode, b"choose one of sogxt, sog" in wrong.stderr) == (2, True)

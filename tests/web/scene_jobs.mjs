@@ -22,7 +22,7 @@ function sourceOf({ url, base64, as = "bytes" }) {
 }
 
 /** Perform one job; never rejects. */
-export async function perform({ format = "sog-xt", source, options = {}, abort, snapshots, throwAt }) {
+export async function perform({ format = "sogxt", source, options = {}, abort, snapshots, throwAt }) {
   const { decode, expandSH } = format === "sog" ? sog : sogxt;
   const report = { progress: [], order: [], snapshots: {} };
   const stop = new AbortController();
