@@ -55,7 +55,7 @@ def write_files(
         UnsupportedError: the scene has no Gaussian to store.
     """
     if not plan.grid.mask.any():
-        raise UnsupportedError("a SOG file cannot hold a scene without visible Gaussians; write a .zip instead")
+        raise UnsupportedError("a SOG file cannot hold a scene without visible Gaussians; write SOG-XT (.zip) instead")
 
     def report(fraction: float) -> None:
         progress("images", fraction)

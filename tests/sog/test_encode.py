@@ -124,6 +124,16 @@ def test_the_metadata_is_what_readers_ask_for():
         assert archive.getinfo("quats.webp").compress_type == zipfile.ZIP_STORED
 
 
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.quick(2)
+def test_few_gaussians_keep_their_own_view_dependent_colour(preset):
+    """Regression: a scene of fewer than 64 Gaussians had a codebook of one entry, or of one for seven."""
+    scene = random_scene(24, 3, seed=3)
+    result = encoded(scene, preset)
+    found = kissgs.decompress(result.files).shN
+    np.testing.assert_allclose(found, scene.select(result.order).shN, atol=np.ptp(scene.shN) / 60)
+
+
 def test_scenes_without_view_dependent_colour_have_no_codebook():
     result = encoded(random_scene(30, 0), "fast")
     assert "shN" not in json.loads(result.files["meta.json"])
