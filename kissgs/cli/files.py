@@ -98,8 +98,8 @@ def _targets(inputs: list[str], output: Path | None, suffix: str) -> list[Path]:
         return [output]
     if output is not None and "-" in inputs:
         raise OutputError(f"-o {output} is a folder, but standard input has no name; give -o NAME{suffix}")
-    if output is not None:
-        make_folder(output)
+    if output is not None and not is_folder(output):
+        _refuse_file_name(output, suffix)
     targets = []
     for name in inputs:
         stem = _stem(name)
@@ -109,7 +109,23 @@ def _targets(inputs: list[str], output: Path | None, suffix: str) -> list[Path]:
         targets.append(folder / (stem + (suffix or ".container")))
     if len(set(targets)) < len(targets):
         raise OutputError("two inputs have the same name and would become one file; process them one by one")
+    if output is not None:
+        make_folder(output)
     return targets
+
+
+def _refuse_file_name(folder: Path, suffix: str) -> None:
+    """Raise OutputError if the name of a folder to be made is that of a scene's file, which somebody expects there."""
+    from kissgs.pipeline.scene_output import SCENE_ENDINGS
+
+    if folder.suffix.lower() not in SCENE_ENDINGS:
+        return
+    if not suffix:
+        raise OutputError(f"{folder!s:.100} is the name of a file, but --unpacked writes folders; name a folder")
+    raise OutputError(
+        f"{folder!s:.100} has the ending of another format than {suffix}, which is written here; kissgs convert writes "
+        "others"
+    )
 
 
 def _ends_with(path: Path, suffix: str) -> bool:

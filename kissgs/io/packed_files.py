@@ -98,7 +98,7 @@ class ZipSource:
 
     def __init__(self, file: io.BufferedIOBase, label: str, root: str | None = None) -> None:
         if sniff_format(file) == "ply":
-            raise InvalidContainerError(f"{label} is a .ply, not a container; compress it first")
+            raise InvalidContainerError(f"{label} is a .ply, not a container; kissgs convert reads both")
         self._zip, entries = _open_zip(file, label, MAX_TREE_ENTRIES if root else MAX_ZIP_ENTRIES)
         self._flat = root is None
         paths = [(entry.filename.replace("\\", "/"), entry) for entry in entries]

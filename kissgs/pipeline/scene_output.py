@@ -9,6 +9,7 @@ from kissgs.core.errors import OutputError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats, clean
 from kissgs.io.compressed_ply import write_compressed
+from kissgs.io.container_names import ENDINGS
 from kissgs.io.gltf_writer import write_glb, write_spz_glb
 from kissgs.io.ply import write_ply
 from kissgs.io.scene_file import BinaryWriter
@@ -19,9 +20,7 @@ OutputFormat = Literal["ply", "compressed.ply", "spz", "splat", "glb", "spz.glb"
 OUTPUT_FORMATS: tuple[OutputFormat, ...] = ("ply", "compressed.ply", "spz", "splat", "glb", "spz.glb")
 """Formats that are written; each is the ending of its files without the first dot."""
 
-_CONTAINERS = (".zip", ".sog")
-
-SCENE_ENDINGS = (".ply", ".spz", ".splat", ".glb", ".ksplat", ".gltf", *_CONTAINERS)
+SCENE_ENDINGS = (".ply", ".spz", ".splat", ".glb", ".ksplat", ".gltf", *ENDINGS)
 """Endings that a folder for outputs does not have."""
 
 
@@ -35,7 +34,7 @@ def output_format(path: Path) -> OutputFormat:
     found = [kind for kind in OUTPUT_FORMATS if name.endswith(f".{kind}")]
     if found:
         return max(found, key=len)
-    if path.suffix.lower() in _CONTAINERS:
+    if path.suffix.lower() in ENDINGS:
         raise OutputError(f"{path!s:.100} is the name of a container; kissgs compress writes those")
     raise OutputError(
         f"{path!s:.100} has no ending of a format that is written: .{', .'.join(OUTPUT_FORMATS)}; choose one of them"

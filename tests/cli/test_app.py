@@ -160,6 +160,20 @@ def test_a_folder_as_output_means_into_it_for_one_file_as_for_many(scene: Path, 
     assert len(kissgs.load(tmp_path / "new" / "scene.container")) > 0
 
 
+def test_no_folder_gets_the_name_of_a_file(scene: Path, tmp_path: Path) -> None:
+    """Regression: compress -o a.spz made a folder a.spz, and wrote a SOG-XT container into it."""
+    for words in (["compress", "-o", "a.spz"], ["compress", "-o", "a.PLY"], ["decompress", "-o", "a.spz"]):
+        message = failure(words[0], scene, *words[1:], cwd=tmp_path)
+        assert f"{words[-1]} has the ending of another format than ." in message
+    assert "a.sog is the name of a file, but --unpacked" in failure(
+        "compress", scene, "-o", "a.sog", "--unpacked", cwd=tmp_path
+    )
+    assert "would become one file" in failure("compress", scene, scene, "-o", "new", cwd=tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == []
+    (tmp_path / "c.sog").mkdir()
+    assert run("compress", scene, "-o", tmp_path / "c.sog", "-p", "fast", "-q", "--unpacked").returncode == 0
+
+
 def test_names_are_printed_as_they_are(scene: Path, tmp_path: Path) -> None:
     """Regression: square brackets were parsed as rich markup."""
     done = run("compress", scene, "-o", tmp_path / "[red]x.zip", "-p", "fast")
