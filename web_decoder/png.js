@@ -65,7 +65,9 @@ function chunksOf(bytes) {
     const [start, end] = [at + 8, at + 8 + view.getUint32(at)];
     if (crc32(bytes.subarray(at + 4, end)) !== view.getUint32(end)) fail("damaged: it does not match its checksums");
     const kind = String.fromCharCode(...bytes.subarray(at + 4, start));
-    chunks.set(kind, [...(chunks.get(kind) ?? []), bytes.subarray(start, end)]);
+    const found = chunks.get(kind) ?? [];
+    chunks.set(kind, found);
+    found.push(bytes.subarray(start, end));
     at = end + 4;
   }
   return chunks;
