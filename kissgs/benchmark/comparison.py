@@ -12,7 +12,7 @@ from pathlib import Path
 from kissgs.benchmark.bd_rate import at_quality_offset
 from kissgs.benchmark.external_codecs import SPLAT_TRANSFORM, ExternalResult, check_external, measure_external
 from kissgs.benchmark.render_speed import resampled
-from kissgs.benchmark.results import Measurement, Run
+from kissgs.benchmark.results import Measurement, Run, curve_name
 from kissgs.benchmark.roundtrip import isolated_roundtrip
 from kissgs.cameras.views import Views
 from kissgs.core.errors import KissgsError
@@ -81,7 +81,13 @@ def compare(
         *product(plan.curve_presets, plan.quality_offsets, plan.containers),
     ]
     jobs: list[tuple[str, Callable[[], Measurement]]] = [
-        *((point[0].preset, partial(_measure_preset, scene, *point, plan)) for point in points),
+        *(
+            (
+                curve_name(str(settings.preset), container),
+                partial(_measure_preset, scene, settings, db, container, plan),
+            )
+            for settings, db, container in points
+        ),
         *((codec, partial(_measure_external, scene, codec, plan)) for codec in plan.external_codecs),
     ]
     rows = []

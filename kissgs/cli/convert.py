@@ -85,7 +85,8 @@ def convert(
 
 def _output_format(output: str, to: str | None) -> OutputFormat:
     """Return the format of the outputs: ``--to``, or what the ending of the output stands for."""
-    from kissgs.pipeline.scene_output import OUTPUT_FORMATS, SCENE_ENDINGS, output_format
+    from kissgs.io.container_names import ENDINGS, SCENE_ENDINGS
+    from kissgs.pipeline.scene_output import OUTPUT_FORMATS, output_format
 
     if to is None:
         if output == "-":
@@ -94,7 +95,7 @@ def _output_format(output: str, to: str | None) -> OutputFormat:
     wanted = next((kind for kind in OUTPUT_FORMATS if kind == to.lower().removeprefix(".")), None)
     if wanted is None:
         raise OutputError(f"--to {to[:40]} is no format that is written; choose {', '.join(OUTPUT_FORMATS)}")
-    if Path(output).suffix.lower() in SCENE_ENDINGS:
+    if Path(output).suffix.lower() in (*ENDINGS, *SCENE_ENDINGS):
         found = output_format(Path(output))
         if found != wanted:
             raise OutputError(f"{output[:100]} has the ending of {found}, but --to asks for {wanted}; choose one")

@@ -116,9 +116,9 @@ def _targets(inputs: list[str], output: Path | None, suffix: str) -> list[Path]:
 
 def _refuse_file_name(folder: Path, suffix: str) -> None:
     """Raise OutputError if the name of a folder to be made is that of a scene's file, which somebody expects there."""
-    from kissgs.pipeline.scene_output import SCENE_ENDINGS
+    from kissgs.io.container_names import ENDINGS, SCENE_ENDINGS
 
-    if folder.suffix.lower() not in SCENE_ENDINGS:
+    if folder.suffix.lower() not in (*ENDINGS, *SCENE_ENDINGS):
         return
     if not suffix:
         raise OutputError(f"{folder!s:.100} is the name of a file, but --unpacked writes folders; name a folder")

@@ -15,6 +15,9 @@ CONTAINERS: tuple[ContainerName, ...] = get_args(ContainerName)
 ENDINGS: dict[str, ContainerName] = {".zip": "sogxt", ".sog": "sog"}
 """Container of a file by its ending."""
 
+SCENE_ENDINGS = (".ply", ".spz", ".splat", ".ksplat", ".glb", ".gltf")
+"""Endings of scenes that are no containers."""
+
 
 def ending_of(container: ContainerName) -> str:
     """Return the ending of a container's files."""
@@ -25,9 +28,15 @@ def named_container(requested: str | None, destination: Path | None) -> Containe
     """Return the container to write: the requested one, else that of the destination's ending, else SOG-XT.
 
     Raises:
-        UnsupportedError: there is no such container, or the ending asks for another one.
+        UnsupportedError: there is no such container, or the ending is that of another one or of another format.
     """
-    by_ending = None if destination is None else ENDINGS.get(destination.suffix.lower())
+    ending = "" if destination is None else destination.suffix.lower()
+    if ending in SCENE_ENDINGS:
+        raise UnsupportedError(
+            f"{destination!s:.100} is not the name of a container: end it in .zip or .sog (kissgs convert writes "
+            "other formats)"
+        )
+    by_ending = ENDINGS.get(ending)
     if requested is None:
         return by_ending or "sogxt"
     for name in CONTAINERS:

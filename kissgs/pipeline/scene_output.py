@@ -20,9 +20,6 @@ OutputFormat = Literal["ply", "compressed.ply", "spz", "splat", "glb", "spz.glb"
 OUTPUT_FORMATS: tuple[OutputFormat, ...] = ("ply", "compressed.ply", "spz", "splat", "glb", "spz.glb")
 """Formats that are written; each is the ending of its files without the first dot."""
 
-SCENE_ENDINGS = (".ply", ".spz", ".splat", ".glb", ".ksplat", ".gltf", *ENDINGS)
-"""Endings that a folder for outputs does not have."""
-
 
 def output_format(path: Path) -> OutputFormat:
     """Return the format that the ending of a name stands for.

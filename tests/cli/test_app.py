@@ -162,9 +162,13 @@ def test_a_folder_as_output_means_into_it_for_one_file_as_for_many(scene: Path, 
 
 def test_no_folder_gets_the_name_of_a_file(scene: Path, tmp_path: Path) -> None:
     """Regression: compress -o a.spz made a folder a.spz, and wrote a SOG-XT container into it."""
-    for words in (["compress", "-o", "a.spz"], ["compress", "-o", "a.PLY"], ["decompress", "-o", "a.spz"]):
-        message = failure(words[0], scene, *words[1:], cwd=tmp_path)
-        assert f"{words[-1]} has the ending of another format than ." in message
+    for name in ("a.spz", "a.PLY", "a.glb"):
+        assert f"{name} is not the name of a container" in failure("compress", scene, "-o", name, cwd=tmp_path)
+    with pytest.raises(kissgs.UnsupportedError, match=r"end it in \.zip or \.sog"):
+        kissgs.compress(scene, tmp_path / "a.spz")
+    assert "a.spz has the ending of another format than .ply" in failure(
+        "decompress", scene, "-o", "a.spz", cwd=tmp_path
+    )
     assert "a.sog is the name of a file, but --unpacked" in failure(
         "compress", scene, "-o", "a.sog", "--unpacked", cwd=tmp_path
     )
