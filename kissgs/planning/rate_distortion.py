@@ -18,6 +18,7 @@ from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.layout import layout_grid
 from kissgs.planning.rd_fields import RdFields, decoded_scene, decoded_sh, largest_errors
 from kissgs.planning.rd_model import (
+    FEW,
     SEEN,
     SH_MEAN_SQUARE,
     CodebookErrorModel,
@@ -184,7 +185,7 @@ def _codebook_error_model(
     splats: Splats, kept: Int[np.ndarray, " M"], sensitivity: Sensitivity, settings: EncodeSettings, pool: Workers
 ) -> CodebookErrorModel:
     """Estimate the codebook's error from a small codebook for a sample of the Gaussians."""
-    if splats.sh_degree == 0 or len(kept) < 64:
+    if splats.sh_degree == 0 or len(kept) < FEW:
         return CodebookErrorModel()
     rng = np.random.Generator(np.random.PCG64(settings.seed))
     some = np.sort(rng.choice(kept, min(SAMPLE, len(kept)), replace=False))

@@ -35,6 +35,9 @@ LABEL_SHARE = 0.5
 QUICK = 1 << 13
 """Number of codebook entries that k-means finds in a few seconds."""
 
+FEW = 64
+"""Number of codebook entries that any scene may have: they take about 1 kB, and SOG-XT has no fewer."""
+
 DIMENSIONS = 14
 """Rounded degrees of freedom per Gaussian: opacity, scales, rotation, base colour, position."""
 
@@ -185,8 +188,11 @@ class CodebookErrorModel:
         """Return the optimal number of entries, of ``entry_bits`` each, for ``count`` Gaussians.
 
         Beyond :data:`QUICK` entries, which would take long to find, there are at least ``ratio`` Gaussians per entry.
+        Where no error is known, :data:`FEW` entries are right: k-means makes no more than the scene needs.
         """
-        low, high = 0.0, np.log(max(count / ratio, min(count / 2, QUICK), 2))
+        if self.weighted == 0:
+            return FEW
+        low, high = 0.0, np.log(max(count / ratio, min(count / 2, QUICK), FEW))
         for _ in range(50):
             middle = 0.5 * (low + high)
             size = np.exp(middle)

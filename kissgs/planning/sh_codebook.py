@@ -21,7 +21,7 @@ from kissgs.settings import EncodeSettings
 
 COEFFICIENTS = SH_REST_COUNTS[-1]
 MIN_SIDE = 8
-"""Smallest side of a codebook: 64 entries take about 1 kB, and scenes of few Gaussians need one each."""
+"""Smallest side of a codebook in SOG-XT."""
 
 WEIGHT_FLOOR, WEIGHT_CEILING = 0.1, 20.0
 """Bounds of weights, in units of the median, so that no Gaussian is ignored and none dominates."""
@@ -66,8 +66,8 @@ def fit_codebook(
         splats: the scene.
         chosen: indices of the Gaussians.
         weights: weight of each Gaussian's squared shN error.
-        size: largest number of entries; :data:`MIN_SIDE` squared are always allowed. In SOG-XT the image's side is a
-            multiple of 8 and unused entries repeat others; in SOG any number will do.
+        size: largest number of entries. In SOG-XT the image's side is a multiple of 8 and unused entries repeat
+            others; in SOG any number will do.
         settings: settings of the encoder.
         container: what the container can hold.
         pool: threads.
@@ -78,11 +78,11 @@ def fit_codebook(
         nothing = quantize(np.zeros((MIN_SIDE**2, 3 * COEFFICIENTS)), step=1)
         return Codebook(MIN_SIDE, nothing, np.zeros(max(len(chosen), 1), dtype=np.int32), half_steps(nothing))
     progress("codebook", 0.0)
-    most = max(min(size, settings.sh_codebook_size), MIN_SIDE**2)
+    most = min(size, settings.sh_codebook_size)
     clusters = kmeans.fit(
         splats.shN[chosen].reshape(len(chosen), dimensions),
         weights,
-        codebook_side(most) ** 2 if container.tables is None else round(most),
+        codebook_side(most) ** 2 if container.tables is None else max(round(most), 1),
         pool,
         kmeans.KMeansOptions(
             seed=settings.seed,

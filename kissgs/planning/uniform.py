@@ -23,6 +23,7 @@ from kissgs.planning.quantize import (
     quantize_means,
 )
 from kissgs.planning.rd_fields import largest_errors
+from kissgs.planning.rd_model import FEW
 from kissgs.planning.rotation_forms import canonicalize
 from kissgs.planning.sh_codebook import fit_codebook, size_weights
 from kissgs.settings import EncodeSettings
@@ -57,7 +58,7 @@ def plan_uniform(
     )
     chosen = cells[grid.mask]
     weights = size_weights(source, settings.sh_weight_power)[chosen]
-    size = len(chosen) / settings.gaussians_per_codebook_entry
+    size = max(len(chosen) / settings.gaussians_per_codebook_entry, FEW)
     codebook = fit_codebook(source, chosen, weights, size, settings, container, pool, progress)
     if container.tables is not None:
         values = np.concatenate([source.opacities[cells, None], scales, quats], axis=1).astype(np.float64)
