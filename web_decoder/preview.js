@@ -172,7 +172,14 @@ async function take(files) {
   const ply = files.find(isPly);
   if (container) {
     const source = { name: container.name.replace(/\.(zip|sog)$/i, ""), container, bytes: container.size };
-    await during(`Opening ${container.name}`, (load) => openContainer(source, load));
+    await during(`Opening ${container.name}`, async (load) => {
+      if (isOther(container)) {
+        throw new UserError(
+          `This page opens .zip, .sog and .ply. "kissgs view ${container.name}" shows other formats.`,
+        );
+      }
+      await openContainer(source, load);
+    });
   }
   if (!ply) return;
   await during(`Reading ${ply.name}`, async (load) => {
@@ -183,6 +190,9 @@ async function take(files) {
 
 /** Whether a file is read by Spark; all others are containers. @param {{name: string}} file */
 const isPly = ({ name }) => /\.ply$/i.test(name);
+
+/** Whether a file is a scene that the page does not read. @param {{name: string}} file */
+const isOther = ({ name }) => /\.(spz|splat|ksplat|glb|gltf)$/i.test(name);
 
 /** @param {string} accept */
 function pick(accept) {

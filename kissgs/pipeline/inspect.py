@@ -37,7 +37,7 @@ class Info:
     Attributes:
         path: path of the file or folder.
         kind: format of the scene.
-        count: Gaussians; of a streamed scene, those of its finest level and the environment.
+        count: Gaussians; of a streamed scene, those of one level and the environment.
         sh_degree: 0 to 3.
         bytes: size of the file or the folder.
         parts: bytes per file of a container, per container of a streamed scene; empty for other files.
