@@ -22,8 +22,8 @@ MODELS: dict[ContainerName, ContainerModel] = {"sogxt": EVEN_LEVELS, "sog": SOG}
 DECODERS = {"sogxt": decode_sogxt, "sog": decode_sog}
 """Decoder of each container."""
 
-FILES: dict[ContainerName, tuple[str, ...]] = {"sogxt": names.FILES, "sog": sog.FILES}
-"""Names of all files that a container may have."""
+FILES = frozenset({*names.FILES, *sog.FILES})
+"""Names of all files that containers may have: a folder with no others may be replaced by a container."""
 
 
 def write_files(

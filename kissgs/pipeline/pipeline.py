@@ -66,7 +66,7 @@ class Compressed:
             UnsupportedError: the ending is that of another container.
         """
         named_container(self.container, Path(path))
-        write_container(self.files, Path(path), overwrite=overwrite)
+        write_container(self.files, Path(path), overwrite=overwrite, names=FILES)
 
 
 def compact(
@@ -194,7 +194,7 @@ def compress(
     target = Path(destination) if destination is not None else None
     kind = named_container(container, target)
     if target is not None:
-        check_destination(target, overwrite=overwrite, names=FILES[kind])
+        check_destination(target, overwrite=overwrite, names=FILES)
     finetune_checkpoint = None
     if settings.finetune.enabled:
         check_finetuning(settings, views, device)
@@ -230,7 +230,7 @@ def compress(
     checkpoints = (None if compacted is None else compacted.checkpoint, finetune_checkpoint)
     if target is not None:
         after_search("write", 0.0)
-        write_container(encoded.files, target, overwrite=overwrite)
+        write_container(encoded.files, target, overwrite=overwrite, names=FILES)
         delete_checkpoints(*checkpoints)
     clock.stop()
     report = Report(

@@ -44,8 +44,16 @@ def is_packed(path: Path) -> bool:
     return path.suffix.lower() in (".zip", ".sog")
 
 
-def write_container(files: Mapping[str, bytes], path: Path, *, overwrite: bool = False) -> int:
+def write_container(
+    files: Mapping[str, bytes], path: Path, *, overwrite: bool = False, names: Collection[str] = ()
+) -> int:
     """Write a container atomically: a zip if the name ends in ``.zip`` or ``.sog``, else a folder.
+
+    Args:
+        files: the container's files.
+        path: the zip or the folder.
+        overwrite: replace what is there.
+        names: names that files of a folder to be replaced may have beside those of ``files``.
 
     Returns:
         Bytes written.
@@ -54,7 +62,7 @@ def write_container(files: Mapping[str, bytes], path: Path, *, overwrite: bool =
         OutputError: the path exists and ``overwrite`` is false, or the file system refuses. A folder is replaced only
             if it holds a container and nothing else.
     """
-    check_destination(path, overwrite=overwrite, names=files.keys())
+    check_destination(path, overwrite=overwrite, names={*files, *names})
     if is_packed(path):
         data = zip_bytes(files)
         with atomic_file(path, overwrite=overwrite) as file:

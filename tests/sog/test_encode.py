@@ -213,6 +213,18 @@ def test_a_folder_holds_the_same_files(tmp_path):
     assert len(kissgs.load(tmp_path / "folder")) == 9
 
 
+@pytest.mark.parametrize("first", [{"container": "sog"}, {"container": "sogxt"}])
+def test_a_folder_of_any_container_is_replaced(first, tmp_path):
+    """Regression: degree 0, which has no codebook, could not replace a higher degree, and said so after the work."""
+    folder, fast = tmp_path / "folder", Settings(preset="fast")
+    compress(random_scene(9, 2), folder, settings=fast, **first)
+    result = compress(random_scene(7), folder, settings=fast, container="sog", overwrite=True)
+    assert {path.name for path in folder.iterdir()} == set(result.files)
+    result.save(folder, overwrite=True)
+    compress(random_scene(9, 2), settings=fast, container="sogxt").save(folder, overwrite=True)
+    assert kissgs.load(folder).sh_degree == 2
+
+
 def test_what_cannot_be_written_is_refused(tmp_path):
     scene, fast = random_scene(5), Settings(preset="fast")
     for call, message in (
