@@ -123,8 +123,8 @@ def _refuse_file_name(folder: Path, suffix: str) -> None:
     if not suffix:
         raise OutputError(f"{folder!s:.100} is the name of a file, but --unpacked writes folders; name a folder")
     raise OutputError(
-        f"{folder!s:.100} has the ending of another format than {suffix}, which is written here; kissgs convert writes "
-        "others"
+        f"{folder!s:.100} has the ending of another format than {suffix}, which this command writes; use kissgs "
+        + ("compress" if folder.suffix.lower() in ENDINGS else "convert")
     )
 
 

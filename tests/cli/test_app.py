@@ -166,9 +166,9 @@ def test_no_folder_gets_the_name_of_a_file(scene: Path, tmp_path: Path) -> None:
         assert f"{name} is not the name of a container" in failure("compress", scene, "-o", name, cwd=tmp_path)
     with pytest.raises(kissgs.UnsupportedError, match=r"end it in \.zip or \.sog"):
         kissgs.compress(scene, tmp_path / "a.spz")
-    assert "a.spz has the ending of another format than .ply" in failure(
-        "decompress", scene, "-o", "a.spz", cwd=tmp_path
-    )
+    for name, command in (("a.spz", "convert"), ("a.sog", "compress")):
+        sentence = f"{name} has the ending of another format than .ply, which this command writes; use kissgs {command}"
+        assert sentence in failure("decompress", scene, "-o", name, cwd=tmp_path)
     assert "a.sog is the name of a file, but --unpacked" in failure(
         "compress", scene, "-o", "a.sog", "--unpacked", cwd=tmp_path
     )
