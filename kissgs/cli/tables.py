@@ -195,6 +195,8 @@ def _kind(info: Info) -> str:
         found = [details["encoding"], "compressed" if details["compressed"] else ""]
     elif info.kind == "sog":
         found = [f"version {details['version']}", details["model"] or "", details["generator"] or ""]
+    elif info.kind == "streamed-sog":
+        found = [f"level {details['level']} of 0 to {len(details['levels']) - 1}"]
     elif info.kind == "spz":
         found = [f"version {details['version']}", "antialiased" if details["antialiased"] else ""]
     elif info.kind == "ksplat":

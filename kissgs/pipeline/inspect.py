@@ -47,8 +47,9 @@ class Info:
             reason; empty for SOG, whose images are not decoded for this.
         details: encoding and whether it is PlayCanvas' compressed layout (``.ply``); side of grid and codebook, version
             and settings of the encoder (SOG-XT); version, variant of the renderer, generator and size of the codebook
-            (SOG); Gaussians per level and of the environment (streamed SOG); version, antialiasing and precision of
-            positions (``.spz``); compression level and sections (``.ksplat``); primitives and compression (glTF).
+            (SOG); the level that is described, and Gaussians per level and of the environment (streamed SOG); version,
+            antialiasing and precision of positions (``.spz``); compression level and sections (``.ksplat``); primitives
+            and compression (glTF).
     """
 
     path: str
@@ -63,8 +64,9 @@ class Info:
 
     @property
     def bits_per_gaussian(self) -> float:
-        """Bits of the whole file per Gaussian."""
-        return 8 * self.bytes / max(self.count, 1)
+        """Bits of the whole file per Gaussian; of a streamed scene, those of the level's files."""
+        total = sum(self.parts.values()) if self.kind == "streamed-sog" else self.bytes
+        return 8 * total / max(self.count, 1)
 
     def as_dict(self) -> dict[str, Any]:
         """Return all fields and derived figures for JSON."""

@@ -72,7 +72,8 @@ def streamed_facts(path: Path, level: int = 0) -> SogFacts:
         parts=parts,
         ranges=_ranges([chunk.layout for chunk in chunks]),
         details={
-            "levels": [tree.count(level) for level in range(tree.levels)],
+            "level": level,
+            "levels": [tree.count(one) for one in range(tree.levels)],
             "environment": environment,
             "files": len(tree.filenames),
         },

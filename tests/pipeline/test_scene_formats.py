@@ -112,10 +112,12 @@ def test_levels_of_a_streamed_scene(tmp_path):
     folder = write_folder(STREAMED, tmp_path / "scene")
     assert [len(kissgs.load(folder, level=level)) for level in (0, 1)] == [32, 7]
     found = describe(folder)
-    assert found.details == {"levels": [30, 5], "environment": 2, "files": 2}
+    assert found.details == {"level": 0, "levels": [30, 5], "environment": 2, "files": 2}
     assert set(found.parts) == {"lod-meta.json", "0_0/", "env/"}
     coarse = describe(folder, ReadOptions(level=1))
     assert (coarse.count, set(coarse.parts)) == (7, {"lod-meta.json", "1_0/", "env/"})
+    assert coarse.details["level"] == 1
+    assert coarse.bits_per_gaussian == 8 * sum(coarse.parts.values()) / 7
     message = r"there is no level 2; this scene has levels 0 \(the finest\) to 1"
     with pytest.raises(KissgsError, match=message):
         kissgs.load(folder, level=2)
