@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from kissgs.io.ply import PlyInfo, read_ply_info
     from kissgs.pipeline.inspect import SceneInfo, read_scene_info
     from kissgs.pipeline.pipeline import Compressed, compact, compress, decompress
+    from kissgs.pipeline.read_options import ReadOptions
     from kissgs.pipeline.report import Report
     from kissgs.pipeline.scene_files import load, save
     from kissgs.pipeline.scene_formats import recognise
@@ -66,6 +67,7 @@ _HOMES = {
     "PlyInfo": "io.ply",
     "Preset": "settings",
     "Progress": "core.progress",
+    "ReadOptions": "pipeline.read_options",
     "Remote": "client.remote",
     "RemoteError": "core.errors",
     "Report": "pipeline.report",
@@ -112,6 +114,7 @@ __all__ = [
     "PlyInfo",
     "Preset",
     "Progress",
+    "ReadOptions",
     "Remote",
     "RemoteError",
     "Report",

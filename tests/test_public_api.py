@@ -29,6 +29,7 @@ PUBLIC = [
     "PlyInfo",
     "Preset",
     "Progress",
+    "ReadOptions",
     "Remote",
     "RemoteError",
     "Report",

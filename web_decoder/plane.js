@@ -13,10 +13,10 @@ const [SIZE_OFFSET, SIDE_BITS] = [21, 14];
  * @param {Task} task
  * @returns {Plane}
  */
-export function decodePlane({ file, bytes, width, height, checksum }) {
+export function decodePlane({ file, bytes, pixels, width, height, checksum }) {
   try {
-    const plane = decodeWebP(bytes, { maxPixels: width * height });
-    if (plane.width !== width || plane.height !== height) {
+    const plane = decodeWebP(bytes, { maxPixels: pixels });
+    if (width !== undefined && (plane.width !== width || plane.height !== height)) {
       throw new Error(`${plane.width} x ${plane.height} pixels, not ${width} x ${height}`);
     }
     if (checksum !== undefined && crc32(plane.rgba) !== checksum) {
@@ -35,8 +35,8 @@ export function decodePlane({ file, bytes, width, height, checksum }) {
  * @returns {Promise<Plane | undefined>}
  */
 export async function decodeNatively({ bytes, width, height, checksum, native }) {
-  if (!native || checksum === undefined || !("ImageDecoder" in globalThis) || bytes.length < SIZE_OFFSET + 4)
-    return undefined;
+  if (!native || checksum === undefined || !width || !height) return undefined;
+  if (!("ImageDecoder" in globalThis) || bytes.length < SIZE_OFFSET + 4) return undefined;
   const header = new DataView(bytes.buffer, bytes.byteOffset).getInt32(SIZE_OFFSET, true);
   if (header !== ((width - 1) | ((height - 1) << SIDE_BITS))) return undefined;
   const data = /** @type {Uint8Array<ArrayBuffer>} */ (bytes);

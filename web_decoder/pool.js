@@ -28,7 +28,7 @@ export class Pool {
   async decode(task) {
     const plane = await decodeNatively(task); // in the browser's own threads
     if (plane) return plane;
-    const worker = task.width * task.height < MIN_WORKER_PIXELS ? undefined : this.choose();
+    const worker = sizeOf(task) < MIN_WORKER_PIXELS ? undefined : this.choose();
     return worker ? this.inWorker(worker, task) : this.inCaller(task);
   }
 
@@ -84,6 +84,9 @@ export class Pool {
     for (const worker of this.workers.keys()) worker.terminate();
   }
 }
+
+/** Number of pixels; if that is unknown, a smaller one from the bytes. @param {Task} task */
+const sizeOf = ({ width, height, bytes }) => (width && height ? width * height : bytes.length);
 
 function startWorker() {
   try {

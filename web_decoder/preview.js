@@ -1,6 +1,6 @@
 /** The preview page: opening, showing and comparing scenes, with its keys and buttons. */
 
-import { decode } from "./sogxt.js";
+import { decode } from "./preview/decode.js";
 import { announce, byId, dropAnywhere, el } from "./preview/dom.js";
 import { count } from "./preview/format.js";
 import { loader } from "./preview/loading.js";
@@ -49,7 +49,7 @@ async function during(what, work) {
  * @param {Load} load
  */
 async function openContainer(source, load) {
-  /** @type {Set<string>} */
+  /** @type {Set<import("./types.js").Attribute>} */
   const arrived = new Set();
   const { ready } = view;
   /** @type {Parameters<typeof refiner>[0]["show"]} */
@@ -59,7 +59,7 @@ async function openContainer(source, load) {
   /** @param {string} file @param {Scene} scene */
   function onPlane(file, scene) {
     if (load.signal.aborted) return;
-    arrived.add(file);
+    for (const attribute of scene.contents[file]) arrived.add(attribute);
     if (shown?.scene !== scene) {
       shown = { scene, source, seconds: null };
       setTitle(source.name);
@@ -112,7 +112,7 @@ function showFacts() {
 async function openAddressed(load) {
   const source = await addressed(location, load.signal);
   const { name, container } = source;
-  if (!isReadBySpark(source)) return openContainer(source, load);
+  if (!isPly(source)) return openContainer(source, load);
   if (typeof container === "string") await openFile(name, await download({ url: container, bytes: 0 }, load), load);
   else await openFile(name, new Uint8Array(await container.arrayBuffer()), load);
 }
@@ -121,7 +121,7 @@ async function openAddressed(load) {
 async function openFile(name, bytes, load) {
   const size = bytes.length; // reading it may take the bytes away
   load.signal.throwIfAborted();
-  const gaussians = await readable(view.showFile(name, bytes));
+  const gaussians = await readable(name, view.showFile(bytes));
   shown = null;
   setTitle(name);
   byId("statistics").replaceChildren(...fileStatisticsView(gaussians, size));
@@ -131,22 +131,25 @@ async function openFile(name, bytes, load) {
   announce(`${name}: ${count(gaussians)} Gaussians.`);
 }
 
-/** @param {Uint8Array} bytes */
-async function compareWith(bytes) {
+/** @param {string} name @param {Uint8Array} bytes */
+async function compareWith(name, bytes) {
   if (!shown) return;
-  await readable(view.compare(bytes));
+  await readable(name, view.compare(bytes));
   shown.source.originalBytes ??= bytes.length;
   byId("statistics").replaceChildren(...statisticsView({ ...shown.source, ...shown }));
   labelCompare();
   announce("Original to the left, compressed to the right of the handle.");
 }
 
-/** Replace errors of reading a .ply or .sog by a message. @template T @param {Promise<T>} reading */
-const readable = (reading) =>
+/**
+ * Replace errors of reading a .ply by a message.
+ * @template T @param {string} name @param {Promise<T>} reading
+ */
+const readable = (name, reading) =>
   reading.catch((error) => {
     throw error instanceof UserError
       ? error
-      : new UserError("This file cannot be read: it holds no Gaussians, or is damaged.");
+      : new UserError(`${name} cannot be read: it holds no Gaussians, or is damaged.`);
   });
 
 function labelCompare() {
@@ -157,28 +160,29 @@ function labelCompare() {
 async function pressCompare() {
   const original = shown?.source.original;
   if (view.comparing) view.endComparison();
-  else if (original) await during("Loading the original", async (load) => compareWith(await download(original, load)));
+  else if (original)
+    await during("Loading the original", async (load) => compareWith("The original", await download(original, load)));
   else pick(".ply");
   labelCompare();
 }
 
 /** @param {File[]} files */
 async function take(files) {
-  const container = files.find((file) => !isReadBySpark(file));
-  const other = files.find(isReadBySpark);
+  const container = files.find((file) => !isPly(file));
+  const ply = files.find(isPly);
   if (container) {
-    const source = { name: container.name.replace(/\.zip$/i, ""), container, bytes: container.size };
+    const source = { name: container.name.replace(/\.(zip|sog)$/i, ""), container, bytes: container.size };
     await during(`Opening ${container.name}`, (load) => openContainer(source, load));
   }
-  if (!other) return;
-  await during(`Reading ${other.name}`, async (load) => {
-    const bytes = new Uint8Array(await other.arrayBuffer());
-    await (shown && /\.ply$/i.test(other.name) ? compareWith(bytes) : openFile(other.name, bytes, load));
+  if (!ply) return;
+  await during(`Reading ${ply.name}`, async (load) => {
+    const bytes = new Uint8Array(await ply.arrayBuffer());
+    await (shown ? compareWith(ply.name, bytes) : openFile(ply.name, bytes, load));
   });
 }
 
-/** @param {{name: string}} file */
-const isReadBySpark = ({ name }) => /\.(ply|sog)$/i.test(name);
+/** Whether a file is read by Spark; all others are containers. @param {{name: string}} file */
+const isPly = ({ name }) => /\.ply$/i.test(name);
 
 /** @param {string} accept */
 function pick(accept) {

@@ -1,8 +1,9 @@
 /** Conversion of decoded images to the arrays of a scene, see docs/reference/format.md of kissgs. */
 
+import { COEFFICIENTS, MAX_SIGNED_LOG, META, parseMeta, positionOf } from "./container.js";
 import { crc32 } from "./zip.js";
 
-/** @import { Scene } from "./types.js" */
+/** @import { Attribute, Plane, Scene } from "./types.js" */
 /** Values of the lowest and the highest level that occur in an image. @typedef {number[]} Range */
 
 /** @type {(why: string) => never} */
@@ -10,14 +11,27 @@ const fail = (why) => {
   throw new Error(why);
 };
 
-export const [META, MASK] = ["meta.json", "active_mask.webp"];
+export const MASK = "active_mask.webp";
 const [KISSGS, CHECKSUM] = ["kissgs", "kissgs_crc32"];
 /** The block "kissgs" of a container of another encoder. */
 const OTHER_ENCODER = { version: "-", sh_degree: 0 };
 const [HIGH, LOW, QUATS] = ["means_bytes_1.webp", "means_bytes_0.webp", "quaternions.webp"];
 const [LABELS, CENTROIDS] = ["f_rest_labels.webp", "f_rest_centroids.webp"];
-/** All images, in the order of decoding: those of a coarse rendering first. */
-export const PLANES = [MASK, HIGH, "f_dc.webp", "opacities.webp", "scales.webp", QUATS, LOW, LABELS, CENTROIDS];
+/** What each image gives, in the order of decoding: those of a coarse rendering first. @type {Record<string, Attribute[]>} */
+const CONTENTS = {
+  [MASK]: ["cells"],
+  [HIGH]: ["high means"],
+  "f_dc.webp": ["sh0"],
+  "opacities.webp": ["opacities"],
+  "scales.webp": ["scales"],
+  [QUATS]: ["quats"],
+  [LOW]: ["low means"],
+  [LABELS]: ["labels"],
+  [CENTROIDS]: ["centroids"],
+};
+export const PLANES = Object.keys(CONTENTS);
+/** Number of images of a coarse rendering: mask, high bytes of positions, colours. */
+const COARSE_PLANES = 3;
 /** Images of a single field with 8-bit levels: the field and its number of channels. */
 const SINGLE_FIELD = /** @type {Record<string, ["sh0" | "opacities" | "scales" | "quats", number]>} */ ({
   "f_dc.webp": ["sh0", 3],
@@ -25,22 +39,16 @@ const SINGLE_FIELD = /** @type {Record<string, ["sh0" | "opacities" | "scales" |
   "scales.webp": ["scales", 3],
   [QUATS]: ["quats", 4],
 });
-/** Number of SH coefficients beside `sh0`, by degree. */
-export const COEFFICIENTS = [0, 3, 8, 15];
 const [TILE_ROWS, TILE_COLUMNS] = [3, 5];
 const VARIANT = JSON.stringify(["sog-xt", 3, "direct", "uv-codebook", 15, TILE_ROWS, TILE_COLUMNS]);
 const MAX_GRID_SIDE = 13376;
 const MAX_CODEBOOK_SIDE = 256;
-const MAX_SIGNED_LOG = 88.7; // exp() of more is not a float32
 
 /** @type {(json: Uint8Array) => any} */
 function parse(json) {
-  try {
-    const { quats, shN, ...meta } = JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(json));
-    return { ...meta, quats: { ...quats }, shN: { ...shN } };
-  } catch {
-    return fail(`${META} is not readable JSON`);
-  }
+  const meta = parseMeta(json);
+  if (meta === null) fail(`${META} is not readable JSON`);
+  return { ...meta, quats: { ...meta.quats }, shN: { ...meta.shN } };
 }
 
 /** Return the range of each channel; a single number is that of all channels. @type {(field: any, ends: string[], channels: number) => Range[]} */
@@ -78,6 +86,8 @@ const valuesOf = ([lowest, highest], ranges, levels = 256, finish = (value) => v
 
 /** A scene that is assembled from decoded images, which may arrive in any order. */
 export class Assembly {
+  files = PLANES;
+  coarse = COARSE_PLANES;
   /** @type {Record<string, Range[]>} */
   ranges = {};
   /** Pixels of position images until both have arrived. @type {Record<string, Uint8Array>} */
@@ -135,25 +145,36 @@ export class Assembly {
     }
     /** @type {Scene} */
     this.scene = {
-      ...{ count, degree, gridSide, codebookSide, meta, planes: {}, sizes: { [META]: json.length } },
+      ...{
+        count,
+        degree,
+        gridSide,
+        codebookSide,
+        meta,
+        contents: CONTENTS,
+        planes: {},
+        sizes: { [META]: json.length },
+      },
       ...{ means: new Float32Array(), quats: new Float32Array(), scales: new Float32Array(), sh0: new Float32Array() },
       ...{ opacities: new Float32Array(), centroids: new Float32Array() },
       ...{ labels: new Uint16Array(), cells: new Uint32Array() },
     };
   }
 
-  /** Return the width and height of an image. @param {string} file */
-  sizeOf(file) {
-    const { gridSide, codebookSide } = this.scene;
-    return file === CENTROIDS ? [TILE_COLUMNS * codebookSide, TILE_ROWS * codebookSide] : [gridSide, gridSide];
+  /** @param {string} file */
+  expect(file) {
+    const { gridSide, codebookSide, meta } = this.scene;
+    const [width, height] =
+      file === CENTROIDS ? [TILE_COLUMNS * codebookSide, TILE_ROWS * codebookSide] : [gridSide, gridSide];
+    return { pixels: width * height, width, height, checksum: meta.kissgs?.crc32?.[file] };
   }
 
   /**
    * Put a decoded image into the scene; the mask must be the first.
    * @param {string} file
-   * @param {Uint8Array} rgba
+   * @param {Plane} plane
    */
-  put(file, rgba) {
+  put(file, { rgba }) {
     if (file === MASK) this.putMask(rgba);
     else if (file === LABELS) this.putLabels(rgba);
     else if (file === CENTROIDS) this.putCentroids(rgba);
@@ -194,12 +215,7 @@ export class Assembly {
     const { cells, means } = this.scene;
     const levels = new Uint16Array(high.length);
     for (let i = 0; i < levels.length; i++) levels[i] = (high[i] << 8) | (low ? low[i] : 128);
-    const values = valuesOf(
-      observedLevels(levels, 3),
-      this.ranges[HIGH],
-      1 << 16,
-      (log) => Math.sign(log) * Math.expm1(Math.abs(log)),
-    );
+    const values = valuesOf(observedLevels(levels, 3), this.ranges[HIGH], 1 << 16, positionOf);
     for (let i = 0, at = 0; i < cells.length; i++) {
       for (let c = 0; c < 3; c++) means[at++] = values[levels[4 * cells[i] + c]];
     }

@@ -5,6 +5,10 @@ export interface Plane {
   rgba: Uint8Array<ArrayBuffer>;
 }
 
+/** A part of a scene that an image gives; positions have two images, of high and of low bytes. */
+export type Attribute =
+  "cells" | "high means" | "low means" | "quats" | "scales" | "opacities" | "sh0" | "labels" | "centroids";
+
 /** A scene of N Gaussians, in the order of the container's grid, row by row. */
 export interface Scene {
   /** Number of Gaussians, N. */
@@ -21,14 +25,18 @@ export interface Scene {
   opacities: Float32Array;
   /** 3 N: red, green, blue; colour = 0.5 + 0.28209479 sh0. */
   sh0: Float32Array;
-  /** N: entries of the codebook. */
+  /** N: entries of the codebook; empty in SOG of degree 0. */
   labels: Uint16Array;
   /** 3 K per codebook entry: red, green, blue of each coefficient, in the order of `.ply` files. */
   centroids: Float32Array;
-  /** N: cells of the grid, row × gridSide + column. */
+  /** N: cells of the grid, row × gridSide + column; in SOG 0 to N - 1, because images have no other pixels before the last. */
   cells: Uint32Array;
+  /** Number of columns. */
   gridSide: number;
+  /** Entries of the codebook per row and per column of its tiles; 0 in SOG, which has no tiles. */
   codebookSide: number;
+  /** What each image gives, in the order of decoding. */
+  contents: Record<string, Attribute[]>;
   /** Bytes of each file. */
   sizes: Record<string, number>;
   /** Decoded images by file, with the option `keepPlanes`. */
@@ -92,8 +100,10 @@ export declare function expandSH(scene: Scene): Float32Array;
 export interface Task {
   file: string;
   bytes: Uint8Array;
-  width: number;
-  height: number;
+  /** Largest number of pixels. */
+  pixels: number;
+  width?: number;
+  height?: number;
   /** CRC-32 of the pixels. */
   checksum?: number;
   native: boolean;

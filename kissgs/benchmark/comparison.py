@@ -5,6 +5,8 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import product
 from pathlib import Path
 
 from kissgs.benchmark.bd_rate import at_quality_offset
@@ -15,6 +17,7 @@ from kissgs.benchmark.roundtrip import isolated_roundtrip
 from kissgs.cameras.views import Views
 from kissgs.core.errors import KissgsError
 from kissgs.core.progress import Progress, silent
+from kissgs.io.container_names import ContainerName
 from kissgs.pipeline.scene_files import load, save
 from kissgs.settings import Settings
 
@@ -28,6 +31,7 @@ class BenchmarkPlan:
 
     Attributes:
         presets: settings that are measured as they are, ``repeats`` times each.
+        containers: containers that each of ``presets`` and ``curve_presets`` is written to.
         curve_presets: settings with rate-distortion planning, measured once at each of ``quality_offsets``.
         quality_offsets: values of ``quality_offset_db``, decibels.
         external_codecs: formats of :data:`kissgs.benchmark.external_codecs.EXTERNAL_FORMATS`.
@@ -41,6 +45,7 @@ class BenchmarkPlan:
     """
 
     presets: Sequence[Settings]
+    containers: Sequence[ContainerName] = ("sogxt",)
     curve_presets: Sequence[Settings] = ()
     quality_offsets: Sequence[float] = ()
     external_codecs: Sequence[str] = ()
@@ -72,14 +77,12 @@ def compare(
     for codec in plan.external_codecs:
         check_external(codec, plan.splat_transform)
     points = [
-        (at_quality_offset(settings, offset), offset)
-        for settings in plan.curve_presets
-        for offset in plan.quality_offsets
+        *product(plan.presets, [None], plan.containers),
+        *product(plan.curve_presets, plan.quality_offsets, plan.containers),
     ]
     jobs: list[tuple[str, Callable[[], Measurement]]] = [
-        *((settings.preset, lambda s=settings: _measure_preset(scene, s, None, plan)) for settings in plan.presets),
-        *((s.preset, lambda s=s, offset=offset: _measure_preset(scene, s, offset, plan)) for s, offset in points),
-        *((codec, lambda codec=codec: _measure_external(scene, codec, plan)) for codec in plan.external_codecs),
+        *((point[0].preset, partial(_measure_preset, scene, *point, plan)) for point in points),
+        *((codec, partial(_measure_external, scene, codec, plan)) for codec in plan.external_codecs),
     ]
     rows = []
     for done, (name, job) in enumerate(jobs):
@@ -108,13 +111,20 @@ def compare_at_counts(
 
 
 def _measure_preset(
-    scene: Path, settings: Settings, quality_offset_db: float | None, plan: BenchmarkPlan
+    scene: Path, settings: Settings, quality_offset_db: float | None, container: ContainerName, plan: BenchmarkPlan
 ) -> Measurement:
     """Measure a preset, or once only a point of its curve, whose times do not matter; evaluate the first container."""
     repeats = plan.repeats if quality_offset_db is None else 1
+    if quality_offset_db is not None:
+        settings = at_quality_offset(settings, quality_offset_db)
     results = [
         isolated_roundtrip(
-            scene, settings, evaluate=plan.evaluate and not number, views=plan.views, threads=plan.threads
+            scene,
+            settings,
+            container=container,
+            evaluate=plan.evaluate and not number,
+            views=plan.views,
+            threads=plan.threads,
         )
         for number in range(repeats)
     ]
@@ -122,6 +132,7 @@ def _measure_preset(
     return Measurement(
         scene=scene.name,
         codec=str(settings.preset),
+        container=container,
         quality_offset_db=quality_offset_db,
         gaussians=first.report.source_count,
         file_bytes=first.report.file_bytes,
@@ -151,6 +162,7 @@ def _measure_external(scene: Path, codec: str, plan: BenchmarkPlan) -> Measureme
     return Measurement(
         scene=scene.name,
         codec=codec,
+        container=None,
         gaussians=first.gaussians,
         file_bytes={codec: first.bytes},
         runs=tuple(map(Run.of, results)),

@@ -12,7 +12,7 @@ import numpy as np
 
 from kissgs.benchmark.bd_rate import pareto_front
 from kissgs.benchmark.plots import MARKERS, new_figure
-from kissgs.benchmark.results import Measurement, PsnrTarget
+from kissgs.benchmark.results import Measurement, PsnrTarget, curve_name, curves
 from kissgs.core.errors import UnsupportedError
 
 if TYPE_CHECKING:
@@ -140,10 +140,10 @@ def _quality(axes: Axes, rows: Sequence[Measurement], target: PsnrTarget) -> lis
     if front:
         style = {"color": "#e8c860", "linewidth": 5, "alpha": 0.6, "solid_joinstyle": "round"}
         axes.step(*zip(*front, strict=True), where="post", label="Pareto front", zorder=1, **style)  # type: ignore[arg-type]
-    for number, preset in enumerate(dict.fromkeys(row.codec for row, _ in known if row.quality_offset_db is not None)):
-        curve = sorted(position for row, position in known if row.codec == preset)
+    for number, (preset, container) in enumerate(curves(row for row, _ in known)):
+        curve = sorted(position for row, position in known if (row.codec, row.container) == (preset, container))
         line = ("-", "--", ":")[number % 3]
-        label = f"{preset}, by quality_offset_db"
+        label = f"{curve_name(preset, container)}, by quality_offset_db"
         axes.plot(*zip(*curve, strict=True), line, color=BLACK, marker=".", linewidth=1.2, label=label)
     whole = [(row, position) for row, position in known if row.quality_offset_db is None]
     labels = _points(axes, [row for row, _ in whole], [position for _, position in whole])

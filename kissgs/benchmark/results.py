@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import product
 from statistics import median
 from typing import Any, Literal
 
@@ -13,6 +14,7 @@ from kissgs.benchmark.external_codecs import ExternalResult
 from kissgs.benchmark.roundtrip import RoundTrip
 from kissgs.evaluation.attributes import AttributeErrors
 from kissgs.evaluation.results import Evaluation
+from kissgs.io.container_names import ContainerName, ending_of
 
 PsnrTarget = Literal["original", "photographs"]
 """The images that a PSNR compares with: renderings of the original scene, or photographs."""
@@ -78,6 +80,7 @@ class Measurement:
     Attributes:
         scene: file name of the scene, with as much of its path as distinguishes it from others.
         codec: name of a preset, or format of an external codec.
+        container: container that the preset was written to; None for external codecs.
         quality_offset_db: quality offset of a point of a preset's curve, decibels; None for a preset as it is and for
             external codecs.
         gaussians: number of Gaussians in the scene, before any is left out.
@@ -90,6 +93,7 @@ class Measurement:
 
     scene: str
     codec: str
+    container: ContainerName | None = "sogxt"
     quality_offset_db: float | None = None
     gaussians: int
     file_bytes: Mapping[str, int]
@@ -115,14 +119,14 @@ class Measurement:
 
     @property
     def name(self) -> str:
-        """Name in tables: the preset, with its quality offset if it is a point of a curve, or for example ``.sog``."""
-        name = f".{self.codec}" if self.is_external else self.codec
+        """Name in tables, such as "balanced", "balanced .sog", "balanced at -6" for a point of a curve, or ".spz"."""
+        name = f".{self.codec}" if self.container is None else curve_name(self.codec, self.container)
         return name if self.quality_offset_db is None else f"{name} at {self.quality_offset_db:g}"
 
     @property
     def is_external(self) -> bool:
-        """Whether the codec is an external one, which has a single file."""
-        return len(self.file_bytes) == 1
+        """Whether the codec is an external one."""
+        return self.container is None
 
     def psnr(self, target: PsnrTarget) -> float | None:
         """Return the PSNR to these images, decibels, mean over views; None if they were not compared with."""
@@ -136,6 +140,7 @@ class Measurement:
         return {
             "scene": self.scene,
             "codec": self.codec,
+            "container": self.container,
             "quality_offset_db": self.quality_offset_db,
             **self.details,
             "gaussians": self.gaussians,
@@ -149,30 +154,32 @@ class Measurement:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EqualPsnr:
-    """Bytes of a preset at the PSNR of an external codec.
+    """Bytes of a preset at the PSNR of an external codec, or of a preset in another container.
 
     Attributes:
         scene: file name of the scene.
-        external: format of the external codec.
+        reference: name of the external codec, or of the preset in another container.
         preset: preset whose rate curve is used.
+        container: container of that curve.
         target: images that the PSNR compares with.
-        psnr: PSNR of the external codec, decibels.
-        external_bytes: bytes of the external codec.
+        psnr: PSNR of the reference, decibels.
+        reference_bytes: bytes of the reference.
         bytes: bytes of the preset at this PSNR, interpolated; None if the PSNR is beyond the ends of the curve.
     """
 
     scene: str
-    external: str
+    reference: str
     preset: str
+    container: ContainerName
     target: PsnrTarget
     psnr: float
-    external_bytes: int
+    reference_bytes: int
     bytes: float | None
 
     @property
     def ratio(self) -> float | None:
-        """Bytes of the preset divided by those of the external codec; None as for ``bytes``."""
-        return None if self.bytes is None else self.bytes / self.external_bytes
+        """Bytes of the preset divided by those of the reference; None as for ``bytes``."""
+        return None if self.bytes is None else self.bytes / self.reference_bytes
 
     def as_dict(self) -> dict[str, Any]:
         """Return all attributes and the ratio by name, for JSON."""
@@ -180,31 +187,43 @@ class EqualPsnr:
 
 
 def at_equal_psnr(rows: Sequence[Measurement]) -> list[EqualPsnr]:
-    """Return the bytes of each preset with a curve at the PSNR of each external codec on the same scene."""
+    """Return the bytes of each curve at the PSNR of each external codec, and of its preset in other containers."""
     found = []
     targets: tuple[PsnrTarget, ...] = ("original", "photographs")
     for scene in dict.fromkeys(row.scene for row in rows):
         here = [row for row in rows if row.scene == scene]
-        for external in (row for row in here if row.is_external):
-            for preset in dict.fromkeys(row.codec for row in here if row.quality_offset_db is not None):
-                for target in targets:
-                    psnr = external.psnr(target)
-                    if psnr is not None and math.isfinite(psnr):
-                        found.append(
-                            EqualPsnr(
-                                scene=scene,
-                                external=external.codec,
-                                preset=preset,
-                                target=target,
-                                psnr=psnr,
-                                external_bytes=external.bytes,
-                                bytes=rate_curve(here, preset, target).bytes_at(psnr),
-                            )
-                        )
+        whole = [row for row in here if row.quality_offset_db is None]
+        for reference, (preset, container), target in product(whole, curves(here), targets):
+            psnr = reference.psnr(target)
+            other = reference.is_external or (reference.codec == preset and reference.container != container)
+            if other and psnr is not None and math.isfinite(psnr):
+                found.append(
+                    EqualPsnr(
+                        scene=scene,
+                        reference=reference.name,
+                        preset=preset,
+                        container=container,
+                        target=target,
+                        psnr=psnr,
+                        reference_bytes=reference.bytes,
+                        bytes=rate_curve(here, preset, container, target).bytes_at(psnr),
+                    )
+                )
     return found
 
 
-def rate_curve(rows: Sequence[Measurement], preset: str, target: PsnrTarget) -> RateCurve:
+def curves(rows: Iterable[Measurement]) -> list[tuple[str, ContainerName]]:
+    """Return the preset and container of each curve, in order."""
+    points = (row for row in rows if row.quality_offset_db is not None)
+    return list(dict.fromkeys((row.codec, row.container) for row in points if row.container is not None))
+
+
+def curve_name(preset: str, container: ContainerName) -> str:
+    """Return the name of a preset in a container: only containers other than SOG-XT are named."""
+    return preset if container == "sogxt" else f"{preset} {ending_of(container)}"
+
+
+def rate_curve(rows: Sequence[Measurement], preset: str, container: ContainerName, target: PsnrTarget) -> RateCurve:
     """Return the rate curve of a preset on one scene, through all its quality offsets and the preset as it is."""
-    points = ((row.psnr(target), row.bytes) for row in rows if row.codec == preset)
+    points = ((row.psnr(target), row.bytes) for row in rows if (row.codec, row.container) == (preset, container))
     return RateCurve.of((psnr, size) for psnr, size in points if psnr is not None)

@@ -7,6 +7,7 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from kissgs.evaluation.attributes import AttributeErrors, attribute_errors
 from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.evaluate import compare_images
 from kissgs.evaluation.results import Evaluation
+from kissgs.io.container_names import ContainerName
 from kissgs.pipeline.pipeline import compress, decompress
 from kissgs.pipeline.report import Report
 from kissgs.pipeline.scene_files import load
@@ -57,6 +59,7 @@ def roundtrip(
     source: Splats | Path,
     settings: Settings,
     *,
+    container: ContainerName = "sogxt",
     evaluate: bool = False,
     views: Views | None = None,
     threads: int = 0,
@@ -67,6 +70,7 @@ def roundtrip(
     Args:
         source: a scene, or the path of a ``.ply`` file.
         settings: settings of the compression.
+        container: container to write.
         evaluate: whether to compare rendered images too (:func:`kissgs.evaluation.evaluate.compare_images`); the
             times do not include this.
         views: capture for rate-distortion planning and, by its held-out views, for the evaluation; None to evaluate
@@ -74,7 +78,7 @@ def roundtrip(
         threads: number of threads; 0 means one per processor.
         progress: receives the stages of compression and decompression.
     """
-    result = compress(source, settings=settings, views=views, threads=threads, progress=progress)
+    result = compress(source, settings=settings, container=container, views=views, threads=threads, progress=progress)
     archive = result.to_zip()
     wall, cpu = time.perf_counter(), time.process_time()
     decoded = decompress(archive, threads=threads, progress=progress)
@@ -97,7 +101,13 @@ def _evaluation(scene: Splats, decoded: Splats, views: Views | None, threads: in
 
 
 def isolated_roundtrip(
-    source: Path, settings: Settings, *, evaluate: bool = False, views: Views | None = None, threads: int = 0
+    source: Path,
+    settings: Settings,
+    *,
+    container: ContainerName = "sogxt",
+    evaluate: bool = False,
+    views: Views | None = None,
+    threads: int = 0,
 ) -> RoundTrip:
     """Run :func:`roundtrip` in a separate process, so that times and peak memory are those of this scene alone.
 
@@ -107,8 +117,8 @@ def isolated_roundtrip(
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context) as pool:
         try:
-            work = pool.submit(roundtrip, source, settings, evaluate=evaluate, views=views, threads=threads)
-            return work.result()
+            work = partial(roundtrip, container=container, evaluate=evaluate, views=views, threads=threads)
+            return pool.submit(work, source, settings).result()
         except BrokenProcessPool as error:
             raise UnsupportedError(
                 f"{source}: the measurement was killed, most likely for lack of memory; free some or give a "

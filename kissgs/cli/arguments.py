@@ -11,6 +11,13 @@ ScenesArgument = Annotated[
     list[str], typer.Argument(metavar="FILE…", help="Files or glob patterns; '-' reads standard input.")
 ]
 FilesArgument = Annotated[list[str], typer.Argument(metavar="FILE…", help="Files or glob patterns.")]
+ContainerOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help="Container: sogxt, or sog for other viewers. Default: sog if --output ends in .sog, else sogxt.",
+    ),
+]
 PresetOption = Annotated[
     str, typer.Option("--preset", "-p", help="Trade-off of speed, size and quality: fast, balanced, small or paper.")
 ]
@@ -26,6 +33,24 @@ SeedOption = Annotated[int | None, typer.Option(help="Seed of all random choices
 ForceOption = Annotated[bool, typer.Option("--force", "-f", help="Overwrite existing output files.")]
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print a JSON report: an object for one file, a list for several.")
+]
+MaxGaussiansOption = Annotated[
+    int | None,
+    typer.Option(
+        min=0,
+        help="Refuse files with more Gaussians. Default: 20 million in compressed formats, whose files can declare far "
+        "more than they hold.",
+    ),
+]
+LevelOption = Annotated[
+    int, typer.Option(min=0, help="Level of detail of a streamed SOG scene; 0 is the finest.", show_default=True)
+]
+RawAxesOption = Annotated[
+    bool,
+    typer.Option(
+        "--raw-axes",
+        help="Take the axes of .spz as those of a .ply, as splat-transform writes and reads them. Default: y up.",
+    ),
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")]
 ThreadsOption = Annotated[

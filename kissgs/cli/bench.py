@@ -31,6 +31,10 @@ def codecs(
     scenes: FilesArgument,
     presets: PresetsOption = None,
     changes: SetAllOption = None,
+    containers: Annotated[
+        list[str] | None,
+        typer.Option("--container", help="Container of the presets, sogxt or sog; repeatable. Default: sogxt."),
+    ] = None,
     external_codecs: Annotated[
         list[str] | None,
         typer.Option("--external", help="External codec to measure, sog or spz, by splat-transform; repeatable."),
@@ -73,6 +77,7 @@ def codecs(
         inputs,
         presets=presets,
         changes=changes,
+        containers=containers or [],
         external=bench_codecs.ExternalCodecs(external_codecs or [], splat_transform, sog_iterations),
         quality_offsets=quality_offsets or [],
         repeats=repeats,

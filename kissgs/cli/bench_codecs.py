@@ -39,6 +39,7 @@ def codecs(
     *,
     presets: list[str] | None,
     changes: list[str] | None,
+    containers: list[str],
     external: ExternalCodecs,
     quality_offsets: list[float],
     repeats: int,
@@ -51,6 +52,7 @@ def codecs(
     from kissgs.benchmark.comparison_plots import comparison_plot
     from kissgs.benchmark.results import at_equal_psnr
     from kissgs.cli.bench_tables import bench_tables
+    from kissgs.io.container_names import named_container
 
     settings = _all_settings(presets, changes)
     curve_presets = _curve_presets(settings, only_balanced=not presets)
@@ -58,6 +60,7 @@ def codecs(
         raise UnsupportedError("--quality-offset needs a preset with rate-distortion planning: balanced or small")
     plan = BenchmarkPlan(
         presets=settings,
+        containers=list(dict.fromkeys(named_container(name, None) for name in containers)) or ["sogxt"],
         curve_presets=curve_presets,
         quality_offsets=quality_offsets,
         external_codecs=external.formats,
@@ -78,8 +81,8 @@ def codecs(
     equals = at_equal_psnr(rows)
     entries = [row.as_dict() for row in rows]
     for row, entry in zip(rows, entries, strict=True):
-        if row.is_external and quality_offsets:
-            matching = (equal for equal in equals if (equal.scene, equal.external) == (row.scene, row.codec))
+        if row.quality_offset_db is None and quality_offsets:
+            matching = (equal for equal in equals if (equal.scene, equal.reference) == (row.scene, row.name))
             entry["at_equal_psnr"] = [equal.as_dict() for equal in matching]
     return BenchOutput(
         rows=entries,

@@ -9,7 +9,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from kissgs.benchmark.ablation import AblationRow
-from kissgs.benchmark.results import EqualPsnr, Measurement, PsnrTarget
+from kissgs.benchmark.results import EqualPsnr, Measurement, PsnrTarget, curve_name
 from kissgs.evaluation.results import Evaluation, format_metric
 
 TARGETS: dict[PsnrTarget, str] = {"original": "to the original", "photographs": "to photographs"}
@@ -141,10 +141,11 @@ def _columns(title: str, names: Sequence[str], parts: Sequence[Mapping[str, floa
 
 
 def _equal(equal: EqualPsnr) -> str:
-    prefix = f"at the PSNR of .{equal.external} {TARGETS[equal.target]} ({equal.psnr:.2f} dB)"
+    prefix = f"at the PSNR of {equal.reference} {TARGETS[equal.target]} ({equal.psnr:.2f} dB)"
+    name = curve_name(equal.preset, equal.container)
     if equal.bytes is None or equal.ratio is None:
-        return f"{prefix}: beyond the curve of {equal.preset}; give more values of --quality-offset"
-    return f"{prefix}: {equal.preset} {equal.bytes:,.0f} bytes, {equal.ratio:.3f} of its {equal.external_bytes:,}"
+        return f"{prefix}: beyond the curve of {name}; give more values of --quality-offset"
+    return f"{prefix}: {name} {equal.bytes:,.0f} bytes, {equal.ratio:.3f} of its {equal.reference_bytes:,}"
 
 
 def _not_reproducible(row: Measurement) -> str:

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from kissgs.cli.arguments import LevelOption, MaxGaussiansOption, RawAxesOption
 from kissgs.cli.files import for_each_input, show, sibling, source, stdout
 from kissgs.cli.options import chosen, count_of, device_of, open_views
 from kissgs.core.errors import UnsupportedError
@@ -65,6 +66,9 @@ def compact(
         bool,
         typer.Option("--checkpoint", help="Save the training state next to the scene, and resume from it next time."),
     ] = False,
+    max_gaussians: MaxGaussiansOption = None,
+    level: LevelOption = 0,
+    raw_axes: RawAxesOption = False,
     device: Annotated[
         str, typer.Option(help="Device of the training: cpu (reproducible) or cuda (results vary slightly).")
     ] = "cpu",
@@ -82,6 +86,7 @@ def compact(
     from kissgs.cli.signals import stoppable
     from kissgs.io.ply import write_ply
     from kissgs.pipeline.pipeline import compact as run
+    from kissgs.pipeline.read_options import ReadOptions
     from kissgs.training.checkpoint import delete_checkpoints
 
     settings = chosen(
@@ -99,6 +104,7 @@ def compact(
         )
     if output is None:
         raise UnsupportedError("missing -o: by default the output would overwrite the input")
+    reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes)
     capture, training_device = open_views(views), device_of(device)
 
     def work(scene: str, target: Path) -> dict[str, Any]:
@@ -108,6 +114,7 @@ def compact(
                 source(scene),
                 None if piped else target,
                 settings=settings,
+                reading=reading,
                 evaluate=evaluate,
                 views=capture,
                 checkpoint=sibling(scene, CHECKPOINT) if checkpoint else None,

@@ -9,10 +9,14 @@ from typing import Annotated, Any
 import typer
 
 from kissgs.cli.arguments import (
+    ContainerOption,
     ForceOption,
     JsonOption,
+    LevelOption,
+    MaxGaussiansOption,
     PresetOption,
     QuietOption,
+    RawAxesOption,
     ScenesArgument,
     SeedOption,
     SetOption,
@@ -36,13 +40,7 @@ def compress(
             help="Output NAME.zip, NAME.sog, a folder, or '-' for standard output. Default: next to the scene.",
         ),
     ] = None,
-    container: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help="Container: sog-xt, or sog for other viewers. Default: sog if --output ends in .sog, else sog-xt.",
-        ),
-    ] = None,
+    container: ContainerOption = None,
     preset: PresetOption = "balanced",
     changes: SetOption = None,
     psnr: Annotated[
@@ -101,6 +99,9 @@ def compress(
             "--checkpoint", help="Save the state of --compact and --finetune next to the scene, and resume from it."
         ),
     ] = False,
+    max_gaussians: MaxGaussiansOption = None,
+    level: LevelOption = 0,
+    raw_axes: RawAxesOption = False,
     device: Annotated[str, typer.Option(help="Device of --compact and --finetune: cpu or cuda.")] = "cpu",
     threads: ThreadsOption = 0,
     force: ForceOption = False,
@@ -108,11 +109,13 @@ def compress(
     quiet: QuietOption = False,
 ) -> None:
     """Compress each scene into a SOG-XT container, or into SOG."""
-    from kissgs.pipeline.containers import ending_of, named_container
+    from kissgs.io.container_names import ending_of, named_container
     from kissgs.pipeline.pipeline import compress as run
+    from kissgs.pipeline.read_options import ReadOptions
     from kissgs.training.checkpoint import delete_checkpoints
 
     kind = named_container(container, output)
+    reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes)
     budget = None if compact is None else budget_of(compact)
     settings = chosen(
         preset,
@@ -142,6 +145,7 @@ def compress(
                 source(scene),
                 None if piped else target,
                 settings=settings,
+                reading=reading,
                 container=kind,
                 cache=sibling(scene, ".sensitivity.npz") if cache else None,
                 evaluate=evaluate,

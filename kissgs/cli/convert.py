@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kissgs.cli.arguments import ForceOption, JsonOption, QuietOption, ThreadsOption
+from kissgs.cli.arguments import (
+    ForceOption,
+    JsonOption,
+    LevelOption,
+    MaxGaussiansOption,
+    QuietOption,
+    RawAxesOption,
+    ThreadsOption,
+)
 from kissgs.cli.console import progress_bar
 from kissgs.cli.files import for_each_input, show, source, stdout
 from kissgs.core.errors import InvalidSceneError, OutputError
@@ -23,36 +31,26 @@ def convert(
         list[str],
         typer.Argument(
             metavar="IN… OUT",
-            help="Scenes ('-' reads standard input), then the output: NAME.ply, .compressed.ply, .spz, .splat or .glb; "
-            "with --to also a folder, or '-' for standard output.",
+            help="Scenes ('-' reads standard input), then the output: NAME.ply, .compressed.ply, .spz, .splat, .glb "
+            "or .spz.glb; with --to also a folder, or '-' for standard output.",
         ),
     ],
     to: Annotated[
         str | None,
-        typer.Option("--to", help="Format where OUT has no ending: ply, compressed.ply, spz, splat or glb."),
+        typer.Option("--to", help="Format where OUT has no ending: ply, compressed.ply, spz, splat, glb or spz.glb."),
     ] = None,
-    max_gaussians: Annotated[
-        int | None, typer.Option(min=0, help="Refuse compressed files with more Gaussians. Default: 20 million.")
-    ] = None,
-    level: Annotated[
-        int, typer.Option(min=0, help="Level of detail of a streamed SOG scene; 0 is the finest.", show_default=True)
-    ] = 0,
-    raw_axes: Annotated[
-        bool,
-        typer.Option(
-            "--raw-axes",
-            help="Take the axes of .spz, read or written, as those of a .ply, as splat-transform does. Default: y up.",
-        ),
-    ] = False,
+    max_gaussians: MaxGaussiansOption = None,
+    level: LevelOption = 0,
+    raw_axes: RawAxesOption = False,
     threads: ThreadsOption = 0,
     force: ForceOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Convert scenes and containers into .ply, .compressed.ply, .spz, .splat or .glb; the ending of OUT decides."""
-    from kissgs.core.limits import MAX_GAUSSIANS
+    """Convert scenes into .ply, .compressed.ply, .spz, .splat, .glb or .spz.glb; the ending of OUT decides."""
     from kissgs.core.splats import clean
     from kissgs.io.atomic import atomic_file, refuse_existing
+    from kissgs.pipeline.read_options import ReadOptions
     from kissgs.pipeline.scene_files import read_scene
     from kissgs.pipeline.scene_output import write_scene
 
@@ -60,21 +58,14 @@ def convert(
     if not inputs:
         raise OutputError("convert needs an input and an output: kissgs convert IN OUT")
     kind = _output_format(output, to)
+    reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes)
 
     def work(scene: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"
         if not piped:
             refuse_existing(target, overwrite=force)
         with progress_bar(quiet or as_json) as progress:
-            read = read_scene(
-                source(scene),
-                max_gaussians=MAX_GAUSSIANS if max_gaussians is None else max_gaussians,
-                level=level,
-                raw_axes=raw_axes,
-                threads=threads,
-                progress=progress,
-            )
-            splats, cleaned = clean(read)
+            splats, cleaned = clean(read_scene(source(scene), reading, threads=threads, progress=progress))
             with stdout() if piped else atomic_file(target, overwrite=force) as file:
                 stream = sys.stdout.buffer if file is None else file
                 losses = write_scene(stream, splats, kind, raw_axes=raw_axes, progress=progress)

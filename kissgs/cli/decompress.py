@@ -11,7 +11,10 @@ import typer
 from kissgs.cli.arguments import (
     ForceOption,
     JsonOption,
+    LevelOption,
+    MaxGaussiansOption,
     QuietOption,
+    RawAxesOption,
     ScenesArgument,
     ThreadsOption,
 )
@@ -30,26 +33,15 @@ def decompress(
             help="Output NAME.ply, a folder, or '-' for standard output. Default: next to the container.",
         ),
     ] = None,
-    max_gaussians: Annotated[
-        int | None, typer.Option(min=0, help="Refuse compressed files with more Gaussians. Default: 20 million.")
-    ] = None,
-    level: Annotated[
-        int, typer.Option(min=0, help="Level of detail of a streamed SOG scene; 0 is the finest.", show_default=True)
-    ] = 0,
-    raw_axes: Annotated[
-        bool,
-        typer.Option(
-            "--raw-axes",
-            help="Take the axes of .spz as those of a .ply, as splat-transform writes them. Default: y up.",
-        ),
-    ] = False,
+    max_gaussians: MaxGaussiansOption = None,
+    level: LevelOption = 0,
+    raw_axes: RawAxesOption = False,
     threads: ThreadsOption = 0,
     force: ForceOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
     """Decode containers, and .sog, .spz, .splat, .ksplat, .glb and .gltf scenes, into .ply files."""
-    from kissgs.core.limits import MAX_GAUSSIANS
     from kissgs.io.ply import write_ply
     from kissgs.pipeline.pipeline import decompress as run
 
@@ -59,7 +51,7 @@ def decompress(
             splats = run(
                 source(container),
                 None if piped else target,
-                max_gaussians=MAX_GAUSSIANS if max_gaussians is None else max_gaussians,
+                max_gaussians=max_gaussians,
                 level=level,
                 raw_axes=raw_axes,
                 overwrite=force,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, cast
 
@@ -10,7 +11,10 @@ import typer
 from kissgs.cli.arguments import (
     ForceOption,
     ImagesOption,
+    LevelOption,
+    MaxGaussiansOption,
     QuietOption,
+    RawAxesOption,
     RenderDeviceOption,
     RenderThreadsOption,
     ResolutionOption,
@@ -42,6 +46,9 @@ def evaluate(
         Path | None,
         typer.Option(metavar="FILE", help="Write an HTML report with renderings of both scenes and error maps."),
     ] = None,
+    max_gaussians: MaxGaussiansOption = None,
+    level: LevelOption = 0,
+    raw_axes: RawAxesOption = False,
     device: RenderDeviceOption = "cpu",
     threads: RenderThreadsOption = 0,
     force: ForceOption = False,
@@ -62,8 +69,9 @@ def evaluate(
         refuse_existing(html, overwrite=force)
     capture = open_views(views, scale=scale, images=images, resolution=resolution)
     with progress_bar(quiet or as_json) as progress:
+        loaded = partial(load, max_gaussians=max_gaussians, level=level, raw_axes=raw_axes, threads=threads)
         sides = [
-            ReportScene(name=path.name, splats=load(path, threads=threads, progress=progress), bytes=stored_bytes(path))
+            ReportScene(name=path.name, splats=loaded(path, progress=progress), bytes=stored_bytes(path))
             for path in (reference, candidate)
         ]
         scenes = sides[0].splats, sides[1].splats

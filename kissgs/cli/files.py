@@ -19,6 +19,8 @@ from kissgs.core.errors import InvalidSceneError, KissgsError, OutputError, Unsu
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
+_DOUBLE_ENDINGS = (".compressed.ply", ".spz.glb")
+
 
 def for_each_input(
     names: list[str],
@@ -59,7 +61,8 @@ def for_each_input(
         except KissgsError as error:
             failed = True
             reports.append({"input": name, "error": {"code": error.code, "message": str(error)}})
-            where = "" if Path(name).name in str(error) else f"{name}: "  # files of a container have names of their own
+            named = name[:100] in str(error) or Path(name).name in str(error)
+            where = "" if named else f"{name}: "  # files of a container have names of their own
             sys.stderr.write(f"kissgs: {where}{error}\n")
     if as_json:
         print_json(reports)
@@ -131,11 +134,12 @@ def sibling(name: str, suffix: str) -> Path:
 
 
 def _stem(name: str) -> str:
-    """Return the name of an input without its ending, of which ``.compressed.ply`` is one; folders have none."""
+    """Return the name of an input without its ending, which may have two parts; folders have none."""
     path = Path(name).absolute()
     if is_folder(path):
         return path.name
-    return path.stem[: -len(".compressed")] if path.name.lower().endswith(".compressed.ply") else path.stem
+    ending = next((ending for ending in _DOUBLE_ENDINGS if path.name.lower().endswith(ending)), path.suffix)
+    return path.name[: len(path.name) - len(ending)]
 
 
 def is_folder(path: Path) -> bool:

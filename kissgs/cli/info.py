@@ -5,20 +5,26 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from kissgs.cli.arguments import (
-    FilesArgument,
-    JsonOption,
-)
+from kissgs.cli.arguments import FilesArgument, JsonOption, LevelOption, MaxGaussiansOption, RawAxesOption
 from kissgs.cli.files import for_each_input, show
 
 
-def info(files: FilesArgument, as_json: JsonOption = False) -> None:
+def info(
+    files: FilesArgument,
+    max_gaussians: MaxGaussiansOption = None,
+    level: LevelOption = 0,
+    raw_axes: RawAxesOption = False,
+    as_json: JsonOption = False,
+) -> None:
     """Describe scenes of any format and containers: Gaussians, SH degree, bytes per file, value ranges."""
     from kissgs.cli.tables import info_table
     from kissgs.pipeline.inspect import describe
+    from kissgs.pipeline.read_options import ReadOptions
+
+    reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes)
 
     def work(file: str, target: Path) -> dict[str, Any]:
-        found = describe(Path(file))
+        found = describe(Path(file), reading)
         if not as_json:
             show(info_table(found))
         return found.as_dict()

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from kissgs.cli.arguments import ContainerOption
 from kissgs.cli.files import for_each_input, print_json, show
 
 ServerOption = Annotated[
@@ -25,8 +26,10 @@ app = typer.Typer(name="remote", help="Compress with a kissgs service.", no_args
 def compress(
     scenes: Annotated[list[str], typer.Argument(metavar="FILE…", help="Files or glob patterns.")],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Output NAME.zip, or a folder. Default: next to the scene.")
+        Path | None,
+        typer.Option("--output", "-o", help="Output NAME.zip, NAME.sog or a folder. Default: next to the scene."),
     ] = None,
+    container: ContainerOption = None,
     server: ServerOption = DEFAULT_SERVER,
     key: KeyOption = None,
     preset: Annotated[
@@ -73,9 +76,11 @@ def compress(
     from kissgs.cli.options import budget_of, chosen
     from kissgs.client.remote import Remote
     from kissgs.core.errors import UnsupportedError
+    from kissgs.io.container_names import ending_of, named_container
 
     if "-" in scenes or str(output) == "-":
         raise UnsupportedError("kissgs remote reads and writes files only; '-' is not possible")
+    kind = named_container(container, output)
     settings = chosen(
         preset,
         changes,
@@ -90,13 +95,19 @@ def compress(
         def work(scene: str, target: Path) -> dict[str, Any]:
             with progress_bar(quiet or as_json) as progress:
                 status = remote.compress(
-                    scene, target, settings=settings, evaluate=evaluate, overwrite=force, progress=progress
+                    scene,
+                    target,
+                    settings=settings,
+                    container=kind,
+                    evaluate=evaluate,
+                    overwrite=force,
+                    progress=progress,
                 )
             if not (quiet or as_json):
                 show(_summary(status, target))
             return status
 
-        for_each_input(scenes, output, ".zip", as_json, work)
+        for_each_input(scenes, output, ending_of(kind), as_json, work)
 
 
 @app.command(name="list")
@@ -123,7 +134,7 @@ def list_jobs(
 def get(
     job: Annotated[str, typer.Argument(help="Id of the job, see 'kissgs remote list'.")],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Output NAME.zip. Default: the name of the scene.")
+        Path | None, typer.Option("--output", "-o", help="Output NAME.zip or NAME.sog. Default: the name of the scene.")
     ] = None,
     server: ServerOption = DEFAULT_SERVER,
     key: KeyOption = None,
@@ -133,9 +144,12 @@ def get(
     from kissgs.cli.console import progress_bar
     from kissgs.client.remote import Remote
     from kissgs.io.atomic import refuse_existing
+    from kissgs.io.container_names import ending_of, named_container
 
     with Remote(server, key=key) as remote, progress_bar(False) as progress:
-        target = output or Path(f"{remote.status(job)['name']}.zip")
+        known = remote.status(job)
+        kind = named_container(known["options"].get("format"), output)  # services of older versions state none
+        target = output or Path(f"{known['name']}{ending_of(kind)}")
         refuse_existing(target, overwrite=force)
         status = remote.follow(job, progress)
         remote.download(status, target, overwrite=force, progress=progress)

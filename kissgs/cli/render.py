@@ -11,7 +11,10 @@ import typer
 from kissgs.cli.arguments import (
     ForceOption,
     ImagesOption,
+    LevelOption,
+    MaxGaussiansOption,
     QuietOption,
+    RawAxesOption,
     RenderDeviceOption,
     RenderThreadsOption,
     ResolutionOption,
@@ -104,6 +107,9 @@ def render(
     scale: ScaleOption = None,
     images: ImagesOption = None,
     resolution: ResolutionOption = None,
+    max_gaussians: MaxGaussiansOption = None,
+    level: LevelOption = 0,
+    raw_axes: RawAxesOption = False,
     device: RenderDeviceOption = "cpu",
     threads: RenderThreadsOption = 0,
     force: ForceOption = False,
@@ -143,7 +149,14 @@ def render(
             refuse_existing(path, overwrite=force)
         with progress_bar(quiet or as_json) as progress:
             job = RenderJob(
-                splats=load(Path(name), threads=threads, progress=progress),
+                splats=load(
+                    Path(name),
+                    max_gaussians=max_gaussians,
+                    level=level,
+                    raw_axes=raw_axes,
+                    threads=threads,
+                    progress=progress,
+                ),
                 size=image_size,
                 background=colour,
                 device=render_device,

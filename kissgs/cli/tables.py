@@ -155,7 +155,7 @@ def info_table(info: Info) -> RenderableType:
     """Format the output of ``kissgs info``."""
     head = Text.assemble((info.path, "bold"), f"  {_kind(info)}, {size(info.bytes)}")
     body = f"{info.count:,} Gaussians, SH degree {info.sh_degree}, {info.bits_per_gaussian:.1f} bits per Gaussian"
-    stored = info.kind in ("sog-xt", "sog", "streamed-sog")
+    stored = info.kind in ("sogxt", "sog", "streamed-sog")
     of = "value of {} level" if stored else "{} value"  # channels share a step, so few reach the highest
     ends = [_right(of.format(end)) for end in ("lowest", "highest")]
     ranges = Table("attribute", *ends, box=None, pad_edge=False)
@@ -165,7 +165,7 @@ def info_table(info: Info) -> RenderableType:
     if info.parts:
         blocks.insert(2, parts_table(info.parts, info.count))
     details = info.details
-    if info.kind == "sog-xt":
+    if info.kind == "sogxt":
         origin = "unknown"
         if details["version"]:
             origin = f"kissgs {details['version']} from {details['source_count']:,} Gaussians"
@@ -182,7 +182,7 @@ def _kind(info: Info) -> str:
     details = info.details
     name = {
         "ply": "3DGS scene",
-        "sog-xt": "SOG-XT container",
+        "sogxt": "SOG-XT container",
         "sog": "SOG container",
         "streamed-sog": "streamed SOG scene",
         "spz": "SPZ scene",

@@ -8,15 +8,25 @@ import sys
 import threading
 import webbrowser
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kissgs.cli.arguments import ForceOption, QuietOption, ThreadsOption
+from kissgs.cli.arguments import (
+    ForceOption,
+    LevelOption,
+    MaxGaussiansOption,
+    QuietOption,
+    RawAxesOption,
+    ThreadsOption,
+)
 from kissgs.cli.console import progress_bar
 from kissgs.cli.files import check_input, show, source
 from kissgs.cli.interrupts import Interrupted
 from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
+
+if TYPE_CHECKING:
+    from kissgs.pipeline.read_options import ReadOptions
 
 
 def view(
@@ -39,26 +49,31 @@ def view(
     fetch: Annotated[
         bool, typer.Option("--fetch-viewer", help="Download Spark and three.js first, if they are not installed.")
     ] = False,
+    max_gaussians: MaxGaussiansOption = None,
+    level: LevelOption = 0,
+    raw_axes: RawAxesOption = False,
     threads: ThreadsOption = 0,
     force: ForceOption = False,
     quiet: QuietOption = False,
 ) -> None:
     """Show a scene in the browser, from a server on this machine that Ctrl-C ends; -o writes a page instead."""
+    from kissgs.pipeline.read_options import ReadOptions
     from kissgs.preview.page_files import fetch_viewer, page_files
 
+    reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes)
     check_input(scene, InvalidSceneError)
     if fetch:
         fetch_viewer()
     page_files()  # before the work
     if output is None:
-        _serve(scene, port, browser, threads, quiet)
+        _serve(scene, reading, port, browser, threads, quiet)
     elif port or not browser:
         raise UnsupportedError("--port and --no-browser are for the server, which -o does not start")
     else:
-        _write(scene, output, threads, force, quiet)
+        _write(scene, reading, output, threads, force, quiet)
 
 
-def _write(scene: str, output: Path, threads: int, force: bool, quiet: bool) -> None:
+def _write(scene: str, reading: ReadOptions, output: Path, threads: int, force: bool, quiet: bool) -> None:
     from kissgs.io.atomic import atomic_file, refuse_existing
     from kissgs.preview.page_scene import page_container
     from kissgs.preview.standalone_page import standalone_page
@@ -67,7 +82,7 @@ def _write(scene: str, output: Path, threads: int, force: bool, quiet: bool) -> 
         raise OutputError(f"{output!s:.100} is not the name of a page: end it in .html")
     refuse_existing(output, overwrite=force)
     with progress_bar(quiet) as progress:
-        container = page_container(source(scene), threads=threads, progress=progress)
+        container = page_container(source(scene), reading, threads=threads, progress=progress)
     page = standalone_page(container)
     with atomic_file(output, overwrite=force) as file:
         file.write(page)
@@ -76,12 +91,12 @@ def _write(scene: str, output: Path, threads: int, force: bool, quiet: bool) -> 
         show(f"{output}  {len(page):,} bytes, holds {container.name}{made}")
 
 
-def _serve(scene: str, port: int, browser: bool, threads: int, quiet: bool) -> None:
+def _serve(scene: str, reading: ReadOptions, port: int, browser: bool, threads: int, quiet: bool) -> None:
     from kissgs.preview.page_scene import page_scene
     from kissgs.preview.server import PageServer
 
     with progress_bar(quiet) as progress:
-        prepared = page_scene(source(scene), threads=threads, progress=progress)
+        prepared = page_scene(source(scene), reading, threads=threads, progress=progress)
     with PageServer(prepared, port) as server, contextlib.suppress(Interrupted):
         sys.stdout.write(f"{server.url}  (Ctrl-C ends)\n")
         sys.stdout.flush()

@@ -18,6 +18,7 @@ from urllib.parse import urlsplit
 from kissgs.core.errors import Cancelled, InvalidSceneError, KissgsError, RemoteError, UnsupportedError
 from kissgs.core.progress import Progress, silent
 from kissgs.io.atomic import atomic_file, reason_of, refuse_existing
+from kissgs.io.container_names import ContainerName, named_container
 from kissgs.settings import Settings
 
 if TYPE_CHECKING:
@@ -81,6 +82,7 @@ class Remote:
         destination: str | PathLike[str],
         *,
         settings: Settings | None = None,
+        container: ContainerName | None = None,
         evaluate: bool = False,
         overwrite: bool = False,
         progress: Progress = silent,
@@ -89,8 +91,9 @@ class Remote:
 
         Args:
             source: the scene: ``.ply``, ``.sog``, ``.spz``, ``.splat``, ``.ksplat`` or ``.glb``.
-            destination: the ``.zip`` file to write, atomically.
+            destination: the ``.zip`` or ``.sog`` file to write, atomically.
             settings: None for the preset ``balanced``.
+            container: ``"sogxt"`` or ``"sog"``; by default SOG if ``destination`` ends in ``.sog``, else SOG-XT.
             evaluate: whether the service also compares rendered images.
             overwrite: whether to replace ``destination`` if it exists.
             progress: receives "upload", "queue", the stages of the service, "download", and "wait for server". An
@@ -101,13 +104,14 @@ class Remote:
 
         Raises:
             InvalidSceneError: the file cannot be read, or is not a scene.
-            UnsupportedError: a limit is exceeded, or a setting is invalid.
+            UnsupportedError: a limit is exceeded, a setting is invalid, or the ending is that of another container.
             RemoteError: the service cannot be reached, refuses the job or fails.
             OutputError: ``destination`` cannot be written.
         """
         target = Path(destination)
+        kind = named_container(container, target)
         refuse_existing(target, overwrite=overwrite)
-        status = self.submit(source, settings=settings, evaluate=evaluate, progress=progress)
+        status = self.submit(source, settings=settings, container=kind, evaluate=evaluate, progress=progress)
         try:
             status = self.follow(status["id"], progress)
             self.download(status, target, overwrite=overwrite, progress=progress)
@@ -129,6 +133,7 @@ class Remote:
         source: str | PathLike[str],
         *,
         settings: Settings | None = None,
+        container: ContainerName = "sogxt",
         evaluate: bool = False,
         progress: Progress = silent,
     ) -> dict[str, Any]:
@@ -137,6 +142,7 @@ class Remote:
         Args:
             source: the scene: ``.ply``, ``.sog``, ``.spz``, ``.splat``, ``.ksplat`` or ``.glb``.
             settings: None for the preset ``balanced``.
+            container: ``"sogxt"`` or ``"sog"``.
             evaluate: whether the service also compares rendered images.
             progress: receives "upload" and "wait for server".
 
@@ -147,7 +153,11 @@ class Remote:
             KissgsError: see :meth:`compress`.
         """
         path = Path(source)
-        options = {**(settings or Settings()).model_dump(mode="json", exclude_unset=True), "evaluate": evaluate}
+        options = {
+            **(settings or Settings()).model_dump(mode="json", exclude_unset=True),
+            "format": container,
+            "evaluate": evaluate,
+        }
         size = _size(path)
         headers = {
             "Content-Type": "application/octet-stream",

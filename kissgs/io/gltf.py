@@ -70,7 +70,7 @@ def read_gltf_info(source: Path | bytes) -> GltfInfo:
         InvalidSceneError: as for :func:`read_gltf`.
         UnsupportedError: as for :func:`read_gltf`.
     """
-    with open_scene_file(source, ".glb") as opened:
+    with open_scene_file(source) as opened:
         binary = opened.file.read(4) == GLB_MAGIC
         document = Document(opened, None if isinstance(source, bytes) else source.parent)
         found = list(_primitives(document))
@@ -96,7 +96,7 @@ def read_gltf(source: Path | bytes, *, max_gaussians: int | None = None, progres
         UnsupportedError: another kernel or colour space, an unknown compression, a node that stretches or mirrors, or
             more Gaussians than ``max_gaussians``.
     """
-    with open_scene_file(source, ".glb") as opened:
+    with open_scene_file(source) as opened:
         document = Document(opened, None if isinstance(source, bytes) else source.parent)
         found = list(_primitives(document))
         count = sum(primitive.count for primitive in found)

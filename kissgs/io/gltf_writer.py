@@ -1,10 +1,12 @@
-"""Writing of ``.glb``: one primitive with ``KHR_gaussian_splatting``, all attributes as floats.
+"""Writing of ``.glb``: one primitive with ``KHR_gaussian_splatting``, all attributes as floats or as ``.spz`` inside.
 
-Colours and opacities are also there as ``COLOR_0``, so that programs without the extension show coloured points.
+In the form of floats, colours and opacities are also there as ``COLOR_0``, so that programs without the extension show
+coloured points.
 """
 
 from __future__ import annotations
 
+import io
 import json
 import struct
 from collections.abc import Callable, Iterator
@@ -21,14 +23,19 @@ from kissgs.core.splats import Splats
 from kissgs.io.activations import steps
 from kissgs.io.codes import colors_of, opacities_of, to_bytes
 from kissgs.io.frames import sh_signs
-from kissgs.io.gltf import EXTENSION, TO_PLY
+from kissgs.io.gltf import EXTENSION, SPZ_EXTENSIONS, TO_PLY
 from kissgs.io.gltf_document import GLB_MAGIC
 from kissgs.io.scene_file import BinaryWriter
+from kissgs.io.spz_values import decode_positions, encode_positions, fractional_bits_for
+from kissgs.io.spz_writer import write_spz
 
 _FLOAT, _BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 _MAX_BYTES = (1 << 32) - 1
 """Largest GLB: its header has 32 bits for the size."""
+
+_NOT_IN_SPZ = (f"{EXTENSION}:OPACITY", f"{EXTENSION}:SH_DEGREE_0_COEF_0")
+"""Attributes that the extension for ``.spz`` gives no source: there, ``COLOR_0`` is colour and opacity."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,23 +63,80 @@ def write_glb(file: BinaryWriter, splats: Splats, *, progress: Progress = silent
     Raises:
         UnsupportedError: the scene has no Gaussians, which glTF does not allow, or takes 4 GiB or more.
     """
-    count = len(splats)
-    if not count:
-        raise UnsupportedError("a scene without Gaussians cannot be written as .glb; write it as .ply")
+    count = _count(splats, ".glb")
     attributes = list(_attributes(splats))
     body = count * sum(attribute.row_bytes for attribute in attributes)
-    text = _json(splats, attributes, body)
-    size = 12 + 8 + len(text) + 8 + body
-    if size > _MAX_BYTES:
-        raise UnsupportedError(f"{count:,} Gaussians take {size:,} bytes, and .glb ends at 4 GiB; write .spz or .ply")
-    file.write(struct.pack("<4sII", GLB_MAGIC, 2, size) + struct.pack("<I4s", len(text), b"JSON") + text)
-    file.write(struct.pack("<I4s", body, b"BIN\0"))
+    ends = np.stack([splats.means.min(axis=0), splats.means.max(axis=0)]) * np.array(TO_PLY, np.float32)
+    views, start = list[dict[str, Any]](), 0
+    for attribute in attributes:
+        length = count * attribute.row_bytes
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": length, "target": _ARRAY_BUFFER})
+        start += length
+    accessors = _accessors(count, attributes, ends)
+    for i, accessor in enumerate(accessors):
+        accessor["bufferView"] = i
+    _write_head(file, count, _json(attributes, accessors, views, {}), body)
     for done, attribute in enumerate(attributes, 1):
         dtype = np.uint8 if attribute.is_byte else "<f4"
         for part in steps(count):
             file.write(attribute.values(part).astype(dtype).tobytes())
         progress("write", done / len(attributes))
     return ()
+
+
+def write_spz_glb(file: BinaryWriter, splats: Splats, *, progress: Progress = silent) -> tuple[str, ...]:
+    """Write a clean scene as ``.spz`` inside ``.glb``; return what the format cannot hold, one phrase each.
+
+    The ``.spz`` has its own axes (x right, y up, z back), as the extension wants it, whose text has the library of
+    ``.spz`` turn them from and to those of glTF. Accessors have types and counts, and no data.
+
+    Args:
+        file: The stream; it is not flushed or closed, and its OSErrors are not caught.
+        splats: The scene, cleaned.
+        progress: Receives events of stage ``write``.
+
+    Raises:
+        UnsupportedError: the scene has no Gaussians, or takes 4 GiB or more.
+    """
+    count = _count(splats, ".glb")
+    packed = io.BytesIO()  # its size stands before it
+    notes = write_spz(packed, splats, progress=progress)
+    body = packed.getbuffer()
+    bits = fractional_bits_for(float(np.abs(splats.means).max()))
+    ends = np.empty((2, 3), np.float32)  # as they are read: in steps
+    decode_positions(encode_positions(np.stack([splats.means.min(axis=0), splats.means.max(axis=0)]), bits), bits, ends)
+    attributes = [attribute for attribute in _attributes(splats) if attribute.name not in _NOT_IN_SPZ]
+    view = {"buffer": 0, "byteOffset": 0, "byteLength": len(body)}
+    accessors = _accessors(count, attributes, ends * np.array(TO_PLY, np.float32))
+    _write_head(file, count, _json(attributes, accessors, [view], {SPZ_EXTENSIONS[0]: {"bufferView": 0}}), len(body))
+    file.write(body)
+    file.write(bytes(-len(body) % 4))
+    return notes
+
+
+def _count(splats: Splats, ending: str) -> int:
+    """Return the number of Gaussians.
+
+    Raises:
+        UnsupportedError: there are none, which glTF does not allow.
+    """
+    if not len(splats):
+        raise UnsupportedError(f"a scene without Gaussians cannot be written as {ending}; write it as .ply")
+    return len(splats)
+
+
+def _write_head(file: BinaryWriter, count: int, text: bytes, body: int) -> None:
+    """Write all that stands before the ``body`` bytes of the buffer.
+
+    Raises:
+        UnsupportedError: the file would have 4 GiB or more.
+    """
+    body += -body % 4
+    size = 12 + 8 + len(text) + 8 + body
+    if size > _MAX_BYTES:
+        raise UnsupportedError(f"{count:,} Gaussians take {size:,} bytes, and .glb ends at 4 GiB; write .spz or .ply")
+    file.write(struct.pack("<4sII", GLB_MAGIC, 2, size) + struct.pack("<I4s", len(text), b"JSON") + text)
+    file.write(struct.pack("<I4s", body, b"BIN\0"))
 
 
 def _attributes(splats: Splats) -> Iterator[_Attribute]:
@@ -106,25 +170,36 @@ def _linear_colors(splats: Splats, part: slice) -> Float64[np.ndarray, "B 4"]:
     return to_bytes(255 * rgba).astype(np.float64)
 
 
-def _json(splats: Splats, attributes: list[_Attribute], body: int) -> bytes:
-    """Return the JSON, filled up with spaces to a multiple of four bytes."""
-    views: list[dict[str, Any]] = []
+def _accessors(count: int, attributes: list[_Attribute], ends: Float32[np.ndarray, "2 3"]) -> list[dict[str, Any]]:
+    """Return the accessors without their buffer views; ``ends`` are opposite corners of all positions."""
     accessors: list[dict[str, Any]] = []
-    start = 0
-    for i, attribute in enumerate(attributes):
-        length = len(splats) * attribute.row_bytes
-        views.append({"buffer": 0, "byteOffset": start, "byteLength": length, "target": _ARRAY_BUFFER})
+    for attribute in attributes:
         component = {"componentType": _BYTE, "normalized": True} if attribute.is_byte else {"componentType": _FLOAT}
-        accessors.append({"bufferView": i, **component, "count": len(splats), "type": _TYPES[attribute.width]})
-        start += length
-    ends = np.stack([splats.means.min(axis=0), splats.means.max(axis=0)]) * np.array(TO_PLY, np.float32)
+        accessors.append({**component, "count": count, "type": _TYPES[attribute.width]})
     accessors[0] |= {"min": ends.min(axis=0).tolist(), "max": ends.max(axis=0).tolist()}
-    splatting = {
+    return accessors
+
+
+def _json(
+    attributes: list[_Attribute],
+    accessors: list[dict[str, Any]],
+    views: list[dict[str, Any]],
+    compression: dict[str, Any],
+) -> bytes:
+    """Return the JSON, filled up with spaces to a multiple of four bytes.
+
+    ``compression`` holds the extension without which the accessors have no data; it is empty where they have it.
+    """
+    splatting: dict[str, Any] = {
         "kernel": "ellipse",
         "colorSpace": "srgb_rec709_display",
         "projection": "perspective",
         "sortingMethod": "cameraDistance",
     }
+    required: dict[str, Any] = {}
+    if compression:
+        splatting["extensions"] = compression
+        required["extensionsRequired"] = [EXTENSION, *compression]
     primitive = {
         "mode": _POINTS,
         "attributes": {attribute.name: i for i, attribute in enumerate(attributes)},
@@ -132,14 +207,15 @@ def _json(splats: Splats, attributes: list[_Attribute], body: int) -> bytes:
     }
     root = {
         "asset": {"version": "2.0", "generator": "kissgs"},
-        "extensionsUsed": [EXTENSION],
+        "extensionsUsed": [EXTENSION, *compression],
+        **required,
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,
-        "buffers": [{"byteLength": body}],
+        "buffers": [{"byteLength": sum(view["byteLength"] for view in views)}],
     }
     text = json.dumps(root, separators=(",", ":")).encode("ascii")
     return text + b" " * (-len(text) % 4)

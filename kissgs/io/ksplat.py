@@ -95,7 +95,7 @@ def read_ksplat_info(source: Path | bytes) -> KsplatInfo:
         InvalidSceneError: as for :func:`read_ksplat`.
         UnsupportedError: as for :func:`read_ksplat`.
     """
-    with open_scene_file(source, ".ksplat") as opened:
+    with open_scene_file(source) as opened:
         headers = _read_headers(opened)
         sections = len(headers.sections)
         return KsplatInfo(count=headers.count, sh_degree=headers.degree, level=headers.level, sections=sections)
@@ -113,7 +113,7 @@ def read_ksplat(source: Path | bytes, *, max_gaussians: int | None = None, progr
         InvalidSceneError: the file cannot be read, is damaged or cut short.
         UnsupportedError: another version or compression level, or more Gaussians than ``max_gaussians``.
     """
-    with open_scene_file(source, ".ksplat") as opened:
+    with open_scene_file(source) as opened:
         headers = _read_headers(opened)
         count = headers.count
         refuse_more_than(max_gaussians, count, opened.name)

@@ -14,7 +14,7 @@ from kissgs.core.splats import SH_C0, SH_REST_COUNTS, Splats
 from kissgs.io.compressed_ply import check_compressed, is_compressed, read_compressed
 from kissgs.io.ply_body import check_complete, rows
 from kissgs.io.ply_header import Element, Encoding, PlyFile, open_ply, sh_degree
-from kissgs.io.scene_file import BinaryWriter
+from kissgs.io.scene_file import BinaryWriter, refuse_more_than
 
 _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
@@ -76,8 +76,7 @@ def read_ply(source: Path | bytes, *, max_gaussians: int | None = None, progress
     """
     with open_ply(source) as ply:
         info = _check(ply)
-        if max_gaussians is not None and info.count > max_gaussians:
-            raise UnsupportedError(f"{ply.name} has {info.count:,} Gaussians; the limit is {max_gaussians:,}")
+        refuse_more_than(max_gaussians, info.count, ply.name)
         progress("read", 0.0)
         if info.compressed:
             return read_compressed(ply, info.sh_degree, progress)

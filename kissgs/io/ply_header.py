@@ -111,7 +111,7 @@ def open_ply(source: Path | bytes, *, size: int | None = None) -> Iterator[PlyFi
     Raises:
         InvalidSceneError: the file cannot be read, or it has no valid PLY header.
     """
-    with open_scene_file(source, ".ply") as opened:
+    with open_scene_file(source) as opened:
         header = _read_header(opened.file, opened.name)
         yield PlyFile(opened.name, opened.file, opened.size if size is None else size, header)
 

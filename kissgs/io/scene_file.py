@@ -64,8 +64,8 @@ class BinaryWriter(Protocol):
 
 
 @contextlib.contextmanager
-def open_scene_file(source: Path | bytes, ending: str) -> Iterator[SceneFile]:
-    """Open a file, or the bytes of one; ``ending`` is that of its format, for messages.
+def open_scene_file(source: Path | bytes, remedy: str = "name a scene file") -> Iterator[SceneFile]:
+    """Open a file, or the bytes of one; ``remedy`` is what to do where there is no file, for messages.
 
     Raises:
         InvalidSceneError: the file cannot be read.
@@ -76,7 +76,7 @@ def open_scene_file(source: Path | bytes, ending: str) -> Iterator[SceneFile]:
     try:
         if not source.is_file():  # before opening, because opening a named pipe would wait for its writer
             reason = "it is a folder or a device" if source.exists() else "there is no such file"
-            raise InvalidSceneError(f"cannot read {source}: {reason}; name a {ending} file")
+            raise InvalidSceneError(f"cannot read {source}: {reason}; {remedy}")
         with source.open("rb") as file:
             size = file.seek(0, io.SEEK_END)
             file.seek(0)

@@ -30,7 +30,7 @@ def count_splat(source: Path | bytes) -> int:
     Raises:
         InvalidSceneError: the file cannot be read, or its size is not a multiple of 32 bytes.
     """
-    with open_scene_file(source, ".splat") as opened:
+    with open_scene_file(source) as opened:
         return _count(opened)
 
 
@@ -46,7 +46,7 @@ def read_splat(source: Path | bytes, *, max_gaussians: int | None = None, progre
         InvalidSceneError: the file cannot be read, or its size is not a multiple of 32 bytes.
         UnsupportedError: more Gaussians than ``max_gaussians``.
     """
-    with open_scene_file(source, ".splat") as opened:
+    with open_scene_file(source) as opened:
         count = _count(opened)
         refuse_more_than(max_gaussians, count, opened.name)
         progress("read", 0.0)

@@ -40,7 +40,11 @@ _COEFFICIENTS = (*SH_REST_COUNTS, 24)
 
 _COORDINATES = 0xADBE0003
 _FRAMES = ("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF")
-"""Frame of each value of the extension for coordinate systems; the first is unspecified."""
+"""Frame of each value of the extension for coordinate systems; the first is unspecified.
+
+Values 9 to 16, with z up or down, are refused: version 0.2.3 of the format's library turns the positions of RFU and the
+rotations of its Gaussians in opposite directions, so that it is unknown how files with them are meant.
+"""
 
 DEFAULT_FRAME, PLY_FRAME = "RUB", "RDF"
 
@@ -102,7 +106,7 @@ def read_spz_info(source: Path | bytes) -> SpzInfo:
         InvalidSceneError: the file cannot be read, is not ``.spz`` or is damaged.
         UnsupportedError: another version, an SH degree above 4, or Spark's levels of detail.
     """
-    with open_scene_file(source, ".spz") as opened:
+    with open_scene_file(source) as opened:
         return _read_header(opened)
 
 
@@ -124,7 +128,7 @@ def read_spz(
         UnsupportedError: another version, an SH degree above 4, Spark's levels of detail, or more Gaussians than
             ``max_gaussians``.
     """
-    with open_scene_file(source, ".spz") as opened:
+    with open_scene_file(source) as opened:
         info = _read_header(opened)
         refuse_more_than(max_gaussians, info.count, opened.name)
         progress("read", 0.0)
@@ -255,7 +259,9 @@ def _frame(extensions: bytes, name: str) -> str:
         if kind == _COORDINATES and length >= 4:
             value = int.from_bytes(payload[:4], "little")
             if value >= len(_FRAMES):
-                raise UnsupportedError(f"{name} names a coordinate system {value}; 0 to {len(_FRAMES) - 1} are known")
+                raise UnsupportedError(
+                    f"{name} names a coordinate system {value}, which is not read; export it with y up or down"
+                )
             return _FRAMES[value] or DEFAULT_FRAME
         start += _EXTENSION.size + length
     return DEFAULT_FRAME

@@ -19,8 +19,9 @@ from kissgs.core.errors import StopSearch, UnsupportedError
 from kissgs.core.progress import Progress, SearchNote, as_stage
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import ATTRIBUTES, Cleaned, Splats
+from kissgs.io.container_names import ContainerName
 from kissgs.io.sensitivity_file import read_sensitivity, write_sensitivity
-from kissgs.pipeline.containers import DECODERS, MODELS, ContainerName, write_files
+from kissgs.pipeline.containers import DECODERS, MODELS, write_files
 from kissgs.pipeline.rate_control import Container, Encoder, RateControl
 from kissgs.pipeline.trial import Trial
 from kissgs.planning.encoded import Encoded

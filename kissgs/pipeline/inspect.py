@@ -19,6 +19,7 @@ from kissgs.io.splat import count_splat
 from kissgs.io.spz import SpzInfo, read_spz_info
 from kissgs.io.webp import decode_plane
 from kissgs.pipeline.inspect_sog import SogFacts, sog_facts, streamed_facts
+from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.scene_files import read_scene, stored_bytes
 from kissgs.pipeline.scene_formats import SceneFormat, recognise, scene_root
 from kissgs.sogxt.metadata import CHANNELS, Layout
@@ -99,7 +100,7 @@ def read_scene_info(path: Path, *, name: str | None = None) -> SceneInfo:
     if kind == "splat":
         return SceneInfo(format=kind, count=count_splat(path), sh_degree=0)
     found: PlyInfo | SpzInfo | KsplatInfo | GltfInfo | SogFacts | Info
-    if kind == "sog-xt":
+    if kind == "sogxt":
         found = _describe_sogxt(path)
     elif kind == "sog":
         found = sog_facts(scene_root(path))
@@ -116,7 +117,7 @@ def read_scene_info(path: Path, *, name: str | None = None) -> SceneInfo:
     return SceneInfo(format=kind, count=found.count, sh_degree=found.sh_degree)
 
 
-def describe(path: Path) -> Info:
+def describe(path: Path, reading: ReadOptions = DEFAULT_READ_OPTIONS) -> Info:
     """Describe a scene file.
 
     No image of a container is decoded, except SOG-XT's mask if the metadata does not state the number of Gaussians.
@@ -125,16 +126,16 @@ def describe(path: Path) -> Info:
         KissgsError: the file is not a usable scene or container.
     """
     kind = recognise(path)
-    if kind == "sog-xt":
+    if kind == "sogxt":
         return _describe_sogxt(path)
     if kind == "sog" or kind == "streamed-sog":
-        return _describe_sog(path, kind)
-    return _describe_file(path, kind)
+        return _describe_sog(path, kind, reading.level)
+    return _describe_file(path, kind, reading)
 
 
-def _describe_sog(path: Path, kind: Literal["sog", "streamed-sog"]) -> Info:
+def _describe_sog(path: Path, kind: Literal["sog", "streamed-sog"], level: int) -> Info:
     root = scene_root(path)
-    facts = sog_facts(root) if kind == "sog" else streamed_facts(root)
+    facts = sog_facts(root) if kind == "sog" else streamed_facts(root, level)
     return Info(
         path=str(path),
         kind=kind,
@@ -148,8 +149,8 @@ def _describe_sog(path: Path, kind: Literal["sog", "streamed-sog"]) -> Info:
     )
 
 
-def _describe_file(path: Path, kind: SceneFormat) -> Info:
-    details, splats = _details(path, kind), read_scene(path)
+def _describe_file(path: Path, kind: SceneFormat, reading: ReadOptions) -> Info:
+    details, splats = _details(path, kind), read_scene(path, reading)
     return Info(
         path=str(path),
         kind=kind,
@@ -201,7 +202,7 @@ def _describe_sogxt(path: Path) -> Info:
     made = layout.provenance
     return Info(
         path=str(path),
-        kind="sog-xt",
+        kind="sogxt",
         count=count,
         sh_degree=layout.sh_degree,
         bytes=sum(parts.values()) if root.is_dir() else path.stat().st_size,

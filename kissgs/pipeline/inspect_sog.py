@@ -51,15 +51,16 @@ def sog_facts(path: Path) -> SogFacts:
     )
 
 
-def streamed_facts(path: Path) -> SogFacts:
-    """Return the facts of a streamed scene: of its finest level and the environment; ``parts`` are its containers.
+def streamed_facts(path: Path, level: int = 0) -> SogFacts:
+    """Return the facts of one level of a streamed scene and its environment; ``parts`` are the level's containers.
 
     Raises:
-        KissgsError: the index or a container's metadata is damaged, or a file of the finest level is missing.
+        KissgsError: the index or a container's metadata is damaged, a file of the level is missing, or there is no such
+            level.
     """
     with open_source(path, LOD_NAME) as files:
         tree = read_tree(files)
-        chunks = list(level_chunks(files, tree, 0))
+        chunks = list(level_chunks(files, tree, level))
         parts = {LOD_NAME: _size(files, LOD_NAME)}
         for chunk in chunks:
             names = (META_NAME, *_images(chunk.layout))

@@ -17,7 +17,9 @@ from kissgs.core.progress import Progress, SearchNote, as_stage, ignore_stop_sea
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats
 from kissgs.core.timing import StageTimer, peak_memory
-from kissgs.pipeline.containers import FILES, ContainerName, named_container
+from kissgs.io.container_names import ContainerName, named_container
+from kissgs.pipeline.containers import FILES
+from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.report import Report
 from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, save_ply
 from kissgs.rendering.rasterizer import Device
@@ -43,14 +45,14 @@ class Compressed:
         order: ``(M,)`` index in the cleaned scene of each Gaussian of the container, in the container's order.
         report: sizes, counts, errors, times and settings.
         checkpoints: files of compaction and fine-tuning that still exist because no destination was given.
-        container: "sog-xt" or "sog".
+        container: "sogxt" or "sog".
     """
 
     files: Mapping[str, bytes]
     order: Int[np.ndarray, " M"]
     report: Report
     checkpoints: tuple[Path, ...] = ()
-    container: ContainerName = "sog-xt"
+    container: ContainerName = "sogxt"
 
     def to_zip(self) -> bytes:
         """Return the container as the bytes of a zip."""
@@ -72,6 +74,7 @@ def compact(
     destination: AnyPath | None = None,
     *,
     settings: Settings,
+    reading: ReadOptions = DEFAULT_READ_OPTIONS,
     evaluate: bool = False,
     views: Views | None = None,
     checkpoint: AnyPath | None = None,
@@ -87,6 +90,7 @@ def compact(
         destination: ``.ply`` to write; by default nothing is written.
         settings: their group ``compact`` says how many Gaussians to keep, and how: for example
             ``Settings.from_preset("balanced", compact={"ratio": 0.2})``.
+        reading: options for a ``source`` that is a file.
         evaluate: measure PSNR, SSIM and bytes after every step, for the report.
         views: capture whose training photographs are the targets, and whose held-out views are for evaluation; by
             default renderings of the scene from virtual cameras.
@@ -109,7 +113,7 @@ def compact(
     if target is not None:
         check_ply(target, overwrite=overwrite)
     clock = StageTimer(progress)
-    splats, cleaned, _ = open_scene(source, threads, clock)
+    splats, cleaned, _ = open_scene(source, reading, threads, clock)
     result = compact_scene(
         splats,
         settings.compact,
@@ -138,6 +142,7 @@ def compress(
     destination: AnyPath | None = None,
     *,
     settings: Settings | None = None,
+    reading: ReadOptions = DEFAULT_READ_OPTIONS,
     container: ContainerName | None = None,
     sensitivity: Sensitivity | None = None,
     cache: AnyPath | None = None,
@@ -158,7 +163,8 @@ def compress(
         settings: by default those of the preset ``balanced``. If their group ``compact`` has a budget, the scene is
             compacted first, see :func:`kissgs.compact`; if their group ``finetune`` is ``enabled``, the levels are then
             fine-tuned on the photographs of ``views``, or on renderings of the scene.
-        container: ``"sog-xt"``, or ``"sog"`` for the files of SOG 2, which other viewers open; by default SOG if
+        reading: options for a ``source`` that is a file.
+        container: ``"sogxt"``, or ``"sog"`` for the files of SOG 2, which other viewers open; by default SOG if
             ``destination`` ends in ``.sog``, else SOG-XT.
         sensitivity: sensitivity of a clean ``source`` (:func:`kissgs.measure_sensitivity`); by default it is measured
             if the settings need it.
@@ -195,7 +201,7 @@ def compress(
         if checkpoint is not None and not settings.encode.has_goal:
             finetune_checkpoint = finetune_checkpoint_path(Path(checkpoint))
     clock = StageTimer(progress)
-    original, cleaned, source_bytes = open_scene(source, threads, clock)
+    original, cleaned, source_bytes = open_scene(source, reading, threads, clock)
     encoding = Encoding(
         splats=original,
         original=original,
@@ -266,7 +272,7 @@ def decompress(
     source: AnyPath | bytes | Mapping[str, bytes],
     destination: AnyPath | None = None,
     *,
-    max_gaussians: int = MAX_GAUSSIANS,
+    max_gaussians: int | None = None,
     level: int = 0,
     raw_axes: bool = False,
     overwrite: bool = False,
@@ -279,7 +285,7 @@ def decompress(
         source: path of a zip or a folder, the bytes of a zip, or the files in memory; or any other file that
             :func:`kissgs.load` reads, except a ``.ply``.
         destination: ``.ply`` to write; by default nothing is written.
-        max_gaussians: refuse a compressed file that holds more, before memory is allocated for them.
+        max_gaussians: see :class:`kissgs.ReadOptions`, as for ``level`` and ``raw_axes``.
         level: level of detail of a streamed SOG scene; 0 is the finest.
         raw_axes: read ``.spz`` that stores the axes of a ``.ply`` without saying so.
         overwrite: replace ``destination`` if it exists.
@@ -299,9 +305,7 @@ def decompress(
         check_ply(Path(destination), overwrite=overwrite)
     splats = read_scene(
         source if isinstance(source, bytes | Mapping) else Path(source),
-        max_gaussians=max_gaussians,
-        level=level,
-        raw_axes=raw_axes,
+        ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes),
         threads=threads,
         progress=progress,
         only_containers=True,
@@ -346,6 +350,7 @@ def _evaluate(
     from kissgs.evaluation.evaluate import evaluate
 
     progress("evaluate", 0.0)
-    decoded = read_scene(container, max_gaussians=max(len(splats), MAX_GAUSSIANS), threads=threads)
+    most = ReadOptions(max_gaussians=max(len(splats), MAX_GAUSSIANS))
+    decoded = read_scene(container, most, threads=threads)
 
     return evaluate(splats, decoded, views, threads=threads, progress=as_stage("evaluate", progress))

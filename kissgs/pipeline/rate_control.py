@@ -16,6 +16,7 @@ from kissgs.core.splats import Splats
 from kissgs.evaluation.psnr_loss import SEARCH_SEED
 from kissgs.evaluation.results import MAX_VIEW_PSNR
 from kissgs.finetuning.result import FinetuneReport
+from kissgs.pipeline.read_options import ReadOptions
 from kissgs.pipeline.scene_files import read_scene
 from kissgs.pipeline.trial import Trial
 from kissgs.planning.encoded import Encoded
@@ -401,7 +402,7 @@ class RateControl:
             self.views = evaluation_views(self.original, seed=SEARCH_SEED, threads=self.threads)
             self._rendered = {}
         most = max(len(self.original), MAX_GAUSSIANS)
-        decoded = read_scene(encoded.files, max_gaussians=most, threads=self.threads)
+        decoded = read_scene(encoded.files, ReadOptions(max_gaussians=most), threads=self.threads)
         return compare_images(self.original, decoded, self.views, threads=self.threads, reference_images=self._rendered)
 
 

@@ -7,7 +7,6 @@ from os import PathLike
 from pathlib import Path
 
 from kissgs.core.errors import InvalidContainerError, OutputError
-from kissgs.core.limits import MAX_GAUSSIANS
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Cleaned, Splats, clean
 from kissgs.io.atomic import atomic_file, reason_of, refuse_existing
@@ -16,6 +15,7 @@ from kissgs.io.ksplat import read_ksplat
 from kissgs.io.ply import read_ply
 from kissgs.io.splat import read_splat
 from kissgs.io.spz import read_spz
+from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.scene_formats import recognise, scene_root
 from kissgs.pipeline.scene_output import output_format, write_scene
 from kissgs.sog import streamed
@@ -28,7 +28,7 @@ AnyPath = str | PathLike[str]
 def load(
     path: AnyPath,
     *,
-    max_gaussians: int = MAX_GAUSSIANS,
+    max_gaussians: int | None = None,
     level: int = 0,
     raw_axes: bool = False,
     threads: int = 0,
@@ -39,9 +39,9 @@ def load(
     Args:
         path: ``.ply``, ``.spz``, ``.splat``, ``.ksplat``, ``.glb`` or ``.gltf``; a SOG-XT or SOG container (zip,
             folder, or its ``meta.json``); a streamed SOG scene (zip, folder, or its ``lod-meta.json``).
-        max_gaussians: largest number of Gaussians of a compressed file; more are refused before memory is allocated.
+        max_gaussians: see :class:`kissgs.ReadOptions`, as for ``level`` and ``raw_axes``.
         level: level of detail of a streamed scene; 0 is the finest.
-        raw_axes: read ``.spz`` that stores the axes of a ``.ply`` without saying so, as some tools write it.
+        raw_axes: read ``.spz`` that stores the axes of a ``.ply`` without saying so.
         threads: number of threads; 0 means one per processor.
         progress: receives events.
 
@@ -50,10 +50,8 @@ def load(
         InvalidContainerError: the container is damaged.
         UnsupportedError: the file is valid, but uses a feature that kissgs does not read.
     """
-    splats = read_scene(
-        Path(path), max_gaussians=max_gaussians, level=level, raw_axes=raw_axes, threads=threads, progress=progress
-    )
-    return clean(splats)[0]
+    reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes)
+    return clean(read_scene(Path(path), reading, threads=threads, progress=progress))[0]
 
 
 def save(
@@ -62,8 +60,8 @@ def save(
     """Write a scene atomically, in the format that the ending of ``path`` names: see docs/reference/formats.md.
 
     ``.ply`` (binary, INRIA layout, at the scene's own SH degree) holds every number bit by bit. For the others,
-    ``.compressed.ply``, ``.spz``, ``.splat`` and ``.glb``, the scene is cleaned. Containers are written by
-    :func:`compress`.
+    ``.compressed.ply``, ``.spz``, ``.splat``, ``.glb`` and ``.spz.glb``, the scene is cleaned. Containers are written
+    by :func:`compress`.
 
     Args:
         splats: the scene; it is not changed.
@@ -106,7 +104,9 @@ def check_ply(path: Path, *, overwrite: bool) -> None:
     refuse_existing(path, overwrite=overwrite)
 
 
-def open_scene(source: Splats | AnyPath | bytes, threads: int, progress: Progress) -> tuple[Splats, Cleaned, int]:
+def open_scene(
+    source: Splats | AnyPath | bytes, reading: ReadOptions, threads: int, progress: Progress
+) -> tuple[Splats, Cleaned, int]:
     """Read and clean a scene; return it, the defects that were corrected, and the bytes of the source.
 
     Raises:
@@ -117,42 +117,38 @@ def open_scene(source: Splats | AnyPath | bytes, threads: int, progress: Progres
         return splats, cleaned, source.nbytes
     progress("read", 0.0)
     scene = source if isinstance(source, bytes) else Path(source)
-    splats, cleaned = clean(read_scene(scene, threads=threads, progress=progress))
+    splats, cleaned = clean(read_scene(scene, reading, threads=threads, progress=progress))
     return splats, cleaned, len(scene) if isinstance(scene, bytes) else stored_bytes(scene)
 
 
 def read_scene(
     source: Path | bytes | Mapping[str, bytes],
+    reading: ReadOptions = DEFAULT_READ_OPTIONS,
     *,
-    max_gaussians: int = MAX_GAUSSIANS,
-    level: int = 0,
-    raw_axes: bool = False,
     threads: int = 0,
     progress: Progress = silent,
     only_containers: bool = False,
 ) -> Splats:
-    """Read a scene without cleaning; the parameters are those of :func:`load`.
-
-    ``max_gaussians`` is for formats whose decoded size can be far above their bytes. With ``only_containers``, a
-    ``.ply`` is refused.
+    """Read a scene without cleaning. With ``only_containers``, a ``.ply`` is refused.
 
     Raises:
         KissgsError: the scene cannot be read.
     """
     found = recognise(source)
     root = scene_root(source) if isinstance(source, Path) else source
+    most = reading.max_compressed
     if found == "streamed-sog":
-        return streamed.decode(root, level=level, max_gaussians=max_gaussians, threads=threads, progress=progress)
+        return streamed.decode(root, level=reading.level, max_gaussians=most, threads=threads, progress=progress)
     if found == "sog":
-        return decode_sog(root, max_gaussians=max_gaussians, threads=threads, progress=progress)
-    if found == "sog-xt" or (only_containers and found == "ply") or isinstance(source, Mapping):
-        return decode_sogxt(root, max_gaussians=max_gaussians, threads=threads, progress=progress)
+        return decode_sog(root, max_gaussians=most, threads=threads, progress=progress)
+    if found == "sogxt" or (only_containers and found == "ply") or isinstance(source, Mapping):
+        return decode_sogxt(root, max_gaussians=most, threads=threads, progress=progress)
     if found == "spz":
-        return read_spz(source, max_gaussians=max_gaussians, raw_axes=raw_axes, progress=progress)
+        return read_spz(source, max_gaussians=most, raw_axes=reading.raw_axes, progress=progress)
     if found == "gltf":
-        return read_gltf(source, max_gaussians=max_gaussians, progress=progress)
+        return read_gltf(source, max_gaussians=most, progress=progress)
     reader = {"splat": read_splat, "ksplat": read_ksplat, "ply": read_ply}[found]
-    return reader(source, progress=progress)
+    return reader(source, max_gaussians=reading.max_gaussians, progress=progress)
 
 
 def stored_bytes(path: Path) -> int:

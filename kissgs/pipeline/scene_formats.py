@@ -17,7 +17,7 @@ from kissgs.sog.metadata import LOD_NAME, MAX_METADATA_BYTES, META_NAME
 from kissgs.sogxt.container import is_packed
 from kissgs.sogxt.names import YAML_NAME
 
-SceneFormat = Literal["ply", "sog-xt", "sog", "streamed-sog", "spz", "splat", "ksplat", "gltf"]
+SceneFormat = Literal["ply", "sogxt", "sog", "streamed-sog", "spz", "splat", "ksplat", "gltf"]
 """All formats that are read. "ply" stands for unknown content too, about which its reader has the best messages."""
 
 HEAD_BYTES = 512
@@ -37,7 +37,7 @@ def recognise(
     The metadata file of a SOG container stands for its folder. ``.splat`` is recognised by its name only.
 
     Args:
-        source: the scene, or the first 512 bytes of a file, of which every zip then counts as "sog-xt".
+        source: the scene, or the first 512 bytes of a file, of which every zip then counts as "sogxt".
         name: name of the file, if ``source`` has none or another one.
         size: bytes of the whole file, if ``source`` is only its beginning.
     """
@@ -47,14 +47,14 @@ def recognise(
     name = name.lower()
     ending = Path(name).suffix
     if isinstance(source, Path) and (_is_folder(source) or scene_root(source) != source):
-        return "streamed-sog" if name == LOD_NAME else _packed_format(scene_root(source), "sog-xt")
+        return "streamed-sog" if name == LOD_NAME else _packed_format(scene_root(source), "sogxt")
     head, found_size = _beginning(source)
     if marked := _by_mark(head):
         return marked
     if ending in _WITHOUT_MARK and head[:4] not in ZIP_MAGICS:
         return _WITHOUT_MARK[ending]
     if is_container(source):
-        return _packed_format(source, "sog" if ending == ".sog" else "sog-xt")
+        return _packed_format(source, "sog" if ending == ".sog" else "sogxt")
     if is_ksplat(head, found_size if size is None else size):
         return "ksplat"
     if ending not in _ENDINGS and _is_json(head):
@@ -136,13 +136,13 @@ def _opened(source: Path | bytes) -> io.BufferedIOBase:
     return io.BytesIO(source) if isinstance(source, bytes) else source.open("rb")
 
 
-def _container_format(files: Source, unknown: SceneFormat = "sog-xt") -> SceneFormat:
+def _container_format(files: Source, unknown: SceneFormat = "sogxt") -> SceneFormat:
     """Tell the containers apart: only SOG-XT has a YAML file, and a mask in ``meta.json``."""
     names = files.names()
     if LOD_NAME in names:
         return "streamed-sog"
     if YAML_NAME in names or META_NAME not in names:
-        return "sog-xt" if YAML_NAME in names else unknown
+        return "sogxt" if YAML_NAME in names else unknown
     try:
         document = json.loads(files.read(META_NAME, MAX_METADATA_BYTES).decode("utf-8-sig"))
     except (ValueError, RecursionError, InvalidContainerError):

@@ -9,14 +9,14 @@ from kissgs.core.errors import OutputError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats, clean
 from kissgs.io.compressed_ply import write_compressed
-from kissgs.io.gltf_writer import write_glb
+from kissgs.io.gltf_writer import write_glb, write_spz_glb
 from kissgs.io.ply import write_ply
 from kissgs.io.scene_file import BinaryWriter
 from kissgs.io.splat import write_splat
 from kissgs.io.spz_writer import write_spz
 
-OutputFormat = Literal["ply", "compressed.ply", "spz", "splat", "glb"]
-OUTPUT_FORMATS: tuple[OutputFormat, ...] = ("ply", "compressed.ply", "spz", "splat", "glb")
+OutputFormat = Literal["ply", "compressed.ply", "spz", "splat", "glb", "spz.glb"]
+OUTPUT_FORMATS: tuple[OutputFormat, ...] = ("ply", "compressed.ply", "spz", "splat", "glb", "spz.glb")
 """Formats that are written; each is the ending of its files without the first dot."""
 
 _CONTAINERS = (".zip", ".sog")
@@ -58,5 +58,7 @@ def write_scene(
     splats = clean(splats)[0]
     if kind == "spz":
         return write_spz(file, splats, raw_axes=raw_axes, progress=progress)
-    writer = {"compressed.ply": write_compressed, "splat": write_splat, "glb": write_glb}[kind]
+    writer = {"compressed.ply": write_compressed, "splat": write_splat, "glb": write_glb, "spz.glb": write_spz_glb}[
+        kind
+    ]
     return writer(file, splats, progress=progress)

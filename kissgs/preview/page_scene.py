@@ -11,15 +11,15 @@ from kissgs.core.errors import InvalidSceneError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import clean
 from kissgs.io.atomic import reason_of
+from kissgs.io.container_names import CONTAINERS, ending_of
 from kissgs.io.packed_files import open_source
 from kissgs.io.ply import write_ply
-from kissgs.pipeline.containers import ContainerName, ending_of
 from kissgs.pipeline.pipeline import compress
+from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.scene_files import read_scene
 from kissgs.pipeline.scene_formats import recognise, scene_root
 from kissgs.sogxt.container import zip_bytes
 
-_CONTAINERS: tuple[ContainerName, ...] = ("sog-xt", "sog")
 _MAX_FILE_BYTES = 1 << 30
 _FILE_ENDINGS = (".webp", ".json", ".yaml", ".yml")
 
@@ -39,18 +39,21 @@ class PageScene:
     converted: bool
 
 
-def page_scene(source: Path | bytes, *, threads: int = 0, progress: Progress = silent) -> PageScene:
+def page_scene(
+    source: Path | bytes, reading: ReadOptions = DEFAULT_READ_OPTIONS, *, threads: int = 0, progress: Progress = silent
+) -> PageScene:
     """Return a scene for the page: a SOG-XT or SOG container unchanged, any other format as a ``.ply`` of equal values.
 
     Args:
         source: path of a scene of any format, or the bytes of its file.
+        reading: options for reading it.
         threads: number of threads; 0 means one per processor.
         progress: receives events.
 
     Raises:
         KissgsError: the scene cannot be read.
     """
-    read = read_scene(source, threads=threads, progress=progress)
+    read = read_scene(source, reading, threads=threads, progress=progress)
     container = _as_container(source)
     if container is not None:
         return container
@@ -60,23 +63,27 @@ def page_scene(source: Path | bytes, *, threads: int = 0, progress: Progress = s
     return PageScene(f"{_stem(source)}.ply", file.getvalue(), converted=recognise(source) != "ply")
 
 
-def page_container(source: Path | bytes, *, threads: int = 0, progress: Progress = silent) -> PageScene:
+def page_container(
+    source: Path | bytes, reading: ReadOptions = DEFAULT_READ_OPTIONS, *, threads: int = 0, progress: Progress = silent
+) -> PageScene:
     """Return a scene as a container: SOG-XT or SOG unchanged, any other format compressed by the preset ``balanced``.
 
     The parameters and errors are those of :func:`page_scene`.
     """
     container = _as_container(source)
     if container is not None:
-        read_scene(source, threads=threads, progress=progress)  # whoever gets the page cannot mend a damaged one
+        read_scene(
+            source, reading, threads=threads, progress=progress
+        )  # whoever gets the page cannot mend a damaged one
         return container
-    result = compress(source, threads=threads, progress=progress)
+    result = compress(source, reading=reading, threads=threads, progress=progress)
     return PageScene(f"{_stem(source)}.zip", result.to_zip(), converted=True)
 
 
 def _as_container(source: Path | bytes) -> PageScene | None:
     """Return the zip of a container, None for other formats. The files of a folder are packed."""
     found = recognise(source)
-    kind = next((kind for kind in _CONTAINERS if kind == found), None)
+    kind = next((kind for kind in CONTAINERS if kind == found), None)
     if kind is None:
         return None
     root = scene_root(source) if isinstance(source, Path) else source

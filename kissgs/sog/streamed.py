@@ -124,10 +124,6 @@ def decode(
     """
     with open_source(source, LOD_NAME) as files, Workers(threads) as pool:
         tree = read_tree(files)
-        if not 0 <= level < tree.levels:
-            raise UnsupportedError(
-                f"there is no level {level}; this scene has levels 0 (the finest) to {tree.levels - 1}"
-            )
         chunks = list(level_chunks(files, tree, level))
         count = sum(chunk.count for chunk in chunks)
         refuse_more_than(max_gaussians, count, f"level {level}")
@@ -161,8 +157,10 @@ def level_chunks(files: Source, tree: Tree, level: int) -> Iterator[Chunk]:
 
     Raises:
         InvalidContainerError: a container's metadata is missing or invalid, or has too few rows.
-        UnsupportedError: a container is of another version.
+        UnsupportedError: there is no such level, or a container is of another version.
     """
+    if not 0 <= level < tree.levels:
+        raise UnsupportedError(f"there is no level {level}; this scene has levels 0 (the finest) to {tree.levels - 1}")
     rows: dict[int, list[tuple[int, int]]] = {}
     for file, offset, count in tree.rows[level]:
         merged = rows.setdefault(file, [])

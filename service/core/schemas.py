@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 import kissgs
 
+from .formats import DEFAULT, Format
 from .models import NOTE_CHARS, State
 from .problems import Problem
 
@@ -29,10 +30,15 @@ class JobOptions(kissgs.Settings):
                 {"preset": "small", "encode": {"seed": 7}},
                 {"compact": {"ratio": 0.2}},
                 {"finetune": {"enabled": True}},
+                {"format": "sog"},
             ]
         },
     )
 
+    format: Format = Field(
+        DEFAULT,
+        description="Format of the container: sogxt (.zip), or sog, which other viewers open (.sog, SOG version 2).",
+    )
     evaluate: bool = Field(
         False, description="Also render both scenes and compare the images (PSNR, SSIM), which takes longer."
     )
@@ -176,6 +182,7 @@ class Limits(ApiModel):
     """Limits of the service; null means no limit."""
 
     formats: list[str] = Field(description="Supported formats of uploads.")
+    containers: list[Format] = Field(description="Formats of containers, for the option `format`.")
     max_upload_bytes: int
     max_header_bytes: int
     max_gaussians: int
@@ -231,7 +238,7 @@ class ProblemKind(ApiModel):
 
 
 class Version(ApiModel):
-    """Versions of the library and of the interface, and the container format."""
+    """Versions of the library and of the interface, and the default container format."""
 
     kissgs: str
     api: str

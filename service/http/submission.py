@@ -108,7 +108,7 @@ def parse_options(text: str | bytes) -> JobOptions:
     """Parse options from JSON.
 
     Raises:
-        ProblemError: they are invalid; the problem lists every invalid field.
+        ProblemError: they are invalid; the problem lists every invalid field. Or they cannot be met on this server.
     """
     try:
         options = JobOptions.model_validate_json(text)

@@ -11,6 +11,7 @@ from typing import Any
 from anyio.to_thread import run_sync
 
 from ..core.disk_estimates import BYTES_PER_GAUSSIAN
+from ..core.formats import container_file
 from ..core.models import Job, State
 from ..core.problems import PROBLEM_TYPES, ProblemError
 from ..core.settings import ServiceSettings
@@ -82,7 +83,7 @@ class Decoder:
 
         task = {
             "kind": "decode",
-            "source": str(self.storage.result(job.id) / "scene.zip"),
+            "source": str(self.storage.result(job.id) / container_file(job.options).name),
             "work": str(work),
             "threads": self.settings.job_threads,
             "memory": int(self.settings.job_memory),

@@ -60,7 +60,8 @@ def _compress(task: dict[str, Any], send: Send) -> dict[str, Any]:
     result = _run_compression(task, send)
     folder = Path(task["work"]) / "result"
     folder.mkdir()
-    result.save(folder / "scene.zip")
+    container = folder / task["container"]
+    result.save(container)
     result.save(folder / "files")
     for path in (folder / "files", folder):
         _sync(path)
@@ -72,7 +73,7 @@ def _compress(task: dict[str, Any], send: Send) -> dict[str, Any]:
         for path in sorted((folder / "files").iterdir())
     }
     summary = {
-        "container": _size_and_hash(folder / "scene.zip"),
+        "container": _size_and_hash(container),
         "report": _size_and_hash(folder / "report.json"),
         "files": files,
         "source_format": kissgs.recognise(Path(task["source"])),
@@ -112,6 +113,7 @@ def _run_compression(task: dict[str, Any], send: Send) -> kissgs.Compressed:
             return kissgs.compress(
                 Path(task["source"]),
                 settings=kissgs.Settings.model_validate(task["settings"]),
+                container=task["format"],
                 evaluate=task["evaluate"],
                 checkpoint=checkpoint,
                 threads=task["threads"],

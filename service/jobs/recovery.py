@@ -10,6 +10,7 @@ import logging
 from pathlib import Path
 from typing import Any
 
+from ..core.formats import container_file
 from ..core.models import Job, State
 from ..storage.job_files import JobStorage
 from .container import ServiceContainer
@@ -33,7 +34,7 @@ def recover(context: ServiceContainer) -> None:
 def _recover_job(context: ServiceContainer, job: Job) -> None:
     store, storage, completion = context.store, context.storage, context.worker.completion
     result = storage.result(job.id)
-    summary = read_summary(result)
+    summary = read_summary(result, container_file(job.options).name)
     if summary is None and result.exists():
         log.warning("job %s: its result is damaged", job.id)
     if summary is not None:
@@ -60,14 +61,14 @@ def _finish_removal(storage: JobStorage, job_id: str, *, failed: bool) -> None:
         storage.remove_job(job_id)
 
 
-def read_summary(result: Path) -> dict[str, Any] | None:
-    """Return the summary of a complete result; None if there is no result or it is damaged."""
+def read_summary(result: Path, container: str) -> dict[str, Any] | None:
+    """Return the summary of a complete result with this container file; None if there is none or it is damaged."""
     try:
         summary: dict[str, Any] = json.loads((result / "summary.json").read_text(encoding="utf-8"))
         files = {name: entry["bytes"] for name, entry in summary["files"].items()}
         sizes = {result / "files" / name: size for name, size in files.items()}
         sizes |= {
-            result / "scene.zip": summary["container"]["bytes"],
+            result / container: summary["container"]["bytes"],
             result / "report.json": summary["report"]["bytes"],
         }
         complete = all(path.stat().st_size == size for path, size in sizes.items())

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from anyio.to_thread import run_sync
 from sqlalchemy.exc import SQLAlchemyError
 
+from ..core.formats import CONTAINER_FILES
 from ..core.metrics import Metrics
 from ..core.models import Job, State
 from ..core.notifier import JobNotifier, ended, wait
@@ -141,14 +142,16 @@ class Worker:
         if current is None or current.state != State.RUNNING:
             return Outcome("stopped")
         work = await run_sync(self.storage.new_work, job.id)
-        resumable = JobOptions.model_validate(job.options).resumable
+        options = JobOptions.model_validate(job.options)
         task = {
             "kind": "compress",
             "source": str(self.storage.upload(job.id)),
             "work": str(work),
-            "settings": {name: value for name, value in job.options.items() if name != "evaluate"},
-            "evaluate": job.options["evaluate"],
-            "checkpoint": str(self.storage.checkpoint(job.id)) if resumable else None,
+            "settings": {name: value for name, value in job.options.items() if name not in ("format", "evaluate")},
+            "format": options.format,
+            "container": CONTAINER_FILES[options.format].name,
+            "evaluate": options.evaluate,
+            "checkpoint": str(self.storage.checkpoint(job.id)) if options.resumable else None,
             "threads": self.settings.job_threads,
             "memory": int(self.settings.job_memory),
         }

@@ -7,7 +7,7 @@
  *   bytes_per_gaussian: number}} Sizes
  * @typedef {{created_at: string, queue_seconds?: number, run_seconds?: number}} Timings
  * @typedef {{id: string, name: string, state: string, position?: number, progress?: Progress,
- *   estimate?: {seconds_left: number}, options: {preset: string, encode: {rate_distortion: boolean} & import("./goal.js").Goals,
+ *   estimate?: {seconds_left: number}, options: {preset: string, format?: string, encode: {rate_distortion: boolean} & import("./goal.js").Goals,
  *     evaluate: boolean,
  *     compact: {count: number | null, ratio: number | null, max_psnr_drop: number | null, auto_count: boolean,
  *     sparsify_steps: number, refine_steps: number}, finetune: {enabled: boolean}},

@@ -2,12 +2,13 @@
 
 import { announce, byId, el } from "./dom.js";
 import { bytes, count } from "./format.js";
+import { formatField } from "./container_formats.js";
 import { goalField } from "./goal.js";
 import { UnsuitableFile, inspect } from "./ply.js";
 import { presetList } from "./presets.js";
 
 /**
- * @typedef {{preset: string, evaluate: boolean, encode?: import("./goal.js").Goals,
+ * @typedef {{preset: string, evaluate: boolean, format?: string, encode?: import("./goal.js").Goals,
  *   compact?: {ratio?: number | null, auto_count?: boolean}, finetune?: {enabled?: boolean}}} Options
  * @typedef {{file: File, options: Options}} Submission
  */
@@ -21,7 +22,7 @@ import { presetList } from "./presets.js";
 export function composer(limits, presets, submit) {
   const [form, input] = [byId("compose"), byId("file")];
   const list = presetList(presets);
-  const goal = goalField(presets, list.chosen);
+  const [goal, format] = [goalField(presets, list.chosen), formatField()];
   /** @type {File | null} */
   let chosen = null;
   let inspections = 0; // only the result of the latest is shown
@@ -67,7 +68,7 @@ export function composer(limits, presets, submit) {
     const [preset, evaluate, encode] = [list.chosen(), byId("evaluate").checked, goal.chosen()];
     const [compact, finetune] = [budget(byId("keep").value), byId("finetune").checked && { enabled: true }];
     const optional = { ...(encode && { encode }), ...(compact && { compact }), ...(finetune && { finetune }) };
-    if (chosen) return submit({ file: chosen, options: { preset, evaluate, ...optional } });
+    if (chosen) return submit({ file: chosen, options: { preset, evaluate, format: format.chosen(), ...optional } });
     showError("Choose a scene first.");
     input.focus();
   });
@@ -82,6 +83,7 @@ export function composer(limits, presets, submit) {
     prefer(options) {
       list.choose(options.preset);
       goal.prefer(options.encode ?? {});
+      format.prefer(options.format);
       byId("evaluate").checked = options.evaluate;
       byId("finetune").checked = limits.training && (options.finetune?.enabled ?? false);
       const [keep, ratio] = [/** @type {HTMLSelectElement} */ (byId("keep")), options.compact?.ratio ?? null];

@@ -3,11 +3,11 @@
 import { Problem, active, cancel, status as statusOf } from "./api.js";
 import { announce, byId, el, setTitle } from "./dom.js";
 import { follow } from "./follow.js";
-import { count, short } from "./format.js";
+import { short } from "./format.js";
 import { resultView } from "./result.js";
 import { runningView } from "./running.js";
 import { explain, problemBox } from "./problems.js";
-import { stateLabel } from "./labels.js";
+import { jobLabel, stateLabel } from "./labels.js";
 
 /** @typedef {import("./api.js").Status} Status */
 
@@ -76,7 +76,7 @@ export function jobCard(page) {
     return [
       el("p", { class: `kicker ${status.state === "failed" ? "bad" : ""}` }, stateLabel(status.state)),
       el("h1", { id: "job-title", tabindex: "-1" }, status.name),
-      el("p", { class: "muted" }, `${count(status.gaussians)} Gaussians · ${status.options.preset} preset`),
+      el("p", { class: "muted" }, jobLabel(status)),
       status.problem ? problemBox(status.problem) : el("p", {}, reason(status)),
       el(
         "div",

@@ -1,6 +1,7 @@
 /** Labels for the service's names of states, stages, files and corrections; unknown names are shown unchanged. */
 
 import { count } from "./format.js";
+import { formatOf } from "./container_formats.js";
 
 /** @typedef {import("./api.js").Status} Status */
 
@@ -44,14 +45,15 @@ const WITH_SH_REST = ["codebook", "sort codebook"];
 
 /** @type {[RegExp, string][]} */
 const PLANES = [
-  [/^means_bytes_0\b/, "Positions, low bytes"],
-  [/^means_bytes_1\b/, "Positions, high bytes"],
-  [/^quaternions\b/, "Rotations"],
+  [/^means_(bytes_0|l)\b/, "Positions, low bytes"],
+  [/^means_(bytes_1|u)\b/, "Positions, high bytes"],
+  [/^quat(ernion)?s\b/, "Rotations"],
   [/^scales\b/, "Scales"],
   [/^f_dc\b/, "Base colours"],
+  [/^sh0\b/, "Colours, opacities"],
   [/^opacities\b/, "Opacities"],
-  [/^f_rest_centroids\b/, "SH codebook"],
-  [/^f_rest_labels\b/, "SH labels"],
+  [/^(f_rest|shN)_centroids\b/, "SH codebook"],
+  [/^(f_rest|shN)_labels\b/, "SH labels"],
   [/^active_mask\b/, "Mask"],
   [/\.(json|ya?ml)$/, "Metadata"],
 ];
@@ -70,6 +72,10 @@ const CLEANED = {
 
 /** @param {string} state */
 export const stateLabel = (state) => STATES[state] ?? state;
+
+/** Describe what a job was given. @param {Status} status */
+export const jobLabel = (status) =>
+  `${count(status.gaussians)} Gaussians · ${status.options.preset} preset · ${formatOf(status).title}`;
 
 /** @param {string} stage */
 export const stageLabel = (stage) => STAGES[stage] ?? stage;

@@ -92,7 +92,7 @@ async function start() {
   showProblem(null);
   try {
     const [limits, presets, version] = await Promise.all([json("/v1/limits"), json("/v1/presets"), json("/version")]);
-    byId("version").textContent = `kissgs ${version.kissgs} · API ${version.api} · ${version.container}`;
+    byId("version").textContent = `kissgs ${version.kissgs} · API ${version.api}`;
     run(limits, presets);
   } catch (error) {
     showProblem(error, start);

@@ -3,6 +3,7 @@
 import { call } from "./api.js";
 import { el, facts, time } from "./dom.js";
 import { ago, bytes, count, duration, moment, share, short } from "./format.js";
+import { formatLabel, formatOf } from "./container_formats.js";
 import { explain, problemBox } from "./problems.js";
 import { cleaningNotes, planes } from "./labels.js";
 
@@ -54,6 +55,7 @@ function figures(status) {
     ["Gaussians", count(kept), kept === status.gaussians ? "all of them" : `of ${count(status.gaussians)}`],
     ["Time", duration(timings.run_seconds ?? 0), waited >= 1 ? `after ${duration(waited)} in the queue` : undefined],
     ["Preset", status.options.preset],
+    ["Format", formatLabel(formatOf(status))],
   ];
   if (finetuning) pairs.push(["Fine-tuning", gain(finetuning), "on held-out views"]);
   if (evaluation) {
@@ -127,11 +129,13 @@ function notesList(notes) {
  * @param {Status} status
  * @param {boolean} keyed
  */
-function downloads({ name, links, expires_at: expires }, keyed) {
+function downloads(status, keyed) {
+  const { name, links, expires_at: expires } = status;
+  const { ending } = formatOf(status);
   const message = el("div");
   /** @type {[string, string, string, string][]} */
   const all = [
-    ["result", "Download container (zip)", `${name}.zip`, "primary"],
+    ["result", `Download container (${ending})`, `${name}${ending}`, "primary"],
     ["decoded", "Decoded .ply", `${name}.decoded.ply`, "quiet"],
     ["report", "Report", `${name}.report.json`, "quiet"],
   ];

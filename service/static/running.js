@@ -1,8 +1,8 @@
 /** The view of a queued or running job: stage, progress and time estimate. */
 
 import { announce, el, setTitle } from "./dom.js";
-import { clock, count, percent, roughly } from "./format.js";
-import { plannedStages, stageLabel } from "./labels.js";
+import { clock, percent, roughly } from "./format.js";
+import { jobLabel, plannedStages, stageLabel } from "./labels.js";
 
 /** @typedef {import("./api.js").Status} Status */
 
@@ -23,7 +23,7 @@ export function runningView(first, cancel) {
   const children = [
     kicker,
     el("h1", { id: "job-title", tabindex: "-1" }, first.name),
-    el("p", { class: "muted" }, `${count(first.gaussians)} Gaussians · ${first.options.preset} preset`),
+    el("p", { class: "muted" }, jobLabel(first)),
     el("p", { class: "spread" }, headline, amount),
     bar,
     el("p", { class: "spread muted" }, elapsed, left),

@@ -5,7 +5,7 @@
     jobs/ID/work-TOKEN/          files of a running job process
     jobs/ID/checkpoint*.npz      checkpoints of training, kept until the job ends
     jobs/ID/result/              the result, renamed to this when it is complete and on the disk
-        scene.zip  report.json  files/NAME
+        scene.zip or scene.sog  report.json  files/NAME
     jobs/ID/decoded.ply          the decoded scene, after the first request; decoded.json has its size and checksum
     jobs/.orphaned/ID/           folders of jobs that the database does not know; never read or removed
     lock, identity, database     lock of the service, number of the folder, number of its database

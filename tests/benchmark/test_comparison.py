@@ -58,15 +58,32 @@ def test_bytes_that_differ_between_runs_are_reported():
 
 def test_bytes_at_equal_psnr_are_on_the_rate_curve():
     rows = many(photo=True)
-    found = {(equal.external, equal.target): equal for equal in at_equal_psnr(rows)}
-    assert set(found) == {(external, target) for external in ("sog", "spz") for target in ("original", "photographs")}
+    found = {(equal.reference, equal.target): equal for equal in at_equal_psnr(rows)}
+    assert set(found) == {(external, target) for external in (".sog", ".spz") for target in ("original", "photographs")}
     expected = math.exp((math.log(700) + math.log(1600)) / 2)  # half-way from 40 to 46 dB
-    assert found["sog", "original"].bytes == pytest.approx(expected)
-    assert found["sog", "original"].ratio == pytest.approx(expected / 2000)
-    assert found["spz", "original"].ratio is None
+    assert found[".sog", "original"].bytes == pytest.approx(expected)
+    assert found[".sog", "original"].ratio == pytest.approx(expected / 2000)
+    assert found[".spz", "original"].ratio is None
     table = text(bench_tables(rows, list(found.values())))
     assert f"at the PSNR of .sog to the original (43.00 dB): balanced 1,058 bytes, {expected / 2000:.3f} of" in table
     assert "at the PSNR of .spz to photographs (20.00 dB): beyond the curve of balanced" in table
+
+
+def test_containers_are_compared_at_equal_psnr():
+    """A preset in another container is a reference for the curve of the preset, and the other way round."""
+    rows = [row for row in many() if row.codec in ("fast", "balanced")]
+    rows += [measured("balanced", 800, 41.5, container="sog"), measured("fast", 1100, 37.0, container="sog")]
+    (found,) = at_equal_psnr(rows)
+    assert (found.reference, found.preset, found.container) == ("balanced .sog", "balanced", "sogxt")
+    expected = math.exp(0.75 * math.log(700) + 0.25 * math.log(1600))  # a quarter of the way from 40 to 46 dB
+    assert found.bytes == pytest.approx(expected)
+    assert found.ratio == pytest.approx(expected / 800)
+    rows.append(measured("balanced", 1700, 46.5, container="sog", quality_offset_db=6.0))
+    back = next(equal for equal in at_equal_psnr(rows) if equal.container == "sog")
+    assert (back.reference, back.bytes) == ("balanced", None), "40 dB is below the curve of .sog"
+    table = text(bench_tables(rows, at_equal_psnr(rows)))
+    assert f"at the PSNR of balanced .sog to the original (41.50 dB): balanced {expected:,.0f} bytes" in table
+    assert "balanced .sog at 6" in table
 
 
 SCALING = [measured(f"preset{n}", 1, 30.0, gaussians=size) for size in (10**5, 10**6, 10**7) for n in range(4)]

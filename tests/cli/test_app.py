@@ -69,7 +69,7 @@ def test_info_of_both_kinds(scene: Path, tmp_path: Path) -> None:
     run("compress", scene, "-o", container, "-q")
     ply, zipped = json.loads(run("info", scene, container, "--json").stdout)
     assert (ply["kind"], ply["count"], ply["sh_degree"]) == ("ply", 600, 1)
-    assert (zipped["kind"], zipped["sh_degree"]) == ("sog-xt", 1)
+    assert (zipped["kind"], zipped["sh_degree"]) == ("sogxt", 1)
     assert zipped["count"] == len(kissgs.decompress(container))
     assert sum(zipped["parts"].values()) < zipped["bytes"] == container.stat().st_size
     table = run("info", container).stdout.decode()

@@ -22,7 +22,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_ending_decides(scene: Path, tmp_path: Path) -> None:
-    for ending in ("ply", "compressed.ply", "spz", "glb"):
+    for ending in ("ply", "compressed.ply", "spz", "glb", "spz.glb"):
         done = run("convert", scene, tmp_path / f"a.{ending}")
         assert (done.returncode, done.stderr) == (0, b"")
         kissgs.save(kissgs.load(scene), tmp_path / f"b.{ending}")

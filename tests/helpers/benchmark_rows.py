@@ -41,12 +41,23 @@ def evaluation(psnr, photo=None):
 
 
 def measured(
-    codec, size, psnr, *, photo=None, quality_offset_db=None, external=False, runs=None, gaussians=30, seconds=1.0
+    codec,
+    size,
+    psnr,
+    *,
+    photo=None,
+    quality_offset_db=None,
+    container="sogxt",
+    external=False,
+    runs=None,
+    gaussians=30,
+    seconds=1.0,
 ):
     files = {codec: size} if external else dict.fromkeys(FILES, size // len(FILES))
     return Measurement(
         scene="scene.ply",
         codec=codec,
+        container=None if external else container,
         quality_offset_db=quality_offset_db,
         gaussians=gaussians,
         file_bytes=files,

@@ -1,20 +1,22 @@
 """Oracle: a naive parser, the naive columns of helpers/reference_gltf.py, and the file of splat-transform."""
 
 import io
+import json
 import struct
 
 import numpy as np
 import pytest
 from helpers.format_scenes import assert_alike, made_scene
-from helpers.reference_gltf import NAME, attributes, parse_glb
+from helpers.reference_gltf import NAME, SPZ, attributes, parse_glb
 from helpers.splat_transform import convert, needs_splat_transform
 
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.splats import ATTRIBUTES, clean
 from kissgs.io import gltf_writer
 from kissgs.io.gltf import GltfInfo, read_gltf, read_gltf_info
-from kissgs.io.gltf_writer import write_glb
+from kissgs.io.gltf_writer import write_glb, write_spz_glb
 from kissgs.io.ply import write_ply
+from kissgs.io.spz_writer import write_spz
 
 
 def written(splats):
@@ -76,6 +78,37 @@ def test_scenes_that_glb_cannot_hold(monkeypatch):
     monkeypatch.setattr(gltf_writer, "_MAX_BYTES", size - 1)
     with pytest.raises(UnsupportedError, match=r"^5 Gaussians take [\d,]+ bytes, and \.glb ends at 4 GiB; write"):
         written(made_scene(5, 1))
+
+
+@pytest.mark.parametrize(("count", "degree"), [(1, 0), (65, 1), (66, 3)])
+def test_spz_inside(count, degree):
+    """The file is a GLB around the bytes of the .spz, whose losses are those of the file."""
+    scene, file, packed = clean(made_scene(count, degree))[0], io.BytesIO(), io.BytesIO()
+    assert write_spz_glb(file, scene) == write_spz(packed, scene)
+    data = file.getvalue()
+    info = GltfInfo(count=count, sh_degree=degree, primitives=1, binary=True, spz=True)
+    assert read_gltf_info(data) == info
+    size, text = struct.unpack_from("<II", data, 8)
+    assert size == len(data)
+    root = json.loads(data[20 : 20 + text])
+    (view,) = root["bufferViews"]
+    assert root["buffers"] == [{"byteLength": view["byteLength"]}]
+    body = data[28 + text :]
+    assert body == packed.getvalue() + bytes(-len(packed.getvalue()) % 4)
+    assert struct.unpack_from("<I4s", data, 20 + text) == (len(body), b"BIN\0")
+    assert root["extensionsRequired"] == root["extensionsUsed"] == [NAME, SPZ]
+    means = read_gltf(data).means * [-1, -1, 1]
+    assert root["accessors"][0]["min"] == means.min(axis=0).tolist()
+    assert root["accessors"][0]["max"] == means.max(axis=0).tolist()
+    assert all("bufferView" not in accessor for accessor in root["accessors"])
+
+
+def test_scenes_that_spz_inside_glb_cannot_hold(monkeypatch):
+    with pytest.raises(UnsupportedError, match=r"^a scene without Gaussians cannot be written as \.glb; write it as"):
+        write_spz_glb(io.BytesIO(), made_scene(0, 1))
+    monkeypatch.setattr(gltf_writer, "_MAX_BYTES", 1000)
+    with pytest.raises(UnsupportedError, match=r"^5 Gaussians take [\d,]+ bytes, and \.glb ends at 4 GiB; write"):
+        write_spz_glb(io.BytesIO(), made_scene(5, 1))
 
 
 def test_bytes_are_the_same_again():

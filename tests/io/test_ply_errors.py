@@ -182,7 +182,7 @@ def test_a_line_without_end_is_not_collected(monkeypatch):
 def test_more_than_the_limit_is_refused_before_reading():
     data = ply_bytes(random_columns(3, 0))
     assert len(read_ply(data, max_gaussians=3)) == 3
-    with pytest.raises(UnsupportedError, match=r"^the data has 3 Gaussians; the limit is 2$"):
+    with pytest.raises(UnsupportedError, match=r"^the data has 3 Gaussians; the limit is 2: raise it"):
         read_ply(data, max_gaussians=2)
 
 
@@ -216,7 +216,7 @@ def test_file_cut_while_it_is_read(encoding, tmp_path, monkeypatch):
 def test_missing_file(name, tmp_path):
     with pytest.raises(InvalidSceneError) as error:
         read_ply(tmp_path / name)
-    assert str(error.value) == f"cannot read {tmp_path / name}: there is no such file; name a .ply file"
+    assert str(error.value) == f"cannot read {tmp_path / name}: there is no such file; name a scene file"
 
 
 def test_folder_and_pipe(tmp_path):
@@ -224,7 +224,7 @@ def test_folder_and_pipe(tmp_path):
     for path in (tmp_path, tmp_path / "pipe.ply"):
         with pytest.raises(InvalidSceneError) as error:
             read_ply_info(path)
-        assert str(error.value) == f"cannot read {path}: it is a folder or a device; name a .ply file"
+        assert str(error.value) == f"cannot read {path}: it is a folder or a device; name a scene file"
 
 
 def test_no_permission(tmp_path, monkeypatch):

@@ -13,6 +13,7 @@ from helpers.command_line import run
 import kissgs
 from kissgs import InvalidContainerError, KissgsError, Settings, decompress, sample_scene
 from kissgs.pipeline.inspect import describe
+from kissgs.pipeline.read_options import ReadOptions
 from kissgs.pipeline.scene_files import open_scene
 from kissgs.pipeline.scene_formats import is_container
 
@@ -56,9 +57,9 @@ def test_all_commands_read_what_decompress_reads(name, tmp_path):
     wanted = decompress(FORMS["plain.zip"])
     for found in (decompress(path), decompress(FORMS[name]), kissgs.load(path)):
         np.testing.assert_array_equal(found.means, wanted.means)
-    assert (described := describe(path)).kind == "sog-xt"
+    assert (described := describe(path)).kind == "sogxt"
     assert described.count == len(wanted)
-    assert open_scene(FORMS[name], 1, lambda *_: None)[2] == len(FORMS[name])
+    assert open_scene(FORMS[name], ReadOptions(), 1, lambda *_: None)[2] == len(FORMS[name])
 
 
 def test_a_ply_with_a_zip_at_its_end_is_a_ply_to_all(tmp_path):
@@ -84,7 +85,7 @@ def test_evaluate_and_render_read_what_decompress_reads(tmp_path):
     program = tmp_path / "program.exe"
     program.write_bytes(FORMS["program.exe"])
     assert run("decompress", program, "-o", tmp_path / "a.ply").returncode == 0
-    assert json.loads(run("info", program, "--json").stdout)["kind"] == "sog-xt"
+    assert json.loads(run("info", program, "--json").stdout)["kind"] == "sogxt"
     done = run("evaluate", tmp_path / "a.ply", program, "--json")
     assert json.loads(done.stdout)["bytes"]["candidate"] == len(FORMS["program.exe"])
     assert run("render", program, "-o", tmp_path / "a.png", "--size", "64x48").returncode == 0

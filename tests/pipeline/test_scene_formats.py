@@ -11,11 +11,13 @@ from helpers.reference_ply import assert_identical
 from helpers.reference_sog import sog_files, streamed_files, write_folder, zip_of
 from helpers.reference_splat import ksplat_bytes, splat_bytes
 from helpers.reference_spz import spz_bytes
+from helpers.web_tools import DECODER
 
 import kissgs
-from kissgs import InvalidContainerError, InvalidSceneError, KissgsError, Settings
+from kissgs import InvalidContainerError, InvalidSceneError, KissgsError, Settings, UnsupportedError
 from kissgs.core.splats import clean
 from kissgs.pipeline.inspect import describe
+from kissgs.pipeline.read_options import ReadOptions
 from kissgs.pipeline.scene_files import open_scene, read_scene, stored_bytes
 from kissgs.pipeline.scene_formats import recognise
 
@@ -46,7 +48,7 @@ def test_files_are_recognised_and_read_by_all(name, tmp_path):
     wanted = read_scene(path)
     assert_identical(kissgs.decompress(path), wanted)
     assert_identical(kissgs.load(path), clean(wanted)[0])
-    opened, _, size = open_scene(path, 1, lambda *_: None)
+    opened, _, size = open_scene(path, ReadOptions(), 1, lambda *_: None)
     assert_identical(opened, clean(wanted)[0])
     assert size == len(data) == stored_bytes(path)
     found = describe(path)
@@ -101,8 +103,8 @@ def test_folders_of_sog_xt_stay_what_they_are(tmp_path):
     packed.save(tmp_path / "folder")
     only_json = {name: data for name, data in packed.files.items() if not name.endswith(".yaml")}
     for source in (tmp_path / "folder", packed.to_zip(), packed.files, only_json, zip_of(only_json)):
-        assert recognise(source) == "sog-xt"
-    assert recognise(tmp_path / "folder/meta.json") == "sog-xt"
+        assert recognise(source) == "sogxt"
+    assert recognise(tmp_path / "folder/meta.json") == "sogxt"
     assert len(kissgs.load(tmp_path / "folder/meta.json")) == len(kissgs.decompress(only_json))
 
 
@@ -112,8 +114,13 @@ def test_levels_of_a_streamed_scene(tmp_path):
     found = describe(folder)
     assert found.details == {"levels": [30, 5], "environment": 2, "files": 2}
     assert set(found.parts) == {"lod-meta.json", "0_0/", "env/"}
-    with pytest.raises(KissgsError, match=r"there is no level 2; this scene has levels 0 \(the finest\) to 1"):
+    coarse = describe(folder, ReadOptions(level=1))
+    assert (coarse.count, set(coarse.parts)) == (7, {"lod-meta.json", "1_0/", "env/"})
+    message = r"there is no level 2; this scene has levels 0 \(the finest\) to 1"
+    with pytest.raises(KissgsError, match=message):
         kissgs.load(folder, level=2)
+    with pytest.raises(KissgsError, match=message):
+        describe(folder, ReadOptions(level=2))
 
 
 def test_raw_axes(tmp_path):
@@ -121,7 +128,7 @@ def test_raw_axes(tmp_path):
     path.write_bytes(spz_bytes(SCENE, 3))
     raw, turned = kissgs.load(path, raw_axes=True), kissgs.load(path)
     np.testing.assert_array_equal(raw.means, turned.means * [1, -1, -1])
-    assert_identical(kissgs.decompress(path, raw_axes=True), read_scene(path, raw_axes=True))
+    assert_identical(kissgs.decompress(path, raw_axes=True), read_scene(path, ReadOptions(raw_axes=True)))
 
 
 def test_details(tmp_path):
@@ -168,3 +175,58 @@ def test_the_command_line_reads_them(tmp_path):
     said = run("info", tmp_path / "a.sog", tmp_path / "a2.spz", tmp_path / "a.zip").stdout.decode()
     for text in ("SOG container (version 2, by hand)", "SPZ scene (version 2)", "finest first: 30, 5; environment: 2"):
         assert text in said
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_limit_that_is_given_holds_for_every_format(name, tmp_path):
+    path = tmp_path / name
+    path.write_bytes(FILES[name][1])
+    count = len(kissgs.load(path))
+    assert len(kissgs.load(path, max_gaussians=count)) == count
+    with pytest.raises(UnsupportedError, match=rf"has {count} Gaussians; the limit is {count - 1}: raise it"):
+        kissgs.load(path, max_gaussians=count - 1)
+
+
+def test_the_default_limit_is_for_formats_that_can_declare_more_than_they_hold(tmp_path, monkeypatch):
+    monkeypatch.setattr("kissgs.pipeline.read_options.MAX_GAUSSIANS", 3)
+    refused = set()
+    for name, (_, data) in FILES.items():
+        (tmp_path / name).write_bytes(data)
+        try:
+            kissgs.load(tmp_path / name)
+        except UnsupportedError:
+            refused.add(name)
+    assert set(FILES) - refused == {name for name in FILES if name.endswith((".ply", "splat"))}
+
+
+TINY = ("--size", "32x24")
+READING = {
+    "info": ("info", "IN", "--json"),
+    "convert": ("convert", "IN", "OUT.ply"),
+    "decompress": ("decompress", "IN", "-o", "OUT.ply"),
+    "compress": ("compress", "IN", "-o", "OUT.zip", "-p", "fast", "--json"),
+    "compact": ("compact", "IN", "-o", "OUT.ply", "-n", "5", "-p", "fast", "--json"),
+    "evaluate": ("evaluate", "IN", "IN", "--json"),
+    "render": ("render", "IN", "-o", "OUT.png", *TINY),
+    "view": ("view", "IN", "-o", "OUT.html"),
+}
+
+
+@pytest.mark.parametrize("command", READING)
+@pytest.mark.quick(2)
+def test_every_command_that_reads_scenes_has_the_options_for_it(command, tmp_path):
+    """A limit that the coarse level meets and the finest does not: the level is chosen, and the limit is heeded."""
+    packed = tmp_path / "lod.zip"
+    packed.write_bytes(zip_of(STREAMED))
+    words = [word.replace("IN", str(packed)).replace("OUT", str(tmp_path / "out")) for word in READING[command]]
+    if command == "view" and not (DECODER / "vendor").exists():
+        pytest.skip("scripts/vendor has not run")
+    if command != "info":  # which decodes nothing
+        done = run(*words, "--max-gaussians", "7")
+        assert (done.returncode, b"level 0 has 32 Gaussians; the limit is 7" in done.stderr) == (2, True), done.stderr
+    done = run(*words, "--level", "1", "--max-gaussians", "7")
+    assert done.returncode == 0, done.stderr
+    if command in ("info", "compress"):
+        report = json.loads(done.stdout)
+        assert 7 in (report.get("count"), report.get("source_count"))
+    assert run(*words, "--raw-axes", "--level", "1", "-f" if command != "info" else "--json").returncode == 0

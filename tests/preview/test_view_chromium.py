@@ -69,15 +69,16 @@ def test_a_sog(tmp_path, shown, preview):  # noqa: F811
     splats = kissgs.decompress(sog)
     kissgs.save(splats, tmp_path / "scene.ply")
     read = shown(page_scene(tmp_path / "scene.ply"), len(splats))
-    assert psnr(shown(page_scene(sog), len(splats)), read) > 45
+    served = shown(page_scene(sog), len(splats))
+    assert psnr(read[:-80], served[:-80]) > 40  # below are the buttons, which differ
     path = tmp_path / "page.html"
     path.write_bytes(standalone_page(page_scene(sog)))
     tab = preview(offline=True)
     tab.origin = path.as_uri()
     tab.page.goto(tab.origin)
-    assert psnr(tab.shown(len(splats)), read) > 45
+    assert psnr(tab.shown(len(splats)), served) > 60
     tab.choose(("half.sog", sog[: len(sog) // 2]))
-    tab.error_message("cannot be read")
+    tab.error_message("zip", "cut off")
 
 
 def test_a_page_from_disk_reaches_nothing(tmp_path, container, preview):  # noqa: F811

@@ -83,6 +83,31 @@ def test_upload_compression_and_download(visit, service, tmp_path):
     assert download.value.suggested_filename == "my scene.decoded.ply"
 
 
+def test_the_choice_of_the_format(visit, service, tmp_path):
+    page = visit()
+    choose(page)
+    page.get_by_text("300 Gaussians").wait_for()
+    page.get_by_label("Fast").check()
+    formats = page.get_by_label("Format", exact=True)
+    assert formats.locator("option").all_inner_texts() == ["SOG-XT (.zip)", "SOG (.sog)"]
+    assert "kissgs" in page.locator("#format-note").inner_text()
+    formats.select_option("SOG (.sog)")
+    assert "other viewers" in page.locator("#format-note").inner_text()
+    page.get_by_role("button", name="Compress").click()
+    page.get_by_text("smaller").first.wait_for()
+    assert newest(service)["options"]["format"] == "sog"
+    assert page.locator(".facts > div", has_text="Format").inner_text().split("\n")[-1] == "SOG (.sog)"
+    rows = page.locator("table.planes tbody th").all_inner_texts()
+    assert {"Colours, opacities", "Rotations", "SH codebook", "SH labels", "Metadata"} <= set(rows)
+    assert not [row for row in rows if "webp" in row]
+    with page.expect_download() as download:
+        page.get_by_role("link", name="Download container (.sog)").click()
+    assert download.value.suggested_filename == "my scene.sog"
+    download.value.save_as(tmp_path / "x.sog")
+    fast = kissgs.Settings(preset="fast")
+    assert (tmp_path / "x.sog").read_bytes() == kissgs.compress(SMALL, settings=fast, container="sog").to_zip()
+
+
 def test_keyboard_operation(visit, service):
     page = visit()
     choose(page)
@@ -90,7 +115,7 @@ def test_keyboard_operation(visit, service):
     page.locator("#file").focus()
     page.keyboard.press("Tab")
     page.keyboard.press("ArrowUp")  # from balanced to fast
-    for _ in range(2):
+    for _ in range(3):
         page.keyboard.press("Tab")
     page.keyboard.press("Enter")
     page.get_by_text("smaller").first.wait_for()

@@ -66,9 +66,9 @@ def test_dropping_files(preview, service):
         ("letter.txt", b"Dear reader,\n" * 99, ["zip"]),
         ("nothing.zip", b"", ["zip"]),
         ("half.zip", ZIP[: len(ZIP) // 2], ["zip"]),
-        ("letter.ply", b"Dear reader,\n" * 99, [".ply"]),
-        ("half.ply", PLY[: len(PLY) // 2], [".ply"]),
-        ("mesh.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n", [".ply"]),
+        ("letter.ply", b"Dear reader,\n" * 99, ["letter.ply"]),
+        ("half.ply", PLY[: len(PLY) // 2], ["half.ply"]),
+        ("mesh.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n", ["mesh.ply"]),
     ],
 )
 @pytest.mark.quick(1)

@@ -11,7 +11,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from helpers.service import SMALL, Service, scene_bytes
+from helpers.service import ROOT, SMALL, Service, scene_bytes
 
 import kissgs
 
@@ -252,3 +252,26 @@ def test_interrupting_the_command_cancels_the_job(start, tmp_path):
     (job,) = service.http.get("/v1/jobs").json()["jobs"]
     assert job["state"] == "cancelled"
     assert list(tmp_path.glob("*.zip")) == []
+
+
+def test_the_ending_chooses_the_container(service, scene, tmp_path):
+    expected = kissgs.compress(scene, settings=FAST, container="sog").to_zip()
+    done = kissgs_command("compress", scene, "-p", "fast", "-o", tmp_path / "a.sog", KISSGS_SERVER=service.url)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (tmp_path / "a.sog").read_bytes() == expected
+    folder = ("-o", tmp_path / "out", "--container", "sog", "--json")
+    done = kissgs_command("compress", scene, "-p", "fast", *folder, KISSGS_SERVER=service.url)
+    assert (tmp_path / "out" / "Schloß 1.sog").read_bytes() == expected
+    job = json.loads(done.stdout)["id"]
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", "from kissgs.cli.main import main; main()", "remote", "get", job],
+        env={**os.environ, "KISSGS_SERVER": service.url, "PYTHONPATH": str(ROOT)}, cwd=tmp_path, check=True,
+    )  # fmt: skip
+    assert (tmp_path / "Schloß 1.sog").read_bytes() == expected
+    refused = kissgs_command("get", job, "-o", tmp_path / "b.zip", KISSGS_SERVER=service.url)
+    assert (refused.returncode, "end it in .sog" in refused.stderr) == (2, True)
+    with kissgs.Remote(service.url) as remote:
+        assert remote.compress(scene, tmp_path / "b.sog", settings=FAST)["options"]["format"] == "sog"
+        with pytest.raises(kissgs.UnsupportedError, match=r"end it in \.zip"):
+            remote.compress(scene, tmp_path / "c.sog", settings=FAST, container="sogxt")
+    assert (tmp_path / "b.sog").read_bytes() == expected

@@ -111,9 +111,12 @@ def test_splat_transform_reads_the_reference_files_as_we_do(tmp_path):
 
 
 @needs_splat_transform
-def test_splat_transform_writes_what_we_read(tmp_path):
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("count", [1, 65])
+@pytest.mark.quick(2)
+def test_splat_transform_writes_what_we_read(count, degree, tmp_path):
     with (tmp_path / "a.ply").open("wb") as file:
-        write_ply(file, made_scene(65, 1))
+        write_ply(file, made_scene(count, degree))
     packed = convert(tmp_path / "a.ply", tmp_path / "lod/lod-meta.json", "-i", "2")
     theirs = read_ply(convert(packed, tmp_path / "b.ply"))
     assert_alike(streamed.decode(packed.parent), theirs, rtol=1e-6, atol=1e-6)

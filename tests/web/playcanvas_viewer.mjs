@@ -50,10 +50,11 @@ function cameraOf({ viewmat, K, width, height }, background) {
 let files = 0;
 window.draw = async ({ file, ending, cameras, background }) => {
   const filename = `scene-${files++}.${ending}`;
+  const bytes = bytesOf(file);
   const asset = new pc.Asset(
     filename,
-    "gsplat",
-    { url: filename, filename, contents: new Response(bytesOf(file)) },
+    ending === "glb" ? "container" : "gsplat",
+    { url: filename, filename, contents: ending === "glb" ? bytes.buffer : new Response(bytes) },
     { reorder: false },
   );
   app.assets.add(asset);
@@ -62,8 +63,13 @@ window.draw = async ({ file, ending, cameras, background }) => {
     asset.on("error", (error) => reject(new Error(error)));
     app.assets.load(asset);
   });
-  const entity = new pc.Entity();
-  entity.addComponent("gsplat", { asset });
+  let entity = new pc.Entity();
+  if (ending === "glb") {
+    entity = asset.resource.instantiateRenderEntity();
+    entity.setEulerAngles(0, 0, 180); // from glTF's axes to those of the other files
+  } else {
+    entity.addComponent("gsplat", { asset });
+  }
   app.root.addChild(entity);
   const images = [];
   for (const pinhole of cameras) {
@@ -74,7 +80,8 @@ window.draw = async ({ file, ending, cameras, background }) => {
     images.push(textOf(app.graphicsDevice.gl));
     camera.destroy();
   }
-  const count = asset.resource.numSplats;
+  const { numSplats, gsplats } = asset.resource;
+  const count = gsplats ? gsplats[0].resource.numSplats : numSplats;
   entity.destroy();
   asset.unload();
   app.assets.remove(asset);

@@ -1,6 +1,7 @@
 /** Decodes containers by jobs, and reports results and events as JSON; used in Node.js, in pages and in workers. */
 
-import { decode, expandSH } from "../../web_decoder/sogxt.js";
+import * as sog from "../../web_decoder/sog.js";
+import * as sogxt from "../../web_decoder/sogxt.js";
 
 const FIELDS = ["means", "quats", "scales", "opacities", "sh0", "labels", "centroids", "cells"];
 
@@ -21,7 +22,8 @@ function sourceOf({ url, base64, as = "bytes" }) {
 }
 
 /** Perform one job; never rejects. */
-export async function perform({ source, options = {}, abort, snapshots, throwAt }) {
+export async function perform({ format = "sogxt", source, options = {}, abort, snapshots, throwAt }) {
+  const { decode, expandSH } = format === "sog" ? sog : sogxt;
   const report = { progress: [], order: [], snapshots: {} };
   const stop = new AbortController();
   if (abort === "before") stop.abort();
@@ -42,8 +44,8 @@ export async function perform({ source, options = {}, abort, snapshots, throwAt 
         if (throwAt === file) throw new Error("thrown by the caller");
       },
     });
-    const { count, degree, gridSide, codebookSide, sizes, meta } = scene;
-    Object.assign(report, { count, degree, gridSide, codebookSide, sizes, meta });
+    const { count, degree, gridSide, codebookSide, contents, sizes, meta } = scene;
+    Object.assign(report, { count, degree, gridSide, codebookSide, contents, sizes, meta });
     report.types = Object.fromEntries(FIELDS.map((field) => [field, scene[field].constructor.name]));
     report.arrays = Object.fromEntries(
       [...FIELDS.map((f) => [f, scene[f]]), ["shN", expandSH(scene)]].map(([f, a]) => [f, toBase64(a)]),

@@ -6,7 +6,13 @@ import { CLASSIC, WIDE_RANGES } from "/web_decoder/preview/classic.js";
 import { setPinhole } from "/web_decoder/preview/camera.js";
 import { bytesOf, canvas, textOf } from "./viewer_page.mjs";
 
-const TYPES = { sog: SplatFileType.PCSOGSZIP, ply: SplatFileType.PLY };
+const TYPES = {
+  sog: SplatFileType.PCSOGSZIP,
+  ply: SplatFileType.PLY,
+  "compressed.ply": SplatFileType.PLY,
+  spz: SplatFileType.SPZ,
+  splat: SplatFileType.SPLAT,
+};
 
 const renderer = new THREE.WebGLRenderer({ canvas, antialias: false, preserveDrawingBuffer: true });
 renderer.setPixelRatio(1);
@@ -16,7 +22,7 @@ const camera = new THREE.PerspectiveCamera();
 window.draw = async ({ file, ending, cameras, background }) => {
   const mesh = new SplatMesh({ fileBytes: bytesOf(file), fileType: TYPES[ending], splatEncoding: WIDE_RANGES });
   await mesh.initialized;
-  mesh.quaternion.set(1, 0, 0, 0); // y down, as all files here have it
+  if (ending !== "spz") mesh.quaternion.set(1, 0, 0, 0); // y down, as all other files have it
   const scene = new THREE.Scene();
   scene.add(spark, mesh);
   renderer.setClearColor(background, 1);

@@ -11,13 +11,15 @@ from helpers.web_tools import DECODER, node, run_node
 
 import kissgs
 
-PARTS = ("webp.js", "sogxt.js", "zip.js")
-MAX_BYTES = 12_000
+PARTS = ("webp.js", "sogxt.js", "container.js", "zip.js")
+MAX_BYTES = 12_500
 
 AGREE = """
 import * as main from "./web_decoder/sogxt.js";
+import * as sog from "./web_decoder/sog.js";
 import * as webp from "./web_decoder/webp.js";
 import type * as mainTypes from "./declared/types.js";
+import type * as sogTypes from "./declared/sog.js";
 import type * as webpTypes from "./declared/webp.js";
 
 // Declarations and code agree in both directions.
@@ -26,6 +28,11 @@ const declaredDecode: typeof main.decode = null! as typeof mainTypes.decode;
 const expandSH: typeof mainTypes.expandSH = main.expandSH;
 const declaredExpandSH: typeof main.expandSH = null! as typeof mainTypes.expandSH;
 const SogxtError: typeof mainTypes.SogxtError = main.SogxtError;
+const decodeSog: typeof sogTypes.decode = sog.decode;
+const declaredDecodeSog: typeof sog.decode = null! as typeof sogTypes.decode;
+const SogError: typeof sogTypes.SogError = sog.SogError;
+const undeclaredSog: never[] = [] as Exclude<keyof typeof sog, keyof typeof sogTypes>[];
+const missingSog: never[] = [] as Exclude<keyof typeof sogTypes, keyof typeof sog>[];
 const decodeWebP: typeof webpTypes.decodeWebP = webp.decodeWebP;
 const declaredDecodeWebP: typeof webp.decodeWebP = null! as typeof webpTypes.decodeWebP;
 const WebPError: typeof webpTypes.WebPError = webp.WebPError;
@@ -72,7 +79,7 @@ def test_declarations_agree_with_the_code(tmp_path):
     (tmp_path / "declared").mkdir()
     for path in DECODER.glob("*.js"):
         shutil.copy(path, tmp_path / "web_decoder")
-    for name in ("types.d.ts", "webp.d.ts"):
+    for name in ("types.d.ts", "sog.d.ts", "webp.d.ts"):
         shutil.copy(DECODER / name, tmp_path / "declared")
     shutil.copy(DECODER / "types.d.ts", tmp_path / "web_decoder")  # the code imports types from it
     (tmp_path / "use.ts").write_text(AGREE)
@@ -85,6 +92,7 @@ def test_exports():
     program = "import * as m from '%s'; console.log(JSON.stringify(Object.keys(m)))"
     for name, expected in (
         ("sogxt.js", ["SogxtError", "decode", "expandSH"]),
+        ("sog.js", ["SogError", "decode", "expandSH"]),
         ("webp.js", ["WebPError", "decodeWebP"]),
     ):
         output = subprocess.run(
@@ -131,7 +139,7 @@ def test_package():
 
 
 def test_imports_of_the_installed_package(tmp_path):
-    """The installed package exports ``kissgs`` and ``kissgs/webp``; internal files cannot be imported."""
+    """The package exports ``kissgs``, ``kissgs/sog`` and ``kissgs/webp``; internal files cannot be imported."""
     package = tmp_path / "node_modules" / "kissgs"
     package.mkdir(parents=True)
     for name in [*json.loads((DECODER / "package.json").read_text())["files"], "package.json"]:
@@ -139,10 +147,11 @@ def test_imports_of_the_installed_package(tmp_path):
             shutil.copy(DECODER / name, package)
     (tmp_path / "use.mjs").write_text(
         'import { decode } from "kissgs";\nimport { decodeWebP } from "kissgs/webp";\n'
+        'import { decode as decodeSog } from "kissgs/sog";\n'
         'const inner = await import("kissgs/zip.js").catch((error) => error.code);\n'
-        "console.log(typeof decode, typeof decodeWebP, inner);\n"
+        "console.log(typeof decode, typeof decodeWebP, typeof decodeSog, inner);\n"
     )
-    assert run_node(tmp_path / "use.mjs").split() == ["function", "function", "ERR_PACKAGE_PATH_NOT_EXPORTED"]
+    assert run_node(tmp_path / "use.mjs").split() == [*["function"] * 3, "ERR_PACKAGE_PATH_NOT_EXPORTED"]
 
 
 def test_the_version_is_that_of_the_python_package():

@@ -71,7 +71,7 @@ window.draw = async ({ scene, cameras, background = "#000000", ply = null }) => 
   one.setBackground(background);
   const found = { drawn: await imagesOf(one, cameras) };
   if (ply !== null) {
-    found.read = await other.setFile("scene.ply", bytesOf(ply), one);
+    found.read = await other.setFile(bytesOf(ply), one);
     found.beside = await imagesOf(other, cameras);
   }
   return found;

@@ -56,7 +56,7 @@ export async function comparison(stage, compressed, bytes) {
 
   const original = new Viewer(canvas, { lost: compressed.lost });
   try {
-    await original.setFile("original.ply", bytes, compressed);
+    await original.setFile(bytes, compressed);
   } catch (error) {
     original.dispose();
     throw error;

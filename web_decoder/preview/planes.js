@@ -2,6 +2,7 @@
 
 import { el } from "./dom.js";
 import { canvasOf, paint, planeView } from "./plane.js";
+import { gives } from "./scene.js";
 import { inOrder, planeName } from "./words.js";
 
 /** Longest wait for the browser to be idle, milliseconds. */
@@ -30,7 +31,7 @@ function paintInTurn([next, ...others]) {
  */
 export function planesView(scene, mark) {
   const files = inOrder(Object.keys(scene.planes));
-  const indexOfCell = new Int32Array(scene.gridSide ** 2).fill(-1);
+  const indexOfCell = new Int32Array(1 + (scene.cells.at(-1) ?? -1)).fill(-1);
   scene.cells.forEach((cell, index) => (indexOfCell[cell] = index));
   const large = el("div", { class: "plane" });
   const canvases = files.map((file) => canvasOf(scene.planes[file], { "aria-hidden": "true" }));
@@ -50,7 +51,7 @@ export function planesView(scene, mark) {
     mark(null);
   }
 
-  const first = files.find((file) => file.startsWith("f_dc")) ?? files[0];
+  const first = files.find((file) => gives(scene, file, "sh0")) ?? files[0];
   if (first) choose(first);
   paintInTurn(files.map((file, at) => [canvases[at], scene.planes[file]]));
   return [el("h2", { id: "planes-title" }, "Planes"), el("div", { class: "thumbs" }, ...thumbs), large];

@@ -14,37 +14,49 @@ export const baseColour = (sh0) => 0.5 + SH_CONSTANT * sh0;
 /** Stages of decoding, each of which is worth a new rendering. */
 export const STAGES = /** @type {const} */ ({ nothing: 0, coarse: 1, base: 2, whole: 3 });
 
-const POSITIONS = ["active_mask.webp", "means_bytes_1.webp"];
-const COARSE = [...POSITIONS, "f_dc.webp"];
-const BASE = [...COARSE, "opacities.webp", "scales.webp", "quaternions.webp", "means_bytes_0.webp"];
-const SPHERICAL = ["f_rest_labels.webp", "f_rest_centroids.webp"];
+/** @typedef {import("../types.js").Attribute} Attribute */
+
+/** @type {Attribute[]} */
+const POSITIONS = ["cells", "high means"];
+/** @type {Attribute[]} */
+const COARSE = [...POSITIONS, "sh0"];
+/** @type {Attribute[]} */
+const BASE = [...COARSE, "opacities", "scales", "quats", "low means"];
+/** @type {Attribute[]} */
+const SPHERICAL = ["labels", "centroids"];
+
+/** Whether an image of a container gives an attribute. @type {(scene: Scene, file: string, attribute: Attribute) => boolean} */
+export const gives = ({ contents }, file, attribute) => contents[file]?.includes(attribute) ?? false;
+
+/** Whether a scene has an attribute, because its image has been decoded and kept. @type {(scene: Scene, attribute: Attribute) => boolean} */
+export const holds = (scene, attribute) => Object.keys(scene.planes).some((file) => gives(scene, file, attribute));
 
 /**
- * @param {Set<string>} arrived files that have been decoded
+ * @param {Set<Attribute>} arrived whose images have been decoded
  * @param {number} degree
  */
 export function stageOf(arrived, degree) {
-  const have = (/** @type {string[]} */ files) => files.every((file) => arrived.has(file));
+  const have = (/** @type {Attribute[]} */ attributes) => attributes.every((attribute) => arrived.has(attribute));
   if (have(BASE)) return degree === 0 || have(SPHERICAL) ? STAGES.whole : STAGES.base;
   return have(COARSE) ? STAGES.coarse : STAGES.nothing;
 }
 
 /**
  * Return the stage to draw after an error, when no more images will arrive.
- * @param {Set<string>} arrived
+ * @param {Set<Attribute>} arrived
  */
-export const lastStageOf = (arrived) => (POSITIONS.every((file) => arrived.has(file)) ? STAGES.whole : STAGES.nothing);
+export const lastStageOf = (arrived) => (POSITIONS.every((part) => arrived.has(part)) ? STAGES.whole : STAGES.nothing);
 
 /**
  * Return which parts of a rendering are final: positions with opacities, sizes, spherical harmonics.
- * @param {Set<string>} arrived
+ * @param {Set<Attribute>} arrived
  * @param {number} stage
  * @returns {Parts}
  */
 export const partsOf = (arrived, stage) => ({
-  placed: arrived.has("means_bytes_0.webp") && arrived.has("opacities.webp"), // the extent depends on both
-  sized: stage >= STAGES.base && arrived.has("scales.webp"),
-  spherical: SPHERICAL.every((file) => arrived.has(file)),
+  placed: arrived.has("low means") && arrived.has("opacities"), // the extent depends on both
+  sized: stage >= STAGES.base && arrived.has("scales"),
+  spherical: SPHERICAL.every((part) => arrived.has(part)),
 });
 
 /** @typedef {{placed: boolean, sized: boolean, spherical: boolean}} Parts */
@@ -61,7 +73,7 @@ export function gaussianAt(scene, index) {
   return {
     index,
     mean: three(scene.means),
-    deviations: "scales.webp" in scene.planes ? three(scene.scales).map(Math.exp) : [0, 0, 0],
+    deviations: holds(scene, "scales") ? three(scene.scales).map(Math.exp) : [0, 0, 0],
     rotation: stored.map((part) => part / length),
     opacity: sigmoid(scene.opacities[index]),
     colour: three(scene.sh0).map(baseColour),

@@ -100,11 +100,11 @@ export function stage(failed) {
       live?.viewer.setScene(scene, parts, live.camera.moved);
       reveal(fresh);
     },
-    /** @param {string} name of a .ply or .sog @param {Uint8Array} bytes */
-    async showFile(name, bytes) {
+    /** @param {Uint8Array} bytes of a .ply */
+    async showFile(bytes) {
       const { viewer } = await ready;
       endComparison();
-      const count = await viewer.setFile(name, bytes);
+      const count = await viewer.setFile(bytes);
       reveal(true);
       return count;
     },

@@ -1,5 +1,6 @@
 /** Statistics of a container. */
 
+import { META } from "../container.js";
 import { el } from "./dom.js";
 import { bytes, count, duration, share, short } from "./format.js";
 import { attributes } from "./words.js";
@@ -14,11 +15,12 @@ import { attributes } from "./words.js";
 
 /** @param {Facts} facts */
 export function statisticsView({ scene, bytes: known, originalBytes, seconds }) {
-  const loaded = Object.values(scene.sizes).reduce((sum, size) => sum + size, 0);
-  const total = Math.max(known ?? 0, loaded);
-  /** @type {Record<string, number>} */
-  const sizes = { ...scene.sizes };
-  if (total > loaded && seconds !== null) sizes["rest.json"] = total - loaded; // metadata that was not needed
+  const { [META]: metadata, ...images } = scene.sizes;
+  const loaded = Object.values(images).reduce((sum, size) => sum + size, 0);
+  const whole = known !== undefined && seconds !== null;
+  const total = Math.max(known ?? 0, loaded + (whole ? 0 : metadata));
+  // Metadata is smaller inside a zip, and not all of it was needed.
+  const sizes = { ...images, [META]: whole ? total - loaded : metadata };
   /** @type {[string, string, string?][]} */
   const pairs = [
     ["Gaussians", count(scene.count)],
@@ -42,7 +44,7 @@ export function statisticsView({ scene, bytes: known, originalBytes, seconds }) 
 const perGaussian = (size, gaussians) => (gaussians ? `${short((8 * size) / gaussians)} bits` : "none");
 
 /**
- * Return the statistics of a .ply or .sog that Spark has read.
+ * Return the statistics of a .ply that Spark has read.
  * @param {number} gaussians
  * @param {number} size
  */

@@ -82,16 +82,14 @@ export class Viewer {
   }
 
   /**
-   * Show a .ply or .sog, read by Spark.
-   * @param {string} name
+   * Show a .ply, read by Spark.
    * @param {Uint8Array} bytes
    * @param {Viewer} [beside] viewer whose frame is used
    * @returns {Promise<number>} the number of Gaussians
    */
-  async setFile(name, bytes, beside) {
+  async setFile(bytes, beside) {
     const splatEncoding = beside?.encoding ?? WIDE_RANGES;
-    const fileType = /\.sog$/i.test(name) ? SplatFileType.PCSOGSZIP : SplatFileType.PLY;
-    const mesh = new SplatMesh({ fileBytes: bytes, fileType, splatEncoding });
+    const mesh = new SplatMesh({ fileBytes: bytes, fileType: SplatFileType.PLY, splatEncoding });
     await mesh.initialized;
     this.#shown = null;
     this.#extent = beside?.extent ?? extentOfMesh(mesh);

@@ -3,14 +3,15 @@
 /** @type {[RegExp, string][]} */
 const NAMES = [
   [/^active_mask\b/, "Mask"],
-  [/^means_bytes_1\b/, "Positions, high bytes"],
-  [/^means_bytes_0\b/, "Positions, low bytes"],
+  [/^means_(bytes_1|u)\b/, "Positions, high bytes"],
+  [/^means_(bytes_0|l)\b/, "Positions, low bytes"],
   [/^f_dc\b/, "Base colours"],
+  [/^sh0\b/, "Colours, opacities"],
   [/^opacities\b/, "Opacities"],
   [/^scales\b/, "Scales"],
-  [/^quaternions\b/, "Rotations"],
-  [/^f_rest_labels\b/, "SH labels"],
-  [/^f_rest_centroids\b/, "SH codebook"],
+  [/^quat(ernion)?s\b/, "Rotations"],
+  [/^(f_rest|shN)_labels\b/, "SH labels"],
+  [/^(f_rest|shN)_centroids\b/, "SH codebook"],
   [/\.(json|ya?ml)$/, "Metadata"],
 ];
 

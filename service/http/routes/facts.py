@@ -10,6 +10,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 import kissgs
 
+from ...core.formats import CONTAINER_FILES
 from ...core.metrics import CONTENT_TYPE
 from ...core.presets import can_train, presets
 from ...core.problems import PROBLEM_TYPES, ProblemError
@@ -31,6 +32,7 @@ async def get_limits(context: Service) -> Limits:
     settings = context.settings
     return Limits(
         formats=["ply", "compressed.ply", "sog", "spz", "splat", "ksplat", "glb"],
+        containers=list(CONTAINER_FILES),
         max_upload_bytes=settings.max_upload_bytes,
         max_header_bytes=settings.max_header_bytes,
         max_gaussians=settings.max_gaussians,
@@ -77,7 +79,7 @@ async def get_problem(code: Annotated[str, Path(description="Code of a problem t
 @router.head("/version", include_in_schema=False)
 @router.get("/version", tags=["health"], operation_id="version", summary="Get the version")
 async def get_version() -> Version:
-    """Versions of the library and of this API, and the container format."""
+    """Versions of the library and of this API, and the default container format."""
     return Version(kissgs=kissgs.__version__, api=API_VERSION, container=CONTAINER)
 
 

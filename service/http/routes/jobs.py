@@ -25,7 +25,7 @@ from .common import (
     statuses,
     wait_for_end,
 )
-from .results import container
+from .results import CONTAINER_TYPES, container
 
 log = logging.getLogger("kissgs.service")
 
@@ -150,7 +150,7 @@ async def submit_job(
     responses={
         200: {
             "description": "The container. `Content-Location` is the path of the result, `Link` that of the job.",
-            "content": {"application/zip": {"schema": {"type": "string", "format": "binary"}}},
+            "content": {name: {"schema": {"type": "string", "format": "binary"}} for name in CONTAINER_TYPES},
         },
         **_ACCEPTED,
         **problems(*_REFUSALS, "crashed", "cancelled", "not-finished", "not-found"),

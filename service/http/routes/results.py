@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Response
 
+from ...core.formats import CONTAINER_FILES, container_file
 from ...core.models import Job, State
 from ...core.problems import ProblemError
 from ...jobs.container import Service, ServiceContainer
@@ -16,6 +17,9 @@ from .common import RequestedJob, problems
 router = APIRouter(prefix="/v1/jobs/{id}", tags=["results"])
 
 _MEDIA_TYPES = {".webp": "image/webp", ".json": "application/json", ".yaml": "application/yaml"}
+
+CONTAINER_TYPES = tuple(file.media_type for file in CONTAINER_FILES.values())
+"""Media types of containers."""
 
 _PRIVATE = {"Cache-Control": "private, no-cache"}
 _FOREVER = {"Cache-Control": "private, max-age=31536000, immutable"}
@@ -49,7 +53,7 @@ def _file_answers(media_types: str, *codes: str) -> dict[int | str, dict[str, An
 
 
 async def get_result(context: Service, job: RequestedJob) -> Response:
-    """The container as a zip, for any SOG-XT reader, until the job expires."""
+    """The container, `.zip` (SOG-XT) or `.sog` as the options say, until the job expires."""
     return container(context, job)
 
 
@@ -92,16 +96,16 @@ async def get_report(context: Service, job: RequestedJob) -> Response:
 
 
 def container(context: ServiceContainer, job: Job) -> StoredFile:
-    """Return the response with the zip of a succeeded job.
+    """Return the response with the container of a succeeded job.
 
     Raises:
         ProblemError: the job has not succeeded.
     """
     _ready(job)
     entry = described(job.result or {}, ("container",))
-    path = context.storage.result(job.id) / "scene.zip"
-    download = f"{job.name}.zip"
-    return StoredFile(path, sha256=entry["sha256"], media_type="application/zip", download=download, headers=_PRIVATE)
+    file = container_file(job.options)
+    path, download = context.storage.result(job.id) / file.name, f"{job.name}{file.ending}"
+    return StoredFile(path, sha256=entry["sha256"], media_type=file.media_type, download=download, headers=_PRIVATE)
 
 
 def _ready(job: Job) -> None:
@@ -135,7 +139,12 @@ def _add(endpoint: Callable[..., Any], path: str, summary: str, media_types: str
         )
 
 
-_add(get_result, "/result", "Download the container", "application/zip")
+_add(
+    get_result,
+    "/result",
+    "Download the container",
+    " ".join(CONTAINER_TYPES),
+)
 _add(get_file, "/files/{name}", "Download one file of the container", " ".join(_MEDIA_TYPES.values()))
 _add(
     get_decoded,
