@@ -15,6 +15,7 @@ from kissgs.planning import smallest_three
 from kissgs.planning.container_model import ByteTables
 from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.quantize import MEANS_TOP, Quantized
+from kissgs.planning.rdo_quantize import CAPTURED
 from kissgs.planning.sh_codebook import COEFFICIENTS
 from kissgs.planning.value_table import SIZE
 from kissgs.rendering.rasterizer import Device
@@ -83,7 +84,12 @@ def planes_of(
         elif name in FIELDS:
             planes[name] = _even(name, field, device, as_text=True)
         if name in TABLES and field.table is not None:
-            trained[name] = ValueTable.of(field.table, device, freeze_zero=name == "f_rest_centroids")
+            trained[name] = ValueTable.of(
+                field.table,
+                device,
+                freeze_zero=name == "f_rest_centroids",
+                largest_gap=CAPTURED.get(name, CAPTURED["f_dc"]),
+            )
     return planes, trained
 
 
@@ -95,7 +101,8 @@ def _codebook(field: Quantized, table: Float32[np.ndarray, " L"], sh_degree: int
     levels = np.arange(len(table))
     frozen = np.zeros(field.levels.shape, bool)
     frozen[:, np.arange(field.levels.shape[1]) % COEFFICIENTS >= SH_REST_COUNTS[sh_degree]] = True
-    return TablePlane.of(field, [levels], np.zeros(len(frozen), np.int64), frozen, device)
+    rows = np.zeros(len(frozen), np.int64)
+    return TablePlane.of(field, [levels], rows, frozen, device, largest_gap=CAPTURED["f_dc"])
 
 
 def _of_table(
@@ -107,4 +114,4 @@ def _of_table(
     frozen = (field.levels < usable[0]) | (field.levels > usable[1])
     lists = [np.unique(field.levels[classes == number]) for number in range(int(classes.max()) + 1)]
     fixed = {"opacities": tables.opacity_logits, "quaternions": smallest_three.TABLE}.get(name)
-    return TablePlane.of(field, lists, classes, frozen, device, fixed=fixed, usable=usable)
+    return TablePlane.of(field, lists, classes, frozen, device, fixed=fixed, usable=usable, largest_gap=CAPTURED[name])

@@ -30,8 +30,8 @@ class ValueTable:
 
     Attributes:
         start: ``(L,)`` float64, ascending values of the plan.
-        unit: ``(L,)`` float64, change of a value per unit of its latent: the distance to the nearer neighbour; 0 for
-            frozen values.
+        unit: ``(L,)`` float64, change of a value per unit of its latent: the distance to the nearer neighbour, or the
+            median one if that is smaller; 0 for frozen values.
         min_latent: ``(L,)`` float32, smallest latent.
         max_latent: ``(L,)`` float32, largest latent.
     """
@@ -42,15 +42,26 @@ class ValueTable:
     max_latent: Float32[Tensor, " L"]
 
     @classmethod
-    def of(cls, table: Float32[np.ndarray, " L"], device: Device, *, freeze_zero: bool) -> ValueTable:
-        """Return the table of a plan; with ``freeze_zero``, 0 stays 0."""
+    def of(
+        cls, table: Float32[np.ndarray, " L"], device: Device, *, freeze_zero: bool, largest_gap: float
+    ) -> ValueTable:
+        """Return the table of a plan.
+
+        Args:
+            table: ascending values.
+            device: device of the tensors.
+            freeze_zero: whether 0 stays 0.
+            largest_gap: largest unit.
+        """
         start = table.astype(np.float64)
         if len(start) < 2:
             gaps = np.zeros((2, len(start)))
         else:
             between = np.diff(start)
             gaps = np.stack([np.r_[between[:1], between], np.r_[between, between[-1:]]])  # below and above
-        unit = np.where(freeze_zero & (start == 0), 0.0, gaps.min(axis=0))
+        usual = np.quantile(gaps[0], 0.5, method="lower") if len(start) else 0.0
+        unit = np.minimum(gaps.min(axis=0), min(usual, largest_gap))
+        unit = np.where(freeze_zero & (start == 0), 0.0, unit)
         below, above = REACH * gaps * (unit > 0) / np.where(unit > 0, unit, 1)
         arrays = (start, unit, -below.astype(np.float32), above.astype(np.float32))
         return cls(*(torch.from_numpy(array).to(device) for array in arrays))
@@ -93,6 +104,7 @@ class TablePlane:
         *,
         fixed: Float64[np.ndarray, " L"] | None = None,
         usable: tuple[int, int] = (0, SIZE - 1),
+        largest_gap: float = np.inf,
     ) -> TablePlane:
         """Return the plane of a field.
 
@@ -104,17 +116,24 @@ class TablePlane:
             device: device of the tensors.
             fixed: value of each level; None if the table is trained.
             usable: smallest and largest level that training may choose.
+            largest_gap: largest distance of values that a latent crosses: a step over a wider one, as between the flat
+                and the thick axes of discs, would make a different Gaussian.
         """
         longest = max(len(levels) for levels in lists)
         padded = np.stack(
             [np.pad(levels.astype(np.int64), (0, longest - len(levels)), mode="edge") for levels in lists]
         )
-        lowest = np.array([np.searchsorted(levels, usable[0]) for levels in lists])[rows][:, None]
-        highest = np.array([np.searchsorted(levels, usable[1], side="right") - 1 for levels in lists])[rows][:, None]
+        scale = fixed if fixed is not None else field.table
+        if scale is None:
+            raise ValueError("the field has no table")
+        lowest, highest = np.empty(field.levels.shape, np.int64), np.empty(field.levels.shape, np.int64)
         place = np.empty(field.levels.shape, np.int64)
         for number, levels in enumerate(lists):
             inside = rows == number
             place[inside] = np.searchsorted(levels, field.levels[inside])
+            allowed = np.searchsorted(levels, [usable[0], usable[1] + 1])
+            ends = _reachable(scale[levels].astype(np.float64), allowed, largest_gap)
+            lowest[inside], highest[inside] = (end[place[inside]] for end in ends)
         bounds = (np.where(frozen, 0, bound - place).astype(np.float32) for bound in (lowest, highest))
         first = (rows * longest)[:, None].astype(np.int64)
         arrays = (place.astype(np.float64), *bounds, padded, first, *(() if fixed is None else (fixed,)))
@@ -208,6 +227,22 @@ class _TableValues(torch.autograd.Function):
         if ctx.needs_input_grad[1]:
             total = _sums(gradient.double().reshape(-1), levels.reshape(-1), ctx.size)
         return (gradient * units).float(), total, None
+
+
+def _reachable(
+    values: Float64[np.ndarray, " levels"], usable: Int[np.ndarray, " 2"], largest_gap: float
+) -> tuple[Int[np.ndarray, " levels"], Int[np.ndarray, " levels"]]:
+    """Return the first and the last place that each place of a list reaches without a wide gap.
+
+    Args:
+        values: ascending.
+        usable: first place that may be used, and the one after the last.
+        largest_gap: largest gap that is not wide.
+    """
+    wide = np.diff(values) > largest_gap
+    part, places = np.concatenate([[0], np.cumsum(wide)]), np.arange(len(values))
+    first, last = np.searchsorted(part, part), np.searchsorted(part, part, side="right") - 1
+    return np.minimum(np.maximum(first, usable[0]), places), np.maximum(np.minimum(last, usable[1] - 1), places)
 
 
 def _sums(terms: Float64[Tensor, " T"], groups: Int[Tensor, " T"], size: int) -> Float64[Tensor, " size"]:

@@ -13,10 +13,10 @@ from kissgs.core.splats import ATTRIBUTES
 QUICK = {"enabled": True, "steps": 25, "lr": 0.1, "view_size": 48}
 
 
-def check(scene, preset="balanced", **changes):
+def check(scene, preset="balanced", container="sog-xt", **changes):
     settings = Settings.from_preset(preset, finetune={**QUICK, **changes}, sensitivity_view_size=48)
     views = Views(around(5), around(3), black(), "circle")
-    result = kissgs.compress(scene, settings=settings, views=views)
+    result = kissgs.compress(scene, settings=settings, views=views, container=container)
     found = kissgs.decompress(result.to_zip())
     for name in ATTRIBUTES:
         assert np.isfinite(getattr(found, name)).all(), name
@@ -29,6 +29,13 @@ def check(scene, preset="balanced", **changes):
 @pytest.mark.quick(2)
 def test_degenerate_scenes_are_tuned_without_nan(scene):
     check(scene())
+
+
+@pytest.mark.parametrize("scene", [made for made in SCENES if made.__name__ != "transparent"], ids=lambda s: s.__name__)
+@pytest.mark.quick(2)
+def test_degenerate_scenes_are_tuned_as_sog(scene):
+    """SOG holds no scene without visible Gaussians."""
+    check(scene(), container="sog", steps=12)
 
 
 def test_needles_with_the_papers_settings():

@@ -174,6 +174,20 @@ def test_everything_stays_within_what_the_container_holds(sign, preset):
     assert same(decompress(files_of(work, scene)), decoded_by(work))
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_no_step_crosses_a_wide_gap(sign):
+    """Discs stay discs: no axis of e^-1 becomes one of e^-30, and the values of the table stay apart."""
+    flat = np.r_[np.full(100, -30.0), np.linspace(-1.2, -0.8, 200)].reshape(100, 3)
+    scene = replaced(cloud(100), scales=np.random.default_rng(0).permuted(flat, axis=1))
+    work = quantized(scene)
+    thick = work.gaussians()["scales"].detach().numpy() > -2
+    moved_far(work, sign)
+    found = work.gaussians()["scales"].detach().numpy()
+    assert ((found > -15) == thick).all()
+    units = work.trained_tables["scales"].unit.numpy()
+    assert ((units > 0) & (units < 0.6)).all()
+
+
 def test_latents_settle_at_the_level_nearest_to_the_best_value():
     """The loss is quadratic around a value between two levels; the gradient is evaluated at the levels only."""
     work = quantized(cloud(200, 1), "fast")
