@@ -19,16 +19,10 @@ from kissgs.io.packed_files import Source, open_source
 from kissgs.io.png import decode_png, is_png, probe_png
 from kissgs.io.scene_file import refuse_more_than
 from kissgs.io.webp import decode_plane, probe_webp
-from kissgs.sog.metadata import MAX_SH_ENTRIES, Rest, SogLayout, read_layout
+from kissgs.sog.metadata import ENTRIES_PER_ROW, FIRST_TAG, MAX_SH_ENTRIES, Rest, SogLayout, read_layout
 
 _FREE_PIXELS = 1 << 20
 """Pixels that images may have beyond four per Gaussian: encoders may round sides up to powers of two."""
-
-_ENTRIES_PER_ROW = 64
-"""Entries of the SH codebook in a row of its image."""
-
-_FIRST_TAG = 252
-"""Alpha of a rotation whose largest component is w; 253 to 255 are x, y, z."""
 
 
 def decode(
@@ -108,15 +102,15 @@ class _Images:
         """Return the SH codebook's levels, one row per entry."""
         name, most = rest.centroids, MAX_SH_ENTRIES * rest.coefficients
         data, width, height = self._open(name, most)
-        entries = rest.entries or height * _ENTRIES_PER_ROW
-        rows = -(-entries // _ENTRIES_PER_ROW)
-        if width != _ENTRIES_PER_ROW * rest.coefficients or not rows <= height <= MAX_SH_ENTRIES // _ENTRIES_PER_ROW:
+        entries = rest.entries or height * ENTRIES_PER_ROW
+        rows = -(-entries // ENTRIES_PER_ROW)
+        if width != ENTRIES_PER_ROW * rest.coefficients or not rows <= height <= MAX_SH_ENTRIES // ENTRIES_PER_ROW:
             raise InvalidContainerError(
                 f"{name} is {width} x {height} pixels; {entries:,} entries of {rest.coefficients} coefficients need "
-                f"{_ENTRIES_PER_ROW * rest.coefficients} x {rows}: export the scene again"
+                f"{ENTRIES_PER_ROW * rest.coefficients} x {rows}: export the scene again"
             )
         image = _decode_image(data, name, width, height, 3)
-        return image.reshape(height * _ENTRIES_PER_ROW, rest.coefficients * 3)[:entries]
+        return image.reshape(height * ENTRIES_PER_ROW, rest.coefficients * 3)[:entries]
 
     def _open(self, name: str, most_pixels: int) -> tuple[bytes, int, int]:
         # Lossless WebP and PNG never need more than 4 bytes a pixel, and some for headers.
@@ -146,14 +140,14 @@ def _decode_means(images: _Images, out: Float32[np.ndarray, "N 3"]) -> None:
 def _decode_quats(images: _Images, out: Float32[np.ndarray, "N 4"]) -> None:
     name = images.layout.files["quats"]
     pixels = images.plane(name, 4)
-    if len(pixels) and int(pixels[:, 3].min()) < _FIRST_TAG:
+    if len(pixels) and int(pixels[:, 3].min()) < FIRST_TAG:
         raise InvalidContainerError(
-            f"{name} has a rotation whose alpha is {pixels[:, 3].min()}; {_FIRST_TAG} to 255 are valid: "
+            f"{name} has a rotation whose alpha is {pixels[:, 3].min()}; {FIRST_TAG} to 255 are valid: "
             "export the scene again"
         )
     for part in steps(len(out)):
         small = (pixels[part, :3] / 255 - 0.5) * np.sqrt(2)
-        out[part] = insert_largest(small, pixels[part, 3].astype(np.int64) - _FIRST_TAG)
+        out[part] = insert_largest(small, pixels[part, 3].astype(np.int64) - FIRST_TAG)
 
 
 def _decode_scales(images: _Images, out: Float32[np.ndarray, "N 3"]) -> None:

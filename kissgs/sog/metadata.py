@@ -20,6 +20,12 @@ META_NAME, LOD_NAME = "meta.json", "lod-meta.json"
 MAX_METADATA_BYTES = 1 << 20
 """Largest size of ``meta.json``, bytes; four codebooks in full digits take 15 kB."""
 
+ENTRIES_PER_ROW = 64
+"""Entries of the SH codebook in a row of its image."""
+
+FIRST_TAG = 252
+"""Alpha of a rotation whose largest component is w; 253 to 255 are x, y, z."""
+
 MAX_SH_ENTRIES = 1 << 16
 """Largest number of entries of the SH codebook: labels have two bytes."""
 
