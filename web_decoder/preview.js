@@ -2,6 +2,7 @@
 
 import { decode } from "./preview/decode.js";
 import { announce, byId, dropAnywhere, el } from "./preview/dom.js";
+import { FILE_ENDINGS, fileTypeOf } from "./preview/file_types.js";
 import { count } from "./preview/format.js";
 import { loader } from "./preview/loading.js";
 import { help, listen, switchFullScreen, switchPanels } from "./preview/keys.js";
@@ -17,6 +18,7 @@ import { UserError, aborted, showProblem } from "./preview/problem.js";
  * @typedef {import("./preview/scene.js").Scene} Scene
  * @typedef {import("./preview/sources.js").Source} Source
  * @typedef {import("./preview/loading.js").Load} Load
+ * @typedef {import("./preview/file_types.js").FileType} FileType
  */
 
 /** Larger scenes are refused: few browsers have the memory, and a small file may declare any size. */
@@ -112,16 +114,20 @@ function showFacts() {
 async function openAddressed(load) {
   const source = await addressed(location, load.signal);
   const { name, container } = source;
-  if (!isPly(source)) return openContainer(source, load);
-  if (typeof container === "string") await openFile(name, await download({ url: container, bytes: 0 }, load), load);
-  else await openFile(name, new Uint8Array(await container.arrayBuffer()), load);
+  const type = fileTypeOf(name);
+  if (!type) return openContainer(source, load);
+  const bytes =
+    typeof container === "string"
+      ? await download({ url: container, bytes: 0 }, load)
+      : new Uint8Array(await container.arrayBuffer());
+  await openFile(name, type, bytes, load);
 }
 
-/** @param {string} name @param {Uint8Array} bytes @param {Load} load */
-async function openFile(name, bytes, load) {
+/** @param {string} name @param {FileType} type @param {Uint8Array} bytes @param {Load} load */
+async function openFile(name, type, bytes, load) {
   const size = bytes.length; // reading it may take the bytes away
   load.signal.throwIfAborted();
-  const gaussians = await readable(name, view.showFile(bytes));
+  const gaussians = await readable(name, view.showFile(type, bytes));
   shown = null;
   setTitle(name);
   byId("statistics").replaceChildren(...fileStatisticsView(gaussians, size));
@@ -131,10 +137,10 @@ async function openFile(name, bytes, load) {
   announce(`${name}: ${count(gaussians)} Gaussians.`);
 }
 
-/** @param {string} name @param {Uint8Array} bytes */
-async function compareWith(name, bytes) {
+/** @param {string} name @param {FileType} type @param {Uint8Array} bytes */
+async function compareWith(name, type, bytes) {
   if (!shown) return;
-  await readable(name, view.compare(bytes));
+  await readable(name, view.compare(type, bytes));
   shown.source.originalBytes ??= bytes.length;
   byId("statistics").replaceChildren(...statisticsView({ ...shown.source, ...shown }));
   labelCompare();
@@ -142,7 +148,7 @@ async function compareWith(name, bytes) {
 }
 
 /**
- * Replace errors of reading a .ply by a message.
+ * Replace errors of Spark by a message.
  * @template T @param {string} name @param {Promise<T>} reading
  */
 const readable = (name, reading) =>
@@ -161,38 +167,36 @@ async function pressCompare() {
   const original = shown?.source.original;
   if (view.comparing) view.endComparison();
   else if (original)
-    await during("Loading the original", async (load) => compareWith("The original", await download(original, load)));
-  else pick(".ply");
+    await during("Loading the original", async (load) =>
+      compareWith("The original", original.type, await download(original, load)),
+    );
+  else pick(FILE_ENDINGS);
   labelCompare();
 }
 
 /** @param {File[]} files */
 async function take(files) {
-  const container = files.find((file) => !isPly(file));
-  const ply = files.find(isPly);
+  const container = files.find(({ name }) => !fileTypeOf(name));
+  const file = files.find(({ name }) => fileTypeOf(name));
   if (container) {
     const source = { name: container.name.replace(/\.(zip|sog)$/i, ""), container, bytes: container.size };
     await during(`Opening ${container.name}`, async (load) => {
-      if (isOther(container)) {
-        throw new UserError(
-          `This page opens .zip, .sog and .ply. "kissgs view ${container.name}" shows other formats.`,
-        );
+      if (isGltf(container)) {
+        throw new UserError(`This page does not open glTF; "kissgs view ${container.name}" does.`);
       }
       await openContainer(source, load);
     });
   }
-  if (!ply) return;
-  await during(`Reading ${ply.name}`, async (load) => {
-    const bytes = new Uint8Array(await ply.arrayBuffer());
-    await (shown ? compareWith(ply.name, bytes) : openFile(ply.name, bytes, load));
+  const type = file && fileTypeOf(file.name);
+  if (!type) return;
+  await during(`Reading ${file.name}`, async (load) => {
+    const bytes = new Uint8Array(await file.arrayBuffer());
+    await (shown ? compareWith(file.name, type, bytes) : openFile(file.name, type, bytes, load));
   });
 }
 
-/** Whether a file is read by Spark; all others are containers. @param {{name: string}} file */
-const isPly = ({ name }) => /\.ply$/i.test(name);
-
-/** Whether a file is a scene that the page does not read. @param {{name: string}} file */
-const isOther = ({ name }) => /\.(spz|splat|ksplat|glb|gltf)$/i.test(name);
+/** @param {{name: string}} file */
+const isGltf = ({ name }) => /\.(glb|gltf)$/i.test(name);
 
 /** @param {string} accept */
 function pick(accept) {
@@ -209,8 +213,8 @@ function setTitle(name) {
 /** @param {string} id @param {(button: any) => void} action */
 const onPress = (id, action) => byId(id).addEventListener("click", () => action(byId(id)));
 
-onPress("open", () => pick(".zip,.sog,.ply"));
-onPress("choose", () => pick(".zip,.sog,.ply"));
+onPress("open", () => pick(`.zip,.sog,${FILE_ENDINGS}`));
+onPress("choose", () => pick(`.zip,.sog,${FILE_ENDINGS}`));
 onPress("reset", view.home);
 onPress("compare", pressCompare);
 onPress("fullscreen", switchFullScreen);

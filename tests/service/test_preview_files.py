@@ -42,7 +42,9 @@ def test_choosing_files(preview, service):
 
 
 @pytest.mark.quick(0)
-def test_dropping_files(preview, service):
+def test_dropping_files(preview, service, tmp_path):
+    (tmp_path / "a.ply").write_bytes(PLY)
+    kissgs.save(kissgs.load(tmp_path / "a.ply"), tmp_path / "a.spz")
     tab = preview().open(service)
     page = tab.page
     tab.drop(("a.ply", PLY))  # alone
@@ -50,6 +52,8 @@ def test_dropping_files(preview, service):
     assert colours(alone) > 3000
     assert f"{len(PLY):,}" in page.locator("#statistics").inner_text()
     assert not page.locator("#compare").is_visible()
+    tab.drop(("a.spz", (tmp_path / "a.spz").read_bytes()))
+    assert psnr(tab.shown(800), alone) > 25  # upright, and in the same place
     tab.drop(("a.zip", ZIP), ("a.ply", PLY))  # both at once
     page.get_by_role("slider").wait_for()
     tab.shown(COUNT)

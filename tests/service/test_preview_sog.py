@@ -165,6 +165,6 @@ def test_an_unsuitable_file(preview, service):
     tab = preview().open(service)
     tab.drop(("other.sog", zip_of({"notes.txt": b"hello"})))
     tab.error_message("no SOG-XT or SOG container", "meta.json")
-    tab.drop(("garden.spz", b"anything"))
-    tab.error_message("opens .zip, .sog and .ply", '"kissgs view garden.spz"')
+    tab.drop(("garden.glb", b"anything"))
+    tab.error_message("does not open glTF", '"kissgs view garden.glb"')
     assert tab.page.locator("#empty").is_visible()

@@ -4,7 +4,6 @@
 """
 
 import base64
-import io
 import logging
 import shutil
 from dataclasses import replace
@@ -17,7 +16,6 @@ from scipy.special import lpmv
 
 import kissgs
 from kissgs.core.splats import ATTRIBUTES, SH_C0, SH_REST_COUNTS, Splats
-from kissgs.io.ply import write_ply
 from kissgs.rendering.camera import Camera, look_at
 
 playwright = pytest.importorskip("playwright.sync_api")
@@ -66,12 +64,13 @@ async function imagesOf(viewer, cameras) {
   return images;
 }
 
-window.draw = async ({ scene, cameras, background = "#000000", ply = null }) => {
+window.draw = async ({ scene, cameras, background = "#000000", file = null }) => {
   one.setScene(sceneOf(scene));
   one.setBackground(background);
   const found = { drawn: await imagesOf(one, cameras) };
-  if (ply !== null) {
-    found.read = await other.setFile(bytesOf(ply), one);
+  if (file !== null) {
+    found.read = await other.setFile(file.type, bytesOf(file.bytes), one);
+    if (!file.beside) await other.setFile(file.type, bytesOf(file.bytes));
     found.beside = await imagesOf(other, cameras);
   }
   return found;
@@ -115,7 +114,7 @@ def scene_of(splats):
 
 
 def draw(page, splats, cameras, **options):
-    """Return images by the page, 0 to 1; with ``ply``, also those of its viewer of originals and the count."""
+    """Return images by the page, 0 to 1; with ``file``, also those of its viewer of originals and the count."""
     pinholes = [
         {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist(), "width": camera.width, "height": camera.height}
         for camera in cameras
@@ -129,7 +128,7 @@ def draw(page, splats, cameras, **options):
         [pixels(text, camera) for text, camera in zip(found.get(kind, []), cameras, strict=False)]
         for kind in ("drawn", "beside")
     )
-    return (drawn, beside, found["read"]) if "ply" in options else drawn
+    return (drawn, beside, found["read"]) if "file" in options else drawn
 
 
 def psnr(a, b):
@@ -191,17 +190,22 @@ def test_far_from_the_origin(page):
     assert reached > 40
 
 
-def test_a_ply_read_by_spark_and_a_decoded_scene_agree(page):
-    splats = kissgs.sample_scene(5000, sh_degree=3)
-    file = io.BytesIO()
-    write_ply(file, splats)
-    drawn, beside, count = draw(page, splats, [FRONT, SIDE], ply=base64.b64encode(file.getvalue()).decode())
+@pytest.mark.parametrize("beside", [True, False])
+@pytest.mark.parametrize("ending", ["ply", "spz", "splat"])
+@pytest.mark.quick(3)
+def test_a_file_read_by_spark_and_a_decoded_scene_agree(page, ending, beside, tmp_path):
+    """Beside the decoded scene, whose frame it takes, or in a frame of its own."""
+    path = tmp_path / f"scene.{ending}"
+    kissgs.save(kissgs.sample_scene(5000, sh_degree=0 if ending == "splat" else 3), path)
+    splats = kissgs.load(path)
+    file = {"type": ending, "bytes": base64.b64encode(path.read_bytes()).decode(), "beside": beside}
+    drawn, read, count = draw(page, splats, [FRONT, SIDE], file=file)
     assert count == len(splats)
-    for camera, one, other in zip((FRONT, SIDE), drawn, beside, strict=True):
+    for camera, one, other in zip((FRONT, SIDE), drawn, read, strict=True):
         to_decoded, to_reference = psnr(one, other), psnr(other, expected(splats, camera))
-        log.info("read from a .ply: %.1f dB, and %.1f dB to the decoded scene", to_reference, to_decoded)
-        assert to_decoded > 45
-        assert to_reference > 40
+        log.info("read from a .%s: %.1f dB, and %.1f dB to the decoded scene", ending, to_reference, to_decoded)
+        assert to_decoded > (45 if beside and ending != "spz" else 38)
+        assert to_reference > 38
 
 
 def spherical_harmonic(degree, order, direction):

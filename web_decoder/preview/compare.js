@@ -9,9 +9,10 @@ const LARGE_STEP = 10; // of a page key, per cent
 /**
  * @param {HTMLElement} stage
  * @param {Viewer} compressed
- * @param {Uint8Array} bytes of the original .ply
+ * @param {import("./file_types.js").FileType} type of the original
+ * @param {Uint8Array} bytes of the original
  */
-export async function comparison(stage, compressed, bytes) {
+export async function comparison(stage, compressed, type, bytes) {
   const canvas = el("canvas", { class: "original", "aria-hidden": "true" });
   const handle = el(
     "div",
@@ -56,7 +57,7 @@ export async function comparison(stage, compressed, bytes) {
 
   const original = new Viewer(canvas, { lost: compressed.lost });
   try {
-    await original.setFile(bytes, compressed);
+    await original.setFile(type, bytes, compressed);
   } catch (error) {
     original.dispose();
     throw error;

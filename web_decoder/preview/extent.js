@@ -40,11 +40,16 @@ export const extentOfScene = ({ count, means, opacities }) =>
     (i) => sigmoid(opacities[i]),
   );
 
-/** @param {import("@sparkjsdev/spark").SplatMesh} mesh */
-export function extentOfMesh(mesh) {
+/**
+ * Return the extent of a mesh, with y down and z ahead.
+ * @param {import("@sparkjsdev/spark").SplatMesh} mesh
+ * @param {boolean} up whether y points up and z back in the mesh
+ */
+export function extentOfMesh(mesh, up) {
+  const sign = up ? -1 : 1;
   const [means, weights] = [new Float32Array(3 * mesh.numSplats), new Float32Array(mesh.numSplats)];
   mesh.forEachSplat((index, centre, _scales, _rotation, opacity) => {
-    means.set([centre.x, centre.y, centre.z], 3 * index);
+    means.set([centre.x, sign * centre.y, sign * centre.z], 3 * index);
     weights[index] = opacity;
   });
   return extentOf(

@@ -1,5 +1,6 @@
 /** Sources of scenes: the page's address, the page itself, or a file. */
 
+import { fileTypeOfFormat } from "./file_types.js";
 import { UserError } from "./problem.js";
 
 /**
@@ -9,7 +10,8 @@ import { UserError } from "./problem.js";
  * @property {number} [bytes] size of the container
  * @property {boolean} [zipped] whether it is a zip at an address, whose response tells its size
  * @property {RequestInit} [request]
- * @property {{url: string, bytes: number} | null} [original] address and size of the original .ply
+ * @property {{url: string, bytes: number, type: import("./file_types.js").FileType} | null} [original]
+ *   address, size and type of the original, if it is a file that Spark reads
  * @property {number} [originalBytes]
  */
 
@@ -80,21 +82,16 @@ async function ofJob(id, signal) {
   const job = `../v1/jobs/${id}`; // relative: the service may be served under a prefix
   const status = await (await get(job, { ...request, signal })).json();
   if (!status.sizes) throw new UserError(`This job has no container to show: it is ${status.state}.`);
+  const type = (status.links.source && fileTypeOfFormat(status.source_format ?? "ply")) || null;
   return {
     name: status.name,
     container: new URL(`${job}/files/`, window.location.href).href,
     bytes: status.sizes.container,
     request,
-    original: hasPly(status) ? { url: `${job}/source`, bytes: status.upload_bytes } : null,
+    original: type && { url: `${job}/source`, bytes: status.upload_bytes, type },
     originalBytes: status.upload_bytes,
   };
 }
-
-/**
- * Whether the upload is still there, as a .ply, which is what this page reads for comparisons.
- * @param {{links: {source?: string}, source_format?: string}} status
- */
-const hasPly = (status) => Boolean(status.links.source) && (status.source_format ?? "ply") === "ply";
 
 /**
  * @param {string} url
@@ -115,8 +112,8 @@ async function get(url, init) {
 }
 
 /**
- * Download a .ply, with progress.
- * @param {{url: string, bytes: number}} ply address, and its size if that is known, else 0
+ * Download a file, with progress.
+ * @param {{url: string, bytes: number}} file address, and its size if that is known, else 0
  * @param {import("./loading.js").Load} load
  */
 export async function download({ url, bytes: total }, load) {

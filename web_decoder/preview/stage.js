@@ -100,19 +100,19 @@ export function stage(failed) {
       live?.viewer.setScene(scene, parts, live.camera.moved);
       reveal(fresh);
     },
-    /** @param {Uint8Array} bytes of a .ply */
-    async showFile(bytes) {
+    /** @param {import("./file_types.js").FileType} type @param {Uint8Array} bytes */
+    async showFile(type, bytes) {
       const { viewer } = await ready;
       endComparison();
-      const count = await viewer.setFile(bytes);
+      const count = await viewer.setFile(type, bytes);
       reveal(true);
       return count;
     },
-    /** @param {Uint8Array} bytes */
-    async compare(bytes) {
+    /** @param {import("./file_types.js").FileType} type @param {Uint8Array} bytes */
+    async compare(type, bytes) {
       const { viewer, comparison } = await ready;
       endComparison();
-      beside = await comparison(container, viewer, bytes);
+      beside = await comparison(container, viewer, type, bytes);
       fit();
       paint();
     },

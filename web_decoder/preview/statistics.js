@@ -44,7 +44,7 @@ export function statisticsView({ scene, bytes: known, originalBytes, seconds }) 
 const perGaussian = (size, gaussians) => (gaussians ? `${short((8 * size) / gaussians)} bits` : "none");
 
 /**
- * Return the statistics of a .ply that Spark has read.
+ * Return the statistics of a file that Spark has read.
  * @param {number} gaussians
  * @param {number} size
  */

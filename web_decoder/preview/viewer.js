@@ -4,6 +4,7 @@ import * as THREE from "three";
 import { SparkRenderer, SplatFileType, SplatMesh } from "@sparkjsdev/spark";
 import { lookAtAll, setPinhole } from "./camera.js";
 import { CLASSIC, WIDE_RANGES, drawFromOutside } from "./classic.js";
+import { pointsUp } from "./file_types.js";
 import { extentOfMesh, extentOfScene } from "./extent.js";
 import { marker } from "./marker.js";
 import { pack } from "./pack.js";
@@ -82,26 +83,28 @@ export class Viewer {
   }
 
   /**
-   * Show a .ply, read by Spark.
+   * Show a file that Spark reads.
+   * @param {import("./file_types.js").FileType} type
    * @param {Uint8Array} bytes
    * @param {Viewer} [beside] viewer whose frame is used
    * @returns {Promise<number>} the number of Gaussians
    */
-  async setFile(bytes, beside) {
+  async setFile(type, bytes, beside) {
     const splatEncoding = beside?.encoding ?? WIDE_RANGES;
-    const mesh = new SplatMesh({ fileBytes: bytes, fileType: SplatFileType.PLY, splatEncoding });
+    const fileType = /** @type {SplatFileType} */ (type); // its values are these names
+    const mesh = new SplatMesh({ fileBytes: bytes, fileType, splatEncoding });
     await mesh.initialized;
     this.#shown = null;
-    this.#extent = beside?.extent ?? extentOfMesh(mesh);
+    this.#extent = beside?.extent ?? extentOfMesh(mesh, pointsUp(type));
     const [x, y, z] = this.#extent.centre;
     mesh.position.set(-x, y, z);
-    this.#replace(mesh);
+    this.#replace(mesh, pointsUp(type));
     return mesh.numSplats;
   }
 
-  /** @param {SplatMesh} mesh */
-  #replace(mesh) {
-    mesh.quaternion.set(1, 0, 0, 0); // scenes have y down and z ahead
+  /** @param {SplatMesh} mesh @param {boolean} [up] whether its y points up, as in three.js */
+  #replace(mesh, up = false) {
+    if (!up) mesh.quaternion.set(1, 0, 0, 0); // scenes have y down and z ahead
     if (this.#mesh) {
       this.#scene.remove(this.#mesh);
       this.#mesh.dispose();
