@@ -276,7 +276,7 @@ def _turn_to_ply(splats: Splats) -> None:
     """Turn a scene from glTF's axes to those of a ``.ply``, half a turn about z.
 
     The rotation of each Gaussian follows by half a turn of its own about the same axis, which its ellipsoid does not
-    show, so that files that were a ``.ply`` get back the same numbers.
+    show, so that a ``.ply`` written as floats gets back the same numbers.
     """
     mirror(splats, TO_PLY)
     w, x, y, z = (splats.quats[:, i].copy() for i in range(4))

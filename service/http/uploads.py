@@ -269,7 +269,8 @@ def scene_name(given: str | None) -> str:
     """Return a scene name that is safe in listings and downloads: no path, no control characters, never empty."""
     name = re.split(r"[/\\]", unicodedata.normalize("NFC", given or ""))[-1]
     name = "".join(c for c in name if unicodedata.category(c)[0] != "C" and c not in '"<>|:*?')
-    for ending in UPLOAD_ENDINGS.values():
-        name = name[: -len(ending) - 1] if name.lower().endswith(f".{ending}") else name
+    endings = ("compressed.ply", "spz.glb", *UPLOAD_ENDINGS.values())
+    ending = next((f".{ending}" for ending in endings if name.lower().endswith(f".{ending}")), "")
+    name = name[: len(name) - len(ending)]
     name = name.strip(" .")
     return name[:100] or "scene"

@@ -504,6 +504,9 @@ def test_names_are_sanitised(service):
     for name, kept in {
         "../../x.ply": "x",
         "a\\b.ply": "b",
+        "c.compressed.ply": "c",
+        "d.spz.glb": "d",
+        "e.ply.spz": "e.ply",
         "…": "…",
         "\u202etxt": "txt",
         "": "scene",
