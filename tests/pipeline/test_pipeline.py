@@ -274,7 +274,8 @@ def test_files_have_the_permissions_that_new_files_have(tmp_path):
 
 def test_the_content_decides_and_not_the_name(tmp_path):
     compress(SCENE, tmp_path / "scene.zip")
-    compress(SCENE, tmp_path / "folder.ply")
+    compress(SCENE, tmp_path / "folder")
+    (tmp_path / "folder").rename(tmp_path / "folder.ply")
     (tmp_path / "scene.zip").rename(tmp_path / "zip.ply")
     kissgs.save(SCENE, tmp_path / "scene.ply")
     (tmp_path / "scene.ply").rename(tmp_path / "ply.zip")

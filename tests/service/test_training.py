@@ -154,6 +154,8 @@ def test_a_full_disk_disables_checkpoints(tmp_path, monkeypatch, saved):
         "source": str(tmp_path / "scene.ply"),
         "work": str(work),
         "settings": BRIEF,
+        "format": "sogxt",
+        "container": "scene.zip",
         "evaluate": False,
         "checkpoint": str(tmp_path / "checkpoint.npz"),
         "threads": 0,
