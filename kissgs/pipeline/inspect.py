@@ -15,6 +15,7 @@ from kissgs.io.gltf import GltfInfo, read_gltf_info
 from kissgs.io.ksplat import KsplatInfo, read_ksplat_info
 from kissgs.io.packed_files import Source, open_source
 from kissgs.io.ply import PlyInfo, read_ply_info
+from kissgs.io.scene_file import refuse_more_than
 from kissgs.io.splat import count_splat
 from kissgs.io.spz import SpzInfo, read_spz_info
 from kissgs.io.webp import decode_plane
@@ -125,14 +126,17 @@ def describe(path: Path, reading: ReadOptions = DEFAULT_READ_OPTIONS) -> Info:
     No image of a container is decoded, except SOG-XT's mask if the metadata does not state the number of Gaussians.
 
     Raises:
-        KissgsError: the file is not a usable scene or container.
+        KissgsError: the file is not a usable scene or container, or has more Gaussians than ``reading`` allows.
     """
     kind = recognise(path)
     if kind == "sogxt":
-        return _describe_sogxt(path)
-    if kind == "sog" or kind == "streamed-sog":
-        return _describe_sog(path, kind, reading.level)
-    return _describe_file(path, kind, reading)
+        found = _describe_sogxt(path)
+    elif kind == "sog" or kind == "streamed-sog":
+        found = _describe_sog(path, kind, reading.level)
+    else:
+        return _describe_file(path, kind, reading)
+    refuse_more_than(reading.max_gaussians, found.count, str(path))  # no default: no image is decoded
+    return found
 
 
 def _describe_sog(path: Path, kind: Literal["sog", "streamed-sog"], level: int) -> Info:

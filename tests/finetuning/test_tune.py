@@ -1,6 +1,5 @@
 """Fine-tuning. Oracle: uninterrupted work, and the container and its renderings before fine-tuning."""
 
-import itertools
 from dataclasses import replace
 from functools import partial
 
@@ -8,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.training_scenes import around, cloud
-from helpers.tuning_scenes import chosen
+from helpers.tuning_scenes import Interrupted, chosen, stopping_after
 
 import kissgs
 from kissgs import FinetuneSettings, OutputError, Settings, UnsupportedError, decompress
@@ -93,20 +92,6 @@ def test_the_result_depends_on_the_seed_but_not_on_threads(batch):
     torch.set_num_threads(before)
     assert found[0] == found[1] == found[2]
     assert found[0] != tuned(scene, batch=batch, size=140, view_size=160, seed=1, **GENTLE)[0].files
-
-
-class Interrupted(Exception):
-    pass
-
-
-def stopping_after(steps):
-    remaining = itertools.count(steps - 1, -1)
-
-    def progress(stage, fraction, note=""):
-        if stage == "finetune" and note and next(remaining) < 0:
-            raise Interrupted
-
-    return progress
 
 
 @pytest.mark.parametrize("steps", [0, 1, 5, 11, 12])

@@ -1,6 +1,5 @@
 """Fine-tuning of SOG. Oracle: uninterrupted work, readers of the files, and the container before fine-tuning."""
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +7,7 @@ import pytest
 import torch
 from helpers.reference_sog import read_files
 from helpers.training_scenes import around, cloud
-from helpers.tuning_scenes import chosen
+from helpers.tuning_scenes import Interrupted, chosen, stopping_after
 
 import kissgs
 from kissgs import FinetuneSettings, OutputError, Settings, decompress
@@ -74,20 +73,6 @@ def test_the_result_does_not_depend_on_threads():
         found.append(tuned(scene, work=replace(tuner(scene), threads=threads))[0].files)
     torch.set_num_threads(before)
     assert found[0] == found[1]
-
-
-class Interrupted(Exception):
-    pass
-
-
-def stopping_after(steps):
-    remaining = itertools.count(steps - 1, -1)
-
-    def progress(stage, fraction, note=""):
-        if stage == "finetune" and note and next(remaining) < 0:
-            raise Interrupted
-
-    return progress
 
 
 @pytest.mark.parametrize("steps", [5, 0, 1, 12])

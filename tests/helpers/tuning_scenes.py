@@ -1,4 +1,6 @@
-"""Encoding plans for fine-tuning tests, and their scenes."""
+"""Encoding plans for fine-tuning tests, their scenes, and interruptions."""
+
+import itertools
 
 import numpy as np
 
@@ -10,6 +12,21 @@ from kissgs.planning.planner import plan_encoding
 from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
 
 FIELDS = ("means", "opacities", "scales", "quaternions", "f_dc", "f_rest_centroids")
+
+
+class Interrupted(Exception):
+    """Raised from a progress callback."""
+
+
+def stopping_after(steps):
+    """Return a progress callback that raises :class:`Interrupted` after some steps of fine-tuning."""
+    remaining = itertools.count(steps - 1, -1)
+
+    def progress(stage, fraction, note=""):
+        if stage == "finetune" and note and next(remaining) < 0:
+            raise Interrupted
+
+    return progress
 
 
 def chosen(scene, preset="balanced", container=EVEN_LEVELS, **changes):

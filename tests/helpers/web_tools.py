@@ -161,3 +161,18 @@ class Site:
 def sha_of(array):
     """Return the SHA-256 of an array's bytes."""
     return hashlib.sha256(np.ascontiguousarray(array)).hexdigest()
+
+
+def put_value(path, value):
+    """Return a change of the metadata at a dotted path; the value ``del`` deletes it."""
+
+    def change(meta):
+        *parents, last = path.split(".")
+        for key in parents:
+            meta = meta[key]
+        if value == "del":
+            del meta[last]
+        else:
+            meta[last] = value
+
+    return change

@@ -125,6 +125,17 @@ def test_levels_of_a_streamed_scene(tmp_path):
         describe(folder, ReadOptions(level=2))
 
 
+@pytest.mark.parametrize("container", ["sogxt", "sog"])
+def test_a_limit_of_gaussians_holds_for_descriptions_of_containers(container, tmp_path):
+    kissgs.compress(
+        kissgs.sample_scene(100), tmp_path / "c", container=container, settings=kissgs.Settings(preset="fast")
+    )
+    count = describe(tmp_path / "c").count
+    assert describe(tmp_path / "c", ReadOptions(max_gaussians=count)).count == count
+    with pytest.raises(UnsupportedError, match=f"{count:,}|{count}"):
+        describe(tmp_path / "c", ReadOptions(max_gaussians=count - 1))
+
+
 def test_raw_axes(tmp_path):
     path = tmp_path / "a.spz"
     path.write_bytes(spz_bytes(SCENE, 3))

@@ -8,7 +8,7 @@ import zipfile
 import numpy as np
 import pytest
 from helpers.web_scenes import assert_scene, container, in_node, job, with_meta, without_checksums, zipped
-from helpers.web_tools import Site, pillow, webp
+from helpers.web_tools import Site, pillow, put_value, webp
 from PIL import Image
 
 FILES = container("fast", 3, 65)
@@ -120,21 +120,6 @@ def test_labels_outside_the_codebook():
     assert set(refusals(*jobs[1:])) == {"f_rest_labels.webp points outside the codebook"}
 
 
-def put(path, value):
-    """Return a change of the metadata at a dotted path; the value ``del`` deletes it."""
-
-    def change(meta):
-        *parents, last = path.split(".")
-        for key in parents:
-            meta = meta[key]
-        if value == "del":
-            del meta[last]
-        else:
-            meta[last] = value
-
-    return change
-
-
 IMPOSSIBLE = [
     *(("count", value, "count is impossible") for value in (-1, 1.5, "65", None, 1e99, 257, "del", [65], True)),
     *(("gridSide", value, "impossible") for value in (0, -16, 16.5, "16", None, 13377, 2**40, "del", {}, [16])),
@@ -156,7 +141,7 @@ IMPOSSIBLE = [
 
 
 def test_invalid_metadata():
-    found = refusals(*(job(with_meta(FILES, put(path, value))) for path, value, _ in IMPOSSIBLE))
+    found = refusals(*(job(with_meta(FILES, put_value(path, value))) for path, value, _ in IMPOSSIBLE))
     for error, (path, value, why) in zip(found, IMPOSSIBLE, strict=True):
         assert error.startswith("meta.json: "), (path, value, error)
         assert why in error, (path, value, error)
@@ -173,7 +158,7 @@ def test_metadata_that_is_not_json():
 
 def test_more_gaussians_than_allowed():
     """The limit applies to the size of the grid too, and is inclusive."""
-    large = with_meta(FILES, put("gridSide", 13376))
+    large = with_meta(FILES, put_value("gridSide", 13376))
     found = refusals(
         job(large), job(large, options={"maxGaussians": 80_000_000}), job(FILES, options={"maxGaussians": 64})
     )
@@ -185,10 +170,10 @@ def test_more_gaussians_than_allowed():
 def test_invalid_and_missing_checksums():
     """Values that are not numbers are refused; missing ones are not compared."""
     numbers = ("123", [], {}, None, -1, 1.5, True)
-    jobs = [job(with_meta(FILES, put("kissgs.crc32", dict.fromkeys(FILES, value)))) for value in numbers]
-    jobs += [job(with_meta(FILES, put("kissgs.crc32", value))) for value in ("text", 5, None, [])]
+    jobs = [job(with_meta(FILES, put_value("kissgs.crc32", dict.fromkeys(FILES, value)))) for value in numbers]
+    jobs += [job(with_meta(FILES, put_value("kissgs.crc32", value))) for value in ("text", 5, None, [])]
     assert all(" is impossible: " in error for error in refusals(*jobs))
-    found = in_node(*(job(with_meta(FILES, put("kissgs.crc32", value))) for value in ("del", {})))
+    found = in_node(*(job(with_meta(FILES, put_value("kissgs.crc32", value))) for value in ("del", {})))
     assert all("error" not in report for report in found)
 
 

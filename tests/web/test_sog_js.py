@@ -13,7 +13,7 @@ from helpers.format_scenes import made_scene
 from helpers.reference_sog import sog_files, webp, zip_of
 from helpers.splat_transform import convert, needs_splat_transform
 from helpers.web_scenes import array_of, in_node, job, scene_of, ulps
-from helpers.web_tools import Site
+from helpers.web_tools import Site, put_value
 from PIL import Image
 
 import kissgs
@@ -174,17 +174,7 @@ def edited(change):
 
 def put(path, value):
     """Return a container with a changed value at a dotted path of its metadata; the value ``del`` deletes it."""
-
-    def change(meta):
-        *parents, last = path.split(".")
-        for key in parents:
-            meta = meta[key]
-        if value == "del":
-            del meta[last]
-        else:
-            meta[last] = value
-
-    return edited(change)
+    return edited(put_value(path, value))
 
 
 def refusals(*jobs):
