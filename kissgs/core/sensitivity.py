@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kissgs.core.array_types import Float32, Float64
+from kissgs.core.array_types import Float, Float32, Float64
 from kissgs.core.errors import InvalidSceneError
 from kissgs.core.splats import SH_C0, SH_REST_COUNTS, Splats
 
@@ -26,6 +26,12 @@ LARGEST = 1e25
 OPACITY, SCALES, ROTATION = (0,), (7, 13, 18), (22, 25, 27)
 """Indices of the diagonal entries in ``shape_hessian``."""
 
+POSITION = (0, 1, 2)
+"""Indices of the diagonal entries in ``position_hessian``."""
+
+RATIO_SAMPLE = 1 << 18
+"""Largest number of Gaussians from which the ratio of a Hessian to the colour sensitivity is estimated."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sensitivity:
@@ -35,7 +41,7 @@ class Sensitivity:
     far as the errors of different Gaussians are independent.
 
     Attributes:
-        position_hessian: ``(N, 6)``, upper triangle of the Hessian by position, world units: xx, xy, xz, yy, yz, zz.
+        position_hessian: ``(N, 3)``, diagonal of the Hessian by position, world units: xx, yy, zz.
         shape_hessian: ``(N, 28)``, upper triangle, row by row, of the Hessian by (opacity logit; three log-scales; a
             rotation vector, radians, about the Gaussian's own axes). The 48 equivalent forms only permute it.
         color_weight: ``(N,)`` weight of one colour channel, 0 to 1: mean of (alpha T)², divided by 3.
@@ -47,7 +53,7 @@ class Sensitivity:
         view_uncertainty: from 0 to 1, how strongly sensitivity is shrunk towards the prior for unseen views.
     """
 
-    position_hessian: Float32[np.ndarray, "N 6"]
+    position_hessian: Float32[np.ndarray, "N 3"]
     shape_hessian: Float32[np.ndarray, "N 28"]
     color_weight: Float32[np.ndarray, " N"]
     mean_sh_basis: Float32[np.ndarray, "N K"]
@@ -60,7 +66,7 @@ class Sensitivity:
     def none(cls, count: int, sh_degree: int) -> Sensitivity:
         """Return the sensitivity of a scene that no camera has seen: zeros."""
         return cls(
-            position_hessian=np.zeros((count, 6), np.float32),
+            position_hessian=np.zeros((count, 3), np.float32),
             shape_hessian=np.zeros((count, 28), np.float32),
             color_weight=np.zeros(count, np.float32),
             mean_sh_basis=np.zeros((count, SH_REST_COUNTS[sh_degree]), np.float32),
@@ -113,7 +119,7 @@ class Sensitivity:
         self,
         splats: Splats,
         close_up: Float64[np.ndarray, " N"],
-        coverage: Float64[np.ndarray, " N"],
+        coverage: Float[np.ndarray, " N"],
         view_uncertainty: float,
     ) -> Sensitivity:
         """Return sensitivity for all cameras, not only for those that it was measured with.
@@ -122,6 +128,8 @@ class Sensitivity:
         nearby: by ``view_uncertainty`` for Gaussians seen from nearby, and completely for those that no camera saw.
         (Fitted to photographs of a scene, logarithms of sensitivity from virtual cameras have weight 0.72, the prior
         0.23.) The result is at least :data:`FLOOR` · ``view_uncertainty`` times the prior.
+
+        The arrays of this object become those of the result, so that large scenes need no second set of them.
 
         Args:
             splats: the scene.
@@ -141,24 +149,32 @@ class Sensitivity:
         shrunk = np.maximum(colors ** (1 - share) * prior**share, FLOOR * view_uncertainty * prior)
         raised = np.where(colors > 0, shrunk / np.maximum(colors, 1e-300), 1.0)
         least = colors - self.color_weight
+        some = np.flatnonzero(known)
+        some = some[:: -(-len(some) // RATIO_SAMPLE)]
         across = np.exp(-2.0 * np.sort(splats.scales, axis=1)[:, 1].astype(np.float64))
-        forms = {}
-        shapes = ((OPACITY, _transparency(splats) ** 2), (SCALES, 1.0), (ROTATION, 1.0))
-        for name, diagonals in (("shape_hessian", shapes), ("position_hessian", (((0, 3, 5), across),))):
-            values = getattr(self, name).astype(np.float64)
-            for of, unit in diagonals:
-                each = np.maximum(values[:, of].mean(axis=1), 0)
-                ratio = float(np.median((each / (colors * unit))[known]))
-                values[:, of] += (ratio * least * unit)[:, None]
-            forms[name] = np.clip(values * raised[:, None], -LARGEST, LARGEST).astype(np.float32)
-        return Sensitivity(
+        transparent = _transparency(splats) ** 2
+        ones = np.ones(len(splats))
+        for values, of, unit in (
+            (self.shape_hessian, OPACITY, transparent),
+            (self.shape_hessian, SCALES, ones),
+            (self.shape_hessian, ROTATION, ones),
+            (self.position_hessian, POSITION, across),
+        ):
+            each = np.maximum(values[np.ix_(some, of)].mean(axis=1, dtype=np.float64), 0)
+            ratio = float(np.median(each / (colors * unit)[some]))
+            for column in of:
+                values[:, column] += ratio * least * unit
+        for values in (self.shape_hessian, self.position_hessian):
+            with np.errstate(over="ignore"):
+                values *= raised[:, None]
+            np.clip(values, -LARGEST, LARGEST, out=values)
+        self.mean_sh_basis[:] *= np.float32(1 - view_uncertainty)
+        return replace(
+            self,
             color_weight=shrunk.astype(np.float32),
-            mean_sh_basis=self.mean_sh_basis * np.float32(1 - view_uncertainty),
             prior=np.maximum(shrunk - self.color_weight, 0).astype(np.float32),
             coverage=coverage,
-            captured=self.captured,
             view_uncertainty=view_uncertainty,
-            **forms,
         )
 
     def diagonal(self, of: tuple[int, ...]) -> Float64[np.ndarray, "N n"]:

@@ -13,7 +13,7 @@ from kissgs.evaluation.prominence import prominence
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu import blending
 from kissgs.rendering.cpu.frame import LIMITS, Frame, draw
-from kissgs.rendering.cpu.lists import each_part, even_tiles
+from kissgs.rendering.cpu.lists import each_part, even_tiles, number_slots
 
 SHOWN_SHARE = 1e-6
 """Share of an image that a Gaussian must exceed to count as shown by it."""
@@ -36,14 +36,15 @@ def blending_weights(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
     height, width = frame.transmittance.shape
     ones, zeros = np.zeros((height, width, 3), np.float32), np.zeros((height, width), np.float32)
     ones[:, :, 0] = 1  # so the gradient with respect to a red value is the sum of weights
-    slots = np.empty((len(lists.members), 9), np.float32)
+    slots = number_slots(footprints, lists, 0, len(lists.starts) - 1)
+    v_slots = np.empty((len(lists.members), 9), np.float32)
 
     def blend(first: int, last: int) -> None:
         blending.blend_backward(
             footprints.records,
             lists.members,
             lists.spans,
-            lists.slots,
+            slots.of,
             lists.starts,
             first,
             last,
@@ -54,13 +55,12 @@ def blending_weights(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
             frame.stops,
             ones,
             zeros,
-            slots,
+            v_slots,
         )
 
     each_part(blend, even_tiles(lists, pool), pool)
     weights = np.zeros(len(frame.splats), np.float64)
-    slot_weights, visible = np.ascontiguousarray(slots[:, 6]), footprints.visible
-    blending.sum_errors(slot_weights, lists.slots_from, lists.slot_counts, visible, 0, len(visible), weights)
+    blending.sum_errors(np.ascontiguousarray(v_slots[:, 6]), slots.rows, slots.first, footprints.visible, weights)
     return weights
 
 

@@ -86,7 +86,7 @@ class Costs:
             scale=_floored(sensitivity.diagonal(SCALES).mean(axis=1)),
             rotation=_floored(sensitivity.diagonal(ROTATION).mean(axis=1)),
             color=_floored(sensitivity.base_colors()),
-            position=_floored((sensitivity.position_hessian[:, [0, 3, 5]] * factor).mean(axis=1)),
+            position=_floored((sensitivity.position_hessian * factor).mean(axis=1)),
             removal=sensitivity.removal(splats),
             coverage=sensitivity.coverage.astype(np.float64),
         )

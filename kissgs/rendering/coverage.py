@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from kissgs.core.array_types import Float, Float64
+from kissgs.core.array_types import Float32, Float64
 from kissgs.core.splats import Splats
-from kissgs.rendering.camera import Camera
+from kissgs.core.threads import Workers
 from kissgs.rendering.constants import NEAR
 from kissgs.rendering.local_scale import local_scale
+
+if TYPE_CHECKING:
+    from kissgs.rendering.cpu.frame import Frame
 
 VISIBLE = 0.003
 """Share of a Gaussian's squared alpha in an image from which on it counts as seen; with less than a twentieth of its
@@ -30,32 +35,50 @@ class Coverage:
     """
 
     def __init__(self, splats: Splats) -> None:
-        self._means = splats.means
-        self._scale = local_scale(splats)
-        self._sizes = np.exp(np.sort(splats.scales, axis=1)[:, 1:].astype(np.float64))
-        self._squared_opacity = (1 / (1 + np.exp(-splats.opacities.astype(np.float64)))) ** 2
-        self.share = np.zeros(len(splats))
+        self._splats = splats
+        self._scale = local_scale(splats).astype(np.float32)
+        self.share: Float32[np.ndarray, " N"] = np.zeros(len(splats), np.float32)
         """``(N,)`` coverage from 0, seen by no camera or only from far away, to 1, seen from nearby."""
 
     @property
     def close_up(self) -> Float64[np.ndarray, " N"]:
         """``(N,)`` mean squared alpha, 0 to 1, of each Gaussian in an unobstructed image that its surroundings fill."""
-        near = np.maximum(np.minimum(self._scale, ISOLATED * self._sizes[:, 0]), self._scale / MAX_APPROACH)
-        area = np.pi * self._sizes[:, 0] * self._sizes[:, 1] / near**2
-        return self._squared_opacity * np.minimum(area, 1)
+        logs = np.sort(self._splats.scales, axis=1)[:, 1:].astype(np.float64)
+        scale = self._scale.astype(np.float64)
+        near = np.maximum(np.minimum(scale, ISOLATED * np.exp(logs[:, 0])), scale / MAX_APPROACH)
+        area = np.pi * np.exp(logs.sum(axis=1)) / near**2
+        squared_opacity = (1 / (1 + np.exp(-self._splats.opacities.astype(np.float64)))) ** 2
+        return squared_opacity * np.minimum(area, 1)
 
-    def add(self, camera: Camera, seen: Float[np.ndarray, " N"], finer: float = 1.0) -> None:
+    def add(self, frame: Frame, seen: Float32[np.ndarray, " N"], pool: Workers, finer: float = 1.0) -> None:
         """Update the coverage by one rendered image.
 
         Args:
-            camera: camera of the image.
-            seen: ``(N,)`` sum over pixels of (alpha T)², T being the transmittance in front of the Gaussian.
+            frame: the image.
+            seen: sum over pixels of (alpha T)², T being the transmittance in front of the Gaussian, by row of the
+                frame's footprints.
+            pool: threads.
             finer: ratio of the resolution of the image that this one is a thumbnail of to its own.
         """
-        distance = np.linalg.norm(self._means - camera.position, axis=1)
-        pixels = np.sqrt(camera.K[0, 0] * camera.K[1, 1]) / np.maximum(distance, NEAR)
-        area = np.pi * (self._sizes[:, 0] * pixels) * (self._sizes[:, 1] * pixels) + 1  # of a squared Gaussian
-        shown = self._squared_opacity * np.minimum(area, camera.width * camera.height)
-        visible = np.minimum(seen / np.maximum(VISIBLE * shown, 1e-300), 1)
-        resolved = np.minimum(finer * self._scale * pixels / RESOLVED, 1) ** 2
-        np.maximum(self.share, visible * resolved, out=self.share)
+        from kissgs.rendering.cpu.coverage import raise_coverage
+
+        splats, camera = frame.splats, frame.camera
+        limits = np.array([NEAR, VISIBLE, RESOLVED / finer])
+
+        def part(rows: tuple[int, int]) -> None:
+            raise_coverage(
+                splats.means,
+                splats.scales,
+                splats.opacities,
+                self._scale,
+                frame.footprints.visible,
+                *rows,
+                seen,
+                camera.position,
+                float(np.sqrt(camera.K[0, 0] * camera.K[1, 1])),
+                camera.width * camera.height,
+                limits,
+                self.share,
+            )
+
+        pool.map(part, frame.footprints.parts)

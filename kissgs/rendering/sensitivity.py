@@ -17,6 +17,9 @@ from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.coverage import Coverage
 
+BLOCK = 1 << 16
+"""Gaussians per step of array arithmetic, so that temporary arrays stay small."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WeightedCameras:
@@ -83,31 +86,46 @@ def measure_sensitivity(
         UnsupportedError: an image would take too much memory.
     """
     from kissgs.rendering.cpu.frame import add_sensitivities, draw
+    from kissgs.rendering.cpu.lists import each_part, even
+    from kissgs.rendering.cpu.sensitivity import moments_to_hessians
 
-    found = Sensitivity.none(len(splats), splats.sh_degree)
-    coverage, captured = Coverage(splats), np.zeros(len(splats))
+    coverage = Coverage(splats)
+    found, captured = Sensitivity.none(len(splats), splats.sh_degree), np.ones(len(splats), np.float32)
+    if view_uncertainty:  # without it, no other cameras count
+        captured[:] = 0
     with Workers(threads) as pool:
         for done, (camera, weight) in enumerate(zip(cameras.cameras, cameras.per_pixel(), strict=True)):
             progress("sensitivity", done / len(cameras.cameras))
-            before = found.color_weight.copy()
-            add_sensitivities(draw(splats, camera, cameras.background, pool), weight, cameras.spread, found, pool)
-            coverage.add(camera, np.maximum(found.color_weight - before, 0) / weight)
-            if done < cameras.captured:
-                captured = coverage.share.copy()
-    _bound(found.position_hessian, (0, 3, 5))
+            frame = draw(splats, camera, cameras.background, pool)
+            coverage.add(frame, add_sensitivities(frame, weight, cameras.spread, found, pool), pool)
+            if view_uncertainty and done + 1 == cameras.captured:
+                captured[:] = coverage.share
+        each_part(
+            lambda a, b: moments_to_hessians(splats.scales, splats.opacities, a, b, found.shape_hessian),
+            even(len(splats), pool),
+            pool,
+        )
+    _bound(found.position_hessian, (0, 1, 2))
     _bound(found.shape_hessian, OPACITY + SCALES + ROTATION)
     np.nan_to_num(found.color_weight, copy=False, nan=LARGEST, posinf=LARGEST)
     np.nan_to_num(found.mean_sh_basis, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
-    seen = found.color_weight > 0
-    found.mean_sh_basis[seen] /= found.color_weight[seen, None]
-    found.captured[:] = captured if view_uncertainty else 1.0  # at view uncertainty 0, no other cameras count
+    np.divide(
+        found.mean_sh_basis,
+        found.color_weight[:, None],
+        out=found.mean_sh_basis,
+        where=found.color_weight[:, None] > 0,
+    )
+    found.captured[:] = captured
     progress("sensitivity", 1.0)
     return found.with_prior(splats, coverage.close_up, coverage.share, view_uncertainty)
 
 
 def _bound(hessians: Float32[np.ndarray, "N n"], diagonal: tuple[int, ...]) -> None:
     """Replace Hessians that overflow by their diagonals, at most :data:`LARGEST`."""
-    overflowing = ~(np.abs(hessians) <= LARGEST).all(axis=1)
-    kept = np.nan_to_num(hessians[overflowing][:, diagonal], nan=LARGEST)
-    hessians[overflowing] = 0
-    hessians[np.ix_(overflowing, diagonal)] = np.minimum(kept, LARGEST)
+    for first in range(0, len(hessians), BLOCK):
+        block = hessians[first : first + BLOCK]
+        overflowing = ~(np.abs(block) <= LARGEST).all(axis=1)
+        if overflowing.any():
+            kept = np.nan_to_num(block[overflowing][:, diagonal], nan=LARGEST)
+            block[overflowing] = 0
+            block[np.ix_(overflowing, diagonal)] = np.minimum(kept, LARGEST)

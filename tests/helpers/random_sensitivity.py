@@ -16,7 +16,7 @@ def random_sensitivity(splats, seed=0, spread=2.0):
     forms = np.einsum("nij,nkj->nik", roots, roots) * size[:, None, None]
     rows, columns = np.triu_indices(7)
     return Sensitivity(
-        position_hessian=(np.array([1, 0, 0, 1, 0, 1]) * size[:, None]).astype(np.float32),
+        position_hessian=(np.ones(3) * size[:, None]).astype(np.float32),
         shape_hessian=forms[:, rows, columns].astype(np.float32),
         color_weight=size.astype(np.float32),
         mean_sh_basis=rng.normal(0, 0.2, (count, splats.shN.shape[1])).astype(np.float32),

@@ -89,8 +89,8 @@ def coverage_of(splats: Splats, *cameras: Camera) -> np.ndarray:
     with Workers(1) as pool:
         for camera in cameras:
             found = Sensitivity.none(len(splats), splats.sh_degree)
-            add_sensitivities(draw(splats, camera, np.zeros(3, np.float32), pool), 1.0, 0.0, found, pool)
-            coverage.add(camera, found.color_weight)
+            frame = draw(splats, camera, np.zeros(3, np.float32), pool)
+            coverage.add(frame, add_sensitivities(frame, 1.0, 0.0, found, pool), pool)
     return coverage.share
 
 

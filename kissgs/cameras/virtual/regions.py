@@ -18,7 +18,7 @@ from kissgs.cameras.virtual.scene_bounds import SceneBounds, opacity, scene_boun
 from kissgs.cameras.virtual.scored_candidates import ScoredCandidates, score_candidates
 from kissgs.cameras.virtual.scoring import PROXY_GAUSSIANS, ViewScorer, proxy_scene
 from kissgs.cameras.virtual.select import select_diverse
-from kissgs.core.array_types import Float64, Int
+from kissgs.core.array_types import Float32, Float64, Int
 from kissgs.core.progress import Progress
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats
@@ -132,15 +132,15 @@ def _visible_opacity(splats: Splats) -> Float64[np.ndarray, " n"]:
     return np.where(visible > 1 / 255, visible, 0.0)
 
 
-def _updated_coverage(coverage: Coverage, proxy: Splats, region: Region, pool: Workers) -> Float64[np.ndarray, " n"]:
+def _updated_coverage(coverage: Coverage, proxy: Splats, region: Region, pool: Workers) -> Float32[np.ndarray, " n"]:
     """Add some of the region's cameras to ``coverage``; return the coverage of each Gaussian of the proxy, 0 to 1."""
     from kissgs.rendering.cpu.frame import add_sensitivities, draw
 
     for camera in region.cameras(PROBE_CAMERAS):
         probe = camera.at_most(PROBE_SIZE)
-        sensitivity = Sensitivity.none(len(proxy), 0)
-        add_sensitivities(draw(proxy, probe, black(), pool), 1.0, 0.0, sensitivity, pool)
-        coverage.add(probe, sensitivity.color_weight, TYPICAL_SIZE / PROBE_SIZE)
+        frame = draw(proxy, probe, black(), pool)
+        seen = add_sensitivities(frame, 1.0, 0.0, Sensitivity.none(len(proxy), 0), pool)
+        coverage.add(frame, seen, pool, TYPICAL_SIZE / PROBE_SIZE)
     return coverage.share
 
 

@@ -310,19 +310,13 @@ def removal_errors(
             errors[slots[i]] = total
 
 
-@compiled("void(float32[::1], int64[::1], int64[::1], int32[::1], int64, int64, float64[::1])")
+@compiled("void(float32[::1], int32[::1], int32[::1], int32[::1], float64[::1])")
 def sum_errors(
-    errors: np.ndarray,
-    slots_from: np.ndarray,
-    slot_counts: np.ndarray,
-    visible: np.ndarray,
-    first: int,
-    last: int,
-    scores: np.ndarray,
+    errors: np.ndarray, rows: np.ndarray, slots_from: np.ndarray, visible: np.ndarray, scores: np.ndarray
 ) -> None:
-    """Write the sum of each footprint's slots to ``scores[visible]``, footprints ``first`` to ``last`` (exclusive)."""
-    for n in range(first, last):
+    """Write the sum of the slots of each of the footprints ``rows`` to ``scores[visible]``."""
+    for row in rows:
         total = 0.0
-        for slot in range(slots_from[n], slots_from[n] + slot_counts[n]):
+        for slot in range(slots_from[row], slots_from[row + 1]):
             total += errors[slot]
-        scores[visible[n]] = total
+        scores[visible[row]] = total

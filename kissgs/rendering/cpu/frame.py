@@ -6,11 +6,12 @@ writes its own slots, and the slots of a footprint are added in order.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
 
-from kissgs.core.array_types import Float32, Float64, Int32, Shaped
+from kissgs.core.array_types import Float32, Float64, Int32, Int64, Shaped
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import ATTRIBUTES, Splats
@@ -21,11 +22,13 @@ from kissgs.rendering.cpu import blending, projection, sensitivity, shading
 from kissgs.rendering.cpu.lists import (
     PROJECTION_CONSTANTS,
     Footprints,
+    Slots,
     TileLists,
     each_part,
     even,
     even_tiles,
     find_footprints,
+    number_slots,
     sort_into_tiles,
 )
 
@@ -33,6 +36,9 @@ LIMITS = np.array([constants.ALPHA_MIN, constants.ALPHA_MAX, constants.TRANSMITT
 """Constants of blending, as kernels take them."""
 
 PIXELS_PER_TILE = constants.TILE**2
+
+BAND = 1 << 21
+"""Number of members of tiles whose moments are in memory at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,8 +139,8 @@ def differentiate(
         MemoryError: there is not enough memory.
     """
     splats = frame.splats
-    camera, lists, visible, rows = frame.camera, frame.lists, frame.footprints.visible, frame.footprints.rows
-    records = frame.footprints.records
+    camera, lists, visible, records = frame.camera, frame.lists, frame.footprints.visible, frame.footprints.records
+    slots = number_slots(frame.footprints, lists, 0, len(lists.starts) - 1)
     v_slots = np.empty((len(lists.members), 9), np.float32)
 
     def blend(first: int, last: int) -> None:
@@ -142,7 +148,7 @@ def differentiate(
             records,
             lists.members,
             lists.spans,
-            lists.slots,
+            slots.of,
             lists.starts,
             first,
             last,
@@ -167,9 +173,8 @@ def differentiate(
             splats.scales,
             splats.opacities,
             visible,
-            rows,
-            lists.slots_from,
-            lists.slot_counts,
+            slots.rows,
+            slots.first,
             v_slots,
             first,
             last,
@@ -189,7 +194,7 @@ def differentiate(
             splats.shN,
             camera.position,
             visible,
-            rows,
+            slots.rows,
             first,
             last,
             records,
@@ -199,7 +204,7 @@ def differentiate(
             found.shN,
         )
 
-    each_part(project, even(len(visible), pool), pool)
+    each_part(project, even(len(slots.rows), pool), pool)
     return found
 
 
@@ -210,6 +215,7 @@ def removal_scores(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
     which a removal may reveal; 0 for Gaussians outside the image.
     """
     lists, (visible, records) = frame.lists, (frame.footprints.visible, frame.footprints.records)
+    slots = number_slots(frame.footprints, lists, 0, len(lists.starts) - 1)
     errors = np.empty(len(lists.members), np.float32)
 
     def blend(first: int, last: int) -> None:
@@ -217,7 +223,7 @@ def removal_scores(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
             records,
             lists.members,
             lists.spans,
-            lists.slots,
+            slots.of,
             lists.starts,
             first,
             last,
@@ -231,72 +237,91 @@ def removal_scores(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
 
     each_part(blend, even_tiles(lists, pool), pool)
     scores = np.zeros(len(frame.splats), np.float64)
-    blending.sum_errors(errors, lists.slots_from, lists.slot_counts, visible, 0, len(visible), scores)
+    blending.sum_errors(errors, slots.rows, slots.first, visible, scores)
     return scores
 
 
-def add_sensitivities(frame: Frame, weight: float, spread: float, into: Sensitivity, pool: Workers) -> None:
+def add_sensitivities(
+    frame: Frame, weight: float, spread: float, into: Sensitivity, pool: Workers
+) -> Float32[np.ndarray, " N"]:
     """Add the sensitivity in this image, times ``weight``, to ``into``.
 
     Args:
         frame: a rendered image.
         weight: weight of the squared error of a single value of the image.
         spread: standard deviation of each channel of the background.
-        into: sums over images; ``mean_sh_basis`` receives sums of (alpha T)² times the spherical harmonics, to be
-            divided by ``color_weight`` in the end.
+        into: sums over images; ``shape_hessian`` receives moments, to be converted by
+            :func:`kissgs.rendering.cpu.sensitivity.moments_to_hessians` in the end, and ``mean_sh_basis`` sums of
+            (alpha T)² times the spherical harmonics, to be divided by ``color_weight``.
         pool: threads; the result does not depend on their number.
+
+    Returns:
+        Sum of (alpha T)² over the pixels of this image, by row of the frame's footprints; rows without a footprint are
+        not set.
     """
     splats, camera, lists = frame.splats, frame.camera, frame.lists
-    visible, rows, records = frame.footprints.visible, frame.footprints.rows, frame.footprints.records
-    slots = np.empty((len(lists.members), 16), np.float32)
+    visible, records = frame.footprints.visible, frame.footprints.records
+    seen = np.empty(len(visible), np.float32)
+    for a, b in frame.footprints.parts:
+        seen[a:b] = 0
+    for top, bottom in itertools.pairwise(_bands(lists)):
+        slots = number_slots(frame.footprints, lists, top, bottom)
+        moments = np.empty((len(slots.of), sensitivity.MOMENTS), np.float32)
 
-    def blend(first: int, last: int) -> None:
-        sensitivity.moments(
-            records,
-            lists.members,
-            lists.spans,
-            lists.slots,
-            lists.starts,
-            first,
-            last,
-            lists.columns,
-            LIMITS,
-            frame.background,
-            spread,
-            frame.transmittance,
-            frame.stops,
-            slots,
-        )
+        def blend(first: int, last: int, slots: Slots = slots, moments: np.ndarray = moments, top: int = top) -> None:
+            sensitivity.moments(
+                records,
+                lists.members,
+                lists.spans,
+                slots.of,
+                lists.starts,
+                lists.starts[top],
+                first,
+                last,
+                lists.columns,
+                LIMITS,
+                frame.background,
+                spread,
+                frame.transmittance,
+                frame.stops,
+                moments,
+            )
 
-    each_part(blend, even_tiles(lists, pool), pool)
+        each_part(blend, even_tiles(lists, pool, top, bottom), pool)
 
-    def project(first: int, last: int) -> None:
-        sensitivity.add_to_parameters(
-            splats.means,
-            splats.quats,
-            splats.scales,
-            splats.opacities,
-            visible,
-            rows,
-            lists.slots_from,
-            lists.slot_counts,
-            slots,
-            first,
-            last,
-            camera.viewmat,
-            camera.position,
-            camera.K,
-            camera.width,
-            camera.height,
-            PROJECTION_CONSTANTS,
-            weight,
-            into.position_hessian,
-            into.shape_hessian,
-            into.color_weight,
-            into.mean_sh_basis,
-        )
+        def project(first: int, last: int, slots: Slots = slots, moments: np.ndarray = moments) -> None:
+            sensitivity.add_to_parameters(
+                splats.means,
+                splats.quats,
+                splats.scales,
+                visible,
+                slots.rows,
+                slots.first,
+                moments,
+                first,
+                last,
+                camera.viewmat,
+                camera.position,
+                camera.K,
+                camera.width,
+                camera.height,
+                PROJECTION_CONSTANTS,
+                weight,
+                into.position_hessian,
+                into.shape_hessian,
+                into.color_weight,
+                into.mean_sh_basis,
+                seen,
+            )
 
-    each_part(project, even(len(visible), pool), pool)
+        each_part(project, even(len(slots.rows), pool), pool)
+    return seen
+
+
+def _bands(lists: TileLists) -> Int64[np.ndarray, " edges"]:
+    """Return the edges of bands of tiles of about :data:`BAND` members each."""
+    edges = np.searchsorted(lists.starts, np.arange(0, lists.starts[-1], BAND))
+    return np.unique(np.append(edges, [0, len(lists.starts) - 1]))
 
 
 def _colour(background: Shaped[np.ndarray, "..."]) -> Float32[np.ndarray, "3"]:

@@ -12,7 +12,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from kissgs.core.array_types import Float32, Int32, Int64, UInt16
+from kissgs.core.array_types import Float32, Int32, Int64, UInt16, UInt32
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.splats import Splats
 from kissgs.core.threads import Workers
@@ -39,17 +39,28 @@ PARTS_PER_THREAD = 4
 
 @dataclass(frozen=True, slots=True)
 class Footprints:
-    """The M Gaussians that touch an image, front to back.
+    """The M Gaussians that touch an image, in the order of the scene, in rows of arrays for all N.
 
     Attributes:
-        visible: ``(M,)`` indices of the Gaussians.
-        rows: ``(M,)`` footprints in the order of their Gaussians.
-        records: ``(M, 11)``, see :func:`kissgs.rendering.cpu.projection.project`.
+        parts: ranges of rows that hold footprints; other rows are not set.
+        visible: ``(N,)`` index of the Gaussian of each row.
+        depths: ``(N,)`` bits of each footprint's depth, a positive float32; they sort as depths do.
+        records: ``(N, 11)``, see :func:`kissgs.rendering.cpu.projection.project`.
     """
 
-    visible: Int32[np.ndarray, " M"]
-    rows: Int64[np.ndarray, " M"]
-    records: Float32[np.ndarray, "M 11"]
+    parts: list[tuple[int, int]]
+    visible: Int32[np.ndarray, " N"]
+    depths: UInt32[np.ndarray, " N"]
+    records: Float32[np.ndarray, "N 11"]
+
+    @property
+    def count(self) -> int:
+        """The number M of footprints."""
+        return sum(last - first for first, last in self.parts)
+
+    def rows(self) -> Int64[np.ndarray, " M"]:
+        """Return the rows that hold footprints, ascending."""
+        return np.concatenate([np.arange(first, last) for first, last in self.parts])
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,29 +70,38 @@ class TileLists:
     Attributes:
         columns: number of tiles in a row of tiles.
         starts: ``(tiles + 1,)`` index of the first member of each tile.
-        members: ``(P,)`` footprints, tile after tile, front to back.
+        members: ``(P,)`` rows of the footprints, tile after tile, front to back.
         spans: ``(P,)`` rows of pixels that each member touches, see :func:`kissgs.rendering.cpu.tiles.fill_tiles`.
-        slots: ``(P,)`` slot of each member.
-        slots_from: ``(M,)`` first slot of each footprint; slots are numbered in the order of the Gaussians.
-        slot_counts: ``(M,)`` number of slots of each footprint, one per tile that it touches.
     """
 
     columns: int
     starts: Int64[np.ndarray, " tiles_1"]
     members: Int32[np.ndarray, " P"]
     spans: UInt16[np.ndarray, " P"]
-    slots: Int32[np.ndarray, " P"]
-    slots_from: Int64[np.ndarray, " M"]
-    slot_counts: Int64[np.ndarray, " M"]
+
+
+@dataclass(frozen=True, slots=True)
+class Slots:
+    """Numbers of the members of some tiles, footprint by footprint, so that sums over tiles have a fixed order.
+
+    Attributes:
+        of: ``(S,)`` slot of each member of these tiles.
+        rows: ``(T,)`` rows of the footprints that are members, ascending.
+        first: ``(N + 1,)`` first slot of each row; a row's slots end where the next one's begin.
+    """
+
+    of: Int32[np.ndarray, " S"]
+    rows: Int32[np.ndarray, " T"]
+    first: Int32[np.ndarray, " N_1"]
 
 
 def find_footprints(splats: Splats, camera: Camera, pool: Workers) -> Footprints:
-    """Project and shade all Gaussians; return those that touch the image, nearest first."""
+    """Project and shade all Gaussians; return those that touch the image."""
     count = len(splats)
     visible, depths = np.empty(count, np.int32), np.empty(count, np.float32)
     records = np.empty((count, 11), np.float32)
 
-    def part(first: int, last: int) -> slice:
+    def part(first: int, last: int) -> tuple[int, int]:
         found = projection.project(
             splats.means,
             splats.quats,
@@ -99,16 +119,9 @@ def find_footprints(splats: Splats, camera: Camera, pool: Workers) -> Footprints
             records,
         )
         shading.shade(splats.means, splats.sh0, splats.shN, camera.position, visible, first, first + found, records)
-        return slice(first, first + found)
+        return first, first + found
 
-    parts = each_part(part, even(count, pool), pool)
-    rows = np.concatenate([np.arange(part.start, part.stop) for part in parts])
-    order = np.empty_like(rows)
-    tiles.sort_keys(depths[rows].view(np.uint32), order, np.empty_like(rows))  # positive floats sort as their bits
-    in_scene = np.empty_like(order)
-    in_scene[order] = np.arange(len(order))
-    rows = rows[order]
-    return Footprints(visible[rows], in_scene, records[rows])
+    return Footprints(each_part(part, even(count, pool), pool), visible, depths.view(np.uint32), records)
 
 
 def sort_into_tiles(footprints: Footprints, camera: Camera, pool: Workers) -> TileLists:
@@ -118,28 +131,35 @@ def sort_into_tiles(footprints: Footprints, camera: Camera, pool: Workers) -> Ti
         UnsupportedError: there are more than :data:`MAX_PAIRS`, or more than :data:`MAX_MEMBERS` in one tile.
     """
     columns, rows = -(-camera.width // constants.TILE), -(-camera.height // constants.TILE)
-    records = footprints.records
-    parts = even(len(records), pool)
-    slot_counts = np.empty(len(records), np.int64)
+    records, depths = footprints.records, footprints.depths
 
-    def count(first: int, last: int) -> Int64[np.ndarray, " tiles"]:
+    def count(part: tuple[int, int]) -> Int64[np.ndarray, " tiles"]:
         per_tile = np.zeros(columns * rows, np.int64)
-        tiles.count_tiles(records, first, last, columns, rows, per_tile, slot_counts)
+        tiles.count_tiles(records, *part, columns, rows, per_tile)
         return per_tile
 
-    per_part = np.stack(each_part(count, parts, pool))
-    starts, slots_from = _running_sum(per_part.sum(axis=0)), np.empty_like(slot_counts)
-    slots_from[footprints.rows] = _running_sum(slot_counts[footprints.rows])[:-1]
+    per_part = np.stack(pool.map(count, footprints.parts))
+    starts = _running_sum(per_part.sum(axis=0))
     _check_lists(starts)
-    members, slots = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int32)
+    keys, members = np.empty(starts[-1], np.uint32), np.empty(starts[-1], np.int32)
     spans = np.empty(starts[-1], np.uint16)
-    ends = dict(zip(parts.tolist(), starts[:-1] + np.cumsum(per_part, axis=0) - per_part, strict=False))
+    ends = starts[:-1] + np.cumsum(per_part, axis=0) - per_part
 
-    def fill(first: int, last: int) -> None:
-        tiles.fill_tiles(records, first, last, columns, rows, ends[first], slots_from, members, slots, spans)
+    def fill(n: int) -> None:
+        tiles.fill_tiles(records, depths, *footprints.parts[n], columns, rows, ends[n], keys, members, spans)
 
-    each_part(fill, parts, pool)
-    return TileLists(columns, starts, members, spans, slots, slots_from, slot_counts)
+    pool.map(fill, range(len(footprints.parts)))
+    lists = TileLists(columns, starts, members, spans)
+    each_part(lambda a, b: tiles.sort_tiles(starts, a, b, keys, members, spans), even_tiles(lists, pool), pool)
+    return lists
+
+
+def number_slots(footprints: Footprints, lists: TileLists, first: int, last: int) -> Slots:
+    """Return the slots of the members of tiles ``first`` to ``last`` (exclusive)."""
+    members = lists.members[lists.starts[first] : lists.starts[last]]
+    from_slot, of = np.empty(len(footprints.records) + 1, np.int32), np.empty(len(members), np.int32)
+    rows = np.empty(min(len(members), len(footprints.records)), np.int32)
+    return Slots(of, rows[: tiles.number_slots(members, from_slot, of, rows)], from_slot)
 
 
 def _check_lists(starts: Int64[np.ndarray, " tiles_1"]) -> None:
@@ -168,13 +188,22 @@ def even(count: int, pool: Workers) -> Int64[np.ndarray, " edges"]:
     return np.linspace(0, count, parts + 1).astype(np.int64)
 
 
-def even_tiles(lists: TileLists, pool: Workers) -> Int64[np.ndarray, " edges"]:
-    """Return the edges of parts of tiles of about equal cost: the number of members plus a constant per tile."""
-    tiles_count = len(lists.starts) - 1
-    work = lists.starts + 8 * np.arange(tiles_count + 1)
-    edges = np.searchsorted(work, np.linspace(0, work[-1], pool.threads * PARTS_PER_THREAD + 1))
-    edges[0], edges[-1] = 0, tiles_count
-    return np.unique(edges)
+def even_tiles(
+    lists: TileLists, pool: Workers, first: int = 0, last: int | None = None
+) -> Int64[np.ndarray, " edges"]:
+    """Return the edges of parts of tiles of about equal cost: the number of members plus a constant per tile.
+
+    Args:
+        lists: lists of all tiles.
+        pool: threads.
+        first: first tile.
+        last: end of the tiles, exclusive; None for all.
+    """
+    last = len(lists.starts) - 1 if last is None else last
+    work = lists.starts[first : last + 1] + 8 * np.arange(last - first + 1)
+    edges = np.searchsorted(work, np.linspace(work[0], work[-1], pool.threads * PARTS_PER_THREAD + 1))
+    edges[0], edges[-1] = 0, last - first
+    return first + np.unique(edges)
 
 
 def each_part(work: Callable[[int, int], R], edges: Int64[np.ndarray, " edges"], pool: Workers) -> list[R]:

@@ -224,7 +224,7 @@ def project(
 
 @compiled(
     "void(float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[::1],"
-    " int32[::1], int64[::1], int64[::1], int64[::1], float32[:, ::1], int64, int64,"
+    " int32[::1], int32[::1], int32[::1], float32[:, ::1], int64, int64,"
     " float64[:, ::1], float64[:, ::1], int64, int64, float64[::1],"
     " float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[::1], float64[:, ::1])"
 )
@@ -236,7 +236,6 @@ def project_backward(
     visible: np.ndarray,
     rows: np.ndarray,
     slots_from: np.ndarray,
-    slot_counts: np.ndarray,
     v_slots: np.ndarray,
     first: int,
     last: int,
@@ -257,8 +256,7 @@ def project_backward(
         means, quats, scales, opacities, viewmat, K, width, height, constants: as for :func:`project`.
         visible: ``(M,)`` the Gaussian of each footprint.
         rows: ``(M,)`` footprints in the order of their Gaussians, so that memory is accessed in order.
-        slots_from: ``(M,)`` first slot of each footprint.
-        slot_counts: ``(M,)`` number of its slots.
+        slots_from: first slot of each footprint; its slots end where the next footprint's begin.
         v_slots: output of :func:`kissgs.rendering.cpu.blending.blend_backward`.
         first: first index into ``rows``.
         last: end of the indices, exclusive.
@@ -274,7 +272,7 @@ def project_backward(
         row = rows[i]
         n = visible[row]
         sums[:] = 0.0
-        for slot in range(slots_from[row], slots_from[row] + slot_counts[row]):
+        for slot in range(slots_from[row], slots_from[row + 1]):
             for c in range(9):
                 sums[c] += v_slots[slot, c]
         v_colors[row, 0], v_colors[row, 1], v_colors[row, 2] = sums[6], sums[7], sums[8]

@@ -4,7 +4,8 @@ The derivative of a pixel by the logarithm of a footprint's alpha is w = alpha T
 it. To first order, the change of that logarithm is a polynomial of degree 2 in the footprint's own coordinates u, v:
 the opacity changes its constant term, the centre its linear terms, the covariance its quadratic terms. The squared
 change of the image is then a quadratic form in these six coefficients, whose entries are moments, sums of |w|² uⁱ vʲ
-over pixels with i + j up to 4. The chain rule gives J ᵀ J of the image by the stored parameters, without random probes.
+over pixels with i + j of 0, 2 and 4. The chain rule gives J ᵀ J of the image by the stored parameters, without random
+probes.
 
 The background that a scene will be shown with is unknown, so it is random: |w|² is the mean over backgrounds.
 """
@@ -17,6 +18,8 @@ from numba import njit
 from kissgs.core.numba_kernels import compiled
 from kissgs.rendering.cpu.blending import _FAST, _exp_minus, _footprint, _pixel_centres
 from kissgs.rendering.cpu.projection import (
+    Vector,
+    _applied,
     _cholesky,
     _deviations,
     _dot,
@@ -32,9 +35,12 @@ from kissgs.rendering.cpu.projection import (
 )
 from kissgs.rendering.cpu.shading import _harmonics
 
+MOMENTS = 10
+"""Number of moments of each footprint in each tile."""
+
 
 @compiled(
-    "void(float32[:, ::1], int32[::1], uint16[::1], int32[::1], int64[::1], int64, int64, int64,"
+    "void(float32[:, ::1], int32[::1], uint16[::1], int32[::1], int64[::1], int64, int64, int64, int64,"
     " float32[::1], float32[::1], float64, float32[:, ::1], int32[:, ::1], float32[:, ::1])",
     fastmath=_FAST,
 )
@@ -44,6 +50,7 @@ def moments(
     spans: np.ndarray,
     slots: np.ndarray,
     starts: np.ndarray,
+    slots_begin: int,
     first: int,
     last: int,
     columns: int,
@@ -56,10 +63,11 @@ def moments(
 ) -> None:
     """Compute moments of the members of tiles ``first`` to ``last`` (exclusive).
 
-    The arguments are those of :func:`kissgs.rendering.cpu.blending.removal_errors`, and ``spread``, the standard
-    deviation of each channel of the background. ``sums``: out, ``(slots, 16)``, sums over the tile's pixels of |w|²
-    times 1, u, v, u², uv, v², u³, u²v, uv², v³, u⁴, u³v, u²v², uv³, v⁴; and of (alpha T)². Pixels at which alpha is
-    clamped to ALPHA_MAX count in the first sum only, which is therefore the error of removing the Gaussian.
+    The arguments are those of :func:`kissgs.rendering.cpu.blending.removal_errors`, and ``slots_begin``, the member to
+    which the first entry of ``slots`` belongs, and ``spread``, the standard deviation of each channel of the
+    background. ``sums``: out, ``(slots, 10)``, sums over the tile's pixels of |w|² times 1, u², uv, v², u⁴, u³v, u²v²,
+    uv³, v⁴; and of (alpha T)². Pixels at which alpha is clamped to ALPHA_MAX count in the first sum only, which is
+    therefore the error of removing the Gaussian.
     """
     alpha_min, alpha_max = limits[0], limits[1]
     zero, one = np.float32(0), np.float32(1)
@@ -80,15 +88,14 @@ def moments(
             s[1024 + p], s[1280 + p], s[1536 + p] = background[0], background[1], background[2]
             s[1792 + p] = one
         for i in range(begin + last_stop, starts[tile + 1]):
-            sums[slots[i], :] = zero
+            sums[slots[i - slots_begin], :] = zero
         for i in range(begin + last_stop - 1, begin - 1, -1):
             (mx, my, l0, l1, l2), (opacity, red, green, blue) = _footprint(records, members[i], x0, y0)
             red, green, blue = min(red, max_color), min(green, max_color), min(blue, max_color)
             top, bottom = np.uint64(spans[i] >> 5), np.uint64(spans[i] & 31)
             index = np.float32(i - begin)
-            m0, mu, mv, muu, muv, mvv = zero, zero, zero, zero, zero, zero
-            m30, m21, m12, m03 = zero, zero, zero, zero
-            m40, m31, m22, m13, m04, squared_weight = zero, zero, zero, zero, zero, zero
+            m0, m20, m11, m02, m40, m31, m22, m13, m04 = zero, zero, zero, zero, zero, zero, zero, zero, zero
+            squared_weight = zero
             for p in range(top * np.uint64(16), bottom * np.uint64(16)):
                 dx, dy = s[p] - mx, s[p + np.uint64(256)] - my
                 u, v = l0 * dx + l1 * dy, l2 * dy
@@ -112,73 +119,54 @@ def moments(
                 m0 += g
                 g = g if full <= alpha_max else zero
                 uu, uv, vv = u * u, u * v, v * v
-                guu, guv, gvv = g * uu, g * uv, g * vv
-                mu += g * u
-                mv += g * v
-                muu += guu
-                muv += guv
-                mvv += gvv
-                m30 += guu * u
-                m21 += guu * v
-                m12 += gvv * u
-                m03 += gvv * v
+                guu, gvv = g * uu, g * vv
+                m20 += guu
+                m11 += g * uv
+                m02 += gvv
                 m40 += guu * uu
                 m31 += guu * uv
                 m22 += guu * vv
-                m13 += guv * vv
+                m13 += gvv * uv
                 m04 += gvv * vv
-            slot = slots[i]
-            sums[slot, 0] = m0
-            sums[slot, 1] = mu
-            sums[slot, 2] = mv
-            sums[slot, 3] = muu
-            sums[slot, 4] = muv
-            sums[slot, 5] = mvv
-            sums[slot, 6] = m30
-            sums[slot, 7] = m21
-            sums[slot, 8] = m12
-            sums[slot, 9] = m03
-            sums[slot, 10] = m40
-            sums[slot, 11] = m31
-            sums[slot, 12] = m22
-            sums[slot, 13] = m13
-            sums[slot, 14] = m04
-            sums[slot, 15] = squared_weight
+            slot = slots[i - slots_begin]
+            sums[slot, 0], sums[slot, 1], sums[slot, 2], sums[slot, 3] = m0, m20, m11, m02
+            sums[slot, 4], sums[slot, 5], sums[slot, 6], sums[slot, 7], sums[slot, 8] = m40, m31, m22, m13, m04
+            sums[slot, 9] = squared_weight
+
+
+Products = tuple[float, float, float]
+"""Coefficients of the product of two coordinates in the Gaussian's frame by u², uv, v²."""
 
 
 @njit(nogil=True, error_model="numpy")
-def _form(m: np.ndarray, form: np.ndarray) -> None:
-    """Write the 6x6 matrix of moments of polynomials in 1, u, v, u², uv, v² into ``form``."""
-    moment_index = np.array(
-        [
-            [0, 1, 2, 3, 4, 5],
-            [1, 3, 4, 6, 7, 8],
-            [2, 4, 5, 7, 8, 9],
-            [3, 6, 7, 10, 11, 12],
-            [4, 7, 8, 11, 12, 13],
-            [5, 8, 9, 12, 13, 14],
-        ]
-    )
-    for i in range(6):
-        for j in range(6):
-            form[i, j] = m[moment_index[i, j]]
+def _product(u: Vector, v: Vector, a: int, b: int) -> Products:
+    """Return u², uv and v² coefficients of g[a] g[b], g being u times row ``u`` plus v times row ``v``."""
+    return u[a] * u[b], u[a] * v[b] + v[a] * u[b], v[a] * v[b]
+
+
+@njit(nogil=True, error_model="numpy")
+def _thickened(s: Vector) -> Vector:
+    """Return the factors by which a Gaussian's axes are enlarged to at least 1/10,000 of the longest.
+
+    Moments of a needle's thin axes would underflow, while their derivatives by rotations are large.
+    """
+    least = 1e-4 * max(s[0], s[1], s[2])
+    return max(least / s[0], 1.0), max(least / s[1], 1.0), max(least / s[2], 1.0)
 
 
 @compiled(
-    "void(float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[::1],"
-    " int32[::1], int64[::1], int64[::1], int64[::1], float32[:, ::1], int64, int64,"
+    "void(float32[:, ::1], float32[:, ::1], float32[:, ::1],"
+    " int32[::1], int32[::1], int32[::1], float32[:, ::1], int64, int64,"
     " float64[:, ::1], float64[::1], float64[:, ::1], int64, int64, float64[::1], float64,"
-    " float32[:, ::1], float32[:, ::1], float32[::1], float32[:, ::1])"
+    " float32[:, ::1], float32[:, ::1], float32[::1], float32[:, ::1], float32[::1])"
 )
 def add_to_parameters(
     means: np.ndarray,
     quats: np.ndarray,
     scales: np.ndarray,
-    opacities: np.ndarray,
     visible: np.ndarray,
     rows: np.ndarray,
     slots_from: np.ndarray,
-    slot_counts: np.ndarray,
     slots: np.ndarray,
     first: int,
     last: int,
@@ -190,43 +178,56 @@ def add_to_parameters(
     constants: np.ndarray,
     weight: float,
     position_hessian: np.ndarray,
-    shape_hessian: np.ndarray,
+    shape_moments: np.ndarray,
     color_weight: np.ndarray,
     sh_basis_sum: np.ndarray,
+    seen: np.ndarray,
 ) -> None:
-    """Add the Hessians of one image to those of the Gaussians whose footprints are ``rows[first:last]``.
+    """Add the moments of some tiles of an image to those of the Gaussians of the footprints ``rows[first:last]``.
+
+    A footprint's coordinates (u, v) times L W are coordinates g in the Gaussian's own frame, in units of its axes, here
+    :func:`_thickened`. The derivative of ln alpha by a strain of the Gaussian is quadratic in g whatever the camera, so images are added as
+    moments of g, and the Hessian by log-scales and rotation follows once (:func:`moments_to_hessians`).
 
     Args:
-        means, quats, scales, opacities, visible, rows, slots_from, slot_counts, first, last, viewmat, K, width, height,
-            constants: as for :func:`kissgs.rendering.cpu.projection.project_backward`.
+        means, quats, scales, visible, rows, slots_from, first, last, viewmat, K, width, height, constants: as for
+            :func:`kissgs.rendering.cpu.projection.project_backward`.
         slots: output of :func:`moments`.
         eye: ``(3,)`` position of the camera, world units.
         weight: weight of the image.
-        position_hessian: ``(N, 6)`` upper triangle of the Hessian by position: xx, xy, xz, yy, yz, zz.
-        shape_hessian: ``(N, 28)`` upper triangle, row by row, of the Hessian by opacity logit, three log-scales, and a
-            rotation vector in the Gaussian's own frame.
+        position_hessian: ``(N, 3)`` diagonal of the Hessian by position.
+        shape_moments: ``(N, 22)`` or wider: sums over pixels of |w|² times 1; times g0², g0 g1, g0 g2, g1², g1 g2, g2²;
+            and times the 15 products of four of g0, g1, g2 in the order 0000, 0001, 0002, 0011 and so on to 2222.
         color_weight: ``(N,)`` sum of (alpha T)².
         sh_basis_sum: ``(N, K)`` sum of (alpha T)² times the spherical harmonics without the constant one.
+        seen: by row, sum of (alpha T)² of this image alone, without its weight; added.
     """
     dilation = constants[2]
     fx, fy = K[0, 0], K[1, 1]
     rotation, translation = _pose(viewmat)
     left, right, top, bottom = _frustum(K, width, height, constants[3])
-    m, form = np.empty(16, np.float64), np.empty((6, 6), np.float64)
-    by_shape, product = np.zeros((7, 6), np.float64), np.zeros((7, 6), np.float64)
-    by_position = np.zeros((3, 2), np.float64)
     basis = np.zeros(15, np.float64)
     for i in range(first, last):
         row = rows[i]
         n = visible[row]
-        m[:] = 0.0
-        for slot in range(slots_from[row], slots_from[row] + slot_counts[row]):
-            for c in range(16):
-                m[c] += slots[slot, c]
-        if m[15] == 0.0:
+        m0 = m20 = m11 = m02 = m40 = m31 = m22 = m13 = m04 = squared_weight = 0.0
+        for slot in range(slots_from[row], slots_from[row + 1]):
+            m0 += slots[slot, 0]
+            m20 += slots[slot, 1]
+            m11 += slots[slot, 2]
+            m02 += slots[slot, 3]
+            m40 += slots[slot, 4]
+            m31 += slots[slot, 5]
+            m22 += slots[slot, 6]
+            m13 += slots[slot, 7]
+            m04 += slots[slot, 8]
+            squared_weight += slots[slot, 9]
+        if squared_weight == 0.0:
             continue
-        m *= weight
-        _form(m, form)
+        seen[row] += squared_weight
+        m0, m20, m11, m02 = weight * m0, weight * m20, weight * m11, weight * m02
+        m40, m31, m22, m13, m04 = weight * m40, weight * m31, weight * m22, weight * m13, weight * m04
+        squared_weight *= weight
 
         # As in project.
         mean = _load(means, n)
@@ -238,53 +239,100 @@ def add_to_parameters(
         R, s = _rotation(qw, qx, qy, qz), _deviations(scales, n)
         w, v = _scaled(_times(p, R), s), _scaled(_times(q, R), s)
         l0, l1, l2 = _cholesky(w, v, dilation)
-        u_rows, v_rows = _whitened(w, v, dilation)
+        u_row, v_row = _whitened(w, v, dilation)
+        thickened = _thickened(s)
+        u_row, v_row = _scaled(u_row, thickened), _scaled(v_row, thickened)
 
         # Derivative of ln alpha by position: 2 (u, v) L dc, c being the centre.
         across = _mix(fx / z, rotation[0], -fx / z * x, rotation[2])
         down = _mix(fy / z, rotation[1], -fy / z * y, rotation[2])
         for c in range(3):
-            by_position[c, 0] = 2 * (l0 * across[c] + l1 * down[c])
-            by_position[c, 1] = 2 * l2 * down[c]
-        k = 0
-        for c in range(3):
-            for d in range(c, 3):
-                position_hessian[n, k] += by_position[c, 0] * (
-                    form[1, 1] * by_position[d, 0] + form[1, 2] * by_position[d, 1]
-                ) + by_position[c, 1] * (form[2, 1] * by_position[d, 0] + form[2, 2] * by_position[d, 1])
-                k += 1
+            a, b = 2 * (l0 * across[c] + l1 * down[c]), 2 * l2 * down[c]
+            position_hessian[n, c] += m20 * a * a + 2 * m11 * a * b + m02 * b * b
 
-        # By opacity; by the covariance S, 2 (u, v) L dS Lᵀ (u, v)ᵀ, and S by log-scales and by rotations about the
-        # axes.
-        by_shape[0, 0] = 1.0 / (1.0 + np.exp(np.float64(opacities[n])))
-        for c in range(6):
-            if c < 3:
-                d, e, size = c, c, 2.0
-            else:
-                d, e = (c - 2) % 3, (c - 1) % 3  # the two axes that rotate about axis c - 3
-                size = 2 * (s[d] / s[e] - s[e] / s[d])
-            by_shape[1 + c, 3] = 2 * size * u_rows[d] * u_rows[e]
-            by_shape[1 + c, 4] = 2 * size * (u_rows[d] * v_rows[e] + v_rows[d] * u_rows[e])
-            by_shape[1 + c, 5] = 2 * size * v_rows[d] * v_rows[e]
-        for c in range(7):
-            for d in range(6):
-                product[c, d] = by_shape[c, 0] * form[0, d]
-                for e in range(3, 6):
-                    product[c, d] += by_shape[c, e] * form[e, d]
-        k = 0
-        for c in range(7):
-            for d in range(c, 7):
-                total = product[c, 0] * by_shape[d, 0]
-                for e in range(3, 6):
-                    total += product[c, e] * by_shape[d, e]
-                shape_hessian[n, k] += total
-                k += 1
+        g00, g01, g02 = _product(u_row, v_row, 0, 0), _product(u_row, v_row, 0, 1), _product(u_row, v_row, 0, 2)
+        g11, g12, g22 = _product(u_row, v_row, 1, 1), _product(u_row, v_row, 1, 2), _product(u_row, v_row, 2, 2)
+        second, fourth = (m20, m11, m02), ((m40, m31, m22), (m31, m22, m13), (m22, m13, m04))
+        by_00, by_11, by_22 = _applied(fourth, g00), _applied(fourth, g11), _applied(fourth, g22)
+        out = shape_moments[n]
+        out[0] += m0
+        out[1] += _dot(second, g00)
+        out[2] += _dot(second, g01)
+        out[3] += _dot(second, g02)
+        out[4] += _dot(second, g11)
+        out[5] += _dot(second, g12)
+        out[6] += _dot(second, g22)
+        out[7] += _dot(by_00, g00)
+        out[8] += _dot(by_00, g01)
+        out[9] += _dot(by_00, g02)
+        out[10] += _dot(by_00, g11)
+        out[11] += _dot(by_00, g12)
+        out[12] += _dot(by_00, g22)
+        out[13] += _dot(by_11, g01)
+        out[14] += _dot(by_11, g02)
+        out[15] += _dot(by_22, g01)
+        out[16] += _dot(by_22, g02)
+        out[17] += _dot(by_11, g11)
+        out[18] += _dot(by_11, g12)
+        out[19] += _dot(by_11, g22)
+        out[20] += _dot(by_22, g12)
+        out[21] += _dot(by_22, g22)
 
-        color_weight[n] += m[15]
+        color_weight[n] += squared_weight
         if sh_basis_sum.shape[1] > 0:
             direction = (mean[0] - eye[0], mean[1] - eye[1], mean[2] - eye[2])
             inverse = 1.0 / np.sqrt(_dot(direction, direction))
             dx, dy, dz = direction[0] * inverse, direction[1] * inverse, direction[2] * inverse
             _harmonics(dx, dy, dz, sh_basis_sum.shape[1], basis)
             for c in range(sh_basis_sum.shape[1]):
-                sh_basis_sum[n, c] += m[15] * basis[c]
+                sh_basis_sum[n, c] += squared_weight * basis[c]
+
+
+@compiled("void(float32[:, ::1], float32[::1], int64, int64, float32[:, ::1])")
+def moments_to_hessians(
+    scales: np.ndarray, opacities: np.ndarray, first: int, last: int, shape_hessian: np.ndarray
+) -> None:
+    """Replace the moments of Gaussians ``first`` to ``last`` (exclusive) by Hessians.
+
+    With g as in :func:`add_to_parameters`, the derivative of ln alpha by the opacity logit is 1 - opacity, by a
+    log-scale 4 g[c]², and by a rotation about axis c 4 (s[d] / s[e] - s[e] / s[d]) g[d] g[e].
+
+    Args:
+        scales, opacities: stored parameters, see :class:`kissgs.Splats`.
+        first: first Gaussian.
+        last: end of the Gaussians, exclusive.
+        shape_hessian: ``(N, 28)``; on entry, columns 0 to 21 hold the moments; on return, the upper triangle, row by
+            row, of the Hessian by opacity logit, three log-scales, and a rotation vector in the Gaussian's own frame.
+    """
+    # Index into the moments of each product of two of the pairs 00, 11, 22, 12, 20, 01: of scales, then rotations.
+    second = np.array([1, 4, 6, 5, 3, 2])
+    fourth = np.array(
+        [
+            [7, 10, 12, 11, 9, 8],
+            [10, 17, 19, 18, 14, 13],
+            [12, 19, 21, 20, 16, 15],
+            [11, 18, 20, 19, 15, 14],
+            [9, 14, 16, 15, 12, 11],
+            [8, 13, 15, 14, 11, 10],
+        ]
+    )
+    moments, factor = np.empty(22, np.float64), np.full(6, 4.0)
+    for n in range(first, last):
+        out = shape_hessian[n]
+        for c in range(22):
+            moments[c] = out[c]
+        s = _deviations(scales, n)
+        k = _thickened(s)
+        for c in range(3):
+            d, e = (c + 1) % 3, (c + 2) % 3  # the two axes that rotate about axis c
+            factor[c] = 4 / (k[c] * k[c])
+            factor[3 + c] = 4 * (s[d] / s[e] - s[e] / s[d]) / (k[d] * k[e])
+        transparency = 1.0 / (1.0 + np.exp(np.float64(opacities[n])))
+        out[0] = transparency * transparency * moments[0]
+        for c in range(6):
+            out[1 + c] = transparency * factor[c] * moments[second[c]]
+        entry = 7
+        for c in range(6):
+            for d in range(c, 6):
+                out[entry] = factor[c] * factor[d] * moments[fourth[c, d]]
+                entry += 1

@@ -100,7 +100,7 @@ def shade(
 
 
 @compiled(
-    "void(float32[:, ::1], float32[:, :, ::1], float64[::1], int32[::1], int64[::1], int64, int64, float32[:, ::1],"
+    "void(float32[:, ::1], float32[:, :, ::1], float64[::1], int32[::1], int32[::1], int64, int64, float32[:, ::1],"
     " float64[:, ::1], float32[:, ::1], float32[:, ::1], float32[:, :, ::1])"
 )
 def shade_backward(

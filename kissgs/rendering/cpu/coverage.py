@@ -1,0 +1,57 @@
+"""Numba kernel of coverage: how well an image shows each Gaussian, by visibility and resolution."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kissgs.core.numba_kernels import compiled
+
+
+@compiled(
+    "void(float32[:, ::1], float32[:, ::1], float32[::1], float32[::1], int32[::1], int64, int64, float32[::1],"
+    " float64[::1], float64, float64, float64[::1], float32[::1])"
+)
+def raise_coverage(
+    means: np.ndarray,
+    scales: np.ndarray,
+    opacities: np.ndarray,
+    local_scale: np.ndarray,
+    visible: np.ndarray,
+    first: int,
+    last: int,
+    seen: np.ndarray,
+    eye: np.ndarray,
+    focal: float,
+    pixels: float,
+    limits: np.ndarray,
+    share: np.ndarray,
+) -> None:
+    """Raise the coverage of the Gaussians of footprints ``first`` to ``last`` (exclusive) by one image.
+
+    Args:
+        means, scales, opacities: stored parameters, see :class:`kissgs.Splats`.
+        local_scale: ``(N,)`` see :func:`kissgs.rendering.local_scale.local_scale`.
+        visible: the Gaussian of each footprint.
+        first: first footprint.
+        last: end of the footprints, exclusive.
+        seen: sum of (alpha T)² over the pixels of each footprint.
+        eye: ``(3,)`` position of the camera, world units.
+        focal: focal length, pixels.
+        pixels: number of pixels of the image.
+        limits: smallest depth; share of the squared alpha from which a Gaussian counts as seen; length in the image of
+            the local scale from which it counts as resolved, pixels.
+        share: ``(N,)`` coverage; modified.
+    """
+    near, seen_share, resolved_length = limits[0], limits[1], limits[2]
+    for row in range(first, last):
+        n = visible[row]
+        x, y, z = means[n, 0] - eye[0], means[n, 1] - eye[1], means[n, 2] - eye[2]
+        per_unit = focal / max(np.sqrt(x * x + y * y + z * z), near)
+        a, b, c = np.float64(scales[n, 0]), np.float64(scales[n, 1]), np.float64(scales[n, 2])
+        across = a + b + c - min(a, b, c)  # of the two largest
+        area = np.pi * np.exp(across) * per_unit * per_unit + 1.0  # of a squared Gaussian
+        opacity = 1.0 / (1.0 + np.exp(-np.float64(opacities[n])))
+        shown = max(opacity * opacity * min(area, pixels), 1e-300)
+        visibility = min(seen[row] / (seen_share * shown), 1.0)
+        resolution = min(np.float64(local_scale[n]) * per_unit / resolved_length, 1.0)
+        share[n] = max(share[n], np.float32(visibility * resolution * resolution))
