@@ -17,6 +17,10 @@ from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.coverage import Coverage
 
+HIDDEN = 0.01
+"""Transmittance from which on what is behind counts as hidden: a change there has less than a ten-thousandth of the
+squared error that it has in the open, and is bounded by the prior."""
+
 BLOCK = 1 << 16
 """Gaussians per step of array arithmetic, so that temporary arrays stay small."""
 
@@ -72,7 +76,8 @@ def measure_sensitivity(
     """Measure the sensitivity of a scene: the Gauss-Newton Hessian of the squared image error, a block per Gaussian.
 
     The Hessian is J ᵀ J with J the derivative of the images, without sampling. Of a change of position, J omits the
-    small effects on the footprint's shape, on the view-dependent colour and on the depth order.
+    small effects on the footprint's shape, on the view-dependent colour and on the depth order. A Gaussian behind a
+    transmittance of :data:`HIDDEN` counts as unseen in that pixel.
 
     Args:
         splats: a finite scene (:func:`kissgs.clean`).
@@ -96,7 +101,7 @@ def measure_sensitivity(
     with Workers(threads) as pool:
         for done, (camera, weight) in enumerate(zip(cameras.cameras, cameras.per_pixel(), strict=True)):
             progress("sensitivity", done / len(cameras.cameras))
-            frame = draw(splats, camera, cameras.background, pool)
+            frame = draw(splats, camera, cameras.background, pool, HIDDEN)
             coverage.add(frame, add_sensitivities(frame, weight, cameras.spread, found, pool), pool)
             if view_uncertainty and done + 1 == cameras.captured:
                 captured[:] = coverage.share

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from kissgs.cameras.virtual.scene_bounds import SceneBounds, Vec3, opacity, weighted_quantile
+from kissgs.cameras.virtual.scene_bounds import SceneBounds, Vec3, opacity, weighted_quantiles
 from kissgs.core.array_types import Float64
 from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera, look_at
@@ -116,7 +116,7 @@ def _framing_camera(
     target, half_extents = bounds.centre.copy(), []
     for axis in (right, down, direction):
         along = (means - bounds.centre) @ axis
-        low, high = (weighted_quantile(along, weights, quantile) for quantile in (0.01, 0.99))
+        low, high = weighted_quantiles(along, weights, (0.01, 0.99))
         target += 0.5 * (low + high) * axis
         half_extents.append(max(0.5 * (high - low), 0.5 * bounds.radius))
     slopes = np.array([width, height]) / (2 * towards.K[0, 0])  # tangents of half the angles of view

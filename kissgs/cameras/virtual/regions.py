@@ -162,8 +162,8 @@ def _further_region(splats: Splats, bounds: SceneBounds, like: Camera, pool: Wor
     distance = np.linalg.norm(splats.means - bounds.centre, axis=1)
     near = distance <= 6 * bounds.radius
     proxy = _concatenated(
-        proxy_scene(splats.select(np.flatnonzero(near)), PROXY_GAUSSIANS // 2),
-        proxy_scene(splats.select(np.flatnonzero(~near)), PROXY_GAUSSIANS // 2),
+        proxy_scene(splats, PROXY_GAUSSIANS // 2, np.flatnonzero(near)),
+        proxy_scene(splats, PROXY_GAUSSIANS // 2, np.flatnonzero(~near)),
     )
     scorer = ViewScorer(proxy, bounds, pool, progress)
     cameras = list(_surrounding_cameras(bounds, like))

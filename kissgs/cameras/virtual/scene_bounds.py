@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,11 +81,19 @@ def weighted_quantile(
         weights: ``(n,)`` float64, 0 or more.
         quantile: 0 to 1.
     """
+    return weighted_quantiles(values, weights, (quantile,))[0]
+
+
+def weighted_quantiles(
+    values: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"], quantiles: Sequence[float]
+) -> list[float]:
+    """Return the values at which the fractions ``quantiles`` of the weight are reached, see :func:`weighted_quantile`."""
     if not len(values):
-        return 0.0
+        return [0.0] * len(quantiles)
     order = np.argsort(values, kind="stable")
     cumulative = np.cumsum(weights[order])
-    return float(values[order][min(np.searchsorted(cumulative, quantile * cumulative[-1]), len(values) - 1)])
+    places = np.searchsorted(cumulative, np.asarray(quantiles) * cumulative[-1])
+    return [float(value) for value in values[order[np.minimum(places, len(values) - 1)]]]
 
 
 def _up(splats: Splats, weights: Float64[np.ndarray, " N"], offsets: Float64[np.ndarray, "N 3"]) -> Vec3:

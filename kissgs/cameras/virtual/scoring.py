@@ -8,7 +8,7 @@ import numpy as np
 
 from kissgs.cameras.views import black
 from kissgs.cameras.virtual.scene_bounds import SceneBounds, weighted_quantile
-from kissgs.core.array_types import Float64
+from kissgs.core.array_types import Float64, Int
 from kissgs.core.progress import Progress
 from kissgs.core.splats import SH_C0, Splats
 from kissgs.core.threads import Workers
@@ -116,17 +116,26 @@ def _from_colour(colour: np.ndarray) -> np.ndarray:
     return (colour - 0.5) * 60
 
 
-def proxy_scene(splats: Splats, max_count: int = PROXY_GAUSSIANS) -> Splats:
-    """Return at most ``max_count`` evenly selected Gaussians, without SH rest, enlarged to cover the same area."""
-    step = max(1, -(-len(splats) // max_count))
-    selected = splats.select(slice(None, None, step))
+def proxy_scene(
+    splats: Splats, max_count: int = PROXY_GAUSSIANS, among: Int[np.ndarray, " m"] | None = None
+) -> Splats:
+    """Return at most ``max_count`` evenly selected Gaussians, without SH rest, enlarged to cover the same area.
+
+    Args:
+        splats: the scene.
+        max_count: largest number of Gaussians.
+        among: indices of the Gaussians to select from; by default, all.
+    """
+    count = len(splats) if among is None else len(among)
+    step = max(1, -(-count // max_count))
+    chosen = slice(None, None, step) if among is None else among[::step]
     return Splats(
-        means=np.ascontiguousarray(selected.means),
-        quats=np.ascontiguousarray(selected.quats),
-        scales=selected.scales + np.float32(np.log(step) / 2),
-        opacities=np.ascontiguousarray(selected.opacities),
-        sh0=np.ascontiguousarray(selected.sh0),
-        shN=np.empty((len(selected), 0, 3), np.float32),
+        means=np.ascontiguousarray(splats.means[chosen]),
+        quats=np.ascontiguousarray(splats.quats[chosen]),
+        scales=splats.scales[chosen] + np.float32(np.log(step) / 2),
+        opacities=np.ascontiguousarray(splats.opacities[chosen]),
+        sh0=np.ascontiguousarray(splats.sh0[chosen]),
+        shN=np.empty((-(-count // step), 0, 3), np.float32),
     )
 
 

@@ -45,6 +45,16 @@ def _pixel_centres(s: np.ndarray) -> None:
 
 
 @njit(nogil=True, error_model="numpy")
+def _gathered(records: np.ndarray, members: np.ndarray) -> np.ndarray:
+    """Return the first 9 values of the records of a tile's members: memory is read faster all at once."""
+    found = np.empty((members.shape[0], 9), np.float32)
+    for i in range(members.shape[0]):
+        for c in range(9):
+            found[i, c] = records[members[i], c]
+    return found
+
+
+@njit(nogil=True, error_model="numpy")
 def _footprint(records: np.ndarray, n: int, x0: int, y0: int) -> tuple[tuple[np.float32, ...], tuple[np.float32, ...]]:
     """Return the centre relative to (x0, y0), l0, l1, l2; and opacity, red, green, blue."""
     return (
@@ -111,8 +121,9 @@ def blend(
             s[512 + p] = np.float32(end - begin) if inside else zero
             s[768 + p] = one
             s[1024 + p] = s[1280 + p] = s[1536 + p] = zero
+        near = _gathered(records, members[begin:end])
         for i in range(begin, end):
-            (mx, my, l0, l1, l2), (opacity, red, green, blue) = _footprint(records, members[i], x0, y0)
+            (mx, my, l0, l1, l2), (opacity, red, green, blue) = _footprint(near, i - begin, x0, y0)
             top, bottom = np.uint64(spans[i] >> 5), np.uint64(spans[i] & 31)
             index = np.float32(i - begin)
             for p in range(top * np.uint64(16), bottom * np.uint64(16)):

@@ -78,26 +78,41 @@ class Gradients:
     shN: Float32[np.ndarray, "N K 3"]
 
 
-def draw(splats: Splats, camera: Camera, background: Shaped[np.ndarray, "..."], pool: Workers) -> Frame:
+def draw(
+    splats: Splats,
+    camera: Camera,
+    background: Shaped[np.ndarray, "..."],
+    pool: Workers,
+    end: float = constants.TRANSMITTANCE_MIN,
+) -> Frame:
     """Render an image of a finite scene (:func:`kissgs.clean`) by the image model of :mod:`kissgs.rendering.constants`.
+
+    Args:
+        splats: the scene.
+        camera: the camera.
+        background: ``(3,)`` RGB.
+        pool: threads; the result does not depend on their number.
+        end: transmittance at which the list of a pixel ends; that of the image model by default. A larger one takes
+            less time, and shows the background instead of what is behind.
 
     Raises:
         InvalidViewsError: the background is not three finite numbers.
         UnsupportedError: too many footprints for the lists of tiles, or too little memory for the image.
     """
     try:
-        return _draw(_for_kernels(splats), camera, _colour(background), pool)
+        return _draw(_for_kernels(splats), camera, _colour(background), pool, end)
     except MemoryError as error:
         size = f"{camera.width}x{camera.height}"
         raise UnsupportedError(f"there is not enough memory for an image of {size}; render a smaller one") from error
 
 
-def _draw(splats: Splats, camera: Camera, background: Float32[np.ndarray, "3"], pool: Workers) -> Frame:
+def _draw(splats: Splats, camera: Camera, background: Float32[np.ndarray, "3"], pool: Workers, end: float) -> Frame:
     footprints = find_footprints(splats, camera, pool)
     lists = sort_into_tiles(footprints, camera, pool)
     image = np.empty((camera.height, camera.width, 3), np.float32)
     transmittance = np.empty((camera.height, camera.width), np.float32)
     stops = np.empty((len(lists.starts) - 1, PIXELS_PER_TILE), np.int32)
+    limits = np.array([constants.ALPHA_MIN, constants.ALPHA_MAX, end], np.float32)
 
     def blend(first: int, last: int) -> None:
         blending.blend(
@@ -110,7 +125,7 @@ def _draw(splats: Splats, camera: Camera, background: Float32[np.ndarray, "3"], 
             camera.width,
             camera.height,
             lists.columns,
-            LIMITS,
+            limits,
             background,
             image,
             transmittance,

@@ -188,19 +188,30 @@ def project(
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     rotation, translation = _pose(viewmat)
     left, right, top, bottom = _frustum(K, width, height, constants[3])
+    most = -2.001 * np.log(alpha_min)  # of 2 tau, for an opacity of 1
     found = 0
     for n in range(first, last):
         mean = _load(means, n)
         z = _dot(rotation[2], mean) + translation[2]
         if not (z >= near and z <= far):
             continue
+        x, y = (_dot(rotation[0], mean) + translation[0]) / z, (_dot(rotation[1], mean) + translation[1]) / z
+        centre_x, centre_y = fx * x + cx, fy * y + cy
+        clamped_x, clamped_y = min(right, max(left, x)), min(bottom, max(top, y))
+        beyond_x, beyond_y = max(-centre_x, centre_x - width), max(-centre_y, centre_y - height)
+        if beyond_x > 0 or beyond_y > 0:
+            # Most Gaussians outside the image are far from it: a bound on the footprint's size needs less arithmetic.
+            longest = np.exp(np.float64(max(scales[n, 0], scales[n, 1], scales[n, 2])))
+            squared = longest * longest / (z * z)
+            reach_x = most * (fx * fx * (1 + clamped_x * clamped_x) * squared + dilation)
+            reach_y = most * (fy * fy * (1 + clamped_y * clamped_y) * squared + dilation)
+            if (beyond_x > 0 and beyond_x * beyond_x > reach_x) or (beyond_y > 0 and beyond_y * beyond_y > reach_y):
+                continue
         opacity = 1.0 / (1.0 + np.exp(-np.float64(opacities[n])))
         if not opacity >= alpha_min:
             continue
-        x, y = (_dot(rotation[0], mean) + translation[0]) / z, (_dot(rotation[1], mean) + translation[1]) / z
-        centre_x, centre_y = fx * x + cx, fy * y + cy
-        p = _mix(fx / z, rotation[0], -fx / z * min(right, max(left, x)), rotation[2])
-        q = _mix(fy / z, rotation[1], -fy / z * min(bottom, max(top, y)), rotation[2])
+        p = _mix(fx / z, rotation[0], -fx / z * clamped_x, rotation[2])
+        q = _mix(fy / z, rotation[1], -fy / z * clamped_y, rotation[2])
         qw, qx, qy, qz, _ = _unit_quat(quats, n)
         R, s = _rotation(qw, qx, qy, qz), _deviations(scales, n)
         w, v = _scaled(_times(p, R), s), _scaled(_times(q, R), s)

@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 
 from kissgs.core.numba_kernels import compiled
-from kissgs.rendering.cpu.blending import _FAST, _exp_minus, _footprint, _pixel_centres
+from kissgs.rendering.cpu.blending import _FAST, _exp_minus, _footprint, _gathered, _pixel_centres
 from kissgs.rendering.cpu.projection import (
     Vector,
     _applied,
@@ -89,8 +89,9 @@ def moments(
             s[1792 + p] = one
         for i in range(begin + last_stop, starts[tile + 1]):
             sums[slots[i - slots_begin], :] = zero
+        near = _gathered(records, members[begin : begin + last_stop])
         for i in range(begin + last_stop - 1, begin - 1, -1):
-            (mx, my, l0, l1, l2), (opacity, red, green, blue) = _footprint(records, members[i], x0, y0)
+            (mx, my, l0, l1, l2), (opacity, red, green, blue) = _footprint(near, i - begin, x0, y0)
             red, green, blue = min(red, max_color), min(green, max_color), min(blue, max_color)
             top, bottom = np.uint64(spans[i] >> 5), np.uint64(spans[i] & 31)
             index = np.float32(i - begin)
