@@ -160,7 +160,7 @@ class Sensitivity:
             (self.shape_hessian, ROTATION, ones),
             (self.position_hessian, POSITION, across),
         ):
-            each = np.maximum(values[np.ix_(some, of)].mean(axis=1, dtype=np.float64), 0)
+            each = np.maximum(values[some][:, list(of)].mean(axis=1, dtype=np.float64), 0)
             ratio = float(np.median(each / (colors * unit)[some]))
             for column in of:
                 values[:, column] += ratio * least * unit

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -45,6 +45,9 @@ SENSITIVITY_VERSION = 4
 
 MAX_FINETUNED_ENCODES = 4
 """Largest number of containers that a search for a goal fine-tunes; each takes a training."""
+
+REFIT_SIZE = 320
+"""Largest longer side of the images that colours are refitted to, pixels."""
 
 Planner = Callable[[EncodeSettings, Progress], EncodingPlan]
 
@@ -190,7 +193,7 @@ class Encoding:
 
     def _rd_planner(self) -> Planner:
         """Measure the sensitivity once; return a planner that uses it for every plan."""
-        from kissgs.cameras.virtual.sensitivity_cameras import sensitivity_cameras
+        from kissgs.cameras.virtual.sensitivity_cameras import default_view_count, sensitivity_cameras
         from kissgs.rendering.rasterizer import load_kernels as load_rasterizer
 
         splats, views, settings = self.splats, self.views, self.settings.encode
@@ -206,7 +209,7 @@ class Encoding:
             cameras = sensitivity_cameras(
                 splats,
                 views,
-                count=settings.sensitivity_views,
+                count=settings.sensitivity_views or default_view_count(len(splats)),
                 size=size,
                 threads=self.threads,
                 progress=self.progress,
@@ -293,6 +296,8 @@ def _recolor(
 ) -> ColorRefit:
     """Return a function that refits base colours to renderings of the scene from the capture's cameras."""
     from kissgs.rendering.color_refit import refit_colors
+
+    cameras = replace(cameras, cameras=[camera.at_most(REFIT_SIZE) for camera in cameras.cameras])
 
     def recolor(decoded: Splats, order: Int[np.ndarray, " M"]) -> Float32[np.ndarray, "M 3"]:
         weights = sensitivity.color_weight[order], sensitivity.prior[order]

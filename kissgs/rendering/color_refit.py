@@ -109,18 +109,17 @@ class _LeastSquares:
 
     def negative_gradient(self, sh0: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarray, "M 3"]:
         """Return minus half the gradient by the base colours; renders all images once."""
-        from kissgs.rendering.cpu.frame import differentiate, draw
+        from kissgs.rendering.cpu.frame import add_color_gradients, draw
 
-        total = self.attraction * (self.decoded.sh0 - sh0)
+        total = np.zeros(sh0.shape, np.float32)
         scene, count = replace(self.decoded, sh0=sh0.astype(np.float32)), len(self.cameras.cameras)
         for done, (camera, weight) in enumerate(zip(self.cameras.cameras, self.cameras.per_pixel(), strict=True)):
             self.progress("refit", (self.passes + done / count) / self.total_passes)
             frame = draw(scene, camera, self.cameras.background, self.pool)
             target = self.targets[done] if self.targets else self._target(camera)
-            error = (target - frame.image) * np.float32(weight)
-            total += differentiate(frame, error, np.zeros(error.shape[:2], np.float32), self.pool).sh0
+            add_color_gradients(frame, (target - frame.image) * np.float32(weight), total, self.pool)
         self.passes += 1
-        return total
+        return self.attraction * (self.decoded.sh0 - sh0) + total
 
 
 def _conjugate_gradients(

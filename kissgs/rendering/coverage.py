@@ -36,7 +36,7 @@ class Coverage:
 
     def __init__(self, splats: Splats) -> None:
         self._splats = splats
-        self._scale = local_scale(splats).astype(np.float32)
+        self._scale = local_scale(splats)
         self.share: Float32[np.ndarray, " N"] = np.zeros(len(splats), np.float32)
         """``(N,)`` coverage from 0, seen by no camera or only from far away, to 1, seen from nearby."""
 

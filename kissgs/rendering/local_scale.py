@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
-from kissgs.core.array_types import Bool, Float64, Int
+from kissgs.core.array_types import Float32
 from kissgs.core.splats import Splats
+from kissgs.core.threads import Workers
+from kissgs.rendering.cpu.lists import each_part, even
 
 LEAF = 512
 """Largest number of Gaussians in a leaf of the tree, among which neighbours are searched."""
@@ -23,7 +23,7 @@ GAP = 0.2
 neighbours is nearer than that, the object has no more Gaussians, and their distance is used."""
 
 
-def local_scale(splats: Splats) -> Float64[np.ndarray, " N"]:
+def local_scale(splats: Splats, *, threads: int = 0) -> Float32[np.ndarray, " N"]:
     """Return the distance from each Gaussian to about its 128th neighbour, ``(N,)``, world units, positive.
 
     Distances are measured within the leaves of a k-d tree of equal counts, which adapts to parts of any size. For an
@@ -32,41 +32,21 @@ def local_scale(splats: Splats) -> Float64[np.ndarray, " N"]:
 
     Args:
         splats: a finite scene.
+        threads: number of threads; 0 means one per processor. The result does not depend on it.
     """
-    means = splats.means.astype(np.float64)
-    found = np.empty(len(means))
-    for leaf in _leaves(means):
-        points = means[leaf]
-        squared = sum(
-            np.square(axis[:, None] - axis[::SAMPLED]) for axis in points.T
-        )  # accurate for near ones, unlike |a|² + |b|² - 2ab
-        rank = min(squared.shape[1] // NEIGHBOURS, squared.shape[1] - 1)
-        ranks = [rank, *(few for few in (rank // 2, rank // 4, rank // 8) if few > 1)]
-        nearest = np.partition(squared, ranks, axis=1)[:, ranks] * (rank / np.maximum(ranks, 1))
-        smallest = nearest.min(axis=1)
-        found[leaf] = np.sqrt(np.where(smallest < GAP**2 * nearest[:, 0], smallest, nearest[:, 0]))
-    sizes = np.exp(np.sort(splats.scales, axis=1)[:, 1].astype(np.float64))
-    least = np.maximum(1e-6 * np.abs(means).max(axis=1, initial=0), 1e-12)  # about the resolution of float32 positions
-    return np.maximum(np.maximum(found, sizes), least)
+    from kissgs.rendering.cpu.neighbours import leaf_scales, split_into_leaves
 
-
-def _leaves(means: Float64[np.ndarray, "N 3"]) -> Iterator[Int[np.ndarray, " n"]]:
-    """Yield the indices of each leaf: parts are split at the median of the longest side down to :data:`LEAF` points."""
-    parts = [np.arange(len(means))] if len(means) else []
-    while parts:
-        part = parts.pop()
-        if len(part) <= LEAF:
-            yield part
-            continue
-        axis = int(np.ptp(means[part], axis=0).argmax())
-        lower = _lower_half(means[part, axis])
-        parts += [part[lower], part[~lower]]
-
-
-def _lower_half(values: Float64[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-    """Return a mask of the lower half, the first of equal values: argpartition's choice depends on the processor."""
-    count = len(values) // 2
-    middle = np.partition(values, count)[count]
-    lower = values < middle
-    lower[np.flatnonzero(values == middle)[: count - int(lower.sum())]] = True
-    return lower
+    count = len(splats)
+    columns = np.ascontiguousarray(splats.means.T)
+    order, edges = np.arange(count, dtype=np.int32), np.empty(4 * count // LEAF + 2, np.int64)
+    leaves = split_into_leaves(columns, LEAF, order, edges)
+    found = np.empty(count, np.float32)
+    with Workers(threads) as pool:
+        each_part(
+            lambda first, last: leaf_scales(columns, order, edges, first, last, SAMPLED, NEIGHBOURS, GAP, found),
+            even(leaves, pool),
+            pool,
+        )
+    sizes = np.exp(np.median(splats.scales, axis=1))
+    least = np.maximum(1e-6 * np.abs(splats.means).max(axis=1, initial=0), 1e-12)  # about float32's resolution
+    return np.maximum(np.maximum(found, sizes), least).astype(np.float32)

@@ -17,9 +17,9 @@ from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.coverage import Coverage
 
-HIDDEN = 0.01
-"""Transmittance from which on what is behind counts as hidden: a change there has less than a ten-thousandth of the
-squared error that it has in the open, and is bounded by the prior."""
+HIDDEN = 0.003
+"""Transmittance from which on what is behind counts as hidden: a change there has a hundred-thousandth of the squared
+error that it has in the open."""
 
 BLOCK = 1 << 16
 """Gaussians per step of array arithmetic, so that temporary arrays stay small."""

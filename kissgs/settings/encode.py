@@ -104,12 +104,13 @@ class EncodeSettings(BaseModel):
         description="With rate_distortion and a capture: iterations of the fit of base colours to its training images, "
         "which compensates other losses.",
     )
-    sensitivity_views: int = Field(
-        48,
+    sensitivity_views: int | None = Field(
+        None,
         ge=1,
         le=1000,
         description="With rate_distortion: number of renderings that sensitivity is measured in; with a capture, the "
-        "largest number of its cameras, to which two thirds as many virtual cameras are added.",
+        "largest number of its cameras, to which two thirds as many virtual cameras are added. auto: 48 for up to "
+        "150,000 Gaussians, fewer for more, such as 30 for a million.",
     )
     sensitivity_view_size: int = Field(
         480, ge=16, le=4096, description="Largest longer side of these renderings, pixels."

@@ -1,5 +1,6 @@
 """Reference: a stable sort, which has only one result, and grids of known spacing."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -8,14 +9,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kissgs import sample_scene
-from kissgs.rendering.local_scale import _lower_half, local_scale
+from kissgs.rendering.cpu.neighbours import split_into_leaves
+from kissgs.rendering.local_scale import local_scale
 
 
-@given(st.lists(st.integers(-3, 3), min_size=2, max_size=60))
-def test_of_equal_values_the_first_are_in_the_lower_half(values):
+@given(st.lists(st.integers(-3, 3), min_size=0, max_size=60), st.integers(1, 8))
+def test_a_part_is_split_at_its_median_and_the_first_of_equal_values_are_below_it(values, leaf):
     """The choice among equal values is the same on every processor."""
-    lower = np.flatnonzero(_lower_half(np.array(values, float)))
-    assert lower.tolist() == sorted(np.argsort(values, kind="stable")[: len(values) // 2].tolist())
+    columns = np.zeros((3, len(values)), np.float32)
+    columns[1] = values
+    order, edges = np.arange(len(values), dtype=np.int32), np.empty(4 * len(values) + 2, np.int64)
+    found = split_into_leaves(columns, leaf, order, edges)
+
+    def parts(members):
+        if len(members) <= leaf:
+            return [sorted(members)]
+        ascending = sorted(members, key=lambda n: (values[n], n))
+        return parts(ascending[: len(members) // 2]) + parts(ascending[len(members) // 2 :])
+
+    assert [sorted(order[a:b].tolist()) for a, b in itertools.pairwise(edges[: found + 1])] == parts(range(len(values)))
 
 
 @pytest.mark.parametrize("spacing", [1e-3, 1.0, 1e4])

@@ -15,7 +15,7 @@ from kissgs.core.splats import SH_C0, clean
 from kissgs.core.threads import Workers
 from kissgs.rendering.color_refit import refit_colors
 from kissgs.rendering.rasterizer import removal_scores, render
-from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
+from kissgs.rendering.sensitivity import HIDDEN, WeightedCameras, measure_sensitivity
 
 BACKGROUND = np.array([0.3, 0.6, 0.1], np.float32)
 
@@ -119,7 +119,8 @@ def test_removal_agrees_with_removal_scores():
     splats.opacities[:3] = 5, 9, 13.8  # clamped to the largest alpha
     found = measure_sensitivity(splats, weighted(view)).removal(splats) * (3 * view.width * view.height)
     scores = removal_scores(splats, [view], background=BACKGROUND.tolist())
-    np.testing.assert_allclose(found, scores, rtol=1e-4, atol=1e-5 * scores.max())
+    hidden = 9 * HIDDEN**2 * view.width * view.height  # largest score behind that transmittance
+    np.testing.assert_allclose(found, scores, rtol=1e-2, atol=min(hidden, 1e-3 * scores.max()))
 
 
 @pytest.mark.parametrize("spread", [0.1, 0.5])

@@ -144,7 +144,7 @@ def _updated_coverage(coverage: Coverage, proxy: Splats, region: Region, pool: W
     return coverage.share
 
 
-def _densest_part(proxy: Splats, remaining: Int[np.ndarray, " m"], spacing: Float64[np.ndarray, " n"]) -> SceneBounds:
+def _densest_part(proxy: Splats, remaining: Int[np.ndarray, " m"], spacing: Float32[np.ndarray, " n"]) -> SceneBounds:
     """Return the bounds of the part where the Gaussians ``remaining`` are densest.
 
     Mean shift starts at the 5 % quantile of spacing, because the smallest spacings are often single pairs.

@@ -87,7 +87,7 @@ def weighted_quantile(
 def weighted_quantiles(
     values: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"], quantiles: Sequence[float]
 ) -> list[float]:
-    """Return the values at which the fractions ``quantiles`` of the weight are reached, see :func:`weighted_quantile`."""
+    """Return the values at which several fractions of the weight are reached, see :func:`weighted_quantile`."""
     if not len(values):
         return [0.0] * len(quantiles)
     order = np.argsort(values, kind="stable")

@@ -116,9 +116,7 @@ def _from_colour(colour: np.ndarray) -> np.ndarray:
     return (colour - 0.5) * 60
 
 
-def proxy_scene(
-    splats: Splats, max_count: int = PROXY_GAUSSIANS, among: Int[np.ndarray, " m"] | None = None
-) -> Splats:
+def proxy_scene(splats: Splats, max_count: int = PROXY_GAUSSIANS, among: Int[np.ndarray, " m"] | None = None) -> Splats:
     """Return at most ``max_count`` evenly selected Gaussians, without SH rest, enlarged to cover the same area.
 
     Args:

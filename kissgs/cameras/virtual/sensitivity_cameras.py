@@ -21,6 +21,20 @@ fall apart, and the photographed parts lose almost nothing by it."""
 WIDE_FOCAL_SCALE = 0.6
 """Focal length of every other virtual camera, relative to the others: parts just outside their images count too."""
 
+MAX_VIEWS, MIN_VIEWS = 48, 16
+"""Largest and smallest number of cameras that are chosen by the size of the scene."""
+
+FEW_GAUSSIANS = 150_000
+"""Number of Gaussians up to which there are :data:`MAX_VIEWS`."""
+
+
+def default_view_count(gaussians: int) -> int:
+    """Return how many cameras measure a scene of so many Gaussians.
+
+    The number falls with the fourth root: in a large scene, errors of single Gaussians matter less.
+    """
+    return round(min(max(MAX_VIEWS * (FEW_GAUSSIANS / max(gaussians, 1)) ** 0.25, MIN_VIEWS), MAX_VIEWS))
+
 
 def sensitivity_cameras(
     splats: Splats,

@@ -258,6 +258,99 @@ def blend_backward(
 
 @compiled(
     "void(float32[:, ::1], int32[::1], uint16[::1], int32[::1], int64[::1], int64, int64, int64,"
+    " float32[::1], int32[:, ::1], float32[:, :, ::1], float32[:, ::1])",
+    fastmath=_FAST,
+)
+def blend_colors_backward(
+    records: np.ndarray,
+    members: np.ndarray,
+    spans: np.ndarray,
+    slots: np.ndarray,
+    starts: np.ndarray,
+    first: int,
+    last: int,
+    columns: int,
+    limits: np.ndarray,
+    stops: np.ndarray,
+    v_image: np.ndarray,
+    v_slots: np.ndarray,
+) -> None:
+    """Compute gradients by colours alone, of tiles ``first`` to ``last`` (exclusive).
+
+    The arguments are those of :func:`blend_backward`. ``v_slots``: out, ``(slots, 3)``, sums over the tile's pixels of
+    the gradient by the colour's R, G, B.
+    """
+    alpha_min, alpha_max = limits[0], limits[1]
+    zero, one = np.float32(0), np.float32(1)
+    height, width = v_image.shape[0], v_image.shape[1]
+    # Per pixel: x, y, stop, T; gradient by R, G, B.
+    s = np.empty(7 * 256, np.float32)
+    _pixel_centres(s)
+    for tile in range(first, last):
+        x0, y0 = (tile % columns) * 16, (tile // columns) * 16
+        begin, last_stop = starts[tile], 0
+        for p in range(256):
+            x, y = x0 + (p & 15), y0 + (p >> 4)
+            last_stop = max(last_stop, stops[tile, p])
+            s[512 + p] = np.float32(stops[tile, p])
+            s[768 + p] = one
+            inside = x < width and y < height
+            x, y = min(x, width - 1), min(y, height - 1)
+            s[1024 + p] = v_image[y, x, 0] if inside else zero
+            s[1280 + p] = v_image[y, x, 1] if inside else zero
+            s[1536 + p] = v_image[y, x, 2] if inside else zero
+        for i in range(begin + last_stop, starts[tile + 1]):
+            v_slots[slots[i], :] = zero
+        near = _gathered(records, members[begin : begin + last_stop])
+        for i in range(begin, begin + last_stop):
+            (mx, my, l0, l1, l2), (opacity, _, _, _) = _footprint(near, i - begin, x0, y0)
+            top, bottom = np.uint64(spans[i] >> 5), np.uint64(spans[i] & 31)
+            index = np.float32(i - begin)
+            red, green, blue = zero, zero, zero
+            for p in range(top * np.uint64(16), bottom * np.uint64(16)):
+                dx, dy = s[p] - mx, s[p + np.uint64(256)] - my
+                u, v = l0 * dx + l1 * dy, l2 * dy
+                alpha = min(opacity * _exp_minus(u * u + v * v), alpha_max)
+                alpha = alpha if alpha >= alpha_min else zero
+                alpha = alpha if index < s[p + np.uint64(512)] else zero
+                weight = alpha * s[p + np.uint64(768)]
+                s[p + np.uint64(768)] -= weight
+                red += weight * s[p + np.uint64(1024)]
+                green += weight * s[p + np.uint64(1280)]
+                blue += weight * s[p + np.uint64(1536)]
+            v_slots[slots[i], 0], v_slots[slots[i], 1], v_slots[slots[i], 2] = red, green, blue
+
+
+@compiled(
+    "void(float32[:, ::1], float32[:, ::1], int32[::1], int32[::1], int32[::1], int64, int64, float32, float32[:, ::1])"
+)
+def add_colors(
+    v_slots: np.ndarray,
+    records: np.ndarray,
+    rows: np.ndarray,
+    slots_from: np.ndarray,
+    visible: np.ndarray,
+    first: int,
+    last: int,
+    factor: float,
+    v_colors: np.ndarray,
+) -> None:
+    """Add ``factor`` times the sum of the slots of the footprints ``rows[first:last]`` to ``v_colors[visible]``.
+
+    Colours that are clamped to 0 have no gradient.
+    """
+    for i in range(first, last):
+        row = rows[i]
+        for c in range(3):
+            if records[row, 6 + c] > 0:
+                total = np.float32(0)
+                for slot in range(slots_from[row], slots_from[row + 1]):
+                    total += v_slots[slot, c]
+                v_colors[visible[row], c] += factor * total
+
+
+@compiled(
+    "void(float32[:, ::1], int32[::1], uint16[::1], int32[::1], int64[::1], int64, int64, int64,"
     " float32[::1], float32[::1], float32[:, ::1], int32[:, ::1], float32[::1])",
     fastmath=_FAST,
 )

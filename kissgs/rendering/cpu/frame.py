@@ -14,7 +14,7 @@ import numpy as np
 from kissgs.core.array_types import Float32, Float64, Int32, Int64, Shaped
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 from kissgs.core.sensitivity import Sensitivity
-from kissgs.core.splats import ATTRIBUTES, Splats
+from kissgs.core.splats import ATTRIBUTES, SH_C0, Splats
 from kissgs.core.threads import Workers
 from kissgs.rendering import constants
 from kissgs.rendering.camera import Camera
@@ -221,6 +221,38 @@ def differentiate(
 
     each_part(project, even(len(slots.rows), pool), pool)
     return found
+
+
+def add_color_gradients(
+    frame: Frame, v_image: Float32[np.ndarray, "H W 3"], into: Float32[np.ndarray, "N 3"], pool: Workers
+) -> None:
+    """Add the gradients of a loss by ``sh0`` alone, given its gradient by the image, ``v_image``, to ``into``."""
+    lists, visible, records = frame.lists, frame.footprints.visible, frame.footprints.records
+    slots = number_slots(frame.footprints, lists, 0, len(lists.starts) - 1)
+    v_slots = np.empty((len(lists.members), 3), np.float32)
+
+    def blend(first: int, last: int) -> None:
+        blending.blend_colors_backward(
+            records,
+            lists.members,
+            lists.spans,
+            slots.of,
+            lists.starts,
+            first,
+            last,
+            lists.columns,
+            LIMITS,
+            frame.stops,
+            v_image,
+            v_slots,
+        )
+
+    each_part(blend, even_tiles(lists, pool), pool)
+
+    def add(first: int, last: int) -> None:
+        blending.add_colors(v_slots, records, slots.rows, slots.first, visible, first, last, SH_C0, into)
+
+    each_part(add, even(len(slots.rows), pool), pool)
 
 
 def removal_scores(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:

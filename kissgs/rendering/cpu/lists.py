@@ -188,9 +188,7 @@ def even(count: int, pool: Workers) -> Int64[np.ndarray, " edges"]:
     return np.linspace(0, count, parts + 1).astype(np.int64)
 
 
-def even_tiles(
-    lists: TileLists, pool: Workers, first: int = 0, last: int | None = None
-) -> Int64[np.ndarray, " edges"]:
+def even_tiles(lists: TileLists, pool: Workers, first: int = 0, last: int | None = None) -> Int64[np.ndarray, " edges"]:
     """Return the edges of parts of tiles of about equal cost: the number of members plus a constant per tile.
 
     Args:

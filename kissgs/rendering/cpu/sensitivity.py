@@ -187,8 +187,9 @@ def add_to_parameters(
     """Add the moments of some tiles of an image to those of the Gaussians of the footprints ``rows[first:last]``.
 
     A footprint's coordinates (u, v) times L W are coordinates g in the Gaussian's own frame, in units of its axes, here
-    :func:`_thickened`. The derivative of ln alpha by a strain of the Gaussian is quadratic in g whatever the camera, so images are added as
-    moments of g, and the Hessian by log-scales and rotation follows once (:func:`moments_to_hessians`).
+    :func:`_thickened`. The derivative of ln alpha by a strain of the Gaussian is quadratic in g whatever the camera, so
+    images are added as moments of g, and the Hessian by log-scales and rotation follows once
+    (:func:`moments_to_hessians`).
 
     Args:
         means, quats, scales, visible, rows, slots_from, first, last, viewmat, K, width, height, constants: as for

@@ -192,9 +192,7 @@ def _whole_span(records: np.ndarray, n: int, row: int) -> int:
 
 
 @compiled("void(float32[:, ::1], int64, int64, int64, int64, int64[::1])")
-def count_tiles(
-    records: np.ndarray, first: int, last: int, columns: int, rows: int, per_tile: np.ndarray
-) -> None:
+def count_tiles(records: np.ndarray, first: int, last: int, columns: int, rows: int, per_tile: np.ndarray) -> None:
     """Add the number of footprints ``first`` to ``last`` (exclusive) that touch each tile to ``per_tile``."""
     for n in range(first, last):
         left, right, top, bottom = _box(records, n, columns, rows)
