@@ -297,10 +297,22 @@ def _recolor(
     """Return a function that refits base colours to renderings of the scene from the capture's cameras."""
     from kissgs.rendering.color_refit import refit_colors
 
-    cameras = replace(cameras, cameras=[camera.at_most(REFIT_SIZE) for camera in cameras.cameras])
+    cameras = _refit_cameras(cameras)
 
     def recolor(decoded: Splats, order: Int[np.ndarray, " M"]) -> Float32[np.ndarray, "M 3"]:
         weights = sensitivity.color_weight[order], sensitivity.prior[order]
         return refit_colors(decoded, splats, cameras, *weights, steps=steps, threads=threads, progress=progress)
 
     return recolor
+
+
+def _refit_cameras(cameras: WeightedCameras) -> WeightedCameras:
+    """Return smaller cameras of the capture, and every other virtual one with twice its weight."""
+    chosen = np.arange(len(cameras.cameras))
+    chosen = chosen[(chosen < cameras.captured) | ((chosen - cameras.captured) % 2 == 0)]
+    virtual = chosen >= cameras.captured
+    return replace(
+        cameras,
+        cameras=[cameras.cameras[n].at_most(REFIT_SIZE) for n in chosen],
+        weights=[cameras.weights[n] * (2.0 if other else 1.0) for n, other in zip(chosen, virtual, strict=True)],
+    )
