@@ -46,9 +46,8 @@ class GaussianModel:
             device: device of the tensors.
             extents: ``(N,)`` unit of length, world units, of the learning rate of each position; 1 by default.
         """
-        self._adam = PrunableAdam(tensors_of(splats, device))
         extents = np.ones(len(splats), np.float32) if extents is None else extents
-        self._extents = torch.from_numpy(extents)[:, None].to(device)
+        self._adam = PrunableAdam(tensors_of(splats, device), BOUNDS, {"means": torch.from_numpy(extents)})
 
     @property
     def parameters(self) -> dict[str, Tensor]:
@@ -67,18 +66,11 @@ class GaussianModel:
 
         Values are clamped to :data:`BOUNDS`; NaN and infinite gradients count as 0.
         """
-        before = self.parameters["means"].detach().clone()
-        largest = float(self._extents.max()) if len(self) else 1.0
-        self._adam.step({**rates, "means": rates["means"] * largest})
-        with torch.no_grad():
-            self.parameters["means"].sub_(before).mul_(self._extents / largest).add_(before)
-            for name, (smallest, greatest) in BOUNDS.items():
-                self.parameters[name].clamp_(smallest, greatest)
+        self._adam.step(rates)
 
     def keep(self, index: Int[np.ndarray, " M"]) -> None:
         """Keep only the Gaussians at ``index``, with their Adam moments."""
         self._adam.keep(index)
-        self._extents = self._extents[torch.from_numpy(index).to(self._extents.device)]
 
     def splats(self) -> Splats:
         """Return a clean copy of the current scene."""

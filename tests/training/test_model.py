@@ -7,6 +7,7 @@ from helpers.training_scenes import cloud, same
 
 from kissgs.core.splats import ATTRIBUTES, OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN
 from kissgs.training.model import GaussianModel
+from kissgs.training.optimizer import PrunableAdam, _step_by_torch
 
 RATES = {name: 0.01 * (n + 1) for n, name in enumerate(ATTRIBUTES)}
 
@@ -134,3 +135,22 @@ def test_all_gaussians_can_be_removed():
     push(model, np.random.default_rng(0))
     model.keep(np.empty(0, np.int64))
     assert len(model) == len(model.splats()) == 0
+
+
+def test_steps_on_other_devices_are_the_same():
+    """Torch makes steps there; here it makes them on the CPU, for lack of another device."""
+    rng, factors = np.random.default_rng(4), torch.exp(torch.linspace(-3, 3, 40))
+    one, other = (PrunableAdam({"a": torch.zeros(40, 5)}, {"a": (-0.1, 0.2)}, {"a": factors}) for _ in range(2))
+    for number in range(6):
+        gradient = torch.from_numpy(rng.normal(size=(40, 5)).astype(np.float32))
+        gradient[number] = float(rng.choice([np.nan, np.inf, 3e38]))
+        for adam in (one, other):
+            adam.parameters["a"].grad = gradient.clone()
+        one.step({"a": 0.01})
+        (leaf,) = other._leaves.values()
+        leaf.steps += 1
+        with torch.no_grad():
+            _step_by_torch(leaf, 0.01, -0.1, 0.2)
+    for name, value in one.state().items():
+        np.testing.assert_allclose(value, other.state()[name], rtol=1e-5, atol=1e-7)
+    assert len(np.unique(one.state()["a"])) > 100
