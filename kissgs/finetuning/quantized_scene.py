@@ -123,6 +123,10 @@ class QuantizedScene:
         decoded["opacities"] = values["opacities"][:, 0].float()
         return decoded
 
+    @property
+    def receive(self) -> None:
+        """There is no receiver of gradients: autograd passes them on to the latents."""
+
     def step(self, rates: Mapping[str, float]) -> None:
         """Make an Adam step of the latents, with quadratic attraction, within the levels that the images can hold.
 

@@ -109,7 +109,8 @@ class _LeastSquares:
 
     def negative_gradient(self, sh0: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarray, "M 3"]:
         """Return minus half the gradient by the base colours; renders all images once."""
-        from kissgs.rendering.cpu.frame import differentiate, draw
+        from kissgs.rendering.cpu.frame import draw
+        from kissgs.rendering.cpu.gradients import differentiate
 
         total = self.attraction * (self.decoded.sh0 - sh0)
         scene, count = replace(self.decoded, sh0=sh0.astype(np.float32)), len(self.cameras.cameras)
@@ -118,7 +119,8 @@ class _LeastSquares:
             frame = draw(scene, camera, self.cameras.background, self.pool)
             target = self.targets[done] if self.targets else self._target(camera)
             error = (target - frame.image) * np.float32(weight)
-            total += differentiate(frame, error, np.zeros(error.shape[:2], np.float32), self.pool).sh0
+            no_alpha = np.zeros(error.shape[:2], np.float32)
+            differentiate(frame, error, no_alpha, self.pool).add_to("sh0", total)
         self.passes += 1
         return total
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from kissgs.core.splats import (
     Splats,
     clean,
 )
+from kissgs.rendering.cpu.gradients import Gradients
 from kissgs.rendering.rasterizer import Device
 from kissgs.rendering.tensors import tensors_of
 from kissgs.training.optimizer import PrunableAdam
@@ -48,11 +49,18 @@ class GaussianModel:
         """
         extents = np.ones(len(splats), np.float32) if extents is None else extents
         self._adam = PrunableAdam(tensors_of(splats, device), BOUNDS, {"means": torch.from_numpy(extents)})
+        self._received: list[Gradients] = []
+        self._on_cpu = device == "cpu"
 
     @property
     def parameters(self) -> dict[str, Tensor]:
         """Float32 parameters by their names in :class:`kissgs.core.splats.Splats`; :meth:`keep` replaces them."""
         return self._adam.parameters
+
+    @property
+    def receive(self) -> Callable[[Gradients], None] | None:
+        """Receiver of gradients of images, for :meth:`step`, on the CPU; elsewhere autograd provides them."""
+        return self._received.append if self._on_cpu else None
 
     def gaussians(self) -> dict[str, Tensor]:
         """Return the parameters themselves."""
@@ -66,7 +74,13 @@ class GaussianModel:
 
         Values are clamped to :data:`BOUNDS`; NaN and infinite gradients count as 0.
         """
-        self._adam.step(rates)
+        if self._received:
+            found = Gradients.sum(self._received)
+            of_rows = {name: getattr(found, name) for name in ATTRIBUTES}
+            self._adam.step(rates, (found.gaussians, of_rows))
+            self._received.clear()
+        else:
+            self._adam.step(rates)
 
     def keep(self, index: Int[np.ndarray, " M"]) -> None:
         """Keep only the Gaussians at ``index``, with their Adam moments."""

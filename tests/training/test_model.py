@@ -6,6 +6,7 @@ import torch
 from helpers.training_scenes import cloud, same
 
 from kissgs.core.splats import ATTRIBUTES, OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN
+from kissgs.rendering.cpu.gradients import Gradients
 from kissgs.training.model import GaussianModel
 from kissgs.training.optimizer import PrunableAdam, _step_by_torch
 
@@ -154,3 +155,30 @@ def test_steps_on_other_devices_are_the_same():
     for name, value in one.state().items():
         np.testing.assert_allclose(value, other.state()[name], rtol=1e-5, atol=1e-7)
     assert len(np.unique(one.state()["a"])) > 100
+
+
+def test_gradients_of_a_few_gaussians_count_as_0_for_the_others():
+    """The moments of the others decay, and they go on moving, as in Adam."""
+    scene, rng = cloud(50, 2), np.random.default_rng(5)
+    extents = np.exp(rng.normal(size=50)).astype(np.float32)
+    model, oracle = (
+        GaussianModel(scene, extents=extents),
+        {name: NaiveAdam(getattr(scene, name)) for name in ATTRIBUTES},
+    )
+    for step in range(12):
+        total = {name: np.zeros(parameter.shape) for name, parameter in model.parameters.items()}
+        for _ in range(step % 3):  # several images, one, or none
+            gaussians = np.sort(rng.permutation(len(model))[:15]).astype(np.int32)
+            found = [rng.normal(size=total[name][gaussians].shape).astype(np.float32) for name in ATTRIBUTES]
+            model.receive(Gradients(gaussians, *found))
+            for name, gradient in zip(ATTRIBUTES, found, strict=True):
+                total[name][gaussians] += gradient
+        penalty = rng.normal(size=len(model))
+        model.parameters["opacities"].grad = torch.from_numpy(penalty.astype(np.float32))
+        total["opacities"] += penalty
+        model.step(RATES)
+        for name in ATTRIBUTES if step % 3 else ("opacities",):
+            rate = RATES[name] * (extents[:, None] if name == "means" else 1)
+            oracle[name].step(total[name], rate)
+    for name, parameter in model.parameters.items():
+        np.testing.assert_allclose(parameter.detach().numpy(), oracle[name].value, rtol=2e-5, atol=2e-5)
