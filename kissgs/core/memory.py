@@ -20,7 +20,7 @@ from kissgs.core.array_types import Shaped, UInt8
 SMALLEST = 1 << 20
 """Smallest array, bytes, whose memory is kept; the allocator keeps that of smaller ones itself."""
 
-SPARE = 1.125
+GROWTH = 1.125
 """New blocks are larger by this factor, so that they fit arrays that are a little larger, too."""
 
 
@@ -39,7 +39,7 @@ class _Blocks:
             return self._blocks[min(fitting, key=lambda n: len(self._blocks[n]))][:size]
         if free:  # in place of the largest one that is too small, so that blocks do not accumulate
             del self._blocks[max(free, key=lambda n: len(self._blocks[n]))]
-        self._blocks.append(np.empty(int(size * SPARE), np.uint8))
+        self._blocks.append(np.empty(int(size * GROWTH), np.uint8))
         return self._blocks[-1][:size]
 
 

@@ -148,105 +148,6 @@ def blend(
 
 @compiled(
     "void(float32[:, ::1], int32[::1], uint16[::1], int32[::1], int64[::1], int64, int64, int64,"
-    " float32[::1], float32[::1], float32[:, ::1], int32[:, ::1],"
-    " float32[:, :, ::1], float32[:, ::1], float32[:, ::1])",
-    fastmath=_FAST,
-)
-def blend_backward(
-    records: np.ndarray,
-    members: np.ndarray,
-    spans: np.ndarray,
-    slots: np.ndarray,
-    starts: np.ndarray,
-    first: int,
-    last: int,
-    columns: int,
-    limits: np.ndarray,
-    background: np.ndarray,
-    transmittance: np.ndarray,
-    stops: np.ndarray,
-    v_image: np.ndarray,
-    v_alpha: np.ndarray,
-    v_slots: np.ndarray,
-) -> None:
-    """Compute gradients of tiles ``first`` to ``last`` (exclusive), which :func:`blend` rendered.
-
-    Args:
-        records, members, spans, starts, first, last, columns, limits, background, transmittance, stops: as for
-            :func:`blend`.
-        slots: row of ``v_slots`` of each member.
-        v_image: ``(H, W, 3)`` gradient of the loss by the image.
-        v_alpha: ``(H, W)`` gradient of the loss by 1 - transmittance.
-        v_slots: out, ``(slots, 9)``: sums over the tile's pixels of the gradient by the exponent times 1, u, v, u²,
-            uv, v²; and the gradient by the colour's R, G, B.
-    """
-    alpha_min, alpha_max = limits[0], limits[1]
-    zero, one = np.float32(0), np.float32(1)
-    height, width = transmittance.shape
-    # Per pixel: x, y, stop, T; gradient by R, G, B and alpha; product of the colour behind and its gradient.
-    s = np.empty(9 * 256, np.float32)
-    _pixel_centres(s)
-    for tile in range(first, last):
-        x0, y0 = (tile % columns) * 16, (tile // columns) * 16
-        begin = starts[tile]
-        last_stop = 0
-        for p in range(256):
-            x, y = x0 + (p & 15), y0 + (p >> 4)
-            last_stop = max(last_stop, stops[tile, p])
-            s[512 + p] = np.float32(stops[tile, p])
-            inside = x < width and y < height
-            x, y = min(x, width - 1), min(y, height - 1)
-            s[768 + p] = transmittance[y, x] if inside else one
-            s[1024 + p] = v_image[y, x, 0] if inside else zero
-            s[1280 + p] = v_image[y, x, 1] if inside else zero
-            s[1536 + p] = v_image[y, x, 2] if inside else zero
-            s[1792 + p] = v_alpha[y, x] if inside else zero
-            s[2048 + p] = background[0] * s[1024 + p] + background[1] * s[1280 + p] + background[2] * s[1536 + p]
-        for i in range(begin + last_stop, starts[tile + 1]):
-            v_slots[slots[i], :] = zero
-        for i in range(begin + last_stop - 1, begin - 1, -1):
-            (mx, my, l0, l1, l2), (opacity, red, green, blue) = _footprint(records, members[i], x0, y0)
-            top, bottom = np.uint64(spans[i] >> 5), np.uint64(spans[i] & 31)
-            index = np.float32(i - begin)
-            m, mu, mv, muu, muv, mvv, vr, vg, vb = zero, zero, zero, zero, zero, zero, zero, zero, zero
-            for p in range(top * np.uint64(16), bottom * np.uint64(16)):
-                dx, dy = s[p] - mx, s[p + np.uint64(256)] - my
-                u, v = l0 * dx + l1 * dy, l2 * dy
-                full = opacity * _exp_minus(u * u + v * v)
-                alpha = min(full, alpha_max)
-                alpha = alpha if alpha >= alpha_min else zero
-                alpha = alpha if index < s[p + np.uint64(512)] else zero
-                t = s[p + np.uint64(768)] / (one - alpha)
-                s[p + np.uint64(768)] = t
-                gr, gg, gb = s[p + np.uint64(1024)], s[p + np.uint64(1280)], s[p + np.uint64(1536)]
-                weight = alpha * t
-                vr += weight * gr
-                vg += weight * gg
-                vb += weight * gb
-                change = red * gr + green * gg + blue * gb + s[p + np.uint64(1792)] - s[p + np.uint64(2048)]
-                s[p + np.uint64(2048)] += alpha * change
-                g = -weight * change
-                g = g if full <= alpha_max else zero
-                m += g
-                mu += g * u
-                mv += g * v
-                muu += g * u * u
-                muv += g * u * v
-                mvv += g * v * v
-            slot = slots[i]
-            v_slots[slot, 0] = m
-            v_slots[slot, 1] = mu
-            v_slots[slot, 2] = mv
-            v_slots[slot, 3] = muu
-            v_slots[slot, 4] = muv
-            v_slots[slot, 5] = mvv
-            v_slots[slot, 6] = vr
-            v_slots[slot, 7] = vg
-            v_slots[slot, 8] = vb
-
-
-@compiled(
-    "void(float32[:, ::1], int32[::1], uint16[::1], int32[::1], int64[::1], int64, int64, int64,"
     " float32[::1], float32[::1], float32[:, ::1], int32[:, ::1], float32[::1])",
     fastmath=_FAST,
 )
@@ -267,8 +168,8 @@ def removal_errors(
 ) -> None:
     """Compute the squared change of tiles ``first`` to ``last`` (exclusive) by the removal of each member.
 
-    The arguments are those of :func:`blend_backward`. ``errors``: out, ``(slots,)``, sums over the tile's pixels and
-    RGB.
+    The arguments are those of :func:`kissgs.rendering.cpu.blending_backward.blend_backward`. ``errors``: out,
+    ``(slots,)``, sums over the tile's pixels and RGB.
     """
     alpha_min, alpha_max = limits[0], limits[1]
     zero, one = np.float32(0), np.float32(1)

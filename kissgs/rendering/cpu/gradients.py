@@ -13,7 +13,7 @@ import numpy as np
 from kissgs.core.array_types import Float32, Int32, Int64, Shaped
 from kissgs.core.memory import empty
 from kissgs.core.threads import Workers
-from kissgs.rendering.cpu import blending, projection_backward, shading
+from kissgs.rendering.cpu import blending_backward, projection_backward, shading
 from kissgs.rendering.cpu.frame import LIMITS, Frame
 from kissgs.rendering.cpu.lists import PROJECTION_CONSTANTS, each_part, even, even_tiles
 
@@ -72,28 +72,7 @@ def differentiate(
         MemoryError: there is not enough memory.
     """
     splats, camera, lists, footprints = frame.splats, frame.camera, frame.lists, frame.footprints
-    v_slots = empty((len(lists.members), 9), np.float32)
-
-    def blend(first: int, last: int) -> None:
-        blending.blend_backward(
-            footprints.records,
-            lists.members,
-            lists.spans,
-            lists.slots,
-            lists.starts,
-            first,
-            last,
-            lists.columns,
-            LIMITS,
-            frame.background,
-            frame.transmittance,
-            frame.stops,
-            v_image,
-            v_alpha,
-            v_slots,
-        )
-
-    each_part(blend, even_tiles(lists, pool), pool)
+    v_slots = differentiate_footprints(frame, v_image, v_alpha, pool)
     changed = _changed(frame, v_slots, pool)
     count = len(changed)
     found = Gradients(
@@ -143,6 +122,44 @@ def differentiate(
 
     each_part(project, even(count, pool), pool)
     return found
+
+
+def differentiate_footprints(
+    frame: Frame,
+    v_image: Float32[np.ndarray, "H W 3"],
+    v_alpha: Float32[np.ndarray, "H W"],
+    pool: Workers,
+) -> Float32[np.ndarray, "slots 9"]:
+    """Return the gradients of a loss by each footprint in each tile.
+
+    Arguments are those of :func:`differentiate`; the result is described at
+    :func:`kissgs.rendering.cpu.blending_backward.blend_backward`.
+    """
+    lists = frame.lists
+    v_slots = empty((len(lists.members), 9), np.float32)
+    v_slots.fill(0)  # members behind the end of all pixels get nothing
+
+    def blend(first: int, last: int) -> None:
+        blending_backward.blend_backward(
+            frame.footprints.records,
+            lists.members,
+            lists.spans,
+            lists.slots,
+            lists.starts,
+            first,
+            last,
+            lists.columns,
+            LIMITS,
+            frame.background,
+            frame.transmittance,
+            frame.stops,
+            v_image,
+            v_alpha,
+            v_slots,
+        )
+
+    each_part(blend, even_tiles(lists, pool), pool)
+    return v_slots
 
 
 def _changed(frame: Frame, v_slots: Float32[np.ndarray, "slots 9"], pool: Workers) -> Int64[np.ndarray, " R"]:

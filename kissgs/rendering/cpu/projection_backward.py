@@ -42,7 +42,7 @@ def find_changed(
         rows: ``(M,)`` footprints in the order of their Gaussians.
         slots_from: ``(M,)`` first slot of each footprint.
         slot_counts: ``(M,)`` number of its slots.
-        v_slots: output of :func:`kissgs.rendering.cpu.blending.blend_backward`.
+        v_slots: output of :func:`kissgs.rendering.cpu.blending_backward.blend_backward`.
         first: first index into ``rows``.
         last: end of the indices, exclusive.
         changed: out, from index ``first``: these footprints, in their order.
