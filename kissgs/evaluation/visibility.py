@@ -36,7 +36,7 @@ def blending_weights(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
     height, width = frame.transmittance.shape
     ones, zeros = np.zeros((height, width, 3), np.float32), np.zeros((height, width), np.float32)
     ones[:, :, 0] = 1  # so the gradient with respect to a red value is the sum of weights
-    slots = differentiate_footprints(frame, ones, zeros, pool)
+    slots, _ = differentiate_footprints(frame, ones, zeros, pool)
     weights = np.zeros(len(frame.splats), np.float64)
     slot_weights, visible = np.ascontiguousarray(slots[:, 6]), footprints.visible
     blending.sum_errors(slot_weights, lists.slots_from, lists.slot_counts, visible, 0, len(visible), weights)

@@ -11,7 +11,7 @@ from kissgs.rendering.cpu.blending import _FAST, _exp_minus, _footprint, _pixel_
 @compiled(
     "void(float32[:, ::1], int32[::1], uint16[::1], int32[::1], int64[::1], int64, int64, int64,"
     " float32[::1], float32[::1], float32[:, ::1], int32[:, ::1],"
-    " float32[:, :, ::1], float32[:, ::1], float32[:, ::1])",
+    " float32[:, :, ::1], float32[:, ::1], float32[:, ::1], boolean[::1])",
     fastmath=_FAST,
 )
 def blend_backward(
@@ -30,6 +30,7 @@ def blend_backward(
     v_image: np.ndarray,
     v_alpha: np.ndarray,
     v_slots: np.ndarray,
+    changed: np.ndarray,
 ) -> None:
     """Compute gradients of tiles ``first`` to ``last`` (exclusive), which were rendered.
 
@@ -41,6 +42,7 @@ def blend_backward(
         v_alpha: ``(H, W)`` gradient of the loss by 1 - transmittance.
         v_slots: out, ``(slots, 9)``, 0 before: sums over the tile's pixels of the gradient by the exponent times 1, u,
             v, u², uv, v²; and the gradient by the colour's R, G, B.
+        changed: out, ``(M,)``, False before: True for footprints whose gradient is not 0 in one of the tiles.
     """
     alpha_min, alpha_max = limits[0], limits[1]
     zero, one = np.float32(0), np.float32(1)
@@ -106,3 +108,5 @@ def blend_backward(
             for i in range(start, end):
                 for c in range(9):
                     v_slots[slots[i], c] = sums[i - start, c]
+                    if sums[i - start, c] != 0:
+                        changed[members[i]] = True

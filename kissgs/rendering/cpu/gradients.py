@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from kissgs.core.array_types import Float32, Int32, Int64, Shaped
+from kissgs.core.array_types import Bool, Float32, Int32, Shaped
 from kissgs.core.memory import empty
 from kissgs.core.threads import Workers
 from kissgs.rendering.cpu import blending_backward, projection_backward, shading
@@ -72,8 +72,8 @@ def differentiate(
         MemoryError: there is not enough memory.
     """
     splats, camera, lists, footprints = frame.splats, frame.camera, frame.lists, frame.footprints
-    v_slots = differentiate_footprints(frame, v_image, v_alpha, pool)
-    changed = _changed(frame, v_slots, pool)
+    v_slots, any_gradient = differentiate_footprints(frame, v_image, v_alpha, pool)
+    changed = footprints.rows[any_gradient[footprints.rows]]
     count = len(changed)
     found = Gradients(
         empty(count, np.int32),
@@ -129,13 +129,13 @@ def differentiate_footprints(
     v_image: Float32[np.ndarray, "H W 3"],
     v_alpha: Float32[np.ndarray, "H W"],
     pool: Workers,
-) -> Float32[np.ndarray, "slots 9"]:
-    """Return the gradients of a loss by each footprint in each tile.
+) -> tuple[Float32[np.ndarray, "slots 9"], Bool[np.ndarray, " M"]]:
+    """Return the gradients of a loss by each footprint in each tile, and the mask of footprints that have any.
 
-    Arguments are those of :func:`differentiate`; the result is described at
+    Arguments are those of :func:`differentiate`; the gradients are described at
     :func:`kissgs.rendering.cpu.blending_backward.blend_backward`.
     """
-    lists = frame.lists
+    lists, changed = frame.lists, np.zeros(len(frame.footprints.records), bool)
     v_slots = empty((len(lists.members), 9), np.float32)
     v_slots.fill(0)  # members behind the end of all pixels get nothing
 
@@ -156,22 +156,8 @@ def differentiate_footprints(
             v_image,
             v_alpha,
             v_slots,
+            changed,
         )
 
     each_part(blend, even_tiles(lists, pool), pool)
-    return v_slots
-
-
-def _changed(frame: Frame, v_slots: Float32[np.ndarray, "slots 9"], pool: Workers) -> Int64[np.ndarray, " R"]:
-    """Return the footprints that have a gradient, in the order of their Gaussians."""
-    rows, lists = frame.footprints.rows, frame.lists
-    changed = np.empty_like(rows)
-
-    def find(first: int, last: int) -> slice:
-        count = projection_backward.find_changed(
-            rows, lists.slots_from, lists.slot_counts, v_slots, first, last, changed
-        )
-        return slice(first, first + count)
-
-    parts = each_part(find, even(len(rows), pool), pool)
-    return np.concatenate([changed[part] for part in parts])
+    return v_slots, changed

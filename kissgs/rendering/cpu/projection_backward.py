@@ -1,4 +1,4 @@
-"""Numba kernels of the backward pass of projection: which Gaussians have a gradient, and gradients by their parameters.
+"""Numba kernel of the backward pass of projection: gradients by the parameters of Gaussians.
 
 Arithmetic is that of :mod:`kissgs.rendering.cpu.projection`.
 """
@@ -24,43 +24,6 @@ from kissgs.rendering.cpu.projection import (
     _unit_quat,
     _whitened,
 )
-
-
-@compiled("int64(int64[::1], int64[::1], int64[::1], float32[:, ::1], int64, int64, int64[::1])")
-def find_changed(
-    rows: np.ndarray,
-    slots_from: np.ndarray,
-    slot_counts: np.ndarray,
-    v_slots: np.ndarray,
-    first: int,
-    last: int,
-    changed: np.ndarray,
-) -> int:
-    """Find the footprints of ``rows[first:last]`` by which the loss has a gradient other than 0, or NaN.
-
-    Args:
-        rows: ``(M,)`` footprints in the order of their Gaussians.
-        slots_from: ``(M,)`` first slot of each footprint.
-        slot_counts: ``(M,)`` number of its slots.
-        v_slots: output of :func:`kissgs.rendering.cpu.blending_backward.blend_backward`.
-        first: first index into ``rows``.
-        last: end of the indices, exclusive.
-        changed: out, from index ``first``: these footprints, in their order.
-
-    Returns:
-        Their number.
-    """
-    found = 0
-    for i in range(first, last):
-        row = rows[i]
-        any_ = False
-        for slot in range(slots_from[row], slots_from[row] + slot_counts[row]):
-            for c in range(9):
-                any_ |= v_slots[slot, c] != 0
-        if any_:
-            changed[first + found] = row
-            found += 1
-    return found
 
 
 @compiled(
@@ -101,7 +64,9 @@ def project_backward(
             :func:`kissgs.rendering.cpu.projection.project`.
         visible: ``(M,)`` the Gaussian of each footprint.
         changed: ``(R,)`` footprints.
-        slots_from, slot_counts, v_slots: as for :func:`find_changed`.
+        slots_from: ``(M,)`` first slot of each footprint.
+        slot_counts: ``(M,)`` number of its slots.
+        v_slots: output of :func:`kissgs.rendering.cpu.blending_backward.blend_backward`.
         first: first index into ``changed``.
         last: end of the indices, exclusive.
         gaussians: out, ``(R,)``, the Gaussian of each of ``changed``.
