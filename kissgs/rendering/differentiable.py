@@ -107,7 +107,7 @@ class _Rasterize(torch.autograd.Function):
             frames = [draw(splats, camera, colour, pool) for camera, colour in zip(cameras, backgrounds, strict=True)]
         ctx.frames, ctx.threads, ctx.receive = frames, threads, receive
         ctx.save_for_backward(*parameters)  # so that torch notices if one is changed before the backward pass
-        return _stack([frame.image for frame in frames]), 1 - _stack([frame.transmittance for frame in frames])
+        return _stack([frame.image for frame in frames]), _stack([1 - frame.transmittance for frame in frames])
 
     @staticmethod
     @once_differentiable

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import Protocol
 
+import numpy as np
+
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.memory import reused_memory
 from kissgs.core.progress import Progress, silent
@@ -148,7 +150,7 @@ def image_loss(
     ``receive`` is as in :func:`kissgs.rendering.differentiable.rasterize`.
     """
     camera = targets.cameras[n]
-    target = torch.from_numpy(targets.image(n))[None].to(parameters["means"].device)
+    target = targets.image(n)
     image, _ = rasterize(
         parameters,
         viewmats=torch.from_numpy(camera.viewmat)[None],  # float64: poses far from the origin need it
@@ -159,8 +161,9 @@ def image_loss(
         threads=threads,
         receive=receive,
     )
-    loss = photometric_loss(image, target, ssim_weight=ssim_weight, threads=threads)
-    return loss, float((image.detach() - target).square().mean())
+    targets_there = torch.from_numpy(target)[None].to(image.device)
+    loss = photometric_loss(image, targets_there, ssim_weight=ssim_weight, threads=threads)
+    return loss, float(np.square(image[0].detach().cpu().numpy() - target).mean())
 
 
 @dataclass(slots=True)

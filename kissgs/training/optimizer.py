@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -29,8 +30,8 @@ MAX_GRADIENT = 1e15
 MAX_RATE = 1e30
 """Largest learning rate: the product with a step of Adam is still a finite float32."""
 
-PART = 16_384
-"""Number of rows that a thread updates at a time."""
+PART = 1 << 19
+"""Approximate number of numbers that a thread updates at a time."""
 
 NONE = np.empty(0, np.float32)
 
@@ -84,18 +85,20 @@ class PrunableAdam:
             rows: gradients of some rows, to which those of the tensors are added; for parameters on the CPU.
         """
         index, of_rows = (np.empty(0, np.int32), {}) if rows is None else rows
-        with torch.no_grad(), Workers(torch.get_num_threads()) as pool:
-            for name, leaf in self._leaves.items():
-                everywhere = leaf.value.grad
-                if everywhere is None and name not in of_rows:
-                    continue
-                leaf.steps += 1
-                smallest, largest = self._bounds.get(name, (-math.inf, math.inf))
-                if leaf.value.device.type == "cpu":
-                    _step(leaf, rates[name], index, of_rows.get(name, NONE), smallest, largest, pool)
-                else:
-                    _step_by_torch(leaf, rates[name], smallest, largest)
-                leaf.value.grad = None
+        parts: list[Callable[[], None]] = []
+        for name, leaf in self._leaves.items():
+            if leaf.value.grad is None and name not in of_rows:
+                continue
+            leaf.steps += 1
+            smallest, largest = self._bounds.get(name, (-math.inf, math.inf))
+            if leaf.value.device.type == "cpu":
+                parts += _parts(leaf, rates[name], index, of_rows.get(name, NONE), smallest, largest)
+            else:
+                _step_by_torch(leaf, rates[name], smallest, largest)
+        with Workers(torch.get_num_threads()) as pool:
+            pool.map(lambda part: part(), parts)
+        for leaf in self._leaves.values():
+            leaf.value.grad = None
 
     def keep(self, index: Int[np.ndarray, " M"]) -> None:
         """Keep only the rows at ``index``, with their moments."""
@@ -133,41 +136,44 @@ def _leaf(value: Tensor, factors: Tensor | None) -> _Leaf:
     return _Leaf(value.requires_grad_(), torch.zeros_like(value), torch.zeros_like(value), 0, factors)
 
 
-def _step(
+def _parts(
     leaf: _Leaf,
     rate: float,
     rows: Int32[np.ndarray, " R"],
     of_rows: Float32[np.ndarray, "R ..."],
     smallest: float,
     largest: float,
-    pool: Workers,
-) -> None:
-    """Make a step on the CPU. Parts do not depend on the number of threads, nor does the rounding in them."""
+) -> list[Callable[[], None]]:
+    """Return the parts of a step on the CPU. They do not depend on the number of threads, nor does their rounding."""
     count, everywhere = len(leaf.value), leaf.value.grad
     values, mean, square = (tensor.detach().numpy().reshape(-1) for tensor in (leaf.value, leaf.mean, leaf.square))
     slopes = NONE if everywhere is None else everywhere.contiguous().numpy().reshape(-1)
     factors = NONE if leaf.factors is None else leaf.factors.numpy().reshape(-1)
     corrections = min(rate / (1 - BETA1**leaf.steps), MAX_RATE), 1 / math.sqrt(1 - BETA2**leaf.steps)
     constants = np.array([*corrections, MAX_GRADIENT, smallest, largest], np.float32)
-
-    def part(first: int) -> None:
-        adam(
+    rows, of_rows = rows if len(of_rows) else rows[:0], of_rows.reshape(-1)
+    width = len(values) // max(count, 1)
+    step = max(1, PART // max(width, 1))
+    return [
+        partial(
+            adam,
             values,
             mean,
             square,
-            rows if len(of_rows) else rows[:0],
-            of_rows.reshape(-1),
+            rows,
+            of_rows,
             slopes,
             factors,
-            len(values) // count,
+            width,
             first,
-            min(first + PART, count),
+            min(first + step, count),
             constants,
         )
+        for first in range(0, count, step)
+    ]
 
-    pool.map(part, range(0, count, PART))
 
-
+@torch.no_grad()
 def _step_by_torch(leaf: _Leaf, rate: float, smallest: float, largest: float) -> None:
     """Make a step by torch, on any device."""
     gradient = leaf.value.grad

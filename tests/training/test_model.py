@@ -150,8 +150,7 @@ def test_steps_on_other_devices_are_the_same():
         one.step({"a": 0.01})
         (leaf,) = other._leaves.values()
         leaf.steps += 1
-        with torch.no_grad():
-            _step_by_torch(leaf, 0.01, -0.1, 0.2)
+        _step_by_torch(leaf, 0.01, -0.1, 0.2)
     for name, value in one.state().items():
         np.testing.assert_allclose(value, other.state()[name], rtol=1e-5, atol=1e-7)
     assert len(np.unique(one.state()["a"])) > 100
