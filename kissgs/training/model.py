@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from kissgs.core.array_types import Float32, Int
+from kissgs.core.errors import UnsupportedError
 from kissgs.core.splats import (
     ATTRIBUTES,
     LOG_SCALE_LIMIT,
@@ -23,6 +22,12 @@ from kissgs.rendering.cpu.gradients import Gradients
 from kissgs.rendering.rasterizer import Device
 from kissgs.rendering.tensors import tensors_of
 from kissgs.training.optimizer import PrunableAdam
+
+try:
+    import torch
+    from torch import Tensor
+except ModuleNotFoundError as error:
+    raise UnsupportedError("training needs torch, which is missing: pip install 'kissgs[train]'") from error
 
 BOUNDS = {
     "means": (-0.999 * MEAN_LIMIT, 0.999 * MEAN_LIMIT),  # float32 could round up
@@ -60,7 +65,11 @@ class GaussianModel:
     @property
     def receive(self) -> Callable[[Gradients], None] | None:
         """Receiver of gradients of images, for :meth:`step`, on the CPU; elsewhere autograd provides them."""
-        return self._received.append if self._on_cpu else None
+        return self.add_gradients if self._on_cpu else None
+
+    def add_gradients(self, gradients: Gradients) -> None:
+        """Add gradients of an image to those of the next :meth:`step`, on the CPU."""
+        self._received.append(gradients)
 
     def gaussians(self) -> dict[str, Tensor]:
         """Return the parameters themselves."""
