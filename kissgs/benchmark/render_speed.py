@@ -1,4 +1,4 @@
-"""CPU time of rendering and training: rasteriser, its gradients, loss, a step of Adam, and removal scores."""
+"""CPU time of rendering and training: rasteriser, its gradients, loss, Adam, whole steps, and removal scores."""
 
 from __future__ import annotations
 
@@ -10,18 +10,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kissgs.core.errors import UnsupportedError
+from kissgs.core.memory import reused_memory
 from kissgs.core.progress import Progress, silent
-from kissgs.core.splats import Splats
+from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.rasterizer import load_kernels, removal_scores, render
 
 if TYPE_CHECKING:
     from torch import Tensor
-    from torch.optim import Optimizer
+
+    from kissgs.rendering.cpu.gradients import Gradients
+    from kissgs.training.model import GaussianModel
 
 REPEATS = 5
 """Number of measurements per view."""
+
+NO_RATES = dict.fromkeys(ATTRIBUTES, 0.0)
+"""Learning rates of 0, so that every repeat finds the same scene."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,6 +44,7 @@ class RenderingCost:
         render_and_backward: forward and backward pass.
         loss: L1 + SSIM, forward and backward.
         adam: one step over all parameters of all Gaussians.
+        training_step: a whole step of compaction's training: all of the above once, and what is between them.
         removal_scores: forward pass and removal scores of all Gaussians.
     """
 
@@ -50,6 +57,7 @@ class RenderingCost:
     render_and_backward: float
     loss: float
     adam: float
+    training_step: float
     removal_scores: float
 
     def as_dict(self) -> dict[str, Any]:
@@ -71,15 +79,14 @@ def rendering_cost(
     Raises:
         UnsupportedError: torch is not installed.
     """
-    from kissgs.rendering.tensors import tensors_of
+    from kissgs.training.model import GaussianModel
 
     load_kernels(progress)
-    tensors = {name: tensor.clone().requires_grad_() for name, tensor in tensors_of(splats).items()}
-    adam = _adam(tensors)
-    measured = []
+    model, measured = GaussianModel(splats), []
     for number, camera in enumerate(cameras):
         progress("measure", number / len(cameras))
-        measured.append(_one_view(splats, tensors, adam, camera, threads))
+        with reused_memory():
+            measured.append(_one_view(splats, model, camera, threads))
     return RenderingCost(
         gaussians=len(splats),
         visible=round(float(np.mean([visible for visible, _ in measured]))),
@@ -90,47 +97,64 @@ def rendering_cost(
     )
 
 
-def _adam(tensors: dict[str, Tensor]) -> Optimizer:
-    """Return an Adam optimizer with a learning rate of 0, so that every repeat finds the same scene."""
-    from torch.optim import Adam
-
-    return Adam([{"params": [tensor]} for tensor in tensors.values()], lr=0.0, eps=1e-15, fused=True)
-
-
-def _one_view(
-    splats: Splats, tensors: dict[str, Tensor], adam: Optimizer, camera: Camera, threads: int
-) -> tuple[int, dict[str, list[float]]]:
+def _one_view(splats: Splats, model: GaussianModel, camera: Camera, threads: int) -> tuple[int, dict[str, list[float]]]:
     """Return the number of visible Gaussians, and the milliseconds of each repeat by attribute of the cost."""
     import torch
 
     from kissgs.rendering.cpu.frame import draw
     from kissgs.rendering.differentiable import rasterize
     from kissgs.rendering.losses import photometric_loss
+    from kissgs.training.loop import torch_threads
 
     viewmats, Ks = torch.from_numpy(camera.viewmat[None]), torch.from_numpy(camera.K[None])
     weights = torch.rand((1, camera.height, camera.width, 3), generator=torch.Generator().manual_seed(0))
+    received: list[Gradients] = []
 
-    def step() -> Tensor:
-        for tensor in tensors.values():
-            tensor.grad = None
+    def differentiate() -> Tensor:
+        received.clear()
         images, _ = rasterize(
-            tensors, viewmats=viewmats, Ks=Ks, width=camera.width, height=camera.height, threads=threads
+            model.gaussians(),
+            viewmats=viewmats,
+            Ks=Ks,
+            width=camera.width,
+            height=camera.height,
+            threads=threads,
+            receive=received.append,
         )
         torch.autograd.backward(images, weights)
         return images.detach()
 
-    images = step().requires_grad_()
+    def adam() -> None:
+        model.add_gradients(received[0])
+        model.step(NO_RATES)
+
+    images = differentiate().requires_grad_()
     operations: dict[str, Callable[[], object]] = {
         "render": lambda: render(splats, camera, threads=threads),
-        "render_and_backward": step,
+        "render_and_backward": differentiate,
         "loss": lambda: torch.autograd.backward(photometric_loss(images, weights, threads=threads)),
-        "adam": adam.step,
+        "adam": adam,
         "removal_scores": lambda: removal_scores(splats, [camera], threads=threads),
     }
-    times = {name: [_cpu_milliseconds(operation) for _ in range(REPEATS)] for name, operation in operations.items()}
+    with torch_threads(threads):
+        times = {name: [_cpu_milliseconds(operation) for _ in range(REPEATS)] for name, operation in operations.items()}
+    times["training_step"] = _training_steps(model, camera, threads)
     with Workers(threads) as pool:
         frame = draw(splats, camera, np.zeros(3, np.float32), pool)
-    return len(frame.footprints.visible), times
+    return frame.footprints.count, times
+
+
+def _training_steps(model: GaussianModel, camera: Camera, threads: int) -> list[float]:
+    """Return the milliseconds of steps of training, after a first one that does not count."""
+    from kissgs.training.loop import TrainingPlan, train
+    from kissgs.training.targets import TrainingTargets
+
+    grey = np.full((camera.height, camera.width, 3), 0.5, np.float16)
+    targets = TrainingTargets((camera,), (grey,), np.zeros(3, np.float32), "renderings")
+    plan = TrainingPlan("measure", REPEATS + 1, lambda done: NO_RATES, ssim_weight=0.2, seed=(0,))
+    ends: list[float] = []
+    train(model, targets, plan, after=lambda done: ends.append(time.process_time()), threads=threads)
+    return (1e3 * np.diff(ends)).tolist()
 
 
 def resampled(splats: Splats, count: int, *, seed: int = 0) -> Splats:

@@ -68,11 +68,12 @@ def _group(title: str, parts: list[str]) -> list[Column]:
 
 def rendering_table(rows: Iterable[tuple[str, RenderingCost]]) -> Table:
     """Format the costs of rendering: milliseconds of processor time per rendered image."""
-    columns = ("forward", "forward + backward", "L1 + SSIM", "Adam", "forward + scores")
+    columns = ("forward", "forward + backward", "L1 + SSIM", "Adam", "training step", "forward + scores")
     head = ("Gaussians", "visible", "image", *(f"{column} ms" for column in columns))
     table = Table("scene", *(Column(name, justify="right") for name in head), box=None, pad_edge=False)
     for scene, cost in rows:
-        times = (cost.render, cost.render_and_backward, cost.loss, cost.adam, cost.removal_scores)
+        passes = (cost.render, cost.render_and_backward, cost.loss, cost.adam)
+        times = (*passes, cost.training_step, cost.removal_scores)
         scene_cells = f"{cost.gaussians:,}", f"{cost.visible:,}", f"{cost.width}x{cost.height}"
         table.add_row(scene, *scene_cells, *(f"{milliseconds:.1f}" for milliseconds in times))
     return table

@@ -12,8 +12,8 @@ from kissgs.core.threads import Workers
 from kissgs.evaluation.prominence import prominence
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu import blending
-from kissgs.rendering.cpu.frame import LIMITS, Frame, draw
-from kissgs.rendering.cpu.lists import each_part, even_tiles, number_slots
+from kissgs.rendering.cpu.frame import Frame, draw
+from kissgs.rendering.cpu.gradients import differentiate_footprints
 
 SHOWN_SHARE = 1e-6
 """Share of an image that a Gaussian must exceed to count as shown by it."""
@@ -32,35 +32,12 @@ def blending_weights(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:
         frame: a rendering, with the lists of Gaussians per tile.
         pool: threads.
     """
-    lists, footprints = frame.lists, frame.footprints
     height, width = frame.transmittance.shape
     ones, zeros = np.zeros((height, width, 3), np.float32), np.zeros((height, width), np.float32)
     ones[:, :, 0] = 1  # so the gradient with respect to a red value is the sum of weights
-    slots = number_slots(footprints, lists, 0, len(lists.starts) - 1)
-    v_slots = np.empty((len(lists.members), 9), np.float32)
-
-    def blend(first: int, last: int) -> None:
-        blending.blend_backward(
-            footprints.records,
-            lists.members,
-            lists.spans,
-            slots.of,
-            lists.starts,
-            first,
-            last,
-            lists.columns,
-            LIMITS,
-            frame.background,
-            frame.transmittance,
-            frame.stops,
-            ones,
-            zeros,
-            v_slots,
-        )
-
-    each_part(blend, even_tiles(lists, pool), pool)
+    v_slots, slots, _ = differentiate_footprints(frame, ones, zeros, pool)
     weights = np.zeros(len(frame.splats), np.float64)
-    blending.sum_errors(np.ascontiguousarray(v_slots[:, 6]), slots.rows, slots.first, footprints.visible, weights)
+    blending.sum_errors(np.ascontiguousarray(v_slots[:, 6]), slots.rows, slots.first, frame.footprints.visible, weights)
     return weights
 
 

@@ -10,7 +10,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from kissgs.core.array_types import Float, Float32, Float64, Int
+from kissgs.core.memory import empty
 from kissgs.core.signed_log import signed_exp
+from kissgs.finetuning.kernels import each_part, sum_by_label
 from kissgs.planning import smallest_three
 from kissgs.rendering.rasterizer import Device
 
@@ -67,14 +69,15 @@ class Labels:
         index: ``(M,)`` entry of each Gaussian.
         order: ``(M,)`` Gaussians sorted by entry.
         used: entries that occur, ascending.
-        starts: start of each of these in ``order``.
+        starts: start of each of these in ``order``, and its end.
     """
 
     def __init__(self, labels: Int[np.ndarray, " M"], entries: int, device: Device) -> None:
         self.entries = entries
         self.index = torch.from_numpy(labels.astype(np.int64)).to(device)
         self.order = np.argsort(labels, kind="stable")
-        self.used, self.starts = np.unique(labels[self.order], return_index=True)
+        self.used, starts = np.unique(labels[self.order].astype(np.int64), return_index=True)
+        self.starts = np.append(starts, len(labels))
 
 
 def look_up(entries: Float32[Tensor, "E K 3"], labels: Labels) -> Float32[Tensor, "M K 3"]:
@@ -89,7 +92,11 @@ class _LookUp(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, entries: Float32[Tensor, "E K 3"], labels: Labels) -> Float32[Tensor, "M K 3"]:  # noqa: ANN401
         ctx.labels = labels
-        return entries[labels.index]
+        if entries.device.type != "cpu":
+            return entries[labels.index]
+        out = empty((len(labels.index), *entries.shape[1:]), np.float32)
+        np.take(entries.detach().numpy(), labels.index.numpy(), axis=0, out=out, mode="clip")
+        return torch.from_numpy(out)
 
     @staticmethod
     @once_differentiable
@@ -98,8 +105,11 @@ class _LookUp(torch.autograd.Function):
         total = gradient.new_zeros((labels.entries, *gradient.shape[1:]))
         if gradient.device.type != "cpu":
             return total.index_add_(0, labels.index, gradient), None
+        rows, totals = (tensor.contiguous().numpy().reshape(len(tensor), -1) for tensor in (gradient, total))
+
+        def part(first: int, last: int) -> None:
+            sum_by_label(rows, labels.order, labels.used, labels.starts, first, last, totals)
+
         if gradient.numel():
-            rows = gradient.numpy().reshape(len(gradient), -1)[labels.order]
-            sums = np.add.reduceat(rows, labels.starts, axis=0)
-            total.view(labels.entries, -1)[labels.used] = torch.from_numpy(sums)
+            each_part(part, len(labels.used), torch.get_num_threads())
         return total, None

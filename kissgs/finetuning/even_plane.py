@@ -7,12 +7,16 @@ the step size of the row's sensitivity class.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from kissgs.core.array_types import Float32, Float64
+from kissgs.core.memory import empty
+from kissgs.finetuning import kernels
 from kissgs.planning.quantize import Quantized
 from kissgs.rendering.rasterizer import Device
 
@@ -74,7 +78,32 @@ class EvenPlane:
 
     def values(self, latents: Float32[Tensor, "R C"], table: Tensor | None = None) -> Float64[Tensor, "R C"]:
         """Return the decoded values of the levels, differentiable like :meth:`levels`; there is no ``table``."""
+        if latents.device.type == "cpu":
+            return _Values.apply(latents, self)  # type: ignore[no-untyped-call]
         return self.low + self.step * self.levels(latents)
+
+    def add_attraction(
+        self,
+        gradient: Float32[Tensor, "R C"],
+        latents: Float32[Tensor, "R C"],
+        weights: Float64[Tensor, "R 1"],
+        factor: float,
+    ) -> None:
+        """Add the gradient of the quadratic attraction of each latent to its current level, on the CPU.
+
+        Args:
+            gradient: gradient by the latents; changed.
+            latents: the latents.
+            weights: curvature of the loss by the values.
+            factor: factor of the attraction.
+        """
+        base, stride, step = self.base_multiples.numpy(), self.stride.numpy(), self.step.numpy()
+        values, curvature, slopes = latents.detach().numpy(), weights.numpy(), gradient.numpy()
+
+        def part(first: int, last: int) -> None:
+            kernels.attract(base, values, stride, step, curvature, factor, first, last, slopes)
+
+        kernels.each_part(part, len(latents), torch.get_num_threads())
 
     def units(self, latents: Float32[Tensor, "R C"], table: Tensor | None = None) -> Float64[Tensor, "R C"]:
         """Return the change of each value per unit of its latent."""
@@ -84,6 +113,36 @@ class EvenPlane:
         """Return the field with the levels of these latents."""
         levels = self.levels(latents.detach()).cpu().numpy()
         return replace(self.field, levels=levels.astype(self.field.levels.dtype))
+
+
+class _Values(torch.autograd.Function):
+    """Decoded values on the CPU; the gradient ignores the rounding."""
+
+    @staticmethod
+    def forward(ctx: Any, latents: Float32[Tensor, "R C"], plane: EvenPlane) -> Float64[Tensor, "R C"]:  # noqa: ANN401
+        ctx.plane = plane
+        base, stride, shift = plane.base_multiples.numpy(), plane.stride.numpy(), plane.shift.numpy()
+        low, step, found = plane.low.numpy(), plane.step.numpy(), latents.detach().contiguous().numpy()
+        values = empty(tuple(latents.shape), np.float64)
+
+        def part(first: int, last: int) -> None:
+            kernels.even_values(base, found, stride, shift, low, step, first, last, values)
+
+        kernels.each_part(part, len(values), torch.get_num_threads())
+        return torch.from_numpy(values)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Float64[Tensor, "R C"]) -> tuple[Float32[Tensor, "R C"], None]:  # noqa: ANN401
+        plane: EvenPlane = ctx.plane
+        v_values, stride, step = gradient.contiguous().numpy(), plane.stride.numpy(), plane.step.numpy()
+        v_latents = empty(tuple(gradient.shape), np.float32)
+
+        def part(first: int, last: int) -> None:
+            kernels.even_values_backward(v_values, stride, step, first, last, v_latents)
+
+        kernels.each_part(part, len(v_latents), torch.get_num_threads())
+        return torch.from_numpy(v_latents), None
 
 
 def _as_read(end: Float32[np.ndarray, " C"]) -> Float64[np.ndarray, " C"]:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from kissgs.core.array_types import Float32, Float64, Int
+from kissgs.core.memory import empty
+from kissgs.finetuning import kernels
 from kissgs.finetuning.planes import Plane
 from kissgs.finetuning.quantized_scene import QuantizedScene
 from kissgs.finetuning.table_plane import TablePlane
@@ -164,9 +169,41 @@ class _LevelRate:
 
     def bits(self, latents: Float32[Tensor, "M C"]) -> Tensor:
         """Return the bits of all levels together, a scalar."""
+        table = torch.from_numpy(self.table.reshape(-1))
+        if latents.device.type == "cpu":
+            return _Bits.apply(latents, self._base, self._rows, table, self._symbols)  # type: ignore[no-untyped-call]
         position = self._base + latents
         below = torch.floor(position.detach()).clamp(0, self._symbols - 1)
-        index = self._rows + below.long()
-        table = torch.from_numpy(self.table.reshape(-1)).to(latents.device)
+        index, table = self._rows + below.long(), table.to(latents.device)
         lower, upper = table[index], table[index + 1]
         return (lower + (position - below).float() * (upper - lower)).sum()
+
+
+class _Bits(torch.autograd.Function):
+    """Bits of all levels on the CPU, independent of the number of threads."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,  # noqa: ANN401
+        latents: Float32[Tensor, "M C"],
+        base: Float64[Tensor, "M C"],
+        rows: Int[Tensor, "M C"],
+        table: Float32[Tensor, " T"],
+        symbols: int,
+    ) -> Tensor:
+        start, codes, bits_of = base.numpy(), rows.numpy(), table.numpy()
+        found = latents.detach().contiguous().numpy()
+        slopes = empty(tuple(latents.shape), np.float32)
+
+        def part(first: int, last: int) -> float:
+            return float(kernels.level_bits(start, found, codes, bits_of, symbols, first, last, slopes))
+
+        bits = kernels.each_part(part, len(slopes), torch.get_num_threads())
+        ctx.save_for_backward(torch.from_numpy(slopes))
+        return torch.tensor(math.fsum(bits), dtype=torch.float32)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
+        (slopes,) = ctx.saved_tensors
+        return torch.from_numpy(slopes.numpy() * upstream.numpy()), None, None, None, None

@@ -26,6 +26,7 @@ from torch import Tensor
 from kissgs.core.array_types import Float32, Float64
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.finetuning.decoding import Labels, look_up, positions, quaternions
+from kissgs.finetuning.even_plane import EvenPlane
 from kissgs.finetuning.planes import planes_of
 from kissgs.planning.container_model import EVEN_LEVELS, ContainerModel
 from kissgs.planning.encoding_plan import EncodingPlan
@@ -123,6 +124,10 @@ class QuantizedScene:
         decoded["opacities"] = values["opacities"][:, 0].float()
         return decoded
 
+    @property
+    def receive(self) -> None:
+        """There is no receiver of gradients: autograd passes them on to the latents."""
+
     def step(self, rates: Mapping[str, float]) -> None:
         """Make an Adam step of the latents, with quadratic attraction, within the levels that the images can hold.
 
@@ -149,6 +154,9 @@ class QuantizedScene:
             for name, latents in self.latents.items():
                 if latents.grad is not None:
                     plane = self.planes[name]
+                    if isinstance(plane, EvenPlane) and latents.device.type == "cpu":
+                        plane.add_attraction(latents.grad, latents, self._weights[name], factor)
+                        continue
                     level = (torch.round(plane.base_multiples + latents) - plane.base_multiples).float()
                     curvature = (self._weights[name] * plane.units(latents, tables.get(name)) ** 2).float()
                     latents.grad += factor * curvature * (latents - level)

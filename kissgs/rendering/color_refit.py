@@ -109,7 +109,8 @@ class _LeastSquares:
 
     def negative_gradient(self, sh0: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarray, "M 3"]:
         """Return minus half the gradient by the base colours; renders all images once."""
-        from kissgs.rendering.cpu.frame import add_color_gradients, draw
+        from kissgs.rendering.cpu.frame import draw
+        from kissgs.rendering.cpu.gradients import add_color_gradients
 
         total = np.zeros(sh0.shape, np.float32)
         scene, count = replace(self.decoded, sh0=sh0.astype(np.float32)), len(self.cameras.cameras)

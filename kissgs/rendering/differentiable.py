@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
+from kissgs.core.memory import empty
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera
-from kissgs.rendering.cpu.frame import Frame, differentiate, draw
+from kissgs.rendering.cpu.frame import Frame, draw
+from kissgs.rendering.cpu.gradients import Gradients, differentiate
 from kissgs.rendering.tensors import Parameters
 
 try:
@@ -30,6 +33,7 @@ def rasterize(
     *,
     backgrounds: Tensor | None = None,
     threads: int = 0,
+    receive: Callable[[Gradients], None] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Render images of a scene, with gradients by all of its parameters.
 
@@ -52,6 +56,8 @@ def rasterize(
         height: of the images, pixels.
         backgrounds: ``(C, 3)`` RGB; black by default. No gradient.
         threads: number of CPU threads; 0 means one per processor. The result does not depend on it.
+        receive: on the CPU, called in the backward pass with the gradients of each image, in place of autograd: most
+            Gaussians have none, and arrays for all of them take longer to fill than to compute.
 
     Returns:
         Images ``(C, H, W, 3)``, not clamped, and alphas ``(C, H, W)``.
@@ -76,7 +82,7 @@ def rasterize(
         raise UnsupportedError(f"the rasteriser runs on cpu and cuda, not on {device.type}; move the parameters")
     poses, pinholes, colours = (tensor.cpu().numpy() for tensor in (viewmats, Ks, backgrounds))
     cameras = [Camera(pose, K, width, height) for pose, K in zip(poses, pinholes, strict=True)]
-    images, alphas = _Rasterize.apply(*tensors, cameras, colours, threads)  # type: ignore[no-untyped-call]
+    images, alphas = _Rasterize.apply(*tensors, cameras, colours, threads, receive)  # type: ignore[no-untyped-call]
     return images, alphas
 
 
@@ -94,28 +100,37 @@ def _check_views(viewmats: Tensor, Ks: Tensor, backgrounds: Tensor) -> None:
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor]:  # noqa: ANN401
-        parameters, (cameras, backgrounds, threads) = inputs[: len(ATTRIBUTES)], inputs[len(ATTRIBUTES) :]
+        parameters, (cameras, backgrounds, threads, receive) = inputs[: len(ATTRIBUTES)], inputs[len(ATTRIBUTES) :]
         arrays = [parameter.detach().contiguous().numpy() for parameter in parameters]
         splats = Splats(**dict(zip(ATTRIBUTES, arrays, strict=True)))
         with Workers(threads) as pool:
             frames = [draw(splats, camera, colour, pool) for camera, colour in zip(cameras, backgrounds, strict=True)]
-        ctx.frames, ctx.threads = frames, threads
+        ctx.frames, ctx.threads, ctx.receive = frames, threads, receive
         ctx.save_for_backward(*parameters)  # so that torch notices if one is changed before the backward pass
-        return _stack([frame.image for frame in frames]), 1 - _stack([frame.transmittance for frame in frames])
+        return _stack([frame.image for frame in frames]), _stack([1 - frame.transmittance for frame in frames])
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_images: Tensor, v_alphas: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
-        _ = ctx.saved_tensors
+        parameters = ctx.saved_tensors
         frames: list[Frame] = ctx.frames
         image_gradients, alpha_gradients = v_images.contiguous().numpy(), v_alphas.contiguous().numpy()
-        totals: list[Tensor] = []
+        receive: Callable[[Gradients], None] | None = ctx.receive
+        totals: list[np.ndarray] = []
+        if receive is None:
+            totals = [empty(tuple(parameter.shape), np.float32) for parameter in parameters]
+            for total in totals:
+                total.fill(0)
         with Workers(ctx.threads) as pool:
             for frame, v_image, v_alpha in zip(frames, image_gradients, alpha_gradients, strict=True):
                 found = differentiate(frame, v_image, v_alpha, pool)
-                gradients = [torch.from_numpy(getattr(found, name)) for name in ATTRIBUTES]
-                totals = [a.add_(b) for a, b in zip(totals, gradients, strict=True)] if totals else gradients
-        return (*totals, None, None, None)
+                if receive is not None:
+                    receive(found)
+                for name, total in zip(ATTRIBUTES, totals, strict=False):
+                    found.add_to(name, total)
+        if receive is not None:
+            return (None,) * (len(parameters) + 4)
+        return (*(torch.from_numpy(total) for total in totals), None, None, None, None)
 
 
 def _stack(images: list[np.ndarray]) -> Tensor:

@@ -68,7 +68,8 @@ class _Photometric(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: BackwardCFunction, upstream: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         (gradient,) = ctx.saved_tensors
-        return gradient * upstream, None, None, None
+        # By NumPy, because threads of torch wait for each other longer than this takes.
+        return torch.from_numpy(gradient.numpy() * upstream.numpy()), None, None, None
 
 
 def _photometric(

@@ -97,7 +97,7 @@ def load_kernels(progress: Progress = silent) -> None:
     """Compile the rasteriser's kernels, or load them from numba's cache; ``progress`` receives the stage "kernels"."""
     progress("kernels", 0.0)
     from kissgs.rendering import ssim_kernels
-    from kissgs.rendering.cpu import frame  # noqa: F401
+    from kissgs.rendering.cpu import gradients  # noqa: F401
 
     del ssim_kernels
     progress("kernels", 1.0)

@@ -9,9 +9,13 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import Protocol
 
+import numpy as np
+
 from kissgs.core.errors import UnsupportedError
+from kissgs.core.memory import reused_memory
 from kissgs.core.progress import Progress, silent
 from kissgs.rendering import tensors
+from kissgs.rendering.cpu.gradients import Gradients
 from kissgs.rendering.differentiable import rasterize
 from kissgs.rendering.losses import photometric_loss
 from kissgs.training.targets import TrainingTargets
@@ -37,6 +41,10 @@ class TrainableScene(Protocol):
 
     def gaussians(self) -> dict[str, Tensor]:
         """Return the current :data:`Parameters`, differentiable."""
+
+    @property
+    def receive(self) -> Callable[[Gradients], None] | None:
+        """Receiver of the gradients of images, see :func:`kissgs.rendering.differentiable.rasterize`."""
 
     def step(self, rates: Mapping[str, float]) -> None:
         """Make an optimiser step with the accumulated gradients at these learning rates, and clear the gradients."""
@@ -104,13 +112,15 @@ def train(
             scene is in the state after the last completed step.
     """
     order, running = targets.order(plan.seed, first * plan.batch), RunningMeans()
-    with torch_threads(threads):
+    with torch_threads(threads), reused_memory():
         for step in range(first, plan.steps):
             progress(plan.stage, step / plan.steps, running.text(len(scene)))
             parameters = scene.gaussians()
             losses, errors = [], []
             for n in islice(order, plan.batch):
-                loss, error = image_loss(parameters, targets, n, ssim_weight=plan.ssim_weight, threads=threads)
+                loss, error = image_loss(
+                    parameters, targets, n, ssim_weight=plan.ssim_weight, threads=threads, receive=scene.receive
+                )
                 losses.append(loss)
                 errors.append(error)
             loss = torch.stack(losses).mean()
@@ -127,11 +137,20 @@ def train(
 
 
 def image_loss(
-    parameters: Parameters, targets: TrainingTargets, n: int, *, ssim_weight: float, threads: int
+    parameters: Parameters,
+    targets: TrainingTargets,
+    n: int,
+    *,
+    ssim_weight: float,
+    threads: int,
+    receive: Callable[[Gradients], None] | None = None,
 ) -> tuple[Tensor, float]:
-    """Render target ``n``; return the photometric loss, differentiable, and the mean squared error."""
+    """Render target ``n``; return the photometric loss, differentiable, and the mean squared error.
+
+    ``receive`` is as in :func:`kissgs.rendering.differentiable.rasterize`.
+    """
     camera = targets.cameras[n]
-    target = torch.from_numpy(targets.image(n))[None].to(parameters["means"].device)
+    target = targets.image(n)
     image, _ = rasterize(
         parameters,
         viewmats=torch.from_numpy(camera.viewmat)[None],  # float64: poses far from the origin need it
@@ -140,9 +159,11 @@ def image_loss(
         height=camera.height,
         backgrounds=torch.from_numpy(targets.background)[None],
         threads=threads,
+        receive=receive,
     )
-    loss = photometric_loss(image, target, ssim_weight=ssim_weight, threads=threads)
-    return loss, float((image.detach() - target).square().mean())
+    targets_there = torch.from_numpy(target)[None].to(image.device)
+    loss = photometric_loss(image, targets_there, ssim_weight=ssim_weight, threads=threads)
+    return loss, float(np.square(image[0].detach().cpu().numpy() - target).mean())
 
 
 @dataclass(slots=True)

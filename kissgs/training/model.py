@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from kissgs.core.array_types import Float32, Int
+from kissgs.core.errors import UnsupportedError
 from kissgs.core.splats import (
     ATTRIBUTES,
     LOG_SCALE_LIMIT,
@@ -19,9 +18,16 @@ from kissgs.core.splats import (
     Splats,
     clean,
 )
+from kissgs.rendering.cpu.gradients import Gradients
 from kissgs.rendering.rasterizer import Device
 from kissgs.rendering.tensors import tensors_of
 from kissgs.training.optimizer import PrunableAdam
+
+try:
+    import torch
+    from torch import Tensor
+except ModuleNotFoundError as error:
+    raise UnsupportedError("training needs torch, which is missing: pip install 'kissgs[train]'") from error
 
 BOUNDS = {
     "means": (-0.999 * MEAN_LIMIT, 0.999 * MEAN_LIMIT),  # float32 could round up
@@ -46,14 +52,24 @@ class GaussianModel:
             device: device of the tensors.
             extents: ``(N,)`` unit of length, world units, of the learning rate of each position; 1 by default.
         """
-        self._adam = PrunableAdam(tensors_of(splats, device))
         extents = np.ones(len(splats), np.float32) if extents is None else extents
-        self._extents = torch.from_numpy(extents)[:, None].to(device)
+        self._adam = PrunableAdam(tensors_of(splats, device), BOUNDS, {"means": torch.from_numpy(extents)})
+        self._received: list[Gradients] = []
+        self._on_cpu = device == "cpu"
 
     @property
     def parameters(self) -> dict[str, Tensor]:
         """Float32 parameters by their names in :class:`kissgs.core.splats.Splats`; :meth:`keep` replaces them."""
         return self._adam.parameters
+
+    @property
+    def receive(self) -> Callable[[Gradients], None] | None:
+        """Receiver of gradients of images, for :meth:`step`, on the CPU; elsewhere autograd provides them."""
+        return self.add_gradients if self._on_cpu else None
+
+    def add_gradients(self, gradients: Gradients) -> None:
+        """Add gradients of an image to those of the next :meth:`step`, on the CPU."""
+        self._received.append(gradients)
 
     def gaussians(self) -> dict[str, Tensor]:
         """Return the parameters themselves."""
@@ -67,18 +83,17 @@ class GaussianModel:
 
         Values are clamped to :data:`BOUNDS`; NaN and infinite gradients count as 0.
         """
-        before = self.parameters["means"].detach().clone()
-        largest = float(self._extents.max()) if len(self) else 1.0
-        self._adam.step({**rates, "means": rates["means"] * largest})
-        with torch.no_grad():
-            self.parameters["means"].sub_(before).mul_(self._extents / largest).add_(before)
-            for name, (smallest, greatest) in BOUNDS.items():
-                self.parameters[name].clamp_(smallest, greatest)
+        if self._received:
+            found = Gradients.sum(self._received)
+            of_rows = {name: getattr(found, name) for name in ATTRIBUTES}
+            self._adam.step(rates, (found.gaussians, of_rows))
+            self._received.clear()
+        else:
+            self._adam.step(rates)
 
     def keep(self, index: Int[np.ndarray, " M"]) -> None:
         """Keep only the Gaussians at ``index``, with their Adam moments."""
         self._adam.keep(index)
-        self._extents = self._extents[torch.from_numpy(index).to(self._extents.device)]
 
     def splats(self) -> Splats:
         """Return a clean copy of the current scene."""

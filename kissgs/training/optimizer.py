@@ -2,87 +2,202 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from kissgs.core.array_types import Int
+from kissgs.core.array_types import Float32, Int, Int32
 from kissgs.core.errors import UnsupportedError
+from kissgs.core.threads import Workers
+from kissgs.training.adam_kernels import adam
 
 try:
     import torch
     from torch import Tensor
+    from torch.optim.adam import adam as torch_adam
 except ModuleNotFoundError as error:
     raise UnsupportedError("training needs torch, which is missing: pip install 'kissgs[train]'") from error
 
-MOMENTS = ("exp_avg", "exp_avg_sq")
-"""Names of the moments in the state of ``torch.optim.Adam``."""
+BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
+"""Constants of Adam; the kernel has the same."""
 
 MAX_GRADIENT = 1e15
 """Largest absolute value of a gradient: its square is still a finite float32."""
 
+MAX_RATE = 1e30
+"""Largest learning rate: the product with a step of Adam is still a finite float32."""
+
+PART = 1 << 19
+"""Approximate number of numbers that a thread updates at a time."""
+
+NONE = np.empty(0, np.float32)
+
+RowGradients = tuple[Int32[np.ndarray, " R"], Mapping[str, Float32[np.ndarray, "R ..."]]]
+"""Rows, ascending, and the gradients of these rows by the name of the parameter."""
+
+
+@dataclass(slots=True, eq=False)
+class _Leaf:
+    """A parameter, its moments, and the number of steps made; ``factors``: of the learning rate of each number."""
+
+    value: Tensor
+    mean: Tensor
+    square: Tensor
+    steps: int
+    factors: Tensor | None
+
 
 class PrunableAdam:
-    """Named parameters and the Adam that optimises them.
+    """Named parameters and the Adam that optimises them."""
 
-    Args:
-        values: initial float32 values by name; copied. Rows are what :meth:`keep` selects.
-    """
+    def __init__(
+        self,
+        values: Mapping[str, Tensor],
+        bounds: Mapping[str, tuple[float, float]] | None = None,
+        factors: Mapping[str, Tensor] | None = None,
+    ) -> None:
+        """Copy the parameters.
 
-    def __init__(self, values: Mapping[str, Tensor]) -> None:
-        parameters = {name: value.detach().clone().requires_grad_() for name, value in values.items()}
-        self._adam = torch.optim.Adam(
-            [{"params": [parameter], "name": name} for name, parameter in parameters.items()],
-            lr=0.0,
-            eps=1e-15,
-            fused=True,
-        )
+        Args:
+            values: initial float32 values by name. Rows are what :meth:`keep` selects.
+            bounds: smallest and largest value that a step may reach, by name; by default none.
+            factors: ``(N,)`` float32 factors of the learning rate of each row, by name; 1 by default.
+        """
+        self._bounds, factors = bounds or {}, factors or {}
+        self._leaves = {name: _leaf(value.detach().clone(), factors.get(name)) for name, value in values.items()}
 
     @property
     def parameters(self) -> dict[str, Tensor]:
         """Current parameters by name; :meth:`keep` replaces them."""
-        return {group["name"]: group["params"][0] for group in self._adam.param_groups}
+        return {name: leaf.value for name, leaf in self._leaves.items()}
 
-    def step(self, rates: Mapping[str, float]) -> None:
+    def step(self, rates: Mapping[str, float], rows: RowGradients | None = None) -> None:
         """Make an Adam step at these learning rates, and clear the gradients.
 
-        NaN and infinite gradients count as 0, others are clamped to :data:`MAX_GRADIENT`.
+        Parameters without any gradient stay. NaN and infinite gradients count as 0, others are clamped to
+        :data:`MAX_GRADIENT`. On the CPU, torch's number of threads is used; the result does not depend on it.
+
+        Args:
+            rates: learning rates by name.
+            rows: gradients of some rows, to which those of the tensors are added; for parameters on the CPU.
         """
-        for group in self._adam.param_groups:
-            group["lr"] = rates[group["name"]]
-            gradient = group["params"][0].grad
-            if gradient is not None:
-                gradient.nan_to_num_(0.0, 0.0, 0.0).clamp_(-MAX_GRADIENT, MAX_GRADIENT)
-        self._adam.step()
-        self._adam.zero_grad()
+        index, of_rows = (np.empty(0, np.int32), {}) if rows is None else rows
+        parts: list[Callable[[], None]] = []
+        for name, leaf in self._leaves.items():
+            if leaf.value.grad is None and name not in of_rows:
+                continue
+            leaf.steps += 1
+            smallest, largest = self._bounds.get(name, (-math.inf, math.inf))
+            if leaf.value.device.type == "cpu":
+                parts += _parts(leaf, rates[name], index, of_rows.get(name, NONE), smallest, largest)
+            else:
+                _step_by_torch(leaf, rates[name], smallest, largest)
+        with Workers(torch.get_num_threads()) as pool:
+            pool.map(lambda part: part(), parts)
+        for leaf in self._leaves.values():
+            leaf.value.grad = None
 
     def keep(self, index: Int[np.ndarray, " M"]) -> None:
         """Keep only the rows at ``index``, with their moments."""
-        for group in self._adam.param_groups:
-            old = group["params"][0]
-            rows = torch.from_numpy(index).to(old.device)
-            state = self._adam.state.pop(old, {})
-            parameter = old.detach()[rows].requires_grad_()
-            group["params"] = [parameter]
-            if state:
-                self._adam.state[parameter] = {"step": state["step"], **{name: state[name][rows] for name in MOMENTS}}
+        for leaf in self._leaves.values():
+            rows = torch.from_numpy(index).to(leaf.value.device)
+            leaf.value = leaf.value.detach()[rows].requires_grad_()
+            leaf.mean, leaf.square = leaf.mean[rows], leaf.square[rows]
+            leaf.factors = None if leaf.factors is None else leaf.factors[rows]
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return parameters and Adam's state as arrays, see :meth:`restore`."""
+        """Return parameters and moments as arrays, see :meth:`restore`."""
         arrays = {}
-        for name, parameter in self.parameters.items():
-            arrays[name] = parameter.detach().cpu().numpy()
-            for part, value in self._adam.state.get(parameter, {}).items():
-                arrays[f"{name}.{part}"] = value.cpu().numpy()
+        for name, leaf in self._leaves.items():
+            arrays[name] = leaf.value.detach().cpu().numpy()
+            if leaf.steps:
+                arrays[f"{name}.step"] = np.asarray(leaf.steps)
+                arrays[f"{name}.exp_avg"] = leaf.mean.cpu().numpy()
+                arrays[f"{name}.exp_avg_sq"] = leaf.square.cpu().numpy()
         return arrays
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from a :meth:`state` of parameters of equal shapes."""
-        for name, parameter in self.parameters.items():
+        for name, leaf in self._leaves.items():
+            parts = [(leaf.value, name), (leaf.mean, f"{name}.exp_avg"), (leaf.square, f"{name}.exp_avg_sq")]
+            leaf.steps = int(state.get(f"{name}.step", 0))
             with torch.no_grad():
-                parameter.copy_(torch.from_numpy(state[name].copy()))
-            parts = {part: state[f"{name}.{part}"] for part in ("step", *MOMENTS) if f"{name}.{part}" in state}
-            if parts:
-                self._adam.state[parameter] = {
-                    part: torch.from_numpy(value.copy()).to(parameter.device) for part, value in parts.items()
-                }
+                for tensor, key in parts[: 3 if leaf.steps else 1]:
+                    tensor.copy_(torch.from_numpy(state[key]))
+
+
+def _leaf(value: Tensor, factors: Tensor | None) -> _Leaf:
+    if factors is not None:
+        factors = factors.to(value.device).reshape(-1, *[1] * (value.ndim - 1)).expand_as(value).contiguous()
+    value = value.contiguous()
+    return _Leaf(value.requires_grad_(), torch.zeros_like(value), torch.zeros_like(value), 0, factors)
+
+
+def _parts(
+    leaf: _Leaf,
+    rate: float,
+    rows: Int32[np.ndarray, " R"],
+    of_rows: Float32[np.ndarray, "R ..."],
+    smallest: float,
+    largest: float,
+) -> list[Callable[[], None]]:
+    """Return the parts of a step on the CPU. They do not depend on the number of threads, nor does their rounding."""
+    count, everywhere = len(leaf.value), leaf.value.grad
+    values, mean, square = (tensor.detach().numpy().reshape(-1) for tensor in (leaf.value, leaf.mean, leaf.square))
+    slopes = NONE if everywhere is None else everywhere.contiguous().numpy().reshape(-1)
+    factors = NONE if leaf.factors is None else leaf.factors.numpy().reshape(-1)
+    corrections = min(rate / (1 - BETA1**leaf.steps), MAX_RATE), 1 / math.sqrt(1 - BETA2**leaf.steps)
+    constants = np.array([*corrections, MAX_GRADIENT, smallest, largest], np.float32)
+    rows, of_rows = rows if len(of_rows) else rows[:0], of_rows.reshape(-1)
+    width = len(values) // max(count, 1)
+    step = max(1, PART // max(width, 1))
+    return [
+        partial(
+            adam,
+            values,
+            mean,
+            square,
+            rows,
+            of_rows,
+            slopes,
+            factors,
+            width,
+            first,
+            min(first + step, count),
+            constants,
+        )
+        for first in range(0, count, step)
+    ]
+
+
+@torch.no_grad()
+def _step_by_torch(leaf: _Leaf, rate: float, smallest: float, largest: float) -> None:
+    """Make a step by torch, on any device."""
+    gradient = leaf.value.grad
+    if gradient is None:
+        return
+    gradient.nan_to_num_(0.0, 0.0, 0.0).clamp_(-MAX_GRADIENT, MAX_GRADIENT)
+    most = 1.0 if leaf.factors is None or not len(leaf.factors) else float(leaf.factors.max())
+    before = None if leaf.factors is None else leaf.value.detach().clone()
+    torch_adam(
+        [leaf.value],
+        [gradient],
+        [leaf.mean],
+        [leaf.square],
+        [],
+        [torch.tensor(leaf.steps - 1.0, device=leaf.value.device)],
+        fused=True,
+        amsgrad=False,
+        beta1=BETA1,
+        beta2=BETA2,
+        lr=rate * most,
+        weight_decay=0.0,
+        eps=EPSILON,
+        maximize=False,
+    )
+    if before is not None and leaf.factors is not None:
+        leaf.value.sub_(before).mul_(leaf.factors / most).add_(before)
+    leaf.value.clamp_(smallest, largest)

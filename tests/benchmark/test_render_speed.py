@@ -26,7 +26,8 @@ def test_a_cost_has_sizes_counts_and_positive_times(table):
     cost = rendering_cost(table, [VIEW], progress=lambda stage, fraction: stages.append(stage))
     assert (cost.gaussians, cost.width, cost.height, cost.views) == (4000, 96, 64, 1)
     assert 100 < cost.visible <= 4000
-    assert min(cost.render, cost.render_and_backward, cost.loss, cost.removal_scores) > 0
+    assert min(cost.render, cost.render_and_backward, cost.loss, cost.adam, cost.removal_scores) > 0
+    assert cost.training_step > 0
     assert "measure" in stages
     assert json.loads(json.dumps(cost.as_dict()))["gaussians"] == 4000
 

@@ -9,7 +9,8 @@ from scipy.stats import spearmanr
 import kissgs
 from kissgs.core.errors import Cancelled
 from kissgs.core.threads import Workers
-from kissgs.rendering.cpu.frame import differentiate, draw
+from kissgs.rendering.cpu.frame import draw
+from kissgs.rendering.cpu.gradients import differentiate
 from kissgs.rendering.rasterizer import removal_scores, render
 
 

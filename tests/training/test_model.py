@@ -6,7 +6,9 @@ import torch
 from helpers.training_scenes import cloud, same
 
 from kissgs.core.splats import ATTRIBUTES, OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN
+from kissgs.rendering.cpu.gradients import Gradients
 from kissgs.training.model import GaussianModel
+from kissgs.training.optimizer import PrunableAdam, _step_by_torch
 
 RATES = {name: 0.01 * (n + 1) for n, name in enumerate(ATTRIBUTES)}
 
@@ -134,3 +136,48 @@ def test_all_gaussians_can_be_removed():
     push(model, np.random.default_rng(0))
     model.keep(np.empty(0, np.int64))
     assert len(model) == len(model.splats()) == 0
+
+
+def test_steps_on_other_devices_are_the_same():
+    """Torch makes steps there; here it makes them on the CPU, for lack of another device."""
+    rng, factors = np.random.default_rng(4), torch.exp(torch.linspace(-3, 3, 40))
+    one, other = (PrunableAdam({"a": torch.zeros(40, 5)}, {"a": (-0.1, 0.2)}, {"a": factors}) for _ in range(2))
+    for number in range(6):
+        gradient = torch.from_numpy(rng.normal(size=(40, 5)).astype(np.float32))
+        gradient[number] = float(rng.choice([np.nan, np.inf, 3e38]))
+        for adam in (one, other):
+            adam.parameters["a"].grad = gradient.clone()
+        one.step({"a": 0.01})
+        (leaf,) = other._leaves.values()
+        leaf.steps += 1
+        _step_by_torch(leaf, 0.01, -0.1, 0.2)
+    for name, value in one.state().items():
+        np.testing.assert_allclose(value, other.state()[name], rtol=1e-5, atol=1e-7)
+    assert len(np.unique(one.state()["a"])) > 100
+
+
+def test_gradients_of_a_few_gaussians_count_as_0_for_the_others():
+    """The moments of the others decay, and they go on moving, as in Adam."""
+    scene, rng = cloud(50, 2), np.random.default_rng(5)
+    extents = np.exp(rng.normal(size=50)).astype(np.float32)
+    model, oracle = (
+        GaussianModel(scene, extents=extents),
+        {name: NaiveAdam(getattr(scene, name)) for name in ATTRIBUTES},
+    )
+    for step in range(12):
+        total = {name: np.zeros(parameter.shape) for name, parameter in model.parameters.items()}
+        for _ in range(step % 3):  # several images, one, or none
+            gaussians = np.sort(rng.permutation(len(model))[:15]).astype(np.int32)
+            found = [rng.normal(size=total[name][gaussians].shape).astype(np.float32) for name in ATTRIBUTES]
+            model.receive(Gradients(gaussians, *found))
+            for name, gradient in zip(ATTRIBUTES, found, strict=True):
+                total[name][gaussians] += gradient
+        penalty = rng.normal(size=len(model))
+        model.parameters["opacities"].grad = torch.from_numpy(penalty.astype(np.float32))
+        total["opacities"] += penalty
+        model.step(RATES)
+        for name in ATTRIBUTES if step % 3 else ("opacities",):
+            rate = RATES[name] * (extents[:, None] if name == "means" else 1)
+            oracle[name].step(total[name], rate)
+    for name, parameter in model.parameters.items():
+        np.testing.assert_allclose(parameter.detach().numpy(), oracle[name].value, rtol=2e-5, atol=2e-5)

@@ -1,4 +1,4 @@
-"""One image on the CPU: rendering, gradients, removal scores and sensitivity, independent of the number of threads.
+"""One image on the CPU: rendering, removal scores and sensitivity, independent of the number of threads.
 
 Sums over several tiles go through slots: one per pair of footprint and tile, numbered footprint by footprint. A tile
 writes its own slots, and the slots of a footprint are added in order.
@@ -14,11 +14,11 @@ import numpy as np
 from kissgs.core.array_types import Float32, Float64, Int32, Int64, Shaped
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 from kissgs.core.sensitivity import Sensitivity
-from kissgs.core.splats import ATTRIBUTES, SH_C0, Splats
+from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.core.threads import Workers
 from kissgs.rendering import constants
 from kissgs.rendering.camera import Camera
-from kissgs.rendering.cpu import blending, projection, sensitivity, shading
+from kissgs.rendering.cpu import blending, sensitivity
 from kissgs.rendering.cpu.lists import (
     PROJECTION_CONSTANTS,
     Footprints,
@@ -64,18 +64,6 @@ class Frame:
     footprints: Footprints
     lists: TileLists
     stops: Int32[np.ndarray, "tiles 256"]
-
-
-@dataclass(frozen=True, slots=True)
-class Gradients:
-    """Gradients of a loss by the stored parameters, with the shapes of :class:`kissgs.Splats`."""
-
-    means: Float32[np.ndarray, "N 3"]
-    quats: Float32[np.ndarray, "N 4"]
-    scales: Float32[np.ndarray, "N 3"]
-    opacities: Float32[np.ndarray, " N"]
-    sh0: Float32[np.ndarray, "N 3"]
-    shN: Float32[np.ndarray, "N K 3"]
 
 
 def draw(
@@ -134,125 +122,6 @@ def _draw(splats: Splats, camera: Camera, background: Float32[np.ndarray, "3"], 
 
     each_part(blend, even_tiles(lists, pool), pool)
     return Frame(splats, image, transmittance, camera, background, footprints, lists, stops)
-
-
-def differentiate(
-    frame: Frame,
-    v_image: Float32[np.ndarray, "H W 3"],
-    v_alpha: Float32[np.ndarray, "H W"],
-    pool: Workers,
-) -> Gradients:
-    """Return the gradients of a loss by the stored parameters.
-
-    Args:
-        frame: a rendered image.
-        v_image: ``(H, W, 3)`` gradient of the loss by the image.
-        v_alpha: ``(H, W)`` gradient of the loss by alpha.
-        pool: threads; the result does not depend on their number.
-
-    Raises:
-        MemoryError: there is not enough memory.
-    """
-    splats = frame.splats
-    camera, lists, visible, records = frame.camera, frame.lists, frame.footprints.visible, frame.footprints.records
-    slots = number_slots(frame.footprints, lists, 0, len(lists.starts) - 1)
-    v_slots = np.empty((len(lists.members), 9), np.float32)
-
-    def blend(first: int, last: int) -> None:
-        blending.blend_backward(
-            records,
-            lists.members,
-            lists.spans,
-            slots.of,
-            lists.starts,
-            first,
-            last,
-            lists.columns,
-            LIMITS,
-            frame.background,
-            frame.transmittance,
-            frame.stops,
-            v_image,
-            v_alpha,
-            v_slots,
-        )
-
-    each_part(blend, even_tiles(lists, pool), pool)
-    found = Gradients(*(np.zeros(getattr(splats, name).shape, np.float32) for name in Gradients.__slots__))
-    v_colors = np.empty((len(visible), 3), np.float64)
-
-    def project(first: int, last: int) -> None:
-        projection.project_backward(
-            splats.means,
-            splats.quats,
-            splats.scales,
-            splats.opacities,
-            visible,
-            slots.rows,
-            slots.first,
-            v_slots,
-            first,
-            last,
-            camera.viewmat,
-            camera.K,
-            camera.width,
-            camera.height,
-            PROJECTION_CONSTANTS,
-            found.means,
-            found.quats,
-            found.scales,
-            found.opacities,
-            v_colors,
-        )
-        shading.shade_backward(
-            splats.means,
-            splats.shN,
-            camera.position,
-            visible,
-            slots.rows,
-            first,
-            last,
-            records,
-            v_colors,
-            found.means,
-            found.sh0,
-            found.shN,
-        )
-
-    each_part(project, even(len(slots.rows), pool), pool)
-    return found
-
-
-def add_color_gradients(
-    frame: Frame, v_image: Float32[np.ndarray, "H W 3"], into: Float32[np.ndarray, "N 3"], pool: Workers
-) -> None:
-    """Add the gradients of a loss by ``sh0`` alone, given its gradient by the image, ``v_image``, to ``into``."""
-    lists, visible, records = frame.lists, frame.footprints.visible, frame.footprints.records
-    slots = number_slots(frame.footprints, lists, 0, len(lists.starts) - 1)
-    v_slots = np.empty((len(lists.members), 3), np.float32)
-
-    def blend(first: int, last: int) -> None:
-        blending.blend_colors_backward(
-            records,
-            lists.members,
-            lists.spans,
-            slots.of,
-            lists.starts,
-            first,
-            last,
-            lists.columns,
-            LIMITS,
-            frame.stops,
-            v_image,
-            v_slots,
-        )
-
-    each_part(blend, even_tiles(lists, pool), pool)
-
-    def add(first: int, last: int) -> None:
-        blending.add_colors(v_slots, records, slots.rows, slots.first, visible, first, last, SH_C0, into)
-
-    each_part(add, even(len(slots.rows), pool), pool)
 
 
 def removal_scores(frame: Frame, pool: Workers) -> Float64[np.ndarray, " N"]:

@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 
 from kissgs.core.numba_kernels import compiled
-from kissgs.rendering.cpu.blending import _FAST, _exp_minus, _footprint, _gathered, _pixel_centres
+from kissgs.rendering.cpu.blending import _FAST, _copy_records, _exp_minus, _footprint, _pixel_centres
 from kissgs.rendering.cpu.projection import (
     Vector,
     _applied,
@@ -75,7 +75,7 @@ def moments(
     height, width = transmittance.shape
     variance = np.float32(3 * spread * spread)
     # Per pixel: x, y, stop, T; R, G, B behind the Gaussian, and transmittance to the background behind it.
-    s = np.empty(8 * 256, np.float32)
+    s, copies = np.empty(8 * 256, np.float32), np.empty((64, 9), np.float32)
     _pixel_centres(s)
     for tile in range(first, last):
         x0, y0 = (tile % columns) * 16, (tile // columns) * 16
@@ -89,50 +89,52 @@ def moments(
             s[1792 + p] = one
         for i in range(begin + last_stop, starts[tile + 1]):
             sums[slots[i - slots_begin], :] = zero
-        near = _gathered(records, members[begin : begin + last_stop])
-        for i in range(begin + last_stop - 1, begin - 1, -1):
-            (mx, my, l0, l1, l2), (opacity, red, green, blue) = _footprint(near, i - begin, x0, y0)
-            red, green, blue = min(red, max_color), min(green, max_color), min(blue, max_color)
-            top, bottom = np.uint64(spans[i] >> 5), np.uint64(spans[i] & 31)
-            index = np.float32(i - begin)
-            m0, m20, m11, m02, m40, m31, m22, m13, m04 = zero, zero, zero, zero, zero, zero, zero, zero, zero
-            squared_weight = zero
-            for p in range(top * np.uint64(16), bottom * np.uint64(16)):
-                dx, dy = s[p] - mx, s[p + np.uint64(256)] - my
-                u, v = l0 * dx + l1 * dy, l2 * dy
-                full = opacity * _exp_minus(u * u + v * v)
-                alpha = min(full, alpha_max)
-                alpha = alpha if alpha >= alpha_min else zero
-                alpha = alpha if index < s[p + np.uint64(512)] else zero
-                t = s[p + np.uint64(768)] / (one - alpha)
-                s[p + np.uint64(768)] = t
-                dr = alpha * (red - s[p + np.uint64(1024)])
-                dg = alpha * (green - s[p + np.uint64(1280)])
-                db = alpha * (blue - s[p + np.uint64(1536)])
-                s[p + np.uint64(1024)] += dr
-                s[p + np.uint64(1280)] += dg
-                s[p + np.uint64(1536)] += db
-                weight = alpha * t
-                squared_weight += weight * weight
-                background_change = alpha * s[p + np.uint64(1792)]
-                s[p + np.uint64(1792)] -= background_change
-                g = t * t * (dr * dr + dg * dg + db * db + variance * (background_change * background_change))
-                m0 += g
-                g = g if full <= alpha_max else zero
-                uu, uv, vv = u * u, u * v, v * v
-                guu, gvv = g * uu, g * vv
-                m20 += guu
-                m11 += g * uv
-                m02 += gvv
-                m40 += guu * uu
-                m31 += guu * uv
-                m22 += guu * vv
-                m13 += gvv * uv
-                m04 += gvv * vv
-            slot = slots[i - slots_begin]
-            sums[slot, 0], sums[slot, 1], sums[slot, 2], sums[slot, 3] = m0, m20, m11, m02
-            sums[slot, 4], sums[slot, 5], sums[slot, 6], sums[slot, 7], sums[slot, 8] = m40, m31, m22, m13, m04
-            sums[slot, 9] = squared_weight
+        for end in range(begin + last_stop, begin, -64):
+            start = max(begin, end - 64)
+            _copy_records(records, members, start, end, copies)
+            for i in range(end - 1, start - 1, -1):
+                (mx, my, l0, l1, l2), (opacity, red, green, blue) = _footprint(copies, i - start, x0, y0)
+                red, green, blue = min(red, max_color), min(green, max_color), min(blue, max_color)
+                top, bottom = np.uint64(spans[i] >> 5), np.uint64(spans[i] & 31)
+                index = np.float32(i - begin)
+                m0, m20, m11, m02, m40, m31, m22, m13, m04 = zero, zero, zero, zero, zero, zero, zero, zero, zero
+                squared_weight = zero
+                for p in range(top * np.uint64(16), bottom * np.uint64(16)):
+                    dx, dy = s[p] - mx, s[p + np.uint64(256)] - my
+                    u, v = l0 * dx + l1 * dy, l2 * dy
+                    full = opacity * _exp_minus(u * u + v * v)
+                    alpha = min(full, alpha_max)
+                    alpha = alpha if alpha >= alpha_min else zero
+                    alpha = alpha if index < s[p + np.uint64(512)] else zero
+                    t = s[p + np.uint64(768)] / (one - alpha)
+                    s[p + np.uint64(768)] = t
+                    dr = alpha * (red - s[p + np.uint64(1024)])
+                    dg = alpha * (green - s[p + np.uint64(1280)])
+                    db = alpha * (blue - s[p + np.uint64(1536)])
+                    s[p + np.uint64(1024)] += dr
+                    s[p + np.uint64(1280)] += dg
+                    s[p + np.uint64(1536)] += db
+                    weight = alpha * t
+                    squared_weight += weight * weight
+                    background_change = alpha * s[p + np.uint64(1792)]
+                    s[p + np.uint64(1792)] -= background_change
+                    g = t * t * (dr * dr + dg * dg + db * db + variance * (background_change * background_change))
+                    m0 += g
+                    g = g if full <= alpha_max else zero
+                    uu, uv, vv = u * u, u * v, v * v
+                    guu, gvv = g * uu, g * vv
+                    m20 += guu
+                    m11 += g * uv
+                    m02 += gvv
+                    m40 += guu * uu
+                    m31 += guu * uv
+                    m22 += guu * vv
+                    m13 += gvv * uv
+                    m04 += gvv * vv
+                slot = slots[i - slots_begin]
+                sums[slot, 0], sums[slot, 1], sums[slot, 2], sums[slot, 3] = m0, m20, m11, m02
+                sums[slot, 4], sums[slot, 5], sums[slot, 6], sums[slot, 7], sums[slot, 8] = m40, m31, m22, m13, m04
+                sums[slot, 9] = squared_weight
 
 
 Products = tuple[float, float, float]

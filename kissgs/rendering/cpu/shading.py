@@ -100,55 +100,49 @@ def shade(
 
 
 @compiled(
-    "void(float32[:, ::1], float32[:, :, ::1], float64[::1], int32[::1], int32[::1], int64, int64, float32[:, ::1],"
+    "void(float32[:, ::1], float32[:, :, ::1], float64[::1], int32[::1], int64, int64,"
     " float64[:, ::1], float32[:, ::1], float32[:, ::1], float32[:, :, ::1])"
 )
 def shade_backward(
     means: np.ndarray,
     shN: np.ndarray,
     eye: np.ndarray,
-    visible: np.ndarray,
-    rows: np.ndarray,
+    gaussians: np.ndarray,
     first: int,
     last: int,
-    records: np.ndarray,
     v_colors: np.ndarray,
     v_means: np.ndarray,
     v_sh0: np.ndarray,
     v_shN: np.ndarray,
 ) -> None:
-    """Compute gradients by means and SH coefficients, of the footprints ``rows[first:last]``.
+    """Compute gradients by means and SH coefficients, of ``gaussians[first:last]``.
 
     Args:
-        means, shN, eye, visible, records: as for :func:`shade`.
-        rows, first, last: as for :func:`kissgs.rendering.cpu.projection.project_backward`.
-        v_colors: ``(M, 3)`` gradients by the colours.
-        v_means: ``(N, 3)``; gradients are added.
-        v_sh0: out, ``(N, 3)``.
-        v_shN: out, ``(N, K, 3)``.
+        means, shN, eye: as for :func:`shade`.
+        gaussians, first, last, v_colors: as for :func:`kissgs.rendering.cpu.projection_backward.project_backward`.
+        v_means: ``(R, 3)``; gradients are added.
+        v_sh0: out, ``(R, 3)``.
+        v_shN: out, ``(R, K, 3)``.
     """
     rest = shN.shape[1]
     basis, v_basis = np.empty(15, np.float64), np.empty(15, np.float64)
     for i in range(first, last):
-        row = rows[i]
-        n = visible[row]
+        n = gaussians[i]
         x, y, z = means[n, 0] - eye[0], means[n, 1] - eye[1], means[n, 2] - eye[2]
         inverse = 1.0 / np.sqrt(x * x + y * y + z * z)
         x, y, z = x * inverse, y * inverse, z * inverse
         _harmonics(x, y, z, rest, basis)
-        red = v_colors[row, 0] if records[row, 6] > 0 else 0.0
-        green = v_colors[row, 1] if records[row, 7] > 0 else 0.0
-        blue = v_colors[row, 2] if records[row, 8] > 0 else 0.0
-        v_sh0[n, 0] = 0.28209479177387814 * red
-        v_sh0[n, 1] = 0.28209479177387814 * green
-        v_sh0[n, 2] = 0.28209479177387814 * blue
+        red, green, blue = v_colors[i, 0], v_colors[i, 1], v_colors[i, 2]
+        v_sh0[i, 0] = 0.28209479177387814 * red
+        v_sh0[i, 1] = 0.28209479177387814 * green
+        v_sh0[i, 2] = 0.28209479177387814 * blue
         for k in range(rest):
-            v_shN[n, k, 0] = basis[k] * red
-            v_shN[n, k, 1] = basis[k] * green
-            v_shN[n, k, 2] = basis[k] * blue
+            v_shN[i, k, 0] = basis[k] * red
+            v_shN[i, k, 1] = basis[k] * green
+            v_shN[i, k, 2] = basis[k] * blue
             v_basis[k] = shN[n, k, 0] * red + shN[n, k, 1] * green + shN[n, k, 2] * blue
         gx, gy, gz = _harmonics_gradient(x, y, z, rest, v_basis)
         along = gx * x + gy * y + gz * z  # the component along the direction changes only its length
-        v_means[n, 0] += (gx - along * x) * inverse
-        v_means[n, 1] += (gy - along * y) * inverse
-        v_means[n, 2] += (gz - along * z) * inverse
+        v_means[i, 0] += (gx - along * x) * inverse
+        v_means[i, 1] += (gy - along * y) * inverse
+        v_means[i, 2] += (gz - along * z) * inverse
