@@ -85,8 +85,13 @@ def moments(
             last_stop = max(last_stop, stops[tile, p])
             s[512 + p] = np.float32(stops[tile, p])
             s[768 + p] = transmittance[min(y0 + (p >> 4), height - 1), min(x0 + (p & 15), width - 1)]
-            s[1024 + p], s[1280 + p], s[1536 + p] = background[0], background[1], background[2]
-            s[1792 + p] = one
+            s[1024 + p], s[1280 + p], s[1536 + p], s[1792 + p] = background[0], background[1], background[2], one
+            if begin + stops[tile, p] < starts[tile + 1]:  # what is behind the end has about the colour of the next
+                n = members[begin + stops[tile, p]]
+                s[1024 + p] = min(records[n, 6], max_color)
+                s[1280 + p] = min(records[n, 7], max_color)
+                s[1536 + p] = min(records[n, 8], max_color)
+                s[1792 + p] = zero
         for i in range(begin + last_stop, starts[tile + 1]):
             sums[slots[i - slots_begin], :] = zero
         for end in range(begin + last_stop, begin, -64):
