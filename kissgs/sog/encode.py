@@ -19,7 +19,8 @@ from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.quantize import Quantized
 from kissgs.planning.sh_codebook import COEFFICIENTS
 from kissgs.settings import EncodeSettings
-from kissgs.sog.metadata import ENTRIES_PER_ROW, FIRST_TAG, META_NAME
+from kissgs.sog.metadata import ENTRIES_PER_ROW, FIRST_TAG
+from kissgs.sog.names import META_NAME
 
 MEANS, QUATS, SCALES, SH0 = ("means_l.webp", "means_u.webp"), "quats.webp", "scales.webp", "sh0.webp"
 SHN = ("shN_centroids.webp", "shN_labels.webp")
