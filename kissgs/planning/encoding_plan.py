@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kissgs.core.array_types import Int
+from kissgs.core.array_types import UInt8
 from kissgs.planning.layout import Grid
 from kissgs.planning.quantize import Quantized
 from kissgs.planning.rd_model import Costs
@@ -35,7 +35,7 @@ class EncodingPlan:
     grid: Grid
     fields: dict[str, Quantized]
     codebook: Codebook
-    classes: Int[np.ndarray, " M"]
+    classes: UInt8[np.ndarray, " M"]
     form_error: float
     clipped_colors: int
     errors: dict[str, list[float]]
