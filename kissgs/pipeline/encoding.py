@@ -230,6 +230,7 @@ class Encoding:
                 sensitivity=sensitivity,
                 recolor=recolor,
                 container=MODELS[self.container],
+                keep_costs=self.settings.finetune.enabled,
                 threads=self.threads,
                 progress=without_kernels,
             )

@@ -8,6 +8,15 @@ from numba import njit
 from kissgs.core.numba_kernels import compiled
 
 
+@compiled("void(float32[:, ::1], float64[:, ::1])")
+def normalize(quats: np.ndarray, unit: np.ndarray) -> None:
+    """Write the quaternions ``(N, 4)``, divided by their lengths, to ``unit``."""
+    for n in range(quats.shape[0]):
+        w, x, y, z = np.float64(quats[n, 0]), np.float64(quats[n, 1]), np.float64(quats[n, 2]), np.float64(quats[n, 3])
+        length = np.sqrt(w * w + x * x + y * y + z * z)
+        unit[n, 0], unit[n, 1], unit[n, 2], unit[n, 3] = w / length, x / length, y / length, z / length
+
+
 @compiled("void(float64[:, ::1], float64[:, ::1], uint8[::1])")
 def largest_w(quats: np.ndarray, rotations: np.ndarray, forms: np.ndarray) -> None:
     """Write the form of largest w of each quaternion ``(N, 4)`` to ``forms``; among equals, the first of the table.

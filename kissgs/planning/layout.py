@@ -19,7 +19,7 @@ from kissgs.core.limits import MAX_GRID_SIDE
 from kissgs.core.threads import Workers
 from kissgs.planning.plas import plas
 from kissgs.planning.quantize import quantize_means
-from kissgs.planning.rows import for_each_block, selected
+from kissgs.planning.rows import for_each_block, selected, sorted_order
 from kissgs.settings import EncodeSettings
 
 PLAS_HIGH, PLAS_LOW = 1.0, 0.2
@@ -146,7 +146,7 @@ def hilbert_order(
     Returns:
         Indices of the Gaussians along the curve; Gaussians of equal position keep their order.
     """
-    from kissgs.planning import kernels, order_kernels
+    from kissgs.planning import kernels
 
     count = len(levels)
     keys = np.empty(count, np.uint64)
@@ -157,6 +157,4 @@ def hilbert_order(
             keys[rows] |= classes[rows].astype(np.uint64) << np.uint64(CURVE_BITS)
 
     for_each_block(count, work, pool)
-    order, scratch = np.empty(count, np.int32), np.empty(count, np.int32)
-    order_kernels.sort_keys(keys, order, np.empty_like(keys), scratch, 4 if classes is None else 6)
-    return order
+    return sorted_order(keys, CURVE_BITS if classes is None else 64)

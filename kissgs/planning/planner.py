@@ -26,6 +26,7 @@ def plan_encoding(
     sensitivity: Sensitivity | None = None,
     recolor: ColorRefit | None = None,
     container: ContainerModel = EVEN_LEVELS,
+    keep_costs: bool = True,
     threads: int = 0,
     progress: Progress = silent,
 ) -> EncodingPlan:
@@ -39,6 +40,7 @@ def plan_encoding(
         recolor: for rate-distortion planning: returns better ``sh0`` for the decoded Gaussians and their indices in
             the scene.
         container: what the container can hold.
+        keep_costs: whether the plan of rate-distortion planning has its costs, which fine-tuning needs.
         threads: number of threads; 0 means one per processor.
         progress: receives "kernels", "rate_distortion", "order", "forms", "codebook", "sort codebook" and "rounding".
 
@@ -52,7 +54,9 @@ def plan_encoding(
     kept = visible_gaussians(splats, settings)
     with blas_workers(threads) as pool:
         if sensitivity is not None and (sensitivity.color_weight[kept] > 0).any():
-            return plan_rate_distortion(splats, kept, sensitivity, recolor, settings, container, pool, progress)
+            return plan_rate_distortion(
+                splats, kept, sensitivity, recolor, settings, container, pool, progress, keep_costs=keep_costs
+            )
         return plan_uniform(splats, kept, settings, container, pool, progress)
 
 

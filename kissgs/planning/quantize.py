@@ -167,9 +167,12 @@ def means_bits(splats: Splats, kept: Int[np.ndarray, " M"], tolerance: float, po
 
     def work(rows: slice) -> None:
         some = kept[rows]
-        reach = 1 + np.abs(splats.means[some]).max(axis=1).astype(np.float64)
-        longest = np.sort(splats.scales[some], axis=1)[:, 1:].mean(axis=1, dtype=np.float64)
-        ratio[rows] = longest - np.log(reach)
+        x, y, z = np.abs(splats.means.take(some, axis=0)).T
+        reach = 1 + np.maximum(np.maximum(x, y), z).astype(np.float64)
+        a, b, c = splats.scales.take(some, axis=0).T
+        largest, smaller = np.maximum(a, b), np.minimum(a, b)
+        second = np.maximum(smaller, np.minimum(largest, c))
+        ratio[rows] = (np.maximum(largest, c).astype(np.float64) + second) / 2 - np.log(reach)
 
     for_each_block(len(kept), work, pool)
     allowed = tolerance * np.exp(np.median(ratio, overwrite_input=True))

@@ -68,6 +68,8 @@ def plan_rate_distortion(
     container: ContainerModel,
     pool: Workers,
     progress: Progress,
+    *,
+    keep_costs: bool = True,
 ) -> EncodingPlan:
     """Plan the Gaussians ``kept``, at least one of which a camera has seen, for a container."""
     progress("rate_distortion", 0.0)
@@ -96,9 +98,15 @@ def plan_rate_distortion(
     grid = layout_grid(splats.means, kept, 16, settings, pool, lambda fraction: progress("order", fraction), classes)
     grid = grid.with_padding_last() if container.padding_last else grid
     order = grid.cells[grid.mask]
-    rank = np.searchsorted(kept, order)
-    classes, costs = classes[rank], costs.take(rank)
-    del rank, kept
+    place = np.empty(len(splats), np.int32)
+    place[kept] = np.arange(len(kept), dtype=np.int32)
+    rank = place.take(order)
+    del place, kept
+    ordered = classes.take(rank)
+    if container.tables is None:
+        criterion = RdCriterion(costs, classes, rd_lambda, ordered)
+    else:
+        criterion = RdCriterion(costs.take(rank), ordered, rd_lambda)
 
     progress("forms", 0.0)
     shapes, form_error = choose_forms(
@@ -112,9 +120,9 @@ def plan_rate_distortion(
     codebook = fit_codebook(splats, order, weights, size, settings, container, pool, progress)
     del weights
     progress("rounding", 0.0)
-    captured = sensitivity.captured[order]
-    largest = largest_changes(sensitivity.coverage[order], captured, slack)
-    quantizer = RdFields(container, settings, RdCriterion(costs, classes, rd_lambda), largest, pool)
+    captured = sensitivity.captured.take(order)
+    largest = largest_changes(sensitivity.coverage.take(order), captured, slack)
+    quantizer = RdFields(container, settings, criterion, largest, pool)
     fields = quantizer.shapes(shapes, selected(sensitivity.shape_hessian, order))
     fields["means"] = quantizer.means(splats, order, np.rint(captured + np.log2(slack)).astype(np.int8))
 
@@ -131,11 +139,11 @@ def plan_rate_distortion(
             "f_rest_centroids": codebook.centroids,
         },
         codebook=codebook,
-        classes=classes,
+        classes=ordered,
         form_error=form_error,
         clipped_colors=clipped,
         errors={**errors, "f_rest_centroids": codebook.errors},
-        costs=costs,
+        costs=costs.take(rank) if keep_costs else None,
         rd_lambda=rd_lambda,
         note=note,
     )
@@ -150,12 +158,13 @@ def _compensated_colors(
     pool: Workers,
 ) -> Float32[np.ndarray, "M 3"]:
     """Return base colours that make up for what the codebook loses of each Gaussian's shN, where cameras see it."""
-    base = splats.sh0[order]
+    base = splats.sh0.take(order, axis=0)
 
     def compensate(rows: slice) -> None:
         some = order[rows]
-        lost = splats.shN[some] - entries[labels[rows]]
-        change = np.einsum("nk,nkc->nc", sensitivity.mean_sh_basis[some], lost) / np.float32(SH_C0)
+        lost = splats.shN.take(some, axis=0) - entries.take(labels[rows], axis=0)
+        basis = sensitivity.mean_sh_basis.take(some, axis=0)
+        change = np.einsum("nk,nkc->nc", basis, lost) / np.float32(SH_C0)
         base[rows] += np.clip(change, -MAX_COMPENSATION, MAX_COMPENSATION)
 
     if splats.sh_degree > 0:
@@ -235,6 +244,8 @@ def _codebook_error_model(
 
 def _sh_weights(sensitivity: Sensitivity, chosen: Int[np.ndarray, " M"], splats: Splats) -> Float32[np.ndarray, " M"]:
     """Return the weight of each Gaussian's SH vector in the codebook."""
+    if splats.sh_degree == 0:
+        return np.ones(len(chosen), np.float32)
     power = np.float32(max(1 - SENSITIVITY_SHRINK * sensitivity.view_uncertainty, 0.0))
     sizes = size_weights(splats, SIZE_POWER * sensitivity.view_uncertainty)[chosen]
     return bounded_weights(sensitivity.color_weight[chosen] ** power * sizes, *SH_WEIGHTS)

@@ -77,10 +77,10 @@ class RdFields:
         unit = max(log_extent(means, self.pool), 1e-30) / MEANS_TOP
         steps = criterion.class_steps(criterion.costs.position)
         if self.container.tables is not None:
-            each = np.array(steps)[criterion.classes]
+            each = np.array(steps)[criterion.row_classes]
             return table_fields.means_field(means[:], np.minimum(each, unit * 2.0**most / np.sqrt(2)))
         coarse = np.array([min(max(np.floor(np.log2(step / unit) + 0.5), 0), 8) for step in steps]).astype(np.int8)
-        return quantize_means(means, bits=16 - np.minimum(coarse[criterion.classes], most), pool=self.pool)
+        return quantize_means(means, bits=16 - np.minimum(coarse[criterion.row_classes], most), pool=self.pool)
 
     def colors(self, base: Float32[np.ndarray, "M 3"]) -> tuple[Quantized, int]:
         """Quantise base colours; return them and the number of clipped outliers."""

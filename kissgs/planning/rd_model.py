@@ -20,7 +20,7 @@ from kissgs.core.signed_log import signed_log
 from kissgs.core.splats import Splats
 from kissgs.core.threads import Workers
 from kissgs.planning.quantize import means_bits
-from kissgs.planning.rows import Rows, for_each_block, row_range, selected
+from kissgs.planning.rows import Rows, for_each_block, row_range, selected, sorted_order
 from kissgs.settings import EncodeSettings
 
 FLOOR = 1e-3
@@ -102,7 +102,7 @@ class Costs:
 
     def take(self, chosen: Int[np.ndarray, " k"]) -> Costs:
         """Return the costs of the Gaussians ``chosen``."""
-        return Costs(**{name: getattr(self, name)[chosen] for name in Costs.__slots__})
+        return Costs(**{name: getattr(self, name).take(chosen) for name in Costs.__slots__})
 
     def classes(self, number: int, means: Float32[np.ndarray, "M 3"] | Rows) -> UInt8[np.ndarray, " M"]:
         """Return the sensitivity class of each Gaussian, from 0, the most sensitive; classes have similar sizes.
@@ -113,7 +113,7 @@ class Costs:
         count = len(means)
         each = min(number, count)
         classes = np.empty(count, np.uint8)
-        order = np.argsort(self._least_worth(), kind="stable")
+        order = sorted_order(self._worth_keys())
         for label in range(each):  # class = rank · number / count, rounded down
             classes[order[-(-count * label // each) : -(-count * (label + 1) // each)]] = label
         del order
@@ -121,12 +121,17 @@ class Costs:
         used = np.flatnonzero(np.bincount(classes, minlength=1))
         return np.searchsorted(used, np.arange(256)).astype(np.uint8)[classes]
 
-    def _least_worth(self) -> Float64[np.ndarray, " M"]:
-        """Return numbers by which Gaussians are ordered, the most sensitive first."""
-        worth = np.log(self.scale)
-        worth += np.log(self.rotation)
-        worth += np.log(self.color)
-        return np.negative(worth, out=worth)
+    def _worth_keys(self) -> UInt64[np.ndarray, " M"]:
+        """Return numbers by which Gaussians are ordered, the most sensitive first: bits of float64 that sort alike."""
+        keys = np.empty(len(self.scale), np.uint64)
+
+        def write(rows: slice) -> None:
+            worth = np.log(self.scale[rows]) + np.log(self.rotation[rows]) + np.log(self.color[rows])
+            bits = (0.0 - worth).view(np.uint64)
+            keys[rows] = np.where(bits >> np.uint64(63), ~bits, bits | np.uint64(1 << 63))
+
+        for_each_block(len(keys), write)
+        return keys
 
     def pruned_by_rd(
         self, rd_lambda: float, threshold_bits: float, default_lambda: float | None = None
@@ -170,11 +175,18 @@ class RdCriterion:
         costs: costs of the M Gaussians.
         classes: ``(M,)`` sensitivity class of each, from 0; no class is empty.
         rd_lambda: squared error per bit.
+        ordered: ``(M,)`` classes in the order in which levels are chosen; None if that is the order of ``classes``.
     """
 
     costs: Costs
     classes: Integer[np.ndarray, " M"]
     rd_lambda: float
+    ordered: Integer[np.ndarray, " M"] | None = None
+
+    @property
+    def row_classes(self) -> Integer[np.ndarray, " M"]:
+        """Class of each Gaussian in the order in which levels are chosen."""
+        return self.classes if self.ordered is None else self.ordered
 
     def class_steps(self, cost: Float64[np.ndarray, " M"], channels: int = 1) -> list[float]:
         """Return the optimal step of each class for ``channels`` times the mean of ``cost``, error per squared unit."""
@@ -229,7 +241,8 @@ def default_error(costs: Costs, splats: Splats, kept: Int[np.ndarray, " M"], sh_
         kept: indices of the ``M`` Gaussians that a renderer draws.
         sh_model: error of the view-dependent colour, by codebook size.
     """
-    ends = {name: row_range(selected(getattr(splats, name), kept)) for name in ("opacities", "scales", "sh0", "means")}
+    scene = {"opacities": splats.opacities[:, None], "scales": splats.scales, "sh0": splats.sh0, "means": splats.means}
+    ends = {name: row_range(selected(values, kept)) for name, values in scene.items()}
     spans = [np.ptp(np.array(ends[name], np.float64), axis=0) for name in ("opacities", "scales", "sh0")]
     opacity, scale, color = (span / 255 for span in spans)
     log_extent = np.ptp(signed_log(np.array(ends["means"])), axis=0)
@@ -351,9 +364,8 @@ def _position_keys(means: Float32[np.ndarray, "M 3"] | Rows) -> UInt64[np.ndarra
 
 
 def _join_equal(key: UInt64[np.ndarray, " M"], classes: UInt8[np.ndarray, " M"]) -> None:
-    """Give all Gaussians of an equal ``key`` the smallest of their classes."""
-    order = np.argsort(key, kind="stable")
-    key = key[order]
+    """Give all Gaussians of an equal ``key`` the smallest of their classes; the keys are sorted."""
+    order = sorted_order(key)
     equal = np.flatnonzero(key[1:] == key[:-1])
     if len(equal) == 0:
         return

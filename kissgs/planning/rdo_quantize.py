@@ -31,9 +31,6 @@ for larger errors. A Gaussian smaller than a pixel has no derivative by its size
 nearby, so scales may grow less than they may shrink (``growth``).
 """
 
-_BOUNDS = ("opacities", "scales", "growth", "quaternions")
-"""Bounds of the shapes' attributes, in the order of the compiled loop."""
-
 SLACK_POWER = 1 / 3
 """Exponent with which these bounds grow with ``slack``, measured with cameras that the encoder did not use."""
 
@@ -54,13 +51,9 @@ def largest_changes(
 
     def change(name: str, rows: slice) -> Float64[np.ndarray, " n"]:
         seen, by_capture = coverage[rows].astype(np.float64), captured[rows].astype(np.float64)
-        return np.minimum(
-            UNSEEN[name] ** (1 - seen)
-            * VIRTUAL[name] ** (seen - by_capture)
-            * CAPTURED[name] ** by_capture
-            * slack**SLACK_POWER,
-            CAPTURED[name],
-        )
+        unseen, virtual, capture = np.log([UNSEEN[name], VIRTUAL[name], CAPTURED[name]])
+        logs = unseen * (1 - seen) + virtual * (seen - by_capture) + capture * by_capture
+        return np.minimum(np.exp(logs) * slack**SLACK_POWER, CAPTURED[name])
 
     return {name: Computed(len(coverage), partial(change, name)) for name in CAPTURED}
 
@@ -121,7 +114,7 @@ def quantize_by_class(
     extent = largest.astype(np.float64) - low
     widest = float(extent.max(initial=0))
     optimal = np.array(criterion.class_steps(cost, channels))
-    count, classes = len(values), criterion.classes
+    count, classes = len(values), criterion.row_classes
 
     def steps(rows: slice) -> Float64[np.ndarray, " n"]:
         return np.minimum(optimal[classes[rows]], coarsest[rows])
@@ -165,7 +158,7 @@ def rdo_quantize_shapes(
     """
     from kissgs.planning import rdo_kernels
 
-    costs, classes = criterion.costs, criterion.classes
+    costs, classes = criterion.costs, criterion.row_classes
     levels = np.concatenate([part.levels for part in parts], axis=1)
     low = np.concatenate([part.low for part in parts]).astype(np.float64)
     high = np.concatenate([part.high for part in parts]).astype(np.float64)
@@ -179,7 +172,6 @@ def rdo_quantize_shapes(
         rate_table = criterion.rd_lambda * level_bits(levels, classes, pool)
 
         def choose(rows: slice, rate_table: Float64[np.ndarray, "classes 8 256"] = rate_table) -> None:
-            opacities, scales, growth, quats = (largest[name][rows] for name in _BOUNDS)
             chosen = levels[rows].astype(np.int64)
             rdo_kernels.choose_levels(
                 values[rows],
@@ -192,9 +184,7 @@ def rdo_quantize_shapes(
                 steps,
                 top,
                 rate_table,
-                np.stack(
-                    [np.stack([opacities, *3 * [size], *4 * [quats]], axis=1) for size in (scales, growth)], axis=1
-                ),
+                _bounds(largest, rows),
                 floor,
                 SWEEPS,
                 chosen,
@@ -205,6 +195,16 @@ def rdo_quantize_shapes(
     ends = np.cumsum([0] + [part.levels.shape[1] for part in parts])
     chosen = [_from_zero(levels[:, a:b], part) for part, a, b in zip(parts, ends, ends[1:], strict=False)]
     return chosen[0], chosen[1], chosen[2]
+
+
+def _bounds(largest: Mapping[str, Float64[np.ndarray, " M"] | Rows], rows: slice) -> Float64[np.ndarray, "n 2 8"]:
+    """Return the largest distance of a level below and above each of the eight values."""
+    bounds = np.empty((len(range(rows.stop)[rows]), 2, 8))
+    bounds[:, :, 0] = largest["opacities"][rows][:, None]
+    bounds[:, 0, 1:4] = largest["scales"][rows][:, None]
+    bounds[:, 1, 1:4] = largest["growth"][rows][:, None]
+    bounds[:, :, 4:] = largest["quaternions"][rows][:, None, None]
+    return bounds
 
 
 def _from_zero(levels: UInt8[np.ndarray, "M C"], part: Quantized) -> Quantized:

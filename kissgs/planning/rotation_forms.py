@@ -64,7 +64,7 @@ class StoredShapes:
         """Return opacity logit, log-scales and unit quaternion of some rows."""
         quats, scales = self._turned(rows)
         values = np.empty((len(quats), 8))
-        values[:, 0] = self.splats.opacities[self.index[rows]]
+        values[:, 0] = self.splats.opacities.take(self.index[rows])
         values[:, 1:4], values[:, 4:] = scales, quats
         return values
 
@@ -89,7 +89,7 @@ class StoredShapes:
 
     def _turned(self, rows: slice) -> tuple[Float64[np.ndarray, "n 4"], Float32[np.ndarray, "n 3"]]:
         index = self.index[rows]
-        return apply_forms(unit_quats(self.splats, index), self.splats.scales[index], self.forms[rows])
+        return apply_forms(unit_quats(self.splats, index), self.splats.scales.take(index, axis=0), self.forms[rows])
 
 
 def choose_forms(
@@ -113,12 +113,12 @@ def choose_forms(
 
         for_each_block(len(cells), choose, pool)
     else:
-        quats, scales = unit_quats(splats, cells), splats.scales[cells]
+        quats, scales = unit_quats(splats, cells), splats.scales.take(cells, axis=0)
         forms = pras_forms(quats, scales, side, pool, decay=settings.plas_radius_decay, report=report)
     shapes = StoredShapes(splats, cells, forms)
 
     def error(rows: slice) -> float:
-        quats, scales = unit_quats(splats, cells[rows]), splats.scales[cells[rows]]
+        quats, scales = unit_quats(splats, cells[rows]), splats.scales.take(cells[rows], axis=0)
         return covariance_error(quats, scales, *apply_forms(quats, scales, forms[rows]))
 
     return shapes, max(for_each_block(len(cells), error, pool), default=0.0)
@@ -126,9 +126,11 @@ def choose_forms(
 
 def unit_quats(splats: Splats, index: Int[np.ndarray, " M"]) -> Float64[np.ndarray, "M 4"]:
     """Return the rotations of some Gaussians; float32 lengths are exact to 1e-7 only."""
-    quats = splats.quats[index].astype(np.float64)
-    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
-    return quats
+    from kissgs.planning import form_kernels
+
+    unit = np.empty((len(index), 4))
+    form_kernels.normalize(splats.quats.take(index, axis=0), unit)
+    return unit
 
 
 def apply_forms(

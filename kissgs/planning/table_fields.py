@@ -106,7 +106,7 @@ def criterion_steps(
     cost: Float64[np.ndarray, " M"], criterion: RdCriterion, coarsest: Float64[np.ndarray, " M"]
 ) -> Float64[np.ndarray, " M"]:
     """Return the step of each Gaussian: the best one of its class, at most ``coarsest``."""
-    return np.minimum(np.array(criterion.class_steps(cost))[criterion.classes], coarsest)
+    return np.minimum(np.array(criterion.class_steps(cost))[criterion.row_classes], coarsest)
 
 
 def color_field(

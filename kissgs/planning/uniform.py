@@ -58,7 +58,9 @@ def plan_uniform(
         source, cells, grid.side, settings, pool, lambda fraction: progress("forms", fraction)
     )
     chosen = cells[grid.mask]
-    weights = size_weights(source, settings.sh_weight_power)[chosen]
+    weights = np.ones(len(chosen), np.float32)
+    if source.sh_degree > 0:
+        weights = size_weights(source, settings.sh_weight_power)[chosen]
     size = max(len(chosen) / settings.gaussians_per_codebook_entry, FEW)
     codebook = fit_codebook(source, chosen, weights, size, settings, container, pool, progress)
     if container.tables is not None:
