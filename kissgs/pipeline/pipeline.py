@@ -202,6 +202,7 @@ def compress(
             finetune_checkpoint = finetune_checkpoint_path(Path(checkpoint))
     clock = StageTimer(progress)
     original, cleaned, source_bytes = open_scene(source, reading, threads, clock)
+    source_count, sh_degree = len(original) + cleaned.removed, original.sh_degree
     encoding = Encoding(
         splats=original,
         original=original,
@@ -216,7 +217,9 @@ def compress(
         packed=target is None or is_packed(target),
         threads=threads,
         progress=SearchNote(clock),
+        disposable=not (evaluate or isinstance(source, Splats)),
     )
+    del original
     compacted, search, trials = _compact_first(encoding, checkpoint)
     if compacted is not None:
         encoding = replace(encoding, splats=compacted.splats)
@@ -226,7 +229,7 @@ def compress(
     result, more = encoding.run(search)
     encoded = result.encoded
     container_bytes, file_bytes = stored_sizes(encoded.files, packed=encoding.packed)
-    evaluation = _evaluate(original, encoded.files, views, threads, after_search) if evaluate else None
+    evaluation = _evaluate(encoding.original, encoded.files, views, threads, after_search) if evaluate else None
     checkpoints = (None if compacted is None else compacted.checkpoint, finetune_checkpoint)
     if target is not None:
         after_search("write", 0.0)
@@ -234,9 +237,9 @@ def compress(
         delete_checkpoints(*checkpoints)
     clock.stop()
     report = Report(
-        source_count=len(original) + cleaned.removed,
+        source_count=source_count,
         count=len(encoded.order),
-        sh_degree=original.sh_degree,
+        sh_degree=sh_degree,
         source_bytes=source_bytes,
         container_bytes=container_bytes,
         file_bytes=file_bytes,

@@ -13,11 +13,27 @@ from kissgs.planning.rd_model import Costs
 from kissgs.planning.sh_codebook import Codebook
 
 
+@dataclass(frozen=True, slots=True)
+class PlannedScene:
+    """Facts of the scene that was planned, so that the scene itself is not needed any more.
+
+    Attributes:
+        count: number of Gaussians.
+        visible: number of Gaussians that the plan could keep: those that a renderer draws, or all.
+        sh_degree: 0 to 3.
+    """
+
+    count: int
+    visible: int
+    sh_degree: int
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class EncodingPlan:
     """Levels of every cell, and the errors that they cause.
 
     Attributes:
+        scene: the scene that was planned.
         grid: cell of each Gaussian.
         fields: levels by field of the metadata, one row per cell; ``f_rest_centroids``: one row per entry.
         codebook: the SH codebook, and the entry of each Gaussian.
@@ -32,6 +48,7 @@ class EncodingPlan:
         note: a sentence for the user if many Gaussians were pruned; else empty.
     """
 
+    scene: PlannedScene
     grid: Grid
     fields: dict[str, Quantized]
     codebook: Codebook

@@ -14,7 +14,7 @@ from kissgs.core.splats import SH_C0, Splats
 from kissgs.core.threads import Workers
 from kissgs.planning import kmeans
 from kissgs.planning.container_model import ContainerModel
-from kissgs.planning.encoding_plan import EncodingPlan
+from kissgs.planning.encoding_plan import EncodingPlan, PlannedScene
 from kissgs.planning.layout import layout_grid
 from kissgs.planning.rd_fields import RdFields, decoded_entries, decoded_scene, largest_errors
 from kissgs.planning.rd_model import (
@@ -73,6 +73,7 @@ def plan_rate_distortion(
 ) -> EncodingPlan:
     """Plan the Gaussians ``kept``, at least one of which a camera has seen, for a container."""
     progress("rate_distortion", 0.0)
+    scene = PlannedScene(len(splats), len(kept), splats.sh_degree)
     costs = Costs.of(sensitivity, splats, pool)
     if len(kept) < len(splats):
         costs = costs.take(kept)
@@ -133,6 +134,7 @@ def plan_rate_distortion(
     fields["f_dc"], clipped = quantizer.colors(base)
     errors = largest_errors(fields, shapes, selected(splats.means, order), selected(splats.sh0, order), pool)
     return EncodingPlan(
+        scene=scene,
         grid=grid,
         fields={
             **{name: field.take(grid.cell_to_gaussian) for name, field in fields.items()},  # one row for every cell

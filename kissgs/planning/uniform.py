@@ -10,7 +10,7 @@ from kissgs.core.splats import SH_REST_COUNTS, Splats
 from kissgs.core.threads import Workers
 from kissgs.planning import table_fields
 from kissgs.planning.container_model import ByteTables, ContainerModel
-from kissgs.planning.encoding_plan import EncodingPlan
+from kissgs.planning.encoding_plan import EncodingPlan, PlannedScene
 from kissgs.planning.layout import layout_grid
 from kissgs.planning.quantize import (
     MEANS_TOP,
@@ -77,6 +77,7 @@ def plan_uniform(
         errors = {name: half_steps(field) for name, field in fields.items()}
         errors["means"] = half_steps(fields["means"], 1 << (16 - bits))
     return EncodingPlan(
+        scene=PlannedScene(len(splats), len(kept), splats.sh_degree),
         grid=grid,
         fields={**fields, "f_rest_centroids": codebook.centroids},
         codebook=codebook,
