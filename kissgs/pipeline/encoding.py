@@ -16,6 +16,7 @@ from kissgs._version import __version__
 from kissgs.cameras.views import Views
 from kissgs.core.array_types import Float32, Int
 from kissgs.core.errors import StopSearch, UnsupportedError
+from kissgs.core.memory import return_free_memory
 from kissgs.core.progress import Progress, SearchNote, as_stage
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import ATTRIBUTES, Cleaned, Splats, empty_splats
@@ -124,6 +125,7 @@ class Encoding:
         if self.disposable:
             self.splats = self.original = empty_splats(0, 0)
             self.sensitivity = None
+        return_free_memory()
         return Container(self._write(plan, settings, compacted, 0, self.progress), settings)
 
     def _write(
@@ -234,6 +236,7 @@ class Encoding:
                 if view_uncertainty is None:
                     view_uncertainty = VIEW_UNCERTAINTY[captured]
                 sensitivity = _sensitivity(splats, cameras, view_uncertainty, self.cache, *common)
+                return_free_memory()
             if captured and settings.color_refit_iterations:  # a refit to virtual cameras is worse than none
                 recolor = _recolor(splats, cameras, sensitivity, settings.color_refit_iterations, *common)
 

@@ -88,7 +88,7 @@ def layout_grid(
     del levels
     rank = np.empty(len(kept), dtype=np.int32)
     rank[order[mask]] = np.arange(len(kept), dtype=np.int32)
-    return Grid(side, kept.astype(np.int32)[order], mask, rank[order])
+    return Grid(side, kept.astype(np.int32, copy=False).take(order), mask, rank[order])
 
 
 def _plas_order(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kissgs.core.array_types import Int
+from kissgs.core.array_types import Int32
 from kissgs.core.progress import Progress, silent
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats
@@ -60,11 +60,11 @@ def plan_encoding(
         return plan_uniform(splats, kept, settings, container, pool, progress)
 
 
-def visible_gaussians(splats: Splats, settings: EncodeSettings) -> Int[np.ndarray, " K"]:
+def visible_gaussians(splats: Splats, settings: EncodeSettings) -> Int32[np.ndarray, " K"]:
     """Return the indices of the Gaussians that a renderer draws, or of all if ``prune_invisible`` is off."""
     if not settings.prune_invisible:
-        return np.arange(len(splats))
-    return np.flatnonzero(splats.opacities > np.float32(INVISIBLE_LOGIT))
+        return np.arange(len(splats), dtype=np.int32)
+    return np.flatnonzero(splats.opacities > np.float32(INVISIBLE_LOGIT)).astype(np.int32)
 
 
 def load_kernels(progress: Progress = silent) -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kissgs.core.array_types import Bool, Float32, Int
+from kissgs.core.memory import return_free_memory
 from kissgs.core.progress import Progress
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import SH_C0, Splats
@@ -75,8 +76,9 @@ def plan_rate_distortion(
     progress("rate_distortion", 0.0)
     scene = PlannedScene(len(splats), len(kept), splats.sh_degree)
     costs = Costs.of(sensitivity, splats, pool)
+    return_free_memory()
     if len(kept) < len(splats):
-        costs = costs.take(kept)
+        costs = costs.keep(kept)
     sh_model = _codebook_error_model(splats, kept, sensitivity, settings, pool)
     threshold_bits = settings.prune_threshold_bits * (1 - sensitivity.view_uncertainty)
     lambdas = _LambdaEstimate(
@@ -91,10 +93,20 @@ def plan_rate_distortion(
     slack = max(1.0, float(np.sqrt(rd_lambda / default_lambda)))
     pruned_by_rd = costs.pruned_by_rd(rd_lambda, threshold_bits, default_lambda)
     note = _pruning_note(pruned_by_rd, costs)
+    del lambdas  # it holds the costs of what is pruned now
     if pruned_by_rd.any():
-        remaining = np.flatnonzero(~pruned_by_rd)
-        kept, costs = kept[remaining], costs.take(remaining)
+        remaining = np.flatnonzero(~pruned_by_rd).astype(np.int32)
+        kept, costs = kept.take(remaining), costs.keep(remaining)
+        del remaining
+    del pruned_by_rd
+    condense = container.tables is None and not keep_costs
+    if condense:
+        costs = costs.of_rounding()
     classes = costs.classes(settings.step_classes, selected(splats.means, kept))
+    criterion = RdCriterion(costs, classes, rd_lambda)
+    criterion = criterion.condensed() if condense else criterion
+    del costs
+    return_free_memory()
     progress("order", 0.0)
     grid = layout_grid(splats.means, kept, 16, settings, pool, lambda fraction: progress("order", fraction), classes)
     grid = grid.with_padding_last() if container.padding_last else grid
@@ -103,11 +115,9 @@ def plan_rate_distortion(
     place[kept] = np.arange(len(kept), dtype=np.int32)
     rank = place.take(order)
     del place, kept
-    ordered = classes.take(rank)
-    if container.tables is None:
-        criterion = RdCriterion(costs, classes, rd_lambda, ordered)
-    else:
-        criterion = RdCriterion(costs.take(rank), ordered, rd_lambda)
+    criterion = criterion.take(rank)
+    del classes, rank
+    return_free_memory()
 
     progress("forms", 0.0)
     shapes, form_error = choose_forms(
@@ -120,6 +130,7 @@ def plan_rate_distortion(
     )
     codebook = fit_codebook(splats, order, weights, size, settings, container, pool, progress)
     del weights
+    return_free_memory()
     progress("rounding", 0.0)
     captured = sensitivity.captured.take(order)
     largest = largest_changes(sensitivity.coverage.take(order), captured, slack)
@@ -141,11 +152,11 @@ def plan_rate_distortion(
             "f_rest_centroids": codebook.centroids,
         },
         codebook=codebook,
-        classes=ordered,
+        classes=criterion.classes,
         form_error=form_error,
         clipped_colors=clipped,
         errors={**errors, "f_rest_centroids": codebook.errors},
-        costs=costs.take(rank) if keep_costs else None,
+        costs=criterion.costs if keep_costs else None,
         rd_lambda=rd_lambda,
         note=note,
     )

@@ -50,18 +50,22 @@ class RdFields:
             values: the Gaussians in their stored form.
             hessians: ``(M, 28)`` shape Hessians of :class:`kissgs.Sensitivity`.
         """
-        criterion, largest, costs, pool = self.criterion, self.largest, self.criterion.costs, self.pool
+        criterion, largest, pool = self.criterion, self.largest, self.pool
         if self.container.tables is not None:
             wanted = hessians[:] if self.settings.rdo_quantization else None
             bounds = {name: rows[:] for name, rows in largest.items()}
             return table_fields.rd_shape_fields(
                 values[:], wanted, values.forms, criterion, bounds, self.container.tables, pool
             )
-        parts = (
-            quantize_by_class(values.opacities, costs.opacity, criterion, largest["opacities"], pool),
-            quantize_by_class(values.scales, costs.scale, criterion, largest["scales"], pool),
-            quantize_by_class(values.quats, costs.rotation, criterion, largest["quaternions"], pool, channels=3),
+        opacities, scales, quats = (
+            quantize_by_class(rows, criterion.steps_of(name), criterion.classes, largest[field], pool)
+            for rows, name, field in (
+                (values.opacities, "opacity", "opacities"),
+                (values.scales, "scale", "scales"),
+                (values.quats, "rotation", "quaternions"),
+            )
         )
+        parts = opacities, scales, quats
         if self.settings.rdo_quantization:
             parts = rdo_quantize_shapes(values, parts, hessians, values.forms, criterion, largest, pool)
         return dict(zip(("opacities", "scales", "quaternions"), parts, strict=True))
@@ -75,22 +79,22 @@ class RdFields:
         usual = means_bits(splats, order, self.settings.means_tolerance, self.pool)
         most = np.clip(16 - usual + coarser, 0, 8)
         unit = max(log_extent(means, self.pool), 1e-30) / MEANS_TOP
-        steps = criterion.class_steps(criterion.costs.position)
+        steps = criterion.steps_of("position")
         if self.container.tables is not None:
-            each = np.array(steps)[criterion.row_classes]
+            each = np.array(steps)[criterion.classes]
             return table_fields.means_field(means[:], np.minimum(each, unit * 2.0**most / np.sqrt(2)))
         coarse = np.array([min(max(np.floor(np.log2(step / unit) + 0.5), 0), 8) for step in steps]).astype(np.int8)
-        return quantize_means(means, bits=16 - np.minimum(coarse[criterion.row_classes], most), pool=self.pool)
+        return quantize_means(means, bits=16 - np.minimum(coarse[criterion.classes], most), pool=self.pool)
 
     def colors(self, base: Float32[np.ndarray, "M 3"]) -> tuple[Quantized, int]:
         """Quantise base colours; return them and the number of clipped outliers."""
-        criterion, cost, coarsest = self.criterion, self.criterion.costs.color, self.largest["f_dc"]
+        criterion, coarsest = self.criterion, self.largest["f_dc"]
         if self.container.tables is not None:
-            steps = table_fields.criterion_steps(cost, criterion, coarsest[:])
-            return table_fields.color_field(base.astype(np.float64), steps, cost), 0
-        finest = min(criterion.class_steps(cost))
-        clipped = clip_outliers(base, step=finest, share=OUTLIERS)
-        levels = quantize_by_class(clipped, cost, criterion, coarsest, self.pool)
+            steps = table_fields.criterion_steps("color", criterion, coarsest[:])
+            return table_fields.color_field(base.astype(np.float64), steps, criterion.costs.color), 0
+        optimal = criterion.steps_of("color")
+        clipped = clip_outliers(base, step=min(optimal), share=OUTLIERS)
+        levels = quantize_by_class(clipped, optimal, criterion.classes, coarsest, self.pool)
         return levels, 0 if clipped is base else int((clipped != base).any(axis=1).sum())
 
 

@@ -8,8 +8,8 @@ the decoder needs no classes. WebP's entropy codes, which vary over an image, sp
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -104,6 +104,17 @@ class Costs:
         """Return the costs of the Gaussians ``chosen``."""
         return Costs(**{name: getattr(self, name).take(chosen) for name in Costs.__slots__})
 
+    def of_rounding(self) -> Costs:
+        """Return the costs without those of a removal and the coverage, which only pruning needs."""
+        return replace(self, removal=np.empty(0), coverage=np.empty(0))
+
+    def keep(self, chosen: Int[np.ndarray, " k"]) -> Costs:
+        """Return the costs of the Gaussians ``chosen``, ascending, in the memory of these, which are overwritten."""
+        for name in Costs.__slots__:
+            values = getattr(self, name)
+            values[: len(chosen)] = values.take(chosen)
+        return Costs(**{name: getattr(self, name)[: len(chosen)] for name in Costs.__slots__})
+
     def classes(self, number: int, means: Float32[np.ndarray, "M 3"] | Rows) -> UInt8[np.ndarray, " M"]:
         """Return the sensitivity class of each Gaussian, from 0, the most sensitive; classes have similar sizes.
 
@@ -167,6 +178,10 @@ def step(cost: float, rd_lambda: float) -> float:
     return float(np.sqrt(6 * rd_lambda / (np.log(2) * cost)))
 
 
+ROUNDED = ("opacity", "scale", "rotation", "color", "position")
+"""Attributes of :class:`Costs` that are rounded to steps."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RdCriterion:
     """Costs, sensitivity classes and lambda, by which the levels of Gaussians are chosen.
@@ -175,18 +190,30 @@ class RdCriterion:
         costs: costs of the M Gaussians.
         classes: ``(M,)`` sensitivity class of each, from 0; no class is empty.
         rd_lambda: squared error per bit.
-        ordered: ``(M,)`` classes in the order in which levels are chosen; None if that is the order of ``classes``.
+        steps: optimal step of each class for the attributes of ``costs``; None to compute them.
     """
 
     costs: Costs
     classes: Integer[np.ndarray, " M"]
     rd_lambda: float
-    ordered: Integer[np.ndarray, " M"] | None = None
+    steps: Mapping[str, list[float]] | None = None
 
-    @property
-    def row_classes(self) -> Integer[np.ndarray, " M"]:
-        """Class of each Gaussian in the order in which levels are chosen."""
-        return self.classes if self.ordered is None else self.ordered
+    def condensed(self) -> RdCriterion:
+        """Return the steps and only the smallest costs, for what needs no more."""
+        steps = {name: self.steps_of(name) for name in ROUNDED}
+        least = {name: np.array([getattr(self.costs, name).min(initial=np.inf)]) for name in Costs.__slots__}
+        return RdCriterion(Costs(**least), self.classes, self.rd_lambda, steps)
+
+    def take(self, order: Int[np.ndarray, " M"]) -> RdCriterion:
+        """Return the criterion with the Gaussians in another order."""
+        costs = self.costs.take(order) if self.steps is None else self.costs
+        return replace(self, costs=costs, classes=self.classes.take(order))
+
+    def steps_of(self, name: str) -> list[float]:
+        """Return the optimal step of each class for an attribute; a rotation has an error about each of three axes."""
+        if self.steps is not None:
+            return self.steps[name]
+        return self.class_steps(getattr(self.costs, name), 3 if name == "rotation" else 1)
 
     def class_steps(self, cost: Float64[np.ndarray, " M"], channels: int = 1) -> list[float]:
         """Return the optimal step of each class for ``channels`` times the mean of ``cost``, error per squared unit."""

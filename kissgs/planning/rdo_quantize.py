@@ -7,7 +7,7 @@ error is small, so that the entropy code needs fewer bits.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from math import ceil
 
@@ -88,22 +88,19 @@ AXIS_SIGNS = _axis_signs()
 
 def quantize_by_class(
     values: Float[np.ndarray, "M C"] | Rows,
-    cost: Float64[np.ndarray, " M"],
-    criterion: RdCriterion,
+    optimal: Sequence[float],
+    classes: Integer[np.ndarray, " M"],
     coarsest: Float64[np.ndarray, " M"] | Rows,
     pool: Workers | None = None,
-    *,
-    channels: int = 1,
 ) -> Quantized:
     """Round to the nearest of the levels that each sensitivity class uses.
 
     Args:
         values: finite.
-        cost: squared image error per squared unit, per Gaussian.
-        criterion: sensitivity classes and lambda.
+        optimal: best step of each sensitivity class.
+        classes: class of each Gaussian.
         coarsest: largest step, per Gaussian.
         pool: threads; None for the calling one.
-        channels: number of channels that an error of one unit changes, each by the cost.
 
     Returns:
         Levels from 0 to at most 255, with one step for all channels, of which each class uses multiples.
@@ -113,11 +110,10 @@ def quantize_by_class(
     low = low32.astype(np.float64)
     extent = largest.astype(np.float64) - low
     widest = float(extent.max(initial=0))
-    optimal = np.array(criterion.class_steps(cost, channels))
-    count, classes = len(values), criterion.row_classes
+    count, best = len(values), np.array(optimal)
 
     def steps(rows: slice) -> Float64[np.ndarray, " n"]:
-        return np.minimum(optimal[classes[rows]], coarsest[rows])
+        return np.minimum(best[classes[rows]], coarsest[rows])
 
     least = min(for_each_block(count, lambda rows: float(steps(rows).min()), pool))
     finest = max(least, widest / 255, 1e-30)
@@ -158,7 +154,7 @@ def rdo_quantize_shapes(
     """
     from kissgs.planning import rdo_kernels
 
-    costs, classes = criterion.costs, criterion.row_classes
+    costs, classes = criterion.costs, criterion.classes
     levels = np.concatenate([part.levels for part in parts], axis=1)
     low = np.concatenate([part.low for part in parts]).astype(np.float64)
     high = np.concatenate([part.high for part in parts]).astype(np.float64)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Int
+from kissgs.core.memory import return_free_memory
 from kissgs.core.progress import Progress
 from kissgs.core.splats import SH_REST_COUNTS, Splats
 from kissgs.core.threads import Workers
@@ -63,6 +64,7 @@ def plan_uniform(
         weights = size_weights(source, settings.sh_weight_power)[chosen]
     size = max(len(chosen) / settings.gaussians_per_codebook_entry, FEW)
     codebook = fit_codebook(source, chosen, weights, size, settings, container, pool, progress)
+    return_free_memory()
     if container.tables is not None:
         means, colors = source.means[cells], source.sh0[cells]
         fields, errors = _table_fields(means, colors, shapes[:], bits, settings, container.tables)
