@@ -105,8 +105,9 @@ class Costs:
         return Costs(**{name: getattr(self, name).take(chosen) for name in Costs.__slots__})
 
     def of_rounding(self) -> Costs:
-        """Return the costs without those of a removal and the coverage, which only pruning needs."""
-        return replace(self, removal=np.empty(0), coverage=np.empty(0))
+        """Return the costs with zeros, which take no memory, for those that only pruning needs."""
+        nothing = np.broadcast_to(0.0, self.color.shape)
+        return replace(self, removal=nothing, coverage=nothing)
 
     def keep(self, chosen: Int[np.ndarray, " k"]) -> Costs:
         """Return the costs of the Gaussians ``chosen``, ascending, in the memory of these, which are overwritten."""
