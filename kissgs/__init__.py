@@ -34,8 +34,9 @@ if TYPE_CHECKING:
     from kissgs.evaluation.results import Evaluation
     from kissgs.finetuning.result import FinetuneReport
     from kissgs.io.ply import PlyInfo, read_ply_info
+    from kissgs.pipeline.decompress import decompress
     from kissgs.pipeline.inspect import SceneInfo, read_scene_info
-    from kissgs.pipeline.pipeline import Compressed, compact, compress, decompress
+    from kissgs.pipeline.pipeline import Compressed, compact, compress
     from kissgs.pipeline.read_options import ReadOptions
     from kissgs.pipeline.report import Report
     from kissgs.pipeline.scene_files import load, save
@@ -81,7 +82,7 @@ _HOMES = {
     "clean": "core.splats",
     "compact": "pipeline.pipeline",
     "compress": "pipeline.pipeline",
-    "decompress": "pipeline.pipeline",
+    "decompress": "pipeline.decompress",
     "evaluate": "evaluation.evaluate",
     "load": "pipeline.scene_files",
     "load_views": "cameras.captures.load",

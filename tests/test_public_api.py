@@ -107,15 +107,31 @@ def test_importing_loads_nothing_heavy(module):
     assert fresh(f"import sys, {module}; print([name for name in {HEAVY} if name in sys.modules])") == "[]"
 
 
-def test_decoding_needs_no_compiled_kernels(tmp_path):
+ENCODER = ("kissgs.planning", "kissgs.rendering", "kissgs.cameras", "kissgs.settings", "kissgs.sogxt.encode")
+
+
+def test_decoding_needs_no_compiled_kernels_and_nothing_of_the_encoder(tmp_path):
     kissgs.compress(kissgs.sample_scene(50), tmp_path / "scene.zip")
     program = f"""
 import sys, kissgs
 splats = kissgs.decompress({str(tmp_path / "scene.zip")!r}, {str(tmp_path / "scene.ply")!r})
-print([name for name in {HEAVY} if name in sys.modules])
+print([name for name in {(*HEAVY, *ENCODER)} if name in sys.modules])
 """
     assert fresh(program) == "[]"
     assert (tmp_path / "scene.ply").exists()
+
+
+def test_describing_a_container_loads_only_the_reader_of_its_metadata(tmp_path):
+    kissgs.compress(kissgs.sample_scene(50), tmp_path / "scene.zip")
+    others = ("kissgs.io.ply", "kissgs.io.spz", "kissgs.io.gltf", "kissgs.sog.decode", "kissgs.sogxt.decode")
+    program = f"""
+import sys
+from pathlib import Path
+from kissgs.pipeline.inspect import describe
+assert describe(Path({str(tmp_path / "scene.zip")!r})).kind == "sogxt"
+print([name for name in {(*HEAVY, *ENCODER, *others)} if name in sys.modules])
+"""
+    assert fresh(program) == "[]"
 
 
 @pytest.mark.parametrize(("module", "seconds"), [("kissgs", 0.1), ("kissgs.pipeline.pipeline", 0.5)])

@@ -14,7 +14,8 @@ from kissgs.core.progress import Progress, as_stage, silent
 from kissgs.core.splats import Splats
 from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.evaluate import compare_images
-from kissgs.pipeline.pipeline import compact, compress, decompress
+from kissgs.pipeline.decompress import decompress
+from kissgs.pipeline.pipeline import compact, compress
 from kissgs.settings import Settings
 
 QUALITY_OFFSETS = (-8.0, -5.0, -2.0, 1.0)

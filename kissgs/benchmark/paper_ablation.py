@@ -70,7 +70,7 @@ LeaveOut = Callable[[EncodedParts, EncodeSettings, int], EncodedParts]
 def encode_parts(splats: Splats, settings: EncodeSettings, threads: int) -> EncodedParts:
     """Encode a scene with uniform planning; ``threads``: 0 means one per processor."""
     plan = plan_encoding(splats, settings, threads=threads)
-    files = write_files(plan, splats, settings, threads=threads).files
+    files = write_files(plan, settings, threads=threads).files
     decoded = decode(files, threads=threads)
     exact = _in_forms_of(splats.select(plan.grid.cells[plan.grid.mask]), decoded)
     other_files = {name: files[name] for name in METADATA}

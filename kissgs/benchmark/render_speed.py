@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.memory import reused_memory
 from kissgs.core.progress import Progress, silent
+from kissgs.core.reused_memory import reused_memory
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera

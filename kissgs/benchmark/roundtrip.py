@@ -21,7 +21,8 @@ from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.evaluate import compare_images
 from kissgs.evaluation.results import Evaluation
 from kissgs.io.container_names import ContainerName
-from kissgs.pipeline.pipeline import compress, decompress
+from kissgs.pipeline.decompress import decompress
+from kissgs.pipeline.pipeline import compress
 from kissgs.pipeline.report import Report
 from kissgs.pipeline.scene_files import load
 from kissgs.settings import Settings

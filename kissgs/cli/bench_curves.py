@@ -12,7 +12,7 @@ from rich.text import Text
 from kissgs.cli.bench_scenes import BenchInputs, BenchOutput, each_scene
 from kissgs.cli.options import choice, chosen
 from kissgs.core.errors import UnsupportedError
-from kissgs.evaluation.results import format_metric
+from kissgs.evaluation.metric_text import format_metric
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -10,7 +10,8 @@ from rich.text import Text
 
 from kissgs.benchmark.ablation import AblationRow
 from kissgs.benchmark.results import EqualPsnr, Measurement, PsnrTarget, curve_name
-from kissgs.evaluation.results import Evaluation, format_metric
+from kissgs.evaluation.metric_text import format_metric
+from kissgs.evaluation.results import Evaluation
 
 TARGETS: dict[PsnrTarget, str] = {"original": "to the original", "photographs": "to photographs"}
 

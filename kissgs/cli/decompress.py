@@ -42,8 +42,7 @@ def decompress(
     quiet: QuietOption = False,
 ) -> None:
     """Decode containers, and .sog, .spz, .splat, .ksplat, .glb and .gltf scenes, into .ply files."""
-    from kissgs.io.ply import write_ply
-    from kissgs.pipeline.pipeline import decompress as run
+    from kissgs.pipeline.decompress import decompress as run
 
     def work(container: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"
@@ -59,6 +58,8 @@ def decompress(
                 progress=progress,
             )
         if piped:
+            from kissgs.io.ply import write_ply
+
             with stdout():
                 write_ply(sys.stdout.buffer, splats)
             return {}

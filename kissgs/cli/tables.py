@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from rich.console import Group, RenderableType
 from rich.table import Column, Table
 from rich.text import Text
 
-from kissgs.compaction.result import CompactionReport
-from kissgs.evaluation.results import Evaluation, format_metric
-from kissgs.finetuning.result import FinetuneReport
-from kissgs.pipeline.inspect import Info
-from kissgs.pipeline.report import Report
-from kissgs.pipeline.trial import Trial
+from kissgs.evaluation.metric_text import format_metric
+
+if TYPE_CHECKING:
+    from kissgs.compaction.result import CompactionReport
+    from kissgs.evaluation.results import Evaluation
+    from kissgs.finetuning.result import FinetuneReport
+    from kissgs.pipeline.inspect import Info
+    from kissgs.pipeline.report import Report
+    from kissgs.pipeline.trial import Trial
 
 CHANGES = {
     "invisible": "left out: opacity at most 1/255, which no renderer draws",

@@ -8,7 +8,21 @@ import sys
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING or "jaxtyping" in sys.modules:
-    from jaxtyping import Bool, Float, Float32, Float64, Int, Int32, Int64, Shaped, UInt8, UInt16, UInt32
+    from jaxtyping import (
+        Bool,
+        Float,
+        Float32,
+        Float64,
+        Int,
+        Int32,
+        Int64,
+        Integer,
+        Shaped,
+        UInt8,
+        UInt16,
+        UInt32,
+        UInt64,
+    )
 else:
 
     class _Unchecked:
@@ -17,6 +31,8 @@ else:
         def __class_getitem__(cls, item: object) -> type:
             return cls
 
-    Bool = Float = Float32 = Float64 = Int = Int32 = Int64 = Shaped = UInt8 = UInt16 = UInt32 = _Unchecked
+    Bool = Float = Float32 = Float64 = Int = Int32 = Int64 = Integer = Shaped = _Unchecked
+    UInt8 = UInt16 = UInt32 = UInt64 = _Unchecked
 
-__all__ = ["Bool", "Float", "Float32", "Float64", "Int", "Int32", "Int64", "Shaped", "UInt8", "UInt16", "UInt32"]
+__all__ = ["Bool", "Float", "Float32", "Float64", "Int", "Int32", "Int64", "Integer", "Shaped"]
+__all__ += ["UInt8", "UInt16", "UInt32", "UInt64"]

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from kissgs.core.array_types import Bool, Float32, Int
+from kissgs.core.array_types import Bool, Float32, Float64, Int
 from kissgs.core.errors import InvalidSceneError
 
 SH_REST_COUNTS = (0, 3, 8, 15)
@@ -23,6 +23,10 @@ LOG_SCALE_LIMIT = 30.0
 MEAN_LIMIT = 1e15
 SH_LIMIT = 1e6
 """Bounds of absolute values that cleaning leaves unchanged; beyond, renderers' float32 squares overflow."""
+
+
+BLOCK = 1 << 16
+"""Gaussians that are checked at a time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -145,21 +149,27 @@ def clean(splats: Splats) -> tuple[Splats, Cleaned]:
     Returns:
         The scene, with its Gaussians in their order, and the number of changes.
     """
-    finite = _finite_rows(splats)
-    near = (np.abs(np.where(np.isfinite(splats.means), splats.means, 0)) <= MEAN_LIMIT).all(axis=1)
-    keep = finite & near
-    if not keep.all():
+    keep, non_finite = np.empty(len(splats), bool), 0
+    for rows in _blocks(len(splats)):
+        finite = _finite_rows(splats.select(rows))
+        with np.errstate(invalid="ignore"):  # NaN
+            keep[rows] = finite & (np.abs(splats.means[rows]) <= MEAN_LIMIT).all(axis=1)
+        non_finite += int((~finite).sum())
+    removed = len(keep) - int(keep.sum())
+    if removed:
         splats = splats.select(keep)
 
     quats, zero, unnormalised = _unit_quats(splats.quats)
-    opacities = np.clip(splats.opacities, np.float32(OPACITY_LOGIT_MIN), np.float32(OPACITY_LOGIT_MAX))
+    opacities = splats.opacities
+    if opacities.size and (opacities.min() < OPACITY_LOGIT_MIN or opacities.max() > OPACITY_LOGIT_MAX):
+        opacities = np.clip(opacities, np.float32(OPACITY_LOGIT_MIN), np.float32(OPACITY_LOGIT_MAX))
     infinite = np.isinf(splats.opacities)
     scales, clamped_scales = _clamp(splats.scales, LOG_SCALE_LIMIT)
     sh0, clamped_sh0 = _clamp(splats.sh0, SH_LIMIT)
     shN, clamped_shN = _clamp(splats.shN, SH_LIMIT)
     report = Cleaned(
-        non_finite=int((~finite).sum()),
-        far_away=int((finite & ~near).sum()),
+        non_finite=non_finite,
+        far_away=removed - non_finite,
         infinite_opacities=int(infinite.sum()),
         saturated_opacities=int(((opacities != splats.opacities) & ~infinite).sum()),
         zero_quats=zero,
@@ -183,15 +193,32 @@ def _finite_rows(splats: Splats) -> Bool[np.ndarray, " N"]:
 
 
 def _unit_quats(quats: Float32[np.ndarray, "N 4"]) -> tuple[Float32[np.ndarray, "N 4"], int, int]:
-    wide = quats.astype(np.float64)  # float32 squares underflow at 1e-23 and overflow at 1e19
-    norm = np.sqrt(np.einsum("nc,nc->n", wide, wide))
-    zero = norm == 0
-    unnormalised = ~zero & (np.abs(norm - 1) > 1e-3)
-    if not (zero.any() or (np.abs(norm - 1) > 1e-6).any()):
+    """Return unit quaternions (the given array if nothing changes), and how many were zero and not of unit length."""
+    zeros = unnormalised = 0
+    changed = False
+    for rows in _blocks(len(quats)):
+        norm = _lengths(quats[rows])
+        zeros += int((norm == 0).sum())
+        unnormalised += int(((norm != 0) & (np.abs(norm - 1) > 1e-3)).sum())
+        changed |= bool((np.abs(norm - 1) > 1e-6).any())
+    if not changed:
         return quats, 0, 0
-    wide /= np.where(zero, 1, norm)[:, None]
-    wide[zero] = (1, 0, 0, 0)
-    return wide.astype(np.float32), int(zero.sum()), int(unnormalised.sum())
+    unit = np.empty_like(quats)
+    for rows in _blocks(len(quats)):
+        norm = _lengths(quats[rows])
+        unit[rows] = quats[rows].astype(np.float64) / np.where(norm == 0, 1, norm)[:, None]
+        unit[rows][norm == 0] = (1, 0, 0, 0)
+    return unit, zeros, unnormalised
+
+
+def _lengths(quats: Float32[np.ndarray, "N 4"]) -> Float64[np.ndarray, " N"]:
+    wide = quats.astype(np.float64)  # float32 squares underflow at 1e-23 and overflow at 1e19
+    return np.sqrt(np.einsum("nc,nc->n", wide, wide))
+
+
+def _blocks(count: int) -> list[slice]:
+    """Return slices that cover ``count`` rows, so that no temporary array is as large as the scene."""
+    return [slice(first, first + BLOCK) for first in range(0, count, BLOCK)]
 
 
 def _clamp(values: np.ndarray, limit: float) -> tuple[np.ndarray, Bool[np.ndarray, " N"]]:

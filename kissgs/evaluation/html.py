@@ -25,7 +25,8 @@ from kissgs.evaluation.html_tables import (
     views_table,
     worst_views_text,
 )
-from kissgs.evaluation.results import Comparison, Evaluation, ViewComparison, format_metric
+from kissgs.evaluation.metric_text import format_metric
+from kissgs.evaluation.results import Comparison, Evaluation, ViewComparison
 from kissgs.rendering.images import to_bytes
 from kissgs.rendering.rasterizer import Device
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, format_metric
+from kissgs.evaluation.metric_text import format_metric
+from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics
 
 
 def summary_line(evaluation: Evaluation, shown: int) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 
 from kissgs.cameras.views import View
 from kissgs.core.array_types import Float32, Float64
+from kissgs.evaluation.metric_text import format_metric
 
 Split = Literal["test", "train", "all"]
 
@@ -239,15 +240,6 @@ class Evaluation:
             "shown": self.shown,
             "surroundings": None if self.surroundings is None else self.surroundings.as_dict(),
         }
-
-
-def format_metric(value: float, digits: int, *, signed: bool = False) -> str:
-    """Return a value as text with this number of digits: ∞ for equal images, NaN for a failed rendering."""
-    if math.isinf(value):
-        return "∞" if value > 0 else "-∞"
-    if math.isnan(value):
-        return "NaN"
-    return f"{round(value, digits) + 0.0:{'+' if signed else ''}.{digits}f}"  # -0.0 + 0.0 is 0.0
 
 
 def _mean(values: Sequence[ImageMetrics]) -> ImageMetrics:

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from kissgs.core.array_types import Float, Float32, Float64, Int
-from kissgs.core.memory import empty
+from kissgs.core.reused_memory import empty
 from kissgs.core.signed_log import signed_exp
 from kissgs.finetuning.kernels import each_part, sum_by_label
 from kissgs.planning import smallest_three

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from kissgs.core.array_types import Float32, Float64
-from kissgs.core.memory import empty
+from kissgs.core.reused_memory import empty
 from kissgs.finetuning import kernels
 from kissgs.planning.quantize import Quantized
 from kissgs.rendering.rasterizer import Device

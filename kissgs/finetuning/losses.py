@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from kissgs.core.array_types import Float32, Float64, Int
-from kissgs.core.memory import empty
+from kissgs.core.reused_memory import empty
 from kissgs.finetuning import kernels
 from kissgs.finetuning.planes import Plane
 from kissgs.finetuning.quantized_scene import QuantizedScene

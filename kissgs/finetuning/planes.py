@@ -80,7 +80,7 @@ def planes_of(
         if name == "f_rest_centroids" and field.table is not None:
             planes[name] = _codebook(field, field.table, sh_degree, device)
         elif name in ("opacities", "quaternions", "scales", "f_dc"):
-            planes[name] = _of_table(name, field, plan.classes, tables, device)
+            planes[name] = _of_table(name, field, plan.classes.astype(np.int64), tables, device)
         elif name in FIELDS:
             planes[name] = _even(name, field, device, as_text=True)
         if name in TABLES and field.table is not None:

@@ -58,7 +58,7 @@ class QuantizedScene:
         self._plan, self._sh_degree = plan, sh_degree
         count = int(plan.grid.mask.sum())
         self.planes, self.trained_tables = planes_of(plan, sh_degree, container.tables, device)
-        self.classes, self.grid = plan.classes, plan.grid
+        self.classes, self.grid = plan.classes.astype(np.int64), plan.grid
         self._labels = Labels(plan.codebook.labels[:count], len(plan.codebook.centroids.levels), device)
         self._omitted = None
         if "omitted" in plan.fields:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from kissgs.core.progress import Progress
-from kissgs.core.splats import Cleaned, Splats
+from kissgs.core.splats import Cleaned
 from kissgs.io.container_names import ContainerName
 from kissgs.planning.container_model import EVEN_LEVELS, ContainerModel
 from kissgs.planning.encoded import Encoded
@@ -29,7 +29,6 @@ FILES = frozenset({*names.FILES, *sog.FILES})
 def write_files(
     container: ContainerName,
     plan: EncodingPlan,
-    splats: Splats,
     settings: EncodeSettings,
     *,
     cleaned: Cleaned,
@@ -46,10 +45,9 @@ def write_files(
         UnsupportedError: the container cannot hold the plan.
     """
     if container == "sog":
-        return sog.write_files(plan, splats, settings, threads=threads, progress=progress)
+        return sog.write_files(plan, settings, threads=threads, progress=progress)
     return sogxt.write_files(
         plan,
-        splats,
         settings,
         cleaned=cleaned,
         compacted=compacted,

@@ -16,9 +16,10 @@ from kissgs._version import __version__
 from kissgs.cameras.views import Views
 from kissgs.core.array_types import Float32, Int
 from kissgs.core.errors import StopSearch, UnsupportedError
+from kissgs.core.memory import return_free_memory
 from kissgs.core.progress import Progress, SearchNote, as_stage
 from kissgs.core.sensitivity import Sensitivity
-from kissgs.core.splats import ATTRIBUTES, Cleaned, Splats
+from kissgs.core.splats import ATTRIBUTES, Cleaned, Splats, empty_splats
 from kissgs.io.container_names import ContainerName
 from kissgs.io.sensitivity_file import read_sensitivity, write_sensitivity
 from kissgs.pipeline.containers import DECODERS, MODELS, write_files
@@ -52,12 +53,12 @@ REFIT_SIZE = 320
 Planner = Callable[[EncodeSettings, Progress], EncodingPlan]
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+@dataclass(slots=True, eq=False, kw_only=True)
 class Encoding:
     """The inputs of one encoding: a scene, settings, and where to work.
 
     Attributes:
-        splats: clean scene to encode.
+        splats: clean scene to encode; see ``disposable``.
         original: scene before compaction, or ``splats`` itself. Its renderings are the reference of a goal's PSNR, and
             the targets of fine-tuning where there are no photographs.
         settings: settings of all stages.
@@ -71,6 +72,8 @@ class Encoding:
         packed: whether the files become a zip, whose size then counts; False for a folder.
         threads: number of threads; 0 means one per processor.
         progress: receives the events of all stages; its note says how far a search has come.
+        disposable: whether nobody needs the scene after the encoding. If so, and it is planned only once, it is
+            replaced by an empty one before the images are compressed, so that its memory is free.
     """
 
     splats: Splats
@@ -86,6 +89,7 @@ class Encoding:
     packed: bool
     threads: int
     progress: SearchNote
+    disposable: bool = False
 
     def run(self, search: RateControl | None = None) -> tuple[Container, tuple[Trial, ...]]:
         """Encode the scene; return the container, and the trials of the search if the settings name a goal.
@@ -99,6 +103,8 @@ class Encoding:
             UnsupportedError: the goal cannot be met; the scene is too large for one container.
         """
         encode, returned = self.settings.encode, 0 if search is None else len(search.trials)
+        if not encode.has_goal and not self.settings.finetune.enabled:
+            return self._encode_once(encode), ()
         if not encode.has_goal:
             return self._encoder(self._planner(), self._tuner(), self.checkpoint)(encode), ()
         planner = None
@@ -115,6 +121,29 @@ class Encoding:
                     raise
         container = search.result(suggest_compaction=not self.settings.compact.auto_count)
         return container, tuple(search.trials[returned:])
+
+    def _encode_once(self, settings: EncodeSettings) -> Container:
+        """Plan, forget a disposable scene, and write the files."""
+        plan, compacted = self._planner()(settings, self.progress), len(self.original) - len(self.splats)
+        if self.disposable:
+            self.splats = self.original = empty_splats(0, 0)
+            self.sensitivity = None
+        return_free_memory()
+        return Container(self._write(plan, settings, compacted, 0, self.progress), settings)
+
+    def _write(
+        self, plan: EncodingPlan, settings: EncodeSettings, compacted: int, finetune_steps: int, progress: Progress
+    ) -> Encoded:
+        return write_files(
+            self.container,
+            plan,
+            settings,
+            cleaned=self.cleaned,
+            compacted=compacted,
+            finetune_steps=finetune_steps,
+            threads=self.threads,
+            progress=progress,
+        )
 
     def search(self, planner: Planner | None = None, byte_limit: float = math.inf) -> RateControl:
         """Search for the goal of the settings without fine-tuning; see :class:`RateControl` for ``byte_limit``."""
@@ -138,17 +167,8 @@ class Encoding:
             pruned = self._pruned_for_finetune(settings)
 
             def files(plan: EncodingPlan, finetune_steps: int, progress: Progress) -> Encoded:
-                return write_files(
-                    self.container,
-                    plan,
-                    self.splats,
-                    pruned if finetune_steps else settings,
-                    cleaned=self.cleaned,
-                    compacted=len(self.original) - len(self.splats),
-                    finetune_steps=finetune_steps,
-                    threads=self.threads,
-                    progress=progress,
-                )
+                compacted = len(self.original) - len(self.splats)
+                return self._write(plan, pruned if finetune_steps else settings, compacted, finetune_steps, progress)
 
             plan = planner(settings, self.progress)
             if tuner is None or not plan.grid.mask.any():
@@ -219,6 +239,7 @@ class Encoding:
                 if view_uncertainty is None:
                     view_uncertainty = VIEW_UNCERTAINTY[captured]
                 sensitivity = _sensitivity(splats, cameras, view_uncertainty, self.cache, *common)
+                return_free_memory()
             if captured and settings.color_refit_iterations:  # a refit to virtual cameras is worse than none
                 recolor = _recolor(splats, cameras, sensitivity, settings.color_refit_iterations, *common)
 
@@ -233,6 +254,7 @@ class Encoding:
                 sensitivity=sensitivity,
                 recolor=recolor,
                 container=MODELS[self.container],
+                keep_costs=self.settings.finetune.enabled,
                 threads=self.threads,
                 progress=without_kernels,
             )

@@ -4,22 +4,15 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from kissgs.core.errors import InvalidContainerError
 from kissgs.core.signed_log import signed_exp
 from kissgs.core.splats import ATTRIBUTES, clean
-from kissgs.io.gltf import GltfInfo, read_gltf_info
-from kissgs.io.ksplat import KsplatInfo, read_ksplat_info
 from kissgs.io.packed_files import Source, open_source
-from kissgs.io.ply import PlyInfo, read_ply_info
 from kissgs.io.scene_file import refuse_more_than
-from kissgs.io.splat import count_splat
-from kissgs.io.spz import SpzInfo, read_spz_info
-from kissgs.io.webp import decode_plane
-from kissgs.pipeline.inspect_sog import SogFacts, sog_facts, streamed_facts
 from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.scene_files import read_scene, stored_bytes
 from kissgs.pipeline.scene_formats import SceneFormat, recognise, scene_root
@@ -27,8 +20,25 @@ from kissgs.sogxt.metadata import CHANNELS, Layout
 from kissgs.sogxt.metadata_reader import read_layout
 from kissgs.sogxt.names import FILES, PLANES
 
+if TYPE_CHECKING:
+    from kissgs.io.gltf import GltfInfo
+    from kissgs.io.ksplat import KsplatInfo
+    from kissgs.io.ply import PlyInfo
+    from kissgs.io.spz import SpzInfo
+    from kissgs.pipeline.inspect_sog import SogFacts
+
+    Header = PlyInfo | SpzInfo | KsplatInfo | GltfInfo
+
 NAMES = {"quaternions": "quats", "f_dc": "sh0", "f_rest_centroids": "shN"}
 MAX_PLANE_BYTES = 1 << 30
+
+DETAILS: dict[SceneFormat, dict[str, str]] = {
+    "ply": {"encoding": "encoding", "compressed": "compressed"},
+    "spz": {"version": "version", "antialiased": "antialiased", "fractional_bits": "fractional_bits"},
+    "ksplat": {"compression_level": "level", "sections": "sections"},
+    "gltf": {"binary": "binary", "primitives": "primitives", "spz": "spz"},
+}
+"""Details that the headers of files state, and the fields of the headers that have them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,22 +111,16 @@ def read_scene_info(path: Path, *, name: str | None = None) -> SceneInfo:
     """
     kind = recognise(path, name=name)
     if kind == "splat":
+        from kissgs.io.splat import count_splat
+
         return SceneInfo(format=kind, count=count_splat(path), sh_degree=0)
-    found: PlyInfo | SpzInfo | KsplatInfo | GltfInfo | SogFacts | Info
+    found: Header | SogFacts | Info
     if kind == "sogxt":
         found = _describe_sogxt(path)
-    elif kind == "sog":
-        found = sog_facts(scene_root(path))
-    elif kind == "streamed-sog":
-        found = streamed_facts(scene_root(path))
-    elif kind == "spz":
-        found = read_spz_info(path)
-    elif kind == "ksplat":
-        found = read_ksplat_info(path)
-    elif kind == "gltf":
-        found = read_gltf_info(path)
+    elif kind == "sog" or kind == "streamed-sog":
+        found = _sog_facts(scene_root(path), kind, 0)
     else:
-        found = read_ply_info(path)
+        found = _header(path, kind)
     return SceneInfo(format=kind, count=found.count, sh_degree=found.sh_degree)
 
 
@@ -141,7 +145,7 @@ def describe(path: Path, reading: ReadOptions = DEFAULT_READ_OPTIONS) -> Info:
 
 def _describe_sog(path: Path, kind: Literal["sog", "streamed-sog"], level: int) -> Info:
     root = scene_root(path)
-    facts = sog_facts(root) if kind == "sog" else streamed_facts(root, level)
+    facts = _sog_facts(root, kind, level)
     return Info(
         path=str(path),
         kind=kind,
@@ -153,6 +157,12 @@ def _describe_sog(path: Path, kind: Literal["sog", "streamed-sog"], level: int) 
         changed={},
         details=facts.details,
     )
+
+
+def _sog_facts(root: Path, kind: Literal["sog", "streamed-sog"], level: int) -> SogFacts:
+    from kissgs.pipeline.inspect_sog import sog_facts, streamed_facts
+
+    return sog_facts(root) if kind == "sog" else streamed_facts(root, level)
 
 
 def _describe_file(path: Path, kind: SceneFormat, reading: ReadOptions) -> Info:
@@ -172,19 +182,29 @@ def _describe_file(path: Path, kind: SceneFormat, reading: ReadOptions) -> Info:
 
 def _details(path: Path, kind: SceneFormat) -> dict[str, Any]:
     """Return what the header of a file states besides count and SH degree."""
-    if kind == "ply":
-        header = read_ply_info(path)
-        return {"encoding": header.encoding, "compressed": header.compressed}
+    if kind not in DETAILS:
+        return {}
+    header = _header(path, kind)
+    return {name: getattr(header, field) for name, field in DETAILS[kind].items()}
+
+
+def _header(path: Path, kind: SceneFormat) -> Header:
+    """Read the header of a file that has one."""
     if kind == "spz":
-        spz = read_spz_info(path)
-        return {"version": spz.version, "antialiased": spz.antialiased, "fractional_bits": spz.fractional_bits}
+        from kissgs.io.spz import read_spz_info
+
+        return read_spz_info(path)
     if kind == "ksplat":
-        ksplat = read_ksplat_info(path)
-        return {"compression_level": ksplat.level, "sections": ksplat.sections}
+        from kissgs.io.ksplat import read_ksplat_info
+
+        return read_ksplat_info(path)
     if kind == "gltf":
-        gltf = read_gltf_info(path)
-        return {"binary": gltf.binary, "primitives": gltf.primitives, "spz": gltf.spz}
-    return {}
+        from kissgs.io.gltf import read_gltf_info
+
+        return read_gltf_info(path)
+    from kissgs.io.ply import read_ply_info
+
+    return read_ply_info(path)
 
 
 def _extremes(values: np.ndarray) -> tuple[float, float]:
@@ -238,6 +258,8 @@ def _stored_ranges(layout: Layout) -> dict[str, tuple[float, float]]:
 
 
 def _count_mask(files: Source, layout: Layout) -> int:
+    from kissgs.io.webp import decode_plane
+
     side, name = layout.grid_side, "active_mask.webp"
     mask = decode_plane(files.read(name, MAX_PLANE_BYTES), name, width=side, height=side, channels=1)
     return int(np.count_nonzero(mask))

@@ -12,7 +12,8 @@ import numpy as np
 from kissgs.core.errors import InvalidContainerError
 from kissgs.core.signed_log import signed_exp
 from kissgs.io.packed_files import Source, open_source
-from kissgs.sog.metadata import LOD_NAME, META_NAME, SogLayout, read_layout
+from kissgs.sog.metadata import SogLayout, read_layout
+from kissgs.sog.names import LOD_NAME, META_NAME
 from kissgs.sog.streamed import level_chunks, read_tree
 
 

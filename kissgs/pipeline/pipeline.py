@@ -1,4 +1,4 @@
-"""``compact``, ``compress`` and ``decompress``: all stages in order, and the report."""
+"""``compact`` and ``compress``: all stages in order, and the report."""
 
 from __future__ import annotations
 
@@ -202,6 +202,7 @@ def compress(
             finetune_checkpoint = finetune_checkpoint_path(Path(checkpoint))
     clock = StageTimer(progress)
     original, cleaned, source_bytes = open_scene(source, reading, threads, clock)
+    source_count, sh_degree = len(original) + cleaned.removed, original.sh_degree
     encoding = Encoding(
         splats=original,
         original=original,
@@ -216,7 +217,9 @@ def compress(
         packed=target is None or is_packed(target),
         threads=threads,
         progress=SearchNote(clock),
+        disposable=not (evaluate or isinstance(source, Splats)),
     )
+    del original
     compacted, search, trials = _compact_first(encoding, checkpoint)
     if compacted is not None:
         encoding = replace(encoding, splats=compacted.splats)
@@ -226,7 +229,7 @@ def compress(
     result, more = encoding.run(search)
     encoded = result.encoded
     container_bytes, file_bytes = stored_sizes(encoded.files, packed=encoding.packed)
-    evaluation = _evaluate(original, encoded.files, views, threads, after_search) if evaluate else None
+    evaluation = _evaluate(encoding.original, encoded.files, views, threads, after_search) if evaluate else None
     checkpoints = (None if compacted is None else compacted.checkpoint, finetune_checkpoint)
     if target is not None:
         after_search("write", 0.0)
@@ -234,9 +237,9 @@ def compress(
         delete_checkpoints(*checkpoints)
     clock.stop()
     report = Report(
-        source_count=len(original) + cleaned.removed,
+        source_count=source_count,
         count=len(encoded.order),
-        sh_degree=original.sh_degree,
+        sh_degree=sh_degree,
         source_bytes=source_bytes,
         container_bytes=container_bytes,
         file_bytes=file_bytes,
@@ -266,53 +269,6 @@ def _settings_as_used(requested: Settings, used: EncodeSettings) -> dict[str, An
     """Return the requested settings with the changes by a search for a goal and by fine-tuning."""
     goals = {name: getattr(requested.encode, name) for name in (*GOALS, "rd_lambda")}
     return requested.model_copy(update={"encode": used.model_copy(update=goals)}).model_dump(mode="json")
-
-
-def decompress(
-    source: AnyPath | bytes | Mapping[str, bytes],
-    destination: AnyPath | None = None,
-    *,
-    max_gaussians: int | None = None,
-    level: int = 0,
-    raw_axes: bool = False,
-    overwrite: bool = False,
-    threads: int = 0,
-    progress: Progress = silent,
-) -> Splats:
-    """Decode a SOG-XT container, or a scene of another compressed format.
-
-    Args:
-        source: path of a zip or a folder, the bytes of a zip, or the files in memory; or any other file that
-            :func:`kissgs.load` reads, except a ``.ply``.
-        destination: ``.ply`` to write; by default nothing is written.
-        max_gaussians: see :class:`kissgs.ReadOptions`, as for ``level`` and ``raw_axes``.
-        level: level of detail of a streamed SOG scene; 0 is the finest.
-        raw_axes: read ``.spz`` that stores the axes of a ``.ply`` without saying so.
-        overwrite: replace ``destination`` if it exists.
-        threads: number of threads; 0 means one per processor.
-        progress: receives events.
-
-    Returns:
-        The scene exactly as stored: quaternions are as quantised, so their length is only approximately 1.
-
-    Raises:
-        InvalidContainerError: the container is damaged.
-        InvalidSceneError: a file of another format is damaged.
-        UnsupportedError: the file has a feature that kissgs does not read.
-        OutputError: ``destination`` cannot be written.
-    """
-    if destination is not None:
-        check_ply(Path(destination), overwrite=overwrite)
-    splats = read_scene(
-        source if isinstance(source, bytes | Mapping) else Path(source),
-        ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes),
-        threads=threads,
-        progress=progress,
-        only_containers=True,
-    )
-    if destination is not None:
-        save_ply(splats, destination, overwrite=overwrite, progress=progress)
-    return splats
 
 
 class _Common(TypedDict):

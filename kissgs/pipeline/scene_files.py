@@ -1,8 +1,11 @@
-"""Scenes in files: read every format, write those that are no containers."""
+"""Scenes in files: read every format, write those that are no containers.
+
+The module of a format is loaded when a file of that format is read.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from os import PathLike
 from pathlib import Path
 
@@ -10,17 +13,9 @@ from kissgs.core.errors import InvalidContainerError, OutputError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Cleaned, Splats, clean
 from kissgs.io.atomic import atomic_file, reason_of, refuse_existing
-from kissgs.io.gltf import read_gltf
-from kissgs.io.ksplat import read_ksplat
-from kissgs.io.ply import read_ply
-from kissgs.io.splat import read_splat
-from kissgs.io.spz import read_spz
 from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
-from kissgs.pipeline.scene_formats import recognise, scene_root
+from kissgs.pipeline.scene_formats import SceneFormat, recognise, scene_root
 from kissgs.pipeline.scene_output import output_format, write_scene
-from kissgs.sog import streamed
-from kissgs.sog.decode import decode as decode_sog
-from kissgs.sogxt.decode import decode as decode_sogxt
 
 AnyPath = str | PathLike[str]
 
@@ -138,17 +133,41 @@ def read_scene(
     root = scene_root(source) if isinstance(source, Path) else source
     most = reading.max_compressed
     if found == "streamed-sog":
+        from kissgs.sog import streamed
+
         return streamed.decode(root, level=reading.level, max_gaussians=most, threads=threads, progress=progress)
     if found == "sog":
+        from kissgs.sog.decode import decode as decode_sog
+
         return decode_sog(root, max_gaussians=most, threads=threads, progress=progress)
     if found == "sogxt" or (only_containers and found == "ply") or isinstance(source, Mapping):
+        from kissgs.sogxt.decode import decode as decode_sogxt
+
         return decode_sogxt(root, max_gaussians=most, threads=threads, progress=progress)
     if found == "spz":
+        from kissgs.io.spz import read_spz
+
         return read_spz(source, max_gaussians=most, raw_axes=reading.raw_axes, progress=progress)
     if found == "gltf":
+        from kissgs.io.gltf import read_gltf
+
         return read_gltf(source, max_gaussians=most, progress=progress)
-    reader = {"splat": read_splat, "ksplat": read_ksplat, "ply": read_ply}[found]
-    return reader(source, max_gaussians=reading.max_gaussians, progress=progress)
+    return _reader(found)(source, max_gaussians=reading.max_gaussians, progress=progress)
+
+
+def _reader(found: SceneFormat) -> Callable[..., Splats]:
+    """Return the reader of a format without options."""
+    if found == "splat":
+        from kissgs.io.splat import read_splat
+
+        return read_splat
+    if found == "ksplat":
+        from kissgs.io.ksplat import read_ksplat
+
+        return read_ksplat
+    from kissgs.io.ply import read_ply
+
+    return read_ply
 
 
 def stored_bytes(path: Path) -> int:

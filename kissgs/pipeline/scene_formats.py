@@ -9,11 +9,8 @@ from pathlib import Path
 from typing import Literal
 
 from kissgs.core.errors import InvalidContainerError
-from kissgs.io.gltf_document import GLB_MAGIC
-from kissgs.io.ksplat import is_ksplat
 from kissgs.io.packed_files import ZIP_MAGICS, MemorySource, Source, open_source, sniff_format, zip_names
-from kissgs.io.spz import is_spz
-from kissgs.sog.metadata import LOD_NAME, MAX_METADATA_BYTES, META_NAME
+from kissgs.sog.names import LOD_NAME, MAX_METADATA_BYTES, META_NAME
 from kissgs.sogxt.container import is_packed
 from kissgs.sogxt.names import YAML_NAME
 
@@ -55,6 +52,8 @@ def recognise(
         return _WITHOUT_MARK[ending]
     if is_container(source):
         return _packed_format(source, "sog" if ending == ".sog" else "sogxt")
+    from kissgs.io.ksplat import is_ksplat
+
     if is_ksplat(head, found_size if size is None else size):
         return "ksplat"
     if ending not in _ENDINGS and _is_json(head):
@@ -109,6 +108,11 @@ def _beginning(source: Path | bytes) -> tuple[bytes, int]:
 def _by_mark(head: bytes) -> SceneFormat | None:
     if head[:3] == b"ply" and head[3:4].isspace():
         return "ply"
+    if head[:4] in ZIP_MAGICS:  # the modules of other formats need not be loaded
+        return None
+    from kissgs.io.gltf_document import GLB_MAGIC
+    from kissgs.io.spz import is_spz
+
     if head.startswith(GLB_MAGIC):
         return "gltf"
     return "spz" if is_spz(head) else None

@@ -8,13 +8,8 @@ from typing import Literal
 from kissgs.core.errors import OutputError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats, clean
-from kissgs.io.compressed_ply import write_compressed
 from kissgs.io.container_names import ENDINGS
-from kissgs.io.gltf_writer import write_glb, write_spz_glb
-from kissgs.io.ply import write_ply
 from kissgs.io.scene_file import BinaryWriter
-from kissgs.io.splat import write_splat
-from kissgs.io.spz_writer import write_spz
 
 OutputFormat = Literal["ply", "compressed.ply", "spz", "splat", "glb", "spz.glb"]
 OUTPUT_FORMATS: tuple[OutputFormat, ...] = ("ply", "compressed.ply", "spz", "splat", "glb", "spz.glb")
@@ -49,12 +44,23 @@ def write_scene(
         UnsupportedError: the format cannot hold the scene.
     """
     if kind == "ply":
+        from kissgs.io.ply import write_ply
+
         write_ply(file, splats, progress=progress)
         return ()
     splats = clean(splats)[0]
     if kind == "spz":
+        from kissgs.io.spz_writer import write_spz
+
         return write_spz(file, splats, raw_axes=raw_axes, progress=progress)
-    writer = {"compressed.ply": write_compressed, "splat": write_splat, "glb": write_glb, "spz.glb": write_spz_glb}[
-        kind
-    ]
-    return writer(file, splats, progress=progress)
+    if kind == "compressed.ply":
+        from kissgs.io.compressed_ply import write_compressed
+
+        return write_compressed(file, splats, progress=progress)
+    if kind == "splat":
+        from kissgs.io.splat import write_splat
+
+        return write_splat(file, splats, progress=progress)
+    from kissgs.io.gltf_writer import write_glb, write_spz_glb
+
+    return (write_glb if kind == "glb" else write_spz_glb)(file, splats, progress=progress)

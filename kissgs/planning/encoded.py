@@ -7,10 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kissgs.core.array_types import Int
-from kissgs.core.splats import Splats
 from kissgs.planning.encoding_plan import EncodingPlan
-from kissgs.planning.planner import visible_gaussians
-from kissgs.settings import EncodeSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,15 +39,15 @@ class Encoded:
     note: str = ""
 
     @classmethod
-    def of(cls, plan: EncodingPlan, splats: Splats, settings: EncodeSettings, files: dict[str, bytes]) -> Encoded:
-        """Return the files of a plan of ``splats`` with the plan's figures."""
-        kept = len(visible_gaussians(splats, settings))
+    def of(cls, plan: EncodingPlan, files: dict[str, bytes]) -> Encoded:
+        """Return the files of a plan with the plan's figures."""
+        scene = plan.scene
         return cls(
             files=files,
             order=plan.grid.cells[plan.grid.mask],
             form_error=plan.form_error,
-            invisible=len(splats) - kept,
-            pruned_by_rd=kept - int(plan.grid.mask.sum()),
+            invisible=scene.count - scene.visible,
+            pruned_by_rd=scene.visible - int(plan.grid.mask.sum()),
             clipped_colors=plan.clipped_colors,
             errors=plan.errors,
             rd_lambda=plan.rd_lambda,

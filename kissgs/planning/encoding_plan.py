@@ -6,11 +6,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kissgs.core.array_types import Int
+from kissgs.core.array_types import UInt8
 from kissgs.planning.layout import Grid
 from kissgs.planning.quantize import Quantized
 from kissgs.planning.rd_model import Costs
 from kissgs.planning.sh_codebook import Codebook
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedScene:
+    """Facts of the scene that was planned, so that the scene itself is not needed any more.
+
+    Attributes:
+        count: number of Gaussians.
+        visible: number of Gaussians that the plan could keep: those that a renderer draws, or all.
+        sh_degree: 0 to 3.
+    """
+
+    count: int
+    visible: int
+    sh_degree: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -18,6 +33,7 @@ class EncodingPlan:
     """Levels of every cell, and the errors that they cause.
 
     Attributes:
+        scene: the scene that was planned.
         grid: cell of each Gaussian.
         fields: levels by field of the metadata, one row per cell; ``f_rest_centroids``: one row per entry.
         codebook: the SH codebook, and the entry of each Gaussian.
@@ -32,10 +48,11 @@ class EncodingPlan:
         note: a sentence for the user if many Gaussians were pruned; else empty.
     """
 
+    scene: PlannedScene
     grid: Grid
     fields: dict[str, Quantized]
     codebook: Codebook
-    classes: Int[np.ndarray, " M"]
+    classes: UInt8[np.ndarray, " M"]
     form_error: float
     clipped_colors: int
     errors: dict[str, list[float]]

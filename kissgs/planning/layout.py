@@ -13,16 +13,20 @@ from math import isqrt
 
 import numpy as np
 
-from kissgs.core.array_types import Bool, Float32, Int, UInt16
+from kissgs.core.array_types import Bool, Float32, Int, Int32, Integer, UInt16
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.limits import MAX_GRID_SIDE
 from kissgs.core.threads import Workers
 from kissgs.planning.plas import plas
 from kissgs.planning.quantize import quantize_means
+from kissgs.planning.rows import for_each_block, selected, sorted_order
 from kissgs.settings import EncodeSettings
 
 PLAS_HIGH, PLAS_LOW = 1.0, 0.2
 """Weights of the high and the low position bytes in PLAS, as in the paper's public encoder."""
+
+CURVE_BITS = 48
+"""Bits of a position along the Hilbert curve."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +51,7 @@ class Grid:
         holes = np.flatnonzero(~self.mask[:count])
         if len(holes) == 0:
             return self
-        cells, index = self.cells.copy(), np.arange(len(self.cells))
+        cells, index = self.cells.copy(), np.arange(len(self.cells), dtype=np.int32)
         cells[holes] = cells[count + np.flatnonzero(self.mask[count:])]
         cells[count:] = cells[count - 1]
         return Grid(self.side, cells, index < count, np.minimum(index, count - 1))
@@ -60,7 +64,7 @@ def layout_grid(
     settings: EncodeSettings,
     pool: Workers,
     report: Callable[[float], None],
-    classes: Int[np.ndarray, " M"] | None = None,
+    classes: Integer[np.ndarray, " M"] | None = None,
 ) -> Grid:
     """Assign a cell to every Gaussian of ``kept``.
 
@@ -72,20 +76,19 @@ def layout_grid(
     """
     side = grid_side(len(kept))
     if len(kept) == 0:
-        nothing = np.zeros(side * side, dtype=np.int64)
+        nothing = np.zeros(side * side, dtype=np.int32)
         return Grid(side, nothing, nothing.astype(bool), nothing)
-    levels = quantize_means(means[kept], bits=bits).levels
+    levels = quantize_means(selected(means, kept), bits=bits, pool=pool).levels
     if settings.order == "hilbert":
-        order = hilbert_order(levels)
-        if classes is not None:
-            order = order[np.argsort(classes[order], kind="stable")]
+        order = hilbert_order(levels, classes, pool)
         order = np.concatenate([order, np.repeat(order[-1:], side * side - len(order))])
         mask = np.arange(side * side) < len(kept)
     else:
         order, mask = _plas_order(levels, side, settings, pool, report)
-    rank = np.empty(len(kept), dtype=np.int64)
-    rank[order[mask]] = np.arange(len(kept))
-    return Grid(side, kept[order], mask, rank[order])
+    del levels
+    rank = np.empty(len(kept), dtype=np.int32)
+    rank[order[mask]] = np.arange(len(kept), dtype=np.int32)
+    return Grid(side, kept.astype(np.int32, copy=False).take(order), mask, rank[order])
 
 
 def _plas_order(
@@ -99,7 +102,7 @@ def _plas_order(
     count = len(levels)
     rng = np.random.Generator(np.random.PCG64(settings.seed))
     padding = rng.integers(0, count, side * side - count)
-    index = np.concatenate([np.arange(count), padding])
+    index = np.concatenate([np.arange(count), padding]).astype(np.int32)
     radius = settings.plas_start_radius
     start = rng.permutation(side * side) if radius is None else hilbert_order(levels[index])
     index = index[start]
@@ -130,17 +133,28 @@ def grid_side(count: int) -> int:
     return side
 
 
-def hilbert_order(levels: UInt16[np.ndarray, "N 3"]) -> Int[np.ndarray, " N"]:
-    """Return the order in which a 3D Hilbert curve visits the positions.
+def hilbert_order(
+    levels: UInt16[np.ndarray, "N 3"], classes: Integer[np.ndarray, " N"] | None = None, pool: Workers | None = None
+) -> Int32[np.ndarray, " N"]:
+    """Return the order in which a 3D Hilbert curve visits the positions, the smallest class first.
 
     Args:
         levels: 16-bit positions.
+        classes: class of each Gaussian, below 2^16; None if all are in one.
+        pool: threads; None for the calling one.
 
     Returns:
         Indices of the Gaussians along the curve; Gaussians of equal position keep their order.
     """
     from kissgs.planning import kernels
 
-    keys = np.empty(len(levels), dtype=np.uint64)
-    kernels.hilbert_keys(np.ascontiguousarray(levels), keys)
-    return np.argsort(keys, kind="stable")
+    count = len(levels)
+    keys = np.empty(count, np.uint64)
+
+    def work(rows: slice) -> None:
+        kernels.hilbert_keys(np.ascontiguousarray(levels[rows]), keys[rows])
+        if classes is not None:
+            keys[rows] |= classes[rows].astype(np.uint64) << np.uint64(CURVE_BITS)
+
+    for_each_block(count, work, pool)
+    return sorted_order(keys, CURVE_BITS if classes is None else 64)

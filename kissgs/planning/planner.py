@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kissgs.core.array_types import Int
+from kissgs.core.array_types import Int32
 from kissgs.core.progress import Progress, silent
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats
@@ -26,6 +26,7 @@ def plan_encoding(
     sensitivity: Sensitivity | None = None,
     recolor: ColorRefit | None = None,
     container: ContainerModel = EVEN_LEVELS,
+    keep_costs: bool = True,
     threads: int = 0,
     progress: Progress = silent,
 ) -> EncodingPlan:
@@ -39,6 +40,7 @@ def plan_encoding(
         recolor: for rate-distortion planning: returns better ``sh0`` for the decoded Gaussians and their indices in
             the scene.
         container: what the container can hold.
+        keep_costs: whether the plan of rate-distortion planning has its costs, which fine-tuning needs.
         threads: number of threads; 0 means one per processor.
         progress: receives "kernels", "rate_distortion", "order", "forms", "codebook", "sort codebook" and "rounding".
 
@@ -52,20 +54,22 @@ def plan_encoding(
     kept = visible_gaussians(splats, settings)
     with blas_workers(threads) as pool:
         if sensitivity is not None and (sensitivity.color_weight[kept] > 0).any():
-            return plan_rate_distortion(splats, kept, sensitivity, recolor, settings, container, pool, progress)
+            return plan_rate_distortion(
+                splats, kept, sensitivity, recolor, settings, container, pool, progress, keep_costs=keep_costs
+            )
         return plan_uniform(splats, kept, settings, container, pool, progress)
 
 
-def visible_gaussians(splats: Splats, settings: EncodeSettings) -> Int[np.ndarray, " K"]:
+def visible_gaussians(splats: Splats, settings: EncodeSettings) -> Int32[np.ndarray, " K"]:
     """Return the indices of the Gaussians that a renderer draws, or of all if ``prune_invisible`` is off."""
     if not settings.prune_invisible:
-        return np.arange(len(splats))
-    return np.flatnonzero(splats.opacities > np.float32(INVISIBLE_LOGIT))
+        return np.arange(len(splats), dtype=np.int32)
+    return np.flatnonzero(splats.opacities > np.float32(INVISIBLE_LOGIT)).astype(np.int32)
 
 
 def load_kernels(progress: Progress = silent) -> None:
     """Compile the encoder's kernels, or load them from numba's cache."""
     progress("kernels", 0.0)
-    from kissgs.planning import kernels  # noqa: F401
+    from kissgs.planning import form_kernels, kernels, order_kernels  # noqa: F401
 
     progress("kernels", 1.0)

@@ -12,9 +12,11 @@ from math import ceil
 
 import numpy as np
 
-from kissgs.core.array_types import Bool, Float, Float32, Float64, Int, UInt8, UInt16
+from kissgs.core.array_types import Bool, Float, Float32, Float64, Int, Integer, UInt8, UInt16
 from kissgs.core.signed_log import signed_log
 from kissgs.core.splats import Splats
+from kissgs.core.threads import Workers
+from kissgs.planning.rows import Rows, for_each_block, row_range, selected
 
 MEANS_TOP = 65_535
 """Top level of positions. It must occur, because some readers of meta.json divide by it, not by the observed one."""
@@ -41,7 +43,7 @@ class Quantized:
     low: Float32[np.ndarray, " C"]
     high: Float32[np.ndarray, " C"]
     top: int
-    level_stride: int | Int[np.ndarray, " N"] | Int[np.ndarray, "N C"] = 1
+    level_stride: int | Integer[np.ndarray, " N"] | Integer[np.ndarray, "N C"] = 1
     level_offset: int = 0
     table: Float32[np.ndarray, " table"] | None = None
 
@@ -52,13 +54,20 @@ class Quantized:
         low, high = self.low.astype(np.float64), self.high.astype(np.float64)
         return np.asarray(low + self.levels * ((high - low) / self.top))
 
-    def take(self, rows: Int[np.ndarray, " M"] | Bool[np.ndarray, " N"]) -> Quantized:
-        """Return the rows ``rows``, in that order."""
+    def take(self, rows: Int[np.ndarray, " M"] | Bool[np.ndarray, " N"] | slice) -> Quantized:
+        """Return the rows ``rows``, in that order; those of a slice are not copied."""
         spacing = self.level_stride if isinstance(self.level_stride, int) else self.level_stride[rows]
         return replace(self, levels=self.levels[rows], level_stride=spacing)
 
 
-def quantize(values: Float[np.ndarray, "N C"], *, step: float, shared: bool = True, max_top: int = 255) -> Quantized:
+def quantize(
+    values: Float[np.ndarray, "N C"] | Rows,
+    *,
+    step: float,
+    shared: bool = True,
+    max_top: int = 255,
+    pool: Workers | None = None,
+) -> Quantized:
     """Round to uniform steps.
 
     Args:
@@ -68,19 +77,25 @@ def quantize(values: Float[np.ndarray, "N C"], *, step: float, shared: bool = Tr
         shared: one step for all channels (least error for a given entropy). If false, every channel spreads
             ``max_top`` levels over its own range, and ``step`` has no effect.
         max_top: largest level.
+        pool: threads; None for the calling one.
 
     Returns:
         Levels whose values are at most half a step away; a constant channel is exact.
     """
-    wide = values.astype(np.float64)
-    low, high = _range(wide)
+    low, high = _range(values, pool)
     extent = high.astype(np.float64) - low
     widest = float(extent.max(initial=0.0))
     top = max_top
     if shared and widest > 0:
         top = int(min(max(ceil(widest / step - 1e-3), 1), max_top))  # exactly k steps need k levels
         high = np.where(extent > 0, (low + widest).astype(np.float32), low)
-    return Quantized(_levels(wide, low, high, top).astype(np.uint8), low, high, top)
+    levels = np.empty((len(values), len(low)), np.uint8)
+
+    def work(rows: slice) -> None:
+        levels[rows] = _levels(values[rows].astype(np.float64), low, high, top)
+
+    for_each_block(len(values), work, pool)
+    return Quantized(levels, low, high, top)
 
 
 def clip_outliers(values: Float[np.ndarray, "N C"], *, step: float, share: float) -> Float[np.ndarray, "N C"]:
@@ -102,41 +117,73 @@ def clip_outliers(values: Float[np.ndarray, "N C"], *, step: float, share: float
     return np.clip(values, first.astype(values.dtype), last.astype(values.dtype))
 
 
-def quantize_means(means: Float32[np.ndarray, "N 3"], *, bits: int | Int[np.ndarray, " N"]) -> Quantized:
+def quantize_means(
+    means: Float32[np.ndarray, "N 3"] | Rows, *, bits: int | Int[np.ndarray, " N"], pool: Workers | None = None
+) -> Quantized:
     """Quantise positions to 16-bit levels of their signed logarithm, with one range for all three axes.
 
     Args:
-        means: finite positions.
+        means: finite positions, float32.
         bits: precision, 8 to 16, of all Gaussians or of each. Below 16 the levels are multiples of a power of two (the
             low bytes then compress); the outermost level stays 65535.
+        pool: threads; None for the calling one.
 
     Returns:
         Levels (uint16) with ``low`` and ``high`` in the signed-log domain, equal in all channels.
     """
-    wide = signed_log(means)
-    low32, high32 = _range(wide.reshape(-1, 1))
-    low, high = np.repeat(low32, 3), np.repeat(high32, 3)
-    spacing = np.exp2(16 - np.asarray(bits))
-    levels = _levels(wide, low, high, MEANS_TOP, spacing.reshape(-1, 1))
-    if high[0] > low[0]:
-        levels[wide == wide.max()] = MEANS_TOP  # rounding of the level or of the range could miss it
-    stride = int(spacing) if spacing.ndim == 0 else spacing.astype(np.int64)
-    return Quantized(levels.astype(np.uint16), low, high, MEANS_TOP, stride)
+    if len(means) == 0:
+        zeros = np.zeros(3, np.float32)
+        return Quantized(np.empty((0, 3), np.uint16), zeros, zeros, MEANS_TOP, *_strides(bits))
+    smallest, largest = (end(values) for end, values in zip((np.min, np.max), row_range(means, pool), strict=True))
+    ends = signed_log(np.array([smallest, largest])).astype(np.float32) + np.float32(0)
+    low, high = np.repeat(ends[:1], 3), np.repeat(ends[1:], 3)
+    levels = np.empty((len(means), 3), np.uint16)
+
+    def work(rows: slice) -> None:
+        some = means[rows]
+        spacing = np.exp2(16 - np.asarray(bits if isinstance(bits, int) else bits[rows], np.float64))
+        found = _levels(signed_log(some), low, high, MEANS_TOP, spacing.reshape(-1, 1))
+        if high[0] > low[0]:
+            found[some == largest] = MEANS_TOP  # rounding of the level or of the range could miss it
+        levels[rows] = found
+
+    for_each_block(len(means), work, pool)
+    return Quantized(levels, low, high, MEANS_TOP, *_strides(bits))
 
 
-def means_bits(splats: Splats, kept: Int[np.ndarray, " M"], tolerance: float) -> int:
+def _strides(bits: int | Int[np.ndarray, " N"]) -> tuple[int | Int[np.ndarray, " N"]]:
+    """Return the distance of levels of 16 bits of which only ``bits`` are used."""
+    return (1 << (16 - bits),) if isinstance(bits, int) else (np.left_shift(1, 16 - bits.astype(np.int16)),)
+
+
+def means_bits(splats: Splats, kept: Int[np.ndarray, " M"], tolerance: float, pool: Workers | None = None) -> int:
     """Return the position bits, 8 to 16, with which the median Gaussian moves by at most ``tolerance`` of its size.
 
     The step of a signed logarithm grows as 1 + |x|; size is the geometric mean of the two longest axes.
     """
     if len(kept) == 0:
         return 16
-    reach = 1 + np.abs(splats.means[kept]).max(axis=1).astype(np.float64)
-    longest = np.sort(splats.scales[kept], axis=1)[:, 1:].mean(axis=1, dtype=np.float64)
-    allowed = tolerance * np.exp(np.median(longest - np.log(reach)))
-    extent = float(np.ptp(signed_log(splats.means[kept])))
-    levels = extent / (2 * allowed)  # half a step is the largest error
+    ratio = np.empty(len(kept))
+
+    def work(rows: slice) -> None:
+        some = kept[rows]
+        x, y, z = np.abs(splats.means.take(some, axis=0)).T
+        reach = 1 + np.maximum(np.maximum(x, y), z).astype(np.float64)
+        a, b, c = splats.scales.take(some, axis=0).T
+        largest, smaller = np.maximum(a, b), np.minimum(a, b)
+        second = np.maximum(smaller, np.minimum(largest, c))
+        ratio[rows] = (np.maximum(largest, c).astype(np.float64) + second) / 2 - np.log(reach)
+
+    for_each_block(len(kept), work, pool)
+    allowed = tolerance * np.exp(np.median(ratio, overwrite_input=True))
+    levels = log_extent(selected(splats.means, kept), pool) / (2 * allowed)  # half a step is the largest error
     return int(np.clip(np.ceil(np.log2(max(levels, 1))), 8, 16))
+
+
+def log_extent(means: Float32[np.ndarray, "N 3"] | Rows, pool: Workers | None = None) -> float:
+    """Return the difference of the largest and the smallest signed logarithm of a coordinate."""
+    low, high = row_range(means, pool)
+    return float(np.ptp(signed_log(np.array([low.min(), high.max()]))))
 
 
 def observed_range(quantized: Quantized) -> tuple[Float32[np.ndarray, " C"], Float32[np.ndarray, " C"]]:
@@ -160,13 +207,16 @@ def half_steps(quantized: Quantized, stride: int = 1) -> list[float]:
     return [float(step) for step in extent / quantized.top * stride / 2]
 
 
-def _range(wide: Float64[np.ndarray, "N C"]) -> tuple[Float32[np.ndarray, " C"], Float32[np.ndarray, " C"]]:
+def _range(
+    values: Float[np.ndarray, "N C"] | Rows, pool: Workers | None
+) -> tuple[Float32[np.ndarray, " C"], Float32[np.ndarray, " C"]]:
     """Return each channel's minimum and maximum as the float32 numbers that are written (zeros without rows)."""
-    if len(wide) == 0:
-        zeros = np.zeros(wide.shape[1], dtype=np.float32)
+    if len(values) == 0:
+        zeros = np.zeros(values[:0].shape[1], dtype=np.float32)
         return zeros, zeros
+    low, high = row_range(values, pool)
     # + 0.0 turns -0.0 into 0.0, so that equal scenes give equal bytes.
-    return wide.min(axis=0).astype(np.float32) + np.float32(0), wide.max(axis=0).astype(np.float32) + np.float32(0)
+    return low.astype(np.float32) + np.float32(0), high.astype(np.float32) + np.float32(0)
 
 
 def _levels(

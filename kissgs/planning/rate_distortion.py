@@ -8,15 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from kissgs.core.array_types import Bool, Float32, Int
+from kissgs.core.memory import return_free_memory
 from kissgs.core.progress import Progress
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import SH_C0, Splats
 from kissgs.core.threads import Workers
 from kissgs.planning import kmeans
 from kissgs.planning.container_model import ContainerModel
-from kissgs.planning.encoding_plan import EncodingPlan
+from kissgs.planning.encoding_plan import EncodingPlan, PlannedScene
 from kissgs.planning.layout import layout_grid
-from kissgs.planning.rd_fields import RdFields, decoded_scene, decoded_sh, largest_errors
+from kissgs.planning.rd_fields import RdFields, decoded_entries, decoded_scene, largest_errors
 from kissgs.planning.rd_model import (
     FEW,
     SEEN,
@@ -28,7 +29,8 @@ from kissgs.planning.rd_model import (
     lambda_for,
 )
 from kissgs.planning.rdo_quantize import largest_changes
-from kissgs.planning.rotation_forms import canonicalize
+from kissgs.planning.rotation_forms import choose_forms
+from kissgs.planning.rows import for_each_block, selected
 from kissgs.planning.sh_codebook import bounded_weights, fit_codebook, size_weights
 from kissgs.settings import EncodeSettings
 
@@ -67,10 +69,16 @@ def plan_rate_distortion(
     container: ContainerModel,
     pool: Workers,
     progress: Progress,
+    *,
+    keep_costs: bool = True,
 ) -> EncodingPlan:
     """Plan the Gaussians ``kept``, at least one of which a camera has seen, for a container."""
     progress("rate_distortion", 0.0)
-    costs = Costs.of(sensitivity, splats).take(kept)
+    scene = PlannedScene(len(splats), len(kept), splats.sh_degree)
+    costs = Costs.of(sensitivity, splats, pool)
+    return_free_memory()
+    if len(kept) < len(splats):
+        costs = costs.keep(kept)
     sh_model = _codebook_error_model(splats, kept, sensitivity, settings, pool)
     threshold_bits = settings.prune_threshold_bits * (1 - sensitivity.view_uncertainty)
     lambdas = _LambdaEstimate(
@@ -85,55 +93,96 @@ def plan_rate_distortion(
     slack = max(1.0, float(np.sqrt(rd_lambda / default_lambda)))
     pruned_by_rd = costs.pruned_by_rd(rd_lambda, threshold_bits, default_lambda)
     note = _pruning_note(pruned_by_rd, costs)
-    remaining = np.flatnonzero(~pruned_by_rd)
-    kept, costs = kept[remaining], costs.take(remaining)
-    classes = costs.classes(settings.step_classes, splats.means[kept])
+    del lambdas  # it holds the costs of what is pruned now
+    if pruned_by_rd.any():
+        remaining = np.flatnonzero(~pruned_by_rd).astype(np.int32)
+        kept, costs = kept.take(remaining), costs.keep(remaining)
+        del remaining
+    del pruned_by_rd
+    condense = container.tables is None and not keep_costs
+    if condense:
+        costs = costs.of_rounding()
+    classes = costs.classes(settings.step_classes, selected(splats.means, kept))
+    criterion = RdCriterion(costs, classes, rd_lambda)
+    criterion = criterion.condensed() if condense else criterion
+    del costs
+    return_free_memory()
     progress("order", 0.0)
     grid = layout_grid(splats.means, kept, 16, settings, pool, lambda fraction: progress("order", fraction), classes)
     grid = grid.with_padding_last() if container.padding_last else grid
     order = grid.cells[grid.mask]
-    rank = np.searchsorted(kept, order)
-    classes, costs, ordered = classes[rank], costs.take(rank), splats.select(order)
+    place = np.empty(len(splats), np.int32)
+    place[kept] = np.arange(len(kept), dtype=np.int32)
+    rank = place.take(order)
+    del place, kept
+    criterion = criterion.take(rank)
+    del classes, rank
+    return_free_memory()
 
     progress("forms", 0.0)
-    quats, scales, form_error, forms = canonicalize(
+    shapes, form_error = choose_forms(
         splats, grid.cells, grid.side, settings, pool, lambda fraction: progress("forms", fraction)
     )
-    quats, scales, forms = quats[grid.mask], scales[grid.mask], forms[grid.mask]
+    shapes = shapes.take(grid.mask)
     weights, size = (
         _sh_weights(sensitivity, order, splats),
         sh_model.best_size(rd_lambda, len(order), settings.gaussians_per_codebook_entry, container.entry_bits),
     )
-    codebook = fit_codebook(ordered, np.arange(len(order)), weights, size, settings, container, pool, progress)
+    codebook = fit_codebook(splats, order, weights, size, settings, container, pool, progress)
+    del weights
+    return_free_memory()
     progress("rounding", 0.0)
-    values = np.concatenate([ordered.opacities[:, None], scales, quats], axis=1).astype(np.float64)
-    captured = sensitivity.captured[order]
-    largest = largest_changes(sensitivity.coverage[order], captured, slack)
-    quantizer = RdFields(container, settings, RdCriterion(costs, classes, rd_lambda), largest, pool)
-    fields = quantizer.shapes(values, sensitivity.shape_hessian[order], forms)
-    fields["means"] = quantizer.means(ordered, np.rint(captured + np.log2(slack)))
+    captured = sensitivity.captured.take(order)
+    largest = largest_changes(sensitivity.coverage.take(order), captured, slack)
+    quantizer = RdFields(container, settings, criterion, largest, pool)
+    fields = quantizer.shapes(shapes, selected(sensitivity.shape_hessian, order))
+    fields["means"] = quantizer.means(splats, order, np.rint(captured + np.log2(slack)).astype(np.int8))
 
-    rest = decoded_sh(codebook, ordered)
-    compensation = np.einsum("nk,nkc->nc", sensitivity.mean_sh_basis[order], ordered.shN - rest) / np.float32(SH_C0)
-    base = ordered.sh0 + np.clip(compensation, -MAX_COMPENSATION, MAX_COMPENSATION)
+    rest = decoded_entries(codebook, splats.shN.shape[1])
+    base = _compensated_colors(splats, order, sensitivity, rest, codebook.labels, pool)
     if recolor is not None:
-        base = recolor(decoded_scene(fields, base.astype(np.float32), rest), order)
-    fields["f_dc"], clipped = quantizer.colors(base.astype(np.float64))
+        base = recolor(decoded_scene(fields, base, rest[codebook.labels[: len(order)]]), order)
+    fields["f_dc"], clipped = quantizer.colors(base)
+    errors = largest_errors(fields, shapes, selected(splats.means, order), selected(splats.sh0, order), pool)
     return EncodingPlan(
+        scene=scene,
         grid=grid,
         fields={
             **{name: field.take(grid.cell_to_gaussian) for name, field in fields.items()},  # one row for every cell
             "f_rest_centroids": codebook.centroids,
         },
         codebook=codebook,
-        classes=classes,
+        classes=criterion.classes,
         form_error=form_error,
         clipped_colors=clipped,
-        errors={**largest_errors(fields, values, ordered), "f_rest_centroids": codebook.errors},
-        costs=costs,
+        errors={**errors, "f_rest_centroids": codebook.errors},
+        costs=criterion.costs if keep_costs else None,
         rd_lambda=rd_lambda,
         note=note,
     )
+
+
+def _compensated_colors(
+    splats: Splats,
+    order: Int[np.ndarray, " M"],
+    sensitivity: Sensitivity,
+    entries: Float32[np.ndarray, "entries K 3"],
+    labels: Int[np.ndarray, " M"],
+    pool: Workers,
+) -> Float32[np.ndarray, "M 3"]:
+    """Return base colours that make up for what the codebook loses of each Gaussian's shN, where cameras see it."""
+    base = splats.sh0.take(order, axis=0)
+
+    def compensate(rows: slice) -> None:
+        some = order[rows]
+        lost = splats.shN.take(some, axis=0) - entries.take(labels[rows], axis=0)
+        basis = sensitivity.mean_sh_basis.take(some, axis=0)
+        change = np.einsum("nk,nkc->nc", basis, lost) / np.float32(SH_C0)
+        base[rows] += np.clip(change, -MAX_COMPENSATION, MAX_COMPENSATION)
+
+    if splats.sh_degree > 0:
+        for_each_block(len(order), compensate, pool)
+    return base
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -208,6 +257,8 @@ def _codebook_error_model(
 
 def _sh_weights(sensitivity: Sensitivity, chosen: Int[np.ndarray, " M"], splats: Splats) -> Float32[np.ndarray, " M"]:
     """Return the weight of each Gaussian's SH vector in the codebook."""
+    if splats.sh_degree == 0:
+        return np.ones(len(chosen), np.float32)
     power = np.float32(max(1 - SENSITIVITY_SHRINK * sensitivity.view_uncertainty, 0.0))
     sizes = size_weights(splats, SIZE_POWER * sensitivity.view_uncertainty)[chosen]
     return bounded_weights(sensitivity.color_weight[chosen] ** power * sizes, *SH_WEIGHTS)

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from kissgs.core.array_types import Float, Float32, Float64, UInt8
+from kissgs.core.array_types import Float32, Float64, Int
 from kissgs.core.signed_log import signed_exp, signed_log
 from kissgs.core.splats import Splats
 from kissgs.core.threads import Workers
 from kissgs.planning import table_fields
 from kissgs.planning.container_model import ContainerModel
-from kissgs.planning.quantize import MEANS_TOP, Quantized, clip_outliers, means_bits, quantize_means
+from kissgs.planning.quantize import MEANS_TOP, Quantized, clip_outliers, log_extent, means_bits, quantize_means
 from kissgs.planning.rd_model import RdCriterion
 from kissgs.planning.rdo_quantize import quantize_by_class, rdo_quantize_shapes
+from kissgs.planning.rotation_forms import StoredShapes
+from kissgs.planning.rows import Rows, for_each_block, selected
 from kissgs.planning.sh_codebook import COEFFICIENTS, Codebook
 from kissgs.settings import EncodeSettings
 
@@ -37,67 +40,68 @@ class RdFields:
     container: ContainerModel
     settings: EncodeSettings
     criterion: RdCriterion
-    largest: dict[str, Float64[np.ndarray, " M"]]
+    largest: Mapping[str, Rows]
     pool: Workers
 
-    def shapes(
-        self, values: Float64[np.ndarray, "M 8"], shapes: Float32[np.ndarray, "M 28"], forms: UInt8[np.ndarray, " M"]
-    ) -> dict[str, Quantized]:
+    def shapes(self, values: StoredShapes, hessians: Rows) -> dict[str, Quantized]:
         """Quantise opacity, log-scales and rotation.
 
         Args:
-            values: opacity logit, log-scales and unit quaternion, in the stored form of each Gaussian.
-            shapes: shape Hessians of :class:`kissgs.Sensitivity`.
-            forms: form of each Gaussian, see :mod:`kissgs.planning.rotation_forms`.
+            values: the Gaussians in their stored form.
+            hessians: ``(M, 28)`` shape Hessians of :class:`kissgs.Sensitivity`.
         """
-        criterion, largest, costs = self.criterion, self.largest, self.criterion.costs
+        criterion, largest, pool = self.criterion, self.largest, self.pool
         if self.container.tables is not None:
-            hessians = shapes if self.settings.rdo_quantization else None
+            wanted = hessians[:] if self.settings.rdo_quantization else None
+            bounds = {name: rows[:] for name, rows in largest.items()}
             return table_fields.rd_shape_fields(
-                values, hessians, forms, criterion, largest, self.container.tables, self.pool
+                values[:], wanted, values.forms, criterion, bounds, self.container.tables, pool
             )
-        parts = (
-            quantize_by_class(values[:, :1], costs.opacity, criterion, largest["opacities"]),
-            quantize_by_class(values[:, 1:4], costs.scale, criterion, largest["scales"]),
-            quantize_by_class(values[:, 4:], 3 * costs.rotation, criterion, largest["quaternions"]),
+        opacities, scales, quats = (
+            quantize_by_class(rows, criterion.steps_of(name), criterion.classes, largest[field], pool)
+            for rows, name, field in (
+                (values.opacities, "opacity", "opacities"),
+                (values.scales, "scale", "scales"),
+                (values.quats, "rotation", "quaternions"),
+            )
         )
+        parts = opacities, scales, quats
         if self.settings.rdo_quantization:
-            parts = rdo_quantize_shapes(values, parts, shapes, forms, criterion, largest, self.pool)
+            parts = rdo_quantize_shapes(values, parts, hessians, values.forms, criterion, largest, pool)
         return dict(zip(("opacities", "scales", "quaternions"), parts, strict=True))
 
-    def means(self, ordered: Splats, coarser: Float[np.ndarray, " M"]) -> Quantized:
-        """Quantise positions, with the bits that lambda asks for in each class.
+    def means(self, splats: Splats, order: Int[np.ndarray, " M"], coarser: Int[np.ndarray, " M"]) -> Quantized:
+        """Quantise the positions of the Gaussians ``order``, with the bits that lambda asks for in each class.
 
         A Gaussian has at most ``coarser`` bits less than :func:`means_bits` gives for ``means_tolerance``.
         """
-        means, criterion = ordered.means, self.criterion
-        usual = means_bits(ordered, np.arange(len(ordered)), self.settings.means_tolerance)
+        means, criterion = selected(splats.means, order), self.criterion
+        usual = means_bits(splats, order, self.settings.means_tolerance, self.pool)
         most = np.clip(16 - usual + coarser, 0, 8)
-        unit = max(float(np.ptp(signed_log(means))), 1e-30) / MEANS_TOP
-        steps = criterion.class_steps(criterion.costs.position)
+        unit = max(log_extent(means, self.pool), 1e-30) / MEANS_TOP
+        steps = criterion.steps_of("position")
         if self.container.tables is not None:
             each = np.array(steps)[criterion.classes]
-            return table_fields.means_field(means, np.minimum(each, unit * 2**most / np.sqrt(2)))
-        coarse = [max(np.floor(np.log2(step / unit) + 0.5), 0) for step in steps]
-        return quantize_means(means, bits=16 - np.minimum(np.array(coarse)[criterion.classes], most).astype(np.int64))
+            return table_fields.means_field(means[:], np.minimum(each, unit * 2.0**most / np.sqrt(2)))
+        coarse = np.array([min(max(np.floor(np.log2(step / unit) + 0.5), 0), 8) for step in steps]).astype(np.int8)
+        return quantize_means(means, bits=16 - np.minimum(coarse[criterion.classes], most), pool=self.pool)
 
-    def colors(self, base: Float64[np.ndarray, "M 3"]) -> tuple[Quantized, int]:
+    def colors(self, base: Float32[np.ndarray, "M 3"]) -> tuple[Quantized, int]:
         """Quantise base colours; return them and the number of clipped outliers."""
-        criterion, cost, coarsest = self.criterion, self.criterion.costs.color, self.largest["f_dc"]
+        criterion, coarsest = self.criterion, self.largest["f_dc"]
         if self.container.tables is not None:
-            steps = table_fields.criterion_steps(cost, criterion, coarsest)
-            return table_fields.color_field(base, steps, cost), 0
-        finest = min(criterion.class_steps(cost))
-        clipped = clip_outliers(base, step=finest, share=OUTLIERS)
-        levels = quantize_by_class(clipped, cost, criterion, coarsest)
-        return levels, int((clipped != base).any(axis=1).sum())
+            steps = table_fields.criterion_steps("color", criterion, coarsest[:])
+            return table_fields.color_field(base.astype(np.float64), steps, criterion.costs.color), 0
+        optimal = criterion.steps_of("color")
+        clipped = clip_outliers(base, step=min(optimal), share=OUTLIERS)
+        levels = quantize_by_class(clipped, optimal, criterion.classes, coarsest, self.pool)
+        return levels, 0 if clipped is base else int((clipped != base).any(axis=1).sum())
 
 
-def decoded_sh(codebook: Codebook, ordered: Splats) -> Float32[np.ndarray, "M K 3"]:
-    """Return the decoded shN coefficients."""
-    coefficients = ordered.shN.shape[1]
+def decoded_entries(codebook: Codebook, coefficients: int) -> Float32[np.ndarray, "entries K 3"]:
+    """Return the decoded shN coefficients of the codebook's entries."""
     entries = codebook.centroids.values().reshape(-1, 3, COEFFICIENTS)[:, :, :coefficients].transpose(0, 2, 1)
-    return np.ascontiguousarray(entries.astype(np.float32)[codebook.labels[: len(ordered)]])
+    return np.ascontiguousarray(entries.astype(np.float32))
 
 
 def decoded_scene(
@@ -117,23 +121,35 @@ def decoded_scene(
 
 
 def largest_errors(
-    fields: dict[str, Quantized], values: Float64[np.ndarray, "M 8"], ordered: Splats
+    fields: dict[str, Quantized],
+    values: Float64[np.ndarray, "M 8"] | Rows,
+    means: Float32[np.ndarray, "M 3"] | Rows,
+    colors: Float32[np.ndarray, "M 3"] | Rows,
+    pool: Workers | None = None,
 ) -> dict[str, list[float]]:
     """Return the largest error per field and channel, in the unit of the field (positions: of the signed logarithm).
 
     Args:
         fields: levels of the Gaussians, in order.
         values: opacity logit, log-scales and unit quaternion, in the stored form of each Gaussian.
-        ordered: the Gaussians.
+        means: positions.
+        colors: ``sh0``.
+        pool: threads; None for the calling one.
     """
-    quats = values[:, 4:]
-    if "omitted" in fields:  # the sign of the missing component is not stored
-        quats = table_fields.shape_quats(quats)
-    pairs = {
-        "means": (fields["means"].values(), signed_log(ordered.means)),
-        "opacities": (fields["opacities"].values(), values[:, :1]),
-        "scales": (fields["scales"].values(), values[:, 1:4]),
-        "quaternions": (table_fields.decoded_quats(fields), quats),
-        "f_dc": (fields["f_dc"].values(), ordered.sh0),
-    }
-    return {name: np.abs(found - wanted).max(axis=0).tolist() for name, (found, wanted) in pairs.items()}
+
+    def largest(rows: slice) -> dict[str, np.ndarray]:
+        wanted, some = values[rows], {name: field.take(rows) for name, field in fields.items()}
+        quats = wanted[:, 4:]
+        if "omitted" in fields:  # the sign of the missing component is not stored
+            quats = table_fields.shape_quats(quats)
+        pairs = {
+            "means": (some["means"].values(), signed_log(means[rows])),
+            "opacities": (some["opacities"].values(), wanted[:, :1]),
+            "scales": (some["scales"].values(), wanted[:, 1:4]),
+            "quaternions": (table_fields.decoded_quats(some), quats),
+            "f_dc": (some["f_dc"].values(), colors[rows]),
+        }
+        return {name: np.abs(found - wanted).max(axis=0) for name, (found, wanted) in pairs.items()}
+
+    blocks = for_each_block(len(values), largest, pool)
+    return {name: np.max([block[name] for block in blocks], axis=0).tolist() for name in blocks[0]}

@@ -8,16 +8,19 @@ the decoder needs no classes. WebP's entropy codes, which vary over an image, sp
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
-from kissgs.core.array_types import Bool, Float32, Float64, Int
+from kissgs.core.array_types import Bool, Float32, Float64, Int, Integer, UInt8, UInt64
 from kissgs.core.sensitivity import OPACITY, ROTATION, SCALES, Sensitivity
 from kissgs.core.signed_log import signed_log
 from kissgs.core.splats import Splats
+from kissgs.core.threads import Workers
 from kissgs.planning.quantize import means_bits
+from kissgs.planning.rows import Rows, for_each_block, row_range, selected, sorted_order
 from kissgs.settings import EncodeSettings
 
 FLOOR = 1e-3
@@ -78,40 +81,69 @@ class Costs:
     coverage: Float64[np.ndarray, " M"]
 
     @classmethod
-    def of(cls, sensitivity: Sensitivity, splats: Splats) -> Costs:
+    def of(cls, sensitivity: Sensitivity, splats: Splats, pool: Workers | None = None) -> Costs:
         """Return the costs of all Gaussians; those of attributes are at least :data:`FLOOR` of their median."""
-        factor = (1 + np.abs(splats.means).astype(np.float64)) ** 2
-        return cls(
-            opacity=_floored(sensitivity.diagonal(OPACITY)[:, 0]),
-            scale=_floored(sensitivity.diagonal(SCALES).mean(axis=1)),
-            rotation=_floored(sensitivity.diagonal(ROTATION).mean(axis=1)),
-            color=_floored(sensitivity.base_colors()),
-            position=_floored((sensitivity.position_hessian * factor).mean(axis=1)),
-            removal=sensitivity.removal(splats),
-            coverage=sensitivity.coverage.astype(np.float64),
-        )
+        found = cls(**{name: np.empty(len(splats)) for name in cls.__slots__})
+
+        def measure(rows: slice) -> None:
+            some, scene = _rows_of(sensitivity, rows), splats.select(rows)
+            factor = (1 + np.abs(scene.means).astype(np.float64)) ** 2
+            found.opacity[rows] = some.diagonal(OPACITY)[:, 0]
+            found.scale[rows] = some.diagonal(SCALES).mean(axis=1)
+            found.rotation[rows] = some.diagonal(ROTATION).mean(axis=1)
+            found.color[rows] = some.base_colors()
+            found.position[rows] = (some.position_hessian * factor).mean(axis=1)
+            found.removal[rows], found.coverage[rows] = some.removal(scene), some.coverage
+
+        for_each_block(len(splats), measure, pool)
+        for cost in (found.opacity, found.scale, found.rotation, found.color, found.position):
+            _raise_to_floor(cost)
+        return found
 
     def take(self, chosen: Int[np.ndarray, " k"]) -> Costs:
         """Return the costs of the Gaussians ``chosen``."""
-        return Costs(**{name: getattr(self, name)[chosen] for name in Costs.__slots__})
+        return Costs(**{name: getattr(self, name).take(chosen) for name in Costs.__slots__})
 
-    def classes(self, number: int, means: Float32[np.ndarray, "M 3"]) -> Int[np.ndarray, " M"]:
+    def of_rounding(self) -> Costs:
+        """Return the costs with zeros, which take no memory, for those that only pruning needs."""
+        nothing = np.broadcast_to(0.0, self.color.shape)
+        return replace(self, removal=nothing, coverage=nothing)
+
+    def keep(self, chosen: Int[np.ndarray, " k"]) -> Costs:
+        """Return the costs of the Gaussians ``chosen``, ascending, in the memory of these, which are overwritten."""
+        for name in Costs.__slots__:
+            values = getattr(self, name)
+            values[: len(chosen)] = values.take(chosen)
+        return Costs(**{name: getattr(self, name)[: len(chosen)] for name in Costs.__slots__})
+
+    def classes(self, number: int, means: Float32[np.ndarray, "M 3"] | Rows) -> UInt8[np.ndarray, " M"]:
         """Return the sensitivity class of each Gaussian, from 0, the most sensitive; classes have similar sizes.
 
         Gaussians of equal ``means`` are in one class: renderers blend them in stored order, which is by class. No class
         number below the largest is unused.
         """
-        worth = np.log(self.scale) + np.log(self.rotation) + np.log(self.color)
-        rank = np.empty(len(worth), np.int64)
-        rank[np.argsort(-worth, kind="stable")] = np.arange(len(worth))
-        classes = rank * min(number, len(worth)) // max(len(worth), 1)
-        key = np.zeros(len(means), np.uint64)
-        for axis in (means + np.float32(0)).view(np.uint32).T:
-            key = (key ^ axis) * MIX
-        _, position = np.unique(key, return_inverse=True)
-        first = np.full(len(means), number)
-        np.minimum.at(first, position, classes)
-        return np.unique(first[position], return_inverse=True)[1]
+        count = len(means)
+        each = min(number, count)
+        classes = np.empty(count, np.uint8)
+        order = sorted_order(self._worth_keys())
+        for label in range(each):  # class = rank · number / count, rounded down
+            classes[order[-(-count * label // each) : -(-count * (label + 1) // each)]] = label
+        del order
+        _join_equal(_position_keys(means), classes)
+        used = np.flatnonzero(np.bincount(classes, minlength=1))
+        return np.searchsorted(used, np.arange(256)).astype(np.uint8)[classes]
+
+    def _worth_keys(self) -> UInt64[np.ndarray, " M"]:
+        """Return numbers by which Gaussians are ordered, the most sensitive first: bits of float64 that sort alike."""
+        keys = np.empty(len(self.scale), np.uint64)
+
+        def write(rows: slice) -> None:
+            worth = np.log(self.scale[rows]) + np.log(self.rotation[rows]) + np.log(self.color[rows])
+            bits = (0.0 - worth).view(np.uint64)
+            keys[rows] = np.where(bits >> np.uint64(63), ~bits, bits | np.uint64(1 << 63))
+
+        for_each_block(len(keys), write)
+        return keys
 
     def pruned_by_rd(
         self, rd_lambda: float, threshold_bits: float, default_lambda: float | None = None
@@ -147,6 +179,10 @@ def step(cost: float, rd_lambda: float) -> float:
     return float(np.sqrt(6 * rd_lambda / (np.log(2) * cost)))
 
 
+ROUNDED = ("opacity", "scale", "rotation", "color", "position")
+"""Attributes of :class:`Costs` that are rounded to steps."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RdCriterion:
     """Costs, sensitivity classes and lambda, by which the levels of Gaussians are chosen.
@@ -155,15 +191,35 @@ class RdCriterion:
         costs: costs of the M Gaussians.
         classes: ``(M,)`` sensitivity class of each, from 0; no class is empty.
         rd_lambda: squared error per bit.
+        steps: optimal step of each class for the attributes of ``costs``; None to compute them.
     """
 
     costs: Costs
-    classes: Int[np.ndarray, " M"]
+    classes: Integer[np.ndarray, " M"]
     rd_lambda: float
+    steps: Mapping[str, list[float]] | None = None
 
-    def class_steps(self, cost: Float64[np.ndarray, " M"]) -> list[float]:
-        """Return the optimal step of each class for the mean of ``cost``, squared error per squared unit."""
-        return [step(float(cost[self.classes == c].mean()), self.rd_lambda) for c in range(int(self.classes.max()) + 1)]
+    def condensed(self) -> RdCriterion:
+        """Return the steps and only the smallest costs, for what needs no more."""
+        steps = {name: self.steps_of(name) for name in ROUNDED}
+        least = {name: np.array([getattr(self.costs, name).min(initial=np.inf)]) for name in Costs.__slots__}
+        return RdCriterion(Costs(**least), self.classes, self.rd_lambda, steps)
+
+    def take(self, order: Int[np.ndarray, " M"]) -> RdCriterion:
+        """Return the criterion with the Gaussians in another order."""
+        costs = self.costs.take(order) if self.steps is None else self.costs
+        return replace(self, costs=costs, classes=self.classes.take(order))
+
+    def steps_of(self, name: str) -> list[float]:
+        """Return the optimal step of each class for an attribute; a rotation has an error about each of three axes."""
+        if self.steps is not None:
+            return self.steps[name]
+        return self.class_steps(getattr(self.costs, name), 3 if name == "rotation" else 1)
+
+    def class_steps(self, cost: Float64[np.ndarray, " M"], channels: int = 1) -> list[float]:
+        """Return the optimal step of each class for ``channels`` times the mean of ``cost``, error per squared unit."""
+        number = int(self.classes.max()) + 1
+        return [step(float((channels * cost[self.classes == c]).mean()), self.rd_lambda) for c in range(number)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,9 +269,11 @@ def default_error(costs: Costs, splats: Splats, kept: Int[np.ndarray, " M"], sh_
         kept: indices of the ``M`` Gaussians that a renderer draws.
         sh_model: error of the view-dependent colour, by codebook size.
     """
-    spans = [np.ptp(getattr(splats, name)[kept].astype(np.float64), axis=0) for name in ("opacities", "scales", "sh0")]
+    scene = {"opacities": splats.opacities[:, None], "scales": splats.scales, "sh0": splats.sh0, "means": splats.means}
+    ends = {name: row_range(selected(values, kept)) for name, values in scene.items()}
+    spans = [np.ptp(np.array(ends[name], np.float64), axis=0) for name in ("opacities", "scales", "sh0")]
     opacity, scale, color = (span / 255 for span in spans)
-    log_extent = np.ptp(signed_log(splats.means[kept]), axis=0)
+    log_extent = np.ptp(signed_log(np.array(ends["means"])), axis=0)
     rotation = np.full(3, 2.0)  # a change of a quaternion by 1 is a rotation by 2 radians
     paper = (opacity, scale, rotation * 2 / 99, color, log_extent / 65535)
     defaults = {name: field.default for name, field in EncodeSettings.model_fields.items()}
@@ -306,6 +364,41 @@ def implied_lambda(error: float, count: int) -> float:
     return 2 * float(np.log(2)) * error / (GROWTH * DIMENSIONS * max(count, 1))
 
 
-def _floored(cost: Float64[np.ndarray, " M"]) -> Float64[np.ndarray, " M"]:
+def _rows_of(sensitivity: Sensitivity, rows: slice) -> Sensitivity:
+    """Return the sensitivity of some Gaussians, without a copy."""
+    values: dict[str, Any] = {field.name: getattr(sensitivity, field.name) for field in fields(sensitivity)}
+    for name, value in values.items():
+        if isinstance(value, np.ndarray):
+            values[name] = value[rows]
+    return Sensitivity(**values)
+
+
+def _raise_to_floor(cost: Float64[np.ndarray, " M"]) -> None:
     seen = cost[cost > 0]
-    return np.maximum(cost, max(FLOOR * float(np.median(seen)), 1e-30) if len(seen) else 1e-30)
+    floor = max(FLOOR * float(np.median(seen, overwrite_input=True)), 1e-30) if len(seen) else 1e-30
+    np.maximum(cost, floor, out=cost)
+
+
+def _position_keys(means: Float32[np.ndarray, "M 3"] | Rows) -> UInt64[np.ndarray, " M"]:
+    """Return a hash of each position."""
+    keys = np.zeros(len(means), np.uint64)
+
+    def mix(rows: slice) -> None:
+        for axis in (means[rows] + np.float32(0)).view(np.uint32).T:
+            keys[rows] = (keys[rows] ^ axis) * MIX
+
+    for_each_block(len(means), mix)
+    return keys
+
+
+def _join_equal(key: UInt64[np.ndarray, " M"], classes: UInt8[np.ndarray, " M"]) -> None:
+    """Give all Gaussians of an equal ``key`` the smallest of their classes; the keys are sorted."""
+    order = sorted_order(key)
+    equal = np.flatnonzero(key[1:] == key[:-1])
+    if len(equal) == 0:
+        return
+    rows = np.unique(np.concatenate([equal, equal + 1]))
+    group = np.concatenate([[0], np.cumsum(key[rows[1:]] != key[rows[:-1]])])
+    smallest = np.full(int(group[-1]) + 1, 255, np.uint8)
+    np.minimum.at(smallest, group, classes[order[rows]])
+    classes[order[rows]] = smallest[group]

@@ -7,15 +7,18 @@ error is small, so that the entropy code needs fewer bits.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from functools import partial
 from math import ceil
 
 import numpy as np
 
-from kissgs.core.array_types import Float, Float32, Float64, Int, UInt8
+from kissgs.core.array_types import Float, Float32, Float64, Int, Integer, UInt8
 from kissgs.core.threads import Workers
 from kissgs.planning.quantize import Quantized
 from kissgs.planning.rd_model import RdCriterion
 from kissgs.planning.rotation_forms import PERMUTATIONS, ROTATIONS
+from kissgs.planning.rows import Computed, Rows, for_each_block, row_range
 
 UNSEEN = {"opacities": 0.15, "scales": 0.11, "growth": 0.11, "quaternions": 0.023, "f_dc": 0.055}
 VIRTUAL = {"opacities": 0.4, "scales": 0.13, "growth": 0.12, "quaternions": 0.04, "f_dc": 0.2}
@@ -34,8 +37,8 @@ SLACK_POWER = 1 / 3
 
 def largest_changes(
     coverage: Float[np.ndarray, " M"], captured: Float[np.ndarray, " M"], slack: float
-) -> dict[str, Float64[np.ndarray, " M"]]:
-    """Return the largest change by rounding of each attribute of each Gaussian.
+) -> dict[str, Computed]:
+    """Return the largest change by rounding of each attribute of each Gaussian, rows of float64.
 
     Optimal steps grow as the root of lambda. These bounds grow more slowly: they protect views in which a change is
     more visible than in the measured ones, where pruning or coarser colours would be the smaller loss.
@@ -45,17 +48,14 @@ def largest_changes(
         captured: from 0 to ``coverage``, see :class:`kissgs.Sensitivity`.
         slack: ratio of the optimal steps to those of the default quality, from 1.
     """
-    seen, by_capture = coverage.astype(np.float64), captured.astype(np.float64)
-    return {
-        name: np.minimum(
-            UNSEEN[name] ** (1 - seen)
-            * VIRTUAL[name] ** (seen - by_capture)
-            * CAPTURED[name] ** by_capture
-            * slack**SLACK_POWER,
-            CAPTURED[name],
-        )
-        for name in CAPTURED
-    }
+
+    def change(name: str, rows: slice) -> Float64[np.ndarray, " n"]:
+        seen, by_capture = coverage[rows].astype(np.float64), captured[rows].astype(np.float64)
+        unseen, virtual, capture = np.log([UNSEEN[name], VIRTUAL[name], CAPTURED[name]])
+        logs = unseen * (1 - seen) + virtual * (seen - by_capture) + capture * by_capture
+        return np.minimum(np.exp(logs) * slack**SLACK_POWER, CAPTURED[name])
+
+    return {name: Computed(len(coverage), partial(change, name)) for name in CAPTURED}
 
 
 UNUSED_COUNT = 0.05
@@ -87,45 +87,58 @@ AXIS_SIGNS = _axis_signs()
 
 
 def quantize_by_class(
-    values: Float64[np.ndarray, "M C"],
-    cost: Float64[np.ndarray, " M"],
-    criterion: RdCriterion,
-    coarsest: Float64[np.ndarray, " M"],
+    values: Float[np.ndarray, "M C"] | Rows,
+    optimal: Sequence[float],
+    classes: Integer[np.ndarray, " M"],
+    coarsest: Float64[np.ndarray, " M"] | Rows,
+    pool: Workers | None = None,
 ) -> Quantized:
     """Round to the nearest of the levels that each sensitivity class uses.
 
     Args:
         values: finite.
-        cost: squared image error per squared unit, per Gaussian.
-        criterion: sensitivity classes and lambda.
+        optimal: best step of each sensitivity class.
+        classes: class of each Gaussian.
         coarsest: largest step, per Gaussian.
+        pool: threads; None for the calling one.
 
     Returns:
         Levels from 0 to at most 255, with one step for all channels, of which each class uses multiples.
     """
-    low32 = values.min(axis=0).astype(np.float32) + np.float32(0)
+    smallest, largest = row_range(values, pool)
+    low32 = smallest.astype(np.float32) + np.float32(0)
     low = low32.astype(np.float64)
-    widest = float((values - low).max(initial=0))
-    optimal = np.array(criterion.class_steps(cost))
-    steps = np.minimum(optimal[criterion.classes], coarsest)
-    finest = max(float(steps.min()), widest / 255, 1e-30)
+    extent = largest.astype(np.float64) - low
+    widest = float(extent.max(initial=0))
+    count, best = len(values), np.array(optimal)
+
+    def steps(rows: slice) -> Float64[np.ndarray, " n"]:
+        return np.minimum(best[classes[rows]], coarsest[rows])
+
+    least = min(for_each_block(count, lambda rows: float(steps(rows).min()), pool))
+    finest = max(least, widest / 255, 1e-30)
     top = int(min(max(ceil(widest / finest - 1e-3), 1), 255))
-    spacing = np.clip(np.rint(steps / finest), 1, 255)
-    multiples = spacing[:, None]
-    levels = np.rint((values - low) / finest / multiples) * multiples
-    levels = np.where(levels > top, np.floor(top / multiples) * multiples, levels)
-    extent = values.max(axis=0) - low
+    levels, stride = np.empty((count, len(low)), np.uint8), np.empty(count, np.uint8)
+
+    def round_to_levels(rows: slice) -> None:
+        spacing = np.clip(np.rint(steps(rows) / finest), 1, 255)
+        multiples = spacing[:, None]
+        found = np.rint((values[rows] - low) / finest / multiples) * multiples
+        found = np.where(found > top, np.floor(top / multiples) * multiples, found)
+        levels[rows], stride[rows] = np.clip(found, 0, top), spacing
+
+    for_each_block(count, round_to_levels, pool)
     high = np.where(extent > 0, low + top * finest, low).astype(np.float32)
-    return Quantized(np.clip(levels, 0, top).astype(np.uint8), low32, high, top, spacing.astype(np.int64))
+    return Quantized(levels, low32, high, top, stride)
 
 
 def rdo_quantize_shapes(
-    values: Float64[np.ndarray, "M 8"],
+    values: Float64[np.ndarray, "M 8"] | Rows,
     parts: tuple[Quantized, Quantized, Quantized],
-    shapes: Float32[np.ndarray, "M 28"],
+    shapes: Float32[np.ndarray, "M 28"] | Rows,
     forms: UInt8[np.ndarray, " M"],
     criterion: RdCriterion,
-    largest: dict[str, Float64[np.ndarray, " M"]],
+    largest: Mapping[str, Float64[np.ndarray, " M"] | Rows],
     pool: Workers,
 ) -> tuple[Quantized, Quantized, Quantized]:
     """Choose the levels of opacities, scales and quaternions jointly by squared error plus lambda · bits.
@@ -142,48 +155,55 @@ def rdo_quantize_shapes(
     from kissgs.planning import rdo_kernels
 
     costs, classes = criterion.costs, criterion.classes
-    levels = np.concatenate([part.levels for part in parts], axis=1).astype(np.int64)
+    levels = np.concatenate([part.levels for part in parts], axis=1)
     low = np.concatenate([part.low for part in parts]).astype(np.float64)
     high = np.concatenate([part.high for part in parts]).astype(np.float64)
     top = np.concatenate([np.full(part.levels.shape[1], part.top) for part in parts])
     steps = (high - low) / top
     top[steps <= 0] = 0  # a constant channel
     steps[steps <= 0] = 1.0
-    changes = [
-        np.stack([largest["opacities"], *3 * [largest[scales]], *4 * [largest["quaternions"]]], axis=1)
-        for scales in ("scales", "growth")
-    ]
     floor = np.array([float(cost.min(initial=np.inf)) for cost in (costs.opacity, costs.scale, costs.rotation)])
 
     for _ in range(ROUNDS):
-        rate_table = criterion.rd_lambda * level_bits(levels, classes)
+        rate_table = criterion.rd_lambda * level_bits(levels, classes, pool)
 
-        def choose(first: int, rate_table: Float64[np.ndarray, "classes 8 256"] = rate_table) -> None:
-            rows = slice(first, first + CHUNK)
+        def choose(rows: slice, rate_table: Float64[np.ndarray, "classes 8 256"] = rate_table) -> None:
+            chosen = levels[rows].astype(np.int64)
             rdo_kernels.choose_levels(
                 values[rows],
                 shapes[rows],
                 forms[rows],
                 PERMUTATIONS,
                 AXIS_SIGNS,
-                classes[rows],
+                classes[rows].astype(np.int64),
                 low,
                 steps,
                 top,
                 rate_table,
-                np.stack([change[rows] for change in changes], axis=1),
+                _bounds(largest, rows),
                 floor,
                 SWEEPS,
-                levels[rows],
+                chosen,
             )
+            levels[rows] = chosen
 
-        pool.map(choose, range(0, len(levels), CHUNK))
+        for_each_block(len(levels), choose, pool, block=CHUNK)
     ends = np.cumsum([0] + [part.levels.shape[1] for part in parts])
     chosen = [_from_zero(levels[:, a:b], part) for part, a, b in zip(parts, ends, ends[1:], strict=False)]
     return chosen[0], chosen[1], chosen[2]
 
 
-def _from_zero(levels: Int[np.ndarray, "M C"], part: Quantized) -> Quantized:
+def _bounds(largest: Mapping[str, Float64[np.ndarray, " M"] | Rows], rows: slice) -> Float64[np.ndarray, "n 2 8"]:
+    """Return the largest distance of a level below and above each of the eight values."""
+    bounds = np.empty((len(range(rows.stop)[rows]), 2, 8))
+    bounds[:, :, 0] = largest["opacities"][rows][:, None]
+    bounds[:, 0, 1:4] = largest["scales"][rows][:, None]
+    bounds[:, 1, 1:4] = largest["growth"][rows][:, None]
+    bounds[:, :, 4:] = largest["quaternions"][rows][:, None, None]
+    return bounds
+
+
+def _from_zero(levels: UInt8[np.ndarray, "M C"], part: Quantized) -> Quantized:
     """Shift the levels so that the smallest is 0."""
     first = int(levels.min(initial=255))
     last = max(int(levels.max(initial=0)), first + 1)
@@ -195,12 +215,20 @@ def _from_zero(levels: Int[np.ndarray, "M C"], part: Quantized) -> Quantized:
     )
 
 
-def level_bits(levels: Int[np.ndarray, "M C"], classes: Int[np.ndarray, " M"]) -> Float64[np.ndarray, "classes C 256"]:
+def level_bits(
+    levels: Integer[np.ndarray, "M C"],
+    classes: Integer[np.ndarray, " M"],
+    pool: Workers | None = None,
+) -> Float64[np.ndarray, "classes C 256"]:
     """Estimate the bits of every level of every channel in every class from the counts of ``levels``."""
     number = int(classes.max()) + 1
-    counts = np.stack(
-        [np.bincount(classes * 256 + column, minlength=number * 256).reshape(number, 256) for column in levels.T],
-        axis=1,
-    )
-    likely = counts + UNUSED_COUNT
+
+    def counted(rows: slice) -> Int[np.ndarray, "classes C 256"]:
+        base = classes[rows].astype(np.int64) * 256
+        return np.stack(
+            [np.bincount(base + column, minlength=number * 256).reshape(number, 256) for column in levels[rows].T],
+            axis=1,
+        )
+
+    likely = np.sum(for_each_block(len(levels), counted, pool), axis=0) + UNUSED_COUNT
     return np.asarray(np.log2(likely.sum(axis=2, keepdims=True)) - np.log2(likely))

@@ -75,7 +75,7 @@ def rdo_quantize_tables(
     """
     from kissgs.planning import table_kernels
 
-    costs, classes = criterion.costs, criterion.classes
+    costs, classes = criterion.costs, criterion.classes.astype(np.int64)
     columns = np.concatenate([values.opacities[:, None], values.scales, values.small], axis=1)
     levels, scale_table = start.levels.copy(), start.scale_table
     ranges = np.stack(

@@ -12,13 +12,15 @@ the paper's name (section on permutation-rotation sorting) for choosing among th
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
-from kissgs.core.array_types import Float32, Float64, Int, UInt8
+from kissgs.core.array_types import Bool, Float32, Float64, Int, UInt8
 from kissgs.core.splats import Splats
 from kissgs.core.threads import Workers
 from kissgs.planning.plas import box_blur
+from kissgs.planning.rows import Computed, for_each_block, selected
 from kissgs.settings import EncodeSettings
 
 _A, _H = 0.5**0.5, 0.5
@@ -41,48 +43,114 @@ PERMUTATIONS = np.repeat([(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1),
 CHUNK = 1 << 16
 
 
-def canonicalize(
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredShapes:
+    """Opacity logits, log-scales and rotations of Gaussians in their stored form, computed a block at a time.
+
+    Attributes:
+        splats: the scene.
+        index: ``(M,)`` the Gaussians.
+        forms: ``(M,)`` form of each.
+    """
+
+    splats: Splats
+    index: Int[np.ndarray, " M"]
+    forms: UInt8[np.ndarray, " M"]
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def __getitem__(self, rows: slice) -> Float64[np.ndarray, "n 8"]:
+        """Return opacity logit, log-scales and unit quaternion of some rows."""
+        quats, scales = self._turned(rows)
+        values = np.empty((len(quats), 8))
+        values[:, 0] = self.splats.opacities.take(self.index[rows])
+        values[:, 1:4], values[:, 4:] = scales, quats
+        return values
+
+    def take(self, chosen: Int[np.ndarray, " K"] | Bool[np.ndarray, " M"]) -> StoredShapes:
+        """Return the rows ``chosen``."""
+        return StoredShapes(self.splats, self.index[chosen], self.forms[chosen])
+
+    @property
+    def opacities(self) -> Computed:
+        """Opacity logits, one column, float32."""
+        return selected(self.splats.opacities[:, None], self.index)
+
+    @property
+    def scales(self) -> Computed:
+        """Log-scales, three columns, float32."""
+        return Computed(len(self), lambda rows: self._turned(rows)[1])
+
+    @property
+    def quats(self) -> Computed:
+        """Unit quaternions, four columns, float64."""
+        return Computed(len(self), lambda rows: self._turned(rows)[0])
+
+    def _turned(self, rows: slice) -> tuple[Float64[np.ndarray, "n 4"], Float32[np.ndarray, "n 3"]]:
+        index = self.index[rows]
+        return apply_forms(unit_quats(self.splats, index), self.splats.scales.take(index, axis=0), self.forms[rows])
+
+
+def choose_forms(
     splats: Splats,
     cells: Int[np.ndarray, " cells"],
     side: int,
     settings: EncodeSettings,
     pool: Workers,
     report: Callable[[float], None],
-) -> tuple[Float64[np.ndarray, "cells 4"], Float32[np.ndarray, "cells 3"], float, UInt8[np.ndarray, " cells"]]:
-    """Rewrite rotations and log-scales of the Gaussians in ``cells`` in the form that the settings choose.
+) -> tuple[StoredShapes, float]:
+    """Choose the form of rotation and log-scales of the Gaussian in each of ``cells``, as the settings say.
 
     Returns:
-        Quaternions, log-scales, the largest relative change of a covariance (by rounding only), and the forms.
+        The Gaussians in these forms, and the largest relative change of a covariance, by rounding only.
     """
-    quats, scales = splats.quats[cells].astype(np.float64), splats.scales[cells]
-    quats /= np.linalg.norm(quats, axis=1, keepdims=True)  # float32 lengths are exact to 1e-7 only
     if settings.rotation_form == "canonical":
-        forms = canonical_forms(quats)
+        forms = np.empty(len(cells), np.uint8)
+
+        def choose(rows: slice) -> None:
+            forms[rows] = canonical_forms(unit_quats(splats, cells[rows]))
+
+        for_each_block(len(cells), choose, pool)
     else:
+        quats, scales = unit_quats(splats, cells), splats.scales.take(cells, axis=0)
         forms = pras_forms(quats, scales, side, pool, decay=settings.plas_radius_decay, report=report)
-    new_quats, new_scales = apply_forms(quats, scales, forms)
-    return new_quats, new_scales, covariance_error(quats, scales, new_quats, new_scales), forms
+    shapes = StoredShapes(splats, cells, forms)
+
+    def error(rows: slice) -> float:
+        quats, scales = unit_quats(splats, cells[rows]), splats.scales.take(cells[rows], axis=0)
+        return covariance_error(quats, scales, *apply_forms(quats, scales, forms[rows]))
+
+    return shapes, max(for_each_block(len(cells), error, pool), default=0.0)
+
+
+def unit_quats(splats: Splats, index: Int[np.ndarray, " M"]) -> Float64[np.ndarray, "M 4"]:
+    """Return the rotations of some Gaussians; float32 lengths are exact to 1e-7 only."""
+    from kissgs.planning import form_kernels
+
+    unit = np.empty((len(index), 4))
+    form_kernels.normalize(splats.quats.take(index, axis=0), unit)
+    return unit
 
 
 def apply_forms(
     quats: Float64[np.ndarray, "N 4"], scales: Float32[np.ndarray, "N 3"], forms: UInt8[np.ndarray, " N"]
 ) -> tuple[Float64[np.ndarray, "N 4"], Float32[np.ndarray, "N 3"]]:
     """Rewrite each Gaussian in its form: 0 to 23, a row of the table; plus 24 if the quaternion is negated."""
-    row = forms % 24
-    turned = _multiply(quats, ROTATIONS[row])
-    turned[forms >= 24] *= -1
-    return turned, np.take_along_axis(scales, PERMUTATIONS[row], axis=1)
+    from kissgs.planning import form_kernels
+
+    quats, scales, forms = (np.ascontiguousarray(array) for array in (quats, scales, forms))
+    turned, permuted = np.empty_like(quats), np.empty_like(scales)
+    form_kernels.apply_forms(quats, scales, forms, ROTATIONS, PERMUTATIONS, turned, permuted)
+    return turned, permuted
 
 
 def canonical_forms(quats: Float64[np.ndarray, "N 4"]) -> UInt8[np.ndarray, " N"]:
     """Return the form of largest w, which has the smallest rotation angle; among equals, the first of the table."""
-    forms = np.empty(len(quats), dtype=np.uint8)
-    # w of q g is the scalar product of q with the conjugate of g; without rounding, equal forms would differ.
-    conjugates = ROTATIONS * (1, -1, -1, -1)
-    for first in range(0, len(quats), CHUNK):
-        rows = slice(first, first + CHUNK)
-        w = np.round(quats[rows] @ conjugates.T, 9)
-        forms[rows] = np.concatenate([w, -w], axis=1).argmax(axis=1)
+    from kissgs.planning import form_kernels
+
+    forms = np.empty(len(quats), np.uint8)
+    form_kernels.largest_w(np.ascontiguousarray(quats), ROTATIONS, forms)
     return forms
 
 
@@ -142,39 +210,6 @@ def covariance_error(
     new_scales: Float32[np.ndarray, "N 3"],
 ) -> float:
     """Return the largest relative difference of the covariances, Frobenius norm, over all Gaussians."""
-    worst = 0.0
-    for first in range(0, len(quats), CHUNK):
-        rows = slice(first, first + CHUNK)
-        largest = scales[rows].max(axis=1, keepdims=True).astype(np.float64)  # avoids squares of e^±60
-        before = _covariance(quats[rows], scales[rows] - largest)
-        after = _covariance(new_quats[rows], new_scales[rows] - largest)
-        error = np.linalg.norm(after - before, axis=(1, 2)) / np.linalg.norm(before, axis=(1, 2))
-        worst = max(worst, float(error.max(initial=0.0)))
-    return worst
+    from kissgs.planning import form_kernels
 
-
-def _covariance(quats: Float64[np.ndarray, "N 4"], scales: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3 3"]:
-    w, x, y, z = quats.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    rotation = np.array(rows).transpose(2, 0, 1)
-    axes = rotation * np.exp(scales)[:, None, :]
-    return np.asarray(axes @ axes.transpose(0, 2, 1))
-
-
-def _multiply(p: Float64[np.ndarray, "N 4"], q: Float64[np.ndarray, "N 4"]) -> Float64[np.ndarray, "N 4"]:
-    """Return the Hamilton product, row by row."""
-    w1, x1, y1, z1 = p.T
-    w2, x2, y2, z2 = q.T
-    return np.stack(
-        [
-            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
-            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
-            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
-            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
-        ],
-        axis=1,
-    )
+    return float(form_kernels.covariance_error(*map(np.ascontiguousarray, (quats, scales, new_quats, new_scales))))

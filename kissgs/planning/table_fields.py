@@ -91,9 +91,9 @@ def rd_shape_fields(
     """
     costs = criterion.costs
     steps = (
-        criterion_steps(costs.opacity, criterion, largest["opacities"]),
-        criterion_steps(costs.scale, criterion, largest["scales"]),
-        criterion_steps(3 * costs.rotation, criterion, largest["quaternions"]),
+        criterion_steps("opacity", criterion, largest["opacities"]),
+        criterion_steps("scale", criterion, largest["scales"]),
+        criterion_steps("rotation", criterion, largest["quaternions"]),
     )
     wanted = shape_values(values, tables)
     chosen = rounded_shapes(wanted, costs.scale, steps, tables)
@@ -103,10 +103,10 @@ def rd_shape_fields(
 
 
 def criterion_steps(
-    cost: Float64[np.ndarray, " M"], criterion: RdCriterion, coarsest: Float64[np.ndarray, " M"]
+    name: str, criterion: RdCriterion, coarsest: Float64[np.ndarray, " M"]
 ) -> Float64[np.ndarray, " M"]:
-    """Return the step of each Gaussian: the best one of its class, at most ``coarsest``."""
-    return np.minimum(np.array(criterion.class_steps(cost))[criterion.classes], coarsest)
+    """Return the step of each Gaussian's attribute: the best one of its class, at most ``coarsest``."""
+    return np.minimum(np.array(criterion.steps_of(name))[criterion.classes], coarsest)
 
 
 def color_field(

@@ -4,27 +4,29 @@ from __future__ import annotations
 
 import numpy as np
 
-from kissgs.core.array_types import Float64, Int
+from kissgs.core.array_types import Float32, Float64, Int
+from kissgs.core.memory import return_free_memory
 from kissgs.core.progress import Progress
-from kissgs.core.signed_log import signed_log
 from kissgs.core.splats import SH_REST_COUNTS, Splats
 from kissgs.core.threads import Workers
 from kissgs.planning import table_fields
 from kissgs.planning.container_model import ByteTables, ContainerModel
-from kissgs.planning.encoding_plan import EncodingPlan
+from kissgs.planning.encoding_plan import EncodingPlan, PlannedScene
 from kissgs.planning.layout import layout_grid
 from kissgs.planning.quantize import (
     MEANS_TOP,
     Quantized,
     clip_outliers,
     half_steps,
+    log_extent,
     means_bits,
     quantize,
     quantize_means,
 )
 from kissgs.planning.rd_fields import largest_errors
 from kissgs.planning.rd_model import FEW
-from kissgs.planning.rotation_forms import canonicalize
+from kissgs.planning.rotation_forms import choose_forms
+from kissgs.planning.rows import Rows, selected
 from kissgs.planning.sh_codebook import fit_codebook, size_weights
 from kissgs.settings import EncodeSettings
 
@@ -45,7 +47,7 @@ def plan_uniform(
 ) -> EncodingPlan:
     """Plan the Gaussians ``kept``, which may be none, for a container."""
     progress("order", 0.0)
-    bits = settings.means_bits or means_bits(splats, kept, settings.means_tolerance)
+    bits = settings.means_bits or means_bits(splats, kept, settings.means_tolerance, pool)
     grid = layout_grid(splats.means, kept, bits, settings, pool, lambda fraction: progress("order", fraction))
     grid = grid.with_padding_last() if container.padding_last else grid
     # Padding repeats Gaussians of the scene; in a scene without any, padding is a neutral Gaussian.
@@ -53,63 +55,73 @@ def plan_uniform(
     clips = settings.shared_step_size and container.tables is None
     sh0 = clip_outliers(source.sh0, step=settings.sh0_step, share=OUTLIERS) if clips else source.sh0
     progress("forms", 0.0)
-    quats, scales, form_error, _ = canonicalize(
+    shapes, form_error = choose_forms(
         source, cells, grid.side, settings, pool, lambda fraction: progress("forms", fraction)
     )
     chosen = cells[grid.mask]
-    weights = size_weights(source, settings.sh_weight_power)[chosen]
+    weights = np.ones(len(chosen), np.float32)
+    if source.sh_degree > 0:
+        weights = size_weights(source, settings.sh_weight_power)[chosen]
     size = max(len(chosen) / settings.gaussians_per_codebook_entry, FEW)
     codebook = fit_codebook(source, chosen, weights, size, settings, container, pool, progress)
+    return_free_memory()
     if container.tables is not None:
-        values = np.concatenate([source.opacities[cells, None], scales, quats], axis=1).astype(np.float64)
-        fields, errors = _table_fields(source.select(cells), values, bits, settings, container.tables)
+        means, colors = source.means[cells], source.sh0[cells]
+        fields, errors = _table_fields(means, colors, shapes[:], bits, settings, container.tables)
     else:
         fields = {
-            "means": quantize_means(source.means[cells], bits=bits),
-            "opacities": _quantize(source.opacities[cells, None], settings.opacity_step, settings),
-            "scales": _quantize(scales, settings.scale_step, settings),
-            "quaternions": _quantize(quats, settings.quat_step, settings, paper_top=99),
-            "f_dc": _quantize(sh0[cells], settings.sh0_step, settings),
+            "means": quantize_means(selected(source.means, cells), bits=bits, pool=pool),
+            "opacities": _quantize(shapes.opacities, settings.opacity_step, settings, pool),
+            "scales": _quantize(shapes.scales, settings.scale_step, settings, pool),
+            "quaternions": _quantize(shapes.quats, settings.quat_step, settings, pool, paper_top=99),
+            "f_dc": _quantize(selected(sh0, cells), settings.sh0_step, settings, pool),
         }
         errors = {name: half_steps(field) for name, field in fields.items()}
         errors["means"] = half_steps(fields["means"], 1 << (16 - bits))
     return EncodingPlan(
+        scene=PlannedScene(len(splats), len(kept), splats.sh_degree),
         grid=grid,
         fields={**fields, "f_rest_centroids": codebook.centroids},
         codebook=codebook,
-        classes=np.zeros(len(chosen), np.int64),
+        classes=np.zeros(len(chosen), np.uint8),
         form_error=form_error,
-        clipped_colors=int((sh0 != source.sh0).any(axis=1).sum()),
+        clipped_colors=0 if sh0 is source.sh0 else int((sh0 != source.sh0).any(axis=1).sum()),
         errors={**errors, "f_rest_centroids": codebook.errors},
     )
 
 
 def _table_fields(
-    cells: Splats, values: Float64[np.ndarray, "cells 8"], bits: int, settings: EncodeSettings, tables: ByteTables
+    means: Float32[np.ndarray, "cells 3"],
+    colors: Float32[np.ndarray, "cells 3"],
+    values: Float64[np.ndarray, "cells 8"],
+    bits: int,
+    settings: EncodeSettings,
+    tables: ByteTables,
 ) -> tuple[dict[str, Quantized], dict[str, list[float]]]:
     """Return the levels by field, and the largest errors, for a container with tables.
 
     Without ``shared_step_size``, every table has as many values as it may, and rotations have all their levels.
 
     Args:
-        cells: the Gaussian of each cell.
+        means: position of each cell's Gaussian.
+        colors: its ``sh0``.
         values: its opacity logit, log-scales and unit quaternion, in the stored form.
         bits: precision of positions.
         settings: settings of the encoder.
         tables: tables of the container.
     """
-    equal = np.ones(len(cells))
+    equal = np.ones(len(means))
     steps = (settings.opacity_step, settings.scale_step, settings.quat_step, settings.sh0_step)
     if not settings.shared_step_size:
         steps = (FINEST, FINEST, FINEST, FINEST)
     opacity, scale, rotation, color = (step * equal for step in steps)
-    unit = float(np.ptp(signed_log(cells.means))) / MEANS_TOP
+    unit = log_extent(means) / MEANS_TOP
     fields = {
         **table_fields.shape_fields(values, (opacity, scale, rotation), equal, tables),
-        "means": table_fields.means_field(cells.means, max(unit, 1e-30) * 2.0 ** (16 - bits)),
-        "f_dc": table_fields.color_field(cells.sh0.astype(np.float64), color, equal),
+        "means": table_fields.means_field(means, max(unit, 1e-30) * 2.0 ** (16 - bits)),
+        "f_dc": table_fields.color_field(colors.astype(np.float64), color, equal),
     }
-    return fields, largest_errors(fields, values, cells)
+    return fields, largest_errors(fields, values, means, colors)
 
 
 def _neutral(sh_degree: int) -> Splats:
@@ -124,7 +136,7 @@ def _neutral(sh_degree: int) -> Splats:
     )
 
 
-def _quantize(values: np.ndarray, step: float, settings: EncodeSettings, *, paper_top: int = 255) -> Quantized:
+def _quantize(values: Rows, step: float, settings: EncodeSettings, pool: Workers, *, paper_top: int = 255) -> Quantized:
     if settings.shared_step_size:
-        return quantize(values, step=step)
-    return quantize(values, step=step, shared=False, max_top=paper_top)
+        return quantize(values, step=step, pool=pool)
+    return quantize(values, step=step, shared=False, max_top=paper_top, pool=pool)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
-from kissgs.core.memory import empty
+from kissgs.core.reused_memory import empty
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera

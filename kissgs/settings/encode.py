@@ -210,7 +210,12 @@ class EncodeSettings(BaseModel):
         True,
         description="Prune Gaussians of opacity 1/255 and less, which no renderer draws. Their number is reported.",
     )
-    webp_quality: int = Field(75, ge=0, le=100, description="libwebp's effort, 0 to 100; always lossless.")
+    webp_quality: int = Field(
+        75,
+        ge=0,
+        le=100,
+        description="libwebp's effort, 0 to 100; always lossless. Up to 75, images of a megapixel or more take less.",
+    )
     webp_method: int = Field(4, ge=0, le=6, description="libwebp's method, 0 (fast) to 6 (small); always lossless.")
     codebook_max_effort: bool = Field(
         True, description="Use libwebp's highest effort for the codebook image: saves 8 % of it in some seconds."

@@ -11,7 +11,7 @@ from kissgs._version import __version__
 from kissgs.core.array_types import UInt8
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.progress import Progress, silent
-from kissgs.core.splats import SH_REST_COUNTS, Splats
+from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.core.threads import blas_workers
 from kissgs.io.planes import compress_images
 from kissgs.planning.encoded import Encoded
@@ -19,7 +19,8 @@ from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.quantize import Quantized
 from kissgs.planning.sh_codebook import COEFFICIENTS
 from kissgs.settings import EncodeSettings
-from kissgs.sog.metadata import ENTRIES_PER_ROW, FIRST_TAG, META_NAME
+from kissgs.sog.metadata import ENTRIES_PER_ROW, FIRST_TAG
+from kissgs.sog.names import META_NAME
 
 MEANS, QUATS, SCALES, SH0 = ("means_l.webp", "means_u.webp"), "quats.webp", "scales.webp", "sh0.webp"
 SHN = ("shN_centroids.webp", "shN_labels.webp")
@@ -30,7 +31,6 @@ FILES = (META_NAME, *MEANS, QUATS, SCALES, SH0, *SHN)
 
 def write_files(
     plan: EncodingPlan,
-    splats: Splats,
     settings: EncodeSettings,
     *,
     threads: int = 0,
@@ -40,7 +40,6 @@ def write_files(
 
     Args:
         plan: plan of :func:`~kissgs.planning.planner.plan_encoding` for :data:`kissgs.sog.container_model.SOG`.
-        splats: the scene that was planned.
         settings: settings of the plan.
         threads: number of threads; 0 means one per processor. The bytes do not depend on it.
         progress: receives "images".
@@ -55,15 +54,15 @@ def write_files(
         progress("images", fraction)
 
     report(0.0)
-    images = render_planes(plan, splats.sh_degree)
+    images = render_planes(plan)
     with blas_workers(threads) as pool:
         files = compress_images(images, settings, pool, report, codebook=SHN[0])
-    return Encoded.of(plan, splats, settings, {META_NAME: metadata(plan, splats.sh_degree), **files})
+    return Encoded.of(plan, {META_NAME: metadata(plan, plan.scene.sh_degree), **files})
 
 
-def render_planes(plan: EncodingPlan, sh_degree: int) -> dict[str, UInt8[np.ndarray, "_ _ _"]]:
+def render_planes(plan: EncodingPlan) -> dict[str, UInt8[np.ndarray, "_ _ _"]]:
     """Return the images of a plan, by file name; Gaussians are row-major, and the last one fills the last row."""
-    fields, side = plan.fields, plan.grid.side
+    fields, side, sh_degree = plan.fields, plan.grid.side, plan.scene.sh_degree
     rows = -(-int(plan.grid.mask.sum()) // side)
 
     def image(*channels: np.ndarray) -> UInt8[np.ndarray, "H W C"]:

@@ -14,11 +14,7 @@ from kissgs.core.errors import InvalidContainerError, UnsupportedError
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.io.activations import OPACITY_OF_BYTE
 from kissgs.io.packed_files import Source, is_below
-
-META_NAME, LOD_NAME = "meta.json", "lod-meta.json"
-
-MAX_METADATA_BYTES = 1 << 20
-"""Largest size of ``meta.json``, bytes; four codebooks in full digits take 15 kB."""
+from kissgs.sog.names import MAX_METADATA_BYTES, META_NAME
 
 ENTRIES_PER_ROW = 64
 """Entries of the SH codebook in a row of its image."""

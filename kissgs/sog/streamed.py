@@ -19,7 +19,8 @@ from kissgs.core.threads import Workers
 from kissgs.io.packed_files import Source, open_source
 from kissgs.io.scene_file import refuse_more_than
 from kissgs.sog.decode import decode_files
-from kissgs.sog.metadata import LOD_NAME, SogLayout, is_file_name, parse_json, read_layout
+from kissgs.sog.metadata import SogLayout, is_file_name, parse_json, read_layout
+from kissgs.sog.names import LOD_NAME
 
 MAX_TREE_BYTES = 1 << 25
 """Largest size of ``lod-meta.json``, bytes; one of a thousand leaves and five levels takes 330 kB."""

@@ -18,7 +18,7 @@ from kissgs.io.planes import compress_images
 from kissgs.io.webp import pixels_crc32
 from kissgs.planning.encoded import Encoded
 from kissgs.planning.encoding_plan import EncodingPlan
-from kissgs.planning.planner import plan_encoding, visible_gaussians
+from kissgs.planning.planner import plan_encoding
 from kissgs.planning.quantize import Quantized, observed_range
 from kissgs.planning.rate_distortion import ColorRefit
 from kissgs.planning.sh_codebook import Codebook
@@ -56,12 +56,11 @@ def encode(
         UnsupportedError: the scene is too large for one container.
     """
     plan = plan_encoding(splats, settings, sensitivity=sensitivity, recolor=recolor, threads=threads, progress=progress)
-    return write_files(plan, splats, settings, cleaned=cleaned, compacted=compacted, threads=threads, progress=progress)
+    return write_files(plan, settings, cleaned=cleaned, compacted=compacted, threads=threads, progress=progress)
 
 
 def write_files(
     plan: EncodingPlan,
-    splats: Splats,
     settings: EncodeSettings,
     *,
     cleaned: Cleaned = NOTHING_CLEANED,
@@ -74,7 +73,6 @@ def write_files(
 
     Args:
         plan: plan of :func:`~kissgs.planning.planner.plan_encoding`, perhaps fine-tuned.
-        splats: the scene that was planned.
         settings: settings of the plan.
         cleaned: changes by cleaning, for the metadata.
         compacted: number of Gaussians that compaction removed, for the metadata.
@@ -85,7 +83,7 @@ def write_files(
     images = render_planes(plan)
     with blas_workers(threads) as pool:
         files = compress_images(images, settings, pool, _stage(progress, "images"))
-    kept, count = len(visible_gaussians(splats, settings)), int(plan.grid.mask.sum())
+    scene, count = plan.scene, int(plan.grid.mask.sum())
     omitted = {*GOALS, "max_encodes"} | (
         {"sh_codebook_size"} if settings.sh_codebook_size == MAX_CODEBOOK_SIDE**2 else set()
     )
@@ -97,12 +95,12 @@ def write_files(
         ranges=_ranges(plan.fields),
         provenance=metadata.Provenance(
             version=__version__,
-            sh_degree=splats.sh_degree,
+            sh_degree=scene.sh_degree,
             count=count,
-            source_count=len(splats) + compacted + cleaned.removed,
+            source_count=scene.count + compacted + cleaned.removed,
             changed={
-                "invisible": len(splats) - kept,
-                "pruned_by_rd": kept - count,
+                "invisible": scene.count - scene.visible,
+                "pruned_by_rd": scene.visible - count,
                 "clipped_colors": plan.clipped_colors,
                 **({"compacted": compacted} if compacted else {}),
                 **cleaned.as_dict(),
@@ -114,7 +112,7 @@ def write_files(
     )
     files = {names.JSON_NAME: layout.to_meta_json(), **files}
     files = {names.YAML_NAME: layout.to_yaml(), names.SCENE_NAME: metadata.scene_json(files), **files}
-    return Encoded.of(plan, splats, settings, files)
+    return Encoded.of(plan, files)
 
 
 def render_planes(plan: EncodingPlan) -> dict[str, UInt8[np.ndarray, "H W C"]]:

@@ -12,8 +12,8 @@ from typing import Protocol
 import numpy as np
 
 from kissgs.core.errors import UnsupportedError
-from kissgs.core.memory import reused_memory
 from kissgs.core.progress import Progress, silent
+from kissgs.core.reused_memory import reused_memory
 from kissgs.rendering import tensors
 from kissgs.rendering.cpu.gradients import Gradients
 from kissgs.rendering.differentiable import rasterize

@@ -19,7 +19,8 @@ from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.evaluation import evaluate as evaluation_module
 from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.evaluate import compare_images, evaluate
-from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, ViewComparison, format_metric
+from kissgs.evaluation.metric_text import format_metric
+from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, ViewComparison
 from kissgs.evaluation.visibility import share_shown
 from kissgs.rendering.camera import look_at
 from kissgs.rendering.metrics import ssim

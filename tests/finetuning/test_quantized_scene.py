@@ -18,7 +18,7 @@ IMAGES = {"opacities": 3, "scales": 3, "quaternions": 4, "f_dc": 3}
 
 
 def container(plan, scene):
-    return write_files(plan, scene, Settings().encode, threads=1).files
+    return write_files(plan, Settings().encode, threads=1).files
 
 
 def decoded_by(work):

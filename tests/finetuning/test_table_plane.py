@@ -24,7 +24,7 @@ def quantized(scene, preset="balanced", **changes):
 
 
 def files_of(work, scene):
-    return write_files(work.plan(), scene, Settings().encode, threads=1).files
+    return write_files(work.plan(), Settings().encode, threads=1).files
 
 
 def decoded_by(work):
@@ -59,8 +59,8 @@ def test_readers_find_exactly_what_was_trained(number, moved):
 def test_an_untrained_plan_is_unchanged(preset):
     scene = cloud(300, 2)
     plan = chosen(scene, preset, SOG)
-    found = write_files(QuantizedScene(plan, 2, container=SOG).plan(), scene, Settings().encode, threads=1)
-    assert found.files == write_files(plan, scene, Settings().encode, threads=1).files
+    found = write_files(QuantizedScene(plan, 2, container=SOG).plan(), Settings().encode, threads=1)
+    assert found.files == write_files(plan, Settings().encode, threads=1).files
     assert found.errors == plan.errors
 
 

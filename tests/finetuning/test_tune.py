@@ -33,7 +33,7 @@ def tuner(scene, size=40, **changes):
 
 def written(scene, settings):
     def files(plan, steps, progress):
-        return write_files(plan, scene, settings, finetune_steps=steps, threads=1)
+        return write_files(plan, settings, finetune_steps=steps, threads=1)
 
     return files
 

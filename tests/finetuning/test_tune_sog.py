@@ -35,7 +35,7 @@ def tuner(scene, **changes):
 
 def written(scene):
     def files(plan, steps, progress):
-        return write_files(plan, scene, Settings.from_preset("fast", **COARSE).encode, threads=1)
+        return write_files(plan, Settings.from_preset("fast", **COARSE).encode, threads=1)
 
     return files
 

@@ -77,7 +77,7 @@ def encode_settings(preset):
 @functools.cache
 def packed(name, preset):
     """Return the container of a row."""
-    return write_files(chosen(name, preset), scene(name)[0], encode_settings(preset), threads=1)
+    return write_files(chosen(name, preset), encode_settings(preset), threads=1)
 
 
 def largest(*errors):
@@ -157,7 +157,7 @@ def _levels(splats, choice, settings):
     sum(values.sum() for values in shown.values()).backward()
     if not all(torch.isfinite(latents.grad).all() for latents in work.latents.values()):
         return math.inf
-    files, mask = write_files(work.plan(), splats, settings, threads=1).files, choice.grid.mask
+    files, mask = write_files(work.plan(), settings, threads=1).files, choice.grid.mask
     inside = {field: work.planes[field].levels(work.latents[field]).detach().numpy() for field in (*FIELDS, "means")}
     for field in FIELDS:
         image = reference_decoder.levels(files, field, 4 if field == "quaternions" else 3)[mask]

@@ -12,7 +12,7 @@ from PIL import Image
 
 from kissgs.core.errors import InvalidContainerError
 from kissgs.core.threads import blas_workers
-from kissgs.io.planes import compress_images
+from kissgs.io.planes import compress_images, effort_of
 from kissgs.io.webp import decode_plane, encode_plane, probe_webp
 from kissgs.settings import EncodeSettings
 
@@ -161,3 +161,28 @@ def test_damage_inside_the_image_is_refused():
     broken = LOSSLESS[:30] + bytes(len(LOSSLESS) - 30)
     with pytest.raises(InvalidContainerError, match=r"some\.webp is damaged: its WebP data cannot be decoded"):
         decode_plane(broken, "some.webp", width=16, height=24, channels=3)
+
+
+@pytest.mark.parametrize(
+    ("shape", "asked", "wanted"),
+    [
+        ((1000, 999, 3), (75, 4), (75, 4)),
+        ((1000, 1000, 3), (75, 4), (50, 2)),
+        ((1000, 1000, 4), (50, 2), (50, 2)),
+        ((1000, 1000, 1), (75, 4), (25, 4)),
+        ((2000, 2000, 3), (30, 1), (30, 1)),
+        ((2000, 2000, 3), (76, 4), (76, 4)),
+        ((2000, 2000, 3), (75, 6), (75, 6)),
+    ],
+)
+def test_large_images_take_less_effort_unless_more_than_the_usual_is_asked_for(shape, asked, wanted):
+    assert effort_of(shape, *asked) == wanted
+
+
+def test_large_images_are_compressed_with_that_effort():
+    images = {"book.webp": random_image(1000, 1000, 3) // 64, "other.webp": random_image(1000, 1000, 1) // 64}
+    with blas_workers(2) as pool:
+        settings = EncodeSettings(webp_quality=75, webp_method=4, codebook_max_effort=False)
+        found = compress_images(images, settings, pool, lambda fraction: None, codebook="book.webp")
+    assert found["book.webp"] == encode_plane(images["book.webp"], quality=50, method=2)
+    assert found["other.webp"] == encode_plane(images["other.webp"], quality=25, method=4)

@@ -96,7 +96,7 @@ def test_levels_of_a_class_are_multiples_of_its_step():
     cost = np.repeat([1.0, 0.1, 0.004], 1000)
     splats = random_scene(3000, 0)
     criterion = RdCriterion(Costs.of(random_sensitivity(splats), splats), classes, 1e-4)
-    found = quantize_by_class(values, cost, criterion, np.full(3000, 2.0))
+    found = quantize_by_class(values, criterion.class_steps(cost), classes, np.full(3000, 2.0))
     each = (found.high.astype(float) - found.low) / found.top
     errors = np.abs(found.low + found.levels * each - values)
     for c, wanted in enumerate((1, 3, 16)):

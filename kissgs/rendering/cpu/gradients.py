@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from kissgs.core.array_types import Bool, Float32, Int32, Shaped
-from kissgs.core.memory import empty
+from kissgs.core.reused_memory import empty
 from kissgs.core.splats import SH_C0
 from kissgs.core.threads import Workers
 from kissgs.rendering.cpu import blending_backward, projection_backward, shading

@@ -6,8 +6,8 @@ import threading
 import numpy as np
 import pytest
 
-from kissgs.core import memory
-from kissgs.core.memory import SMALLEST, empty, reused_memory
+from kissgs.core import reused_memory as memory
+from kissgs.core.reused_memory import SMALLEST, empty, reused_memory
 
 
 def address(array):
