@@ -66,6 +66,6 @@ def visible_gaussians(splats: Splats, settings: EncodeSettings) -> Int[np.ndarra
 def load_kernels(progress: Progress = silent) -> None:
     """Compile the encoder's kernels, or load them from numba's cache."""
     progress("kernels", 0.0)
-    from kissgs.planning import kernels  # noqa: F401
+    from kissgs.planning import kernels, kmeans_kernels  # noqa: F401
 
     progress("kernels", 1.0)

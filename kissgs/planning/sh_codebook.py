@@ -80,14 +80,15 @@ def fit_codebook(
     progress("codebook", 0.0)
     most = min(size, settings.sh_codebook_size)
     clusters = kmeans.fit(
-        splats.shN[chosen].reshape(len(chosen), dimensions),
+        splats.shN.reshape(len(splats), dimensions),
+        chosen,
         weights,
         codebook_side(most) ** 2 if container.tables is None else max(round(most), 1),
         pool,
         kmeans.KMeansOptions(
             seed=settings.seed,
             iterations=settings.sh_kmeans_iterations,
-            nprobe=settings.sh_nprobe,
+            neighbors=settings.sh_neighbors,
             tolerance=settings.sh_tolerance,
             lattice=settings.sh_step if settings.shared_step_size else 0.0,
             from_zero=container.tables is not None,

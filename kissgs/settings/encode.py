@@ -193,11 +193,12 @@ class EncodeSettings(BaseModel):
     sh_kmeans_iterations: int = Field(
         6, ge=1, le=50, description="Iterations of codebook refinement: more are slower and slightly better."
     )
-    sh_nprobe: int = Field(
-        24,
-        ge=1,
+    sh_neighbors: int = Field(
+        64,
+        ge=8,
         le=512,
-        description="Coarse clusters that are searched for a Gaussian's codebook entry: more are slower and better.",
+        description="Codebook entries, the nearest to a Gaussian's present one, that an iteration compares: more are "
+        "slower and better.",
     )
     plas_radius_decay: float = Field(
         0.8,

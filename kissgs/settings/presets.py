@@ -19,7 +19,7 @@ ENCODE: dict[Preset, dict[str, Any]] = {
     Preset.FAST: {
         "rate_distortion": False,
         "sh_kmeans_iterations": 1,
-        "sh_nprobe": 6,
+        "sh_neighbors": 32,
         "plas_radius_decay": 0.6,
         "codebook_max_effort": False,
         "webp_quality": 50,
@@ -30,7 +30,7 @@ ENCODE: dict[Preset, dict[str, Any]] = {
         "quality_offset_db": -0.4,
         "color_refit_iterations": 4,
         "sh_kmeans_iterations": 8,
-        "sh_nprobe": 32,
+        "sh_neighbors": 128,
         "plas_radius_decay": 0.9,
     },
     Preset.PAPER: {
@@ -43,7 +43,7 @@ ENCODE: dict[Preset, dict[str, Any]] = {
         "sh_weight_power": 0,
         "sh_tolerance": 0,
         "sh_kmeans_iterations": 8,
-        "sh_nprobe": 32,
+        "sh_neighbors": 128,
         "plas_radius_decay": 0.95,
         "prune_invisible": False,
         "webp_quality": 75,
