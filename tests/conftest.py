@@ -24,6 +24,7 @@ CHECKED = [
     "core/spherical_harmonics",
     "evaluation",
     "io",
+    "planning/axes_order",
     "planning/kmeans",
     "planning/layout",
     "planning/rd_fields",

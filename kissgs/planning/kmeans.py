@@ -41,10 +41,6 @@ TASKS = 64
 CANDIDATES = 8
 """Centroids of nearby cells among which the nearest ones are found, in multiples of the number to be found."""
 
-FROM = 0
-RELOCATED = 0.5
-"""Largest share of the centroids that move to other clusters between two iterations."""
-
 OUTLIERS = 1e-3
 """Share of entries, at either end of a dimension, that may be clipped so that the step of the others stays small."""
 
@@ -128,9 +124,8 @@ def fit(
     state = _start(data, spread, size, options, pool)
     report(0.4)
     for iteration in range(options.iterations):
-        if iteration >= FROM:
-            state.relocate(RELOCATED, pool)
-            state.update(pool)
+        state.relocate(pool)
+        state.update(pool)
         state.reassign(pool)
         state.update(pool)
         report(0.4 + 0.6 * (iteration + 1) / options.iterations)
@@ -235,8 +230,8 @@ class _State:
             self._parts(),
         )
 
-    def relocate(self, share: float, pool: Workers) -> None:
-        """Merge pairs of clusters and split others, at most a share of all, as long as the error shrinks.
+    def relocate(self, pool: Workers) -> None:
+        """Merge pairs of clusters and split others as long as the error shrinks, each cluster once at most.
 
         Only labels and lists of near centroids change; :meth:`update` then finds the centroids.
         """
@@ -246,7 +241,7 @@ class _State:
         partners, costs, gains = np.empty(count, np.int32), np.empty(count), np.zeros(count)
         second = np.zeros(len(self.labels), dtype=np.bool_)
 
-        most = max(int(share * count), int((self.totals == 0).sum()), 1)
+        most = max(count // 2, 1)
         least = np.partition(self.errors, count - most)[count - most]
 
         def work(part: tuple[int, int]) -> None:
