@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from kissgs import sample_scene
 from kissgs.core.threads import blas_workers
-from kissgs.planning import kmeans
-from kissgs.planning.kmeans import KMeansOptions, assign, fit
+from kissgs.planning.kmeans import KMeansOptions, fit
+from kissgs.planning.kmeans_start import allocate, assign
 from kissgs.planning.sh_codebook import codebook_side
 
 
@@ -188,7 +188,7 @@ def test_shares_add_up_and_keep_their_bounds():
         counts = rng.integers(0, 100, 30)
         errors = rng.exponential(1, 30) * counts
         errors[:5] = 0
-        shares = kmeans._allocate(errors, counts, size, 0.0)
+        shares = allocate(errors, counts, size, 0.0)
         assert (shares <= counts).all()
         assert (shares >= np.minimum(counts, 1)).all()
         assert shares.sum() == min(size, np.where(errors > 0, counts, np.minimum(counts, 1)).sum())
