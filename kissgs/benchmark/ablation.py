@@ -120,7 +120,7 @@ RATE_DISTORTION_VARIANTS = (
     Variant(changes={"sensitivity_views": 12}),
     Variant(changes={"order": "plas"}),
     Variant(changes={"rotation_form": "pras"}),
-    Variant(changes={"sh_kmeans_iterations": 1, "sh_nprobe": 6}),
+    Variant(changes={"sh_kmeans_iterations": 1, "sh_neighbors": 32}),
     Variant(changes={"codebook_max_effort": False}),
     Variant(changes={"webp_quality": 50, "webp_method": 2}),
 )

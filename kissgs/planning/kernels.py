@@ -56,19 +56,6 @@ def hilbert_keys(cells: np.ndarray, keys: np.ndarray) -> None:
         keys[n] = key
 
 
-@compiled("void(float32[:, ::1], float32[::1], int32[::1], float64[:, ::1], float64[::1])")
-def weighted_sums(
-    vectors: np.ndarray, weights: np.ndarray, labels: np.ndarray, sums: np.ndarray, totals: np.ndarray
-) -> None:
-    """Add ``weights[n] * vectors[n]`` to ``sums[labels[n]]`` and ``weights[n]`` to ``totals[labels[n]]``."""
-    for n in range(vectors.shape[0]):
-        label = labels[n]
-        weight = np.float64(weights[n])
-        totals[label] += weight
-        for c in range(vectors.shape[1]):
-            sums[label, c] += weight * vectors[n, c]
-
-
 @compiled("void(float32[:, :, ::1], int64, float32[:, :, ::1], float64[:, ::1])")
 def box_blur_rows(image: np.ndarray, radius: int, out: np.ndarray, total: np.ndarray) -> None:
     """Average 2*radius+1 columns of every row of ``(H, W, C)``, wrapping around; ``total`` is ``(1, C)`` scratch."""

@@ -238,16 +238,19 @@ def _codebook_error_model(
         return CodebookErrorModel()
     rng = np.random.Generator(np.random.PCG64(settings.seed))
     some = np.sort(rng.choice(kept, min(SAMPLE, len(kept)), replace=False))
-    vectors = np.ascontiguousarray(splats.shN[some].reshape(len(some), -1))
+    vectors = splats.shN.reshape(len(splats), -1)
     entries = min(SAMPLE_ENTRIES, len(some) // 16)
     clusters = kmeans.fit(
         vectors,
+        some,
         _sh_weights(sensitivity, some, splats),
         entries,
         pool,
-        kmeans.KMeansOptions(seed=settings.seed, iterations=2, nprobe=12, tolerance=settings.sh_tolerance, lattice=0.0),
+        kmeans.KMeansOptions(
+            seed=settings.seed, iterations=2, neighbors=32, tolerance=settings.sh_tolerance, lattice=0.0
+        ),
     )
-    squared = np.square(vectors - clusters.centroids[clusters.labels], dtype=np.float64).sum(axis=1)
+    squared = np.square(vectors[some] - clusters.centroids[clusters.labels], dtype=np.float64).sum(axis=1)
     squared = np.minimum(squared, MAX_DISPLAYED_ERROR / SH_MEAN_SQUARE)
     colors = sensitivity.color_weight[kept].astype(np.float64).sum() * SH_MEAN_SQUARE
     share = sensitivity.color_weight[some].astype(np.float64)

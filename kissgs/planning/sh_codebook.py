@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from kissgs.core.progress import Progress
 from kissgs.core.splats import SH_REST_COUNTS, Splats
 from kissgs.core.threads import Workers
 from kissgs.planning import kmeans
+from kissgs.planning.axes_order import axes_order, principal_axes
 from kissgs.planning.container_model import ContainerModel
 from kissgs.planning.plas import plas
 from kissgs.planning.quantize import Quantized, half_steps, quantize
@@ -25,6 +27,9 @@ MIN_SIDE = 8
 
 WEIGHT_FLOOR, WEIGHT_CEILING = 0.1, 20.0
 """Bounds of weights, in units of the median, so that no Gaussian is ignored and none dominates."""
+
+SORTED_AXES, SORTED_RADIUS = 16, 16
+"""Number of principal axes, and first filter radius, with which PLAS refines an order along the axes."""
 
 PAPER_TOP = 99
 """Largest level of the paper's codebook: 100 levels in every channel."""
@@ -80,14 +85,15 @@ def fit_codebook(
     progress("codebook", 0.0)
     most = min(size, settings.sh_codebook_size)
     clusters = kmeans.fit(
-        splats.shN[chosen].reshape(len(chosen), dimensions),
+        splats.shN.reshape(len(splats), dimensions),
+        chosen,
         weights,
         codebook_side(most) ** 2 if container.tables is None else max(round(most), 1),
         pool,
         kmeans.KMeansOptions(
             seed=settings.seed,
             iterations=settings.sh_kmeans_iterations,
-            nprobe=settings.sh_nprobe,
+            neighbors=settings.sh_neighbors,
             tolerance=settings.sh_tolerance,
             lattice=settings.sh_step if settings.shared_step_size else 0.0,
             from_zero=container.tables is not None,
@@ -137,9 +143,12 @@ def _sort(
     """Return the entry of each pixel of a tile, sorted so that neighbours are similar and the image compresses."""
     if (entries == entries[0]).all():
         return np.arange(len(entries), dtype=np.int32)
-    return plas(
-        np.ascontiguousarray(entries), pool, seed=settings.seed, decay=settings.plas_radius_decay, report=report
-    )
+    sort = partial(plas, pool=pool, seed=settings.seed, decay=settings.plas_radius_decay, report=report)
+    if settings.codebook_order == "plas":
+        return sort(np.ascontiguousarray(entries))
+    coordinates = principal_axes(entries, SORTED_AXES)
+    order = axes_order(coordinates)
+    return order if settings.codebook_order == "axes" else order[sort(coordinates[order], start_radius=SORTED_RADIUS)]
 
 
 def size_weights(splats: Splats, power: float) -> Float32[np.ndarray, " N"]:

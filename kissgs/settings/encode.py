@@ -192,13 +192,20 @@ class EncodeSettings(BaseModel):
         "Gaussians equally, 1 neglects small and faint ones.",
     )
     sh_kmeans_iterations: int = Field(
-        6, ge=1, le=50, description="Iterations of codebook refinement: more are slower and slightly better."
+        4, ge=1, le=50, description="Iterations of codebook refinement: more are slower and slightly better."
     )
-    sh_nprobe: int = Field(
-        24,
-        ge=1,
+    sh_neighbors: int = Field(
+        64,
+        ge=8,
         le=512,
-        description="Coarse clusters that are searched for a Gaussian's codebook entry: more are slower and better.",
+        description="Codebook entries, the nearest to a Gaussian's present one, that an iteration compares: more are "
+        "slower and better.",
+    )
+    codebook_order: Literal["axes", "refined", "plas"] = Field(
+        "refined",
+        description="Order of the entries in the codebook's image: blocks along their principal axes (axes: fast), "
+        "these refined by PLAS within a short radius (refined: smaller), or PLAS from afar over all dimensions (plas: "
+        "the paper). A .sog has its entries by frequency.",
     )
     plas_radius_decay: float = Field(
         0.8,
