@@ -35,8 +35,8 @@ class Vectors:
 
         def moments(first: int) -> Float64[np.ndarray, "2 D"]:
             block = slice(first, first + BLOCK)
-            steps = self.table[self.rows[block]] - start
-            return np.stack([self.weights[block] @ steps, self.weights[block] @ np.square(steps)]).astype(np.float64)
+            steps, weights = self.table[self.rows[block]].astype(np.float64) - start, self.weights[block]
+            return np.stack([weights @ steps, weights @ np.square(steps)])
 
         first, second = sum(pool.map(moments, range(0, len(self.rows), BLOCK))) / self.weights.sum(dtype=np.float64)
         return (start + first).astype(np.float32), float(np.maximum(second - np.square(first), 0).mean()) ** 0.5

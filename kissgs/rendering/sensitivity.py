@@ -90,10 +90,11 @@ def measure_sensitivity(
     Raises:
         UnsupportedError: an image would take too much memory.
     """
-    from kissgs.rendering.cpu.frame import add_sensitivities, draw
+    from kissgs.rendering.cpu.frame import add_sensitivities, draw, for_kernels
     from kissgs.rendering.cpu.lists import each_part, even
     from kissgs.rendering.cpu.sensitivity import moments_to_hessians
 
+    splats = for_kernels(splats)
     coverage = Coverage(splats)
     found, captured = Sensitivity.none(len(splats), splats.sh_degree), np.ones(len(splats), np.float32)
     if view_uncertainty:  # without it, no other cameras count

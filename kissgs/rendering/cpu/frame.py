@@ -88,7 +88,7 @@ def draw(
         UnsupportedError: too many footprints for the lists of tiles, or too little memory for the image.
     """
     try:
-        return _draw(_for_kernels(splats), camera, _colour(background), pool, end)
+        return _draw(for_kernels(splats), camera, _colour(background), pool, end)
     except MemoryError as error:
         size = f"{camera.width}x{camera.height}"
         raise UnsupportedError(f"there is not enough memory for an image of {size}; render a smaller one") from error
@@ -247,7 +247,7 @@ def _colour(background: Shaped[np.ndarray, "..."]) -> Float32[np.ndarray, "3"]:
     return colour
 
 
-def _for_kernels(splats: Splats) -> Splats:
+def for_kernels(splats: Splats) -> Splats:
     """Return the scene with contiguous, writeable arrays, as kernels need them; copied only where necessary."""
     arrays = {name: np.require(getattr(splats, name), requirements=("C", "W")) for name in ATTRIBUTES}
     return splats if all(array is getattr(splats, name) for name, array in arrays.items()) else Splats(**arrays)
