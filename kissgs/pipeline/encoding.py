@@ -16,7 +16,7 @@ from kissgs._version import __version__
 from kissgs.cameras.views import Views
 from kissgs.core.array_types import Float32, Int
 from kissgs.core.errors import StopSearch, UnsupportedError
-from kissgs.core.memory import return_free_memory
+from kissgs.core.free_memory import return_free_memory
 from kissgs.core.progress import Progress, SearchNote, as_stage
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import ATTRIBUTES, Cleaned, Splats, empty_splats

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kissgs.core.array_types import Bool, Float32, Int
-from kissgs.core.memory import return_free_memory
+from kissgs.core.free_memory import return_free_memory
 from kissgs.core.progress import Progress
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import SH_C0, Splats

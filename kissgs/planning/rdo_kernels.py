@@ -9,24 +9,33 @@ from kissgs.core.numba_kernels import compiled
 
 
 @njit(nogil=True, error_model="numpy")
-def _form_hessian(packed: np.ndarray, order: np.ndarray, signs: np.ndarray, hessian: np.ndarray) -> None:
-    """Unpack the 7x7 Hessian from its upper triangle, for permuted and reversed axes of the Gaussian."""
-    k = 0
+def _form_tables(orders: np.ndarray, signs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return, for each of the forms, the place in the packed Hessian and the sign of the 7x7 entries, ``(24, 7, 7)``.
+
+    The axes of a form are permuted by ``orders`` and reversed where ``signs`` is -1, ``(24, 3)``.
+    """
+    places, factors = np.empty((24, 7, 7), np.int64), np.empty((24, 7, 7), np.float64)
+    start = np.array([0, 7, 13, 18, 22, 25, 27])  # place of each row's diagonal entry
+    row, sign = np.empty(7, np.int64), np.empty(7, np.float64)
+    for form in range(24):
+        row[0], sign[0] = 0, 1.0
+        for i in range(3):
+            row[1 + i], sign[1 + i] = 1 + orders[form, i], 1.0
+            row[4 + i], sign[4 + i] = 4 + orders[form, i], signs[form, i]
+        for i in range(7):
+            for j in range(7):
+                first, last = min(row[i], row[j]), max(row[i], row[j])
+                places[form, i, j] = start[first] + last - first
+                factors[form, i, j] = sign[i] * sign[j]
+    return places, factors
+
+
+@njit(nogil=True, error_model="numpy")
+def _form_hessian(packed: np.ndarray, places: np.ndarray, factors: np.ndarray, hessian: np.ndarray) -> None:
+    """Unpack the 7x7 Hessian from its upper triangle, for the axes of one form."""
     for i in range(7):
         for j in range(i, 7):
-            hessian[i, j] = hessian[j, i] = packed[k]
-            k += 1
-    for i in range(3):
-        for j in range(7):
-            hessian[7 + i, j] = hessian[1 + order[i], j]
-            hessian[10 + i, j] = hessian[4 + order[i], j] * signs[i]
-    hessian[1:7, :7] = hessian[7:13, :7]
-    for j in range(7):
-        for i in range(3):
-            hessian[7 + i, j] = hessian[j, 1 + order[i]]
-            hessian[10 + i, j] = hessian[j, 4 + order[i]] * signs[i]
-        for i in range(6):
-            hessian[j, 1 + i] = hessian[7 + i, j]
+            hessian[i, j] = hessian[j, i] = packed[places[i, j]] * factors[i, j]
 
 
 @njit(nogil=True, error_model="numpy")
@@ -83,10 +92,10 @@ def choose_levels(
         sweeps: number of passes over the eight levels.
         levels: ``(N, 8)``; modified.
     """
-    hessian, jacobian = np.empty((13, 13), np.float64), np.empty((8, 7), np.float64)
-    error, gradient = np.empty(7, np.float64), np.empty(7, np.float64)
+    places, factors = _form_tables(orders, signs)
+    hessian, jacobian, error = np.empty((7, 7), np.float64), np.empty((8, 7), np.float64), np.empty(7, np.float64)
     for n in range(values.shape[0]):
-        _form_hessian(shapes[n], orders[forms[n] % 24], signs[forms[n] % 24], hessian)
+        _form_hessian(shapes[n], places[forms[n] % 24], factors[forms[n] % 24], hessian)
         hessian[0, 0] += floor[0]
         for i in range(3):
             hessian[1 + i, 1 + i] += floor[1]
@@ -99,16 +108,16 @@ def choose_levels(
                 error[k] += off * jacobian[j, k]
         for _ in range(sweeps):
             for j in range(8):
+                start, end = (j, j + 1) if j < 4 else (4, 7)  # the other derivatives are 0
                 slope = curvature = 0.0
-                for k in range(7):
-                    if jacobian[j, k] != 0.0:
-                        gradient[k] = 0.0
-                        across = 0.0
-                        for i in range(7):
-                            gradient[k] += hessian[k, i] * error[i]
-                            across += hessian[k, i] * jacobian[j, i]
-                        slope += jacobian[j, k] * gradient[k]
-                        curvature += jacobian[j, k] * across
+                for k in range(start, end):
+                    gradient = across = 0.0
+                    for i in range(7):
+                        gradient += hessian[k, i] * error[i]
+                    for i in range(start, end):
+                        across += hessian[k, i] * jacobian[j, i]
+                    slope += jacobian[j, k] * gradient
+                    curvature += jacobian[j, k] * across
                 curvature = max(curvature, 0.0)
                 here = (values[n, j] - low[j]) / step[j]
                 first = max(int(np.ceil(here - search_range[n, 0, j] / step[j])), 0)
@@ -124,6 +133,6 @@ def choose_levels(
                         best, chosen = cost, level
                 if chosen != current:
                     move = (chosen - current) * step[j]
-                    for k in range(7):
+                    for k in range(start, end):
                         error[k] += move * jacobian[j, k]
                     levels[n, j] = chosen

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from kissgs.core.numba_kernels import compiled
-from kissgs.planning.rdo_kernels import _form_hessian, _jacobian
+from kissgs.planning.rdo_kernels import _form_hessian, _form_tables, _jacobian
 
 
 @njit(nogil=True, error_model="numpy")
@@ -87,11 +87,12 @@ def choose_levels(
         floor: ``(3,)`` added to the Hessian's diagonal: opacity, scales, rotation.
         levels: ``(N, 7)``; modified.
     """
-    hessian, jacobian = np.empty((13, 13), np.float64), np.empty((11, 7), np.float64)
+    places, factors = _form_tables(orders, signs)
+    hessian, jacobian = np.empty((7, 7), np.float64), np.empty((11, 7), np.float64)
     whole = np.empty((8, 7), np.float64)
     error, gradient = np.empty(7, np.float64), np.empty(7, np.float64)
     for n in range(values.shape[0]):
-        _form_hessian(shapes[n], orders[forms[n] % 24], signs[forms[n] % 24], hessian)
+        _form_hessian(shapes[n], places[forms[n] % 24], factors[forms[n] % 24], hessian)
         hessian[0, 0] += floor[0]
         for i in range(3):
             hessian[1 + i, 1 + i] += floor[1]

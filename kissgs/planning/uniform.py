@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Int
-from kissgs.core.memory import return_free_memory
+from kissgs.core.free_memory import return_free_memory
 from kissgs.core.progress import Progress
 from kissgs.core.splats import SH_REST_COUNTS, Splats
 from kissgs.core.threads import Workers

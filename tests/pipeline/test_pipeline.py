@@ -1,6 +1,7 @@
 """Oracle: the parts of the pipeline called one by one, and the file system before and after."""
 
 import dataclasses
+import gc
 import io
 import json
 import os
@@ -349,3 +350,21 @@ def test_given_sensitivity_is_used():
         kissgs.compress(
             SCENE, sensitivity=dataclasses.replace(measured, color_weight=measured.color_weight * np.float32(np.nan))
         )
+
+
+@pytest.mark.parametrize("changes", [{"preset": "fast"}, {"preset": "balanced", "sensitivity_views": 2}])
+@pytest.mark.parametrize("needed", [False, True])
+def test_a_scene_from_a_file_is_dropped_before_its_images_are_compressed(tmp_path, changes, needed):
+    count = 1234
+    kissgs.save(kissgs.sample_scene(count, sh_degree=1), tmp_path / "scene.ply")
+    alive = []
+
+    def progress(stage, fraction, note=""):
+        if stage == "images":
+            scenes = [thing for thing in gc.get_objects() if isinstance(thing, Splats)]
+            alive.append(sum(len(scene) == count for scene in scenes))
+
+    settings = kissgs.Settings.from_preset(**changes)
+    kissgs.compress(tmp_path / "scene.ply", settings=settings, evaluate=needed, progress=progress)
+    assert alive
+    assert (min(alive) > 0) if needed else (max(alive) == 0)
