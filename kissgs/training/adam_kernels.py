@@ -68,6 +68,7 @@ def adam(
     zero, finite = np.float32(0), np.float32(3.4028234e38)
     keep1, keep2, add1, add2 = np.float32(0.9), np.float32(0.999), np.float32(0.1), np.float32(0.001)
     epsilon, fastest = np.float32(1e-15), np.float32(1e30)
+    speed = np.float32(1) if len(factors) else rate
     block = max(1, 4096 // max(width, 1))  # the gradients of a block stay in the first cache
     slopes = np.empty(block * width, np.float32)
     for begin in range(first, last, block):
@@ -79,15 +80,12 @@ def adam(
             g = slopes[i]
             g = g if abs(g) <= finite else zero
             g = min(max(g, -most), most)
-            m[i] = keep1 * m[i] + add1 * g
-            v[i] = keep2 * v[i] + add2 * (g * g)
-            slopes[i] = m[i] / (np.sqrt(v[i]) * correction + epsilon)
+            mi, vi = keep1 * m[i] + add1 * g, keep2 * v[i] + add2 * (g * g)
+            m[i], v[i] = mi, vi
+            slopes[i] = speed * (mi / (np.sqrt(vi) * correction + epsilon))
         if len(factors):
             scale = factors[whole]
             for i in range(len(here)):
                 slopes[i] *= min(rate * scale[i], fastest)
-        else:
-            for i in range(len(here)):
-                slopes[i] *= rate
         for i in range(len(here)):
             here[i] = min(max(here[i] - slopes[i], smallest), largest)
