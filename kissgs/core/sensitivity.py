@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kissgs.core.array_types import Float, Float32, Float64
+from kissgs.core.array_types import Float, Float32, Float64, Int
 from kissgs.core.errors import InvalidSceneError
 from kissgs.core.splats import SH_C0, SH_REST_COUNTS, Splats
 
@@ -30,7 +30,10 @@ POSITION = (0, 1, 2)
 """Indices of the diagonal entries in ``position_hessian``."""
 
 RATIO_SAMPLE = 1 << 18
-"""Largest number of Gaussians from which the ratio of a Hessian to the colour sensitivity is estimated."""
+"""Largest number of Gaussians from which ratios of sensitivities are estimated."""
+
+BLOCK = 1 << 16
+"""Gaussians per step of array arithmetic, so that temporary arrays stay small."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,7 +121,7 @@ class Sensitivity:
     def with_prior(
         self,
         splats: Splats,
-        close_up: Float64[np.ndarray, " N"],
+        close_up: Float[np.ndarray, " N"],
         coverage: Float[np.ndarray, " N"],
         view_uncertainty: float,
     ) -> Sensitivity:
@@ -143,39 +146,42 @@ class Sensitivity:
             known = (self.color_weight > 0) & (close_up > 0)
         if view_uncertainty == 0 or not known.any():
             return replace(self, coverage=coverage, view_uncertainty=view_uncertainty)
-        prior = float(np.median(self.color_weight[known] / close_up[known])) * close_up
-        colors = np.maximum(self.color_weight.astype(np.float64), UNSEEN * prior)
-        share = 1 - coverage.astype(np.float64) * (1 - view_uncertainty)
-        shrunk = np.maximum(colors ** (1 - share) * prior**share, FLOOR * view_uncertainty * prior)
-        raised = np.where(colors > 0, shrunk / np.maximum(colors, 1e-300), 1.0)
-        least = colors - self.color_weight
         some = np.flatnonzero(known)
         some = some[:: -(-len(some) // RATIO_SAMPLE)]
-        across = np.exp(-2.0 * np.sort(splats.scales, axis=1)[:, 1].astype(np.float64))
-        transparent = _transparency(splats) ** 2
-        ones = np.ones(len(splats))
-        for values, of, unit in (
-            (self.shape_hessian, OPACITY, transparent),
-            (self.shape_hessian, SCALES, ones),
-            (self.shape_hessian, ROTATION, ones),
-            (self.position_hessian, POSITION, across),
-        ):
+        per_close_up = float(np.median(self.color_weight[some] / close_up[some]))
+        colors = np.maximum(self.color_weight[some], UNSEEN * per_close_up * close_up[some])
+        ratios = []
+        for values, of, unit in self._diagonals(splats, some):
             each = np.maximum(values[some][:, list(of)].mean(axis=1, dtype=np.float64), 0)
-            ratio = float(np.median(each / (colors * unit)[some]))
-            for column in of:
-                values[:, column] += ratio * least * unit
-        for values in (self.shape_hessian, self.position_hessian):
-            with np.errstate(over="ignore"):
-                values *= raised[:, None]
-            np.clip(values, -LARGEST, LARGEST, out=values)
-        self.mean_sh_basis[:] *= np.float32(1 - view_uncertainty)
-        return replace(
-            self,
-            color_weight=shrunk.astype(np.float32),
-            prior=np.maximum(shrunk - self.color_weight, 0).astype(np.float32),
-            coverage=coverage,
-            view_uncertainty=view_uncertainty,
-        )
+            ratios.append(float(np.median(each / (colors * unit))))
+        for first in range(0, len(splats), BLOCK):
+            rows = slice(first, first + BLOCK)
+            prior = per_close_up * close_up[rows].astype(np.float64)
+            measured = self.color_weight[rows].astype(np.float64)
+            colors = np.maximum(measured, UNSEEN * prior)
+            share = 1 - coverage[rows].astype(np.float64) * (1 - view_uncertainty)
+            shrunk = np.maximum(colors ** (1 - share) * prior**share, FLOOR * view_uncertainty * prior)
+            raised = np.where(colors > 0, shrunk / np.maximum(colors, 1e-300), 1.0)
+            for ratio, (values, of, unit) in zip(ratios, self._diagonals(splats, rows), strict=True):
+                for column in of:
+                    values[rows, column] += ratio * (colors - measured) * unit
+            for values in (self.shape_hessian[rows], self.position_hessian[rows]):
+                np.clip(values * raised[:, None], -LARGEST, LARGEST, out=values)
+            self.color_weight[rows], self.prior[rows] = shrunk, np.maximum(shrunk - measured, 0)
+            self.mean_sh_basis[rows] *= np.float32(1 - view_uncertainty)
+        return replace(self, coverage=coverage, view_uncertainty=view_uncertainty)
+
+    def _diagonals(
+        self, splats: Splats, rows: slice | Int[np.ndarray, " n"]
+    ) -> list[tuple[np.ndarray, tuple[int, ...], Float64[np.ndarray, " n"] | float]]:
+        """Return Hessians, their diagonal entries, and the factor by which these differ from a colour sensitivity."""
+        across = np.exp(-2.0 * np.median(splats.scales[rows], axis=1).astype(np.float64))
+        return [
+            (self.shape_hessian, OPACITY, _transparency(splats.opacities[rows]) ** 2),
+            (self.shape_hessian, SCALES, 1.0),
+            (self.shape_hessian, ROTATION, 1.0),
+            (self.position_hessian, POSITION, across),
+        ]
 
     def diagonal(self, of: tuple[int, ...]) -> Float64[np.ndarray, "N n"]:
         """Return diagonal entries of ``shape_hessian``, at least 0; ``of`` is OPACITY, SCALES or ROTATION."""
@@ -191,9 +197,9 @@ class Sensitivity:
         The image is linear in alpha; the derivative of alpha by the logit is (1 - opacity) alpha, a removal changes
         alpha by all of it. So the score follows from the Hessian's opacity entry.
         """
-        return self.diagonal(OPACITY)[:, 0] / _transparency(splats) ** 2
+        return self.diagonal(OPACITY)[:, 0] / _transparency(splats.opacities) ** 2
 
 
-def _transparency(splats: Splats) -> Float64[np.ndarray, " N"]:
+def _transparency(opacities: Float32[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
     """Return 1 - opacity, at least 1e-7, the value of the largest logits that :func:`kissgs.clean` allows or more."""
-    return 1 / (1 + np.exp(np.clip(splats.opacities.astype(np.float64), None, 16)))
+    return 1 / (1 + np.exp(np.clip(opacities.astype(np.float64), None, 16)))

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kissgs.core.array_types import Float32, Float64
+from kissgs.core.array_types import Float32
+from kissgs.core.sensitivity import BLOCK
 from kissgs.core.splats import Splats
 from kissgs.core.threads import Workers
 from kissgs.rendering.constants import NEAR
@@ -41,14 +42,18 @@ class Coverage:
         """``(N,)`` coverage from 0, seen by no camera or only from far away, to 1, seen from nearby."""
 
     @property
-    def close_up(self) -> Float64[np.ndarray, " N"]:
+    def close_up(self) -> Float32[np.ndarray, " N"]:
         """``(N,)`` mean squared alpha, 0 to 1, of each Gaussian in an unobstructed image that its surroundings fill."""
-        logs = np.sort(self._splats.scales, axis=1)[:, 1:].astype(np.float64)
-        scale = self._scale.astype(np.float64)
-        near = np.maximum(np.minimum(scale, ISOLATED * np.exp(logs[:, 0])), scale / MAX_APPROACH)
-        area = np.pi * np.exp(logs.sum(axis=1)) / near**2
-        squared_opacity = (1 / (1 + np.exp(-self._splats.opacities.astype(np.float64)))) ** 2
-        return squared_opacity * np.minimum(area, 1)
+        found = np.empty(len(self._scale), np.float32)
+        for first in range(0, len(found), BLOCK):
+            rows = slice(first, first + BLOCK)
+            logs = np.sort(self._splats.scales[rows], axis=1)[:, 1:].astype(np.float64)
+            scale = self._scale[rows].astype(np.float64)
+            near = np.maximum(np.minimum(scale, ISOLATED * np.exp(logs[:, 0])), scale / MAX_APPROACH)
+            area = np.pi * np.exp(logs.sum(axis=1)) / near**2
+            opacity = 1 / (1 + np.exp(-self._splats.opacities[rows].astype(np.float64)))
+            found[rows] = opacity**2 * np.minimum(area, 1)
+        return found
 
     def add(self, frame: Frame, seen: Float32[np.ndarray, " N"], pool: Workers, finer: float = 1.0) -> None:
         """Update the coverage by one rendered image.

@@ -10,8 +10,9 @@ import numpy as np
 
 from kissgs.core.array_types import Float32
 from kissgs.core.errors import InvalidViewsError
+from kissgs.core.free_memory import return_free_memory
 from kissgs.core.progress import Progress, silent
-from kissgs.core.sensitivity import LARGEST, OPACITY, ROTATION, SCALES, Sensitivity
+from kissgs.core.sensitivity import BLOCK, LARGEST, OPACITY, ROTATION, SCALES, Sensitivity
 from kissgs.core.splats import Splats
 from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera
@@ -20,9 +21,6 @@ from kissgs.rendering.coverage import Coverage
 HIDDEN = 0.003
 """Transmittance from which on what is behind counts as hidden: a change there has a hundred-thousandth of the squared
 error that it has in the open."""
-
-BLOCK = 1 << 16
-"""Gaussians per step of array arithmetic, so that temporary arrays stay small."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,16 +94,17 @@ def measure_sensitivity(
 
     splats = for_kernels(splats)
     coverage = Coverage(splats)
-    found, captured = Sensitivity.none(len(splats), splats.sh_degree), np.ones(len(splats), np.float32)
-    if view_uncertainty:  # without it, no other cameras count
-        captured[:] = 0
+    found = Sensitivity.none(len(splats), splats.sh_degree)
+    if not view_uncertainty:
+        found.captured[:] = 1  # no other cameras count
     with Workers(threads) as pool:
         for done, (camera, weight) in enumerate(zip(cameras.cameras, cameras.per_pixel(), strict=True)):
             progress("sensitivity", done / len(cameras.cameras))
             frame = draw(splats, camera, cameras.background, pool, HIDDEN)
             coverage.add(frame, add_sensitivities(frame, weight, cameras.spread, found, pool), pool)
             if view_uncertainty and done + 1 == cameras.captured:
-                captured[:] = coverage.share
+                found.captured[:] = coverage.share
+            del frame  # before the next one is made
         each_part(
             lambda a, b: moments_to_hessians(splats.scales, splats.opacities, a, b, found.shape_hessian),
             even(len(splats), pool),
@@ -121,7 +120,7 @@ def measure_sensitivity(
         out=found.mean_sh_basis,
         where=found.color_weight[:, None] > 0,
     )
-    found.captured[:] = captured
+    return_free_memory()
     progress("sensitivity", 1.0)
     return found.with_prior(splats, coverage.close_up, coverage.share, view_uncertainty)
 

@@ -14,13 +14,13 @@ import numpy as np
 
 from kissgs.cameras.views import black
 from kissgs.cameras.virtual.candidates import FIELD_OF_VIEW
-from kissgs.cameras.virtual.scene_bounds import SceneBounds, opacity, scene_bounds
+from kissgs.cameras.virtual.scene_bounds import SceneBounds, Vec3, opacity, scene_bounds
 from kissgs.cameras.virtual.scored_candidates import ScoredCandidates, score_candidates
 from kissgs.cameras.virtual.scoring import PROXY_GAUSSIANS, ViewScorer, proxy_scene
 from kissgs.cameras.virtual.select import select_diverse
-from kissgs.core.array_types import Float32, Float64, Int
+from kissgs.core.array_types import Bool, Float32, Float64, Int
 from kissgs.core.progress import Progress
-from kissgs.core.sensitivity import Sensitivity
+from kissgs.core.sensitivity import BLOCK, Sensitivity
 from kissgs.core.splats import Splats
 from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera, look_at
@@ -159,8 +159,7 @@ def _further_region(splats: Splats, bounds: SceneBounds, like: Camera, pool: Wor
 
     Half of the proxy scene shows what is near the region, the other half what is in front of it and behind.
     """
-    distance = np.linalg.norm(splats.means - bounds.centre, axis=1)
-    near = distance <= 6 * bounds.radius
+    near = _within(splats.means, bounds.centre, 6 * bounds.radius)
     proxy = _concatenated(
         proxy_scene(splats, PROXY_GAUSSIANS // 2, np.flatnonzero(near)),
         proxy_scene(splats, PROXY_GAUSSIANS // 2, np.flatnonzero(~near)),
@@ -168,6 +167,15 @@ def _further_region(splats: Splats, bounds: SceneBounds, like: Camera, pool: Wor
     scorer = ViewScorer(proxy, bounds, pool, progress)
     cameras = list(_surrounding_cameras(bounds, like))
     return Region(ScoredCandidates(scorer, "object", cameras, scorer.measure(cameras), np.zeros(len(cameras))), 0.0)
+
+
+def _within(means: Float32[np.ndarray, "N 3"], centre: Vec3, radius: float) -> Bool[np.ndarray, " N"]:
+    """Return which positions are within ``radius`` of ``centre``."""
+    found = np.empty(len(means), bool)
+    for first in range(0, len(means), BLOCK):
+        offsets = means[first : first + BLOCK] - centre
+        found[first : first + BLOCK] = np.einsum("nc,nc->n", offsets, offsets) <= radius**2
+    return found
 
 
 def _surrounding_cameras(bounds: SceneBounds, like: Camera) -> Iterator[Camera]:
