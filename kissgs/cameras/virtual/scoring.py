@@ -15,8 +15,11 @@ from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu.frame import draw
 
-PROXY_GAUSSIANS = 30_000
+PROXY_GAUSSIANS = 16_000
 """Largest number of Gaussians in the proxy scene that thumbnails show."""
+
+OPAQUE = 0.01
+"""Transmittance at which the list of a thumbnail's pixel ends: what is behind does not change its statistics."""
 
 TOO_NEAR = 0.35
 """Depth in radii of the scene; anything nearer to the camera counts as an obstruction."""
@@ -93,7 +96,7 @@ class ViewScorer:
             shN=np.empty((len(proxy), 0, 3), np.float32),
         )
         with Workers(1) as single:  # cameras are already rendered in parallel
-            frame = draw(coloured, camera, black(), single)
+            frame = draw(coloured, camera, black(), single, OPAQUE)
         alpha = 1 - frame.transmittance.astype(np.float64)
         size, depth, centre = (_from_colour(frame.image[:, :, c] / np.maximum(alpha, 1e-6)) for c in range(3))
         near = (np.exp(depth) < TOO_NEAR * self.bounds.radius) * alpha
