@@ -94,7 +94,7 @@ def scaling(
         ),
     ],
     scenes: Annotated[
-        list[str] | None, typer.Argument(metavar="[FILE]…", help="Files or glob patterns. Default: sample scenes.")
+        list[str] | None, typer.Argument(metavar="FILE…", help="Files or glob patterns. Default: sample scenes.")
     ] = None,
     degrees: Annotated[
         list[int] | None,
