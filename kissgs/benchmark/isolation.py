@@ -30,15 +30,21 @@ def isolated(work: Callable[[], Result], what: str) -> Result:
     context = multiprocessing.get_context("spawn")
     ignore = partial(signal.signal, signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for this process, which ends the other
     with ProcessPoolExecutor(1, mp_context=context, initializer=ignore) as pool:
-        worker = pool.submit(os.getpid).result()
-        result = pool.submit(work)
         try:
-            return result.result()
+            return _result(pool, work)
         except BrokenProcessPool as error:
             raise UnsupportedError(
                 f"{what}: the measurement was killed, most likely for lack of memory; free some or give a smaller scene"
             ) from error
-        finally:
-            if not result.done():  # an interrupt does not wait for the end of the work
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(worker, signal.SIGTERM)
+
+
+def _result(pool: ProcessPoolExecutor, work: Callable[[], Result]) -> Result:
+    """Return the result of ``work``; an interrupt does not wait for its end."""
+    worker = pool.submit(os.getpid).result()
+    result = pool.submit(work)
+    try:
+        return result.result()
+    finally:
+        if not result.done():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(worker, signal.SIGTERM)

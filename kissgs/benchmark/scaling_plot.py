@@ -38,19 +38,7 @@ def scaling_plot(rows: Sequence[Measurement], path: Path) -> None:
     if not all(row.gaussians for row in rows):
         raise UnsupportedError(f"{path}: a scene without Gaussians cannot be plotted; leave out --plot")
     presets = list(dict.fromkeys(row.name for row in rows if not row.is_external))
-    runs = [row.median_run for row in rows]
-    stages = dict.fromkeys(
-        stage for run in runs for part in (run.stage_seconds, run.stage_peak_memory) for stage in part
-    )
-    styles: dict[str, Style] = {
-        stage: {
-            "color": COLOURS[n % len(COLOURS)],
-            "marker": MARKERS[n % len(MARKERS)],
-            "markersize": 4,
-            "linewidth": 1.2,
-        }
-        for n, stage in enumerate(stages)
-    }
+    styles = _styles(rows)
     with new_figure(path, 10, 1.4 + 3.4 * (len(presets) + 1)) as figure:
         panels = figure.subplots(len(presets) + 1, 2, squeeze=False, sharex=True, sharey="col")
         for (seconds, memory), preset in zip(panels, presets, strict=False):
@@ -78,6 +66,23 @@ def scaling_plot(rows: Sequence[Measurement], path: Path) -> None:
             for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)
         }
         figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=6, fontsize="small")
+
+
+def _styles(rows: Sequence[Measurement]) -> dict[str, Style]:
+    """Return the style of each stage of the presets, the same in all panels."""
+    runs = [row.median_run for row in rows if not row.is_external]
+    stages = dict.fromkeys(
+        stage for run in runs for part in (run.stage_seconds, run.stage_peak_memory) for stage in part
+    )
+    return {
+        stage: {
+            "color": COLOURS[n % len(COLOURS)],
+            "marker": MARKERS[n % len(MARKERS)],
+            "markersize": 4,
+            "linewidth": 1.2,
+        }
+        for n, stage in enumerate(stages)
+    }
 
 
 def _curve(rows: Sequence[Measurement], name: str) -> list[Measurement]:
