@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -11,14 +10,13 @@ from pathlib import Path
 
 from kissgs.benchmark.bd_rate import at_quality_offset
 from kissgs.benchmark.external_codecs import SPLAT_TRANSFORM, ExternalResult, check_external, measure_external
-from kissgs.benchmark.render_speed import resampled
 from kissgs.benchmark.results import Measurement, Run, curve_name
 from kissgs.benchmark.roundtrip import isolated_roundtrip
 from kissgs.cameras.views import Views
 from kissgs.core.errors import KissgsError
 from kissgs.core.progress import Progress, silent
+from kissgs.core.splats import float32_bytes
 from kissgs.io.container_names import ContainerName
-from kissgs.pipeline.scene_files import load, save
 from kissgs.settings import Settings
 
 MAX_REPEATED_SECONDS = 60.0
@@ -38,6 +36,7 @@ class BenchmarkPlan:
         splat_transform: command that starts splat-transform, the tool of the external codecs.
         sog_iterations: k-means iterations over the SH of ``.sog``; None for the tool's default.
         repeats: number of measurements, 1 or more.
+        errors: whether to compute the errors of attributes.
         evaluate: whether to compare rendered images.
         views: capture for rate-distortion planning and, by its held-out views, for the evaluation; None to evaluate
             with cameras drawn over the whole scene.
@@ -52,6 +51,7 @@ class BenchmarkPlan:
     splat_transform: Sequence[str] = SPLAT_TRANSFORM
     sog_iterations: int | None = None
     repeats: int = 1
+    errors: bool = True
     evaluate: bool = False
     views: Views | None = None
     threads: int = 0
@@ -76,20 +76,7 @@ def compare(
     """
     for codec in plan.external_codecs:
         check_external(codec, plan.splat_transform)
-    points = [
-        *product(plan.presets, [None], plan.containers),
-        *product(plan.curve_presets, plan.quality_offsets, plan.containers),
-    ]
-    jobs: list[tuple[str, Callable[[], Measurement]]] = [
-        *(
-            (
-                curve_name(str(settings.preset), container),
-                partial(_measure_preset, scene, settings, db, container, plan),
-            )
-            for settings, db, container in points
-        ),
-        *((codec, partial(_measure_external, scene, codec, plan)) for codec in plan.external_codecs),
-    ]
+    jobs = measurements(scene, plan)
     rows = []
     for done, (name, job) in enumerate(jobs):
         progress("measure", done / len(jobs), name)
@@ -102,18 +89,22 @@ def compare(
     return rows
 
 
-def compare_at_counts(
-    scene: Path, counts: Sequence[int], plan: BenchmarkPlan, *, progress: Progress = silent
-) -> list[Measurement]:
-    """Measure the scene resampled to each count (:func:`kissgs.benchmark.render_speed.resampled`), as planned."""
-    splats = load(scene, threads=plan.threads, progress=progress)
-    rows = []
-    with tempfile.TemporaryDirectory(prefix="kissgs-bench-") as folder:
-        for count in counts:
-            path = Path(folder, scene.name).with_suffix(".ply")
-            save(resampled(splats, count), path, overwrite=True)
-            rows += compare(path, plan, progress=progress)
-    return rows
+def measurements(scene: Path, plan: BenchmarkPlan) -> list[tuple[str, Callable[[], Measurement]]]:
+    """Return the measurements of :func:`compare`, not yet made: the name of the codec, and the work."""
+    points = [
+        *product(plan.presets, [None], plan.containers),
+        *product(plan.curve_presets, plan.quality_offsets, plan.containers),
+    ]
+    return [
+        *(
+            (
+                curve_name(str(settings.preset), container),
+                partial(_measure_preset, scene, settings, db, container, plan),
+            )
+            for settings, db, container in points
+        ),
+        *((codec, partial(_measure_external, scene, codec, plan)) for codec in plan.external_codecs),
+    ]
 
 
 def _measure_preset(
@@ -128,6 +119,7 @@ def _measure_preset(
             scene,
             settings,
             container=container,
+            errors=plan.errors,
             evaluate=plan.evaluate and not number,
             views=plan.views,
             threads=plan.threads,
@@ -141,6 +133,7 @@ def _measure_preset(
         container=container,
         quality_offset_db=quality_offset_db,
         gaussians=first.report.source_count,
+        float32_bytes=float32_bytes(first.report.source_count, first.report.sh_degree),
         file_bytes=first.report.file_bytes,
         runs=tuple(map(Run.of, results)),
         errors=first.errors,
@@ -158,6 +151,7 @@ def _measure_external(scene: Path, codec: str, plan: BenchmarkPlan) -> Measureme
             codec,
             command=plan.splat_transform,
             sh_iterations=plan.sog_iterations if codec == "sog" else None,
+            errors=plan.errors,
             evaluate=evaluate,
             views=plan.views,
         )
@@ -170,6 +164,7 @@ def _measure_external(scene: Path, codec: str, plan: BenchmarkPlan) -> Measureme
         codec=codec,
         container=None,
         gaussians=first.gaussians,
+        float32_bytes=float32_bytes(first.gaussians, first.sh_degree),
         file_bytes={codec: first.bytes},
         runs=tuple(map(Run.of, results)),
         errors=first.errors,

@@ -1,4 +1,4 @@
-"""Plots of codec measurements: speed, size, quality, files and stages of one scene, or times over its size."""
+"""Plot of codec measurements on one scene: speed, size, quality, files and stages."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kissgs.benchmark.bd_rate import pareto_front
-from kissgs.benchmark.plots import MARKERS, new_figure
+from kissgs.benchmark.plots import new_figure
 from kissgs.benchmark.results import Measurement, PsnrTarget, curve_name, curves
-from kissgs.core.errors import UnsupportedError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -67,59 +66,6 @@ def comparison_plot(rows: Sequence[Measurement], path: Path) -> None:
         figure.draw_without_rendering()  # the positions of points are known only after the layout
         for name, panel_labels in labels.items():
             _place_labels(figure, panels[name], panel_labels)
-
-
-def scaling_plot(rows: Sequence[Measurement], path: Path) -> None:
-    """Plot the seconds of each stage over the number of Gaussians, both logarithmic, with a panel for each preset.
-
-    Args:
-        rows: measurements of presets on one scene, resampled.
-        path: file to write, ``.svg``, ``.png`` or ``.pdf``; overwritten.
-
-    Raises:
-        OutputError: the file cannot be written.
-        UnsupportedError: matplotlib is not installed, the format is unknown, or a scene has no Gaussians.
-    """
-    if not all(row.gaussians for row in rows):
-        raise UnsupportedError(f"{path}: a scene without Gaussians cannot be plotted; leave out --plot")
-    presets = list(dict.fromkeys(row.codec for row in rows))
-    runs = [row.median_run for row in rows]
-    stages = list(dict.fromkeys(stage for run in runs for stage in run.stage_seconds))
-    across = min(len(presets), 2)
-    down = -(-len(presets) // across)
-    times = [seconds for run in runs for seconds in (*run.stage_seconds.values(), run.encode_seconds)]
-    low, high = max(min(times), 1e-3) / 1.5, max(*times, 1e-2) * 1.5
-    with new_figure(path, 10, 1 + 4 * down) as figure:
-        panels = figure.subplots(down, across, squeeze=False).ravel()
-        for axes in panels[len(presets) :]:
-            axes.set_axis_off()
-        for axes, preset in zip(panels, presets, strict=False):
-            curve = sorted((row for row in rows if row.codec == preset), key=lambda row: row.gaussians)
-            _times(axes, curve, stages)
-            axes.set(title=preset, yscale="log", ylim=(low, high), ylabel="seconds")
-            ticks = [10.0**power for power in range(-4, 6) if low <= 10.0**power <= high]
-            axes.set_yticks(ticks, [f"{tick:,g}" for tick in ticks])
-            axes.minorticks_off()
-            axes.grid(alpha=0.3)
-        handles = {
-            name: handle for axes in panels for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)
-        }
-        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=6, fontsize="small")
-
-
-def _times(axes: Axes, rows: Sequence[Measurement], stages: Sequence[str]) -> None:
-    """Draw a line for each stage, in the same style in all panels, and a thick line for the total."""
-    counts = [row.gaussians for row in rows]
-    runs = [row.median_run for row in rows]
-    for number, stage in enumerate(stages):
-        seconds = [run.stage_seconds.get(stage, 0.0) or math.nan for run in runs]
-        style = {"color": COLOURS[number % len(COLOURS)], "marker": MARKERS[number % len(MARKERS)]}
-        if not all(map(math.isnan, seconds)):
-            axes.plot(counts, seconds, label=stage, markersize=4, linewidth=1.2, **style)  # type: ignore[arg-type]
-    total = [run.encode_seconds for run in runs]
-    axes.plot(counts, total, label="total", marker="o", markersize=5, linewidth=2.2, color=BLACK)
-    axes.set(xscale="log", xlabel="Gaussians")
-    axes.set_xticks(counts, [_count(count) for count in counts])
 
 
 def _speed(axes: Axes, rows: Sequence[Measurement]) -> list[Annotation]:
@@ -258,7 +204,3 @@ def _kilobytes(row: Measurement) -> dict[str, float]:
         return {EXTERNAL: row.bytes / 1000}
     planes = {name.removesuffix(".webp"): size / 1000 for name, size in row.file_bytes.items() if name not in METADATA}
     return {**planes, "metadata": sum(row.file_bytes.get(name, 0) for name in METADATA) / 1000}
-
-
-def _count(count: int) -> str:
-    return f"{count / 1e6:.3g}M" if count >= 1e6 else f"{count / 1000:.3g}k" if count >= 1000 else str(count)

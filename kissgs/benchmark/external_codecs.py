@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -38,6 +39,7 @@ class ExternalResult:
     Attributes:
         format: one of :data:`EXTERNAL_FORMATS`.
         gaussians: number of Gaussians in the scene, after cleaning.
+        sh_degree: SH degree of the scene, 0 to 3.
         kept: number of Gaussians in the decoded file.
         bytes: size of the encoded file.
         encode_seconds: wall time of the encoding process, with start-up and reading the ``.ply``.
@@ -46,12 +48,13 @@ class ExternalResult:
         decode_cpu_seconds: CPU time of the decoding process, user and system, all threads.
         peak_memory: largest resident set of both processes, bytes.
         errors: errors of the visible Gaussians: no renderer draws an opacity of 1/255 or less, and codecs change what
-            such an opacity hides.
+            such an opacity hides; None if not requested.
         evaluation: comparison of rendered images; None if not requested.
     """
 
     format: str
     gaussians: int
+    sh_degree: int
     kept: int
     bytes: int
     encode_seconds: float
@@ -59,7 +62,7 @@ class ExternalResult:
     encode_cpu_seconds: float
     decode_cpu_seconds: float
     peak_memory: int
-    errors: AttributeErrors
+    errors: AttributeErrors | None
     evaluation: Evaluation | None = None
 
     @property
@@ -80,6 +83,7 @@ def measure_external(
     *,
     command: Sequence[str] = SPLAT_TRANSFORM,
     sh_iterations: int | None = None,
+    errors: bool = True,
     evaluate: bool = False,
     views: Views | None = None,
 ) -> ExternalResult:
@@ -92,6 +96,7 @@ def measure_external(
         format: one of :data:`EXTERNAL_FORMATS`.
         command: command that starts splat-transform.
         sh_iterations: k-means iterations over the SH of ``.sog``; None for the tool's default.
+        errors: whether to pair the Gaussians of both scenes and to compute their errors.
         evaluate: whether to compare rendered images too (:func:`kissgs.evaluation.evaluate.compare_images`).
         views: views of that comparison; None for cameras drawn over the whole scene.
 
@@ -114,6 +119,7 @@ def measure_external(
     return ExternalResult(
         format=format,
         gaussians=len(reference),
+        sh_degree=reference.sh_degree,
         kept=len(candidate),
         bytes=size,
         encode_seconds=encoding.wall,
@@ -121,7 +127,7 @@ def measure_external(
         encode_cpu_seconds=encoding.cpu,
         decode_cpu_seconds=decoding.cpu,
         peak_memory=max(encoding.memory, decoding.memory),
-        errors=_errors_of_visible(reference, candidate),
+        errors=_errors_of_visible(reference, candidate) if errors else None,
         evaluation=compare_images(reference, candidate, views or evaluation_views(reference)) if evaluate else None,
     )
 
@@ -177,6 +183,24 @@ def _text(file: IO[bytes]) -> str:
     return file.read().decode(errors="replace").strip()
 
 
+_WATCHER = """
+import json, os, subprocess, sys, time
+begin = time.perf_counter()
+try:
+    process = subprocess.Popen(sys.argv[2:], stdin=subprocess.DEVNULL)
+except OSError as error:
+    result = [error.errno, error.strerror]
+else:
+    _, status, usage = os.wait4(process.pid, 0)
+    wall, cpu = time.perf_counter() - begin, usage.ru_utime + usage.ru_stime
+    resident = usage.ru_maxrss if sys.platform == "darwin" else usage.ru_maxrss * 1024
+    result = [os.waitstatus_to_exitcode(status), wall, cpu, resident]
+with open(sys.argv[1], "w") as file:
+    json.dump(result, file)
+"""
+"""A small process that starts the tool: Linux counts the memory of the process that starts another as the other's."""
+
+
 def _run(call: Sequence[str], output: IO[bytes], errors: IO[bytes]) -> tuple[int, _Resources]:
     """Run a process; return its exit status and the resources that it and the children it waited for used."""
     if sys.platform == "win32":
@@ -184,14 +208,22 @@ def _run(call: Sequence[str], output: IO[bytes], errors: IO[bytes]) -> tuple[int
             "external codecs cannot be measured on Windows, which does not report the resources of a process; use "
             "another system"
         )
-    begin = time.perf_counter()
-    process = subprocess.Popen(call, stdin=subprocess.DEVNULL, stdout=output, stderr=errors)
-    try:
-        _, status, usage = os.wait4(process.pid, 0)
-    except BaseException:  # an interrupt, too, must not leave it running
-        process.kill()
-        process.wait()
-        raise
-    process.returncode = os.waitstatus_to_exitcode(status)
-    resident = usage.ru_maxrss if sys.platform == "darwin" else usage.ru_maxrss * 1024
-    return process.returncode, _Resources(time.perf_counter() - begin, usage.ru_utime + usage.ru_stime, resident)
+    with tempfile.NamedTemporaryFile(prefix="kissgs-external-") as found:
+        watcher = subprocess.Popen(
+            [sys.executable, "-I", "-S", "-c", _WATCHER, found.name, *call],
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=errors,
+            start_new_session=True,
+        )
+        try:
+            watcher.wait()
+        except BaseException:  # an interrupt, too, must not leave the tool running
+            os.killpg(watcher.pid, signal.SIGKILL)
+            watcher.wait()
+            raise
+        result = json.load(found)
+    if len(result) == 2:
+        raise OSError(*result)
+    status, *resources = result
+    return status, _Resources(*resources)

@@ -31,6 +31,8 @@ class Run:
         decode_seconds: wall time from container to arrays; of an external codec, to a ``.ply``.
         decode_cpu_seconds: CPU time of decoding, all threads.
         stage_seconds: wall time of encoding by stage; an external codec has one stage.
+        stage_cpu_seconds: CPU time of encoding by stage, all threads.
+        stage_peak_memory: largest resident set by stage, bytes; decoding is the stage "decode".
         peak_memory: largest resident set of encoding and decoding, bytes.
     """
 
@@ -40,6 +42,8 @@ class Run:
     decode_seconds: float
     decode_cpu_seconds: float
     stage_seconds: Mapping[str, float]
+    stage_cpu_seconds: Mapping[str, float]
+    stage_peak_memory: Mapping[str, int]
     peak_memory: int
 
     @classmethod
@@ -47,9 +51,11 @@ class Run:
         """Return the resources of one measurement."""
         if isinstance(result, ExternalResult):
             size, stages, cpu = result.bytes, {result.format: result.encode_seconds}, result.encode_cpu_seconds
+            stage_cpu, stage_memory = {result.format: cpu}, {result.format: result.peak_memory}
         else:
             report = result.report
             size, stages, cpu = report.container_bytes, report.seconds, report.cpu_seconds
+            stage_cpu, stage_memory = result.stage_cpu_seconds, result.stage_peak_memory
         return cls(
             bytes=size,
             encode_seconds=sum(stages.values()),
@@ -57,17 +63,22 @@ class Run:
             decode_seconds=result.decode_seconds,
             decode_cpu_seconds=result.decode_cpu_seconds,
             stage_seconds=stages,
+            stage_cpu_seconds=stage_cpu,
+            stage_peak_memory=stage_memory,
             peak_memory=result.peak_memory,
         )
 
     @classmethod
     def median_of(cls, runs: Sequence[Run]) -> Run:
-        """Return the median of each time, the largest ``peak_memory`` and the bytes of the first run."""
+        """Return the median of each time, the largest peak of memory and the bytes of the first run."""
         times = ("encode_seconds", "encode_cpu_seconds", "decode_seconds", "decode_cpu_seconds")
         stages = dict.fromkeys(name for run in runs for name in run.stage_seconds)
+        measured = dict.fromkeys(name for run in runs for name in run.stage_peak_memory)
         return cls(
             bytes=runs[0].bytes,
             stage_seconds={name: median(run.stage_seconds.get(name, 0.0) for run in runs) for name in stages},
+            stage_cpu_seconds={name: median(run.stage_cpu_seconds.get(name, 0.0) for run in runs) for name in stages},
+            stage_peak_memory={name: max(run.stage_peak_memory.get(name, 0) for run in runs) for name in measured},
             peak_memory=max(run.peak_memory for run in runs),
             **{name: median(getattr(run, name) for run in runs) for name in times},
         )
@@ -84,9 +95,10 @@ class Measurement:
         quality_offset_db: quality offset of a point of a preset's curve, decibels; None for a preset as it is and for
             external codecs.
         gaussians: number of Gaussians in the scene, before any is left out.
+        float32_bytes: size of the scene's arrays, in float32.
         file_bytes: bytes by file of the container; of an external codec, of its only file.
         runs: all repeats, in order.
-        errors: attribute errors of the first run.
+        errors: attribute errors of the first run; None if not requested.
         evaluation: comparison of rendered images of the first run; None if not requested.
         details: complete measurement of the first run, for JSON.
     """
@@ -96,9 +108,10 @@ class Measurement:
     container: ContainerName | None = "sogxt"
     quality_offset_db: float | None = None
     gaussians: int
+    float32_bytes: int
     file_bytes: Mapping[str, int]
     runs: tuple[Run, ...]
-    errors: AttributeErrors
+    errors: AttributeErrors | None
     evaluation: Evaluation | None = None
     details: Mapping[str, Any] = field(default_factory=dict)
 
@@ -111,6 +124,16 @@ class Measurement:
     def bytes(self) -> int:
         """Size of the container or file of the first run."""
         return self.runs[0].bytes
+
+    @property
+    def peak_memory_per_gaussian(self) -> float:
+        """Largest resident set of all runs, bytes per Gaussian of the scene; that of the process if it has none."""
+        return self.median_run.peak_memory / max(self.gaussians, 1)
+
+    @property
+    def peak_memory_ratio(self) -> float:
+        """Largest resident set of all runs, as a multiple of ``float32_bytes``; infinite for an empty scene."""
+        return self.median_run.peak_memory / self.float32_bytes if self.float32_bytes else math.inf
 
     @property
     def reproducible(self) -> bool:
@@ -145,6 +168,9 @@ class Measurement:
             **self.details,
             "gaussians": self.gaussians,
             "bytes_per_gaussian": self.bytes / max(self.gaussians, 1),
+            "float32_bytes": self.float32_bytes,
+            "peak_memory_per_gaussian": self.peak_memory_per_gaussian,
+            "peak_memory_ratio": self.peak_memory_ratio if self.float32_bytes else None,
             **asdict(self.median_run),
             "file_bytes": dict(self.file_bytes),
             "reproducible": self.reproducible,

@@ -8,11 +8,14 @@ import typer
 
 from kissgs.cli.arguments import FilesArgument, ImagesOption, ResolutionOption, ScaleOption, SetOption, ViewsOption
 from kissgs.cli.bench_arguments import (
+    ExternalCodecsOption,
     JsonOption,
     PlotOption,
     PresetsOption,
     RepeatsOption,
     SetAllOption,
+    SogIterationsOption,
+    SplatTransformOption,
     SupervisionOption,
     ThreadsOption,
 )
@@ -35,15 +38,9 @@ def codecs(
         list[str] | None,
         typer.Option("--container", help="Container of the presets, sogxt or sog; repeatable. Default: sogxt."),
     ] = None,
-    external_codecs: Annotated[
-        list[str] | None,
-        typer.Option("--external", help="External codec to measure, sog or spz, by splat-transform; repeatable."),
-    ] = None,
-    splat_transform: Annotated[str, typer.Option(help="Command that starts splat-transform.")] = "splat-transform",
-    sog_iterations: Annotated[
-        int | None,
-        typer.Option(min=1, help="K-means iterations over the SH of .sog; each takes minutes without a GPU."),
-    ] = None,
+    external_codecs: ExternalCodecsOption = None,
+    splat_transform: SplatTransformOption = "splat-transform",
+    sog_iterations: SogIterationsOption = None,
     quality_offsets: Annotated[
         list[float] | None,
         typer.Option(
@@ -88,13 +85,26 @@ def codecs(
 
 @app.command()
 def scaling(
-    scenes: FilesArgument,
     counts: Annotated[
         list[int],
-        typer.Option("--gaussians", min=1, help="Measure the scene resampled to this number of Gaussians; repeatable."),
+        typer.Option(
+            "--gaussians",
+            min=1,
+            help="Measure the scene resampled to this number of Gaussians, or a sample scene of it; repeatable.",
+        ),
     ],
+    scenes: Annotated[
+        list[str] | None, typer.Argument(metavar="FILE…", help="Files or glob patterns. Default: sample scenes.")
+    ] = None,
+    degrees: Annotated[
+        list[int] | None,
+        typer.Option("--degree", min=0, max=3, help="Degree of the sample scenes; repeatable. Default: 3."),
+    ] = None,
     presets: PresetsOption = None,
     changes: SetAllOption = None,
+    external_codecs: ExternalCodecsOption = None,
+    splat_transform: SplatTransformOption = "splat-transform",
+    sog_iterations: SogIterationsOption = None,
     repeats: RepeatsOption = 1,
     evaluate: Annotated[
         bool, typer.Option("--evaluate", help="Compare rendered images too; implied by --views.")
@@ -107,12 +117,26 @@ def scaling(
     threads: ThreadsOption = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure how bytes, times and memory of presets grow with the number of Gaussians."""
-    capture = open_views(views, scale=scale, images=images, resolution=resolution)
-    inputs = open_inputs(scenes, capture, threads, plot)
-    from kissgs.cli import bench_codecs
+    """Measure how bytes, and times and memory of every stage, grow with the number of Gaussians.
 
-    output = bench_codecs.scaling(inputs, counts, presets=presets, changes=changes, repeats=repeats, evaluate=evaluate)
+    Ctrl-C ends it with what is measured.
+    """
+    capture = open_views(views, scale=scale, images=images, resolution=resolution)
+    inputs = open_inputs(scenes or [], capture, threads, plot)
+    from kissgs.cli import bench_scaling
+    from kissgs.cli.bench_codecs import ExternalCodecs
+
+    output = bench_scaling.scaling(
+        inputs,
+        counts,
+        degrees=degrees or [],
+        presets=presets,
+        changes=changes,
+        external=ExternalCodecs(external_codecs or [], splat_transform, sog_iterations),
+        repeats=repeats,
+        evaluate=evaluate,
+        plotted=plot is not None,
+    )
     report(output, as_json, plot)
 
 

@@ -14,6 +14,15 @@ SetAllOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="NAME=VALUE", help="Change a setting of all these presets; repeatable."),
 ]
+ExternalCodecsOption = Annotated[
+    list[str] | None,
+    typer.Option("--external", help="External codec to measure, sog or spz, by splat-transform; repeatable."),
+]
+SplatTransformOption = Annotated[str, typer.Option(help="Command that starts splat-transform.")]
+SogIterationsOption = Annotated[
+    int | None,
+    typer.Option(min=1, help="K-means iterations over the SH of .sog; each takes minutes without a GPU."),
+]
 RepeatsOption = Annotated[
     int, typer.Option(min=1, max=1000, help="Number of runs per codec: times are medians, memory is the maximum.")
 ]

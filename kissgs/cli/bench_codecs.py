@@ -1,4 +1,4 @@
-"""``kissgs bench codecs`` and ``scaling``."""
+"""``kissgs bench codecs``, and what it shares with ``scaling``."""
 
 from __future__ import annotations
 
@@ -33,6 +33,15 @@ class ExternalCodecs:
     splat_transform: str
     sog_iterations: int | None
 
+    def check(self) -> None:
+        """Check that the options belong together.
+
+        Raises:
+            UnsupportedError: k-means iterations without ``.sog``.
+        """
+        if self.sog_iterations is not None and "sog" not in self.formats:
+            raise UnsupportedError("--sog-iterations needs --external sog")
+
 
 def codecs(
     inputs: BenchInputs,
@@ -46,15 +55,14 @@ def codecs(
     evaluate: bool,
 ) -> BenchOutput:
     """Measure presets, points of their quality curves and external codecs."""
-    if external.sog_iterations is not None and "sog" not in external.formats:
-        raise UnsupportedError("--sog-iterations needs --external sog")
+    external.check()
     from kissgs.benchmark.comparison import BenchmarkPlan, compare
     from kissgs.benchmark.comparison_plots import comparison_plot
     from kissgs.benchmark.results import at_equal_psnr
     from kissgs.cli.bench_tables import bench_tables
     from kissgs.io.container_names import named_container
 
-    settings = _all_settings(presets, changes)
+    settings = all_settings(presets, changes)
     curve_presets = _curve_presets(settings, only_balanced=not presets)
     if quality_offsets and not curve_presets:
         raise UnsupportedError("--quality-offset needs a preset with rate-distortion planning: balanced or small")
@@ -64,7 +72,7 @@ def codecs(
         curve_presets=curve_presets,
         quality_offsets=quality_offsets,
         external_codecs=external.formats,
-        splat_transform=_command(external.splat_transform),
+        splat_transform=command_words(external.splat_transform),
         sog_iterations=external.sog_iterations,
         repeats=repeats,
         evaluate=evaluate or inputs.views is not None or bool(quality_offsets),
@@ -92,42 +100,7 @@ def codecs(
     )
 
 
-def scaling(
-    inputs: BenchInputs,
-    counts: list[int],
-    *,
-    presets: list[str] | None,
-    changes: list[str] | None,
-    repeats: int,
-    evaluate: bool,
-) -> BenchOutput:
-    """Measure presets on scenes resampled to each count."""
-    from kissgs.benchmark.comparison import BenchmarkPlan, compare_at_counts
-    from kissgs.benchmark.comparison_plots import scaling_plot
-    from kissgs.cli.bench_tables import bench_tables
-
-    plan = BenchmarkPlan(
-        presets=_all_settings(presets, changes),
-        repeats=repeats,
-        evaluate=evaluate or inputs.views is not None,
-        views=inputs.views,
-        threads=inputs.threads,
-    )
-
-    def measure(scene: Path, progress: Progress) -> list[Measurement]:
-        return compare_at_counts(scene, list(dict.fromkeys(counts)), plan, progress=progress)
-
-    found, failures = each_scene(inputs.scenes, measure)
-    rows = [replace(row, scene=name) for name, row in found]
-    return BenchOutput(
-        rows=[row.as_dict() for row in rows],
-        table=bench_tables(rows, []),
-        draw=partial(scaling_plot, rows),
-        failures=failures,
-    )
-
-
-def _all_settings(presets: list[str] | None, changes: list[str] | None) -> list[Settings]:
+def all_settings(presets: list[str] | None, changes: list[str] | None) -> list[Settings]:
     """Return the settings of these presets, by default of all, with these changes."""
     from kissgs.settings import Preset
 
@@ -142,7 +115,7 @@ def _curve_presets(settings: list[Settings], *, only_balanced: bool) -> list[Set
     return [each for each in planned if each.preset == Preset.BALANCED] if only_balanced else planned
 
 
-def _command(text: str) -> list[str]:
+def command_words(text: str) -> list[str]:
     """Split a command line into words."""
     try:
         return shlex.split(text)

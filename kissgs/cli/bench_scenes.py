@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import typer
 
 from kissgs.cli.files import expand, print_json, show
+from kissgs.cli.interrupts import Interrupted
 from kissgs.core.errors import KissgsError, UnsupportedError
 
 if TYPE_CHECKING:
@@ -46,12 +47,14 @@ class BenchOutput:
         table: results for the terminal.
         draw: writes a plot to a file; None if there is no plot.
         failures: an error message for each part that failed.
+        interrupt: what Ctrl-C or SIGTERM raised during the measurement; it is raised again after the output.
     """
 
     rows: list[dict[str, Any]]
     table: RenderableType
     draw: Callable[[Path], None] | None = None
     failures: list[str] = field(default_factory=list)
+    interrupt: Interrupted | None = None
 
 
 def open_inputs(scenes: list[str], views: Views | None, threads: int, plot: Path | None = None) -> BenchInputs:
@@ -80,6 +83,8 @@ def report(output: BenchOutput, as_json: bool, plot: Path | None = None) -> None
     finally:
         if plot is not None and output.draw is not None:
             output.draw(plot)
+    if output.interrupt is not None:
+        raise output.interrupt
     for failure in output.failures:
         sys.stderr.write(f"kissgs: {failure}\n")
     if output.failures:
@@ -98,7 +103,7 @@ def each_scene(
 
     rows, failures = list[tuple[str, Row]](), list[str]()
     with progress_bar(False) as progress:
-        for scene, name in zip(scenes, _names(scenes), strict=True):
+        for scene, name in zip(scenes, distinct_names(scenes), strict=True):
             try:
                 rows += [(name, row) for row in measure(scene, progress)]
             except KissgsError as error:
@@ -108,7 +113,7 @@ def each_scene(
     return rows, failures
 
 
-def _names(scenes: list[Path]) -> list[str]:
+def distinct_names(scenes: list[Path]) -> list[str]:
     """Return the shortest ends of the paths that are all different: many captures have a ``point_cloud.ply``."""
     longest = max(len(scene.parts) for scene in scenes)
     for depth in range(1, longest + 1):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from rich.console import Group, RenderableType
 from rich.table import Column, Table
@@ -10,6 +10,7 @@ from rich.text import Text
 
 from kissgs.benchmark.ablation import AblationRow
 from kissgs.benchmark.results import EqualPsnr, Measurement, PsnrTarget, curve_name
+from kissgs.evaluation.attributes import AttributeErrors
 from kissgs.evaluation.metric_text import format_metric
 from kissgs.evaluation.results import Evaluation
 
@@ -24,15 +25,15 @@ def bench_tables(rows: Sequence[Measurement], equals: Sequence[EqualPsnr]) -> Re
         whole = [row for row in here if row.quality_offset_db is None and not row.is_external]
         repeats = max(len(row.runs) for row in here)
         medians = f"; times are medians of {repeats} runs, memory is the maximum" if repeats > 1 else ""
-        blocks += [Text.assemble((scene, "bold"), f"  {_counts(here)} Gaussians{medians}"), _metrics(here)]
+        blocks += [Text.assemble((scene, "bold"), f"  {_counts(here)} Gaussians{medians}"), metrics_table(here)]
         for count in dict.fromkeys(row.gaussians for row in whole):
             group = [row for row in whole if row.gaussians == count]
             suffix, names = ("" if len(group) == len(whole) else f", {count:,}"), [row.name for row in group]
             seconds = [row.median_run.stage_seconds for row in group]
-            blocks.append(_columns(f"seconds{suffix}", names, seconds, "{:.2f}"))
-            blocks.append(_columns(f"bytes{suffix}", names, [row.file_bytes for row in group], "{:,}"))
+            blocks.append(columns_table(f"seconds{suffix}", names, seconds, "{:.2f}"))
+            blocks.append(columns_table(f"bytes{suffix}", names, [row.file_bytes for row in group], "{:,}"))
         blocks += [Text(_equal(equal)) for equal in equals if equal.scene == scene]
-        blocks += [Text(_not_reproducible(row), style="red") for row in here if not row.reproducible]
+        blocks += [Text(not_reproducible(row), style="red") for row in here if not row.reproducible]
     return Group(*blocks)
 
 
@@ -95,26 +96,36 @@ def _names(rows: Sequence[Measurement]) -> list[str]:
     return [f"{row.name}, {row.gaussians:,}" if several else row.name for row in rows]
 
 
-def _metrics(rows: Sequence[Measurement]) -> Table:
+def metrics_table(rows: Sequence[Measurement]) -> Table:
+    """Return a table of sizes, times, memory, errors and quality, a row for each measurement."""
     evaluations = [row.evaluation for row in rows if row.evaluation is not None]
     photographed = any(evaluation.mean.reference is not None for evaluation in evaluations)
+    compared = any(row.errors is not None for row in rows)
     heads = [
-        *("B per\nGaussian", "bytes", "encode\nCPU s", "wall\ns", "decode\nCPU s", "peak\nMB"),
-        *("rotation\n°", "log-\nscale", "SH\nRMSE"),
+        *("bytes/\nGauss.", "bytes", "encode\nCPU s", "wall\ns", "decode\nCPU s"),
+        *("peak\nMB", "peak/\nGauss.", "peak/\nscene"),
+        *(("rot.\n°", "log-\nscale", "SH\nRMSE") if compared else ()),
         *(("PSNR to\nphoto", "change\ndB", "SSIM") if photographed else ()),
         *(("PSNR to\noriginal", "SSIM") if evaluations else ()),
         *(("worst\nview",) if evaluations and not photographed else ()),
     ]
     table = Table("codec", *map(_right, heads), box=None, pad_edge=False, padding=(0, 1, 0, 0))
     for name, row in zip(_names(rows), rows, strict=True):
-        run, errors = row.median_run, row.errors
+        run = row.median_run
         cells = (
             *(f"{row.bytes / max(row.gaussians, 1):.2f}", f"{row.bytes:,}", f"{run.encode_cpu_seconds:.1f}"),
-            *(f"{run.encode_seconds:.1f}", f"{run.decode_cpu_seconds:.2f}", f"{run.peak_memory / 1e6:.0f}"),
-            *(f"{errors.rotation_degrees.rmse:.2f}", f"{errors.scales.rmse:.3f}", f"{errors.shN.rmse:.4f}"),
+            *(f"{run.encode_seconds:.1f}", f"{run.decode_cpu_seconds:.2f}"),
+            *(f"{run.peak_memory / 1e6:.0f}", f"{row.peak_memory_per_gaussian:.0f}", f"{row.peak_memory_ratio:.1f}"),
+            *_error_cells(row.errors, compared),
         )
         table.add_row(name, *cells, *_evaluation_cells(row.evaluation, photographed))
     return table
+
+
+def _error_cells(errors: AttributeErrors | None, compared: bool) -> list[str]:
+    if errors is None:
+        return [""] * 3 if compared else []
+    return [f"{errors.rotation_degrees.rmse:.2f}", f"{errors.scales.rmse:.3f}", f"{errors.shN.rmse:.4f}"]
 
 
 def _evaluation_cells(evaluation: Evaluation | None, photographed: bool) -> list[str]:
@@ -132,12 +143,18 @@ def _evaluation_cells(evaluation: Evaluation | None, photographed: bool) -> list
     return [*to_original, format_metric(evaluation.worst.comparison.candidate_vs_reference.psnr, 2)]
 
 
-def _columns(title: str, names: Sequence[str], parts: Sequence[Mapping[str, float]], form: str) -> Table:
-    """Return a table with a column for each codec, a row for each part, and a row of sums."""
+def columns_table(
+    title: str,
+    names: Sequence[str],
+    parts: Sequence[Mapping[str, float]],
+    form: str,
+    total: Callable[[Iterable[float]], float] = sum,
+) -> Table:
+    """Return a table with a column for each name, a row for each part, and a row of totals, by default of sums."""
     table = Table(title, *map(_right, names), box=None, pad_edge=False)
     for part in dict.fromkeys(part for each in parts for part in each):
         table.add_row(part, *(form.format(each[part]) if part in each else "" for each in parts))
-    table.add_row("total", *(form.format(sum(each.values())) for each in parts), style="bold")
+    table.add_row("total", *(form.format(total(each.values())) for each in parts), style="bold")
     return table
 
 
@@ -149,7 +166,8 @@ def _equal(equal: EqualPsnr) -> str:
     return f"{prefix}: {name} {equal.bytes:,.0f} bytes, {equal.ratio:.3f} of its {equal.reference_bytes:,}"
 
 
-def _not_reproducible(row: Measurement) -> str:
+def not_reproducible(row: Measurement) -> str:
+    """Return the message about a measurement whose runs have different bytes."""
     sizes: Iterable[str] = dict.fromkeys(f"{run.bytes:,}" for run in row.runs)
     return f"{row.name} differs between runs: {', '.join(sizes)} bytes"
 

@@ -92,6 +92,11 @@ class Splats:
         return Splats(**{name: getattr(self, name)[index] for name in ATTRIBUTES})
 
 
+def float32_bytes(count: int, sh_degree: int) -> int:
+    """Return the bytes of the arrays of ``count`` Gaussians of this SH degree, 0 to 3."""
+    return 4 * count * (14 + 3 * SH_REST_COUNTS[sh_degree])
+
+
 def empty_splats(count: int, coefficients: int) -> Splats:
     """Return a scene of uninitialised arrays; ``coefficients`` is K, the number of SH coefficients in ``shN``."""
     return Splats(

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from kissgs.core.progress import Progress
 
@@ -46,10 +48,23 @@ class StageTimer:
 
 
 def peak_memory() -> int:
-    """Return the peak resident memory of this process, bytes; 0 where the system does not report it (Windows)."""
+    """Return the peak resident memory of this process, bytes; 0 where the system does not report it (Windows).
+
+    Linux lets a process begin with the peak of the one that started it in ``getrusage``, so the peak of the memory that
+    it maps itself is read there.
+    """
+    with contextlib.suppress(OSError, StopIteration):
+        status = Path("/proc/self/status").read_text().splitlines()
+        return 1024 * int(next(line for line in status if line.startswith("VmHWM:")).split()[1])
     try:
         import resource
     except ImportError:
         return 0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
+
+
+def reset_peak_memory() -> None:
+    """Let :func:`peak_memory` begin anew at the present resident memory; without effect where the system cannot."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")

@@ -11,11 +11,13 @@ from helpers.benchmark_rows import many, measured, run
 import kissgs
 from kissgs import UnsupportedError
 from kissgs.benchmark import comparison, roundtrip
-from kissgs.benchmark.comparison import BenchmarkPlan, compare, compare_at_counts
+from kissgs.benchmark.comparison import BenchmarkPlan, compare
 from kissgs.benchmark.external_codecs import ExternalResult
 from kissgs.benchmark.results import Run, at_equal_psnr
+from kissgs.benchmark.scaling import measure_scaling
 from kissgs.cli.bench_tables import bench_tables
 from kissgs.cli.console import output
+from kissgs.cli.scaling_tables import scaling_tables
 from kissgs.settings import Settings
 
 QUICK = {"sensitivity_views": 4, "sensitivity_view_size": 60}
@@ -106,7 +108,7 @@ def test_measurements_agree_with_compress_and_evaluate(scene, monkeypatch):
         times = {"encode_seconds": seconds, "decode_seconds": 0.1, "encode_cpu_seconds": 1.0, "decode_cpu_seconds": 0.1}
         row = measured(format, 500, 40.0, external=True)
         evaluation = row.evaluation if evaluate else None
-        sizes = {"gaussians": 300, "kept": 300, "bytes": 500, "peak_memory": 5}
+        sizes = {"gaussians": 300, "sh_degree": 1, "kept": 300, "bytes": 500, "peak_memory": 5}
         return ExternalResult(format=format, **sizes, **times, errors=row.errors, evaluation=evaluation)
 
     monkeypatch.setattr(comparison, "measure_external", fake_codec)
@@ -167,7 +169,7 @@ def test_measurements_go_on_after_an_external_codec_fails(scene, monkeypatch):
 
 @pytest.mark.quick(0)
 def test_a_resampled_scene_is_measured_at_each_count(scene):
-    rows = compare_at_counts(scene, [100, 500], BenchmarkPlan(presets=[Settings.from_preset("fast")]))
+    rows = list(measure_scaling(scene, [100, 500], BenchmarkPlan(presets=[Settings.from_preset("fast")])))
     assert [(row.scene, row.gaussians) for row in rows] == [("tiny.ply", 100), ("tiny.ply", 500)]
     assert rows[0].evaluation is None
-    assert "fast, 500" in text(bench_tables(rows, []))
+    assert "fast, 500" in text(scaling_tables(rows, []))

@@ -67,6 +67,15 @@ def test_bytes_seconds_and_errors(scene, tmp_path):
     assert result.as_dict()["errors"]["means"]["max"] == result.errors.means.max
 
 
+def test_the_memory_is_that_of_the_tool_alone(scene, tmp_path):
+    """The tool holds 128 MB; this process holds 1 GB, which Linux would count as that of the process it starts."""
+    held = b"x" * 2**30
+    code = FAKE_TOOL + "\nheld = b'x' * 2**27\n"
+    result = measure_external(scene, "spz", command=tool(tmp_path, code), errors=False)
+    assert 2**27 < result.peak_memory < len(held)
+    assert result.errors is None
+
+
 def test_images_are_compared_on_request(scene, tmp_path):
     view = View(
         "front", look_at(np.array([1.2, -2.2, -5.2]), np.zeros(3), np.array([0, -1.0, 0]), fov=1, width=48, height=32)

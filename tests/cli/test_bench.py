@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 import json
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from helpers.benchmark_rows import measured
+from helpers.captured_scene import cameras
 from helpers.command_line import failure, run
 
 import kissgs
+from kissgs.benchmark.results import Measurement
+from kissgs.benchmark.scaling import FailedMeasurement
+from kissgs.cli import bench_scaling
+from kissgs.cli.bench_codecs import ExternalCodecs
+from kissgs.cli.bench_scenes import BenchInputs, BenchOutput, report
+from kissgs.cli.interrupts import Interrupted
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +57,77 @@ def test_other_sizes_are_measured_and_plotted(scene: Path, tmp_path: Path) -> No
     assert done.returncode == 0, done.stderr
     assert [row["gaussians"] for row in json.loads(done.stdout)] == [200, 900]
     assert (tmp_path / "p.png").stat().st_size > 10_000
+
+
+@pytest.mark.quick(0)
+def test_sample_scenes_are_measured_beside_other_codecs(tmp_path: Path) -> None:
+    """The external codec copies its input."""
+    tool = tmp_path / "tool.py"
+    tool.write_text("import shutil, sys; shutil.copy(*sys.argv[-2:])")
+    words = ["--gaussians", 500, "--degree", 0, "-p", "fast", "--external", "spz"]
+    done = run("bench", "scaling", *words, "--splat-transform", f"{sys.executable} {tool}", "--json")
+    assert done.returncode == 0, done.stderr
+    rows = json.loads(done.stdout)
+    assert [(row["scene"], row["codec"], row["gaussians"]) for row in rows] == [
+        ("sample, degree 0", "fast", 500),
+        ("sample, degree 0", "spz", 500),
+    ]
+    for row in rows:
+        assert row["peak_memory_per_gaussian"] == row["peak_memory"] / 500
+        assert row["peak_memory_ratio"] == row["peak_memory"] / (56 * 500)
+    assert b"sample scenes of up to 500 Gaussians" in done.stderr
+
+
+def scaled(inputs: BenchInputs) -> BenchOutput:
+    """Measure sample scenes in this process."""
+    return bench_scaling.scaling(
+        inputs,
+        [7, 9],
+        degrees=[],
+        presets=["fast", "small"],
+        changes=None,
+        external=ExternalCodecs([], "splat-transform", None),
+        repeats=1,
+        evaluate=False,
+        plotted=False,
+    )
+
+
+def test_sample_scenes_have_no_photographs() -> None:
+    with pytest.raises(kissgs.UnsupportedError, match="--views needs the FILE of its scene"):
+        scaled(BenchInputs(scenes=[], views=cameras()))
+
+
+def test_an_interrupt_keeps_what_is_measured(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(source: Path | int, *_: object, **__: object) -> Iterator[Measurement | FailedMeasurement]:
+        yield measured("fast", 9, 30.0, gaussians=7)
+        yield FailedMeasurement(scene="scene.ply", name="small", gaussians=7, failure="the measurement was killed")
+        raise Interrupted(2)
+
+    monkeypatch.setattr("kissgs.benchmark.scaling.measure_scaling", interrupted)
+    output = scaled(BenchInputs(scenes=[]))
+    with pytest.raises(Interrupted):
+        report(output, as_json=True)
+    rows = json.loads(capsys.readouterr().out)
+    assert [(row["gaussians"], row.get("failure")) for row in rows] == [(7, None), (7, "the measurement was killed")]
+    with pytest.raises(Interrupted):
+        report(output, as_json=False)
+    assert "small, 7: the measurement was killed" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("scene.ply --degree 1", "--degree is for sample scenes"),
+        ("--degree 1 --degree 2 --plot p.svg", "--plot takes one scene; give one --degree"),
+        ("--external spz --splat-transform no-such-tool", "cannot start no-such-tool"),
+        ("none.ply", "none.ply: there is no such file"),
+    ],
+)
+def test_invalid_options_of_scaling_are_refused(options: str, message: str) -> None:
+    assert message in failure("bench", "scaling", "--gaussians", 5, "-p", "fast", *options.split())
 
 
 @pytest.mark.quick(0)

@@ -3,6 +3,7 @@
 from helpers.captured_scene import cameras
 from kissgs.benchmark.results import Measurement, Run
 from kissgs.cameras.views import black
+from kissgs.core.splats import float32_bytes
 from kissgs.evaluation.attributes import attribute_errors
 from kissgs.evaluation.evaluate import Comparison
 from kissgs.evaluation.results import Evaluation, ImageMetrics, ViewComparison
@@ -15,13 +16,16 @@ FILES = ("container_meta.yaml", "means_bytes_0.webp", "scales.webp", "f_dc.webp"
 
 
 def run(seconds=1.0, size=1000, memory=10**8, stages=None):
+    stages = stages or {"order": seconds / 4, "images": 3 * seconds / 4}
     return Run(
         bytes=size,
         encode_seconds=seconds,
         encode_cpu_seconds=2 * seconds,
         decode_seconds=seconds / 100,
         decode_cpu_seconds=seconds / 50,
-        stage_seconds=stages or {"order": seconds / 4, "images": 3 * seconds / 4},
+        stage_seconds=stages,
+        stage_cpu_seconds={name: 2 * each for name, each in stages.items()},
+        stage_peak_memory={**dict.fromkeys(stages, memory // 2), "decode": memory},
         peak_memory=memory,
     )
 
@@ -52,6 +56,7 @@ def measured(
     runs=None,
     gaussians=30,
     seconds=1.0,
+    memory=10**6,
 ):
     files = {codec: size} if external else dict.fromkeys(FILES, size // len(FILES))
     return Measurement(
@@ -60,8 +65,9 @@ def measured(
         container=None if external else container,
         quality_offset_db=quality_offset_db,
         gaussians=gaussians,
+        float32_bytes=float32_bytes(gaussians, 1),
         file_bytes=files,
-        runs=runs or (run(seconds, size),),
+        runs=runs or (run(seconds, size, memory),),
         errors=ERRORS,
         evaluation=evaluation(psnr, photo),
     )
