@@ -23,7 +23,7 @@ SEEN_COVERAGE = 0.2
 LARGEST = 1e25
 """Largest absolute Hessian entry: squares of enormous Gaussians overflow, and sums of costs would be infinite."""
 
-OPACITY, SCALES, ROTATION = (0,), (7, 13, 18), (22, 25, 27)
+OPACITY, SCALES, ROTATION = (0,), (4, 5, 6), (7, 8, 9)
 """Indices of the diagonal entries in ``shape_hessian``."""
 
 POSITION = (0, 1, 2)
@@ -45,8 +45,9 @@ class Sensitivity:
 
     Attributes:
         position_hessian: ``(N, 3)``, diagonal of the Hessian by position, world units: xx, yy, zz.
-        shape_hessian: ``(N, 28)``, upper triangle, row by row, of the Hessian by (opacity logit; three log-scales; a
-            rotation vector, radians, about the Gaussian's own axes). The 48 equivalent forms only permute it.
+        shape_hessian: ``(N, 10)``, entries of the Hessian by (opacity logit; three log-scales; a rotation vector about the
+            Gaussian's own axes, radians): the opacity; opacity and each scale; each scale; each rotation. The 48
+            equivalent forms only permute them. The other entries hardly change any decision, and are left out.
         color_weight: ``(N,)`` weight of one colour channel, 0 to 1: mean of (alpha T)², divided by 3.
         mean_sh_basis: ``(N, K)`` mean of the spherical harmonics without the constant one, over the directions from
             which the Gaussian is seen, K as in its scene; 0 if it is not seen.
@@ -57,7 +58,7 @@ class Sensitivity:
     """
 
     position_hessian: Float32[np.ndarray, "N 3"]
-    shape_hessian: Float32[np.ndarray, "N 28"]
+    shape_hessian: Float32[np.ndarray, "N 10"]
     color_weight: Float32[np.ndarray, " N"]
     mean_sh_basis: Float32[np.ndarray, "N K"]
     prior: Float32[np.ndarray, " N"]
@@ -70,7 +71,7 @@ class Sensitivity:
         """Return the sensitivity of a scene that no camera has seen: zeros."""
         return cls(
             position_hessian=np.zeros((count, 3), np.float32),
-            shape_hessian=np.zeros((count, 28), np.float32),
+            shape_hessian=np.zeros((count, 10), np.float32),
             color_weight=np.zeros(count, np.float32),
             mean_sh_basis=np.zeros((count, SH_REST_COUNTS[sh_degree]), np.float32),
             prior=np.zeros(count, np.float32),

@@ -48,7 +48,7 @@ class RdFields:
 
         Args:
             values: the Gaussians in their stored form.
-            hessians: ``(M, 28)`` shape Hessians of :class:`kissgs.Sensitivity`.
+            hessians: ``(M, 10)`` shape Hessians of :class:`kissgs.Sensitivity`.
         """
         criterion, largest, pool = self.criterion, self.largest, self.pool
         if self.container.tables is not None:

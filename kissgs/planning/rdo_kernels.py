@@ -9,33 +9,16 @@ from kissgs.core.numba_kernels import compiled
 
 
 @njit(nogil=True, error_model="numpy")
-def _form_tables(orders: np.ndarray, signs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return, for each of the forms, the place in the packed Hessian and the sign of the 7x7 entries, ``(24, 7, 7)``.
+def _form_hessian(packed: np.ndarray, order: np.ndarray, floor: np.ndarray, hessian: np.ndarray) -> None:
+    """Unpack a Hessian of :class:`kissgs.Sensitivity` for a form with its axes in ``order``, ``(3,)``.
 
-    The axes of a form are permuted by ``orders`` and reversed where ``signs`` is -1, ``(24, 3)``.
+    ``floor``: ``(3,)`` is added to the diagonal: opacity, scales, rotation.
     """
-    places, factors = np.empty((24, 7, 7), np.int64), np.empty((24, 7, 7), np.float64)
-    start = np.array([0, 7, 13, 18, 22, 25, 27])  # place of each row's diagonal entry
-    row, sign = np.empty(7, np.int64), np.empty(7, np.float64)
-    for form in range(24):
-        row[0], sign[0] = 0, 1.0
-        for i in range(3):
-            row[1 + i], sign[1 + i] = 1 + orders[form, i], 1.0
-            row[4 + i], sign[4 + i] = 4 + orders[form, i], signs[form, i]
-        for i in range(7):
-            for j in range(7):
-                first, last = min(row[i], row[j]), max(row[i], row[j])
-                places[form, i, j] = start[first] + last - first
-                factors[form, i, j] = sign[i] * sign[j]
-    return places, factors
-
-
-@njit(nogil=True, error_model="numpy")
-def _form_hessian(packed: np.ndarray, places: np.ndarray, factors: np.ndarray, hessian: np.ndarray) -> None:
-    """Unpack the 7x7 Hessian from its upper triangle, for the axes of one form."""
-    for i in range(7):
-        for j in range(i, 7):
-            hessian[i, j] = hessian[j, i] = packed[places[i, j]] * factors[i, j]
+    hessian[0, 0] = packed[0] + floor[0]
+    for i in range(3):
+        hessian[0, 1 + i] = hessian[1 + i, 0] = packed[1 + order[i]]
+        hessian[1 + i, 1 + i] = packed[4 + order[i]] + floor[1]
+        hessian[4 + i, 4 + i] = packed[7 + order[i]] + floor[2]
 
 
 @njit(nogil=True, error_model="numpy")
@@ -51,7 +34,7 @@ def _jacobian(w: float, x: float, y: float, z: float, jacobian: np.ndarray) -> N
 
 
 @compiled(
-    "void(float64[:, ::1], float32[:, ::1], uint8[::1], int64[:, ::1], float64[:, ::1], int64[::1],"
+    "void(float64[:, ::1], float32[:, ::1], uint8[::1], int64[:, ::1], int64[::1],"
     " float64[::1], float64[::1], int64[::1], float64[:, :, ::1], float64[:, :, ::1], float64[::1], int64,"
     " int64[:, ::1])"
 )
@@ -60,7 +43,6 @@ def choose_levels(
     shapes: np.ndarray,
     forms: np.ndarray,
     orders: np.ndarray,
-    signs: np.ndarray,
     classes: np.ndarray,
     low: np.ndarray,
     step: np.ndarray,
@@ -78,10 +60,9 @@ def choose_levels(
 
     Args:
         values: ``(N, 8)``, quaternions of length 1.
-        shapes: ``(N, 28)`` shape Hessians of :class:`kissgs.Sensitivity`.
+        shapes: ``(N, 10)`` shape Hessians of :class:`kissgs.Sensitivity`.
         forms: ``(N,)`` rotation form of each Gaussian, 0 to 23 (plus 24 for -q).
         orders: ``(24, 3)`` original axis of each axis of the form.
-        signs: ``(24, 3)`` 1, or -1 if the axis is reversed.
         classes: ``(N,)`` sensitivity class.
         low: ``(8,)`` value of level 0.
         step: ``(8,)`` quantisation step.
@@ -92,14 +73,9 @@ def choose_levels(
         sweeps: number of passes over the eight levels.
         levels: ``(N, 8)``; modified.
     """
-    places, factors = _form_tables(orders, signs)
-    hessian, jacobian, error = np.empty((7, 7), np.float64), np.empty((8, 7), np.float64), np.empty(7, np.float64)
+    hessian, jacobian, error = np.zeros((7, 7), np.float64), np.empty((8, 7), np.float64), np.empty(7, np.float64)
     for n in range(values.shape[0]):
-        _form_hessian(shapes[n], places[forms[n] % 24], factors[forms[n] % 24], hessian)
-        hessian[0, 0] += floor[0]
-        for i in range(3):
-            hessian[1 + i, 1 + i] += floor[1]
-            hessian[4 + i, 4 + i] += floor[2]
+        _form_hessian(shapes[n], orders[forms[n] % 24], floor, hessian)
         _jacobian(values[n, 4], values[n, 5], values[n, 6], values[n, 7], jacobian)
         error[:] = 0.0
         for j in range(8):

@@ -17,7 +17,7 @@ from kissgs.core.array_types import Float, Float32, Float64, Int, Integer, UInt8
 from kissgs.core.threads import Workers
 from kissgs.planning.quantize import Quantized
 from kissgs.planning.rd_model import RdCriterion
-from kissgs.planning.rotation_forms import PERMUTATIONS, ROTATIONS
+from kissgs.planning.rotation_forms import PERMUTATIONS
 from kissgs.planning.rows import Computed, Rows, for_each_block, row_range
 
 UNSEEN = {"opacities": 0.15, "scales": 0.11, "growth": 0.11, "quaternions": 0.023, "f_dc": 0.055}
@@ -66,24 +66,6 @@ ROUNDS, SWEEPS = 3, 1
 
 CHUNK = 1 << 14
 """Gaussians per task."""
-
-
-def _axis_signs() -> Float64[np.ndarray, "24 3"]:
-    """Return 1, or -1 where a new axis is a reversed old one: entries of the cube's rotation matrices."""
-    w, x, y, z = ROTATIONS.T
-    matrices = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    axes = np.arange(3)
-    return np.stack([np.rint(matrices[PERMUTATIONS[row], axes, row]) for row in range(24)])
-
-
-AXIS_SIGNS = _axis_signs()
-"""Direction of each new axis in the 24 rotations of the cube: 1, or -1 if it is a reversed old axis."""
 
 
 def quantize_by_class(
@@ -135,7 +117,7 @@ def quantize_by_class(
 def rdo_quantize_shapes(
     values: Float64[np.ndarray, "M 8"] | Rows,
     parts: tuple[Quantized, Quantized, Quantized],
-    shapes: Float32[np.ndarray, "M 28"] | Rows,
+    shapes: Float32[np.ndarray, "M 10"] | Rows,
     forms: UInt8[np.ndarray, " M"],
     criterion: RdCriterion,
     largest: Mapping[str, Float64[np.ndarray, " M"] | Rows],
@@ -174,7 +156,6 @@ def rdo_quantize_shapes(
                 shapes[rows],
                 forms[rows],
                 PERMUTATIONS,
-                AXIS_SIGNS,
                 classes[rows].astype(np.int64),
                 low,
                 steps,

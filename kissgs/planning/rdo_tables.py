@@ -9,7 +9,7 @@ import numpy as np
 from kissgs.core.array_types import Float32, Float64, Int, UInt8
 from kissgs.core.threads import Workers
 from kissgs.planning.rd_model import RdCriterion
-from kissgs.planning.rdo_quantize import AXIS_SIGNS, CHUNK, ROUNDS, level_bits
+from kissgs.planning.rdo_quantize import CHUNK, ROUNDS, level_bits
 from kissgs.planning.rotation_forms import PERMUTATIONS
 from kissgs.planning.smallest_three import KEPT, TABLE
 from kissgs.planning.value_table import SIZE, refit_table
@@ -56,7 +56,7 @@ class ShapeLevels:
 def rdo_quantize_tables(
     values: ShapeValues,
     start: ShapeLevels,
-    shapes: Float32[np.ndarray, "M 28"],
+    shapes: Float32[np.ndarray, "M 10"],
     forms: UInt8[np.ndarray, " M"],
     criterion: RdCriterion,
     largest: dict[str, Float64[np.ndarray, " M"]],
@@ -101,7 +101,6 @@ def rdo_quantize_tables(
                 shapes[rows],
                 forms[rows],
                 PERMUTATIONS,
-                AXIS_SIGNS,
                 KEPT,
                 classes[rows],
                 tables,

@@ -71,7 +71,7 @@ def shape_fields(
 
 def rd_shape_fields(
     values: Float64[np.ndarray, "M 8"],
-    shapes: Float32[np.ndarray, "M 28"] | None,
+    shapes: Float32[np.ndarray, "M 10"] | None,
     forms: UInt8[np.ndarray, " M"],
     criterion: RdCriterion,
     largest: dict[str, Float64[np.ndarray, " M"]],

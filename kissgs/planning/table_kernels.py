@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from kissgs.core.numba_kernels import compiled
-from kissgs.planning.rdo_kernels import _form_hessian, _form_tables, _jacobian
+from kissgs.planning.rdo_kernels import _form_hessian, _jacobian
 
 
 @njit(nogil=True, error_model="numpy")
@@ -47,7 +47,7 @@ def _current_error(
 
 
 @compiled(
-    "void(float64[:, ::1], float64[:, ::1], uint8[::1], float32[:, ::1], uint8[::1], int64[:, ::1], float64[:, ::1],"
+    "void(float64[:, ::1], float64[:, ::1], uint8[::1], float32[:, ::1], uint8[::1], int64[:, ::1],"
     " int64[:, ::1], int64[::1], float64[:, ::1], int64[:, ::1], float64[:, :, ::1], float64[:, :, ::1],"
     " float64[::1], int64[:, ::1])"
 )
@@ -58,7 +58,6 @@ def choose_levels(
     shapes: np.ndarray,
     forms: np.ndarray,
     orders: np.ndarray,
-    signs: np.ndarray,
     kept: np.ndarray,
     classes: np.ndarray,
     tables: np.ndarray,
@@ -74,10 +73,9 @@ def choose_levels(
         values: ``(N, 7)`` opacity logit, log-scales, stored components of the rotation.
         quats: ``(N, 4)`` the whole quaternion, of length 1, whose missing component is not negative.
         omitted: ``(N,)`` index of the missing component.
-        shapes: ``(N, 28)`` shape Hessians of :class:`kissgs.Sensitivity`.
+        shapes: ``(N, 10)`` shape Hessians of :class:`kissgs.Sensitivity`.
         forms: ``(N,)`` rotation form of each Gaussian, 0 to 23 (plus 24 for -q).
         orders: ``(24, 3)`` original axis of each axis of the form.
-        signs: ``(24, 3)`` 1, or -1 if the axis is reversed.
         kept: ``(4, 3)`` stored components by the missing one.
         classes: ``(N,)`` sensitivity class.
         tables: ``(7, 256)`` ascending values of the levels.
@@ -87,16 +85,11 @@ def choose_levels(
         floor: ``(3,)`` added to the Hessian's diagonal: opacity, scales, rotation.
         levels: ``(N, 7)``; modified.
     """
-    places, factors = _form_tables(orders, signs)
-    hessian, jacobian = np.empty((7, 7), np.float64), np.empty((11, 7), np.float64)
+    hessian, jacobian = np.zeros((7, 7), np.float64), np.empty((11, 7), np.float64)
     whole = np.empty((8, 7), np.float64)
     error, gradient = np.empty(7, np.float64), np.empty(7, np.float64)
     for n in range(values.shape[0]):
-        _form_hessian(shapes[n], places[forms[n] % 24], factors[forms[n] % 24], hessian)
-        hessian[0, 0] += floor[0]
-        for i in range(3):
-            hessian[1 + i, 1 + i] += floor[1]
-            hessian[4 + i, 4 + i] += floor[2]
+        _form_hessian(shapes[n], orders[forms[n] % 24], floor, hessian)
         _jacobian(quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3], whole)
         jacobian[:8, :] = whole
         squares = _current_error(values[n], quats[n], kept[omitted[n]], omitted[n], tables, levels[n], jacobian, error)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from helpers import reference_decoder
 from helpers.codec_scenes import assert_round_trip, constant_scene, covariances, random_scene
-from helpers.random_sensitivity import encode_rd, random_sensitivity
-from scipy.spatial.transform import Rotation
+from helpers.random_sensitivity import encode_rd, packed_hessian, random_sensitivity
 
 from kissgs import Settings, compress, decompress
 from kissgs.core.sensitivity import Sensitivity
@@ -15,8 +14,7 @@ from kissgs.core.splats import clean
 from kissgs.core.threads import Workers
 from kissgs.planning.quantize import quantize
 from kissgs.planning.rd_model import MIN_ERROR_RATIO, CodebookErrorModel, Costs, RdCriterion, error_at, lambda_for, step
-from kissgs.planning.rdo_quantize import AXIS_SIGNS, CAPTURED, quantize_by_class, rdo_quantize_shapes
-from kissgs.planning.rotation_forms import ROTATIONS, apply_forms
+from kissgs.planning.rdo_quantize import CAPTURED, quantize_by_class, rdo_quantize_shapes
 from kissgs.sogxt.encode import encode
 
 RD_PRESETS = ["balanced", "small"]
@@ -107,31 +105,6 @@ def test_levels_of_a_class_are_multiples_of_its_step():
     assert found.levels.min() == 0
 
 
-@pytest.mark.parametrize("row", range(24))
-def test_axis_signs_are_those_of_the_form(row):
-    """A turn about the original's axis p(i) is one about the form's axis i, or against it."""
-    quat = np.array([[0.5, -0.1, 0.7, 0.3]]) / np.linalg.norm([0.5, -0.1, 0.7, 0.3])
-    form = np.array([row], np.uint8)
-    angle = 1e-6
-    from kissgs.planning.rotation_forms import PERMUTATIONS
-
-    for i, sign in enumerate(AXIS_SIGNS[row]):
-        turn = [0.0, 0.0, 0.0]
-        turn[PERMUTATIONS[row][i]] = angle
-        first = Rotation.from_quat(quat, scalar_first=True) * Rotation.from_rotvec(turn)
-        before, _ = apply_forms(quat, np.zeros((1, 3), np.float32), form)
-        after, _ = apply_forms(first.as_quat(scalar_first=True), np.zeros((1, 3), np.float32), form)
-        own = Rotation.from_quat(before, scalar_first=True).inv() * Rotation.from_quat(after, scalar_first=True)
-        wanted = np.zeros(3)
-        wanted[i] = sign * angle
-        np.testing.assert_allclose(own.as_rotvec().reshape(3), wanted, atol=1e-9)
-    assert len(ROTATIONS) == 24
-
-
-def packed(form):
-    return form[np.triu_indices(7)].astype(np.float32)
-
-
 def parts_of(values, steps=(0.4, 0.3, 0.1)):
     return tuple(quantize(values[:, a:b], step=s) for (a, b), s in zip(((0, 1), (1, 4), (4, 8)), steps, strict=True))
 
@@ -148,7 +121,7 @@ def test_without_a_rate_cost_levels_are_the_nearest_along_each_axis():
         found = rdo_quantize_shapes(
             values,
             parts,
-            np.tile(packed(np.diag([1.0] * 4 + [0] * 3)), (count, 1)),
+            np.tile(packed_hessian(np.diag([1.0] * 4 + [0] * 3)), (count, 1)),
             np.zeros(count, np.uint8),
             RdCriterion(costs, np.zeros(count, np.int64), 1e-30),
             anything(count),
@@ -181,7 +154,7 @@ def test_rdo_quantisation_never_costs_more_than_the_nearest_level():
         found = rdo_quantize_shapes(
             values,
             parts,
-            np.tile(packed(form), (count, 1)),
+            np.tile(packed_hessian(form), (count, 1)),
             np.zeros(count, np.uint8),
             RdCriterion(costs, np.zeros(count, np.int64), rd_lambda),
             anything(count),
@@ -266,7 +239,7 @@ def torture():
     nothing = Sensitivity.none(300, 2)
     only = np.zeros(300, np.float32)
     only[17] = 1e-5
-    one_seen = replace(nothing, color_weight=only, shape_hessian=only[:, None] * np.ones((1, 28), np.float32))
+    one_seen = replace(nothing, color_weight=only, shape_hessian=only[:, None] * np.ones((1, 10), np.float32))
     black = replace(scene, sh0=np.full((300, 3), -5, np.float32))
     few = replace(scene, shN=scene.shN[np.arange(300) % 3])
     huge = random_sensitivity(scene, spread=20)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers import reference_rasterizer
+from helpers.random_sensitivity import packed_hessian
 from helpers.render_scenes import blobs, camera, in_float64, one, together
 
 import kissgs
@@ -73,7 +74,7 @@ def test_shape_hessians_agree_with_derivatives_of_the_image(seed):
     pixels = 3 * view.width * view.height
     for n in range(len(splats)):
         shape, _ = differences(splats, view, n)
-        expected = (shape @ shape.T / pixels)[np.triu_indices(7)]
+        expected = packed_hessian(shape @ shape.T / pixels)
         np.testing.assert_allclose(found.shape_hessian[n], expected, rtol=2e-3, atol=2e-3 * np.abs(expected).max())
 
 
@@ -85,7 +86,7 @@ def test_shape_hessians_of_needles_lose_no_digits(scale):
     found = measure_sensitivity(splats, weighted(view))
     for n in range(len(splats)):
         shape, _ = differences(splats, view, n)
-        expected = (shape @ shape.T / (3 * 25 * 19))[np.triu_indices(7)]
+        expected = packed_hessian(shape @ shape.T / (3 * 25 * 19))
         np.testing.assert_allclose(found.shape_hessian[n], expected, rtol=2e-3, atol=2e-3 * np.abs(expected).max())
 
 
@@ -228,7 +229,7 @@ def test_without_view_uncertainty_the_prior_has_no_effect():
 def measured(colors, splats):
     """Return a sensitivity with these colour weights, and Hessians whose diagonals are equal to them."""
     zeros = Sensitivity.none(len(splats), splats.sh_degree)
-    shapes = np.eye(7)[np.triu_indices(7)] * np.asarray(colors)[:, None]
+    shapes = packed_hessian(np.eye(7)) * np.asarray(colors)[:, None]
     positions = np.ones(3) * np.asarray(colors)[:, None]
     return replace(
         zeros,

@@ -142,14 +142,10 @@ def moments(
                 sums[slot, 9] = squared_weight
 
 
-Products = tuple[float, float, float]
-"""Coefficients of the product of two coordinates in the Gaussian's frame by u², uv, v²."""
-
-
 @njit(nogil=True, error_model="numpy")
-def _product(u: Vector, v: Vector, a: int, b: int) -> Products:
-    """Return u², uv and v² coefficients of g[a] g[b], g being u times row ``u`` plus v times row ``v``."""
-    return u[a] * u[b], u[a] * v[b] + v[a] * u[b], v[a] * v[b]
+def _square(u: Vector, v: Vector, axis: int) -> Vector:
+    """Return the coefficients of g², g being u times an entry of ``u`` plus v times one of ``v``, by u², uv and v²."""
+    return u[axis] * u[axis], 2 * u[axis] * v[axis], v[axis] * v[axis]
 
 
 @njit(nogil=True, error_model="numpy")
@@ -205,8 +201,8 @@ def add_to_parameters(
         eye: ``(3,)`` position of the camera, world units.
         weight: weight of the image.
         position_hessian: ``(N, 3)`` diagonal of the Hessian by position.
-        shape_moments: ``(N, 22)`` or wider: sums over pixels of |w|² times 1; times g0², g0 g1, g0 g2, g1², g1 g2, g2²;
-            and times the 15 products of four of g0, g1, g2 in the order 0000, 0001, 0002, 0011 and so on to 2222.
+        shape_moments: ``(N, 10)`` sums over pixels of |w|² times 1; times g0², g1², g2²; times their squares; and times
+            (g1 g2)², (g2 g0)², (g0 g1)².
         color_weight: ``(N,)`` sum of (alpha T)².
         sh_basis_sum: ``(N, K)`` sum of (alpha T)² times the spherical harmonics without the constant one.
         seen: by row, sum of (alpha T)² of this image alone, without its weight; added.
@@ -259,33 +255,20 @@ def add_to_parameters(
             a, b = 2 * (l0 * across[c] + l1 * down[c]), 2 * l2 * down[c]
             position_hessian[n, c] += m20 * a * a + 2 * m11 * a * b + m02 * b * b
 
-        g00, g01, g02 = _product(u_row, v_row, 0, 0), _product(u_row, v_row, 0, 1), _product(u_row, v_row, 0, 2)
-        g11, g12, g22 = _product(u_row, v_row, 1, 1), _product(u_row, v_row, 1, 2), _product(u_row, v_row, 2, 2)
+        g0, g1, g2 = _square(u_row, v_row, 0), _square(u_row, v_row, 1), _square(u_row, v_row, 2)
         second, fourth = (m20, m11, m02), ((m40, m31, m22), (m31, m22, m13), (m22, m13, m04))
-        by_00, by_11, by_22 = _applied(fourth, g00), _applied(fourth, g11), _applied(fourth, g22)
+        by_0, by_1, by_2 = _applied(fourth, g0), _applied(fourth, g1), _applied(fourth, g2)
         out = shape_moments[n]
         out[0] += m0
-        out[1] += _dot(second, g00)
-        out[2] += _dot(second, g01)
-        out[3] += _dot(second, g02)
-        out[4] += _dot(second, g11)
-        out[5] += _dot(second, g12)
-        out[6] += _dot(second, g22)
-        out[7] += _dot(by_00, g00)
-        out[8] += _dot(by_00, g01)
-        out[9] += _dot(by_00, g02)
-        out[10] += _dot(by_00, g11)
-        out[11] += _dot(by_00, g12)
-        out[12] += _dot(by_00, g22)
-        out[13] += _dot(by_11, g01)
-        out[14] += _dot(by_11, g02)
-        out[15] += _dot(by_22, g01)
-        out[16] += _dot(by_22, g02)
-        out[17] += _dot(by_11, g11)
-        out[18] += _dot(by_11, g12)
-        out[19] += _dot(by_11, g22)
-        out[20] += _dot(by_22, g12)
-        out[21] += _dot(by_22, g22)
+        out[1] += _dot(second, g0)
+        out[2] += _dot(second, g1)
+        out[3] += _dot(second, g2)
+        out[4] += _dot(by_0, g0)
+        out[5] += _dot(by_1, g1)
+        out[6] += _dot(by_2, g2)
+        out[7] += _dot(by_1, g2)
+        out[8] += _dot(by_2, g0)
+        out[9] += _dot(by_0, g1)
 
         color_weight[n] += squared_weight
         if sh_basis_sum.shape[1] > 0:
@@ -310,38 +293,17 @@ def moments_to_hessians(
         scales, opacities: stored parameters, see :class:`kissgs.Splats`.
         first: first Gaussian.
         last: end of the Gaussians, exclusive.
-        shape_hessian: ``(N, 28)``; on entry, columns 0 to 21 hold the moments; on return, the upper triangle, row by
-            row, of the Hessian by opacity logit, three log-scales, and a rotation vector in the Gaussian's own frame.
+        shape_hessian: ``(N, 10)`` the moments; on return, Hessians as :class:`kissgs.Sensitivity` describes them.
     """
-    # Index into the moments of each product of two of the pairs 00, 11, 22, 12, 20, 01: of scales, then rotations.
-    second = np.array([1, 4, 6, 5, 3, 2])
-    fourth = np.array(
-        [
-            [7, 10, 12, 11, 9, 8],
-            [10, 17, 19, 18, 14, 13],
-            [12, 19, 21, 20, 16, 15],
-            [11, 18, 20, 19, 15, 14],
-            [9, 14, 16, 15, 12, 11],
-            [8, 13, 15, 14, 11, 10],
-        ]
-    )
-    moments, factor = np.empty(22, np.float64), np.full(6, 4.0)
     for n in range(first, last):
-        out = shape_hessian[n]
-        for c in range(22):
-            moments[c] = out[c]
-        s = _deviations(scales, n)
+        out, s = shape_hessian[n], _deviations(scales, n)
         k = _thickened(s)
+        transparency = 1.0 / (1.0 + np.exp(np.float64(opacities[n])))
+        out[0] *= transparency * transparency
         for c in range(3):
             d, e = (c + 1) % 3, (c + 2) % 3  # the two axes that rotate about axis c
-            factor[c] = 4 / (k[c] * k[c])
-            factor[3 + c] = 4 * (s[d] / s[e] - s[e] / s[d]) / (k[d] * k[e])
-        transparency = 1.0 / (1.0 + np.exp(np.float64(opacities[n])))
-        out[0] = transparency * transparency * moments[0]
-        for c in range(6):
-            out[1 + c] = transparency * factor[c] * moments[second[c]]
-        entry = 7
-        for c in range(6):
-            for d in range(c, 6):
-                out[entry] = factor[c] * factor[d] * moments[fourth[c, d]]
-                entry += 1
+            by_scale = 4 / (k[c] * k[c])
+            by_rotation = 4 * (s[d] / s[e] - s[e] / s[d]) / (k[d] * k[e])
+            out[1 + c] *= transparency * by_scale
+            out[4 + c] *= by_scale * by_scale
+            out[7 + c] *= by_rotation * by_rotation
