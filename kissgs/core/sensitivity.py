@@ -45,8 +45,8 @@ class Sensitivity:
 
     Attributes:
         position_hessian: ``(N, 3)``, diagonal of the Hessian by position, world units: xx, yy, zz.
-        shape_hessian: ``(N, 10)``, entries of the Hessian by (opacity logit; three log-scales; a rotation vector about the
-            Gaussian's own axes, radians): the opacity; opacity and each scale; each scale; each rotation. The 48
+        shape_hessian: ``(N, 10)``, entries of the Hessian by (opacity logit; three log-scales; a rotation vector about
+            the Gaussian's own axes, radians): the opacity; opacity and each scale; each scale; each rotation. The 48
             equivalent forms only permute them. The other entries hardly change any decision, and are left out.
         color_weight: ``(N,)`` weight of one colour channel, 0 to 1: mean of (alpha T)², divided by 3.
         mean_sh_basis: ``(N, K)`` mean of the spherical harmonics without the constant one, over the directions from
