@@ -361,7 +361,7 @@ def test_a_scene_from_a_file_is_dropped_before_its_images_are_compressed(tmp_pat
 
     def progress(stage, fraction, note=""):
         if stage == "images":
-            scenes = [thing for thing in gc.get_objects() if isinstance(thing, Splats)]
+            scenes = [thing for thing in gc.get_objects() if type(thing) is Splats]
             alive.append(sum(len(scene) == count for scene in scenes))
 
     settings = kissgs.Settings.from_preset(**changes)
