@@ -149,8 +149,9 @@ class Sensitivity:
             return replace(self, coverage=coverage, view_uncertainty=view_uncertainty)
         some = np.flatnonzero(known)
         some = some[:: -(-len(some) // RATIO_SAMPLE)]
-        per_close_up = float(np.median(self.color_weight[some] / close_up[some]))
-        colors = np.maximum(self.color_weight[some], UNSEEN * per_close_up * close_up[some])
+        near, measured = close_up[some].astype(np.float64), self.color_weight[some].astype(np.float64)
+        per_close_up = float(np.median(measured / near))
+        colors = np.maximum(measured, UNSEEN * per_close_up * near)
         ratios = []
         for values, of, unit in self._diagonals(splats, some):
             each = np.maximum(values[some][:, list(of)].mean(axis=1, dtype=np.float64), 0)
