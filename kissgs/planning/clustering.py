@@ -13,6 +13,12 @@ from kissgs.core.threads import Workers
 BLOCK = 1024
 """Vectors per matrix product: its result, against some hundred centroids, stays in the processor's cache."""
 
+SEARCHED = 4
+"""Number of near centroids of a centroid whose own near ones are searched for nearer ones."""
+
+PARTNERS = 24
+"""Number of near centroids, the nearest, with whose clusters a cluster may merge."""
+
 TASKS = 64
 """Number of tasks of an iteration: more than threads, since others may use the processor too."""
 
@@ -110,6 +116,14 @@ class Clustering:
             self._parts(),
         )
 
+    def refresh_near(self, pool: Workers) -> None:
+        """Find the near centroids again, which have moved, among the near ones of the nearest so far."""
+        from kissgs.planning import kmeans_kernels as kernels
+
+        found = np.empty_like(self.near)
+        pool.map(lambda part: kernels.find_near(self.centroids, self.near, SEARCHED, *part, found), self._parts())
+        self.near = found
+
     def relocate(self, pool: Workers) -> None:
         """Merge pairs of clusters and split others as long as the error shrinks, each cluster once at most.
 
@@ -118,6 +132,7 @@ class Clustering:
         from kissgs.planning import kmeans_kernels as kernels
 
         data, count = self.data, len(self.centroids)
+        nearest = np.ascontiguousarray(self.near[:, :PARTNERS])
         partners, costs, gains = np.empty(count, np.int32), np.empty(count), np.zeros(count)
         second = np.zeros(len(self.labels), dtype=np.bool_)
 
@@ -125,7 +140,7 @@ class Clustering:
         least = np.partition(self.errors, count - most)[count - most]
 
         def work(part: tuple[int, int]) -> None:
-            kernels.merge_costs(self.centroids, self.totals, self.near, *part, partners, costs)
+            kernels.merge_costs(self.centroids, self.totals, nearest, *part, partners, costs)
             kernels.split_gains(
                 data.table,
                 data.rows,

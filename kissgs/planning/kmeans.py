@@ -121,6 +121,7 @@ def fit(
     )
     report(0.4)
     for iteration in range(options.iterations):
+        state.refresh_near(pool)
         state.relocate(pool)
         state.update(pool)
         state.reassign(pool)

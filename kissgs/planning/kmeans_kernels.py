@@ -88,31 +88,49 @@ def means(
                 centroids[k, d] = total[d] / weight
 
 
-@compiled("void(float32[:, ::1], int32[::1], int32[:, ::1])")
-def smallest(scores: np.ndarray, names: np.ndarray, near: np.ndarray) -> None:
-    """Write the names of the smallest scores of each row, in ascending order.
+@compiled(
+    "void(float32[:, ::1], int32[:, ::1], int64, int64, int64, int32[:, ::1])",
+    fastmath={"contract", "nnan", "ninf", "nsz", "reassoc"},
+)
+def find_near(centroids: np.ndarray, near: np.ndarray, others: int, first: int, last: int, found: np.ndarray) -> None:
+    """Find near centroids of the centroids ``first`` to ``last`` in the lists of them and of those near to them.
+
+    A neighbour's neighbour is probably a neighbour (NN-descent: Dong, Moses and Li, WWW 2011).
 
     Args:
-        scores: ``(M, C)`` scores.
-        names: ``(C,)`` names of the columns.
-        near: ``(M, k)`` result, k at most C.
+        centroids: ``(K, D)``.
+        near: ``(K, k)`` near centroids of each so far, itself first, none twice.
+        others: number of near centroids whose lists are searched as well.
+        first: first centroid.
+        last: the one after the last.
+        found: ``(K, k)`` receives the near centroids, itself first, then by rising distance.
     """
     count = near.shape[1]
+    seen = np.full(near.shape[0], -1, dtype=np.int32)
     best = np.empty(count, dtype=np.float32)
-    for m in range(scores.shape[0]):
+    for k in range(first, last):
         filled = 0
-        for c in range(scores.shape[1]):
-            score = scores[m, c]
-            if filled == count and score >= best[count - 1]:
-                continue
-            filled = min(filled + 1, count)
-            at = filled - 1
-            while at > 0 and best[at - 1] > score:
-                best[at] = best[at - 1]
-                near[m, at] = near[m, at - 1]
-                at -= 1
-            best[at] = score
-            near[m, at] = names[c]
+        for h in range(min(others + 1, count)):
+            for j in range(count):
+                c = near[near[k, h], j]
+                if seen[c] == k:
+                    continue
+                seen[c] = k
+                score = np.float32(0)
+                for d in range(centroids.shape[1]):
+                    step = centroids[k, d] - centroids[c, d]
+                    score += step * step
+                score = score if c != k else np.float32(-1)
+                if filled == count and score >= best[count - 1]:
+                    continue
+                filled = min(filled + 1, count)
+                at = filled - 1
+                while at > 0 and best[at - 1] > score:
+                    best[at] = best[at - 1]
+                    found[k, at] = found[k, at - 1]
+                    at -= 1
+                best[at] = score
+                found[k, at] = c
 
 
 @compiled(

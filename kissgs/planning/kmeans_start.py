@@ -12,7 +12,7 @@ CELL_ITERATIONS = 4
 START_ITERATIONS = 1
 SAMPLES_PER_CENTROID = 64
 
-CANDIDATES = 8
+CANDIDATES = 4
 """Centroids of nearby cells among which the nearest ones are found, in multiples of the number to be found."""
 
 

@@ -192,10 +192,10 @@ class EncodeSettings(BaseModel):
         "Gaussians equally, 1 neglects small and faint ones.",
     )
     sh_kmeans_iterations: int = Field(
-        4, ge=1, le=50, description="Iterations of codebook refinement: more are slower and slightly better."
+        6, ge=1, le=50, description="Iterations of codebook refinement: more are slower and slightly better."
     )
     sh_neighbors: int = Field(
-        64,
+        96,
         ge=8,
         le=512,
         description="Codebook entries, the nearest to a Gaussian's present one, that an iteration compares: more are "

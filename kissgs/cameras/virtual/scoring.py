@@ -15,7 +15,7 @@ from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu.frame import draw
 
-PROXY_GAUSSIANS = 16_000
+PROXY_GAUSSIANS = 30_000
 """Largest number of Gaussians in the proxy scene that thumbnails show."""
 
 OPAQUE = 0.01
