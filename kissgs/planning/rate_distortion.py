@@ -56,7 +56,7 @@ SH_WEIGHTS = (1e-2, 1e2)
 MANY_PRUNED = 0.2
 """Share of pruned Gaussians above which the report explains why they were pruned."""
 
-REFIT_GAIN = 0.25
+REFIT_GAIN = 0.17
 """PSNR gain per iteration of the colour refit, decibels: below the measured mean, so that it holds for most scenes."""
 
 
@@ -247,7 +247,11 @@ def _codebook_error_model(
         entries,
         pool,
         kmeans.KMeansOptions(
-            seed=settings.seed, iterations=2, neighbors=32, tolerance=settings.sh_tolerance, lattice=0.0
+            seed=settings.seed,
+            iterations=settings.sh_kmeans_iterations,
+            neighbors=settings.sh_neighbors,
+            tolerance=settings.sh_tolerance,
+            lattice=0.0,
         ),
     )
     squared = np.square(vectors[some] - clusters.centroids[clusters.labels], dtype=np.float64).sum(axis=1)

@@ -294,14 +294,20 @@ def default_error(costs: Costs, splats: Splats, kept: Int[np.ndarray, " M"], sh_
 def _error(steps: Sequence[np.ndarray | np.float64], ratio: float, costs: Costs, sh_model: CodebookErrorModel) -> float:
     """Estimate the mean squared error of rounding to such steps of opacity, scale, rotation, colour and position.
 
-    The share of positions is bounded by that of as many other numbers: far from the origin, even 16 bits are coarse, at
+    A Gaussian's error is at most twice that of its removal: one copy too few, and one where there should be none. The
+    Hessian alone overestimates the rotation of long, thin Gaussians, a few of which would then decide. The share of
+    positions is bounded by that of as many other numbers: far from the origin, even 16 bits are coarse, at
     any lambda.
     """
     each = (costs.opacity, costs.scale, costs.rotation, costs.color, costs.position)
     squares = [float(np.sum(np.square(step, dtype=np.float64))) for step in steps]
-    terms = [float(cost.sum()) * square / 12 for cost, square in zip(each, squares, strict=True)]
-    total = sum(terms[:-1])
-    total += min(terms[-1], total * 3 / (DIMENSIONS - 3))
+
+    def bounded(rows: slice) -> float:
+        errors = np.stack([cost[rows] * (square / 12) for cost, square in zip(each[:-1], squares[:-1], strict=True)])
+        return float(np.minimum(errors.sum(axis=0), 2 * costs.removal[rows]).sum())
+
+    total = sum(for_each_block(len(costs.color), bounded))
+    total += min(float(costs.position.sum()) * squares[-1] / 12, total * 3 / (DIMENSIONS - 3))
     entries = max(len(costs.color) / ratio, 1)
     return total + PAPER_SH_GROWTH * sh_model.unweighted * (sh_model.entries / entries) ** SH_SHRINK
 

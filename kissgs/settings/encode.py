@@ -98,7 +98,7 @@ class EncodeSettings(BaseModel):
         True, description="With rate_distortion: prefer frequent levels (RDO quantisation). False: the nearest level."
     )
     color_refit_iterations: int = Field(
-        2,
+        3,
         ge=0,
         le=20,
         description="With rate_distortion and a capture: iterations of the fit of base colours to its training images, "

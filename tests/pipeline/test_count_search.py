@@ -21,7 +21,7 @@ from kissgs.evaluation.psnr_loss import drop_of
 from kissgs.rendering.rasterizer import render
 
 SCENE = kissgs.sample_scene(600, sh_degree=0, seed=5)
-FEW_VIEWS = {"sensitivity_views": 4, "sensitivity_view_size": 48}
+FEW_VIEWS = {"sensitivity_views": 16, "sensitivity_view_size": 96}
 PRUNE = {
     "sparsify_steps": 0,
     "refine_steps": 0,
@@ -88,7 +88,8 @@ def test_a_drop_is_met(allowed):
     chosen = Settings.from_preset("balanced", max_psnr_drop=allowed, **FEW_VIEWS)
     found = kissgs.compress(SCENE, settings=chosen, evaluate=True)
     assert drop_of(found.report.evaluation) < 2 * allowed  # from other cameras
-    assert min(trial.drop for trial in found.report.trials if trial.bytes == len(found.to_zip())) <= allowed
+    (drop,) = {trial.drop for trial in found.report.trials if trial.bytes == len(found.to_zip())}
+    assert drop <= allowed
     tried = [(trial.drop, trial.bytes) for trial in found.report.trials]
     assert all(size >= len(found.to_zip()) for lost, size in tried if lost <= allowed)
     nearest = max(lost for lost, _ in tried if lost <= allowed)  # the smallest may lose a little less
@@ -169,7 +170,7 @@ def test_fewer_gaussians_for_a_quality(goal):
     made = [trial for trial in found.report.trials if trial.bytes == len(found.to_zip())]
     assert any(trial.drop <= 0.4 if "psnr" not in goal else trial.psnr >= 35.0 for trial in made)
     evaluation = found.report.evaluation  # from other cameras
-    assert drop_of(evaluation) <= 2.5 if "psnr" not in goal else evaluation.mean.candidate_vs_reference.psnr >= 33.0
+    assert drop_of(evaluation) <= 0.8 if "psnr" not in goal else evaluation.mean.candidate_vs_reference.psnr >= 33.0
 
 
 @pytest.mark.quick(0)

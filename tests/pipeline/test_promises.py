@@ -40,7 +40,7 @@ def test_fox_is_small_and_keeps_its_view_dependent_colour(shared_data: Path) -> 
     scene, result = fox(shared_data)[0], bare_fox(shared_data)
     assert len(result.to_zip()) <= 0.73 * PAPER_FOX
     errors = kissgs.decompress(result.files).shN.astype(np.float64) - scene.shN[result.order]
-    assert np.sqrt(np.mean(errors**2)) < 0.75 * SPZ_SHN_RMSE
+    assert np.sqrt(np.mean(errors**2)) < 0.7 * SPZ_SHN_RMSE
 
 
 @pytest.mark.quick(0)
@@ -64,8 +64,8 @@ def test_fox_with_its_capture_has_half_the_bytes_of_the_paper(shared_data: Path)
     seen = result.report.evaluation
     assert seen is not None
     assert seen.mean.change is not None
-    assert seen.mean.change > -0.33
-    assert seen.mean.candidate_vs_reference.psnr > PAPER_FOX_PSNR + 0.3
+    assert seen.mean.change > -0.3
+    assert seen.mean.candidate_vs_reference.psnr > PAPER_FOX_PSNR + 0.5
     assert min(view.comparison.candidate_vs_reference.psnr for view in seen.views) > PAPER_FOX_WORST + 0.5
 
 
@@ -74,7 +74,7 @@ def test_guitar_at_lower_quality_is_smaller_than_with_other_encoders(shared_data
     """The default quality equals that of the paper's settings; this one is at most 1.5 dB below."""
     source, settings = (
         shared_data / "guitar" / "guitar.ply",
-        kissgs.Settings.model_validate({"encode": {"quality_offset_db": -2}}),
+        kissgs.Settings.model_validate({"encode": {"quality_offset_db": -1.5}}),
     )
     result = kissgs.compress(source, settings=settings, evaluate=True)
     assert result.report.container_bytes <= min(0.7 * PAPER_GUITAR, 0.65 * SOG_GUITAR)

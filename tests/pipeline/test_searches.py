@@ -157,8 +157,7 @@ def test_a_psnr_is_met(change):
     assert made.worst <= made.fifth_percentile <= made.psnr
     assert abs(found.report.evaluation.mean.candidate_vs_reference.psnr - wanted) < 2.5
     assert found.report.evaluation.mean.candidate_vs_reference.psnr not in [trial.psnr for trial in found.report.trials]
-    ratio = len(found.to_zip()) / len(plain.to_zip())
-    assert ratio > 0.98 if change > 0 else ratio < 1  # the codebook's clustering scatters by a per cent
+    assert (len(found.to_zip()) > len(plain.to_zip())) == (change > 0)
 
 
 @pytest.mark.quick(0)

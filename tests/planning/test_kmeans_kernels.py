@@ -48,6 +48,28 @@ def test_means_totals_and_errors():
         np.testing.assert_allclose(centroids[k], wanted, atol=1e-6)
 
 
+def test_near_centroids_are_the_nearest_of_the_lists_searched():
+    rng = np.random.default_rng(3)
+    centroids = rng.normal(size=(60, 7)).astype(np.float32)
+    near = np.stack([np.append(k, rng.permutation(np.delete(np.arange(60), k))[:7]) for k in range(60)])
+    near = near.astype(np.int32)
+    squared = np.square(centroids.astype(np.float64)[:, None] - centroids).sum(axis=2)
+    found = np.full_like(near, -1)
+    kernels.find_near(centroids, near, 3, 0, 60, found)
+    for k in range(60):
+        candidates = np.unique(near[near[k, :4]])
+        wanted = candidates[np.argsort(np.where(candidates == k, -1, squared[k, candidates]))][:8]
+        assert found[k].tolist() == wanted.tolist()
+
+
+def test_near_centroids_that_all_others_are():
+    centroids = np.arange(4, dtype=np.float32)[:, None] ** 2
+    near = np.array([[0, 3, 1, 2], [1, 0, 2, 3], [2, 1, 3, 0], [3, 2, 1, 0]], np.int32)
+    found = np.empty_like(near)
+    kernels.find_near(centroids, near, 9, 0, 4, found)
+    assert found.tolist() == [[0, 1, 2, 3], [1, 0, 2, 3], [2, 1, 0, 3], [3, 2, 1, 0]]
+
+
 def test_vectors_go_to_the_nearest_of_their_near_centroids():
     table, rows, _, labels, members, edges = clustered()
     rng = np.random.default_rng(2)

@@ -29,16 +29,18 @@ def psnrs(scene, found, views, background=(0, 0, 0)):
 
 
 @pytest.mark.parametrize("background", [(0, 0, 0), (1, 1, 1), (0.2, 0.9, 0.5)])
-@pytest.mark.parametrize("preset", ["balanced", "small"])
+@pytest.mark.parametrize(
+    ("preset", "size", "better", "worst"), [("balanced", 0.86, 2.5, -0.5), ("small", 0.75, 0.0, -2.5)]
+)
 @pytest.mark.quick(1)
-def test_fewer_bytes_than_the_papers_and_better_before_any_background(preset, background):
+def test_fewer_bytes_than_the_papers_and_better_before_any_background(preset, size, better, worst, background):
     """The default quality is that of ``fast`` if the paper's levels are too coarse for the scene's ranges, which takes
-    some of the saved bytes. The worst view may be worse: the paper's codebook counts all Gaussians equally."""
+    some of the saved bytes. The worst view of ``small`` is worse: the paper's codebook counts all Gaussians equally."""
     paper, ours = compressed("paper"), compressed(preset)
-    assert len(ours.to_zip()) < 0.85 * len(paper.to_zip())
+    assert len(ours.to_zip()) < size * len(paper.to_zip())
     wanted, found = (psnrs(SCENE, kissgs.decompress(c.files), cameras(), background) for c in (paper, ours))
-    assert found.mean() > wanted.mean() + 0.3
-    assert found.min() > wanted.min() - 2.5
+    assert found.mean() > wanted.mean() + better
+    assert found.min() > wanted.min() + worst
 
 
 @pytest.mark.parametrize("background", [(0, 0, 0), (1, 1, 1), (0.2, 0.9, 0.5)])
@@ -49,7 +51,7 @@ def test_two_thirds_of_the_papers_bytes_are_as_good_before_any_background(backgr
     assert len(ours.to_zip()) < 0.7 * len(paper.to_zip())
     wanted, found = (psnrs(SCENE, kissgs.decompress(c.files), cameras(), background) for c in (paper, ours))
     assert found.mean() > wanted.mean()
-    assert found.min() > wanted.min() - 2.5
+    assert found.min() > wanted.min() - 1.5
 
 
 def test_what_is_dark_is_kept_for_bright_backgrounds():
