@@ -89,7 +89,7 @@ def means(
 
 
 @compiled(
-    "void(float32[:, ::1], int32[:, ::1], int64, int64, int64, int32[:, ::1])",
+    "void(float32[:, ::1], uint16[:, ::1], int64, int64, int64, uint16[:, ::1])",
     fastmath={"contract", "nnan", "ninf", "nsz", "reassoc"},
 )
 def find_near(centroids: np.ndarray, near: np.ndarray, others: int, first: int, last: int, found: np.ndarray) -> None:
@@ -134,7 +134,7 @@ def find_near(centroids: np.ndarray, near: np.ndarray, others: int, first: int, 
 
 
 @compiled(
-    "void(float32[:, ::1], int64[::1], int32[::1], int64[::1], float32[:, ::1], int32[:, ::1], int64, int64, "
+    "void(float32[:, ::1], int64[::1], int32[::1], int64[::1], float32[:, ::1], uint16[:, ::1], int64, int64, "
     "int32[::1], float32[::1])",
     fastmath={"contract", "nnan", "ninf", "nsz", "reassoc"},
 )
@@ -210,7 +210,7 @@ def assign_near(
             distances[n] = max(lowest + norm, np.float32(0))
 
 
-@compiled("void(float32[:, ::1], float64[::1], int32[:, ::1], int64, int64, int32[::1], float64[::1])")
+@compiled("void(float32[:, ::1], float64[::1], uint16[:, ::1], int64, int64, int32[::1], float64[::1])")
 def merge_costs(
     centroids: np.ndarray,
     totals: np.ndarray,
@@ -336,7 +336,7 @@ def split_gains(
 
 @compiled(
     "void(int32[::1], int32[::1], int32[::1], float64[::1], float64[::1], boolean[::1], int32[::1], int64[::1], "
-    "int32[::1], int32[:, ::1])"
+    "int32[::1], uint16[:, ::1])"
 )
 def relocate(
     merged: np.ndarray,
@@ -369,7 +369,7 @@ def relocate(
     """
     count = near.shape[1]
     used = np.zeros(near.shape[0], dtype=np.bool_)
-    row = np.empty(count, dtype=np.int32)
+    row = np.empty(count, dtype=np.uint16)
     at = 0
     for moved in merged:
         partner = partners[moved]

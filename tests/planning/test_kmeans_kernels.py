@@ -52,9 +52,9 @@ def test_near_centroids_are_the_nearest_of_the_lists_searched():
     rng = np.random.default_rng(3)
     centroids = rng.normal(size=(60, 7)).astype(np.float32)
     near = np.stack([np.append(k, rng.permutation(np.delete(np.arange(60), k))[:7]) for k in range(60)])
-    near = near.astype(np.int32)
+    near = near.astype(np.uint16)
     squared = np.square(centroids.astype(np.float64)[:, None] - centroids).sum(axis=2)
-    found = np.full_like(near, -1)
+    found = np.empty_like(near)
     kernels.find_near(centroids, near, 3, 0, 60, found)
     for k in range(60):
         candidates = np.unique(near[near[k, :4]])
@@ -64,7 +64,7 @@ def test_near_centroids_are_the_nearest_of_the_lists_searched():
 
 def test_near_centroids_that_all_others_are():
     centroids = np.arange(4, dtype=np.float32)[:, None] ** 2
-    near = np.array([[0, 3, 1, 2], [1, 0, 2, 3], [2, 1, 3, 0], [3, 2, 1, 0]], np.int32)
+    near = np.array([[0, 3, 1, 2], [1, 0, 2, 3], [2, 1, 3, 0], [3, 2, 1, 0]], np.uint16)
     found = np.empty_like(near)
     kernels.find_near(centroids, near, 9, 0, 4, found)
     assert found.tolist() == [[0, 1, 2, 3], [1, 0, 2, 3], [2, 1, 0, 3], [3, 2, 1, 0]]
@@ -75,7 +75,7 @@ def test_vectors_go_to_the_nearest_of_their_near_centroids():
     rng = np.random.default_rng(2)
     centroids = rng.normal(size=(12, 7)).astype(np.float32)
     near = np.stack([np.append(k, rng.permutation(np.delete(np.arange(12), k))[:5]) for k in range(12)]).astype(
-        np.int32
+        np.uint16
     )
     found, distances = labels.copy(), np.empty(len(rows), np.float32)
     kernels.assign_near(table, rows, members, edges, centroids, near, 0, 12, found, distances)
@@ -95,7 +95,7 @@ def test_costs_of_merging_and_gains_of_splitting_are_differences_of_the_error():
     def error(own):
         return error_of(vectors[own], weights64[own]) if own.any() else 0.0
 
-    near = np.stack([np.append(k, np.delete(np.arange(12), k)) for k in range(12)]).astype(np.int32)
+    near = np.stack([np.append(k, np.delete(np.arange(12), k)) for k in range(12)]).astype(np.uint16)
     partners, costs = np.empty(12, np.int32), np.empty(12)
     kernels.merge_costs(centroids, totals, near, 0, 12, partners, costs)
     for k in range(12):
@@ -118,7 +118,7 @@ def test_relocation_pays_and_keeps_the_lists_in_order():
     table, rows, weights, labels, members, edges = clustered()
     distances = np.ones(len(rows), np.float32)
     centroids, totals, errors = means_of(table, rows, weights, members, edges, distances)
-    near = np.stack([np.append(k, np.delete(np.arange(12), k)) for k in range(12)]).astype(np.int32)
+    near = np.stack([np.append(k, np.delete(np.arange(12), k)) for k in range(12)]).astype(np.uint16)
     partners, costs = np.empty(12, np.int32), np.empty(12)
     kernels.merge_costs(centroids, totals, near, 0, 12, partners, costs)
     second, gains = np.zeros(len(rows), np.bool_), np.empty(12)
