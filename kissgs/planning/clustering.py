@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from kissgs.core.array_types import Float32, Float64, Int, Int32
+from kissgs.core.array_types import Float32, Float64, Int, Int32, UInt16
 from kissgs.core.threads import Workers
 
 BLOCK = 1024
@@ -68,7 +68,7 @@ class Clustering:
     centroids: Float32[np.ndarray, "K D"]
     labels: Int32[np.ndarray, " N"]
     distances: Float32[np.ndarray, " N"]
-    near: Int32[np.ndarray, "K k"]
+    near: UInt16[np.ndarray, "K k"]
     members: Int32[np.ndarray, " N"]
     edges: Int[np.ndarray, " edges"]
     totals: Float64[np.ndarray, " K"]

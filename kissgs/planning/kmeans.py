@@ -12,7 +12,7 @@ from the literature replace it:
   Plain k-means cannot move a centroid from where it is useless to where it is needed; with this step the error ends
   below that of an exhaustive search.
 
-Vectors are read where they are, by their index; beside them the clustering needs some 20 bytes for each and some 800
+Vectors are read where they are, by their index; beside them the clustering needs some 20 bytes for each and some 600
 for each centroid. Sums run in a fixed order in float64, each cluster belongs to one task, and all random numbers come
 from one seed: the result does not depend on the number of threads.
 """
@@ -29,6 +29,7 @@ from kissgs.core.threads import Workers
 from kissgs.planning.clustering import Vectors
 from kissgs.planning.kmeans_start import start
 from kissgs.planning.quantize import clip_outliers
+from kissgs.planning.rows import for_each_block
 
 OUTLIERS = 1e-3
 """Share of entries, at either end of a dimension, that may be clipped so that the step of the others stays small."""
@@ -88,7 +89,7 @@ def fit(
         table: finite vectors, of which some are clustered.
         rows: their rows in the table, N at least 1.
         weights: positive weight of each vector's squared error.
-        size: K, largest number of centroids.
+        size: K, largest number of centroids, at most 65,536.
         pool: threads.
         options: options of the clustering.
         report: receives the fraction done, 0 to 1.
@@ -143,18 +144,18 @@ def _round_to_lattice(centroids: np.ndarray, step: float, options: KMeansOptions
     Returns:
         The step: ``step``, or the one that 256 levels or the tolerance need if that is larger.
     """
-    tolerance = options.tolerance
+    tolerance, low = options.tolerance, np.zeros(centroids.shape[1])
     step = max(step, 2 * tolerance)
-    if options.from_zero:
-        if step > 0:
-            centroids[:] = np.rint(centroids.astype(np.float64) / step) * step
-        return step
-    # An exact codebook, of few vectors, has no error that outliers could be compared with.
-    wide = (clip_outliers(centroids, step=step, share=OUTLIERS) if step > 2 * tolerance else centroids).astype(
-        np.float64
-    )
-    low = wide.min(axis=0)
-    step = max(step, float((wide - low).max()) / 254)
+    if not options.from_zero:
+        # An exact codebook, of few vectors, has no error that outliers could be compared with.
+        if step > 2 * tolerance:
+            centroids[:] = clip_outliers(centroids, step=step, share=OUTLIERS)
+        low = centroids.min(axis=0).astype(np.float64)
+        step = max(step, float((centroids.max(axis=0) - low).max()) / 254)
+
+    def round_rows(rows: slice) -> None:
+        centroids[rows] = low + np.rint((centroids[rows] - low) / step) * step
+
     if step > 0:
-        centroids[:] = low + np.rint((wide - low) / step) * step
+        for_each_block(len(centroids), round_rows)
     return step

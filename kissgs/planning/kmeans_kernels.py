@@ -89,7 +89,7 @@ def means(
 
 
 @compiled(
-    "void(float32[:, ::1], int32[:, ::1], int64, int64, int64, int32[:, ::1])",
+    "void(float32[:, ::1], uint16[:, ::1], int64, int64, int64, uint16[:, ::1])",
     fastmath={"contract", "nnan", "ninf", "nsz", "reassoc"},
 )
 def find_near(centroids: np.ndarray, near: np.ndarray, others: int, first: int, last: int, found: np.ndarray) -> None:
@@ -134,7 +134,7 @@ def find_near(centroids: np.ndarray, near: np.ndarray, others: int, first: int, 
 
 
 @compiled(
-    "void(float32[:, ::1], int64[::1], int32[::1], int64[::1], float32[:, ::1], int32[:, ::1], int64, int64, "
+    "void(float32[:, ::1], int64[::1], int32[::1], int64[::1], float32[:, ::1], uint16[:, ::1], int64, int64, "
     "int32[::1], float32[::1])",
     fastmath={"contract", "nnan", "ninf", "nsz", "reassoc"},
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kissgs.core.array_types import Float32, Float64, Int, Int32
+from kissgs.core.array_types import Float32, Float64, Int, Int32, UInt16
 from kissgs.core.threads import Workers
 from kissgs.planning.clustering import BLOCK, Clustering, Vectors, sorted_by_label
 
@@ -141,18 +141,18 @@ def assign(
 
 def _near(
     centroids: Float32[np.ndarray, "K D"], firsts: Int[np.ndarray, " edges"], count: int, pool: Workers
-) -> Int32[np.ndarray, "K k"]:
+) -> UInt16[np.ndarray, "K k"]:
     """Return for every centroid the nearest ones, itself first, of those in the nearest cells."""
     filled = np.flatnonzero(np.diff(firsts))
     firsts = np.append(firsts[filled], len(centroids))
     counts = np.diff(firsts)
     centres = (np.add.reduceat(centroids, firsts[:-1], axis=0) / counts[:, None]).astype(np.float32)
-    near = np.empty((len(centroids), min(count, len(centroids))), dtype=np.int32)
+    near = np.empty((len(centroids), min(count, len(centroids))), dtype=np.uint16)
 
     def work(j: int) -> None:
         order = np.argsort(np.square(centres - centres[j]).sum(axis=1), kind="stable")
         order = order[: np.searchsorted(np.cumsum(counts[order]), CANDIDATES * count) + 1]
-        names = np.concatenate([np.arange(firsts[c], firsts[c + 1], dtype=np.int32) for c in order])
+        names = np.concatenate([np.arange(firsts[c], firsts[c + 1], dtype=np.uint16) for c in order])
         some, own = centroids[names], slice(firsts[j], firsts[j + 1])
         scores = np.einsum("kd,kd->k", some, some) - 2 * (centroids[own] @ some.T)
         np.fill_diagonal(scores, -np.inf)

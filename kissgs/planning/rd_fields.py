@@ -100,8 +100,15 @@ class RdFields:
 
 def decoded_entries(codebook: Codebook, coefficients: int) -> Float32[np.ndarray, "entries K 3"]:
     """Return the decoded shN coefficients of the codebook's entries."""
-    entries = codebook.centroids.values().reshape(-1, 3, COEFFICIENTS)[:, :, :coefficients].transpose(0, 2, 1)
-    return np.ascontiguousarray(entries.astype(np.float32))
+    centroids = codebook.centroids
+    entries = np.empty((len(centroids.levels), coefficients, 3), np.float32)
+
+    def decode(rows: slice) -> None:
+        values = centroids.take(rows).values().reshape(-1, 3, COEFFICIENTS)
+        entries[rows] = values[:, :, :coefficients].transpose(0, 2, 1)
+
+    for_each_block(len(entries), decode)
+    return entries
 
 
 def decoded_scene(

@@ -7,7 +7,7 @@ import numpy as np
 from kissgs.core.numba_kernels import compiled
 
 
-@compiled("void(float32[:, ::1], float64[::1], int32[:, ::1], int64, int64, int32[::1], float64[::1])")
+@compiled("void(float32[:, ::1], float64[::1], uint16[:, ::1], int64, int64, int32[::1], float64[::1])")
 def merge_costs(
     centroids: np.ndarray,
     totals: np.ndarray,
@@ -133,7 +133,7 @@ def split_gains(
 
 @compiled(
     "void(int32[::1], int32[::1], int32[::1], float64[::1], float64[::1], boolean[::1], int32[::1], int64[::1], "
-    "int32[::1], int32[:, ::1])"
+    "int32[::1], uint16[:, ::1])"
 )
 def relocate(
     merged: np.ndarray,
@@ -166,7 +166,7 @@ def relocate(
     """
     count = near.shape[1]
     used = np.zeros(near.shape[0], dtype=np.bool_)
-    row = np.empty(count, dtype=np.int32)
+    row = np.empty(count, dtype=np.uint16)
     at = 0
     for moved in merged:
         partner = partners[moved]

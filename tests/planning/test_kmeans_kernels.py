@@ -27,9 +27,9 @@ def test_near_centroids_are_the_nearest_of_the_lists_searched():
     rng = np.random.default_rng(3)
     centroids = rng.normal(size=(60, 7)).astype(np.float32)
     near = np.stack([np.append(k, rng.permutation(np.delete(np.arange(60), k))[:7]) for k in range(60)])
-    near = near.astype(np.int32)
+    near = near.astype(np.uint16)
     squared = np.square(centroids.astype(np.float64)[:, None] - centroids).sum(axis=2)
-    found = np.full_like(near, -1)
+    found = np.empty_like(near)
     kernels.find_near(centroids, near, 3, 0, 60, found)
     for k in range(60):
         candidates = np.unique(near[near[k, :4]])
@@ -39,7 +39,7 @@ def test_near_centroids_are_the_nearest_of_the_lists_searched():
 
 def test_near_centroids_that_all_others_are():
     centroids = np.arange(4, dtype=np.float32)[:, None] ** 2
-    near = np.array([[0, 3, 1, 2], [1, 0, 2, 3], [2, 1, 3, 0], [3, 2, 1, 0]], np.int32)
+    near = np.array([[0, 3, 1, 2], [1, 0, 2, 3], [2, 1, 3, 0], [3, 2, 1, 0]], np.uint16)
     found = np.empty_like(near)
     kernels.find_near(centroids, near, 9, 0, 4, found)
     assert found.tolist() == [[0, 1, 2, 3], [1, 0, 2, 3], [2, 1, 0, 3], [3, 2, 1, 0]]
@@ -50,7 +50,7 @@ def test_vectors_go_to_the_nearest_of_their_near_centroids():
     rng = np.random.default_rng(2)
     centroids = rng.normal(size=(12, 7)).astype(np.float32)
     near = np.stack([np.append(k, rng.permutation(np.delete(np.arange(12), k))[:5]) for k in range(12)]).astype(
-        np.int32
+        np.uint16
     )
     found, distances = labels.copy(), np.empty(len(rows), np.float32)
     kernels.assign_near(table, rows, members, edges, centroids, near, 0, 12, found, distances)

@@ -20,7 +20,7 @@ def test_costs_of_merging_and_gains_of_splitting_are_differences_of_the_error():
     def error(own):
         return error_of(vectors[own], weights64[own]) if own.any() else 0.0
 
-    near = np.stack([np.append(k, np.delete(np.arange(12), k)) for k in range(12)]).astype(np.int32)
+    near = np.stack([np.append(k, np.delete(np.arange(12), k)) for k in range(12)]).astype(np.uint16)
     partners, costs = np.empty(12, np.int32), np.empty(12)
     kernels.merge_costs(centroids, totals, near, 0, 12, partners, costs)
     for k in range(12):
@@ -43,7 +43,7 @@ def test_relocation_pays_and_keeps_the_lists_in_order():
     table, rows, weights, labels, members, edges = clustered()
     distances = np.ones(len(rows), np.float32)
     centroids, totals, errors = means_of(table, rows, weights, members, edges, distances)
-    near = np.stack([np.append(k, np.delete(np.arange(12), k)) for k in range(12)]).astype(np.int32)
+    near = np.stack([np.append(k, np.delete(np.arange(12), k)) for k in range(12)]).astype(np.uint16)
     partners, costs = np.empty(12, np.int32), np.empty(12)
     kernels.merge_costs(centroids, totals, near, 0, 12, partners, costs)
     second, gains = np.zeros(len(rows), np.bool_), np.empty(12)

@@ -37,7 +37,7 @@ LIMITS = np.array([constants.ALPHA_MIN, constants.ALPHA_MAX, constants.TRANSMITT
 
 PIXELS_PER_TILE = constants.TILE**2
 
-BAND = 1 << 19
+BAND = 1 << 18
 """Number of members of tiles whose moments are in memory at once."""
 
 
