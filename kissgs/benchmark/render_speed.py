@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kissgs.core.errors import UnsupportedError
+from kissgs.core.free_memory import keep_free_memory
 from kissgs.core.progress import Progress, silent
-from kissgs.core.reused_memory import reused_memory
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera
@@ -85,7 +85,7 @@ def rendering_cost(
     model, measured = GaussianModel(splats), []
     for number, camera in enumerate(cameras):
         progress("measure", number / len(cameras))
-        with reused_memory():
+        with keep_free_memory():
             measured.append(_one_view(splats, model, camera, threads))
     return RenderingCost(
         gaussians=len(splats),

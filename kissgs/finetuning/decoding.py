@@ -10,7 +10,6 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from kissgs.core.array_types import Float, Float32, Float64, Int
-from kissgs.core.reused_memory import empty
 from kissgs.core.signed_log import signed_exp
 from kissgs.finetuning.kernels import each_part, sum_by_label
 from kissgs.planning import smallest_three
@@ -94,7 +93,7 @@ class _LookUp(torch.autograd.Function):
         ctx.labels = labels
         if entries.device.type != "cpu":
             return entries[labels.index]
-        out = empty((len(labels.index), *entries.shape[1:]), np.float32)
+        out = np.empty((len(labels.index), *entries.shape[1:]), np.float32)
         np.take(entries.detach().numpy(), labels.index.numpy(), axis=0, out=out, mode="clip")
         return torch.from_numpy(out)
 

@@ -15,7 +15,6 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from kissgs.core.array_types import Float32, Float64
-from kissgs.core.reused_memory import empty
 from kissgs.finetuning import kernels
 from kissgs.planning.quantize import Quantized
 from kissgs.rendering.rasterizer import Device
@@ -123,7 +122,7 @@ class _Values(torch.autograd.Function):
         ctx.plane = plane
         base, stride, shift = plane.base_multiples.numpy(), plane.stride.numpy(), plane.shift.numpy()
         low, step, found = plane.low.numpy(), plane.step.numpy(), latents.detach().contiguous().numpy()
-        values = empty(tuple(latents.shape), np.float64)
+        values = np.empty(tuple(latents.shape), np.float64)
 
         def part(first: int, last: int) -> None:
             kernels.even_values(base, found, stride, shift, low, step, first, last, values)
@@ -136,7 +135,7 @@ class _Values(torch.autograd.Function):
     def backward(ctx: Any, gradient: Float64[Tensor, "R C"]) -> tuple[Float32[Tensor, "R C"], None]:  # noqa: ANN401
         plane: EvenPlane = ctx.plane
         v_values, stride, step = gradient.contiguous().numpy(), plane.stride.numpy(), plane.step.numpy()
-        v_latents = empty(tuple(gradient.shape), np.float32)
+        v_latents = np.empty(tuple(gradient.shape), np.float32)
 
         def part(first: int, last: int) -> None:
             kernels.even_values_backward(v_values, stride, step, first, last, v_latents)

@@ -12,7 +12,6 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from kissgs.core.array_types import Float32, Float64, Int
-from kissgs.core.reused_memory import empty
 from kissgs.finetuning import kernels
 from kissgs.finetuning.planes import Plane
 from kissgs.finetuning.quantized_scene import QuantizedScene
@@ -193,7 +192,7 @@ class _Bits(torch.autograd.Function):
     ) -> Tensor:
         start, codes, bits_of = base.numpy(), rows.numpy(), table.numpy()
         found = latents.detach().contiguous().numpy()
-        slopes = empty(tuple(latents.shape), np.float32)
+        slopes = np.empty(tuple(latents.shape), np.float32)
 
         def part(first: int, last: int) -> float:
             return float(kernels.level_bits(start, found, codes, bits_of, symbols, first, last, slopes))

@@ -11,7 +11,7 @@ Straight-through training alone does not converge: if the best value is between 
 the boundary and may end at the worse level. So a quadratic term attracts each latent to its current level, with the
 curvature that the loss has there. The latent converges to the result of one Newton step from the level,
 ``level - gradient / curvature``, which is the same point from both levels, and is rounded to the nearer one. The
-curvature follows from the costs of errors (:class:`kissgs.planning.rd_model.Costs`).
+curvature follows from the costs of errors (:class:`kissgs.planning.gaussian_costs.Costs`).
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from kissgs.finetuning.even_plane import EvenPlane
 from kissgs.finetuning.planes import planes_of
 from kissgs.planning.container_model import EVEN_LEVELS, ContainerModel
 from kissgs.planning.encoding_plan import EncodingPlan
+from kissgs.planning.gaussian_costs import Costs
 from kissgs.planning.quantize import Quantized
-from kissgs.planning.rd_model import Costs
 from kissgs.planning.sh_codebook import COEFFICIENTS
 from kissgs.planning.table_fields import decoded_quats
 from kissgs.rendering.rasterizer import Device

@@ -27,7 +27,8 @@ from kissgs.finetuning.result import FinetuneReport
 from kissgs.planning.container_model import EVEN_LEVELS, ContainerModel
 from kissgs.planning.encoded import Encoded
 from kissgs.planning.encoding_plan import EncodingPlan
-from kissgs.planning.rd_model import Costs, implied_lambda
+from kissgs.planning.gaussian_costs import Costs
+from kissgs.planning.quality_estimate import implied_lambda
 from kissgs.rendering.rasterizer import Device
 from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
 from kissgs.settings import FinetuneSettings

@@ -188,18 +188,14 @@ def compress(
     Raises:
         KissgsError: one of its subclasses, with a message for the user.
     """
-    from kissgs.pipeline.encoding import Encoding, check_finetuning
+    from kissgs.pipeline.encoding import Encoding
 
     settings = settings or Settings()
     target = Path(destination) if destination is not None else None
     kind = named_container(container, target)
     if target is not None:
         check_destination(target, overwrite=overwrite, names=FILES)
-    finetune_checkpoint = None
-    if settings.finetune.enabled:
-        check_finetuning(settings, views, device)
-        if checkpoint is not None and not settings.encode.has_goal:
-            finetune_checkpoint = finetune_checkpoint_path(Path(checkpoint))
+    finetune_checkpoint = _check_finetuning(settings, views, checkpoint, device)
     clock = StageTimer(progress)
     original, cleaned, source_bytes = open_scene(source, reading, threads, clock)
     source_count, sh_degree = len(original) + cleaned.removed, original.sh_degree
@@ -221,9 +217,9 @@ def compress(
     )
     del original
     compacted, search, trials = _compact_first(encoding, checkpoint)
+    after_search = ignore_stop_search(clock) if settings.searches else clock
     if compacted is not None:
         encoding = replace(encoding, splats=compacted.splats)
-    after_search = ignore_stop_search(clock) if settings.searches else clock
     if not settings.encode.has_goal:
         encoding = replace(encoding, progress=SearchNote(after_search))
     result, more = encoding.run(search)
@@ -263,6 +259,18 @@ def compress(
     order = encoded.order if compacted is None else compacted.index[encoded.order]
     remaining = () if target is not None else tuple(path for path in checkpoints if path is not None)
     return Compressed(encoded.files, order, report, remaining, kind)
+
+
+def _check_finetuning(
+    settings: Settings, views: Views | None, checkpoint: AnyPath | None, device: Device
+) -> Path | None:
+    """Check that fine-tuning is possible if the settings ask for it; return its checkpoint file if it has one."""
+    from kissgs.pipeline.encoding import check_finetuning
+
+    if not settings.finetune.enabled:
+        return None
+    check_finetuning(settings, views, device)
+    return None if checkpoint is None or settings.encode.has_goal else finetune_checkpoint_path(Path(checkpoint))
 
 
 def _settings_as_used(requested: Settings, used: EncodeSettings) -> dict[str, Any]:

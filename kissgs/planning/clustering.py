@@ -129,7 +129,7 @@ class Clustering:
 
         Only labels and lists of near centroids change; :meth:`update` then finds the centroids.
         """
-        from kissgs.planning import kmeans_kernels as kernels
+        from kissgs.planning import relocation_kernels as kernels
 
         data, count = self.data, len(self.centroids)
         nearest = np.ascontiguousarray(self.near[:, :PARTNERS])

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from kissgs.core.array_types import UInt8
+from kissgs.planning.gaussian_costs import Costs
 from kissgs.planning.layout import Grid
 from kissgs.planning.quantize import Quantized
-from kissgs.planning.rd_model import Costs
 from kissgs.planning.sh_codebook import Codebook
 
 

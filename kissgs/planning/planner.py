@@ -70,6 +70,6 @@ def visible_gaussians(splats: Splats, settings: EncodeSettings) -> Int32[np.ndar
 def load_kernels(progress: Progress = silent) -> None:
     """Compile the encoder's kernels, or load them from numba's cache."""
     progress("kernels", 0.0)
-    from kissgs.planning import form_kernels, kernels, kmeans_kernels, order_kernels  # noqa: F401
+    from kissgs.planning import form_kernels, kernels, kmeans_kernels, order_kernels, relocation_kernels  # noqa: F401
 
     progress("kernels", 1.0)

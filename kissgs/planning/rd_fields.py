@@ -14,7 +14,7 @@ from kissgs.core.threads import Workers
 from kissgs.planning import table_fields
 from kissgs.planning.container_model import ContainerModel
 from kissgs.planning.quantize import MEANS_TOP, Quantized, clip_outliers, log_extent, means_bits, quantize_means
-from kissgs.planning.rd_model import RdCriterion
+from kissgs.planning.rd_criterion import RdCriterion
 from kissgs.planning.rdo_quantize import quantize_by_class, rdo_quantize_shapes
 from kissgs.planning.rotation_forms import StoredShapes
 from kissgs.planning.rows import Rows, for_each_block, selected

@@ -16,7 +16,7 @@ import numpy as np
 from kissgs.core.array_types import Float, Float32, Float64, Int, Integer, UInt8
 from kissgs.core.threads import Workers
 from kissgs.planning.quantize import Quantized
-from kissgs.planning.rd_model import RdCriterion
+from kissgs.planning.rd_criterion import RdCriterion
 from kissgs.planning.rotation_forms import PERMUTATIONS
 from kissgs.planning.rows import Computed, Rows, for_each_block, row_range
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Int, UInt8
 from kissgs.core.threads import Workers
-from kissgs.planning.rd_model import RdCriterion
+from kissgs.planning.rd_criterion import RdCriterion
 from kissgs.planning.rdo_quantize import CHUNK, ROUNDS, level_bits
 from kissgs.planning.rotation_forms import PERMUTATIONS
 from kissgs.planning.smallest_three import KEPT, TABLE

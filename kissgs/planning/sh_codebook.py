@@ -11,6 +11,7 @@ import numpy as np
 from kissgs.core.array_types import Float32, Int
 from kissgs.core.limits import MAX_CODEBOOK_SIDE
 from kissgs.core.progress import Progress
+from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import SH_REST_COUNTS, Splats
 from kissgs.core.threads import Workers
 from kissgs.planning import kmeans
@@ -27,6 +28,13 @@ MIN_SIDE = 8
 
 WEIGHT_FLOOR, WEIGHT_CEILING = 0.1, 20.0
 """Bounds of weights, in units of the median, so that no Gaussian is ignored and none dominates."""
+
+SENSITIVITY_SHRINK, SIZE_POWER = 0.55, 0.64
+"""Exponents of the codebook's weights: colour sensitivity to the power of 1 - SENSITIVITY_SHRINK · view uncertainty,
+times (opacity × cross-section) to the power of SIZE_POWER · view uncertainty (:func:`size_weights`)."""
+
+SH_WEIGHTS = (1e-2, 1e2)
+"""Bounds of the codebook's weights, in units of their median."""
 
 SORTED_AXES, SORTED_RADIUS = 16, 16
 """Number of principal axes, and first filter radius, with which PLAS refines an order along the axes."""
@@ -159,7 +167,14 @@ def size_weights(splats: Splats, power: float) -> Float32[np.ndarray, " N"]:
     return np.exp(np.clip(logs, np.log(WEIGHT_FLOOR), np.log(WEIGHT_CEILING))).astype(np.float32)
 
 
-def bounded_weights(weights: Float32[np.ndarray, " N"], low: float, high: float) -> Float32[np.ndarray, " N"]:
-    """Return the weights in units of the median of those above 0, clipped to ``low`` and ``high``."""
+def sensitivity_weights(
+    sensitivity: Sensitivity, chosen: Int[np.ndarray, " M"], splats: Splats
+) -> Float32[np.ndarray, " M"]:
+    """Return the weight of each Gaussian's SH vector in the codebook, by how much cameras see of its colour."""
+    if splats.sh_degree == 0:
+        return np.ones(len(chosen), np.float32)
+    power = np.float32(max(1 - SENSITIVITY_SHRINK * sensitivity.view_uncertainty, 0.0))
+    sizes = size_weights(splats, SIZE_POWER * sensitivity.view_uncertainty)[chosen]
+    weights = sensitivity.color_weight[chosen] ** power * sizes
     seen = weights[weights > 0].astype(np.float64)
-    return np.clip(weights / (np.median(seen) if len(seen) else 1.0), low, high).astype(np.float32)
+    return np.clip(weights / (np.median(seen) if len(seen) else 1.0), *SH_WEIGHTS).astype(np.float32)

@@ -10,7 +10,7 @@ from kissgs.core.threads import Workers
 from kissgs.planning import smallest_three
 from kissgs.planning.container_model import ByteTables
 from kissgs.planning.quantize import MEANS_TOP, Quantized
-from kissgs.planning.rd_model import RdCriterion
+from kissgs.planning.rd_criterion import RdCriterion
 from kissgs.planning.rdo_tables import ShapeLevels, ShapeValues, rdo_quantize_tables
 from kissgs.planning.value_table import fit_table, nearest_levels, table_field, without_unused
 

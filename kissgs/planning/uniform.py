@@ -10,6 +10,7 @@ from kissgs.core.progress import Progress
 from kissgs.core.splats import SH_REST_COUNTS, Splats
 from kissgs.core.threads import Workers
 from kissgs.planning import table_fields
+from kissgs.planning.codebook_error import FEW
 from kissgs.planning.container_model import ByteTables, ContainerModel
 from kissgs.planning.encoding_plan import EncodingPlan, PlannedScene
 from kissgs.planning.layout import layout_grid
@@ -24,7 +25,6 @@ from kissgs.planning.quantize import (
     quantize_means,
 )
 from kissgs.planning.rd_fields import largest_errors
-from kissgs.planning.rd_model import FEW
 from kissgs.planning.rotation_forms import choose_forms
 from kissgs.planning.rows import Rows, selected
 from kissgs.planning.sh_codebook import fit_codebook, size_weights

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
-from kissgs.core.reused_memory import empty
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera
@@ -118,7 +117,7 @@ class _Rasterize(torch.autograd.Function):
         receive: Callable[[Gradients], None] | None = ctx.receive
         totals: list[np.ndarray] = []
         if receive is None:
-            totals = [empty(tuple(parameter.shape), np.float32) for parameter in parameters]
+            totals = [np.empty(tuple(parameter.shape), np.float32) for parameter in parameters]
             for total in totals:
                 total.fill(0)
         with Workers(ctx.threads) as pool:

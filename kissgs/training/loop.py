@@ -12,8 +12,8 @@ from typing import Protocol
 import numpy as np
 
 from kissgs.core.errors import UnsupportedError
+from kissgs.core.free_memory import keep_free_memory
 from kissgs.core.progress import Progress, silent
-from kissgs.core.reused_memory import reused_memory
 from kissgs.rendering import tensors
 from kissgs.rendering.cpu.gradients import Gradients
 from kissgs.rendering.differentiable import rasterize
@@ -112,7 +112,7 @@ def train(
             scene is in the state after the last completed step.
     """
     order, running = targets.order(plan.seed, first * plan.batch), RunningMeans()
-    with torch_threads(threads), reused_memory():
+    with torch_threads(threads), keep_free_memory():
         for step in range(first, plan.steps):
             progress(plan.stage, step / plan.steps, running.text(len(scene)))
             parameters = scene.gaussians()

@@ -12,7 +12,7 @@ from kissgs import Settings, Splats, decompress
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.finetuning.quantized_scene import QuantizedScene, table_name
 from kissgs.io.activations import OPACITY_OF_BYTE
-from kissgs.planning.rd_model import Costs
+from kissgs.planning.gaussian_costs import Costs
 from kissgs.sog.container_model import SOG
 from kissgs.sog.encode import write_files
 

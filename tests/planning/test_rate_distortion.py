@@ -1,4 +1,4 @@
-"""Oracle: all levels by brute force, the square law of rounding, and scenes with degenerate sensitivity."""
+"""Whole scenes with rate-distortion planning. Oracle: a naive decoder; scenes with degenerate sensitivity."""
 
 from dataclasses import replace
 
@@ -6,175 +6,15 @@ import numpy as np
 import pytest
 from helpers import reference_decoder
 from helpers.codec_scenes import assert_round_trip, constant_scene, covariances, random_scene
-from helpers.random_sensitivity import encode_rd, packed_hessian, random_sensitivity
+from helpers.random_sensitivity import encode_rd, random_sensitivity
 
+import kissgs
 from kissgs import Settings, compress, decompress
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import clean
-from kissgs.core.threads import Workers
-from kissgs.planning.quantize import quantize
-from kissgs.planning.rd_model import MIN_ERROR_RATIO, CodebookErrorModel, Costs, RdCriterion, error_at, lambda_for, step
-from kissgs.planning.rdo_quantize import CAPTURED, quantize_by_class, rdo_quantize_shapes
 from kissgs.sogxt.encode import encode
 
 RD_PRESETS = ["balanced", "small"]
-
-
-def anything(count):
-    """Changes as large as any may be."""
-    return {name: np.full(count, change) for name, change in CAPTURED.items()}
-
-
-def test_a_step_costs_what_a_bit_does():
-    """Halving it saves H d²/12 (1 - 1/4) by a bit: at the optimum the derivative by bits is lambda."""
-    cost, rd_lambda = 3e-4, 2e-9
-    best = step(cost, rd_lambda)
-
-    def total(bits):
-        return cost * (best * 2**-bits) ** 2 / 12 + rd_lambda * bits
-
-    around = [total(bits) for bits in (-0.01, 0, 0.01)]
-    assert around[1] < min(around[0], around[2])
-
-
-def test_lambda_for_gives_the_requested_error():
-    splats = random_scene(4000, 3, seed=1)
-    costs = Costs.of(random_sensitivity(splats), splats)
-    sh_model = CodebookErrorModel(1024, 1e-6, 2e-6)
-    for error in (1e-6, 1e-4):
-        rd_lambda = lambda_for(error, costs, sh_model, 10, 7, 0.2)
-        np.testing.assert_allclose(error_at(rd_lambda, costs, sh_model, 10, 7, 0.2), error, rtol=0.05)
-    least = error_at(1e-22, costs, sh_model, 10, 7, 0.2)  # what the largest codebook leaves
-    rd_lambda = lambda_for(least / 100, costs, sh_model, 10, 7, 0.2)
-    np.testing.assert_allclose(error_at(rd_lambda, costs, sh_model, 10, 7, 0.2), MIN_ERROR_RATIO * least, rtol=0.05)
-    sizes = [sh_model.best_size(rd_lambda, 100_000, 7) for rd_lambda in (1e-14, 1e-12, 1e-10)]
-    assert sizes == sorted(sizes, reverse=True)
-    assert sizes[0] <= round(100_000 / 7)
-    assert sh_model.best_size(1e-20, 6000, 7) == 3000
-
-
-def test_classes_are_of_like_sensitivity_and_size():
-    splats = random_scene(1000, 0)
-    costs = Costs.of(random_sensitivity(splats), splats).take(np.arange(0, 1000, 2))
-    places = splats.means[::2]
-    classes = costs.classes(5, places)
-    assert np.bincount(classes).tolist() == [100] * 5
-    worth = costs.scale * costs.rotation * costs.color
-    assert all(worth[classes == c].min() >= worth[classes == c + 1].max() for c in range(4))
-    assert (costs.classes(1, places) == 0).all()
-    for few in range(1, 10):
-        assert (np.bincount(costs.take(np.arange(few)).classes(32, places[:few])) == 1).all()
-
-
-def test_gaussians_in_one_place_keep_their_order():
-    """The stored order decides which of them is in front."""
-    splats = random_scene(600, 0)
-    splats = replace(splats, means=np.repeat(splats.means[:20] * np.float32([0, 1, 1]), 30, axis=0))
-    costs = Costs.of(random_sensitivity(splats), splats)
-    classes = costs.classes(5, splats.means).reshape(20, 30)
-    assert (classes == classes[:, :1]).all()
-    assert len(np.unique(classes)) == classes.max() + 1
-    order = encode_rd(splats, random_sensitivity(splats), prune_threshold_bits=0).order
-    for place in range(20):
-        assert (np.diff(order[order // 30 == place]) > 0).all()
-
-
-def test_what_is_dropped_is_worth_least_and_never_more_than_half():
-    splats = random_scene(101, 0, seed=3)
-    costs = Costs.of(random_sensitivity(splats), splats)
-    ranked = np.argsort(costs.removal)
-    for rd_lambda, count in ((0.0, 0), (float(costs.removal[ranked[10]]) / 7, 10), (1e9, 50)):
-        dropped = costs.pruned_by_rd(rd_lambda, 7)
-        assert sorted(np.flatnonzero(dropped)) == sorted(ranked[:count])
-
-
-def test_levels_of_a_class_are_multiples_of_its_step():
-    rng = np.random.default_rng(0)
-    values, classes = rng.normal(size=(3000, 3)), np.repeat([0, 1, 2], 1000)
-    cost = np.repeat([1.0, 0.1, 0.004], 1000)
-    splats = random_scene(3000, 0)
-    criterion = RdCriterion(Costs.of(random_sensitivity(splats), splats), classes, 1e-4)
-    found = quantize_by_class(values, criterion.class_steps(cost), classes, np.full(3000, 2.0))
-    each = (found.high.astype(float) - found.low) / found.top
-    errors = np.abs(found.low + found.levels * each - values)
-    for c, wanted in enumerate((1, 3, 16)):
-        levels = found.levels[classes == c]
-        assert (levels % wanted == 0).all()
-        inner = (levels > 0) & (levels < found.top - wanted)
-        assert errors[classes == c][inner].max() <= 0.5001 * wanted * each.max()
-    assert found.levels.min() == 0
-
-
-def parts_of(values, steps=(0.4, 0.3, 0.1)):
-    return tuple(quantize(values[:, a:b], step=s) for (a, b), s in zip(((0, 1), (1, 4), (4, 8)), steps, strict=True))
-
-
-def test_without_a_rate_cost_levels_are_the_nearest_along_each_axis():
-    rng = np.random.default_rng(1)
-    count = 400
-    quats = rng.normal(size=(count, 4)) * 0.2 + [1, 0, 0, 0]
-    values = np.concatenate([rng.normal(size=(count, 4)), quats / np.linalg.norm(quats, axis=1, keepdims=True)], axis=1)
-    parts = parts_of(values)
-    splats = random_scene(count, 0)
-    costs = Costs.of(random_sensitivity(splats), splats)
-    with Workers(1) as pool:
-        found = rdo_quantize_shapes(
-            values,
-            parts,
-            np.tile(packed_hessian(np.diag([1.0] * 4 + [0] * 3)), (count, 1)),
-            np.zeros(count, np.uint8),
-            RdCriterion(costs, np.zeros(count, np.int64), 1e-30),
-            anything(count),
-            pool,
-        )
-    for part, chosen, (a, b) in list(zip(parts, found, ((0, 1), (1, 4), (4, 8)), strict=True))[:2]:
-        each = (part.high.astype(float) - part.low) / part.top
-        np.testing.assert_allclose(
-            chosen.low + chosen.levels * ((chosen.high.astype(float) - chosen.low) / chosen.top),
-            np.rint((values[:, a:b] - part.low) / each) * each + part.low,
-            atol=1e-4,
-        )
-
-
-def test_rdo_quantisation_never_costs_more_than_the_nearest_level():
-    """Error and bits together, the bits as the levels that were chosen then have them; and close to all pairs tried."""
-    rng = np.random.default_rng(2)
-    count, rd_lambda = 3000, 1e-3
-    quats = rng.normal(size=(count, 4)) * 0.2 + [1, 0, 0, 0]
-    values = np.concatenate([rng.normal(size=(count, 4)), quats / np.linalg.norm(quats, axis=1, keepdims=True)], axis=1)
-    form = np.diag([1.0, 0.5, 0.5, 0.5, 0, 0, 0])
-    form[0, 1] = form[1, 0] = 0.4  # an error of the opacity makes up for one of the first scale
-    parts = parts_of(values)
-    splats = random_scene(count, 0)
-    costs = replace(
-        Costs.of(random_sensitivity(splats), splats),
-        **{name: np.full(count, 1e-9) for name in ("opacity", "scale", "rotation")},
-    )
-    with Workers(1) as pool:
-        found = rdo_quantize_shapes(
-            values,
-            parts,
-            np.tile(packed_hessian(form), (count, 1)),
-            np.zeros(count, np.uint8),
-            RdCriterion(costs, np.zeros(count, np.int64), rd_lambda),
-            anything(count),
-            pool,
-        )
-
-    def decoded(chosen):
-        return np.concatenate([p.low + p.levels * ((p.high.astype(float) - p.low) / p.top) for p in chosen], axis=1)
-
-    def total(chosen):
-        off = (decoded(chosen) - values)[:, :4]
-        bits = 0.0
-        for column in np.concatenate([part.levels for part in chosen], axis=1).T:
-            counts = np.bincount(column)
-            bits -= (counts[counts > 0] * np.log2(counts[counts > 0] / count)).sum()
-        return np.einsum("ni,ij,nj->", off, form[:4, :4], off) + rd_lambda * bits
-
-    assert total(found) < 0.85 * total(parts)
-    reach = np.array([2.0, 0.3, 0.3, 0.3, 0.25, 0.25, 0.25, 0.25])
-    assert ((decoded(found) - values) <= reach + 1e-5).all()
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
@@ -306,3 +146,40 @@ def test_rate_distortion_works_with_every_order_and_form(changes):
     for name, field in (("opacities", "opacities"), ("sh0", "f_dc")):
         assert np.abs(getattr(found, name) - getattr(wanted, name)).max() <= max(result.errors[field]) + 1e-5
     reference_decoder.assert_equal_scenes(found, reference_decoder.decode(result.files), result.files)
+
+
+def faint(count):
+    """Gaussians of which hardly anything shows, though any renderer draws them."""
+    scene = kissgs.sample_scene(count, seed=5)
+    return replace(scene, opacities=np.full(count, -5.3, np.float32), scales=scene.scales - np.float32(2))
+
+
+@pytest.mark.parametrize(("superfluous", "many"), [(0, False), (1500, True)])
+def test_many_gaussians_that_were_dropped_are_noted_in_the_report(superfluous, many):
+    scene = kissgs.sample_scene(2000, seed=1)
+    if superfluous:
+        more = faint(superfluous)
+        scene = kissgs.Splats(
+            **{name: np.concatenate([getattr(scene, name), getattr(more, name)]) for name in kissgs.Splats.__slots__}
+        )
+    settings = kissgs.Settings.from_preset("balanced", sensitivity_views=8, sensitivity_view_size=96)
+    report = kissgs.compress(scene, settings=settings).report
+    assert (report.pruned_by_rd > 0.2 * len(scene)) == many
+    assert bool(report.note) == many
+    if many:
+        drawn = len(scene) - report.invisible
+        assert report.note.startswith(f"{report.pruned_by_rd:,} of {drawn:,} Gaussians were pruned")
+
+
+@pytest.mark.quick(0)
+def test_an_enormous_coefficient_does_not_change_what_is_kept():
+    """Brighter than a display shows is no reason to give up on others: a Gaussian in a hundred at most is chosen
+    otherwise, at the border of what is worth its bytes."""
+    plain = kissgs.sample_scene(4000, seed=3)
+    shN = plain.shN.copy()
+    shN[::800, 4, 1] = 1e5
+    settings = kissgs.Settings.from_preset("balanced", sensitivity_views=12, sensitivity_view_size=128)
+    usual, found = (
+        set(kissgs.compress(scene, settings=settings).order.tolist()) for scene in (plain, replace(plain, shN=shN))
+    )
+    assert len(usual ^ found) < 0.01 * len(plain)

@@ -5,8 +5,8 @@ import pytest
 from helpers.codec_scenes import random_scene
 
 from kissgs.core.threads import Workers
+from kissgs.planning.gaussian_costs import Costs
 from kissgs.planning.quantize import means_bits, quantize, quantize_means
-from kissgs.planning.rd_model import Costs
 from kissgs.planning.rdo_quantize import level_bits
 from kissgs.planning.rotation_forms import PERMUTATIONS, ROTATIONS, StoredShapes, choose_forms
 from kissgs.planning.rows import BLOCK, for_each_block, row_range, selected, sorted_order

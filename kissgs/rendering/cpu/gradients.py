@@ -11,7 +11,6 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from kissgs.core.array_types import Bool, Float32, Int32, Shaped
-from kissgs.core.reused_memory import empty
 from kissgs.core.splats import SH_C0
 from kissgs.core.threads import Workers
 from kissgs.rendering.cpu import blending_backward, projection_backward, shading
@@ -77,10 +76,10 @@ def differentiate(
     changed = slots.rows[any_gradient[slots.rows]]
     count = len(changed)
     found = Gradients(
-        empty(count, np.int32),
-        *(empty((count, *getattr(splats, field.name).shape[1:]), np.float32) for field in fields(Gradients)[1:]),
+        np.empty(count, np.int32),
+        *(np.empty((count, *getattr(splats, field.name).shape[1:]), np.float32) for field in fields(Gradients)[1:]),
     )
-    v_colors = empty((count, 3), np.float64)
+    v_colors = np.empty((count, 3), np.float64)
 
     def project(first: int, last: int) -> None:
         projection_backward.project_backward(
@@ -137,7 +136,7 @@ def differentiate_footprints(
     """
     lists, changed = frame.lists, np.zeros(len(frame.footprints.records), bool)
     slots = number_slots(frame.footprints, lists, 0, len(lists.starts) - 1)
-    v_slots = empty((len(lists.members), 9), np.float32)
+    v_slots = np.empty((len(lists.members), 9), np.float32)
     v_slots.fill(0)  # members behind the end of all pixels get nothing
 
     def blend(first: int, last: int) -> None:

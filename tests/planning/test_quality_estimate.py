@@ -1,0 +1,74 @@
+"""The default quality and the lambda for an error. Oracle: sums written by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.codec_scenes import random_scene
+from helpers.random_sensitivity import random_sensitivity
+
+from kissgs.planning.codebook_error import CodebookErrorModel
+from kissgs.planning.gaussian_costs import Costs
+from kissgs.planning.quality_estimate import MIN_ERROR_RATIO, default_error, error_at, lambda_for
+
+
+def test_lambda_for_gives_the_requested_error():
+    splats = random_scene(4000, 3, seed=1)
+    costs = Costs.of(random_sensitivity(splats), splats)
+    sh_model = CodebookErrorModel(1024, 1e-6, 2e-6)
+    for error in (1e-6, 1e-4):
+        rd_lambda = lambda_for(error, costs, sh_model, 10, 7, 0.2)
+        np.testing.assert_allclose(error_at(rd_lambda, costs, sh_model, 10, 7, 0.2), error, rtol=0.05)
+    least = error_at(1e-22, costs, sh_model, 10, 7, 0.2)  # what the largest codebook leaves
+    rd_lambda = lambda_for(least / 100, costs, sh_model, 10, 7, 0.2)
+    np.testing.assert_allclose(error_at(rd_lambda, costs, sh_model, 10, 7, 0.2), MIN_ERROR_RATIO * least, rtol=0.05)
+    sizes = [sh_model.best_size(rd_lambda, 100_000, 7) for rd_lambda in (1e-14, 1e-12, 1e-10)]
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[0] <= round(100_000 / 7)
+    assert sh_model.best_size(1e-20, 6000, 7) == 3000
+
+
+def spoiled(splats, name, far):
+    """One Gaussian far out, and otherwise the same."""
+    values = getattr(splats, name).copy()
+    values[0] += np.float32(far)
+    return replace(splats, **{name: values})
+
+
+@pytest.mark.parametrize("name", ["scales", "sh0", "opacities"])
+def test_one_outlier_does_not_spoil_the_quality_that_is_aimed_at(name):
+    """However far out it is: the paper's levels lie farther and farther apart, the steps of ``fast`` do not."""
+    splats = random_scene(3000, 0, seed=2)
+    costs, kept = Costs.of(random_sensitivity(splats), splats), np.arange(3000)
+    costs = replace(costs, position=np.zeros(3000))
+    scenes = [splats, *(spoiled(splats, name, far) for far in (600, 6000, 60000))]
+    usual, *found = (default_error(costs, scene, kept, CodebookErrorModel()) for scene in scenes)
+    steps = {"opacity": 0.15, "scale": 0.11 * 3**0.5, "rotation": 2 * 0.023 * 3**0.5, "color": 0.055 * 3**0.5}
+    fast = sum(float(getattr(costs, of).sum()) * step**2 / 12 for of, step in steps.items())
+    np.testing.assert_allclose(found, fast, rtol=1e-6)
+    assert usual <= fast
+
+
+def test_the_quality_aimed_at_is_the_papers_where_its_steps_are_finer():
+    """Opacities alone count: 256 levels over their extent, or a step of 0.15."""
+    splats = random_scene(500, 0, seed=3)
+    kept, count = np.arange(500), 500
+    no_cost = {name: np.zeros(count) for name in ("scale", "rotation", "color", "position")}
+    costs = Costs(opacity=np.full(count, 1e-6), removal=np.ones(count), coverage=np.ones(count), **no_cost)
+    for extent in (10.0, 100.0):
+        scene = replace(splats, opacities=np.linspace(0, extent, count, dtype=np.float32))
+        step = min(extent / 255, 0.15)
+        wanted = count * 1e-6 * step**2 / 12
+        np.testing.assert_allclose(default_error(costs, scene, kept, CodebookErrorModel()), wanted, rtol=1e-5)
+
+
+def test_rounding_a_gaussian_costs_at_most_twice_its_removal():
+    """A few long, thin ones, whose Hessians grow without bound, do not decide the quality that is aimed at."""
+    splats = replace(random_scene(500, 0, seed=3), opacities=np.linspace(0, 10, 500, dtype=np.float32))
+    opacity, removal = np.full(500, 1e-6), np.full(500, 1e-3)
+    opacity[:3], removal[:2] = 1e6, 2e-9
+    nothing = {name: np.zeros(500) for name in ("scale", "rotation", "color", "position")}
+    costs = Costs(opacity=opacity, removal=removal, coverage=np.ones(500), **nothing)
+    wanted = 2 * 4e-9 + 2e-3 + 497 * 1e-6 * (10 / 255) ** 2 / 12
+    found = default_error(costs, splats, np.arange(500), CodebookErrorModel())
+    np.testing.assert_allclose(found, wanted, rtol=1e-5)
