@@ -12,7 +12,7 @@ from pathlib import Path
 from kissgs.io.packed_files import open_source
 from kissgs.io.webp import decode_plane, encode_plane, probe_webp
 
-EFFORTS = ((25, 0), (25, 1), (50, 1), (50, 2), (75, 2), (75, 4))
+EFFORTS = ((25, 0), (25, 1), (25, 4), (50, 1), (50, 2), (75, 2), (75, 4))
 """Quality and method; (50, 2) is that of the preset fast, (75, 4) that of balanced."""
 
 

@@ -31,13 +31,13 @@ class FailedMeasurement:
 
     Attributes:
         scene: name of the scene.
-        name: name of the codec, as in tables.
+        codec: name of the codec: a preset or an external format.
         gaussians: number of Gaussians in the scene.
         failure: error message.
     """
 
     scene: str
-    name: str
+    codec: str
     gaussians: int
     failure: str
 
@@ -92,20 +92,20 @@ def measure_scaling(
         for count in counts:
             make = partial(_write_scene, source, count, path, plan.threads, converted=bool(plan.external_codecs))
             problem = ""
+            path.unlink(missing_ok=True)
             progress("measure", done / max(jobs, 1), f"scene of {count:,}")
             try:
                 isolated(make, f"the scene of {count:,} Gaussians")
             except (KissgsError, MemoryError) as error:
                 problem = _reason(error)
             for codec, measure in measurements(path, plan):
-                shown = f".{codec}" if codec in plan.external_codecs else codec
                 progress("measure", done / jobs, f"{codec}, {count:,}")
                 try:
                     if problem:
                         raise UnsupportedError(problem)
                     yield replace(measure(), scene=name)
                 except (KissgsError, MemoryError) as error:
-                    yield FailedMeasurement(scene=name, name=shown, gaussians=count, failure=_reason(error))
+                    yield FailedMeasurement(scene=name, codec=codec, gaussians=count, failure=_reason(error))
                 done += 1
 
 

@@ -26,7 +26,7 @@ def scaling_tables(rows: Sequence[Measurement], failed: Sequence[FailedMeasureme
         if here:
             blocks.append(metrics_table(here))
         missing = [row for row in failed if row.scene == scene]
-        blocks += [Text(f"{row.name}, {row.gaussians:,}: {row.failure}", style="red") for row in missing]
+        blocks += [Text(f"{row.codec}, {row.gaussians:,}: {row.failure}", style="red") for row in missing]
         for name in dict.fromkeys(row.name for row in here if not row.is_external):
             curve = [row for row in here if row.name == name]
             sizes, runs = [f"{row.gaussians:,}" for row in curve], [row.median_run for row in curve]

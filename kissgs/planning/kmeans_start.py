@@ -43,7 +43,7 @@ def start(
         centroids, labels, distances = _split(data, labels, shares, iterations, rng, pool)
         counts = np.bincount(labels, minlength=len(centroids))
         errors = np.bincount(labels, distances * data.weights, minlength=len(centroids))
-    near = _near(centroids, np.concatenate([[0], np.cumsum(shares)]), neighbors, pool)
+    near = near_centroids(centroids, np.concatenate([[0], np.cumsum(shares)]), neighbors, pool)
     members, edges = sorted_by_label(labels, len(centroids))
     state = Clustering(data, centroids, labels, distances, near, members, edges, np.zeros(len(centroids)), errors)
     state.update(pool)
@@ -139,7 +139,7 @@ def assign(
     return labels, np.maximum(distances, 0)
 
 
-def _near(
+def near_centroids(
     centroids: Float32[np.ndarray, "K D"], firsts: Int[np.ndarray, " edges"], count: int, pool: Workers
 ) -> UInt16[np.ndarray, "K k"]:
     """Return for every centroid the nearest ones, itself first, of those in the nearest cells."""
@@ -150,7 +150,9 @@ def _near(
     near = np.empty((len(centroids), min(count, len(centroids))), dtype=np.uint16)
 
     def work(j: int) -> None:
-        order = np.argsort(np.square(centres - centres[j]).sum(axis=1), kind="stable")
+        distances = np.square(centres - centres[j]).sum(axis=1)
+        distances[j] = -1  # before cells of equal centre: the first names are those of the cell itself
+        order = np.argsort(distances, kind="stable")
         order = order[: np.searchsorted(np.cumsum(counts[order]), CANDIDATES * count) + 1]
         names = np.concatenate([np.arange(firsts[c], firsts[c + 1], dtype=np.uint16) for c in order])
         some, own = centroids[names], slice(firsts[j], firsts[j + 1])

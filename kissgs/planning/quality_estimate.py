@@ -36,7 +36,7 @@ shrunk towards the prior."""
 MIN_ERROR_RATIO = 1.1
 """Smallest error to aim at, in units of the smallest possible one: the last 0.4 dB would cost far too many bits."""
 
-SH_UNCOMPENSATED, SH_UNCOMPENSATED_GROWTH = 0.2, 2.7
+SH_UNCOMPENSATED, SH_UNCOMPENSATED_GROWTH = 0.14, 1.9
 """Measured share of shN errors that base colours cannot compensate, and its growth per unit of view uncertainty."""
 
 REFIT_GAIN = 0.17

@@ -24,7 +24,7 @@ from kissgs.planning.rd_fields import RdFields, decoded_entries, decoded_scene, 
 from kissgs.planning.rdo_quantize import largest_changes
 from kissgs.planning.rotation_forms import choose_forms
 from kissgs.planning.rows import for_each_block, selected
-from kissgs.planning.sh_codebook import Codebook, fit_codebook, sensitivity_weights
+from kissgs.planning.sh_codebook import Codebook, fit_codebook, nearest_square, sensitivity_weights
 from kissgs.settings import EncodeSettings
 
 ColorRefit = Callable[[Splats, Int[np.ndarray, " M"]], Float32[np.ndarray, "M 3"]]
@@ -88,6 +88,7 @@ def plan_rate_distortion(
     )
     shapes = shapes.take(grid.mask)
     size = sh_model.best_size(rd_lambda, len(order), settings.gaussians_per_codebook_entry, container.entry_bits)
+    size = nearest_square(size) if container.tables is None else size
     weights = sensitivity_weights(sensitivity, order, splats)
     codebook = fit_codebook(splats, order, weights, size, settings, container, pool, progress)
     del weights

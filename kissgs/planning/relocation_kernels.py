@@ -195,7 +195,7 @@ def relocate(
             last = 1
             while last < count - 1 and near[c, last] != moved:
                 last += 1
-            if c != moved and last > 0:  # the new neighbour comes second, in place of itself or of the last
+            if c != moved and count > 1:  # the new neighbour comes second, in place of itself or of the last
                 while last > 1:
                     near[c, last] = near[c, last - 1]
                     last -= 1

@@ -136,6 +136,11 @@ def fit_codebook(
     return Codebook(side, levels, position[clusters.labels], half_steps(levels))
 
 
+def nearest_square(size: float) -> int:
+    """Return S · S entries, as many as SOG-XT can hold, for the multiple S of 8 nearest to the root of ``size``."""
+    return codebook_side((size**0.5 + 4) ** 2) ** 2
+
+
 def codebook_side(size: float) -> int:
     """Return S for at most ``size`` entries: a multiple of 8, rounded down, from 8 to 256."""
     side = int(size**0.5) // 8 * 8

@@ -79,16 +79,16 @@ def test_a_failure_is_a_row_and_the_others_are_measured(monkeypatch, same_proces
     assert [type(row) for row in rows] == [Measurement, FailedMeasurement, FailedMeasurement] * 2
     assert rows[4].as_dict() == {
         "scene": "sample, degree 0",
-        "name": "small",
+        "codec": "small",
         "gaussians": 20,
         "failure": "the measurement was killed",
     }
-    assert (rows[5].name, rows[5].failure) == (".spz", "not enough memory: Unable to allocate 9 GiB")
+    assert (rows[5].codec, rows[5].failure) == ("spz", "not enough memory: Unable to allocate 9 GiB")
 
 
 def test_a_scene_that_cannot_be_made_is_a_row(tmp_path, same_process):
     rows = list(measure_scaling(tmp_path / "none.ply", [10], PLAN))
-    assert [(row.scene, row.name, row.gaussians) for row in rows] == [("none.ply", "fast", 10)]
+    assert [(row.scene, row.codec, row.gaussians) for row in rows] == [("none.ply", "fast", 10)]
     assert "there is no such file" in rows[0].failure
 
 

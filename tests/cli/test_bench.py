@@ -103,7 +103,7 @@ def test_an_interrupt_keeps_what_is_measured(
 ) -> None:
     def interrupted(source: Path | int, *_: object, **__: object) -> Iterator[Measurement | FailedMeasurement]:
         yield measured("fast", 9, 30.0, gaussians=7)
-        yield FailedMeasurement(scene="scene.ply", name="small", gaussians=7, failure="the measurement was killed")
+        yield FailedMeasurement(scene="scene.ply", codec="small", gaussians=7, failure="the measurement was killed")
         raise Interrupted(2)
 
     monkeypatch.setattr("kissgs.benchmark.scaling.measure_scaling", interrupted)

@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kissgs import sample_scene
-from kissgs.core.threads import blas_workers
+from kissgs.core.threads import Workers, blas_workers
 from kissgs.planning.kmeans import KMeansOptions, fit
-from kissgs.planning.kmeans_start import allocate, assign
-from kissgs.planning.sh_codebook import codebook_side
+from kissgs.planning.kmeans_start import allocate, assign, near_centroids
+from kissgs.planning.sh_codebook import codebook_side, nearest_square
 
 
 def run(vectors, size, weights=None, threads=1, report=lambda fraction: None, **options):
@@ -214,3 +214,25 @@ def test_codebook_sides_follow_the_formula(count, ratio):
 def test_codebook_sides_of_the_published_containers():
     known = {8: 24, 32: 56, 128: 120, 256: 176, 512: 248, 1024: 256, 2048: 256}
     assert {thousands: codebook_side(1000 * thousands / 8) for thousands in known} == known
+
+
+@pytest.mark.parametrize(
+    "vectors",
+    [
+        [[-1], [1], [-2], [2], [-3], [3], [10], [11]],  # cells of equal centres
+        [[0], [0], [0], [0], [1], [1], [1], [1]],
+        [[1e-30], [2e-30], [3e-30], [4e-30], [5e-30], [6e-30], [7e-30], [8e-30]],  # squares underflow
+    ],
+)
+def test_each_list_of_near_centroids_holds_the_own_one_first(vectors):
+    centroids, firsts = np.array(vectors, np.float32), np.array([0, 2, 4, 6, 8])
+    with Workers(1) as pool:
+        for count in (2, 3, 8):
+            near = near_centroids(centroids, firsts, count, pool)
+            assert near[:, 0].tolist() == list(range(8))
+            assert all(len(set(row)) == count for row in near.tolist())
+
+
+def test_the_square_nearest_to_a_size():
+    sizes, wanted = (0, 1, 143, 145, 525, 625, 785, 1e6), [64, 64, 64, 256, 576, 576, 1024, 65536]
+    assert [nearest_square(size) for size in sizes] == wanted

@@ -29,18 +29,17 @@ def psnrs(scene, found, views, background=(0, 0, 0)):
 
 
 @pytest.mark.parametrize("background", [(0, 0, 0), (1, 1, 1), (0.2, 0.9, 0.5)])
-@pytest.mark.parametrize(
-    ("preset", "size", "better", "worst"), [("balanced", 0.86, 2.5, -0.5), ("small", 0.75, 0.0, -2.5)]
-)
+@pytest.mark.parametrize("preset", ["balanced", "small"])
 @pytest.mark.quick(1)
-def test_fewer_bytes_than_the_papers_and_better_before_any_background(preset, size, better, worst, background):
-    """The default quality is that of ``fast`` if the paper's levels are too coarse for the scene's ranges, which takes
-    some of the saved bytes. The worst view of ``small`` is worse: the paper's codebook counts all Gaussians equally."""
+def test_fewer_bytes_than_the_papers_and_better_before_any_background(preset, background):
+    """The default quality is that of ``fast`` if the paper's levels are too coarse for the scene's ranges. Here that is
+    more than 2 dB, and takes some of the saved bytes. The paper's codebook counts all Gaussians equally, which helps
+    its worst view."""
     paper, ours = compressed("paper"), compressed(preset)
-    assert len(ours.to_zip()) < size * len(paper.to_zip())
+    assert len(ours.to_zip()) < 0.86 * len(paper.to_zip())
     wanted, found = (psnrs(SCENE, kissgs.decompress(c.files), cameras(), background) for c in (paper, ours))
-    assert found.mean() > wanted.mean() + better
-    assert found.min() > wanted.min() + worst
+    assert found.mean() > wanted.mean() + 2
+    assert found.min() > wanted.min() - 0.5
 
 
 @pytest.mark.parametrize("background", [(0, 0, 0), (1, 1, 1), (0.2, 0.9, 0.5)])

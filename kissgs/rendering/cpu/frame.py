@@ -37,7 +37,7 @@ LIMITS = np.array([constants.ALPHA_MIN, constants.ALPHA_MAX, constants.TRANSMITT
 
 PIXELS_PER_TILE = constants.TILE**2
 
-BAND = 1 << 18
+BAND = 1 << 19
 """Number of members of tiles whose moments are in memory at once."""
 
 
@@ -51,7 +51,7 @@ class Frame:
         transmittance: ``(H, W)`` share of the background that is visible, 1 - alpha.
         camera: the camera.
         background: ``(3,)`` RGB.
-        footprints: Gaussians that touch the image, front to back.
+        footprints: Gaussians that touch the image, in the order of the scene.
         lists: lists of the footprints that touch each tile.
         stops: ``(tiles, 256)`` index of the first member of the tile that is not drawn at the pixel.
     """

@@ -166,13 +166,13 @@ def _check_lists(starts: Int64[np.ndarray, " tiles_1"]) -> None:
     if starts[-1] > MAX_PAIRS:
         raise UnsupportedError(
             f"this view has {starts[-1]:,} pairs of a Gaussian and a tile of the image, more than {MAX_PAIRS:,}; "
-            "render a smaller image"
+            "render a smaller image (sensitivity_view_size where an encoder measures)"
         )
     longest = int(np.diff(starts).max())
     if longest > MAX_MEMBERS:
         raise UnsupportedError(
-            f"{longest:,} Gaussians touch the same 16x16 pixels of this view, more than {MAX_MEMBERS:,}; move the "
-            "camera nearer, or render a larger image"
+            f"{longest:,} Gaussians touch the same 16x16 pixels of this view, more than {MAX_MEMBERS:,}; render "
+            "a larger image (sensitivity_view_size where an encoder measures), or move the camera nearer"
         )
 
 

@@ -61,7 +61,7 @@ def project_backward(
     Args:
         means, quats, scales, opacities, viewmat, K, width, height, constants, records: as for
             :func:`kissgs.rendering.cpu.projection.project`.
-        visible: ``(M,)`` the Gaussian of each footprint.
+        visible: ``(N,)`` the Gaussian of each row that holds a footprint.
         changed: ``(R,)`` footprints.
         slots_from: first slot of each footprint; its slots end where the next footprint's begin.
         v_slots: output of :func:`kissgs.rendering.cpu.blending_backward.blend_backward`.
