@@ -16,6 +16,7 @@ from kissgs.core.splats import SH_C0, clean
 from kissgs.core.threads import Workers
 from kissgs.rendering.color_refit import refit_colors
 from kissgs.rendering.constants import TRANSMITTANCE_MIN
+from kissgs.rendering.cpu import frame
 from kissgs.rendering.rasterizer import removal_scores, render
 from kissgs.rendering.sensitivity import HIDDEN, WeightedCameras, measure_sensitivity
 
@@ -178,6 +179,18 @@ def test_sensitivity_does_not_depend_on_threads():
     one_thread, three = (measure_sensitivity(splats, weighted(view), threads=threads) for threads in (1, 3))
     for name in ("position_hessian", "shape_hessian", "color_weight", "mean_sh_basis"):
         np.testing.assert_array_equal(getattr(one_thread, name), getattr(three, name))
+
+
+@pytest.mark.parametrize("band", [64, 1000])
+def test_sensitivity_does_not_depend_on_bands_of_tiles(monkeypatch, band):
+    scene, views = kissgs.sample_scene(3000, sh_degree=1), weighted(camera(96, 64), camera(64, 96))
+    whole = measure_sensitivity(scene, views)
+    monkeypatch.setattr(frame, "BAND", band)
+    parts = measure_sensitivity(scene, views)
+    for name in ("shape_hessian", "position_hessian", "color_weight", "mean_sh_basis", "coverage"):
+        wanted = getattr(whole, name)
+        np.testing.assert_allclose(getattr(parts, name), wanted, rtol=1e-5, atol=1e-6 * np.abs(wanted).max())
+    np.testing.assert_array_equal(measure_sensitivity(scene, views, threads=1).shape_hessian, parts.shape_hessian)
 
 
 def test_the_sensitivity_of_unseen_gaussians_is_0_without_view_uncertainty():
