@@ -122,7 +122,8 @@ def fit(
     )
     report(0.4)
     for iteration in range(options.iterations):
-        state.refresh_near(pool)
+        if iteration:  # the start has just made the lists
+            state.refresh_near(pool)
         state.relocate(pool)
         state.update(pool)
         state.reassign(pool)

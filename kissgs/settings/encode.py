@@ -221,14 +221,14 @@ class EncodeSettings(BaseModel):
         75,
         ge=0,
         le=100,
-        description="libwebp's effort, 0 to 100; always lossless. Up to 75, images of a megapixel or more take less.",
+        description="libwebp's effort, 0 to 100; always lossless. Up to 75, images of half a megapixel or more take less.",
     )
     webp_method: int = Field(
         4,
         ge=0,
         le=6,
-        description="libwebp's method, 0 (fast) to 6 (small); always lossless. Up to 4, images of a megapixel or more "
-        "take 2 at most.",
+        description="libwebp's method, 0 (fast) to 6 (small); always lossless. Up to 4, images of half a megapixel or "
+        "more take 2 at most.",
     )
     codebook_max_effort: bool = Field(
         True, description="Use libwebp's highest effort for the codebook image: saves 8 % of it in some seconds."
