@@ -221,7 +221,8 @@ class EncodeSettings(BaseModel):
         75,
         ge=0,
         le=100,
-        description="libwebp's effort, 0 to 100; always lossless. Up to 75, images of half a megapixel or more take less.",
+        description="libwebp's effort, 0 to 100; always lossless. Up to 75, images of half a megapixel or more take "
+        "less.",
     )
     webp_method: int = Field(
         4,
