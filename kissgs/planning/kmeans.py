@@ -6,7 +6,8 @@ from the literature replace it:
 - The start is hierarchical: vectors are split among cells, cells among smaller cells, and each of these gets centroids
   in proportion to sqrt(its error × its count).
 - A vector then moves only to one of the centroids nearest to its present one (k²-means: Agustsson, Timofte and Van
-  Gool, CVPR 2017). The lists of near centroids are made once, from the cells, and repaired where centroids move far.
+  Gool, CVPR 2017). The lists of near centroids are made from the cells; later iterations search them again, because the
+  centroids move.
 - Between two such iterations, pairs of similar clusters are merged and spread-out clusters are split, as long as that
   lowers the error (iterative splitting and merging: Kaukoranta, Fränti and Nevalainen, Optical Engineering 37, 1998).
   Plain k-means cannot move a centroid from where it is useless to where it is needed; with this step the error ends
