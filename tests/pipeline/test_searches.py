@@ -15,6 +15,7 @@ from kissgs.pipeline.trial import Trial
 
 SCENE = kissgs.sample_scene(1500, sh_degree=1, seed=5)
 FEW_VIEWS = {"sensitivity_views": 4, "sensitivity_view_size": 48}
+MORE_VIEWS = {"sensitivity_views": 16, "sensitivity_view_size": 96}  # their PSNR is near that of other cameras
 
 
 class Recorded:
@@ -145,9 +146,9 @@ def test_a_target_size_is_met(share):
 @pytest.mark.quick(1)
 def test_a_psnr_is_met(change):
     """The search has other cameras than the evaluation, so that their PSNR may differ."""
-    plain = kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **FEW_VIEWS), evaluate=True)
+    plain = kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **MORE_VIEWS), evaluate=True)
     wanted = plain.report.evaluation.mean.candidate_vs_reference.psnr + change
-    settings = Settings.from_preset("balanced", psnr=wanted, **FEW_VIEWS)
+    settings = Settings.from_preset("balanced", psnr=wanted, **MORE_VIEWS)
     found = kissgs.compress(SCENE, settings=settings, evaluate=True)
     made = max((trial for trial in found.report.trials if trial.bytes == len(found.to_zip())), key=lambda t: t.psnr)
     assert made.psnr >= wanted
@@ -155,7 +156,7 @@ def test_a_psnr_is_met(change):
     too_coarse = min(trial.rd_lambda for trial in found.report.trials if trial.psnr < wanted)
     assert made.psnr <= wanted + 0.1 or too_coarse < 1.5 * made.rd_lambda  # near the goal, or at a jump over it
     assert made.worst <= made.fifth_percentile <= made.psnr
-    assert abs(found.report.evaluation.mean.candidate_vs_reference.psnr - wanted) < 2.5
+    assert abs(found.report.evaluation.mean.candidate_vs_reference.psnr - wanted) < 1.5
     assert found.report.evaluation.mean.candidate_vs_reference.psnr not in [trial.psnr for trial in found.report.trials]
     assert (len(found.to_zip()) > len(plain.to_zip())) == (change > 0)
 
