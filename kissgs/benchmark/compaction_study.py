@@ -13,7 +13,6 @@ from kissgs.cameras.views import TargetSource, Views
 from kissgs.compaction.evaluate import evaluate_scene
 from kissgs.compaction.popspa import Popspa
 from kissgs.compaction.scoring import highest_indices
-from kissgs.core.array_types import Int
 from kissgs.core.errors import InvalidSceneError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
@@ -52,14 +51,21 @@ class CompactionPoint:
         return asdict(self)
 
 
-def random_subset(splats: Splats, count: int) -> Int[np.ndarray, " M"]:
-    """Return ``count`` random indices, ascending, with a fixed seed."""
-    return np.sort(np.random.default_rng(0).permutation(len(splats))[:count])
+def random_subset(splats: Splats, count: int) -> Splats:
+    """Return ``count`` random Gaussians, in their order, with a fixed seed."""
+    return splats.select(np.sort(np.random.default_rng(0).permutation(len(splats))[:count]))
 
 
-def most_opaque(splats: Splats, count: int) -> Int[np.ndarray, " M"]:
-    """Return the indices of the ``count`` most opaque Gaussians, ascending."""
-    return highest_indices(splats.opacities, count)
+def most_opaque(splats: Splats, count: int) -> Splats:
+    """Return the ``count`` most opaque Gaussians, in their order."""
+    return splats.select(highest_indices(splats.opacities, count))
+
+
+def merged(splats: Splats, count: int) -> Splats:
+    """Return ``count`` Gaussians by merging."""
+    from kissgs.compaction.merging import merge_gaussians
+
+    return merge_gaussians(splats, count)[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,13 +75,13 @@ class Strategy:
     Attributes:
         name: name in tables and of the option ``--strategy``.
         training: "none", "after" a single pruning, or "along" with prunings and after the last one.
-        start: function of the scene and the count that returns the indices to keep; None to keep the highest scores.
+        start: function of the scene and the count that returns fewer Gaussians; None to keep the highest scores.
         changes: changes of the compaction settings.
     """
 
     name: str
     training: Literal["none", "after", "along"]
-    start: Callable[[Splats, int], Int[np.ndarray, " M"]] | None = None
+    start: Callable[[Splats, int], Splats] | None = None
     changes: Mapping[str, Any] = field(default_factory=dict)
 
     def apply(self, settings: CompactSettings) -> CompactSettings:
@@ -96,9 +102,11 @@ STRATEGIES = (
     Strategy("opacity", "none", most_opaque),
     Strategy("POP", "none", changes=AT_ONCE),
     Strategy("POP in rounds", "none", changes=IN_ROUNDS),
+    Strategy("merge", "none", merged),
     Strategy("opacity + refine", "after", most_opaque),
     Strategy("POP + refine", "after", changes=AT_ONCE),
     Strategy("POP in rounds + refine", "after", changes=IN_ROUNDS),
+    Strategy("merge + refine", "after", merged),
     Strategy("POP + train + POP + refine", "along", changes=ONE_ROUND),
     Strategy("POP + sparsify + POP + refine", "along", changes={**ONE_ROUND, **ADMM}),
     Strategy("POPSpa", "along", changes={**ONE_ROUND, **ADMM, **ERANK}),
@@ -151,7 +159,7 @@ def compare_strategies(
         for ratio in ratios:
             count = max(1, round(len(splats) * ratio))
             wall, cpu = time.perf_counter(), time.process_time()
-            scene = splats if strategy.start is None else splats.select(strategy.start(splats, count))
+            scene = splats if strategy.start is None else strategy.start(splats, count)
             task = Popspa(
                 scene,
                 strategy.apply(settings),

@@ -34,6 +34,14 @@ def compact(
         float | None,
         typer.Option(metavar="DB", help="Keep as few Gaussians as lose at most this PSNR. Takes several runs."),
     ] = None,
+    method: Annotated[
+        str,
+        typer.Option(
+            metavar="METHOD",
+            help="prune: remove what images miss least, and train the rest. merge: replace neighbours by one Gaussian; "
+            "takes seconds, needs neither views nor torch.",
+        ),
+    ] = "prune",
     views: Annotated[
         Path | None,
         typer.Option(
@@ -81,7 +89,7 @@ def compact(
     ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")] = False,
 ) -> None:
-    """Reduce the number of Gaussians of scenes at nearly equal quality: score, prune and train (POPSpa)."""
+    """Reduce the number of Gaussians of scenes at nearly equal quality: score, prune and train (POPSpa), or merge."""
     from kissgs.cli.console import progress_bar
     from kissgs.cli.signals import stoppable
     from kissgs.io.ply import write_ply
@@ -94,6 +102,7 @@ def compact(
         changes,
         group="compact",
         seed=seed,
+        method=method,
         count=None if count is None else count_of(count),
         ratio=ratio,
         max_psnr_drop=max_psnr_drop,

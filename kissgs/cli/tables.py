@@ -93,7 +93,8 @@ def _compaction(report: CompactionReport) -> list[RenderableType]:
     if not report.steps:
         return lines
     trained = {"photos": "trained on photographs", "renderings": "trained on renderings of the scene"}
-    lines.append(Text(f"{trained.get(report.target_source, 'scored with')}: {report.source}"))
+    if report.source:
+        lines.append(Text(f"{trained.get(report.target_source, 'scored with')}: {report.source}"))
     evaluated = report.steps[0].bytes is not None
     columns = [_right(name) for name in ("Gaussians", "seconds", *(("PSNR", "SSIM", "bytes") if evaluated else ()))]
     table = Table("step", *columns, box=None, pad_edge=False)

@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from kissgs.cameras.views import Views
+from kissgs.compaction.evaluate import step_log
 from kissgs.compaction.popspa import Popspa
 from kissgs.compaction.result import Compacted, CompactionReport
+from kissgs.compaction.step_log import StepLog
 from kissgs.core.errors import StopSearch, UnsupportedError
 from kissgs.core.progress import Progress, as_stage, silent
 from kissgs.core.root_finding import find_root
@@ -85,6 +87,8 @@ def compact_scene(
     count = settings.count or max(1, round(len(splats) * (settings.ratio or 0.0)))
     if count >= len(splats):
         return unchanged(splats, "no more than requested")
+    if settings.method == "merge" and not evaluate and settings.max_psnr_drop is None:  # no cameras are needed
+        return _merge(splats, count, StepLog(None), "", threads, progress)
     compactor = Compactor.of(splats, settings, views, threads=threads, device=device, progress=progress)
     if settings.max_psnr_drop is None:
         return compactor(count, evaluate=evaluate, checkpoint=checkpoint)
@@ -99,6 +103,19 @@ def unchanged(splats: Splats, reason: str) -> Compacted:
         source_count=len(splats), count=len(splats), target_source="nothing", source="", steps=(), note=note
     )
     return Compacted(splats, np.arange(len(splats)), report)
+
+
+def _merge(splats: Splats, count: int, log: StepLog, note: str, threads: int, progress: Progress) -> Compacted:
+    """Return the scene with ``count`` Gaussians by merging."""
+    from kissgs.compaction.merging import merge_gaussians  # loads kernels that pruning does not need
+
+    log.record("input", splats)
+    merged, index = merge_gaussians(splats, count, threads=threads, progress=progress)
+    log.record("merge", merged)
+    report = CompactionReport(
+        source_count=len(splats), count=count, target_source="nothing", source="", steps=tuple(log.steps), note=note
+    )
+    return Compacted(merged, index, report)
 
 
 @dataclass(slots=True, eq=False)
@@ -156,6 +173,9 @@ class Compactor:
 
         ``evaluate`` and ``checkpoint`` are those of :func:`compact_scene`.
         """
+        if self.settings.method == "merge":
+            log = step_log(evaluate, self.splats, self.supervision, self.threads, self.progress)
+            return _merge(self.splats, count, log, self.supervision.note, self.threads, self.progress)
         if self._targets is None and self.settings.trains:
             from kissgs.training.targets import training_targets
 

@@ -1,8 +1,11 @@
-"""Evaluation of a compacted scene: image quality in views that no training used, and the size of its container."""
+"""Evaluation of compacted scenes: image quality in views that no training used, and the size of the container."""
 
 from __future__ import annotations
 
+from functools import partial
+
 from kissgs.cameras.views import Views
+from kissgs.compaction.step_log import StepLog
 from kissgs.core.progress import Progress, as_stage, silent
 from kissgs.core.splats import Splats
 from kissgs.evaluation.cameras import evaluation_views
@@ -39,6 +42,17 @@ def evaluate_scene(
     evaluation = compare_images(reference, scene, views, threads=threads, progress=as_evaluate)
     encoded = encode(scene, Settings(preset=Preset.FAST).encode, threads=threads, progress=as_evaluate)
     return evaluation.mean.candidate, len(zip_bytes(encoded.files))
+
+
+def step_log(
+    evaluate: bool, reference: Splats, supervision: SupervisionViews, threads: int, progress: Progress
+) -> StepLog:
+    """Return an empty log, which evaluates each step if ``evaluate``; see :func:`evaluate_scene`."""
+    if not evaluate:
+        return StepLog(None)
+    return StepLog(
+        partial(evaluate_scene, reference=reference, supervision=supervision, threads=threads, progress=progress)
+    )
 
 
 def _views(reference: Splats, supervision: SupervisionViews, threads: int, progress: Progress) -> Views:

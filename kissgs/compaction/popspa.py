@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +11,7 @@ import numpy as np
 
 from kissgs.cameras.virtual.scene_bounds import scene_bounds
 from kissgs.compaction.checkpoint_state import State, Status, work_key
-from kissgs.compaction.evaluate import evaluate_scene
+from kissgs.compaction.evaluate import step_log
 from kissgs.compaction.result import Compacted, CompactionReport
 from kissgs.compaction.schedule import Phase, first_pruning_count, lr_schedule, stage_progress, training_phases
 from kissgs.compaction.scoring import prune_by_score
@@ -86,26 +85,14 @@ class Popspa:
         key = ""
         if checkpoint is not None:
             key = work_key(scenes, count, self.settings, self.supervision, evaluate, self.device)
-        compacted = _Run(self, count, Checkpoint(checkpoint, key), self._step_log(evaluate)).run()
+        log = step_log(evaluate, self.original, self.supervision, self.threads, self.progress)
+        compacted = _Run(self, count, Checkpoint(checkpoint, key), log).run()
         return replace(compacted, checkpoint=checkpoint) if self.settings.trains else compacted
 
     @property
     def original(self) -> Splats:
         """The original scene: the reference, or else the scene itself."""
         return self.reference or self.splats
-
-    def _step_log(self, evaluate: bool) -> StepLog:
-        if not evaluate:
-            return StepLog(None)
-        return StepLog(
-            partial(
-                evaluate_scene,
-                reference=self.original,
-                supervision=self.supervision,
-                threads=self.threads,
-                progress=self.progress,
-            )
-        )
 
 
 @dataclass(slots=True, eq=False)

@@ -17,7 +17,7 @@ class CompactionStep:
     """One step of a compaction, and the scene after it.
 
     Attributes:
-        name: "input", "prune", "sparsify" or "refine".
+        name: "input", "prune", "merge", "sparsify" or "refine".
         count: number of Gaussians after the step.
         seconds: wall time, evaluation excluded.
         psnr: decibels, mean over held-out views, to their photographs; without photographs, over cameras drawn over the
@@ -41,8 +41,8 @@ class CompactionReport:
     Attributes:
         source_count: number of Gaussians before, cleaned.
         count: number of Gaussians after.
-        target_source: training targets: "photos", or "renderings" of the input; "nothing" if it was only pruned.
-        source: description of the training views.
+        target_source: training targets: "photos", or "renderings" of the input; "nothing" without training.
+        source: description of the training views; empty if no view was used.
         steps: all steps in order, the input first; empty if the scene is unchanged.
         trials: counts that a search tried, and the drop of PSNR of each, decibels; empty if the count was given.
         cleaned: invalid values of the input that cleaning removed or replaced.
@@ -76,7 +76,8 @@ class Compacted:
 
     Attributes:
         splats: the scene, clean.
-        index: ``(M,)`` index in the cleaned input of each of its Gaussians, ascending.
+        index: ``(M,)`` index in the cleaned input of each of its Gaussians, ascending; of merged ones, that of
+            the member with the largest weight, in any order.
         report: effort and results.
         checkpoint: file with the final state of the training; to be deleted once the scene is saved. None if there is
             no such file.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Self
+from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -26,6 +26,11 @@ class CompactSettings(TrainingViewSettings):
         False,
         description="Choose the number of Gaussians that meets the goal of encode best. Needs target_size, psnr or "
         "max_psnr_drop of encode.",
+    )
+    method: Literal["prune", "merge"] = Field(
+        "prune",
+        description="prune: remove the Gaussians that images miss least, and train the rest. merge: replace neighbours "
+        "by one Gaussian with their mean, covariance, colour and opacity; no images, no cameras, no training.",
     )
     max_compactions: int = Field(
         3, ge=1, le=20, description="With auto_count: largest number of compactions that are tried."
@@ -118,12 +123,12 @@ class CompactSettings(TrainingViewSettings):
 
     @property
     def steps(self) -> int:
-        """Total number of training steps."""
-        return self.sparsify_steps + self.refine_steps
+        """Total number of training steps; 0 where Gaussians merge."""
+        return 0 if self.method == "merge" else self.sparsify_steps + self.refine_steps
 
     @property
     def trains(self) -> bool:
-        """Whether the scene is trained after pruning."""
+        """Whether the scene is trained."""
         return self.steps > 0
 
     @model_validator(mode="after")

@@ -1,0 +1,280 @@
+"""Numba kernels of merging: moments, opacity and error of two Gaussians that become one.
+
+An image of a Gaussian is taken as ``alpha exp(-x' C^-1 x / 2)``, C being its covariance along one of the three axes of
+the world, plus the variance of a blur. Integrals of products of two such images have a closed form.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from kissgs.core.numba_kernels import compiled
+
+
+@njit(nogil=True, error_model="numpy")
+def _image(covariance: np.ndarray, axis: int, blur: float) -> tuple[float, float, float, float]:
+    """Return xx, xy, yy and the determinant of a covariance's image along an axis; the determinant is positive."""
+    if axis == 0:
+        xx, xy, yy = covariance[3], covariance[4], covariance[5]
+    elif axis == 1:
+        xx, xy, yy = covariance[0], covariance[2], covariance[5]
+    else:
+        xx, xy, yy = covariance[0], covariance[1], covariance[3]
+    xx, yy = xx + blur, yy + blur
+    return xx, xy, yy, max(xx * yy - xy * xy, 1e-12 * xx * yy)  # rounding leaves nothing of a needle's
+
+
+@njit(nogil=True, error_model="numpy")
+def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float, float], dx: float, dy: float) -> float:
+    """Return the integral of the product of two images of peak 1 whose centres differ by (dx, dy)."""
+    xx, xy, yy = a[0] + b[0], a[1] + b[1], a[2] + b[2]
+    determinant = max(xx * yy - xy * xy, 1e-12 * xx * yy)
+    exponent = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / determinant
+    return 2 * math.pi * math.sqrt(a[3]) * math.sqrt(b[3] / determinant) * math.exp(-0.5 * exponent)
+
+
+@njit(nogil=True, error_model="numpy")
+def _overlap_of_three(
+    a: tuple[float, float, float, float],
+    b: tuple[float, float, float, float],
+    c: tuple[float, float, float, float],
+    bx: float,
+    by: float,
+    cx: float,
+    cy: float,
+) -> float:
+    """Return the integral of the product of three images of peak 1; ``a`` is at the origin, others at (x, y)."""
+    xx, xy, yy = a[0] + b[0], a[1] + b[1], a[2] + b[2]
+    determinant = max(xx * yy - xy * xy, 1e-12 * xx * yy)
+    height = math.exp(-0.5 * (yy * bx * bx - 2 * xy * bx * by + xx * by * by) / determinant)
+    if height == 0:
+        return 0.0
+    # The product of a and b is a Gaussian: gain G = a (a + b)^-1, centre G b, covariance a - G a.
+    g00, g01 = (a[0] * yy - a[1] * xy) / determinant, (a[1] * xx - a[0] * xy) / determinant
+    g10, g11 = (a[1] * yy - a[2] * xy) / determinant, (a[2] * xx - a[1] * xy) / determinant
+    pxx = max(a[0] - (g00 * a[0] + g01 * a[1]), 1e-12 * a[0])
+    pyy = max(a[2] - (g10 * a[1] + g11 * a[2]), 1e-12 * a[2])
+    pxy = a[1] - (g00 * a[1] + g01 * a[2])
+    product = pxx, pxy, pyy, max(pxx * pyy - pxy * pxy, 1e-12 * pxx * pyy)
+    return height * _overlap(product, c, g00 * bx + g01 * by - cx, g10 * bx + g11 * by - cy)
+
+
+@njit(nogil=True, error_model="numpy")
+def _join(
+    i: int, j: int, means: np.ndarray, covariances: np.ndarray, weights: np.ndarray, mean: np.ndarray, out: np.ndarray
+) -> float:
+    """Compute mean and covariance of a mixture of two Gaussians; return the share of ``i`` in it."""
+    share = weights[i] / (weights[i] + weights[j])
+    at = 0
+    for a in range(3):
+        da = means[i, a] - means[j, a]
+        mean[a] = means[j, a] + share * da
+        for b in range(a, 3):
+            between = share * (1 - share) * da * (means[i, b] - means[j, b])
+            out[at] = share * covariances[i, at] + (1 - share) * covariances[j, at] + between
+            at += 1
+    return share
+
+
+@njit(nogil=True, error_model="numpy")
+def _opacity(
+    i: int,
+    j: int,
+    means: np.ndarray,
+    covariances: np.ndarray,
+    alphas: np.ndarray,
+    mean: np.ndarray,
+    covariance: np.ndarray,
+    blur: float,
+) -> float:
+    """Return the opacity with which the joint Gaussian is nearest, in least squares, to the alpha of both together.
+
+    Both together have the alpha ``a + b - a b``. The result is 1e-6 to 1 - 1e-6.
+    """
+    target = square = 0.0
+    for axis in range(3):
+        x, y = (1, 2) if axis == 0 else (0, 2 if axis == 1 else 1)
+        joint = _image(covariance, axis, blur)
+        a, b = _image(covariances[i], axis, blur), _image(covariances[j], axis, blur)
+        ax, ay = means[i, x] - mean[x], means[i, y] - mean[y]
+        bx, by = means[j, x] - mean[x], means[j, y] - mean[y]
+        target += alphas[i] * _overlap(a, joint, ax, ay) + alphas[j] * _overlap(b, joint, bx, by)
+        target -= alphas[i] * alphas[j] * _overlap_of_three(a, b, joint, bx - ax, by - ay, -ax, -ay)
+        square += _overlap(joint, joint, 0.0, 0.0)
+    return min(max(target / square, 1e-6), 1 - 1e-6)
+
+
+@njit(nogil=True, error_model="numpy")
+def _error(
+    i: int,
+    j: int,
+    means: np.ndarray,
+    covariances: np.ndarray,
+    alphas: np.ndarray,
+    mean: np.ndarray,
+    covariance: np.ndarray,
+    alpha: float,
+    blur: float,
+    first: float,
+    second: float,
+    cross: float,
+    contrast: float,
+) -> float:
+    """Return the squared image error, world units squared, of drawing the joint Gaussian instead of two.
+
+    A sum over the three axes. ``first``, ``second`` and ``cross`` are squares and product of the colour differences of
+    ``i`` and ``j`` from the joint colour, sums over RGB; ``contrast`` is the squared contrast to what is behind.
+    """
+    error = 0.0
+    for axis in range(3):
+        x, y = (1, 2) if axis == 0 else (0, 2 if axis == 1 else 1)
+        joint = _image(covariance, axis, blur)
+        a, b = _image(covariances[i], axis, blur), _image(covariances[j], axis, blur)
+        ax, ay = means[i, x] - mean[x], means[i, y] - mean[y]
+        bx, by = means[j, x] - mean[x], means[j, y] - mean[y]
+        both = alphas[i] * alphas[j] * _overlap(a, b, ax - bx, ay - by)
+        error += (first + contrast) * alphas[i] ** 2 * _overlap(a, a, 0.0, 0.0)
+        error += (second + contrast) * alphas[j] ** 2 * _overlap(b, b, 0.0, 0.0) + 2 * (cross + contrast) * both
+        mixed = alphas[i] * _overlap(a, joint, ax, ay) + alphas[j] * _overlap(b, joint, bx, by)
+        error += contrast * alpha * (alpha * _overlap(joint, joint, 0.0, 0.0) - 2 * mixed)
+    return max(error, 0.0)
+
+
+@compiled("void(float64[:, ::1], float64[::1], float64[::1], float64, int64, int64, float64[::1])")
+def opacity_areas(
+    covariances: np.ndarray,
+    alphas: np.ndarray,
+    spacing: np.ndarray,
+    blur: float,
+    first: int,
+    last: int,
+    weights: np.ndarray,
+) -> None:
+    """Compute each Gaussian's opacity times its area, the mean over the three axes, into ``weights``, ``(N,)``.
+
+    Args:
+        covariances: ``(N, 6)``.
+        alphas: ``(N,)`` opacities.
+        spacing: ``(N,)`` squared distances to neighbours.
+        blur: variance of the blur in units of ``spacing``.
+        first: first row.
+        last: end of the rows, exclusive.
+        weights: out.
+    """
+    for n in range(first, last):
+        area = 0.0
+        for axis in range(3):
+            area += math.sqrt(_image(covariances[n], axis, blur * spacing[n])[3])
+        weights[n] = alphas[n] * area
+
+
+@compiled(
+    "void(float64[:, ::1], float64[:, ::1], float64[::1], float32[:, ::1], float64[::1], float64[::1], float64[::1], "
+    "float64, float64, int32[:, ::1], int64, int64, float64[::1], float64[::1])"
+)
+def pair_errors(
+    means: np.ndarray,
+    covariances: np.ndarray,
+    alphas: np.ndarray,
+    colors: np.ndarray,
+    weights: np.ndarray,
+    spacing: np.ndarray,
+    errors: np.ndarray,
+    blur: float,
+    contrast: float,
+    pairs: np.ndarray,
+    first: int,
+    last: int,
+    added: np.ndarray,
+    total: np.ndarray,
+) -> None:
+    """Compute the errors that merging each pair would cause, pairs ``first`` to ``last`` (exclusive).
+
+    Args:
+        means: ``(N, 3)``.
+        covariances: ``(N, 6)``.
+        alphas: ``(N,)`` opacities.
+        colors: ``(N, F)`` SH coefficients. The mean over all directions of a squared colour difference is the sum of
+            squared differences of the coefficients, divided by 4 pi.
+        weights: ``(N,)``, see :func:`opacity_areas`.
+        spacing: ``(N,)`` squared distances to neighbours.
+        errors: ``(N,)`` errors that earlier merges have caused.
+        blur: variance of the blur in units of ``spacing``.
+        contrast: squared contrast to what is behind, a sum over RGB.
+        pairs: ``(P, 2)`` indices.
+        first: first pair.
+        last: end of the pairs, exclusive.
+        added: out, ``(P,)`` what the error grows by. Errors of repeated merges are alike: their amplitudes add.
+        total: out, ``(P,)`` error of the joint Gaussian.
+    """
+    mean, covariance = np.empty(3), np.empty(6)
+    for at in range(first, last):
+        i, j = pairs[at, 0], pairs[at, 1]
+        width = blur * 0.5 * (spacing[i] + spacing[j])
+        share = _join(i, j, means, covariances, weights, mean, covariance)
+        alpha = _opacity(i, j, means, covariances, alphas, mean, covariance, width)
+        difference = 0.0
+        for c in range(colors.shape[1]):
+            difference += (np.float64(colors[i, c]) - np.float64(colors[j, c])) ** 2
+        difference /= 4 * math.pi
+        first_, second = (1 - share) ** 2 * difference, share**2 * difference
+        cross = -share * (1 - share) * difference
+        error = _error(
+            i, j, means, covariances, alphas, mean, covariance, alpha, width, first_, second, cross, contrast
+        )
+        before = errors[i] + errors[j]
+        added[at] = error + 2 * math.sqrt(error * before)
+        total[at] = before + added[at]
+
+
+@compiled("int64(int64[::1], int32[:, ::1], int64, int64[::1])")
+def choose(order: np.ndarray, pairs: np.ndarray, count: int, chosen: np.ndarray) -> int:
+    """Choose pairs in this order of which no two share a Gaussian, until ``chosen`` is full; return their number.
+
+    Args:
+        order: ``(P,)`` indices of pairs.
+        pairs: ``(P, 2)`` indices of Gaussians.
+        count: number of Gaussians.
+        chosen: out, indices of the pairs.
+    """
+    used, found = np.zeros(count, np.bool_), 0
+    for at in order:
+        i, j = pairs[at, 0], pairs[at, 1]
+        if not (used[i] or used[j]):
+            used[i] = used[j] = True
+            chosen[found] = at
+            found += 1
+            if found == chosen.shape[0]:
+                break
+    return found
+
+
+@compiled(
+    "void(float64[:, ::1], float64[:, ::1], float64[::1], float32[:, ::1], float64[::1], float64[::1], float64, "
+    "int32[:, ::1], int64, int64)"
+)
+def merge(
+    means: np.ndarray,
+    covariances: np.ndarray,
+    alphas: np.ndarray,
+    colors: np.ndarray,
+    weights: np.ndarray,
+    spacing: np.ndarray,
+    blur: float,
+    pairs: np.ndarray,
+    first: int,
+    last: int,
+) -> None:
+    """Merge pairs ``first`` to ``last`` (exclusive) into the row of the first of each; see :func:`pair_errors`."""
+    mean, covariance = np.empty(3), np.empty(6)
+    for at in range(first, last):
+        i, j = pairs[at, 0], pairs[at, 1]
+        share = _join(i, j, means, covariances, weights, mean, covariance)
+        width = blur * 0.5 * (spacing[i] + spacing[j])
+        alphas[i] = _opacity(i, j, means, covariances, alphas, mean, covariance, width)
+        means[i], covariances[i] = mean, covariance
+        for c in range(colors.shape[1]):
+            colors[i, c] = share * colors[i, c] + (1 - share) * colors[j, c]
