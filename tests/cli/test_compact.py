@@ -57,6 +57,39 @@ def test_the_preset_fast_only_prunes(folder: Path, tmp_path: Path) -> None:
     assert len(found) == 99
 
 
+def test_merging_takes_neither_views_nor_training(folder: Path, tmp_path: Path) -> None:
+    words = ["compact", folder / "a.ply", "--ratio", "0.2", "--method", "merge"]
+    done = run(*words, "-o", tmp_path / "b.ply")
+    assert done.returncode == 0, done.stderr
+    expected = kissgs.compact(SCENE, settings=kissgs.Settings.from_preset(compact={"ratio": 0.2, "method": "merge"}))
+    assert same(kissgs.load(tmp_path / "b.ply"), expected.splats)
+    rows = [row.split()[:2] for row in done.stdout.decode().splitlines() if row.startswith(("input", "merge"))]
+    assert rows == [["input", "1,500"], ["merge", "300"]]
+    report = json.loads(run(*words, "-o", tmp_path / "c.ply", "--evaluate", "--json").stdout)
+    assert [step["name"] for step in report["steps"]] == ["input", "merge"]
+    assert 15 < report["steps"][1]["psnr"] < 60
+    searched = json.loads(
+        run(
+            "compact",
+            folder / "a.ply",
+            "--max-psnr-drop",
+            "0.3",
+            "--method",
+            "merge",
+            *OPTIONS,
+            "--json",
+            "-o",
+            tmp_path / "d.ply",
+        ).stdout
+    )
+    assert max(drop for count, drop in searched["trials"] if count == searched["count"]) <= 0.3
+
+
+def test_an_unknown_method_is_refused(folder: Path, tmp_path: Path) -> None:
+    words = ["compact", folder / "a.ply", "--ratio", "0.2", "-o", tmp_path / "b.ply"]
+    assert "setting method: input should be 'prune' or 'merge', not 'cluster'" in failure(*words, "--method", "cluster")
+
+
 @pytest.mark.quick(0)
 def test_a_search_prints_its_trials(folder: Path, tmp_path: Path) -> None:
     words = ["-p", "fast", "--set", "views=96", "--set", "view_size=48", "-o", tmp_path / "b.ply"]
