@@ -6,7 +6,7 @@ No image is rendered. What a merge costs is the squared error of its image, in c
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -59,12 +59,24 @@ def merge_gaussians(
     """
     with Workers(threads) as pool:
         clusters = _Clusters(splats, pool)
-        while len(clusters.means) > count:
-            left = len(clusters.means)
+        for left in clusters.reduce(count):
             progress("merge", 1 - np.log(left / count) / np.log(len(splats) / count))
-            clusters.merge(min(left - count, max(1, int(left * LARGEST_STEP))))
         progress("merge", 1.0)
         return clusters.splats(), clusters.origin
+
+
+def merged_levels(splats: Splats, counts: Sequence[int], *, threads: int = 0) -> list[Splats]:
+    """Reduce a scene to each of ``counts``, which descend, each result by merging the one before further.
+
+    Arguments and results are those of :func:`merge_gaussians`.
+    """
+    with Workers(threads) as pool:
+        clusters, levels = _Clusters(splats, pool), []
+        for count in counts:
+            for _ in clusters.reduce(count):
+                pass
+            levels.append(clusters.splats())
+        return levels
 
 
 @dataclass(slots=True, eq=False)
@@ -106,7 +118,14 @@ class _Clusters:
         self.errors, self.heaviest = np.zeros(count), np.zeros(count)
         self.origin, self.merged = np.arange(count), np.zeros(count, bool)
 
-    def merge(self, disappearing: int) -> None:
+    def reduce(self, count: int) -> Iterator[int]:
+        """Merge until ``count`` Gaussians are left; before each round, yield how many there are."""
+        while len(self.means) > count:
+            left = len(self.means)
+            yield left
+            self._merge(min(left - count, max(1, int(left * LARGEST_STEP))))
+
+    def _merge(self, disappearing: int) -> None:
         """Merge the pairs that add the least error until this many Gaussians disappear, or fewer if pairs run out."""
         near, spacing = self._neighbours()
         count, weights = len(self.means), np.empty(len(self.means))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -90,6 +91,11 @@ class Splats:
     def select(self, index: Int[np.ndarray, " M"] | Bool[np.ndarray, " N"] | slice) -> Splats:
         """Return the Gaussians at ``index`` (indices, a boolean mask or a slice), in that order."""
         return Splats(**{name: getattr(self, name)[index] for name in ATTRIBUTES})
+
+
+def concatenate(scenes: Sequence[Splats]) -> Splats:
+    """Return one scene with the Gaussians of all scenes, at least one, in their order; their SH degrees are equal."""
+    return Splats(**{name: np.concatenate([getattr(scene, name) for scene in scenes]) for name in ATTRIBUTES})
 
 
 def float32_bytes(count: int, sh_degree: int) -> int:

@@ -65,11 +65,12 @@ def layout_grid(
     pool: Workers,
     report: Callable[[float], None],
     classes: Integer[np.ndarray, " M"] | None = None,
+    groups: UInt16[np.ndarray, " N"] | None = None,
 ) -> Grid:
     """Assign a cell to every Gaussian of ``kept``.
 
     With ``classes`` and the Hilbert order, the Gaussians of class 0 come first, then those of class 1 and so on, each
-    class along its own curve.
+    class along its own curve. With ``groups``, all this is done for group 0, then for group 1 and so on.
 
     Raises:
         UnsupportedError: more Gaussians than one image can hold.
@@ -80,7 +81,7 @@ def layout_grid(
         return Grid(side, nothing, nothing.astype(bool), nothing)
     levels = quantize_means(selected(means, kept), bits=bits, pool=pool).levels
     if settings.order == "hilbert":
-        order = hilbert_order(levels, classes, pool)
+        order = hilbert_order(levels, _with_groups(classes, groups, kept), pool)
         order = np.concatenate([order, np.repeat(order[-1:], side * side - len(order))])
         mask = np.arange(side * side) < len(kept)
     else:
@@ -89,6 +90,16 @@ def layout_grid(
     rank = np.empty(len(kept), dtype=np.int32)
     rank[order[mask]] = np.arange(len(kept), dtype=np.int32)
     return Grid(side, kept.astype(np.int32, copy=False).take(order), mask, rank[order])
+
+
+def _with_groups(
+    classes: Integer[np.ndarray, " M"] | None, groups: UInt16[np.ndarray, " N"] | None, kept: Int[np.ndarray, " M"]
+) -> Integer[np.ndarray, " M"] | None:
+    """Return classes such that the groups follow one another, and the classes within each."""
+    if groups is None:
+        return classes
+    own = groups[kept]
+    return own if classes is None else own * np.uint16(classes.max(initial=0) + 1) + classes
 
 
 def _plas_order(

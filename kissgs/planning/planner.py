@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from kissgs.core.array_types import Int32
+from kissgs.core.array_types import Int32, UInt16
+from kissgs.core.errors import UnsupportedError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats
@@ -27,6 +28,7 @@ def plan_encoding(
     recolor: ColorRefit | None = None,
     container: ContainerModel = EVEN_LEVELS,
     keep_costs: bool = True,
+    groups: UInt16[np.ndarray, " N"] | None = None,
     threads: int = 0,
     progress: Progress = silent,
 ) -> EncodingPlan:
@@ -41,13 +43,17 @@ def plan_encoding(
             the scene.
         container: what the container can hold.
         keep_costs: whether the plan of rate-distortion planning has its costs, which fine-tuning needs.
+        groups: group of each Gaussian, below 16,384: those of a group follow one another in the container, the groups
+            in ascending order. Needs the Hilbert order. None for one group.
         threads: number of threads; 0 means one per processor.
         progress: receives "kernels", "rate_distortion", "order", "forms", "codebook", "sort codebook" and "rounding".
 
     Raises:
         InvalidSceneError: ``sensitivity`` does not fit the scene.
-        UnsupportedError: the scene is too large for one container.
+        UnsupportedError: the scene is too large for one container; groups with another order.
     """
+    if groups is not None and settings.order != "hilbert":
+        raise UnsupportedError("a container with groups of Gaussians needs order=hilbert")
     if sensitivity is not None:
         sensitivity.check(splats)
     load_kernels(progress)
@@ -55,9 +61,18 @@ def plan_encoding(
     with blas_workers(threads) as pool:
         if sensitivity is not None and (sensitivity.color_weight[kept] > 0).any():
             return plan_rate_distortion(
-                splats, kept, sensitivity, recolor, settings, container, pool, progress, keep_costs=keep_costs
+                splats,
+                kept,
+                sensitivity,
+                recolor,
+                settings,
+                container,
+                pool,
+                progress,
+                keep_costs=keep_costs,
+                groups=groups,
             )
-        return plan_uniform(splats, kept, settings, container, pool, progress)
+        return plan_uniform(splats, kept, settings, container, pool, progress, groups)
 
 
 def visible_gaussians(splats: Splats, settings: EncodeSettings) -> Int32[np.ndarray, " K"]:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from kissgs.core.array_types import Bool, Float32, Int, Int32
+from kissgs.core.array_types import Bool, Float32, Int, Int32, UInt16
 from kissgs.core.free_memory import return_free_memory
 from kissgs.core.progress import Progress
 from kissgs.core.sensitivity import Sensitivity
@@ -48,6 +48,7 @@ def plan_rate_distortion(
     progress: Progress,
     *,
     keep_costs: bool = True,
+    groups: UInt16[np.ndarray, " N"] | None = None,
 ) -> EncodingPlan:
     """Plan the Gaussians ``kept``, at least one of which a camera has seen, for a container."""
     progress("rate_distortion", 0.0)
@@ -72,7 +73,7 @@ def plan_rate_distortion(
 
     progress("order", 0.0)
     grid = layout_grid(
-        splats.means, kept, 16, settings, pool, lambda fraction: progress("order", fraction), criterion.classes
+        splats.means, kept, 16, settings, pool, lambda fraction: progress("order", fraction), criterion.classes, groups
     )
     grid = grid.with_padding_last() if container.padding_last else grid
     order = grid.cells[grid.mask]

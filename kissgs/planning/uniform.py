@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kissgs.core.array_types import Float32, Float64, Int
+from kissgs.core.array_types import Float32, Float64, Int, UInt16
 from kissgs.core.free_memory import return_free_memory
 from kissgs.core.progress import Progress
 from kissgs.core.splats import SH_REST_COUNTS, Splats
@@ -44,11 +44,14 @@ def plan_uniform(
     container: ContainerModel,
     pool: Workers,
     progress: Progress,
+    groups: UInt16[np.ndarray, " N"] | None = None,
 ) -> EncodingPlan:
     """Plan the Gaussians ``kept``, which may be none, for a container."""
     progress("order", 0.0)
     bits = settings.means_bits or means_bits(splats, kept, settings.means_tolerance, pool)
-    grid = layout_grid(splats.means, kept, bits, settings, pool, lambda fraction: progress("order", fraction))
+    grid = layout_grid(
+        splats.means, kept, bits, settings, pool, lambda fraction: progress("order", fraction), None, groups
+    )
     grid = grid.with_padding_last() if container.padding_last else grid
     # Padding repeats Gaussians of the scene; in a scene without any, padding is a neutral Gaussian.
     source, cells = (splats, grid.cells) if len(kept) else (_neutral(splats.sh_degree), grid.cells * 0)
