@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 from kissgs.core.array_types import Float32
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.progress import Progress, silent
-from kissgs.core.splats import SH_C0, SH_REST_COUNTS, Splats
+from kissgs.core.splats import BLOCK, SH_C0, SH_REST_COUNTS, Splats, concatenate, empty_splats
 from kissgs.io.compressed_ply import check_compressed, is_compressed, read_compressed
 from kissgs.io.ply_body import check_complete, rows
 from kissgs.io.ply_header import Element, Encoding, PlyFile, open_ply, sh_degree
@@ -83,6 +84,28 @@ def read_ply(source: Path | bytes, *, max_gaussians: int | None = None, progress
         return _read_columns(ply, info.sh_degree, progress)
 
 
+def read_ply_blocks(source: Path, *, progress: Progress = silent) -> Iterator[Splats]:
+    """Yield a scene as :func:`read_ply` reads it, some 65,536 Gaussians at a time.
+
+    PlayCanvas' compressed ``.ply`` comes as one block. Arguments and errors are those of :func:`read_ply`; errors of
+    the body are raised when its block is reached.
+    """
+    with open_ply(source) as ply:
+        info = _check(ply)
+        progress("read", 0.0)
+        if info.compressed:
+            yield read_compressed(ply, info.sh_degree, progress)
+            return
+        columns, waiting, done = _Columns(ply.header.elements["vertex"], info.sh_degree), [], 0
+        for block in rows(ply, columns.vertex):
+            waiting.append(columns.splats(block))
+            done += len(block)
+            if sum(map(len, waiting)) >= BLOCK or done == info.count:
+                yield concatenate(waiting)
+                waiting = []
+                progress("read", done / info.count)
+
+
 def write_ply(file: BinaryWriter, splats: Splats, *, progress: Progress = silent) -> None:
     """Write ``splats`` in INRIA's layout: float32, little-endian, normals zero, the ``f_rest_*`` of the SH degree.
 
@@ -147,28 +170,49 @@ def _rest(k: int) -> tuple[str, ...]:
 
 
 def _read_columns(ply: PlyFile, degree: int, progress: Progress) -> Splats:
-    vertex = ply.header.elements["vertex"]
-    n, k = vertex.count, SH_REST_COUNTS[degree]
-    rgb = _has_rgb(vertex)
-    # f_rest_* has all coefficients of R, then G, then B; shN has R, G, B of the first, then of the second…
-    rest = tuple(f"f_rest_{channel * k + i}" for i in range(k) for channel in range(3))
-    names = (_POSITION, _ROTATION, _SCALE, _OPACITY, _RGB if rgb else _COLOUR, rest)
-    arrays = [np.empty((n, len(group)), np.float32) for group in names]
-    start = 0
-    for block in rows(ply, vertex):
-        part = slice(start, start + len(block))
+    columns = _Columns(ply.header.elements["vertex"], degree)
+    count, start = columns.vertex.count, 0
+    splats = empty_splats(count, SH_REST_COUNTS[degree])
+    for block in rows(ply, columns.vertex):
+        columns.copy(block, splats.select(slice(start, start + len(block))))
+        start += len(block)
+        progress("read", start / count)
+    return splats
+
+
+class _Columns:
+    """The properties of a ``.ply`` that each array of a scene is read from."""
+
+    def __init__(self, vertex: Element, degree: int) -> None:
+        self.vertex = vertex
+        self._k = SH_REST_COUNTS[degree]
+        self._rgb = _has_rgb(vertex)
+
+    def splats(self, block: np.ndarray) -> Splats:
+        """Return the Gaussians of some rows."""
+        splats = empty_splats(len(block), self._k)
+        self.copy(block, splats)
+        return splats
+
+    def copy(self, block: np.ndarray, out: Splats) -> None:
+        """Copy rows to the arrays of ``out``, of the same length."""
+        k, n = self._k, len(block)
+        # f_rest_* has all coefficients of R, then G, then B; shN has R, G, B of the first, then of the second…
+        rest = tuple(f"f_rest_{channel * k + i}" for i in range(k) for channel in range(3))
+        groups = {
+            _POSITION: out.means,
+            _ROTATION: out.quats,
+            _SCALE: out.scales,
+            _OPACITY: out.opacities[:, None],
+            (_RGB if self._rgb else _COLOUR): out.sh0,
+            rest: out.shN.reshape(n, 3 * k),
+        }
         with np.errstate(over="ignore", invalid="ignore"):  # float64 beyond float32 becomes infinite, as it should
-            for group, array in zip(names, arrays, strict=True):
-                for i, name in enumerate(group):
-                    array[part, i] = block[name]
-        start = part.stop
-        progress("read", start / n)
-    means, quats, scales, opacities, sh0, shN = arrays
-    if rgb:
-        _colour_to_sh(sh0)
-    return Splats(
-        means=means, quats=quats, scales=scales, opacities=opacities.reshape(n), sh0=sh0, shN=shN.reshape(n, k, 3)
-    )
+            for names, array in groups.items():
+                for i, name in enumerate(names):
+                    array[:, i] = block[name]
+        if self._rgb:
+            _colour_to_sh(out.sh0)
 
 
 def _colour_to_sh(colour: Float32[np.ndarray, "N 3"]) -> None:
