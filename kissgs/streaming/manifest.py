@@ -1,0 +1,67 @@
+"""``lod-meta.json``: the tree of a streamed SOG."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from kissgs._version import __version__
+from kissgs.core.array_types import Float64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Leaf:
+    """A leaf of the tree.
+
+    Attributes:
+        bounds: ``(2, 3)`` lowest and highest corner.
+        lods: for each level, the file, the first row and the number of rows; levels without rows are absent.
+    """
+
+    bounds: Float64[np.ndarray, "2 3"]
+    lods: Mapping[int, tuple[int, int, int]]
+
+
+def lod_meta(leaves: Sequence[Leaf], levels: int, filenames: Sequence[str]) -> bytes:
+    """Return the manifest.
+
+    Args:
+        leaves: all leaves, neighbours after neighbours.
+        levels: number of levels; 0 is the finest.
+        filenames: metadata file of each container, relative to the manifest.
+    """
+    counts = [sum(leaf.lods[level][2] for leaf in leaves if level in leaf.lods) for level in range(levels)]
+    document = {
+        "version": 1,
+        "asset": {"generator": f"kissgs {__version__}"},
+        "count": counts[0],
+        "counts": counts,
+        "lodLevels": levels,
+        "lodErrors": False,
+        "filenames": list(filenames),
+        "tree": _node(leaves),
+    }
+    return json.dumps(document, separators=(",", ":")).encode()
+
+
+def _node(leaves: Sequence[Leaf]) -> dict[str, Any]:
+    """Return a leaf, or a node with two halves of the leaves."""
+    if len(leaves) == 1:
+        lods = {
+            str(level): dict(zip(("file", "offset", "count"), rows, strict=True))
+            for level, rows in leaves[0].lods.items()
+        }
+        return {"bound": _bound(leaves[0].bounds), "lods": lods}
+    middle = len(leaves) // 2
+    corners = np.stack([leaf.bounds for leaf in leaves])
+    bounds = np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
+    return {"bound": _bound(bounds), "children": [_node(leaves[:middle]), _node(leaves[middle:])]}
+
+
+def _bound(bounds: Float64[np.ndarray, "2 3"]) -> dict[str, list[float]]:
+    low, high = ([float(f"{value:.7g}") for value in corner] for corner in bounds)
+    return {"min": low, "max": high}

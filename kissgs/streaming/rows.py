@@ -1,0 +1,60 @@
+"""Gaussians as rows of float32 numbers in scratch files, which can be appended to and read back bit by bit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from kissgs.core.array_types import Float32
+from kissgs.core.errors import OutputError
+from kissgs.core.splats import SH_REST_COUNTS, Splats
+from kissgs.io.atomic import reason_of
+
+
+def row_bytes(sh_degree: int) -> int:
+    """Return the bytes of one Gaussian."""
+    return 4 * (14 + 3 * SH_REST_COUNTS[sh_degree])
+
+
+def to_rows(splats: Splats) -> Float32[np.ndarray, "N F"]:
+    """Return all numbers of each Gaussian in a row."""
+    rest = splats.shN.reshape(len(splats), 3 * splats.shN.shape[1])
+    return np.concatenate(
+        [splats.means, splats.quats, splats.scales, splats.opacities[:, None], splats.sh0, rest], axis=1
+    )
+
+
+def from_rows(rows: Float32[np.ndarray, "N F"]) -> Splats:
+    """Return the Gaussians of rows."""
+    parts = (np.ascontiguousarray(part) for part in np.split(rows, (3, 7, 10, 11, 14), axis=1))
+    means, quats, scales, opacities, sh0, rest = parts
+    shN = rest.reshape(len(rows), rest.shape[1] // 3, 3)
+    return Splats(means=means, quats=quats, scales=scales, opacities=opacities[:, 0], sh0=sh0, shN=shN)
+
+
+def append_rows(path: Path, rows: Float32[np.ndarray, "N F"]) -> None:
+    """Append rows to a file.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    try:
+        with path.open("ab") as file:
+            file.write(np.ascontiguousarray(rows).data)
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {reason_of(error)}") from error
+
+
+def read_rows(path: Path, sh_degree: int, first: int = 0, count: int = -1) -> Float32[np.ndarray, "N F"]:
+    """Read ``count`` rows from row ``first``; all that follow by default.
+
+    Raises:
+        OutputError: the file cannot be read.
+    """
+    width = row_bytes(sh_degree) // 4
+    try:
+        values = np.fromfile(path, np.float32, count if count < 0 else count * width, offset=first * width * 4)
+    except OSError as error:
+        raise OutputError(f"cannot read {path}: {reason_of(error)}") from error
+    return values.reshape(-1, width)
