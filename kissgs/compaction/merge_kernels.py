@@ -28,11 +28,17 @@ def _image(covariance: np.ndarray, axis: int, blur: float) -> tuple[float, float
 
 
 @njit(nogil=True, error_model="numpy")
+def _squared_distance(xx: float, xy: float, yy: float, determinant: float, dx: float, dy: float) -> float:
+    """Return the squared Mahalanobis distance; for a needle, rounding alone would make it negative, and its exp huge."""
+    return max((yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / determinant, 0.0)
+
+
+@njit(nogil=True, error_model="numpy")
 def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float, float], dx: float, dy: float) -> float:
     """Return the integral of the product of two images of peak 1 whose centres differ by (dx, dy)."""
     xx, xy, yy = a[0] + b[0], a[1] + b[1], a[2] + b[2]
     determinant = max(xx * yy - xy * xy, 1e-12 * xx * yy)
-    exponent = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / determinant
+    exponent = _squared_distance(xx, xy, yy, determinant, dx, dy)
     return 2 * math.pi * math.sqrt(a[3]) * math.sqrt(b[3] / determinant) * math.exp(-0.5 * exponent)
 
 
@@ -49,7 +55,7 @@ def _overlap_of_three(
     """Return the integral of the product of three images of peak 1; ``a`` is at the origin, others at (x, y)."""
     xx, xy, yy = a[0] + b[0], a[1] + b[1], a[2] + b[2]
     determinant = max(xx * yy - xy * xy, 1e-12 * xx * yy)
-    height = math.exp(-0.5 * (yy * bx * bx - 2 * xy * bx * by + xx * by * by) / determinant)
+    height = math.exp(-0.5 * _squared_distance(xx, xy, yy, determinant, bx, by))
     if height == 0:
         return 0.0
     # The product of a and b is a Gaussian: gain G = a (a + b)^-1, centre G b, covariance a - G a.

@@ -125,6 +125,25 @@ def test_moments_opacity_and_error_of_a_pair(seed):
     assert alphas[0] == pytest.approx(alpha, rel=1e-5)
 
 
+@pytest.mark.parametrize("lengths", [1e2, 1e4, 1e6])
+def test_errors_and_opacities_of_needles_far_apart_along_their_own_direction(lengths):
+    """Rounding of their determinants must not make an image's value at a distance larger than its peak."""
+    count, spacing, weights = 50, np.zeros(100), np.ones(100)
+    directions = np.random.default_rng(0).normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    full = np.exp(-4) * directions[:, :, None] * directions[:, None, :] + np.exp(-60) * np.eye(3)
+    covariances = packed(np.repeat(full, 2, axis=0))
+    means = np.repeat(directions, 2, axis=0) * np.tile([0, lengths * np.exp(-2)], count)[:, None]
+    alphas, colors = np.full(2 * count, 0.9), np.zeros((2 * count, 3), np.float32)
+    pairs, added, total = np.arange(2 * count, dtype=np.int32).reshape(-1, 2), np.empty(count), np.empty(count)
+    gaussians = means, covariances, alphas, colors, weights, spacing
+    merge_kernels.pair_errors(*gaussians, np.zeros(2 * count), BLUR, CONTRAST, pairs, 0, count, added, total)
+    assert np.isfinite(added).all()
+    assert (total >= 0).all()
+    merge_kernels.merge(*gaussians, BLUR, pairs, 0, count)
+    assert (alphas[::2] < 0.9).all()  # both together cover little of what the joint Gaussian covers
+
+
 def of_directions(coefficients, count=4000):
     """Return the colours (directions, RGB) of SH coefficients of degree 1 in evenly distributed directions."""
     at = np.arange(count) + 0.5
