@@ -29,7 +29,7 @@ def _image(covariance: np.ndarray, axis: int, blur: float) -> tuple[float, float
 
 @njit(nogil=True, error_model="numpy")
 def _squared_distance(xx: float, xy: float, yy: float, determinant: float, dx: float, dy: float) -> float:
-    """Return the squared Mahalanobis distance; for a needle, rounding alone would make it negative, and its exp huge."""
+    """Return the squared Mahalanobis distance; rounding would make that of a needle negative."""
     return max((yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / determinant, 0.0)
 
 
