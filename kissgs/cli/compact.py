@@ -35,13 +35,13 @@ def compact(
         typer.Option(metavar="DB", help="Keep as few Gaussians as lose at most this PSNR. Takes several runs."),
     ] = None,
     method: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="METHOD",
             help="prune: remove what images miss least, and train the rest. merge: replace neighbours by one Gaussian; "
-            "takes seconds, needs neither views nor torch.",
+            "takes seconds, needs neither views nor torch. Default: prune.",
         ),
-    ] = "prune",
+    ] = None,
     views: Annotated[
         Path | None,
         typer.Option(
