@@ -160,7 +160,7 @@ def opacity_areas(
 
 @compiled(
     "void(float64[:, ::1], float64[:, ::1], float64[::1], float32[:, ::1], float64[::1], float64[::1], float64[::1], "
-    "float64, float64, int32[:, ::1], int64, int64, float64[::1], float64[::1])"
+    "float64, float64, int32[:, ::1], int64, int64, float64[::1])"
 )
 def pair_errors(
     means: np.ndarray,
@@ -176,7 +176,6 @@ def pair_errors(
     first: int,
     last: int,
     added: np.ndarray,
-    total: np.ndarray,
 ) -> None:
     """Compute the errors that merging each pair would cause, pairs ``first`` to ``last`` (exclusive).
 
@@ -195,7 +194,6 @@ def pair_errors(
         first: first pair.
         last: end of the pairs, exclusive.
         added: out, ``(P,)`` what the error grows by. Errors of repeated merges are alike: their amplitudes add.
-        total: out, ``(P,)`` error of the joint Gaussian.
     """
     mean, covariance = np.empty(3), np.empty(6)
     for at in range(first, last):
@@ -211,7 +209,6 @@ def pair_errors(
         _, error = _fit(i, j, means, covariances, alphas, mean, covariance, width, first_, second, cross, contrast)
         before = errors[i] + errors[j]
         added[at] = error + 2 * math.sqrt(error * before)
-        total[at] = before + added[at]
 
 
 @compiled("int64(int64[::1], int32[:, ::1], int64, int64[::1])")

@@ -104,11 +104,10 @@ def test_moments_opacity_and_error_of_a_pair(seed):
         error += (color + CONTRAST * (a + b - alpha * one) ** 2).sum() * pixels.area
 
     pairs, before = np.array([[0, 1]], np.int32), np.array([0.3, 0.2])
-    added, total = np.empty(1), np.empty(1)
+    added = np.empty(1)
     gaussians = means, packed(full), alphas, colors, weights, spacing
-    merge_kernels.pair_errors(*gaussians, before, BLUR, CONTRAST, pairs, 0, 1, added, total)
+    merge_kernels.pair_errors(*gaussians, before, BLUR, CONTRAST, pairs, 0, 1, added)
     assert added[0] == pytest.approx(error + 2 * math.sqrt(error * 0.5), rel=1e-3)
-    assert total[0] == pytest.approx(0.5 + added[0])
 
     merged, index = merge_gaussians(scene, 1)
     spacing_of_two = np.full(2, ((means[0] - means[1]) ** 2).sum())
@@ -135,11 +134,11 @@ def test_errors_and_opacities_of_needles_far_apart_along_their_own_direction(len
     covariances = packed(np.repeat(full, 2, axis=0))
     means = np.repeat(directions, 2, axis=0) * np.tile([0, lengths * np.exp(-2)], count)[:, None]
     alphas, colors = np.full(2 * count, 0.9), np.zeros((2 * count, 3), np.float32)
-    pairs, added, total = np.arange(2 * count, dtype=np.int32).reshape(-1, 2), np.empty(count), np.empty(count)
+    pairs, added = np.arange(2 * count, dtype=np.int32).reshape(-1, 2), np.empty(count)
     gaussians = means, covariances, alphas, colors, weights, spacing
-    merge_kernels.pair_errors(*gaussians, np.zeros(2 * count), BLUR, CONTRAST, pairs, 0, count, added, total)
+    merge_kernels.pair_errors(*gaussians, np.zeros(2 * count), BLUR, CONTRAST, pairs, 0, count, added)
     assert np.isfinite(added).all()
-    assert (total >= 0).all()
+    assert (added >= 0).all()
     merge_kernels.merge(*gaussians, BLUR, pairs, 0, count)
     assert (alphas[::2] < 0.9).all()  # both together cover little of what the joint Gaussian covers
 
@@ -219,7 +218,8 @@ def test_covariances_become_rotations_and_scales_again(seed):
 def test_the_count_is_exact_and_gaussians_that_stay_are_untouched(degree, count, left):
     scene = cloud(count, degree=degree)
     merged, index = merge_gaussians(scene, left)
-    assert len(merged) == left == len(set(index.tolist()))
+    assert len(merged) == left
+    assert (np.diff(index, prepend=-1) > 0).all()
     assert same(kissgs.clean(merged)[0], merged)
     alone = [n for n, origin in enumerate(index) if (merged.means[n] == scene.means[origin]).all()]
     assert same(merged.select(np.array(alone, int)), scene.select(index[alone]))
