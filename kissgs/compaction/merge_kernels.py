@@ -107,26 +107,35 @@ def _fit(
     """Return opacity and error of the joint Gaussian, sums over images along the three axes.
 
     With the opacity, 1e-6 to 1 - 1e-6, it is nearest, in least squares, to the alpha ``a + b - a b`` of both together.
-    The error is the squared error, world units squared, of an image of it instead of two. ``first``, ``second`` and
-    ``cross`` are squares and product of the colour differences of ``i`` and ``j`` from the joint colour, sums over RGB;
-    ``contrast`` is the squared contrast to what is behind.
+    The error is the squared error, world units squared, of an image of it instead of both, whose alphas are
+    ``a (1 - b / 2)`` and ``b (1 - a / 2)``: the mean of both orders of depth. ``first``, ``second`` and ``cross`` are
+    squares and product of the colour differences of ``i`` and ``j`` from the joint colour, sums over RGB; ``contrast`` is
+    the squared contrast to what is behind.
     """
     alpha_i, alpha_j = alphas[i], alphas[j]
-    one = other = both = mixed = three = square = 0.0
+    aa = bb = ab = aab = abb = aabb = joint_ab = square = 0.0
     for axis in range(3):
         x, y = (1, 2) if axis == 0 else (0, 2 if axis == 1 else 1)
         joint = _image(covariance, axis, blur)
         a, b = _image(covariances[i], axis, blur), _image(covariances[j], axis, blur)
         ax, ay = means[i, x] - mean[x], means[i, y] - mean[y]
         bx, by = means[j, x] - mean[x], means[j, y] - mean[y]
-        one, other, square = one + math.sqrt(a[3]), other + math.sqrt(b[3]), square + math.sqrt(joint[3])
-        mixed += alpha_i * _overlap(a, joint, ax, ay) + alpha_j * _overlap(b, joint, bx, by)
-        of_two, of_three = _overlaps(a, b, joint, bx - ax, by - ay, -ax, -ay)
-        both, three = both + alpha_i * alpha_j * of_two, three + alpha_i * alpha_j * of_three
-    square /= 2  # the image's integral is 2 pi sqrt(det C), that of its square half of it
-    alpha = min(max((mixed - three) / square, 1e-6), 1 - 1e-6)
-    error = (first + contrast) * alpha_i**2 * one / 2 + (second + contrast) * alpha_j**2 * other / 2
-    error += 2 * (cross + contrast) * both + contrast * alpha * (alpha * square - 2 * mixed)
+        dx, dy = bx - ax, by - ay
+        a_squared, b_squared = (a[0] / 2, a[1] / 2, a[2] / 2, a[3] / 4), (b[0] / 2, b[1] / 2, b[2] / 2, b[3] / 4)
+        aa, bb, square = aa + math.sqrt(a[3]) / 2, bb + math.sqrt(b[3]) / 2, square + math.sqrt(joint[3]) / 2
+        aab, abb = aab + _overlap(a_squared, b, dx, dy), abb + _overlap(a, b_squared, dx, dy)
+        aabb += _overlap(a_squared, b_squared, dx, dy)
+        of_two, of_three = _overlaps(a, b, joint, dx, dy, -ax, -ay)
+        ab += of_two
+        joint_ab += alpha_i * _overlap(a, joint, ax, ay) + alpha_j * _overlap(b, joint, bx, by)
+        joint_ab -= alpha_i * alpha_j * of_three
+    # Names list the factors of an integral over 2 pi: aab is that of a a b. A square's image has half the covariance.
+    aa, bb, ab = alpha_i**2 * aa, alpha_j**2 * bb, alpha_i * alpha_j * ab
+    aab, abb, aabb = alpha_i**2 * alpha_j * aab, alpha_i * alpha_j**2 * abb, (alpha_i * alpha_j) ** 2 * aabb
+    alpha = min(max(joint_ab / square, 1e-6), 1 - 1e-6)
+    error = first * (aa - aab + aabb / 4) + second * (bb - abb + aabb / 4)
+    error += 2 * cross * (ab - (aab + abb) / 2 + aabb / 4)
+    error += contrast * (aa + bb + 2 * ab - 2 * (aab + abb) + aabb + alpha * (alpha * square - 2 * joint_ab))
     return alpha, max(2 * math.pi * error, 0.0)
 
 

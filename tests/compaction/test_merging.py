@@ -100,8 +100,9 @@ def test_moments_opacity_and_error_of_a_pair(seed):
     for axis in range(3):
         a, b = (value * pixels.image(m, c, axis, blur) for value, m, c in zip(alphas, means, full, strict=True))
         one = pixels.image(mean, joint, axis, blur)
-        color = a**2 * first + b**2 * second + 2 * a * b * cross
-        error += (color + CONTRAST * (a + b - alpha * one) ** 2).sum() * pixels.area
+        drawn_a, drawn_b = a * (1 - b / 2), b * (1 - a / 2)  # the mean of both orders of depth
+        color = drawn_a**2 * first + drawn_b**2 * second + 2 * drawn_a * drawn_b * cross
+        error += (color + CONTRAST * (a + b - a * b - alpha * one) ** 2).sum() * pixels.area
 
     pairs, before = np.array([[0, 1]], np.int32), np.array([0.3, 0.2])
     added = np.empty(1)
