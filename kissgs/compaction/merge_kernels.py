@@ -109,8 +109,8 @@ def _fit(
     With the opacity, 1e-6 to 1 - 1e-6, it is nearest, in least squares, to the alpha ``a + b - a b`` of both together.
     The error is the squared error, world units squared, of an image of it instead of both, whose alphas are
     ``a (1 - b / 2)`` and ``b (1 - a / 2)``: the mean of both orders of depth. ``first``, ``second`` and ``cross`` are
-    squares and product of the colour differences of ``i`` and ``j`` from the joint colour, sums over RGB; ``contrast`` is
-    the squared contrast to what is behind.
+    squares and product of the colour differences of ``i`` and ``j`` from the joint colour, sums over RGB; ``contrast``
+    is the squared contrast to what is behind.
     """
     alpha_i, alpha_j = alphas[i], alphas[j]
     aa = bb = ab = aab = abb = aabb = joint_ab = square = 0.0
