@@ -25,7 +25,7 @@ from kissgs.evaluation.psnr_loss import ESTIMATED_DROP, SEARCH_SEED, drop_of
 from kissgs.rendering.gsplat_backend import need_cuda
 from kissgs.rendering.rasterizer import Device
 from kissgs.settings import CompactSettings
-from kissgs.training.supervision import SCORING_STRIDE, SupervisionViews, supervision_views
+from kissgs.training.supervision import SCORING_STRIDE, SupervisionViews, evaluation_only, supervision_views
 
 if TYPE_CHECKING:
     from kissgs.evaluation.results import Evaluation
@@ -161,10 +161,13 @@ class Compactor:
             )
         if settings.trains and device == "cuda":
             need_cuda()
-        stride = SCORING_STRIDE if settings.trains else 1
-        supervision = supervision_views(
-            splats, views, settings, scoring_stride=stride, threads=threads, progress=progress
-        )
+        if settings.method == "merge":
+            supervision = evaluation_only(views, settings.view_size)
+        else:
+            stride = SCORING_STRIDE if settings.trains else 1
+            supervision = supervision_views(
+                splats, views, settings, scoring_stride=stride, threads=threads, progress=progress
+            )
         eval_views = None if views is None else supervision.eval_views
         return cls(splats, settings, supervision, threads, device, progress, eval_views)
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import kissgs
 from kissgs import CompactSettings
 from kissgs.compaction import covariance_kernels, merge_kernels, nearest_kernels
-from kissgs.compaction.budget import compact_scene
+from kissgs.compaction.budget import Compactor, compact_scene
 from kissgs.compaction.merging import BLUR, CONTRAST, LEAF, NEIGHBOURS, SPACING_RANK, merge_gaussians
 from kissgs.compaction.scoring import highest_indices
 from kissgs.core.splats import ATTRIBUTES, OPACITY_LOGIT_MAX, OPACITY_LOGIT_MIN
@@ -303,3 +303,9 @@ def test_a_budget_is_met_by_merging_without_views():
     assert [(step.name, step.count) for step in result.report.steps] == [("input", 200), ("merge", 50)]
     assert (result.report.target_source, result.report.source) == ("nothing", "")
     assert all(getattr(result.splats, name).dtype == np.float32 for name in ATTRIBUTES)
+
+
+def test_merging_draws_no_cameras_that_nothing_uses():
+    compactor = Compactor.of(cloud(200, degree=1), CompactSettings(ratio=0.25, method="merge"), None)
+    assert compactor.supervision.train == compactor.supervision.score == ()
+    assert len(compactor(50).splats) == 50
