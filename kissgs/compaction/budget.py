@@ -107,8 +107,10 @@ def unchanged(splats: Splats, reason: str) -> Compacted:
 
 def _merge(splats: Splats, count: int, log: StepLog, note: str, threads: int, progress: Progress) -> Compacted:
     """Return the scene with ``count`` Gaussians by merging."""
+    progress("kernels", 0.0)
     from kissgs.compaction.merging import merge_gaussians  # loads kernels that pruning does not need
 
+    progress("kernels", 1.0)
     log.record("input", splats)
     merged, index = merge_gaussians(splats, count, threads=threads, progress=progress)
     log.record("merge", merged)
@@ -157,7 +159,7 @@ class Compactor:
         if settings.trains and find_spec("torch") is None:
             raise UnsupportedError(
                 "training needs torch, which is missing: pip install 'kissgs[train]' (a CPU build is enough); the "
-                "preset fast only prunes and does not need it"
+                "preset fast, which only prunes, and the method merge do not need it"
             )
         if settings.trains and device == "cuda":
             need_cuda()
