@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import logging
 import os
@@ -27,7 +28,7 @@ from kissgs.cli.sample import sample
 from kissgs.cli.signals import unwinding
 from kissgs.cli.view import view
 from kissgs.cli.warmup import warmup
-from kissgs.core.errors import KissgsError, UnsupportedError
+from kissgs.core.errors import KissgsError, OutputError, UnsupportedError
 
 app = typer.Typer(
     name="kissgs",
@@ -54,6 +55,8 @@ def _run() -> None:
     except KissgsError as error:
         _fail(error)
     except OSError as error:
+        if error.filename is None and error.errno == errno.ENOSPC:  # files that we write have errors of their own
+            _fail(OutputError("cannot write to standard output: no space left on device"))
         if error.filename is None:  # concerns no file that the user named: a bug
             raise
         _fail(UnsupportedError(f"cannot use {error.filename!s:.100}: {(error.strerror or str(error)).lower()}"))

@@ -9,7 +9,7 @@ import typer
 
 from kissgs.cli.arguments import LevelOption, MaxGaussiansOption, RawAxesOption
 from kissgs.cli.files import for_each_input, show, sibling, source, stdout
-from kissgs.cli.options import chosen, count_of, device_of, open_views
+from kissgs.cli.options import chosen, count_of, device_of, open_views, share_of
 from kissgs.core.errors import UnsupportedError
 
 CHECKPOINT = ".checkpoint.npz"
@@ -28,20 +28,20 @@ def compact(
         typer.Option("--count", "-n", metavar="N", help="Number of Gaussians to keep, such as 200k or 1.5M."),
     ] = None,
     ratio: Annotated[
-        float | None, typer.Option(metavar="SHARE", help="Share of the Gaussians to keep, 0 to 1, such as 0.2.")
+        str | None, typer.Option(metavar="SHARE", help="Share of the Gaussians to keep, such as 0.2 or 20%.")
     ] = None,
     max_psnr_drop: Annotated[
         float | None,
         typer.Option(metavar="DB", help="Keep as few Gaussians as lose at most this PSNR. Takes several runs."),
     ] = None,
     method: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="METHOD",
             help="prune: remove what images miss least, and train the rest. merge: replace neighbours by one Gaussian; "
-            "takes seconds, needs neither views nor torch.",
+            "takes seconds, needs neither views nor torch. Default: prune.",
         ),
-    ] = "prune",
+    ] = None,
     views: Annotated[
         Path | None,
         typer.Option(
@@ -104,7 +104,7 @@ def compact(
         seed=seed,
         method=method,
         count=None if count is None else count_of(count),
-        ratio=ratio,
+        ratio=None if ratio is None else share_of(ratio),
         max_psnr_drop=max_psnr_drop,
     )
     if not settings.compact.enabled:

@@ -100,6 +100,18 @@ def count_of(text: str) -> int:
     )
 
 
+def share_of(text: str) -> float:
+    """Parse a share: 0.2 or 20%.
+
+    Raises:
+        UnsupportedError: the text is no such number.
+    """
+    word = text.strip().removesuffix("%")
+    if not re.fullmatch(r"[0-9]*\.?[0-9]+", word):
+        raise UnsupportedError(f"--ratio {text}: give a share such as 0.2 or 20%")
+    return float(word) * (0.01 if text.strip().endswith("%") else 1.0)
+
+
 def budget_of(text: str) -> Values:
     """Parse a budget: a count such as 200k, a share such as 20%, a PSNR drop such as 0.2dB, or auto for a goal's best.
 

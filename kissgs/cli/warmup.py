@@ -6,12 +6,16 @@ from kissgs.cli.console import progress_bar
 
 
 def warmup() -> None:
-    """Compile and cache the kernels of encoder and rasteriser now, so that later commands start without delay."""
+    """Compile and cache all kernels now, so that later commands start without delay."""
     from kissgs.planning.planner import load_kernels as load_encoder
     from kissgs.rendering.rasterizer import load_kernels as load_rasterizer
 
-    with progress_bar(False) as progress:  # one stage for both, so that it is reported once
+    with progress_bar(False) as progress:  # one stage for all, so that it is reported once
         progress("kernels", 0.0)
         load_encoder()
         load_rasterizer()
+        from kissgs.compaction import merging
+        from kissgs.planning import table_fields
+
+        del merging, table_fields
         progress("kernels", 1.0)

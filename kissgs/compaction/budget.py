@@ -25,7 +25,7 @@ from kissgs.evaluation.psnr_loss import ESTIMATED_DROP, SEARCH_SEED, drop_of
 from kissgs.rendering.gsplat_backend import need_cuda
 from kissgs.rendering.rasterizer import Device
 from kissgs.settings import CompactSettings
-from kissgs.training.supervision import SCORING_STRIDE, SupervisionViews, supervision_views
+from kissgs.training.supervision import SCORING_STRIDE, SupervisionViews, evaluation_only, supervision_views
 
 if TYPE_CHECKING:
     from kissgs.evaluation.results import Evaluation
@@ -107,8 +107,10 @@ def unchanged(splats: Splats, reason: str) -> Compacted:
 
 def _merge(splats: Splats, count: int, log: StepLog, note: str, threads: int, progress: Progress) -> Compacted:
     """Return the scene with ``count`` Gaussians by merging."""
+    progress("kernels", 0.0)
     from kissgs.compaction.merging import merge_gaussians  # loads kernels that pruning does not need
 
+    progress("kernels", 1.0)
     log.record("input", splats)
     merged, index = merge_gaussians(splats, count, threads=threads, progress=progress)
     log.record("merge", merged)
@@ -157,14 +159,17 @@ class Compactor:
         if settings.trains and find_spec("torch") is None:
             raise UnsupportedError(
                 "training needs torch, which is missing: pip install 'kissgs[train]' (a CPU build is enough); the "
-                "preset fast only prunes and does not need it"
+                "preset fast, which only prunes, and the method merge do not need it"
             )
         if settings.trains and device == "cuda":
             need_cuda()
-        stride = SCORING_STRIDE if settings.trains else 1
-        supervision = supervision_views(
-            splats, views, settings, scoring_stride=stride, threads=threads, progress=progress
-        )
+        if settings.method == "merge":
+            supervision = evaluation_only(views, settings.view_size)
+        else:
+            stride = SCORING_STRIDE if settings.trains else 1
+            supervision = supervision_views(
+                splats, views, settings, scoring_stride=stride, threads=threads, progress=progress
+            )
         eval_views = None if views is None else supervision.eval_views
         return cls(splats, settings, supervision, threads, device, progress, eval_views)
 

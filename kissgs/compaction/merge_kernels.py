@@ -28,30 +28,39 @@ def _image(covariance: np.ndarray, axis: int, blur: float) -> tuple[float, float
 
 
 @njit(nogil=True, error_model="numpy")
-def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float, float], dx: float, dy: float) -> float:
-    """Return the integral of the product of two images of peak 1 whose centres differ by (dx, dy)."""
-    xx, xy, yy = a[0] + b[0], a[1] + b[1], a[2] + b[2]
-    determinant = max(xx * yy - xy * xy, 1e-12 * xx * yy)
-    exponent = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / determinant
-    return 2 * math.pi * math.sqrt(a[3]) * math.sqrt(b[3] / determinant) * math.exp(-0.5 * exponent)
+def _squared_distance(xx: float, xy: float, yy: float, determinant: float, dx: float, dy: float) -> float:
+    """Return the squared Mahalanobis distance; rounding would make that of a needle negative."""
+    return max((yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / determinant, 0.0)
 
 
 @njit(nogil=True, error_model="numpy")
-def _overlap_of_three(
-    a: tuple[float, float, float, float],
-    b: tuple[float, float, float, float],
-    c: tuple[float, float, float, float],
-    bx: float,
-    by: float,
-    cx: float,
-    cy: float,
-) -> float:
-    """Return the integral of the product of three images of peak 1; ``a`` is at the origin, others at (x, y)."""
+def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float, float], dx: float, dy: float) -> float:
+    """Return the integral of the product of two images of peak 1 whose centres differ by (dx, dy), over 2 pi."""
     xx, xy, yy = a[0] + b[0], a[1] + b[1], a[2] + b[2]
     determinant = max(xx * yy - xy * xy, 1e-12 * xx * yy)
-    height = math.exp(-0.5 * (yy * bx * bx - 2 * xy * bx * by + xx * by * by) / determinant)
+    distance = _squared_distance(xx, xy, yy, determinant, dx, dy)
+    return math.sqrt(a[3]) * math.sqrt(b[3] / determinant) * math.exp(-0.5 * distance)
+
+
+@njit(nogil=True, error_model="numpy")
+def _overlaps(
+    a: tuple[float, float, float, float],
+    b: tuple[float, float, float, float],
+    joint: tuple[float, float, float, float],
+    bx: float,
+    by: float,
+    jx: float,
+    jy: float,
+) -> tuple[float, float]:
+    """Return the integrals of the products of a and b, and of all three images, over 2 pi.
+
+    Images have peak 1; ``a`` is at the origin, others at (x, y).
+    """
+    xx, xy, yy = a[0] + b[0], a[1] + b[1], a[2] + b[2]
+    determinant = max(xx * yy - xy * xy, 1e-12 * xx * yy)
+    height = math.exp(-0.5 * _squared_distance(xx, xy, yy, determinant, bx, by))
     if height == 0:
-        return 0.0
+        return 0.0, 0.0
     # The product of a and b is a Gaussian: gain G = a (a + b)^-1, centre G b, covariance a - G a.
     g00, g01 = (a[0] * yy - a[1] * xy) / determinant, (a[1] * xx - a[0] * xy) / determinant
     g10, g11 = (a[1] * yy - a[2] * xy) / determinant, (a[2] * xx - a[1] * xy) / determinant
@@ -59,7 +68,8 @@ def _overlap_of_three(
     pyy = max(a[2] - (g10 * a[1] + g11 * a[2]), 1e-12 * a[2])
     pxy = a[1] - (g00 * a[1] + g01 * a[2])
     product = pxx, pxy, pyy, max(pxx * pyy - pxy * pxy, 1e-12 * pxx * pyy)
-    return height * _overlap(product, c, g00 * bx + g01 * by - cx, g10 * bx + g11 * by - cy)
+    two = math.sqrt(a[3]) * math.sqrt(b[3] / determinant) * height
+    return two, height * _overlap(product, joint, g00 * bx + g01 * by - jx, g10 * bx + g11 * by - jy)
 
 
 @njit(nogil=True, error_model="numpy")
@@ -80,7 +90,7 @@ def _join(
 
 
 @njit(nogil=True, error_model="numpy")
-def _opacity(
+def _fit(
     i: int,
     j: int,
     means: np.ndarray,
@@ -88,59 +98,45 @@ def _opacity(
     alphas: np.ndarray,
     mean: np.ndarray,
     covariance: np.ndarray,
-    blur: float,
-) -> float:
-    """Return the opacity with which the joint Gaussian is nearest, in least squares, to the alpha of both together.
-
-    Both together have the alpha ``a + b - a b``. The result is 1e-6 to 1 - 1e-6.
-    """
-    target = square = 0.0
-    for axis in range(3):
-        x, y = (1, 2) if axis == 0 else (0, 2 if axis == 1 else 1)
-        joint = _image(covariance, axis, blur)
-        a, b = _image(covariances[i], axis, blur), _image(covariances[j], axis, blur)
-        ax, ay = means[i, x] - mean[x], means[i, y] - mean[y]
-        bx, by = means[j, x] - mean[x], means[j, y] - mean[y]
-        target += alphas[i] * _overlap(a, joint, ax, ay) + alphas[j] * _overlap(b, joint, bx, by)
-        target -= alphas[i] * alphas[j] * _overlap_of_three(a, b, joint, bx - ax, by - ay, -ax, -ay)
-        square += _overlap(joint, joint, 0.0, 0.0)
-    return min(max(target / square, 1e-6), 1 - 1e-6)
-
-
-@njit(nogil=True, error_model="numpy")
-def _error(
-    i: int,
-    j: int,
-    means: np.ndarray,
-    covariances: np.ndarray,
-    alphas: np.ndarray,
-    mean: np.ndarray,
-    covariance: np.ndarray,
-    alpha: float,
     blur: float,
     first: float,
     second: float,
     cross: float,
     contrast: float,
-) -> float:
-    """Return the squared image error, world units squared, of drawing the joint Gaussian instead of two.
+) -> tuple[float, float]:
+    """Return opacity and error of the joint Gaussian, sums over images along the three axes.
 
-    A sum over the three axes. ``first``, ``second`` and ``cross`` are squares and product of the colour differences of
-    ``i`` and ``j`` from the joint colour, sums over RGB; ``contrast`` is the squared contrast to what is behind.
+    With the opacity, 1e-6 to 1 - 1e-6, it is nearest, in least squares, to the alpha ``a + b - a b`` of both together.
+    The error is the squared error, world units squared, of an image of it instead of both, whose alphas are
+    ``a (1 - b / 2)`` and ``b (1 - a / 2)``: the mean of both orders of depth. ``first``, ``second`` and ``cross`` are
+    squares and product of the colour differences of ``i`` and ``j`` from the joint colour, sums over RGB; ``contrast``
+    is the squared contrast to what is behind.
     """
-    error = 0.0
+    alpha_i, alpha_j = alphas[i], alphas[j]
+    aa = bb = ab = aab = abb = aabb = joint_ab = square = 0.0
     for axis in range(3):
         x, y = (1, 2) if axis == 0 else (0, 2 if axis == 1 else 1)
         joint = _image(covariance, axis, blur)
         a, b = _image(covariances[i], axis, blur), _image(covariances[j], axis, blur)
         ax, ay = means[i, x] - mean[x], means[i, y] - mean[y]
         bx, by = means[j, x] - mean[x], means[j, y] - mean[y]
-        both = alphas[i] * alphas[j] * _overlap(a, b, ax - bx, ay - by)
-        error += (first + contrast) * alphas[i] ** 2 * _overlap(a, a, 0.0, 0.0)
-        error += (second + contrast) * alphas[j] ** 2 * _overlap(b, b, 0.0, 0.0) + 2 * (cross + contrast) * both
-        mixed = alphas[i] * _overlap(a, joint, ax, ay) + alphas[j] * _overlap(b, joint, bx, by)
-        error += contrast * alpha * (alpha * _overlap(joint, joint, 0.0, 0.0) - 2 * mixed)
-    return max(error, 0.0)
+        dx, dy = bx - ax, by - ay
+        a_squared, b_squared = (a[0] / 2, a[1] / 2, a[2] / 2, a[3] / 4), (b[0] / 2, b[1] / 2, b[2] / 2, b[3] / 4)
+        aa, bb, square = aa + math.sqrt(a[3]) / 2, bb + math.sqrt(b[3]) / 2, square + math.sqrt(joint[3]) / 2
+        aab, abb = aab + _overlap(a_squared, b, dx, dy), abb + _overlap(a, b_squared, dx, dy)
+        aabb += _overlap(a_squared, b_squared, dx, dy)
+        of_two, of_three = _overlaps(a, b, joint, dx, dy, -ax, -ay)
+        ab += of_two
+        joint_ab += alpha_i * _overlap(a, joint, ax, ay) + alpha_j * _overlap(b, joint, bx, by)
+        joint_ab -= alpha_i * alpha_j * of_three
+    # Names list the factors of an integral over 2 pi: aab is that of a a b. A square's image has half the covariance.
+    aa, bb, ab = alpha_i**2 * aa, alpha_j**2 * bb, alpha_i * alpha_j * ab
+    aab, abb, aabb = alpha_i**2 * alpha_j * aab, alpha_i * alpha_j**2 * abb, (alpha_i * alpha_j) ** 2 * aabb
+    alpha = min(max(joint_ab / square, 1e-6), 1 - 1e-6)
+    error = first * (aa - aab + aabb / 4) + second * (bb - abb + aabb / 4)
+    error += 2 * cross * (ab - (aab + abb) / 2 + aabb / 4)
+    error += contrast * (aa + bb + 2 * ab - 2 * (aab + abb) + aabb + alpha * (alpha * square - 2 * joint_ab))
+    return alpha, max(2 * math.pi * error, 0.0)
 
 
 @compiled("void(float64[:, ::1], float64[::1], float64[::1], float64, int64, int64, float64[::1])")
@@ -173,7 +169,7 @@ def opacity_areas(
 
 @compiled(
     "void(float64[:, ::1], float64[:, ::1], float64[::1], float32[:, ::1], float64[::1], float64[::1], float64[::1], "
-    "float64, float64, int32[:, ::1], int64, int64, float64[::1], float64[::1])"
+    "float64, float64, int32[:, ::1], int64, int64, float64[::1])"
 )
 def pair_errors(
     means: np.ndarray,
@@ -189,7 +185,6 @@ def pair_errors(
     first: int,
     last: int,
     added: np.ndarray,
-    total: np.ndarray,
 ) -> None:
     """Compute the errors that merging each pair would cause, pairs ``first`` to ``last`` (exclusive).
 
@@ -208,26 +203,21 @@ def pair_errors(
         first: first pair.
         last: end of the pairs, exclusive.
         added: out, ``(P,)`` what the error grows by. Errors of repeated merges are alike: their amplitudes add.
-        total: out, ``(P,)`` error of the joint Gaussian.
     """
     mean, covariance = np.empty(3), np.empty(6)
     for at in range(first, last):
         i, j = pairs[at, 0], pairs[at, 1]
         width = blur * 0.5 * (spacing[i] + spacing[j])
         share = _join(i, j, means, covariances, weights, mean, covariance)
-        alpha = _opacity(i, j, means, covariances, alphas, mean, covariance, width)
         difference = 0.0
         for c in range(colors.shape[1]):
             difference += (np.float64(colors[i, c]) - np.float64(colors[j, c])) ** 2
         difference /= 4 * math.pi
         first_, second = (1 - share) ** 2 * difference, share**2 * difference
         cross = -share * (1 - share) * difference
-        error = _error(
-            i, j, means, covariances, alphas, mean, covariance, alpha, width, first_, second, cross, contrast
-        )
+        _, error = _fit(i, j, means, covariances, alphas, mean, covariance, width, first_, second, cross, contrast)
         before = errors[i] + errors[j]
         added[at] = error + 2 * math.sqrt(error * before)
-        total[at] = before + added[at]
 
 
 @compiled("int64(int64[::1], int32[:, ::1], int64, int64[::1])")
@@ -274,7 +264,7 @@ def merge(
         i, j = pairs[at, 0], pairs[at, 1]
         share = _join(i, j, means, covariances, weights, mean, covariance)
         width = blur * 0.5 * (spacing[i] + spacing[j])
-        alphas[i] = _opacity(i, j, means, covariances, alphas, mean, covariance, width)
+        alphas[i], _ = _fit(i, j, means, covariances, alphas, mean, covariance, width, 0.0, 0.0, 0.0, 0.0)
         means[i], covariances[i] = mean, covariance
         for c in range(colors.shape[1]):
             colors[i, c] = share * colors[i, c] + (1 - share) * colors[j, c]

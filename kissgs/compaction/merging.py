@@ -35,6 +35,9 @@ much smaller than their distance apart."""
 CONTRAST = 0.09
 """Squared contrast of Gaussians to what is behind them, a sum over RGB in [0, 1]."""
 
+BLOCK = 65536
+"""Number of Gaussians whose colours are moved at a time."""
+
 LARGEST_STEP = 0.3
 """Largest share of the Gaussians that disappears before neighbours and errors are computed anew."""
 
@@ -54,15 +57,15 @@ def merge_gaussians(
         progress: receives the stage "merge".
 
     Returns:
-        The scene, clean, in the order of the input; and for each of its Gaussians the index of the one with the largest
-        weight among those it stands for, ``(M,)``.
+        The scene, clean; and for each of its Gaussians the index of the one with the largest weight among those it
+        stands for, ``(M,)``, ascending.
     """
     with Workers(threads) as pool:
         clusters = _Clusters(splats, pool)
         for left in clusters.reduce(count):
             progress("merge", 1 - np.log(left / count) / np.log(len(splats) / count))
         progress("merge", 1.0)
-        return clusters.splats(), clusters.origin
+        return clusters.splats()
 
 
 def merged_levels(splats: Splats, counts: Sequence[int], *, threads: int = 0) -> list[Splats]:
@@ -82,6 +85,8 @@ def merged_levels(splats: Splats, counts: Sequence[int], *, threads: int = 0) ->
 @dataclass(slots=True, eq=False)
 class _Clusters:
     """The Gaussians that are left, each of which stands for one or more of the input.
+
+    Neighbours have rows near each other, which processors read faster.
 
     Attributes:
         source: the input.
@@ -103,20 +108,24 @@ class _Clusters:
     alphas: Float64[np.ndarray, " M"] = field(init=False)
     colors: Float32[np.ndarray, "M F"] = field(init=False)
     errors: Float64[np.ndarray, " M"] = field(init=False)
-    origin: Int64[np.ndarray, " M"] = field(init=False)
+    origin: Int32[np.ndarray, " M"] = field(init=False)
     heaviest: Float64[np.ndarray, " M"] = field(init=False)
     merged: Bool[np.ndarray, " M"] = field(init=False)
 
     def __post_init__(self) -> None:
         splats, count = self.source, len(self.source)
-        self.means = splats.means.astype(np.float64)
+        self.origin, _, _ = self._leaves(splats.means)
+        self.means = splats.means[self.origin].astype(np.float64)
         self.covariances = np.empty((count, 6))
-        quats, scales = np.ascontiguousarray(splats.quats), np.ascontiguousarray(splats.scales)
+        quats, scales = splats.quats[self.origin], splats.scales[self.origin]
         self._each(count, lambda a, b: covariance_kernels.covariances_of(quats, scales, a, b, self.covariances))
-        self.alphas = 1 / (1 + np.exp(-splats.opacities.astype(np.float64)))
-        self.colors = np.concatenate([splats.sh0, splats.shN.reshape(count, 3 * splats.shN.shape[1])], axis=1)
-        self.errors, self.heaviest = np.zeros(count), np.zeros(count)
-        self.origin, self.merged = np.arange(count), np.zeros(count, bool)
+        self.alphas = 1 / (1 + np.exp(-splats.opacities[self.origin].astype(np.float64)))
+        self.colors = np.empty((count, 3 + 3 * splats.shN.shape[1]), np.float32)
+        self.colors[:, :3] = splats.sh0[self.origin]
+        for a in range(0, count, BLOCK):
+            rows = self.origin[a : a + BLOCK]
+            self.colors[a : a + BLOCK, 3:] = splats.shN[rows].reshape(len(rows), -1)
+        self.errors, self.heaviest, self.merged = np.zeros(count), np.zeros(count), np.zeros(count, bool)
 
     def reduce(self, count: int) -> Iterator[int]:
         """Merge until ``count`` Gaussians are left; before each round, yield how many there are."""
@@ -133,37 +142,59 @@ class _Clusters:
             count, lambda a, b: merge_kernels.opacity_areas(self.covariances, self.alphas, spacing, BLUR, a, b, weights)
         )
         self.heaviest = np.where(self.merged, self.heaviest, weights)
+        joined, added = self._cheapest_pairs(near, weights, spacing, disappearing)
+        del near
+        self._each(
+            len(joined),
+            lambda a, b: merge_kernels.merge(
+                self.means, self.covariances, self.alphas, self.colors, weights, spacing, BLUR, joined, a, b
+            ),
+        )
+        self._drop(joined, added)
+
+    def _cheapest_pairs(
+        self,
+        near: Int32[np.ndarray, "M K"],
+        weights: Float64[np.ndarray, " M"],
+        spacing: Float64[np.ndarray, " M"],
+        count: int,
+    ) -> tuple[Int32[np.ndarray, "P 2"], Float64[np.ndarray, " P"]]:
+        """Return at most ``count`` pairs of which no two share a Gaussian, and the error that each adds."""
         pairs = np.empty((near.size, 2), np.int32)
         pairs = pairs[: nearest_kernels.unique_pairs(near, pairs)]
-        added, total = np.empty(len(pairs)), np.empty(len(pairs))
+        added = np.empty(len(pairs))
         gaussians = self.means, self.covariances, self.alphas, self.colors, weights, spacing
         self._each(
             len(pairs),
-            lambda a, b: merge_kernels.pair_errors(*gaussians, self.errors, BLUR, CONTRAST, pairs, a, b, added, total),
+            lambda a, b: merge_kernels.pair_errors(*gaussians, self.errors, BLUR, CONTRAST, pairs, a, b, added),
         )
-        chosen = np.empty(disappearing, np.int64)
-        chosen = chosen[: merge_kernels.choose(np.argsort(added, kind="stable"), pairs, count, chosen)]
-        joined = np.ascontiguousarray(pairs[chosen])
-        self._each(len(joined), lambda a, b: merge_kernels.merge(*gaussians, BLUR, joined, a, b))
-        self._drop(joined, total[chosen])
+        chosen = np.empty(count, np.int64)
+        order = np.argsort(added, kind="stable")
+        chosen = chosen[: merge_kernels.choose(order, pairs, len(self.means), chosen)]
+        return np.ascontiguousarray(pairs[chosen]), added[chosen]
 
-    def _drop(self, joined: Int32[np.ndarray, "P 2"], errors: Float64[np.ndarray, " P"]) -> None:
+    def _drop(self, joined: Int32[np.ndarray, "P 2"], added: Float64[np.ndarray, " P"]) -> None:
         """Remove the second of each pair; the first stands for both."""
         kept, dropped = joined.T
         second = self.heaviest[dropped] > self.heaviest[kept]
         self.origin[kept] = np.where(second, self.origin[dropped], self.origin[kept])
         self.heaviest[kept] = np.maximum(self.heaviest[dropped], self.heaviest[kept])
-        self.errors[kept], self.merged[kept] = errors, True
+        self.errors[kept] += self.errors[dropped] + added
+        self.merged[kept] = True
         left = np.ones(len(self.means), bool)
         left[dropped] = False
-        for name in ("means", "covariances", "alphas", "colors", "errors", "origin", "heaviest", "merged"):
+        for name in ("means", "covariances", "alphas", "errors", "origin", "heaviest", "merged"):
             setattr(self, name, getattr(self, name)[left])
+        rows = np.flatnonzero(left)
+        for a in range(0, len(rows), BLOCK):  # in place: the colours are most of the memory
+            some = rows[a : a + BLOCK]
+            self.colors[a : a + len(some)] = self.colors[some]
+        self.colors = self.colors[: len(rows)]
 
     def _neighbours(self) -> tuple[Int32[np.ndarray, "M K"], Float64[np.ndarray, " M"]]:
         """Return the nearest neighbours of each Gaussian, and its squared spacing."""
         count = len(self.means)
-        order, edges = np.arange(count, dtype=np.int32), np.empty(4 * count // LEAF + 2, np.int64)
-        leaves = split_into_leaves(np.ascontiguousarray(self.means.T.astype(np.float32)), LEAF, order, edges)
+        order, edges, leaves = self._leaves(self.means)
         boxes = np.empty((2 << (leaves - 1).bit_length(), 2, 3))
         nearest_kernels.fill_boxes(self.means, order, edges, leaves, boxes)
         near, spacing = np.empty((count, min(NEIGHBOURS, count - 1)), np.int32), np.empty(count)
@@ -173,22 +204,30 @@ class _Clusters:
         )
         return near, spacing
 
+    @staticmethod
+    def _leaves(means: np.ndarray) -> tuple[Int32[np.ndarray, " M"], Int64[np.ndarray, " edges"], int]:
+        """Return the indices of the Gaussians in the order of a k-d tree, and the edges and number of its leaves."""
+        order, edges = np.arange(len(means), dtype=np.int32), np.empty(4 * len(means) // LEAF + 2, np.int64)
+        leaves = split_into_leaves(np.ascontiguousarray(means.T.astype(np.float32)), LEAF, order, edges)
+        return order, edges, leaves
+
     def _each(self, count: int, kernel: Callable[[int, int], None]) -> None:
         """Call a kernel with the first and last row of each part, in threads."""
         each_part(kernel, even(count, self.pool), self.pool)
 
-    def splats(self) -> Splats:
-        """Return the scene."""
-        kept = self.source.select(self.origin)
-        rows = np.flatnonzero(self.merged)
-        quats, scales = kept.quats.copy(), kept.scales.copy()
+    def splats(self) -> tuple[Splats, Int64[np.ndarray, " M"]]:
+        """Return the scene and the indices in the input, ascending."""
+        order = np.argsort(self.origin)
+        index = self.origin[order].astype(np.int64)
+        kept = self.source.select(index)
+        places = np.flatnonzero(self.merged[order])
+        rows = order[places]
+        quats, scales = np.empty((len(order), 4), np.float32), np.empty((len(order), 3), np.float32)
         self._each(len(rows), lambda a, b: covariance_kernels.decompose(self.covariances, rows, a, b, quats, scales))
-        scales[rows] = np.clip(scales[rows], -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)  # what was far apart is larger
-        alphas = self.alphas[rows]
-        kept.means[rows] = self.means[rows]
-        kept.opacities[rows] = np.clip(np.log(alphas / (1 - alphas)), OPACITY_LOGIT_MIN, OPACITY_LOGIT_MAX)
-        kept.sh0[rows] = self.colors[rows, :3]
-        kept.shN[rows] = self.colors[rows, 3:].reshape(len(rows), kept.shN.shape[1], 3)
-        return Splats(
-            means=kept.means, quats=quats, scales=scales, opacities=kept.opacities, sh0=kept.sh0, shN=kept.shN
-        )
+        kept.quats[places], alphas = quats[rows], self.alphas[rows]
+        kept.scales[places] = np.clip(scales[rows], -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)  # what was far apart is larger
+        kept.means[places] = self.means[rows]
+        kept.opacities[places] = np.clip(np.log(alphas / (1 - alphas)), OPACITY_LOGIT_MIN, OPACITY_LOGIT_MAX)
+        kept.sh0[places] = self.colors[rows, :3]
+        kept.shN[places] = self.colors[rows, 3:].reshape(len(rows), kept.shN.shape[1], 3)
+        return kept, index

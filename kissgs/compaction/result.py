@@ -76,8 +76,8 @@ class Compacted:
 
     Attributes:
         splats: the scene, clean.
-        index: ``(M,)`` index in the cleaned input of each of its Gaussians, ascending; of merged ones, that of
-            the member with the largest weight, in any order.
+        index: ``(M,)`` index in the cleaned input of each of its Gaussians, ascending; of a merged one, that of the
+            member with the largest weight.
         report: effort and results.
         checkpoint: file with the final state of the training; to be deleted once the scene is saved. None if there is
             no such file.

@@ -35,7 +35,7 @@ class SupervisionViews:
     """Views by their role, all at the training resolution.
 
     Attributes:
-        train: training views, one or more.
+        train: training views; none if nothing is trained.
         score: views that score Gaussians: the training views of a capture, or some virtual cameras and close-ups, each
             with a background of its own.
         test: evaluation views: held-out views, or some training views if there are none. All have photographs or none.
@@ -92,7 +92,6 @@ def supervision_views(
         synthetic = scene_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
         train, source = (*train, *synthetic.all), f"{source}, and {synthetic.source}"
     resized = _resized(train, size)
-    note = "" if views.test else "no view is held out: training views are used for evaluation too"
     return SupervisionViews(
         train=resized,
         score=resized,
@@ -100,8 +99,32 @@ def supervision_views(
         background=views.background,
         source=source,
         captured=True,
-        note="; ".join(filter(None, [views.note, note])),
+        note=_note(views),
     )
+
+
+def evaluation_only(views: Views | None, size: int) -> SupervisionViews:
+    """Return the evaluation views of a capture, at most ``size`` pixels on a side, none of which trains or scores.
+
+    Without a capture there are none at all.
+    """
+    if views is None:
+        return SupervisionViews(train=(), score=(), test=(), background=np.zeros(3, np.float32), source="")
+    return SupervisionViews(
+        train=(),
+        score=(),
+        test=_evaluation_views(views, size),
+        background=views.background,
+        source=views.source,
+        captured=True,
+        note=_note(views),
+    )
+
+
+def _note(views: Views) -> str:
+    """Return the note on a capture, and whether its training views evaluate."""
+    note = "" if views.test else "no view is held out: training views are used for evaluation too"
+    return "; ".join(filter(None, [views.note, note]))
 
 
 def _evaluation_views(views: Views, size: int) -> tuple[View, ...]:

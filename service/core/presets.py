@@ -88,5 +88,5 @@ def usual_seconds(kind: str, evaluate: bool, gaussians: int) -> float:
 
 
 def can_train() -> bool:
-    """Return whether torch is installed, which fine-tuning needs, and compaction except for pruning alone."""
+    """Return whether torch is installed, which fine-tuning needs, and compaction that trains."""
     return find_spec("torch") is not None

@@ -120,8 +120,8 @@ def parse_options(text: str | bytes) -> JobOptions:
     if options.trains and not can_train():
         raise ProblemError(
             "invalid-request",
-            "these options need torch, which this server does not have; use preset fast without fine-tuning, or ask "
-            "the operator to install kissgs[train]",
+            "these options need torch, which this server does not have; use preset fast without fine-tuning, or "
+            "compact with method merge, or ask the operator to install kissgs[train]",
         )
     return options
 

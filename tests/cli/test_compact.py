@@ -63,6 +63,8 @@ def test_merging_takes_neither_views_nor_training(folder: Path, tmp_path: Path) 
     assert done.returncode == 0, done.stderr
     expected = kissgs.compact(SCENE, settings=kissgs.Settings.from_preset(compact={"ratio": 0.2, "method": "merge"}))
     assert same(kissgs.load(tmp_path / "b.ply"), expected.splats)
+    assert run(*words[:-2], "--set", "method=merge", "-o", tmp_path / "e.ply").returncode == 0
+    assert (tmp_path / "e.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
     rows = [row.split()[:2] for row in done.stdout.decode().splitlines() if row.startswith(("input", "merge"))]
     assert rows == [["input", "1,500"], ["merge", "300"]]
     report = json.loads(run(*words, "-o", tmp_path / "c.ply", "--evaluate", "--json").stdout)
