@@ -78,7 +78,7 @@ def merged_levels(splats: Splats, counts: Sequence[int], *, threads: int = 0) ->
         for count in counts:
             for _ in clusters.reduce(count):
                 pass
-            levels.append(clusters.splats())
+            levels.append(clusters.splats()[0])
         return levels
 
 
