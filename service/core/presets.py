@@ -15,10 +15,10 @@ EVALUATION = 60.0
 """Approximate CPU seconds per million Gaussians to decode, select 24 cameras, and render two small images from each."""
 
 _FACTS: dict[kissgs.Preset, tuple[str, str, float, float, float]] = {
-    kissgs.Preset.FAST: ("Fast", "Takes seconds; for previews and quick checks.", 13.13, -0.39, 26),
-    kissgs.Preset.BALANCED: ("Balanced", "The best quality for its size. The default.", 12.50, -0.29, 370),
-    kissgs.Preset.SMALL: ("Small", "Slightly smaller, and slower.", 12.36, -0.29, 370),
-    kissgs.Preset.PAPER: ("Paper", "KISS-GS as published, for comparison.", 17.13, -0.38, 460),
+    kissgs.Preset.FAST: ("Fast", "Takes seconds; for previews and quick checks.", 13.30, -0.37, 13),
+    kissgs.Preset.BALANCED: ("Balanced", "The best quality for its size. The default.", 12.43, -0.28, 190),
+    kissgs.Preset.SMALL: ("Small", "Slightly smaller, and slower.", 12.32, -0.28, 210),
+    kissgs.Preset.PAPER: ("Paper", "KISS-GS as published, for comparison.", 17.20, -0.36, 260),
 }
 
 
