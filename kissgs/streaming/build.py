@@ -7,7 +7,6 @@ goes on where it was, and items may run in any process that sees the folder.
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path

@@ -11,7 +11,7 @@ from typing import Any
 from kissgs._version import __version__
 from kissgs.core.errors import OutputError, UnsupportedError
 from kissgs.core.progress import Progress, silent
-from kissgs.core.splats import BLOCK, Splats
+from kissgs.core.splats import BLOCK
 from kissgs.io.atomic import atomic_file, path_state, reason_of
 from kissgs.io.ply import read_ply_blocks, read_ply_info
 from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
@@ -21,7 +21,6 @@ from kissgs.settings import Settings
 from kissgs.sog.names import LOD_NAME
 from kissgs.streaming import build
 from kissgs.streaming.build import Blocks, Layout
-from kissgs.streaming.rows import row_bytes
 
 WORK = "work.json"
 """File of the work folder that says which work it belongs to."""

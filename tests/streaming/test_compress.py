@@ -1,0 +1,134 @@
+"""Streamed scenes. Oracle: the reader of streamed SOG, the input's Gaussians, and work that is interrupted anywhere."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+import kissgs
+from kissgs import Settings
+from kissgs.core.errors import OutputError, UnsupportedError
+from kissgs.core.splats import concatenate
+from kissgs.streaming import build
+from kissgs.streaming.compress import compress_streamed
+from kissgs.streaming.levels import bounds
+
+FAST = Settings.from_preset("fast")
+COUNT = 3000
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    for name, value in {"CHUNK": 800, "LEAF": 150, "COARSEST": 500}.items():
+        monkeypatch.setattr(build, name, value)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    path = tmp_path_factory.mktemp("streamed") / "scene.ply"
+    kissgs.save(kissgs.sample_scene(COUNT, sh_degree=1, seed=3), path)
+    return path
+
+
+def tree_leaves(node):
+    return [node] if "lods" in node else [leaf for child in node["children"] for leaf in tree_leaves(child)]
+
+
+def files_of(folder):
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_every_level_is_read_and_every_leaf_has_every_level(scene, tmp_path):
+    report = compress_streamed(scene, tmp_path / "city" / "lod-meta.json", FAST)
+    original = kissgs.load(scene)
+    document = json.loads((tmp_path / "city" / "lod-meta.json").read_bytes())
+    assert document["lodLevels"] == len(report.counts) == 4
+    leaves = tree_leaves(document["tree"])
+    assert all(sorted(leaf["lods"]) == ["0", "1", "2", "3"] for leaf in leaves)
+    for level in range(4):
+        found = kissgs.load(tmp_path / "city" / "lod-meta.json", level=level)
+        assert len(found) == report.counts[level] == document["counts"][level]
+        assert abs(len(found) - len(original) / 2**level) < 0.02 * COUNT + len(leaves)
+    assert report.total_bytes == sum(map(len, files_of(tmp_path / "city").values()))
+    assert not (tmp_path / "city.partial").exists()
+
+
+def test_rows_of_a_leaf_are_inside_its_bounds(scene, tmp_path):
+    compress_streamed(scene, tmp_path / "city" / "lod-meta.json", FAST)
+    document = json.loads((tmp_path / "city" / "lod-meta.json").read_bytes())
+    decoded = [kissgs.load(tmp_path / "city" / name) for name in document["filenames"]]
+    for leaf in tree_leaves(document["tree"]):
+        rows = [
+            decoded[lod["file"]].select(slice(lod["offset"], lod["offset"] + lod["count"]))
+            for lod in leaf["lods"].values()
+        ]
+        low, high = bounds(concatenate(rows))
+        slack = 0.05 * (high - low) + 1e-3
+        assert (low >= np.array(leaf["bound"]["min"]) - slack).all()
+        assert (high <= np.array(leaf["bound"]["max"]) + slack).all()
+
+
+class Stop(Exception):
+    pass
+
+
+def test_interrupted_work_goes_on_and_ends_with_the_same_bytes(scene, tmp_path, monkeypatch):
+    compress_streamed(scene, tmp_path / "whole" / "lod-meta.json", FAST)
+    expected = files_of(tmp_path / "whole")
+    target = tmp_path / "city" / "lod-meta.json"
+    events = 0
+    while True:
+        left = [events]
+
+        def stop(stage, fraction, note="", left=left):
+            left[0] -= 1
+            if left[0] < 0:
+                raise Stop
+
+        try:
+            compress_streamed(scene, target, FAST, progress=stop)
+        except Stop:
+            events += 1
+            assert not target.exists()
+            continue
+        break
+    assert events > 8
+    assert files_of(tmp_path / "city") == expected
+
+
+def test_work_of_other_settings_is_not_continued(scene, tmp_path):
+    target = tmp_path / "city" / "lod-meta.json"
+
+    def stop(stage, fraction, note=""):
+        if stage == "images":
+            raise Stop
+
+    with pytest.raises(Stop):
+        compress_streamed(scene, target, FAST, progress=stop)
+    other = Settings.from_preset("fast", sh0_step=0.1)
+    with pytest.raises(OutputError, match="city.partial belongs to other or older work; delete it"):
+        compress_streamed(scene, target, other)
+    shutil.rmtree(tmp_path / "city.partial")
+    compress_streamed(scene, target, other)
+
+
+def test_other_files_are_never_replaced(scene, tmp_path):
+    folder = tmp_path / "city"
+    folder.mkdir()
+    (folder / "mine.txt").write_text("mine")
+    with pytest.raises(OutputError, match="holds other files"):
+        compress_streamed(scene, folder / "lod-meta.json", FAST, overwrite=True)
+    assert (folder / "mine.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("changes", [{"target_size": "1MB"}, {"compact": {"ratio": 0.5}}, {"order": "plas"}])
+def test_settings_that_do_not_fit_are_refused(scene, tmp_path, changes):
+    with pytest.raises(UnsupportedError):
+        compress_streamed(scene, tmp_path / "city" / "lod-meta.json", Settings.from_preset("fast", **changes))
+
+
+def test_the_number_of_threads_does_not_matter(scene, tmp_path):
+    for threads in (1, 3):
+        compress_streamed(scene, tmp_path / str(threads) / "lod-meta.json", FAST, threads=threads)
+    assert files_of(tmp_path / "1") == files_of(tmp_path / "3")
