@@ -1,7 +1,7 @@
 """Work items that turn a scene into a streamed scene: partition, levels of a chunk, one file, the manifest.
 
-Every item reads and writes files of the work folder, and the last file that it writes marks it as done. So interrupted work
-goes on where it was, and items may run in any process that sees the folder.
+Every item reads and writes files of the work folder, and the last file that it writes marks it as done. So interrupted
+work goes on where it was, and items may run in any process that sees the folder.
 """
 
 from __future__ import annotations
@@ -35,12 +35,13 @@ CHUNK = 400_000
 """Largest number of Gaussians in a chunk, but for the scatter of estimated medians."""
 
 LEAF, MOST_LEAVES = 32_768, 1024
-"""Largest number of Gaussians in a leaf; larger scenes have larger leaves, so that their number stays near the second."""
+"""Largest number of Gaussians in a leaf; and of leaves, so that large scenes have larger leaves."""
 
 COARSEST = 70_000
 """Largest number of Gaussians in the coarsest level."""
 
-PARTITION = "partition.json"
+PARTITION, OUT = "partition.json", "out"
+"""Names in the work folder: the marker of the partition, and the folder of the result."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -141,7 +142,7 @@ def make_file(work: Path, layout: Layout, settings: EncodeSettings, level: int, 
     groups = np.repeat(np.arange(len(counts)), counts).astype(np.uint16)
     plan = plan_encoding(from_rows(rows), settings, container=SOG, groups=groups, keep_costs=False, threads=threads)
     encoded = write_files(plan, settings, threads=threads)
-    write_container(encoded.files, work / "out" / f"{level}_{file}", overwrite=True)
+    write_container(encoded.files, work / OUT / f"{level}_{file}", overwrite=True)
     _write_json(done, {"counts": np.bincount(groups[encoded.order], minlength=len(counts)).tolist()})
 
 
@@ -164,7 +165,7 @@ def make_manifest(work: Path, layout: Layout) -> None:
         if layout.counts[chunk]
         for leaf, bounds in enumerate(_leaves(work, chunk)["bounds"])
     ]
-    with atomic_file(work / "out" / LOD_NAME, overwrite=True) as out:
+    with atomic_file(work / OUT / LOD_NAME, overwrite=True) as out:
         out.write(lod_meta(leaves, layout.levels, filenames))
 
 

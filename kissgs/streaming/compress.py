@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +22,11 @@ from kissgs.sog.names import LOD_NAME
 from kissgs.streaming import build
 from kissgs.streaming.build import Blocks, Layout
 
-WORK = "work.json"
-"""File of the work folder that says which work it belongs to."""
+WORK, REPORT = "work.json", "report.json"
+"""Files of the work folder: which work it belongs to; the report, once everything is made."""
+
+OUT, REPLACED = build.OUT, "replaced"
+"""Folders of the work folder: the result, and what it replaces."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,17 +71,23 @@ def compress_streamed(
         reading: options of reading.
         overwrite: replace the folder if it holds a streamed scene.
         threads: number of threads; 0 means one per processor. The bytes do not depend on it.
-        progress: receives the stages "partition", "merge" and "images"; raise :class:`kissgs.Cancelled` from it to stop.
+        progress: receives the stages "partition", "merge" and "images"; raise :class:`kissgs.Cancelled` from it to
+            stop.
 
     Raises:
         OutputError: the folder cannot be written, holds something else, or the work folder belongs to other work.
         UnsupportedError: a setting does not fit.
     """
     folder = destination.parent
-    _check(settings, folder, overwrite)
-    blocks, count = _reader(source, reading, threads)
     work = folder.with_name(f"{folder.name}.partial")
+    _check_settings(settings)
+    if not (work / REPORT).exists():
+        _check_folder(folder, overwrite)
     _claim(work, source, settings, reading)
+    if (found := _read_json(work / REPORT)) is not None:
+        _finish(work, folder)
+        return StreamedReport(**{**found, "counts": tuple(found["counts"]), "level_bytes": tuple(found["level_bytes"])})
+    blocks, count = _reader(source, reading, threads)
     layout = _partition(work, blocks, count, progress)
     chunks = [chunk for chunk, size in enumerate(layout.counts) if size]
     for at, chunk in enumerate(chunks):
@@ -92,18 +101,24 @@ def compress_streamed(
     progress("images", 1.0)
     build.make_manifest(work, layout)
     report = _report(work, layout, count, len(chunks))
+    with atomic_file(work / REPORT) as file:
+        file.write(json.dumps(asdict(report)).encode())
     _finish(work, folder)
     return report
 
 
-def _check(settings: Settings, folder: Path, overwrite: bool) -> None:
-    """Check settings and destination before any work."""
+def _check_settings(settings: Settings) -> None:
+    """Refuse settings that do not fit, before any work."""
     if settings.compact.enabled or settings.finetune.enabled or settings.encode.has_goal:
         raise UnsupportedError(
             "levels of detail are made without goals, compaction and fine-tuning; leave these out, or write a .sog"
         )
     if settings.encode.order != "hilbert":
         raise UnsupportedError(f"levels of detail need order=hilbert, not {settings.encode.order}")
+
+
+def _check_folder(folder: Path, overwrite: bool) -> None:
+    """Refuse to replace anything but a streamed scene, and that only if allowed."""
     present, is_folder = path_state(folder)
     if present and not is_folder:
         raise OutputError(f"{folder} is a file; name {LOD_NAME} in a new folder")
@@ -145,8 +160,10 @@ def _claim(work: Path, source: Path, settings: Settings, reading: ReadOptions) -
             found = _read_json(work / WORK)
             if found != mine:
                 raise OutputError(f"{work} belongs to other or older work; delete it, or choose another name")
+            for left in (*work.glob(".kissgs.*"), *(work / OUT).glob(".kissgs.*")):  # of a process that was killed
+                shutil.rmtree(left) if left.is_dir() else left.unlink()
             return
-        (work / "out").mkdir(parents=True)
+        (work / OUT).mkdir(parents=True)
     except OSError as error:
         raise OutputError(f"cannot use {work}: {reason_of(error)}") from error
     with atomic_file(work / WORK) as file:
@@ -172,7 +189,7 @@ def _partition(work: Path, blocks: Blocks, count: int, progress: Progress) -> La
 
 
 def _report(work: Path, layout: Layout, source_count: int, chunks: int) -> StreamedReport:
-    out = work / "out"
+    out = work / OUT
     document = json.loads((out / LOD_NAME).read_bytes())
     sizes = [0] * layout.levels
     for level, file in layout.files():
@@ -187,14 +204,16 @@ def _report(work: Path, layout: Layout, source_count: int, chunks: int) -> Strea
 
 
 def _finish(work: Path, folder: Path) -> None:
-    """Move the result into place, and delete the work folder."""
-    old = folder.with_name(f"{folder.name}.old")
+    """Move the result into place, and delete the work folder; may be repeated after an interruption anywhere.
+
+    What the result replaces is in the work folder until the result is in place.
+    """
+    out, replaced = work / OUT, work / REPLACED
     try:
-        if folder.exists():
-            folder.rename(old)
-        (work / "out").rename(folder)
+        if out.exists():
+            if folder.exists():
+                folder.rename(replaced)
+            out.rename(folder)
         shutil.rmtree(work)
-        if old.exists():
-            shutil.rmtree(old)
     except OSError as error:
         raise OutputError(f"cannot write {folder}: {reason_of(error)}") from error

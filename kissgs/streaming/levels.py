@@ -21,8 +21,8 @@ class ChunkLevels:
     Attributes:
         levels: the Gaussians of each level, the finest first, leaf after leaf.
         counts: number of Gaussians of each leaf, per level.
-        bounds: ``(leaves, 2, 3)`` lowest and highest corner of each leaf: the boxes of one standard deviation around the
-            Gaussians of all its levels.
+        bounds: ``(leaves, 2, 3)`` lowest and highest corner of each leaf: the boxes of one standard deviation around
+            the Gaussians of all its levels.
     """
 
     levels: list[Splats]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -81,6 +82,6 @@ def leaf_groups(
     order, edges = np.arange(len(means), dtype=np.int32), np.empty(4 * len(means) // leaf + 2, np.int64)
     leaves = split_into_leaves(np.ascontiguousarray(means.T), leaf, order, edges)
     edges = edges[: leaves + 1]
-    for first, last in zip(edges[:-1], edges[1:], strict=True):
+    for first, last in itertools.pairwise(edges):
         order[first:last].sort()
     return order.astype(np.int64), edges

@@ -107,7 +107,7 @@ def test_work_of_other_settings_is_not_continued(scene, tmp_path):
     with pytest.raises(Stop):
         compress_streamed(scene, target, FAST, progress=stop)
     other = Settings.from_preset("fast", sh0_step=0.1)
-    with pytest.raises(OutputError, match="city.partial belongs to other or older work; delete it"):
+    with pytest.raises(OutputError, match=r"city\.partial belongs to other or older work; delete it"):
         compress_streamed(scene, target, other)
     shutil.rmtree(tmp_path / "city.partial")
     compress_streamed(scene, target, other)

@@ -1,5 +1,7 @@
 """Partition. Oracle: each position compared with the cuts on its way, and the counts of a direct assignment."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -59,4 +61,4 @@ def test_leaves_hold_every_gaussian_once(count):
     assert (np.diff(edges) <= 64).all()
     assert edges[0] == 0
     assert edges[-1] == count
-    assert all((np.diff(order[a:b]) > 0).all() for a, b in zip(edges[:-1], edges[1:], strict=True))
+    assert all((np.diff(order[a:b]) > 0).all() for a, b in itertools.pairwise(edges))
