@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -28,6 +30,11 @@ from kissgs.cli.files import for_each_input, show, sibling, source, write_stdout
 from kissgs.cli.options import budget_of, chosen, device_of, open_views
 from kissgs.cli.signals import stoppable
 from kissgs.core.errors import UnsupportedError
+from kissgs.sog.names import LOD_NAME
+
+if TYPE_CHECKING:
+    from kissgs.pipeline.read_options import ReadOptions
+    from kissgs.settings import Settings
 
 
 def compress(
@@ -37,7 +44,8 @@ def compress(
         typer.Option(
             "--output",
             "-o",
-            help="Output NAME.zip, NAME.sog, a folder, or '-' for standard output. Default: next to the scene.",
+            help="Output NAME.zip, NAME.sog, FOLDER/lod-meta.json for levels of detail, a folder, or '-' for standard "
+            "output. Default: next to the scene.",
         ),
     ] = None,
     container: ContainerOption = None,
@@ -134,6 +142,15 @@ def compress(
     if views is not None and not renders and not quiet:
         sys.stderr.write(f"kissgs: --views has no effect: the preset {preset} renders no images; add --evaluate\n")
 
+    if output is not None and output.name == LOD_NAME:
+        unused = {"--views": views, "--evaluate": evaluate, "--cache": cache, "--container": container}
+        if wrong := next((name for name, value in unused.items() if value), None):
+            raise UnsupportedError(f"levels of detail ({LOD_NAME}) are made without {wrong}")
+        for_each_input(
+            scenes, output, ".json", as_json, partial(_streamed, settings, reading, force, threads, quiet or as_json)
+        )
+        return
+
     def work(scene: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"
         with progress_bar(quiet or as_json) as bar, stoppable(bar, settings.searches) as progress:
@@ -166,3 +183,22 @@ def compress(
         return result.report.as_dict()
 
     for_each_input(scenes, output, "" if unpacked else ending_of(kind), as_json, work)
+
+
+def _streamed(
+    settings: Settings, reading: ReadOptions, force: bool, threads: int, quiet: bool, scene: str, target: Path
+) -> dict[str, Any]:
+    """Compress one scene into a streamed SOG."""
+    from kissgs.streaming.compress import compress_streamed
+
+    if scene == "-":
+        raise UnsupportedError("levels of detail need a file: it is read more than once")
+    with progress_bar(quiet) as progress:
+        report = compress_streamed(
+            Path(scene), target, settings, reading=reading, overwrite=force, threads=threads, progress=progress
+        )
+    if not quiet:
+        from kissgs.cli.tables import streamed_table
+
+        show(streamed_table(report, str(target)))
+    return asdict(report)

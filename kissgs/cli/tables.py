@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from kissgs.compaction.result import CompactionReport
     from kissgs.evaluation.results import Evaluation
     from kissgs.finetuning.result import FinetuneReport
+    from kissgs.streaming.compress import StreamedReport
     from kissgs.pipeline.inspect import Info
     from kissgs.pipeline.report import Report
     from kissgs.pipeline.trial import Trial
@@ -82,6 +83,19 @@ def compaction_table(report: CompactionReport, target: str) -> RenderableType:
         f", {seconds:.1f} s",
     )
     return Group(head, *_compaction(report))
+
+
+def streamed_table(report: StreamedReport, target: str) -> RenderableType:
+    """Format the report of a streamed compression."""
+    head = Text.assemble(
+        (target, "bold"),
+        f"  {report.source_count:,} Gaussians in {report.chunks} chunks, ",
+        (size(report.total_bytes), "bold green"),
+    )
+    table = Table("level", *map(_right, ("Gaussians", "bytes", "per Gaussian")), box=None, pad_edge=False)
+    for level, (count, stored) in enumerate(zip(report.counts, report.level_bytes, strict=True)):
+        table.add_row(str(level), f"{count:,}", f"{stored:,}", f"{stored / max(count, 1):.2f}")
+    return Group(head, table)
 
 
 def _compaction(report: CompactionReport) -> list[RenderableType]:

@@ -101,8 +101,8 @@ def compress_streamed(
     progress("images", 1.0)
     build.make_manifest(work, layout)
     report = _report(work, layout, count, len(chunks))
-    with atomic_file(work / REPORT) as file:
-        file.write(json.dumps(asdict(report)).encode())
+    with atomic_file(work / REPORT) as done:
+        done.write(json.dumps(asdict(report)).encode())
     _finish(work, folder)
     return report
 
