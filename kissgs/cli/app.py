@@ -19,7 +19,7 @@ from kissgs.cli.compress import compress
 from kissgs.cli.convert import convert
 from kissgs.cli.decompress import decompress
 from kissgs.cli.evaluate import evaluate
-from kissgs.cli.files import write_stdout
+from kissgs.cli.files import discard_stdout, write_stdout
 from kissgs.cli.info import info
 from kissgs.cli.options import with_finetune_value
 from kissgs.cli.remote import app as remote
@@ -56,6 +56,7 @@ def _run() -> None:
         _fail(error)
     except OSError as error:
         if error.filename is None and error.errno == errno.ENOSPC:  # files that we write have errors of their own
+            discard_stdout()
             _fail(OutputError("cannot write to standard output: no space left on device"))
         if error.filename is None:  # concerns no file that the user named: a bug
             raise

@@ -7,7 +7,17 @@ from typing import Annotated, Any
 
 import typer
 
-from kissgs.cli.arguments import LevelOption, MaxGaussiansOption, RawAxesOption
+from kissgs.cli.arguments import (
+    ForceOption,
+    JsonOption,
+    LevelOption,
+    MaxGaussiansOption,
+    QuietOption,
+    RawAxesOption,
+    ScenesArgument,
+    SetOption,
+    ThreadsOption,
+)
 from kissgs.cli.files import for_each_input, show, sibling, source, stdout
 from kissgs.cli.options import chosen, count_of, device_of, open_views, share_of
 from kissgs.core.errors import UnsupportedError
@@ -16,9 +26,7 @@ CHECKPOINT = ".checkpoint.npz"
 
 
 def compact(
-    scenes: Annotated[
-        list[str], typer.Argument(metavar="FILE…", help="Files or glob patterns; '-' reads standard input.")
-    ],
+    scenes: ScenesArgument,
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", help="Output NAME.ply, a folder, or '-' for standard output. Required."),
@@ -55,14 +63,7 @@ def compact(
         str,
         typer.Option("--preset", "-p", help="fast only prunes; balanced, small and paper also train."),
     ] = "balanced",
-    changes: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="NAME=VALUE",
-            help="Change a setting of the preset; repeatable. List: docs/reference/settings.md.",
-        ),
-    ] = None,
+    changes: SetOption = None,
     seed: Annotated[
         int | None,
         typer.Option(help="Seed of the image order and the virtual cameras; same seed, same result. Default: 0."),
@@ -80,14 +81,10 @@ def compact(
     device: Annotated[
         str, typer.Option(help="Device of the training: cpu (reproducible) or cuda (results vary slightly).")
     ] = "cpu",
-    threads: Annotated[
-        int, typer.Option(min=0, help="Number of threads; 0 for one per processor. The output does not depend on it.")
-    ] = 0,
-    force: Annotated[bool, typer.Option("--force", "-f", help="Overwrite existing output files.")] = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print a JSON report: an object for one file, a list for several.")
-    ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")] = False,
+    threads: ThreadsOption = 0,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Reduce the number of Gaussians of scenes at nearly equal quality: score, prune and train (POPSpa), or merge."""
     from kissgs.cli.console import progress_bar

@@ -200,8 +200,13 @@ def stdout() -> Iterator[None]:
     except OSError as error:
         from kissgs.io.atomic import reason_of
 
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # the flush at exit would fail again
+        discard_stdout()
         raise OutputError(f"cannot write to standard output: {reason_of(error)}") from error
+
+
+def discard_stdout() -> None:
+    """Discard what standard output still holds after an error: Python's flush at exit would fail with it again."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
 def write_stdout(data: bytes) -> None:

@@ -106,10 +106,11 @@ def share_of(text: str) -> float:
     Raises:
         UnsupportedError: the text is no such number.
     """
-    word = text.strip().removesuffix("%")
-    if not re.fullmatch(r"[0-9]*\.?[0-9]+", word):
-        raise UnsupportedError(f"--ratio {text}: give a share such as 0.2 or 20%")
-    return float(word) * (0.01 if text.strip().endswith("%") else 1.0)
+    word = text.strip()
+    try:
+        return float(word.removesuffix("%")) * (0.01 if word.endswith("%") else 1.0)
+    except ValueError as error:
+        raise UnsupportedError(f"--ratio {text}: give a share such as 0.2 or 20%") from error
 
 
 def budget_of(text: str) -> Values:

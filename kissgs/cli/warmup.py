@@ -14,8 +14,7 @@ def warmup() -> None:
         progress("kernels", 0.0)
         load_encoder()
         load_rasterizer()
-        from kissgs.compaction import merging
-        from kissgs.planning import table_fields
+        from kissgs.compaction import merging  # noqa: F401
+        from kissgs.planning import table_fields  # noqa: F401
 
-        del merging, table_fields
         progress("kernels", 1.0)

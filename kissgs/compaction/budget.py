@@ -88,7 +88,7 @@ def compact_scene(
     if count >= len(splats):
         return unchanged(splats, "no more than requested")
     if settings.method == "merge" and not evaluate and settings.max_psnr_drop is None:  # no cameras are needed
-        return _merge(splats, count, StepLog(None), "", threads, progress)
+        return _merge(splats, count, threads, progress)
     compactor = Compactor.of(splats, settings, views, threads=threads, device=device, progress=progress)
     if settings.max_psnr_drop is None:
         return compactor(count, evaluate=evaluate, checkpoint=checkpoint)
@@ -105,17 +105,31 @@ def unchanged(splats: Splats, reason: str) -> Compacted:
     return Compacted(splats, np.arange(len(splats)), report)
 
 
-def _merge(splats: Splats, count: int, log: StepLog, note: str, threads: int, progress: Progress) -> Compacted:
-    """Return the scene with ``count`` Gaussians by merging."""
+def _merge(
+    splats: Splats,
+    count: int,
+    threads: int,
+    progress: Progress,
+    *,
+    evaluate: bool = False,
+    supervision: SupervisionViews | None = None,
+) -> Compacted:
+    """Return the scene with ``count`` Gaussians by merging; ``supervision`` is needed to evaluate the steps."""
     progress("kernels", 0.0)
     from kissgs.compaction.merging import merge_gaussians  # loads kernels that pruning does not need
 
     progress("kernels", 1.0)
+    log = StepLog(None) if supervision is None else step_log(evaluate, splats, supervision, threads, progress)
     log.record("input", splats)
     merged, index = merge_gaussians(splats, count, threads=threads, progress=progress)
     log.record("merge", merged)
     report = CompactionReport(
-        source_count=len(splats), count=count, target_source="nothing", source="", steps=tuple(log.steps), note=note
+        source_count=len(splats),
+        count=count,
+        target_source="nothing",
+        source="",
+        steps=tuple(log.steps),
+        note="" if supervision is None else supervision.note,
     )
     return Compacted(merged, index, report)
 
@@ -179,8 +193,9 @@ class Compactor:
         ``evaluate`` and ``checkpoint`` are those of :func:`compact_scene`.
         """
         if self.settings.method == "merge":
-            log = step_log(evaluate, self.splats, self.supervision, self.threads, self.progress)
-            return _merge(self.splats, count, log, self.supervision.note, self.threads, self.progress)
+            return _merge(
+                self.splats, count, self.threads, self.progress, evaluate=evaluate, supervision=self.supervision
+            )
         if self._targets is None and self.settings.trains:
             from kissgs.training.targets import training_targets
 

@@ -99,18 +99,18 @@ def _fit(
     mean: np.ndarray,
     covariance: np.ndarray,
     blur: float,
-    first: float,
-    second: float,
-    cross: float,
+    color_ii: float,
+    color_jj: float,
+    color_ij: float,
     contrast: float,
 ) -> tuple[float, float]:
     """Return opacity and error of the joint Gaussian, sums over images along the three axes.
 
     With the opacity, 1e-6 to 1 - 1e-6, it is nearest, in least squares, to the alpha ``a + b - a b`` of both together.
     The error is the squared error, world units squared, of an image of it instead of both, whose alphas are
-    ``a (1 - b / 2)`` and ``b (1 - a / 2)``: the mean of both orders of depth. ``first``, ``second`` and ``cross`` are
-    squares and product of the colour differences of ``i`` and ``j`` from the joint colour, sums over RGB; ``contrast``
-    is the squared contrast to what is behind.
+    ``a (1 - b / 2)`` and ``b (1 - a / 2)``: the mean of both orders of depth. ``color_ii``, ``color_jj`` and
+    ``color_ij`` are squares and product of the colour differences of ``i`` and ``j`` from the joint colour, sums over
+    RGB; ``contrast`` is the squared contrast to what is behind.
     """
     alpha_i, alpha_j = alphas[i], alphas[j]
     aa = bb = ab = aab = abb = aabb = joint_ab = square = 0.0
@@ -133,8 +133,8 @@ def _fit(
     aa, bb, ab = alpha_i**2 * aa, alpha_j**2 * bb, alpha_i * alpha_j * ab
     aab, abb, aabb = alpha_i**2 * alpha_j * aab, alpha_i * alpha_j**2 * abb, (alpha_i * alpha_j) ** 2 * aabb
     alpha = min(max(joint_ab / square, 1e-6), 1 - 1e-6)
-    error = first * (aa - aab + aabb / 4) + second * (bb - abb + aabb / 4)
-    error += 2 * cross * (ab - (aab + abb) / 2 + aabb / 4)
+    error = color_ii * (aa - aab + aabb / 4) + color_jj * (bb - abb + aabb / 4)
+    error += 2 * color_ij * (ab - (aab + abb) / 2 + aabb / 4)
     error += contrast * (aa + bb + 2 * ab - 2 * (aab + abb) + aabb + alpha * (alpha * square - 2 * joint_ab))
     return alpha, max(2 * math.pi * error, 0.0)
 
@@ -213,9 +213,11 @@ def pair_errors(
         for c in range(colors.shape[1]):
             difference += (np.float64(colors[i, c]) - np.float64(colors[j, c])) ** 2
         difference /= 4 * math.pi
-        first_, second = (1 - share) ** 2 * difference, share**2 * difference
-        cross = -share * (1 - share) * difference
-        _, error = _fit(i, j, means, covariances, alphas, mean, covariance, width, first_, second, cross, contrast)
+        color_ii, color_jj = (1 - share) ** 2 * difference, share**2 * difference
+        color_ij = -share * (1 - share) * difference
+        _, error = _fit(
+            i, j, means, covariances, alphas, mean, covariance, width, color_ii, color_jj, color_ij, contrast
+        )
         before = errors[i] + errors[j]
         added[at] = error + 2 * math.sqrt(error * before)
 

@@ -72,16 +72,21 @@ def test_evaluation_views_do_not_depend_on_the_supervision(tmp_path, supervision
 def test_settings_that_a_strategy_fixes_have_no_effect():
     """Without training steps, strategies that train are left out."""
     scene, views = cloud(80), Views(around(5), around(3), black(), "five views")
-    usual = compare_strategies(scene, SHORT, views, ratios=[0.3])
-    other = SHORT.model_copy(
-        update={"prune_rounds": 7, "min_keep_per_scoring": 0.3, "admm_rho": 0.1, "erank_weight": 1.0}
-    )
-    assert [point.psnr for point in compare_strategies(scene, other, views, ratios=[0.3])] == [
-        point.psnr for point in usual
-    ]
+
+    def psnrs(strategies=STRATEGIES, **changes):
+        settings = SHORT.model_copy(update=changes)
+        found = compare_strategies(scene, settings, views, ratios=[0.3], strategies=strategies)
+        return {point.strategy: point.psnr for point in found}
+
+    usual = psnrs()
+    assert psnrs(prune_rounds=7, min_keep_per_scoring=0.3, admm_rho=0.1) == usual
+    along = [strategy for strategy in STRATEGIES if strategy.training == "along"]
+    found = psnrs(along, prune_rounds=7, min_keep_per_scoring=0.3, admm_rho=0.1, erank_weight=1.0)
+    assert found == {name: usual[name] for name in found}
+    assert len(found) == 1 + len(along)
     no_steps = SHORT.model_copy(update={"sparsify_steps": 0, "refine_steps": 0})
     names = [point.strategy for point in compare_strategies(scene, no_steps, views, ratios=[0.3])]
-    assert names == ["input", "random", "opacity", "POP", "POP in rounds"]
+    assert names == ["input", "random", "opacity", "POP", "POP in rounds", "merge"]
 
 
 def test_an_empty_scene_is_refused():

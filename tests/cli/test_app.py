@@ -134,10 +134,18 @@ def test_errors_are_one_line(scene: Path, tmp_path: Path) -> None:
             f"{KISSGS} info {scene} > /dev/full", shell=True, capture_output=True, text=True, check=False
         ).stderr
     )
-    full = subprocess.run(
-        f"{KISSGS} info {scene} --json > /dev/full", shell=True, capture_output=True, text=True, check=False
-    )
-    assert (full.returncode, full.stderr) == (2, "kissgs: cannot write to standard output: no space left on device\n")
+    expected = (2, "kissgs: cannot write to standard output: no space left on device\n")
+    for words in (f"info {scene} --json", "compact --help"):
+        for environment in (None, {}):  # with and without what a terminal sets, on which the help's output depends
+            full = subprocess.run(
+                f"{KISSGS} {words} > /dev/full",
+                shell=True,
+                capture_output=True,
+                text=True,
+                check=False,
+                env=environment,
+            )
+            assert (full.returncode, full.stderr) == expected
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bad.zip", "text.ply"]
 
 

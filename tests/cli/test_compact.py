@@ -15,7 +15,8 @@ from helpers.held_training import HeldTraining
 from helpers.training_scenes import same
 
 import kissgs
-from kissgs.cli.options import budget_of, count_of
+from kissgs import UnsupportedError
+from kissgs.cli.options import budget_of, count_of, share_of
 
 SHORT = {"sparsify_steps": 6, "refine_steps": 4, "prune_rounds": 2, "views": 24, "view_size": 48}
 OPTIONS = [word for name, value in SHORT.items() for word in ("--set", f"{name}={value}")]
@@ -85,6 +86,17 @@ def test_merging_takes_neither_views_nor_training(folder: Path, tmp_path: Path) 
         ).stdout
     )
     assert max(drop for count, drop in searched["trials"] if count == searched["count"]) <= 0.3
+
+
+@pytest.mark.parametrize(("text", "share"), [("0.2", 0.2), ("20%", 0.2), (" 2.5 % ", 0.025), ("1e-3", 0.001)])
+def test_a_share_is_a_number_or_a_percentage(text: str, share: float) -> None:
+    assert share_of(text) == pytest.approx(share)
+
+
+@pytest.mark.parametrize("text", ["a fifth", "%", "", "2%%"])
+def test_other_shares_are_refused(text: str) -> None:
+    with pytest.raises(UnsupportedError, match=r"--ratio .*: give a share such as 0\.2 or 20%"):
+        share_of(text)
 
 
 def test_an_unknown_method_is_refused(folder: Path, tmp_path: Path) -> None:
