@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     from kissgs.compaction.result import CompactionReport
     from kissgs.evaluation.results import Evaluation
     from kissgs.finetuning.result import FinetuneReport
-    from kissgs.streaming.compress import StreamedReport
     from kissgs.pipeline.inspect import Info
     from kissgs.pipeline.report import Report
     from kissgs.pipeline.trial import Trial
+    from kissgs.streaming.compress import StreamedReport
 
 CHANGES = {
     "invisible": "left out: opacity at most 1/255, which no renderer draws",
