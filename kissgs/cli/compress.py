@@ -193,7 +193,13 @@ def _streamed(
 
     if scene == "-":
         raise UnsupportedError("levels of detail need a file: it is read more than once")
-    with progress_bar(quiet) as progress:
+    with progress_bar(quiet) as bar:
+
+        def progress(stage: str, fraction: float, note: str = "") -> None:
+            if stage == "scratch" and not quiet:
+                sys.stderr.write(f"kissgs: {note}\n")
+            bar(stage, fraction, note)
+
         report = compress_streamed(
             Path(scene), target, settings, reading=reading, overwrite=force, threads=threads, progress=progress
         )

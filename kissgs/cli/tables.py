@@ -95,7 +95,7 @@ def streamed_table(report: StreamedReport, target: str) -> RenderableType:
     table = Table("level", *map(_right, ("Gaussians", "bytes", "per Gaussian")), box=None, pad_edge=False)
     for level, (count, stored) in enumerate(zip(report.counts, report.level_bytes, strict=True)):
         table.add_row(str(level), f"{count:,}", f"{stored:,}", f"{stored / max(count, 1):.2f}")
-    return Group(head, table)
+    return Group(head, table, *_changes(report.changed))
 
 
 def _compaction(report: CompactionReport) -> list[RenderableType]:

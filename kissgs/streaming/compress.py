@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from kissgs._version import __version__
-from kissgs.core.errors import OutputError, UnsupportedError
+from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import BLOCK
-from kissgs.io.atomic import atomic_file, path_state, reason_of
+from kissgs.io.atomic import atomic_file, reason_of
 from kissgs.io.ply import read_ply_blocks, read_ply_info
 from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.scene_files import read_scene
@@ -20,13 +19,12 @@ from kissgs.pipeline.scene_formats import recognise
 from kissgs.settings import Settings
 from kissgs.sog.names import LOD_NAME
 from kissgs.streaming import build
-from kissgs.streaming.build import Blocks, Layout
+from kissgs.streaming.build import OUT, Blocks, Layout
+from kissgs.streaming.time_left import with_time_left
+from kissgs.streaming.work_folder import check_destination, check_space, claim, finish, needed_bytes, read_json
 
-WORK, REPORT = "work.json", "report.json"
-"""Files of the work folder: which work it belongs to; the report, once everything is made."""
-
-OUT, REPLACED = build.OUT, "replaced"
-"""Folders of the work folder: the result, and what it replaces."""
+REPORT = "report.json"
+"""File of the work folder: the report, once everything is made."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,6 +33,8 @@ class StreamedReport:
 
     Attributes:
         source_count: number of Gaussians of the input.
+        changed: number of Gaussians that were removed or changed, by kind, as in :class:`kissgs.core.splats.Cleaned`,
+            and "invisible", those that the finest level leaves out because no renderer draws them.
         counts: number of Gaussians of each level, the finest first.
         level_bytes: bytes of the files of each level.
         chunks: number of chunks of the finest level.
@@ -42,6 +42,7 @@ class StreamedReport:
     """
 
     source_count: int
+    changed: dict[str, int]
     counts: tuple[int, ...]
     level_bytes: tuple[int, ...]
     chunks: int
@@ -61,8 +62,8 @@ def compress_streamed(
     """Compress a scene into a folder with ``lod-meta.json``, chunks and levels of detail.
 
     A ``.ply`` is read in blocks; other formats are decoded whole. Intermediate results are in a folder beside the
-    destination that ends in ``.partial``; interrupted work goes on from there. It takes up to three times the bytes of
-    the scene as float32 numbers.
+    destination that ends in ``.partial``; interrupted work goes on from there. It takes up to twice the bytes of the
+    scene as float32 numbers, and those of the result.
 
     Args:
         source: a scene of any format.
@@ -71,40 +72,48 @@ def compress_streamed(
         reading: options of reading.
         overwrite: replace the folder if it holds a streamed scene.
         threads: number of threads; 0 means one per processor. The bytes do not depend on it.
-        progress: receives the stages "partition", "merge" and "images"; raise :class:`kissgs.Cancelled` from it to
-            stop.
+        progress: receives "scratch", whose note is the size of the work folder, and the stages "partition", "merge"
+            and "images" with the time left; raise :class:`kissgs.Cancelled` from it to stop.
 
     Raises:
-        OutputError: the folder cannot be written, holds something else, or the work folder belongs to other work.
+        InvalidSceneError: the scene cannot be read, or has no Gaussians.
+        OutputError: the folder cannot be written, holds something else, the disk has too little room, or the work
+            folder belongs to other work.
         UnsupportedError: a setting does not fit.
     """
     folder = destination.parent
     work = folder.with_name(f"{folder.name}.partial")
     _check_settings(settings)
     if not (work / REPORT).exists():
-        _check_folder(folder, overwrite)
-    _claim(work, source, settings, reading)
-    if (found := _read_json(work / REPORT)) is not None:
-        _finish(work, folder)
-        return StreamedReport(**{**found, "counts": tuple(found["counts"]), "level_bytes": tuple(found["level_bytes"])})
-    blocks, count = _reader(source, reading, threads)
-    layout = _partition(work, blocks, count, progress)
+        check_destination(folder, overwrite)
+    claim(work, _identity(source, settings, reading))
+    if (found := read_json(work / REPORT)) is None:
+        layout = _partition(work, source, reading, threads, progress)
+        found = asdict(_make(work, layout, settings, threads, progress))
+        with atomic_file(work / REPORT) as done:
+            done.write(json.dumps(found).encode())
+    finish(work, folder)
+    return StreamedReport(**{**found, "counts": tuple(found["counts"]), "level_bytes": tuple(found["level_bytes"])})
+
+
+def _make(work: Path, layout: Layout, settings: Settings, threads: int, progress: Progress) -> StreamedReport:
+    """Make all levels and files that are not in the work folder yet."""
+    report = with_time_left(progress)
     chunks = [chunk for chunk, size in enumerate(layout.counts) if size]
+    if not chunks:
+        raise InvalidSceneError("the scene has no Gaussian of finite values, so that there are no levels to write")
     for at, chunk in enumerate(chunks):
-        progress("merge", at / len(chunks))
-        build.make_levels(work, layout, chunk, threads)
-    progress("merge", 1.0)
+        if not build.has_levels(work, chunk):
+            report("merge", at / len(chunks))
+            build.make_levels(work, layout, chunk, threads)
     files = layout.files()
     for at, (level, file) in enumerate(files):
-        progress("images", at / len(files), f"level {level}, file {file}")
-        build.make_file(work, layout, settings.encode, level, file, threads)
-    progress("images", 1.0)
+        if not build.has_file(work, level, file):
+            report("images", at / len(files), f"level {level}")
+            build.make_file(work, layout, settings.encode, level, file, threads)
+    report("images", 1.0)
     build.make_manifest(work, layout)
-    report = _report(work, layout, count, len(chunks))
-    with atomic_file(work / REPORT) as done:
-        done.write(json.dumps(asdict(report)).encode())
-    _finish(work, folder)
-    return report
+    return _report(work, layout, len(chunks))
 
 
 def _check_settings(settings: Settings) -> None:
@@ -117,103 +126,68 @@ def _check_settings(settings: Settings) -> None:
         raise UnsupportedError(f"levels of detail need order=hilbert, not {settings.encode.order}")
 
 
-def _check_folder(folder: Path, overwrite: bool) -> None:
-    """Refuse to replace anything but a streamed scene, and that only if allowed."""
-    present, is_folder = path_state(folder)
-    if present and not is_folder:
-        raise OutputError(f"{folder} is a file; name {LOD_NAME} in a new folder")
-    if present and any(folder.iterdir()):
-        if not (folder / LOD_NAME).is_file():
-            raise OutputError(f"{folder} holds other files; name {LOD_NAME} in a new folder")
-        if not overwrite:
-            raise OutputError(f"{folder / LOD_NAME} exists already; choose another name or allow overwriting (--force)")
-
-
-def _reader(source: Path, reading: ReadOptions, threads: int) -> tuple[Blocks, int]:
-    """Return a function that reads the scene in blocks, and the number of its Gaussians."""
+def _reader(source: Path, reading: ReadOptions, threads: int) -> tuple[Blocks, int, int]:
+    """Return a function that reads the scene in blocks, the number of its Gaussians, and their SH degree."""
     if recognise(source) == "ply":
         info = read_ply_info(source)
         if not info.compressed:
-            return lambda: read_ply_blocks(source), info.count
+            return lambda: read_ply_blocks(source), info.count, info.sh_degree
     scene = read_scene(source, reading, threads=threads)
     starts = range(0, len(scene), BLOCK)
-    return lambda: (scene.select(slice(start, start + BLOCK)) for start in starts), len(scene)
+    return lambda: (scene.select(slice(start, start + BLOCK)) for start in starts), len(scene), scene.sh_degree
 
 
-def _claim(work: Path, source: Path, settings: Settings, reading: ReadOptions) -> None:
-    """Make the work folder, or check that the one that is there belongs to the same work.
+def _identity(source: Path, settings: Settings, reading: ReadOptions) -> dict[str, Any]:
+    """Return what the work depends on.
 
     Raises:
-        OutputError: it belongs to other work, or cannot be written.
+        OutputError: the source cannot be read.
     """
     try:
         status = source.stat()
-        mine = {
-            "version": __version__,
-            "source": str(source.resolve()),
-            "bytes": status.st_size,
-            "modified_ns": status.st_mtime_ns,
-            "reading": str(reading),
-            "settings": settings.model_dump(mode="json"),
-        }
-        if work.exists():
-            found = _read_json(work / WORK)
-            if found != mine:
-                raise OutputError(f"{work} belongs to other or older work; delete it, or choose another name")
-            for left in (*work.glob(".kissgs.*"), *(work / OUT).glob(".kissgs.*")):  # of a process that was killed
-                shutil.rmtree(left) if left.is_dir() else left.unlink()
-            return
-        (work / OUT).mkdir(parents=True)
+        path = str(source.resolve())
     except OSError as error:
-        raise OutputError(f"cannot use {work}: {reason_of(error)}") from error
-    with atomic_file(work / WORK) as file:
-        file.write(json.dumps(mine).encode())
+        raise OutputError(f"cannot read {source}: {reason_of(error)}") from error
+    return {
+        "version": __version__,
+        "source": path,
+        "bytes": status.st_size,
+        "modified_ns": status.st_mtime_ns,
+        "reading": str(reading),
+        "settings": settings.model_dump(mode="json"),
+    }
 
 
-def _read_json(path: Path) -> Any:  # noqa: ANN401  any JSON
-    try:
-        return json.loads(path.read_bytes())
-    except (OSError, ValueError):
-        return None
-
-
-def _partition(work: Path, blocks: Blocks, count: int, progress: Progress) -> Layout:
+def _partition(work: Path, source: Path, reading: ReadOptions, threads: int, progress: Progress) -> Layout:
     """Partition the scene, unless that has been done."""
-    found = _read_json(work / build.PARTITION)
+    found = read_json(work / build.PARTITION)
     if found is not None:
-        return Layout(**{**found, "counts": tuple(found["counts"])})
-    progress("partition", 0.0)
-    layout = build.partition(work, blocks, count)
-    progress("partition", 1.0)
-    return layout
+        layout = Layout(**{**found, "counts": tuple(found["counts"])})
+        _announce(work, layout.source_count, layout.sh_degree, progress)
+        return layout
+    blocks, count, sh_degree = _reader(source, reading, threads)
+    _announce(work, count, sh_degree, progress)
+    return build.partition(work, blocks, count, with_time_left(progress))
 
 
-def _report(work: Path, layout: Layout, source_count: int, chunks: int) -> StreamedReport:
+def _announce(work: Path, count: int, sh_degree: int, progress: Progress) -> None:
+    """Check that the disk has room for the work folder, and report its size."""
+    needed = needed_bytes(count, sh_degree)
+    check_space(work, needed)
+    progress("scratch", 1.0, f"{work} takes up to {needed / 1e6:,.0f} MB until the work is done")
+
+
+def _report(work: Path, layout: Layout, chunks: int) -> StreamedReport:
     out = work / OUT
     document = json.loads((out / LOD_NAME).read_bytes())
     sizes = [0] * layout.levels
     for level, file in layout.files():
         sizes[level] += sum(path.stat().st_size for path in (out / f"{level}_{file}").iterdir())
     return StreamedReport(
-        source_count=source_count,
+        source_count=layout.source_count,
+        changed={"invisible": sum(layout.counts) - document["counts"][0], **layout.changed},
         counts=tuple(document["counts"]),
         level_bytes=tuple(sizes),
         chunks=chunks,
         total_bytes=sum(sizes) + (out / LOD_NAME).stat().st_size,
     )
-
-
-def _finish(work: Path, folder: Path) -> None:
-    """Move the result into place, and delete the work folder; may be repeated after an interruption anywhere.
-
-    What the result replaces is in the work folder until the result is in place.
-    """
-    out, replaced = work / OUT, work / REPLACED
-    try:
-        if out.exists():
-            if folder.exists():
-                folder.rename(replaced)
-            out.rename(folder)
-        shutil.rmtree(work)
-    except OSError as error:
-        raise OutputError(f"cannot write {folder}: {reason_of(error)}") from error
