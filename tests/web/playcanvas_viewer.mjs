@@ -47,6 +47,30 @@ function cameraOf({ viewmat, K, width, height }, background) {
   return camera;
 }
 
+/** @param {pc.Asset} asset */
+async function loaded(asset) {
+  app.assets.add(asset);
+  await new Promise((resolve, reject) => {
+    asset.on("load", resolve);
+    asset.on("error", (error) => reject(new Error(error)));
+    app.assets.load(asset);
+  });
+}
+
+/** Return the pixels that each camera sees. */
+async function imagesOf(cameras, background) {
+  const images = [];
+  for (const pinhole of cameras) {
+    app.setCanvasResolution(pc.RESOLUTION_FIXED, pinhole.width, pinhole.height);
+    const camera = cameraOf(pinhole, background);
+    app.root.addChild(camera);
+    await rendered();
+    images.push(textOf(app.graphicsDevice.gl));
+    camera.destroy();
+  }
+  return images;
+}
+
 let files = 0;
 window.draw = async ({ file, ending, cameras, background }) => {
   const filename = `scene-${files++}.${ending}`;
@@ -57,12 +81,7 @@ window.draw = async ({ file, ending, cameras, background }) => {
     { url: filename, filename, contents: ending === "glb" ? bytes.buffer : new Response(bytes) },
     { reorder: false },
   );
-  app.assets.add(asset);
-  await new Promise((resolve, reject) => {
-    asset.on("load", resolve);
-    asset.on("error", (error) => reject(new Error(error)));
-    app.assets.load(asset);
-  });
+  await loaded(asset);
   let entity = new pc.Entity();
   if (ending === "glb") {
     entity = asset.resource.instantiateRenderEntity();
@@ -71,19 +90,48 @@ window.draw = async ({ file, ending, cameras, background }) => {
     entity.addComponent("gsplat", { asset });
   }
   app.root.addChild(entity);
-  const images = [];
-  for (const pinhole of cameras) {
-    app.setCanvasResolution(pc.RESOLUTION_FIXED, pinhole.width, pinhole.height);
-    const camera = cameraOf(pinhole, background);
-    app.root.addChild(camera);
-    await rendered();
-    images.push(textOf(app.graphicsDevice.gl));
-    camera.destroy();
-  }
+  const images = await imagesOf(cameras, background);
   const { numSplats, gsplats } = asset.resource;
   const count = gsplats ? gsplats[0].resource.numSplats : numSplats;
   entity.destroy();
   asset.unload();
   app.assets.remove(asset);
   return { count, images };
+};
+
+/** Draw one level of a streamed scene. */
+window.drawLevel = async ({ url, level, cameras, background }) => {
+  const asset = new pc.Asset("streamed", "gsplat", { url });
+  await loaded(asset);
+  const entity = new pc.Entity();
+  entity.addComponent("gsplat", { asset, lodRangeMin: level, lodRangeMax: level });
+  app.root.addChild(entity);
+  const images = await imagesOf(cameras, background);
+  entity.destroy();
+  asset.unload();
+  app.assets.remove(asset);
+  return images;
+};
+
+/** Show a streamed scene, coarse levels first; return the bytes that were read before the first image with content. */
+window.firstImage = async ({ url, camera: pinhole }) => {
+  app.scene.gsplat.lodUnderfillLimit = 10; // a coarse level is drawn until the wanted one is there
+  performance.setResourceTimingBufferSize(10000);
+  performance.clearResourceTimings();
+  app.setCanvasResolution(pc.RESOLUTION_FIXED, pinhole.width, pinhole.height);
+  const camera = cameraOf(pinhole, "#000000");
+  app.root.addChild(camera);
+  const asset = new pc.Asset("streamed", "gsplat", { url });
+  await loaded(asset);
+  const entity = new pc.Entity();
+  entity.addComponent("gsplat", { asset });
+  app.root.addChild(entity);
+  let image;
+  do {
+    await new Promise((resolve) => app.once("frameend", resolve));
+    image = textOf(app.graphicsDevice.gl);
+  } while (bytesOf(image).every((value, at) => at % 4 === 3 || value === 0));
+  const folder = url.slice(0, url.lastIndexOf("/") + 1);
+  const read = performance.getEntriesByType("resource").filter(({ name }) => name.startsWith(folder));
+  return { image, files: read.map(({ name, encodedBodySize }) => [name.slice(folder.length), encodedBodySize]) };
 };

@@ -4,35 +4,17 @@ References: ``kissgs.render``, and each viewer's own reading of a ``.ply`` with 
 INFO`` shows how close they are.
 """
 
-import base64
 import io
 import logging
-import shutil
 
 import numpy as np
 import pytest
-from helpers.web_tools import DECODER, Site
+from helpers.viewers import chromium, opened, scattered, seen_from
 
 import kissgs
-from kissgs.core.splats import Splats
 from kissgs.io.ply import write_ply
 from kissgs.pipeline.scene_output import write_scene
-from kissgs.rendering.camera import Camera, look_at
-
-playwright = pytest.importorskip("playwright.sync_api")
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
-
-SOFTWARE = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--no-sandbox"]
-SPARK = "vendor/spark/dist/spark.module.min.js"
-PLAYCANVAS = "node_modules/playcanvas/build/playcanvas.min.mjs"
-PAGE = f"""<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,"><body>
-<script type="importmap">{{"imports": {{
-  "three": "/web_decoder/vendor/three/build/three.module.min.js",
-  "three/addons/": "/web_decoder/vendor/three/examples/jsm/",
-  "@sparkjsdev/spark": "/web_decoder/{SPARK}",
-  "playcanvas": "/web_decoder/{PLAYCANVAS}"}}}}</script>
-<script type="module" src="/tests/web/NAME_viewer.mjs"></script>"""
+from kissgs.rendering.camera import Camera
 
 # To kissgs.render, dB. Spark rounds colours and sizes, and reaches 46. PlayCanvas draws exp(-x) less a constant, so
 # that every Gaussian ends at 2.8 standard deviations, and reaches 37, from a .ply too. One SH band of wrong sign, or
@@ -44,73 +26,14 @@ log = logging.getLogger(__name__)
 
 @pytest.fixture(scope="module")
 def browser():
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
+    with chromium() as browser:
         yield browser
-        browser.close()
-
-
-class Viewer:
-    """Page of a viewer, which draws files."""
-
-    def __init__(self, name, page):
-        self.name, self.page = name, page
-
-    def draw(self, file, ending, cameras, background="#000000"):
-        """Return the number of Gaussians, and an image of 0 to 1 for each camera."""
-        pinholes = [
-            {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist(), "width": camera.width, "height": camera.height}
-            for camera in cameras
-        ]
-        job = {"file": base64.b64encode(file).decode(), "ending": ending, "cameras": pinholes, "background": background}
-        found = self.page.evaluate("job => draw(job)", job)
-        pixels = [np.frombuffer(base64.b64decode(text), np.uint8) for text in found["images"]]
-        return found["count"], [
-            image.reshape(camera.height, camera.width, 4)[::-1, :, :3] / 255
-            for image, camera in zip(pixels, cameras, strict=True)
-        ]
 
 
 @pytest.fixture(scope="module", params=["spark", "playcanvas"])
 def viewer(request, browser):
-    needed, how = {"spark": (SPARK, "scripts/vendor"), "playcanvas": (PLAYCANVAS, "scripts/setup dev")}[request.param]
-    if not (DECODER / needed).exists():
-        pytest.skip(f"{how} has not run")
-    errors = []
-    site = Site()
-    site.files["/"] = PAGE.replace("NAME", request.param).encode()
-    site.headers["/"] = {"Content-Type": "text/html"}
-    page = browser.new_page()
-    page.on("pageerror", lambda error: errors.append(str(error)))
-    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-    page.goto(f"{site.url}/")
-    page.wait_for_function("() => 'draw' in window")
-    yield Viewer(request.param, page)
-    page.close()
-    site.close()
-    assert errors == []
-
-
-def scattered(count, degree):
-    """Return a scene whose Gaussians rarely overlap, because viewers sort coarsely, with colours of 24 kinds."""
-    rng = np.random.default_rng(degree)
-    quats = rng.normal(size=(count, 4))
-    kinds = rng.normal(0, 0.2, (24, (degree + 1) ** 2 - 1, 3))
-    values = {
-        "means": rng.uniform(-1, 1, (count, 3)),
-        "quats": quats / np.linalg.norm(quats, axis=1, keepdims=True),
-        "scales": rng.normal(-3, 0.4, (count, 3)),
-        "opacities": rng.normal(1, 2, count),
-        "sh0": rng.normal(0, 0.8, (count, 3)),
-        "shN": kinds[rng.integers(24, size=count)],
-    }
-    return Splats(**{name: np.ascontiguousarray(value, np.float32) for name, value in values.items()})
-
-
-def seen_from(position, size):
-    return look_at(
-        np.array(position, float), np.zeros(3), np.array([0, -1.0, 0]), fov=0.9, width=size[0], height=size[1]
-    )
+    with opened(request.param, browser) as (viewer, _):
+        yield viewer
 
 
 def skewed(camera):

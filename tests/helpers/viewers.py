@@ -1,0 +1,116 @@
+"""Viewers that others wrote, in real Chromium: pages that draw files to given cameras."""
+
+import base64
+import contextlib
+import shutil
+
+import numpy as np
+import pytest
+
+from helpers.web_tools import DECODER, Site
+from kissgs.core.splats import Splats
+from kissgs.rendering.camera import look_at
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+SOFTWARE = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--no-sandbox"]
+SPARK = "vendor/spark/dist/spark.module.min.js"
+PLAYCANVAS = "node_modules/playcanvas/build/playcanvas.min.mjs"
+PAGE = f"""<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,"><body>
+<script type="importmap">{{"imports": {{
+  "three": "/web_decoder/vendor/three/build/three.module.min.js",
+  "three/addons/": "/web_decoder/vendor/three/examples/jsm/",
+  "@sparkjsdev/spark": "/web_decoder/{SPARK}",
+  "playcanvas": "/web_decoder/{PLAYCANVAS}"}}}}</script>
+<script type="module" src="/tests/web/NAME_viewer.mjs"></script>"""
+
+
+def scattered(count, degree):
+    """Return a scene whose Gaussians rarely overlap, because viewers sort coarsely, with colours of 24 kinds."""
+    rng = np.random.default_rng(degree)
+    quats = rng.normal(size=(count, 4))
+    kinds = rng.normal(0, 0.2, (24, (degree + 1) ** 2 - 1, 3))
+    values = {
+        "means": rng.uniform(-1, 1, (count, 3)),
+        "quats": quats / np.linalg.norm(quats, axis=1, keepdims=True),
+        "scales": rng.normal(-3, 0.4, (count, 3)),
+        "opacities": rng.normal(1, 2, count),
+        "sh0": rng.normal(0, 0.8, (count, 3)),
+        "shN": kinds[rng.integers(24, size=count)],
+    }
+    return Splats(**{name: np.ascontiguousarray(value, np.float32) for name, value in values.items()})
+
+
+def seen_from(position, size):
+    return look_at(
+        np.array(position, float), np.zeros(3), np.array([0, -1.0, 0]), fov=0.9, width=size[0], height=size[1]
+    )
+
+
+def pinhole(camera):
+    """Return a camera as JSON."""
+    return {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist(), "width": camera.width, "height": camera.height}
+
+
+def image_of(text, camera):
+    """Return the image of 0 to 1 that a viewer sent as text."""
+    pixels = np.frombuffer(base64.b64decode(text), np.uint8)
+    return pixels.reshape(camera.height, camera.width, 4)[::-1, :, :3] / 255
+
+
+class Viewer:
+    """Page of a viewer, which draws files."""
+
+    def __init__(self, name, page):
+        self.name, self.page = name, page
+
+    def draw(self, file, ending, cameras, background="#000000"):
+        """Return the number of Gaussians, and an image of 0 to 1 for each camera."""
+        job = {"file": base64.b64encode(file).decode(), "ending": ending, **self._cameras(cameras, background)}
+        found = self.page.evaluate("job => draw(job)", job)
+        return found["count"], list(map(image_of, found["images"], cameras))
+
+    def draw_level(self, url, level, cameras, background="#000000"):
+        """Return images of one level of a streamed scene."""
+        job = {"url": url, "level": level, **self._cameras(cameras, background)}
+        return list(map(image_of, self.page.evaluate("job => drawLevel(job)", job), cameras))
+
+    def first_image(self, url, camera):
+        """Return the first image with content of a streamed scene, and the name and bytes of each file read for it."""
+        found = self.page.evaluate("job => firstImage(job)", {"url": url, "camera": pinhole(camera)})
+        return image_of(found["image"], camera), found["files"]
+
+    def _cameras(self, cameras, background):
+        return {"cameras": list(map(pinhole, cameras)), "background": background}
+
+
+@contextlib.contextmanager
+def chromium():
+    """Yield a browser; skip the test where there is none."""
+    playwright = pytest.importorskip("playwright.sync_api")
+    if CHROMIUM is None:
+        pytest.skip("no Chromium is installed")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
+        yield browser
+        browser.close()
+
+
+@contextlib.contextmanager
+def opened(name, browser):
+    """Yield a viewer, "spark" or "playcanvas", and the site that its page is from; no script may fail meanwhile."""
+    needed, how = {"spark": (SPARK, "scripts/vendor"), "playcanvas": (PLAYCANVAS, "scripts/setup dev")}[name]
+    if not (DECODER / needed).exists():
+        pytest.skip(f"{how} has not run")
+    errors = []
+    site = Site()
+    site.files["/"] = PAGE.replace("NAME", name).encode()
+    site.headers["/"] = {"Content-Type": "text/html"}
+    page = browser.new_page()
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    page.goto(f"{site.url}/")
+    page.wait_for_function("() => 'draw' in window")
+    yield Viewer(name, page), site
+    page.close()
+    site.close()
+    assert errors == []

@@ -1,0 +1,62 @@
+"""Our streamed SOG in the PlayCanvas engine. Oracle: ``kissgs.render`` of what ``kissgs.load`` reads of each level."""
+
+import logging
+
+import numpy as np
+import pytest
+from helpers.viewers import chromium, opened, scattered, seen_from
+
+import kissgs
+from kissgs import Settings
+from kissgs.streaming import build
+from kissgs.streaming.compress import compress_streamed
+
+FIRST_IMAGE_BYTES = 1_000_000
+TO_RASTERISER = 35  # dB; PlayCanvas ends Gaussians at 2.8 standard deviations
+log = logging.getLogger(__name__)
+
+
+@pytest.fixture(scope="module")
+def playcanvas():
+    with chromium() as browser, opened("playcanvas", browser) as (viewer, site):
+        yield viewer, site
+
+
+def streamed(scene, folder, site):
+    """Compress a scene, and return its folder and its address on the site."""
+    kissgs.save(scene, folder / "scene.ply")
+    compress_streamed(folder / "scene.ply", folder / "city" / "lod-meta.json", Settings.from_preset("fast"))
+    files = {str(path.relative_to(folder)): path.read_bytes() for path in (folder / "city").rglob("*.*")}
+    return folder / "city" / "lod-meta.json", site.put(folder.name, files) + "city/lod-meta.json"
+
+
+def psnr(a, b):
+    return -10 * np.log10(max(np.mean((a - b) ** 2), 1e-10))
+
+
+def test_each_level_is_drawn_whole(playcanvas, tmp_path, monkeypatch):
+    for name, value in {"CHUNK": 400, "LEAF": 80, "COARSEST": 200}.items():
+        monkeypatch.setattr(build, name, value)
+    viewer, site = playcanvas
+    source, url = streamed(scattered(1200, 2), tmp_path, site)
+    cameras = [seen_from((1.2, -1.2, -4.2), (300, 200)), seen_from((-3.5, -2.6, 2.0), (200, 180))]
+    for level in range(4):
+        wanted = [np.clip(kissgs.render(kissgs.load(source, level=level), each)[0], 0, 1) for each in cameras]
+        drawn = viewer.draw_level(url, level, cameras)
+        reached = [psnr(*both) for both in zip(drawn, wanted, strict=True)]
+        log.info("level %d: %s dB to kissgs.render", level, ", ".join(f"{value:.1f}" for value in reached))
+        assert min(reached) > TO_RASTERISER
+        assert all(psnr(image[:, ::-1], image) < 30 for image in wanted)
+
+
+def test_the_first_image_needs_less_than_a_megabyte(playcanvas, tmp_path):
+    """The manifest and the coarsest level show the whole scene, with the sizes that users get; level 0 is late."""
+    viewer, site = playcanvas
+    source, url = streamed(scattered(140_000, 3), tmp_path, site)
+    site.late.update({path: 5.0 for path in site.files if "/city/0_0/" in path})
+    view = seen_from((1.2, -1.2, -4.2), (300, 200))
+    image, files = viewer.first_image(url, view)
+    log.info("%s", files)
+    assert 0 < sum(size for _, size in files) <= FIRST_IMAGE_BYTES
+    coarsest = np.clip(kissgs.render(kissgs.load(source, level=1), view)[0], 0, 1)
+    assert psnr(image, coarsest) > 28  # thousands of Gaussians overlap in each pixel, and the viewer sorts coarsely
