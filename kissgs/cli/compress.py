@@ -27,6 +27,7 @@ from kissgs.cli.arguments import (
 from kissgs.cli.compact import CHECKPOINT
 from kissgs.cli.console import progress_bar
 from kissgs.cli.files import for_each_input, show, sibling, source, write_stdout
+from kissgs.cli.interrupts import say_when_interrupted
 from kissgs.cli.options import budget_of, chosen, device_of, open_views
 from kissgs.cli.signals import stoppable
 from kissgs.core.errors import UnsupportedError
@@ -189,8 +190,6 @@ def _streamed(
     settings: Settings, reading: ReadOptions, force: bool, threads: int, quiet: bool, scene: str, target: Path
 ) -> dict[str, Any]:
     """Compress one scene into a streamed SOG."""
-    from kissgs.streaming.compress import compress_streamed
-
     if scene == "-":
         raise UnsupportedError("levels of detail need a file: it is read more than once")
     with progress_bar(quiet) as bar:
@@ -198,7 +197,12 @@ def _streamed(
         def progress(stage: str, fraction: float, note: str = "") -> None:
             if stage == "scratch" and not quiet:
                 sys.stderr.write(f"kissgs: {note}\n")
+            if stage == "merge":  # what is interrupted earlier begins anew
+                say_when_interrupted("the same command goes on where it was")
             bar(stage, fraction, note)
+
+        progress("kernels", 0.0)
+        from kissgs.streaming.compress import compress_streamed
 
         report = compress_streamed(
             Path(scene), target, settings, reading=reading, overwrite=force, threads=threads, progress=progress

@@ -36,10 +36,18 @@ def signal_behind(error: BaseException | None) -> int | None:
     return error.args[0] if isinstance(error, Interrupted) else None
 
 
+_left = ["no partial file is left"]
+
+
+def say_when_interrupted(left: str) -> None:
+    """Set what the message of an interruption says about files."""
+    _left[:] = [left]
+
+
 def exit_by_signal(number: int) -> NoReturn:
     """Print a message and exit, without waiting for threads inside libwebp, which cannot be stopped."""
     try:
-        os.write(2, b"kissgs: interrupted; no partial file is left\n")  # sys.stderr may hold an incomplete line
+        os.write(2, f"kissgs: interrupted; {_left[0]}\n".encode())  # sys.stderr may hold an incomplete line
     finally:
         os._exit(128 + number)
 

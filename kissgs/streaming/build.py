@@ -18,7 +18,7 @@ import numpy as np
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats, clean
 from kissgs.io.atomic import atomic_file
-from kissgs.planning.planner import plan_encoding
+from kissgs.planning.planner import plan_encoding, visible_gaussians
 from kissgs.settings import EncodeSettings
 from kissgs.sog.container_model import SOG
 from kissgs.sog.encode import write_files
@@ -56,7 +56,7 @@ class Layout:
         depth: number of cuts one after another; there are 2^depth chunks.
         levels: number of levels.
         leaf: largest number of Gaussians in a leaf.
-        changed: number of Gaussians that cleaning removed or changed, by kind.
+        changed: number of Gaussians that cleaning removed or changed, by kind, and of those that are invisible.
     """
 
     source_count: int
@@ -82,13 +82,14 @@ class Layout:
         ]
 
 
-def partition(work: Path, blocks: Blocks, count: int, progress: Progress = silent) -> Layout:
+def partition(work: Path, blocks: Blocks, count: int, settings: EncodeSettings, progress: Progress = silent) -> Layout:
     """Split a scene into chunks, one file of rows each, in two passes; return the layout.
 
     Args:
         work: the work folder.
         blocks: reads the scene.
         count: number of Gaussians in it before cleaning.
+        settings: settings of the encoder, which say whether invisible Gaussians are left out.
         progress: receives "partition".
     """
     depth, done = chunk_depth(count, CHUNK), 0
@@ -106,8 +107,9 @@ def partition(work: Path, blocks: Blocks, count: int, progress: Progress = silen
     counts, sh_degree, changed = np.zeros(cuts.chunks, np.int64), 0, Counter[str]()
     for block in counted():
         splats, cleaned = clean(block)
-        changed.update(cleaned.as_dict())
-        sh_degree = splats.sh_degree
+        visible = visible_gaussians(splats, settings)
+        changed.update({**cleaned.as_dict(), "invisible": len(splats) - len(visible)})
+        splats, sh_degree = splats.select(visible), splats.sh_degree
         chunks = cuts.chunk_of(splats.means)
         rows = to_rows(splats)
         for chunk in np.unique(chunks):
@@ -142,7 +144,9 @@ def make_levels(work: Path, layout: Layout, chunk: int, threads: int) -> None:
         path = _level_file(work, chunk, level)
         path.unlink(missing_ok=True)
         append_rows(path, to_rows(splats))
-    _write_json(_leaves_file(work, chunk), {"counts": made.counts, "bounds": made.bounds.tolist()})
+    _write_json(
+        _leaves_file(work, chunk), {"counts": made.counts, "bounds": made.bounds.tolist(), "errors": made.errors}
+    )
     _chunk_file(work, chunk).unlink()
 
 
@@ -157,13 +161,16 @@ def make_file(work: Path, layout: Layout, settings: EncodeSettings, level: int, 
     rows = np.concatenate([read_rows(_level_file(work, chunk, level), layout.sh_degree) for chunk in members])
     counts = [count for chunk in members for count in _leaves(work, chunk)["counts"][level]]
     groups = np.repeat(np.arange(len(counts)), counts).astype(np.uint16)
+    splats = from_rows(rows)
+    del rows
     settings = settings if level == 0 else coarse_settings(settings)
-    plan = plan_encoding(from_rows(rows), settings, container=SOG, groups=groups, keep_costs=False, threads=threads)
-    encoded = write_files(plan, settings, threads=threads)
-    write_container(encoded.files, work / OUT / f"{level}_{file}", overwrite=True)
-    _write_json(
-        _rows_file(work, level, file), {"counts": np.bincount(groups[encoded.order], minlength=len(counts)).tolist()}
-    )
+    stored = [0] * len(counts)
+    if len(visible_gaussians(splats, settings)):  # merging may have made all of them invisible
+        plan = plan_encoding(splats, settings, container=SOG, groups=groups, keep_costs=False, threads=threads)
+        encoded = write_files(plan, settings, threads=threads)
+        write_container(encoded.files, work / OUT / f"{level}_{file}", overwrite=True)
+        stored = np.bincount(groups[encoded.order], minlength=len(counts)).tolist()
+    _write_json(_rows_file(work, level, file), {"counts": stored})
     for chunk in members:
         _level_file(work, chunk, level).unlink()
 
@@ -194,20 +201,20 @@ def make_manifest(work: Path, layout: Layout) -> None:
                 if counts[at]:
                     lods.setdefault((chunk, leaf), {})[level] = (len(filenames), offset, counts[at])
                 offset, at = offset + counts[at], at + 1
-        filenames.append(f"{level}_{file}/{META_NAME}")
-    leaves = [
-        Leaf(np.array(bounds), dict(sorted(lods[chunk, leaf].items())))
-        for chunk in range(len(layout.counts))
-        if layout.counts[chunk]
-        for leaf, bounds in enumerate(_leaves(work, chunk)["bounds"])
-        if (chunk, leaf) in lods
-    ]
+        if any(counts):
+            filenames.append(f"{level}_{file}/{META_NAME}")
+    leaves = []
+    for chunk in (chunk for chunk, size in enumerate(layout.counts) if size):
+        own = _leaves(work, chunk)
+        for leaf, (bounds, errors) in enumerate(zip(own["bounds"], own["errors"], strict=True)):
+            if (chunk, leaf) in lods:  # some Gaussian of it is visible
+                leaves.append(Leaf(np.array(bounds), dict(sorted(lods[chunk, leaf].items())), errors))
     with atomic_file(work / OUT / LOD_NAME, overwrite=True) as out:
         out.write(lod_meta(leaves, layout.levels, filenames))
 
 
 def _leaves(work: Path, chunk: int) -> dict[str, Any]:
-    """Return the bounds of a chunk's leaves, and their counts by level."""
+    """Return the bounds and errors of a chunk's leaves, and their counts by level."""
     return json.loads(_leaves_file(work, chunk).read_bytes())
 
 

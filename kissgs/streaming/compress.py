@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from kissgs.io.ply import read_ply_blocks, read_ply_info
 from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.scene_files import read_scene
 from kissgs.pipeline.scene_formats import recognise
-from kissgs.settings import Settings
+from kissgs.settings import EncodeSettings, Settings
 from kissgs.sog.names import LOD_NAME
 from kissgs.streaming import build
 from kissgs.streaming.build import OUT, Blocks, Layout
@@ -88,7 +89,7 @@ def compress_streamed(
         check_destination(folder, overwrite)
     claim(work, _identity(source, settings, reading))
     if (found := read_json(work / REPORT)) is None:
-        layout = _partition(work, source, reading, threads, progress)
+        layout = _partition(work, source, reading, settings.encode, threads, progress)
         found = asdict(_make(work, layout, settings, threads, progress))
         with atomic_file(work / REPORT) as done:
             done.write(json.dumps(found).encode())
@@ -101,7 +102,9 @@ def _make(work: Path, layout: Layout, settings: Settings, threads: int, progress
     report = with_time_left(progress)
     chunks = [chunk for chunk, size in enumerate(layout.counts) if size]
     if not chunks:
-        raise InvalidSceneError("the scene has no Gaussian of finite values, so that there are no levels to write")
+        raise InvalidSceneError(
+            "the scene has no Gaussian that is finite and visible, so that there are no levels to write"
+        )
     for at, chunk in enumerate(chunks):
         if not build.has_levels(work, chunk):
             report("merge", at / len(chunks))
@@ -158,16 +161,25 @@ def _identity(source: Path, settings: Settings, reading: ReadOptions) -> dict[st
     }
 
 
-def _partition(work: Path, source: Path, reading: ReadOptions, threads: int, progress: Progress) -> Layout:
+def _partition(
+    work: Path, source: Path, reading: ReadOptions, encode: EncodeSettings, threads: int, progress: Progress
+) -> Layout:
     """Partition the scene, unless that has been done."""
     found = read_json(work / build.PARTITION)
     if found is not None:
         layout = Layout(**{**found, "counts": tuple(found["counts"])})
         _announce(work, layout.source_count, layout.sh_degree, progress)
         return layout
-    blocks, count, sh_degree = _reader(source, reading, threads)
-    _announce(work, count, sh_degree, progress)
-    return build.partition(work, blocks, count, with_time_left(progress))
+    try:
+        blocks, count, sh_degree = _reader(source, reading, threads)
+        _announce(work, count, sh_degree, progress)
+        layout = build.partition(work, blocks, count, encode, with_time_left(progress))
+        if not any(layout.counts):
+            raise InvalidSceneError(f"{source} has no Gaussian that is finite and visible; there is nothing to write")
+    except BaseException:
+        shutil.rmtree(work, ignore_errors=True)  # a partition that is not complete is of no use
+        raise
+    return layout
 
 
 def _announce(work: Path, count: int, sh_degree: int, progress: Progress) -> None:
@@ -182,10 +194,10 @@ def _report(work: Path, layout: Layout, chunks: int) -> StreamedReport:
     document = json.loads((out / LOD_NAME).read_bytes())
     sizes = [0] * layout.levels
     for level, file in layout.files():
-        sizes[level] += sum(path.stat().st_size for path in (out / f"{level}_{file}").iterdir())
+        sizes[level] += sum(path.stat().st_size for path in (out / f"{level}_{file}").glob("*"))
     return StreamedReport(
         source_count=layout.source_count,
-        changed={"invisible": sum(layout.counts) - document["counts"][0], **layout.changed},
+        changed=layout.changed,
         counts=tuple(document["counts"]),
         level_bytes=tuple(sizes),
         chunks=chunks,

@@ -11,6 +11,7 @@ from kissgs.compaction.merging import merged_levels
 from kissgs.core.array_types import Float64
 from kissgs.core.splats import Splats, concatenate
 from kissgs.core.threads import Workers
+from kissgs.streaming.level_errors import level_errors
 from kissgs.streaming.partition import leaf_groups
 
 
@@ -23,11 +24,13 @@ class ChunkLevels:
         counts: number of Gaussians of each leaf, per level.
         bounds: ``(leaves, 2, 3)`` lowest and highest corner of each leaf: the boxes of one standard deviation around
             the Gaussians of all its levels.
+        errors: for each leaf, the error of each level (:func:`kissgs.streaming.level_errors.level_errors`).
     """
 
     levels: list[Splats]
     counts: list[list[int]]
     bounds: Float64[np.ndarray, "leaves 2 3"]
+    errors: list[list[float]]
 
 
 def level_count(count: int, coarsest: int) -> int:
@@ -49,10 +52,12 @@ def chunk_levels(chunk: Splats, levels: int, leaf: int, threads: int) -> ChunkLe
         leaves = pool.map(
             lambda at: _leaf_levels(chunk.select(order[edges[at] : edges[at + 1]]), levels), range(len(edges) - 1)
         )
+        errors = pool.map(level_errors, leaves)
     return ChunkLevels(
         [concatenate([own[level] for own in leaves]) for level in range(levels)],
         [[len(own[level]) for own in leaves] for level in range(levels)],
         np.stack([bounds(concatenate(own)) for own in leaves]),
+        errors,
     )
 
 

@@ -20,10 +20,12 @@ class Leaf:
     Attributes:
         bounds: ``(2, 3)`` lowest and highest corner.
         lods: for each level, the file, the first row and the number of rows; levels without rows are absent.
+        errors: error of each level; 0 for the finest.
     """
 
     bounds: Float64[np.ndarray, "2 3"]
     lods: Mapping[int, tuple[int, int, int]]
+    errors: Sequence[float]
 
 
 def lod_meta(leaves: Sequence[Leaf], levels: int, filenames: Sequence[str]) -> bytes:
@@ -41,7 +43,7 @@ def lod_meta(leaves: Sequence[Leaf], levels: int, filenames: Sequence[str]) -> b
         "count": counts[0],
         "counts": counts,
         "lodLevels": levels,
-        "lodErrors": False,
+        "lodErrors": True,
         "filenames": list(filenames),
         "tree": _node(leaves),
     }
@@ -55,7 +57,7 @@ def _node(leaves: Sequence[Leaf]) -> dict[str, Any]:
             str(level): dict(zip(("file", "offset", "count"), rows, strict=True))
             for level, rows in leaves[0].lods.items()
         }
-        return {"bound": _bound(leaves[0].bounds), "lods": lods}
+        return {"bound": _bound(leaves[0].bounds), "lods": lods, "errors": list(leaves[0].errors)}
     middle = len(leaves) // 2
     corners = np.stack([leaf.bounds for leaf in leaves])
     bounds = np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])

@@ -2,13 +2,16 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.format_scenes import assert_alike
+from helpers.splat_transform import convert, needs_splat_transform
 
 import kissgs
 from kissgs import Settings
-from kissgs.core.errors import OutputError, UnsupportedError
+from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
 from kissgs.core.splats import concatenate
 from kissgs.streaming import build
 from kissgs.streaming.compress import compress_streamed
@@ -111,6 +114,51 @@ def test_work_of_other_settings_is_not_continued(scene, tmp_path):
         compress_streamed(scene, target, other)
     shutil.rmtree(tmp_path / "city.partial")
     compress_streamed(scene, target, other)
+
+
+def test_what_cannot_be_read_leaves_no_work_folder(scene, tmp_path):
+    (tmp_path / "cut.ply").write_bytes(scene.read_bytes()[:-10])
+    with pytest.raises(InvalidSceneError, match=r"cut\.ply"):
+        compress_streamed(tmp_path / "cut.ply", tmp_path / "city" / "lod-meta.json", FAST)
+    assert [path.name for path in tmp_path.iterdir()] == ["cut.ply"]
+
+
+def test_a_full_disk_is_noticed_before_any_work(scene, tmp_path, monkeypatch):
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=100_000))
+    with pytest.raises(OutputError, match=r"city\.partial will take up to 1 MB, but its disk has 0 MB free; free some"):
+        compress_streamed(scene, tmp_path / "city" / "lod-meta.json", FAST)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_invisible_gaussians_are_left_out_and_counted(tmp_path):
+    made = kissgs.sample_scene(COUNT, sh_degree=0, seed=3)
+    opacities, means = made.opacities.copy(), made.means.copy()
+    opacities[::7], means[5] = -9.0, np.nan
+    kissgs.save(replace(made, opacities=opacities, means=means), tmp_path / "scene.ply")
+    report = compress_streamed(tmp_path / "scene.ply", tmp_path / "city" / "lod-meta.json", FAST)
+    untiled = kissgs.compress(tmp_path / "scene.ply", settings=FAST).report
+    assert report.changed["invisible"] == untiled.invisible > len(opacities[::7])
+    assert report.changed["non_finite"] == 1
+    assert (report.source_count, report.counts[0]) == (COUNT, untiled.count)
+
+
+def test_leaves_have_errors_that_rise_with_the_level(scene, tmp_path):
+    compress_streamed(scene, tmp_path / "city" / "lod-meta.json", FAST)
+    leaves = tree_leaves(json.loads((tmp_path / "city" / "lod-meta.json").read_bytes())["tree"])
+    for leaf in leaves:
+        assert leaf["errors"][0] == 0 < leaf["errors"][1]
+        assert leaf["errors"] == sorted(leaf["errors"])
+        assert leaf["errors"][-1] < 0.5
+
+
+@needs_splat_transform
+def test_splat_transform_reads_every_level(scene, tmp_path):
+    target = tmp_path / "city" / "lod-meta.json"
+    report = compress_streamed(scene, target, FAST)
+    for level in range(len(report.counts)):
+        theirs = kissgs.load(convert(target, tmp_path / f"{level}.ply", "-L", str(level)))
+        assert_alike(kissgs.load(target, level=level), theirs, rtol=1e-6, atol=1e-6)
 
 
 def test_other_files_are_never_replaced(scene, tmp_path):

@@ -1,0 +1,76 @@
+"""Streamed scenes at every extreme. Oracle: the cleaned scene, and the formats' own reader."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from helpers.extreme_containers import BY_NAME, given, scene
+
+import kissgs
+from kissgs import Settings
+from kissgs.core.errors import InvalidSceneError
+from kissgs.core.splats import Splats
+from kissgs.streaming import build
+from kissgs.streaming.compress import compress_streamed
+
+FAST = Settings.from_preset("fast")
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    for name, value in {"CHUNK": 6, "LEAF": 3, "COARSEST": 3}.items():
+        monkeypatch.setattr(build, name, value)
+
+
+def numbers(node):
+    """Return all numbers of a document."""
+    if isinstance(node, dict):
+        return [value for child in node.values() for value in numbers(child)]
+    if isinstance(node, list):
+        return [value for child in node for value in numbers(child)]
+    return [node] if isinstance(node, (int, float)) else []
+
+
+@pytest.mark.parametrize("name", list(BY_NAME))
+@pytest.mark.quick(8)
+def test_all_levels_of_an_extreme_scene_can_be_read(name, tmp_path):
+    source = given(name)
+    if isinstance(source, bytes):
+        (tmp_path / "scene.ply").write_bytes(source)
+    else:
+        kissgs.save(source, tmp_path / "scene.ply")
+    cleaned, target = scene(name)[0], tmp_path / "city" / "lod-meta.json"
+    visible = int((cleaned.opacities > math.log(1 / 254)).sum())
+    if not visible:
+        with pytest.raises(InvalidSceneError, match="no Gaussian"):
+            compress_streamed(tmp_path / "scene.ply", target, FAST)
+        return
+    report = compress_streamed(tmp_path / "scene.ply", target, FAST)
+    assert report.counts[0] == visible
+    for level, count in enumerate(report.counts):
+        if count:
+            assert len(kissgs.load(target, level=level)) == count
+    assert np.isfinite(numbers(json.loads(target.read_bytes()))).all()
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 7, 8, 9])
+@pytest.mark.parametrize("degree", [0, 3])
+def test_few_gaussians(count, degree, tmp_path):
+    kissgs.save(kissgs.sample_scene(count, sh_degree=degree), tmp_path / "scene.ply")
+    target = tmp_path / "city" / "lod-meta.json"
+    if count == 0:
+        with pytest.raises(InvalidSceneError, match="no Gaussian"):
+            compress_streamed(tmp_path / "scene.ply", target, FAST)
+        return
+    assert compress_streamed(tmp_path / "scene.ply", target, FAST).counts[0] == count
+    assert len(kissgs.load(target)) == count
+
+
+def test_gaussians_at_one_place(tmp_path):
+    """No cut separates them, so that one chunk has all."""
+    values = {"means": np.zeros((40, 3)), "quats": np.tile([1.0, 0, 0, 0], (40, 1)), "scales": np.full((40, 3), -3.0)}
+    values |= {"opacities": np.ones(40), "sh0": np.zeros((40, 3)), "shN": np.zeros((40, 0, 3))}
+    kissgs.save(Splats(**{name: value.astype(np.float32) for name, value in values.items()}), tmp_path / "scene.ply")
+    target = tmp_path / "city" / "lod-meta.json"
+    assert compress_streamed(tmp_path / "scene.ply", target, FAST).counts[0] == 40
