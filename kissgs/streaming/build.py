@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from kissgs.core.progress import Progress, silent
-from kissgs.core.splats import Splats, clean
+from kissgs.core.splats import SH_REST_COUNTS, Splats, clean, empty_splats
 from kissgs.io.atomic import atomic_file
 from kissgs.planning.planner import plan_encoding, visible_gaussians
 from kissgs.settings import EncodeSettings
@@ -28,6 +28,7 @@ from kissgs.streaming.levels import chunk_levels, level_count
 from kissgs.streaming.manifest import Leaf, lod_meta
 from kissgs.streaming.partition import Cuts, chunk_depth, sampled_positions
 from kissgs.streaming.rows import append_rows, from_rows, read_rows, to_rows
+from kissgs.streaming.sensitivities import cameras_json, cameras_of, choose_cameras, measure_file
 
 Blocks = Callable[[], Iterable[Splats]]
 """Function that reads the scene from its beginning, some Gaussians at a time."""
@@ -41,8 +42,14 @@ LEAF, MOST_LEAVES = 32_768, 1024
 COARSEST = 70_000
 """Largest number of Gaussians in the coarsest level."""
 
-PARTITION, OUT = "partition.json", "out"
-"""Names in the work folder: the marker of the partition, and the folder of the result."""
+CONTEXT = 280_000
+"""Largest number of Gaussians of the level that stands for other chunks where sensitivity is measured."""
+
+COARSER_DB = 6.0
+"""Decibels by which coarser levels are encoded less accurately, with rate-distortion planning."""
+
+PARTITION, CAMERAS, OUT = "partition.json", "cameras.json", "out"
+"""Names in the work folder: the marker of the partition, the cameras, and the folder of the result."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,6 +73,17 @@ class Layout:
     levels: int
     leaf: int
     changed: dict[str, int]
+
+    @property
+    def filled(self) -> list[int]:
+        """Chunks that have Gaussians."""
+        return [chunk for chunk, count in enumerate(self.counts) if count]
+
+    @property
+    def context(self) -> int:
+        """Level that stands for other chunks where sensitivity is measured: the finest of few Gaussians."""
+        total = sum(self.counts)
+        return next((level for level in range(self.levels) if total >> level <= CONTEXT), self.levels - 1)
 
     def members(self, level: int, file: int) -> range:
         """Return the chunks in a file of a level: twice as many as in one of the level before, up to all."""
@@ -155,32 +173,65 @@ def has_file(work: Path, level: int, file: int) -> bool:
     return _rows_file(work, level, file).exists()
 
 
+def make_cameras(work: Path, layout: Layout, settings: EncodeSettings, threads: int) -> None:
+    """Choose the cameras that sensitivity is measured with, and write them to a file."""
+    coarsest = _read_level(work, layout, layout.levels - 1, layout.filled)
+    total = sum(layout.counts)
+    cameras = choose_cameras(coarsest, len(layout.filled), total, settings, threads)
+    _write_json(work / CAMERAS, cameras_json(cameras))
+
+
+def has_cameras(work: Path) -> bool:
+    """Return whether the cameras are chosen."""
+    return (work / CAMERAS).exists()
+
+
 def make_file(work: Path, layout: Layout, settings: EncodeSettings, level: int, file: int, threads: int) -> None:
     """Encode the Gaussians of one level of some chunks."""
     members = [chunk for chunk in layout.members(level, file) if layout.counts[chunk]]
-    rows = np.concatenate([read_rows(_level_file(work, chunk, level), layout.sh_degree) for chunk in members])
+    splats = _read_level(work, layout, level, members)
     counts = [count for chunk in members for count in _leaves(work, chunk)["counts"][level]]
     groups = np.repeat(np.arange(len(counts)), counts).astype(np.uint16)
-    splats = from_rows(rows)
-    del rows
-    settings = settings if level == 0 else coarse_settings(settings)
+    settings = file_settings(settings, level)
     stored = [0] * len(counts)
     if len(visible_gaussians(splats, settings)):  # merging may have made all of them invisible
-        plan = plan_encoding(splats, settings, container=SOG, groups=groups, keep_costs=False, threads=threads)
+        sensitivity = None
+        if settings.rate_distortion:
+            others = _read_level(work, layout, layout.context, sorted({*layout.filled} - {*members}))
+            cameras = cameras_of(json.loads((work / CAMERAS).read_bytes()))
+            sensitivity = measure_file(splats, others, cameras, level, settings, threads)
+            del others
+        plan = plan_encoding(
+            splats, settings, sensitivity=sensitivity, container=SOG, groups=groups, keep_costs=False, threads=threads
+        )
+        del sensitivity, splats
         encoded = write_files(plan, settings, threads=threads)
         write_container(encoded.files, work / OUT / f"{level}_{file}", overwrite=True)
         stored = np.bincount(groups[encoded.order], minlength=len(counts)).tolist()
     _write_json(_rows_file(work, level, file), {"counts": stored})
-    for chunk in members:
-        _level_file(work, chunk, level).unlink()
+    if level != layout.context:
+        for chunk in members:
+            _level_file(work, chunk, level).unlink()
 
 
-def coarse_settings(settings: EncodeSettings) -> EncodeSettings:
-    """Return settings for merged Gaussians: the error of merging is larger than that of the finest level's encoding.
+def _read_level(work: Path, layout: Layout, level: int, chunks: Sequence[int]) -> Splats:
+    """Return the Gaussians of a level of some chunks."""
+    rows = [read_rows(_level_file(work, chunk, level), layout.sh_degree) for chunk in chunks]
+    return from_rows(np.concatenate(rows)) if rows else empty_splats(0, SH_REST_COUNTS[layout.sh_degree])
 
-    Levels of 1/2 and 1/4, seen from 2 and 4 times the distance, take 10 and 13 % fewer bytes for it on the captures
-    of docs/method/streaming.md, and lose 0.1 to 0.4 dB to the original.
+
+def file_settings(settings: EncodeSettings, level: int) -> EncodeSettings:
+    """Return the settings of the files of a level.
+
+    There is one class of steps: within each leaf, classes would have an order of their own, which costs 5 % of the
+    bytes. Coarser levels are encoded less accurately, because the error of merging is larger than that of the finest
+    level's encoding; docs/method/streaming.md has what it saves and costs.
     """
+    settings = settings.model_copy(update={"step_classes": 1})
+    if level == 0:
+        return settings
+    if settings.rate_distortion:
+        return settings.model_copy(update={"quality_offset_db": settings.quality_offset_db - COARSER_DB})
     return settings.model_copy(
         update={
             "gaussians_per_codebook_entry": min(4096.0, 2 * settings.gaussians_per_codebook_entry),
@@ -204,7 +255,7 @@ def make_manifest(work: Path, layout: Layout) -> None:
         if any(counts):
             filenames.append(f"{level}_{file}/{META_NAME}")
     leaves = []
-    for chunk in (chunk for chunk, size in enumerate(layout.counts) if size):
+    for chunk in layout.filled:
         own = _leaves(work, chunk)
         for leaf, (bounds, errors) in enumerate(zip(own["bounds"], own["errors"], strict=True)):
             if (chunk, leaf) in lods:  # some Gaussian of it is visible

@@ -73,8 +73,8 @@ def compress_streamed(
         reading: options of reading.
         overwrite: replace the folder if it holds a streamed scene.
         threads: number of threads; 0 means one per processor. The bytes do not depend on it.
-        progress: receives "scratch", whose note is the size of the work folder, and the stages "partition", "merge"
-            and "images" with the time left; raise :class:`kissgs.Cancelled` from it to stop.
+        progress: receives "scratch", whose note is the size of the work folder, and the stages "partition", "merge",
+            "cameras" and "images" with the time left; raise :class:`kissgs.Cancelled` from it to stop.
 
     Raises:
         InvalidSceneError: the scene cannot be read, or has no Gaussians.
@@ -99,24 +99,23 @@ def compress_streamed(
 
 def _make(work: Path, layout: Layout, settings: Settings, threads: int, progress: Progress) -> StreamedReport:
     """Make all levels and files that are not in the work folder yet."""
-    report = with_time_left(progress)
-    chunks = [chunk for chunk, size in enumerate(layout.counts) if size]
-    if not chunks:
-        raise InvalidSceneError(
-            "the scene has no Gaussian that is finite and visible, so that there are no levels to write"
-        )
-    for at, chunk in enumerate(chunks):
+    encode = settings.encode
+    report = with_time_left(progress, encode.rate_distortion)
+    for at, chunk in enumerate(layout.filled):
         if not build.has_levels(work, chunk):
-            report("merge", at / len(chunks))
+            report("merge", at / len(layout.filled))
             build.make_levels(work, layout, chunk, threads)
+    if encode.rate_distortion and not build.has_cameras(work):
+        report("cameras", 0.0)
+        build.make_cameras(work, layout, encode, threads)
     files = layout.files()
     for at, (level, file) in enumerate(files):
         if not build.has_file(work, level, file):
             report("images", at / len(files), f"level {level}")
-            build.make_file(work, layout, settings.encode, level, file, threads)
+            build.make_file(work, layout, encode, level, file, threads)
     report("images", 1.0)
     build.make_manifest(work, layout)
-    return _report(work, layout, len(chunks))
+    return _report(work, layout, len(layout.filled))
 
 
 def _check_settings(settings: Settings) -> None:
@@ -173,7 +172,7 @@ def _partition(
     try:
         blocks, count, sh_degree = _reader(source, reading, threads)
         _announce(work, count, sh_degree, progress)
-        layout = build.partition(work, blocks, count, encode, with_time_left(progress))
+        layout = build.partition(work, blocks, count, encode, with_time_left(progress, encode.rate_distortion))
         if not any(layout.counts):
             raise InvalidSceneError(f"{source} has no Gaussian that is finite and visible; there is nothing to write")
     except BaseException:
