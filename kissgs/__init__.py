@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from kissgs.rendering.rasterizer import render
     from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
     from kissgs.settings import CompactSettings, EncodeSettings, FinetuneSettings, Preset, Settings
+    from kissgs.streaming.compress import StreamedReport, compress_streamed
     from kissgs.synthetic.scene import sample_scene
 
 _HOMES = {
@@ -56,6 +57,7 @@ _HOMES = {
     "Compressed": "pipeline.pipeline",
     "EncodeSettings": "settings",
     "StopSearch": "core.errors",
+    "StreamedReport": "streaming.compress",
     "Evaluation": "evaluation.results",
     "FinetuneReport": "finetuning.result",
     "FinetuneSettings": "settings",
@@ -82,6 +84,7 @@ _HOMES = {
     "clean": "core.splats",
     "compact": "pipeline.pipeline",
     "compress": "pipeline.pipeline",
+    "compress_streamed": "streaming.compress",
     "decompress": "pipeline.decompress",
     "evaluate": "evaluation.evaluate",
     "load": "pipeline.scene_files",
@@ -124,6 +127,7 @@ __all__ = [
     "Settings",
     "Splats",
     "StopSearch",
+    "StreamedReport",
     "UnsupportedError",
     "View",
     "Views",
@@ -132,6 +136,7 @@ __all__ = [
     "clean",
     "compact",
     "compress",
+    "compress_streamed",
     "decompress",
     "evaluate",
     "load",

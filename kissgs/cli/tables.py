@@ -89,7 +89,7 @@ def streamed_table(report: StreamedReport, target: str) -> RenderableType:
     """Format the report of a streamed compression."""
     head = Text.assemble(
         (target, "bold"),
-        f"  {report.source_count:,} Gaussians in {report.chunks} chunks, ",
+        f"  {report.source_count:,} Gaussians in {report.chunks} chunk{'s' * (report.chunks > 1)}, ",
         (size(report.total_bytes), "bold green"),
     )
     table = Table("level", *map(_right, ("Gaussians", "bytes", "per Gaussian")), box=None, pad_edge=False)
