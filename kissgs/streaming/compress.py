@@ -35,7 +35,8 @@ class StreamedReport:
     Attributes:
         source_count: number of Gaussians of the input.
         changed: number of Gaussians that were removed or changed, by kind, as in :class:`kissgs.core.splats.Cleaned`,
-            and "invisible", those that the finest level leaves out because no renderer draws them.
+            "invisible", those that no renderer draws, and "pruned_by_rd", those whose bits are worth more than their removal
+            costs; the finest level has neither.
         counts: number of Gaussians of each level, the finest first.
         level_bytes: bytes of the files of each level.
         chunks: number of chunks of the finest level.
@@ -196,7 +197,7 @@ def _report(work: Path, layout: Layout, chunks: int) -> StreamedReport:
         sizes[level] += sum(path.stat().st_size for path in (out / f"{level}_{file}").glob("*"))
     return StreamedReport(
         source_count=layout.source_count,
-        changed=layout.changed,
+        changed={**layout.changed, "pruned_by_rd": sum(layout.counts) - document["counts"][0]},
         counts=tuple(document["counts"]),
         level_bytes=tuple(sizes),
         chunks=chunks,
