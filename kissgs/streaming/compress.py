@@ -35,8 +35,8 @@ class StreamedReport:
     Attributes:
         source_count: number of Gaussians of the input.
         changed: number of Gaussians that were removed or changed, by kind, as in :class:`kissgs.core.splats.Cleaned`,
-            "invisible", those that no renderer draws, and "pruned_by_rd", those whose bits are worth more than their removal
-            costs; the finest level has neither.
+            "invisible", those that no renderer draws, and "pruned_by_rd", those whose bits are worth more than their
+            removal costs; the finest level has neither.
         counts: number of Gaussians of each level, the finest first.
         level_bytes: bytes of the files of each level.
         chunks: number of chunks of the finest level.
