@@ -33,7 +33,7 @@ from ..jobs.recovery import recover
 from ..jobs.worker import Worker
 from ..storage.database_health import error_text
 from ..storage.folder_binding import open_store
-from ..storage.job_files import JobStorage
+from ..storage.job_files import FolderStorage
 from .middleware import RequestMiddleware
 from .openapi import describe
 from .routes import facts, jobs, page, preview, results
@@ -102,7 +102,7 @@ def _build_and_recover(settings: ServiceSettings) -> ServiceContainer:
 
 def build(settings: ServiceSettings) -> ServiceContainer:
     """Create all parts of a service without starting them."""
-    storage, clock = JobStorage(settings.data_dir), Clock()
+    storage, clock = FolderStorage(settings.data_dir), Clock()
     try:
         store = open_store(settings, storage, clock)
     except BaseException:

@@ -17,8 +17,8 @@ from ..core.notifier import JobNotifier, ended, wait
 from ..core.schemas import JobOptions
 from ..core.settings import ServiceSettings
 from ..storage.database_health import error_text
-from ..storage.job_files import JobStorage
 from ..storage.job_records import Store
+from ..storage.job_storage import RESULT, JobStorage
 from .completion import JobCompletion
 from .runner import JobProcess, Outcome
 
@@ -145,7 +145,7 @@ class Worker:
         options = JobOptions.model_validate(job.options)
         task = {
             "kind": "compress",
-            "source": str(self.storage.upload(job.id)),
+            "source": str(await run_sync(self.storage.fetch_scene, job.id, work)),
             "work": str(work),
             "settings": {name: value for name, value in job.options.items() if name not in ("format", "evaluate")},
             "format": options.format,
@@ -211,12 +211,11 @@ class Worker:
         if current is None or current.state != State.RUNNING:  # cancelled or deleted meanwhile
             self.storage.remove_work(job.id)
             return
-        if outcome.kind == "done":
-            self.storage.keep_result(job.id)
+        folder = self.storage.keep_result(job.id) if outcome.kind == "done" else RESULT
         self.storage.remove_work(job.id)  # before requeueing, because another worker may then run the job
         match outcome.kind:
             case "done":
-                self.completion.succeed(job, outcome.data)
+                self.completion.succeed(job, outcome.data, folder)
             case "error":
                 self.completion.fail(job, outcome.data["code"], outcome.data["detail"])
             case "stopped" | "postponed":

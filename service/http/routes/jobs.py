@@ -174,7 +174,7 @@ async def compress_now(
     job = await wait_for_end(context, job, context.settings.sync_seconds, request)
     if job.state == State.SUCCEEDED:
         result = f"/v1/jobs/{job.id}/result"
-        answer = container(context, job)
+        answer = await container(context, job)
         answer.headers["Content-Location"] = result
         answer.headers["Link"] = f'</v1/jobs/{job.id}>; rel="describedby"'
         return answer
