@@ -84,11 +84,14 @@ class StoredFile(FileResponse):
             headers["content-length"] = str(end - first)
         start: Message = {"type": "http.response.start", "status": status, "headers": headers.raw}
         if scope["method"] != "HEAD" and self._file.stream is not None:
-            async for block in self._file.stream(first, end):
-                if start:  # only now, because opening the stream may fail
-                    await send(start)
-                    start = {}
-                await send({"type": "http.response.body", "body": block, "more_body": True})
+            try:
+                async for block in self._file.stream(first, end):
+                    if start:  # only now, because opening the stream may fail
+                        await send(start)
+                        start = {}
+                    await send({"type": "http.response.body", "body": block, "more_body": True})
+            except FileNotFoundError as error:
+                raise removed() from error
         if start:
             await send(start)
         await send({"type": "http.response.body", "body": b"", "more_body": False})
@@ -113,6 +116,11 @@ def described(summary: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
             )
         entry = entry[name]
     return dict(entry)
+
+
+def removed() -> ProblemError:
+    """Return the problem of a file that has expired or was reclaimed since the job was read."""
+    return ProblemError("gone", "the file was removed during the request; submit the scene again")
 
 
 def _attachment(name: str) -> str:

@@ -48,15 +48,21 @@ class Admission:
         """Queue a job.
 
         Raises:
-            ProblemError: ``queue-full`` or ``too-many-jobs``.
+            ProblemError: ``queue-full``, ``too-many-jobs`` or ``disk-full``.
             LimitExceeded: its idempotency key is in use.
         """
         try:
             with self._lock:  # counting and adding is one step with every database
-                return self.store.add(job, max_queue=self.settings.max_queue, max_owner=self.settings.max_jobs_per_key)
+                limits = self.settings
+                most = (
+                    limits.max_disk_bytes if self.storage.shared else None
+                )  # replicas do not see each other's uploads
+                return self.store.add(job, max_queue=limits.max_queue, max_owner=limits.max_jobs_per_key, max_disk=most)
         except LimitExceeded as refused:
             if refused.limit == "key":
                 raise
+            if refused.limit == "disk":
+                raise self._full(job.disk_bytes) from refused
             raise self._refused(refused.limit) from refused
 
     @contextlib.contextmanager

@@ -17,6 +17,9 @@ from ..storage.job_storage import RESULT, JobStorage
 log = logging.getLogger("kissgs.service")
 
 
+LOST = "the upload is no longer on the server's disk; submit the scene again"
+
+
 @dataclass(frozen=True, slots=True)
 class JobCompletion:
     """Recorder of the end of jobs; methods block on the disk and the database."""
@@ -27,8 +30,8 @@ class JobCompletion:
     metrics: Metrics
     clock: Clock
 
-    def succeed(self, job: Job, summary: dict[str, Any], folder: str) -> None:
-        """Record success of a job whose result is complete, in a folder of its files."""
+    def succeed(self, job: Job, summary: dict[str, Any], folder: str, *, dead: str | None = None) -> None:
+        """Record success of a job whose result is complete, in a folder of its files; for ``dead``, see ``move``."""
         keep, shared = self.settings.keep_uploads, self.storage.shared
         if shared:  # another replica may have taken the job over, so nothing is removed before the end is recorded
             kept = keep and self.storage.upload_name(job.id) is not None
@@ -40,20 +43,20 @@ class JobCompletion:
             "reclaimable_bytes": job.upload_bytes if kept else 0,
             "disk_bytes": self.storage.job_bytes(job.id),
         }
-        if not self.end(job, State.SUCCEEDED, **values):
+        if not self.end(job, State.SUCCEEDED, dead=dead, **values):
             self.storage.remove_result(job.id, folder)
         elif shared:
             self.storage.settle(job.id, folder, keep_upload=keep)
             self.store.update(job.number, disk_bytes=self.storage.job_bytes(job.id))
 
-    def fail(self, job: Job, code: str, detail: str) -> None:
-        """Record failure of a job and remove its files."""
-        if self._failed(job, code, detail):
+    def fail(self, job: Job, code: str, detail: str, *, dead: str | None = None) -> None:
+        """Record failure of a job and remove its files; for ``dead``, see ``move``."""
+        if self._failed(job, code, detail, dead):
             self.storage.remove_job(job.id)
 
     def lose(self, job: Job) -> None:
         """Record failure of a job whose upload is missing; other files move to the orphaned folder."""
-        if self._failed(job, "internal", "the upload is no longer on the server's disk; submit the scene again"):
+        if self._failed(job, "internal", LOST):
             self.storage.set_aside(job.id, "has lost its upload")
 
     def end(self, job: Job, state: State, **values: Any) -> bool:  # noqa: ANN401
@@ -67,9 +70,9 @@ class JobCompletion:
             log.info("job %s %s %s", job.id, state, when)
         return moved
 
-    def _failed(self, job: Job, code: str, detail: str) -> bool:
+    def _failed(self, job: Job, code: str, detail: str, dead: str | None = None) -> bool:
         document = problem(code if code in PROBLEM_TYPES else "internal", detail).model_dump(exclude_none=True)
-        return self.end(job, State.FAILED, problem=document, upload_kept=False, disk_bytes=0)
+        return self.end(job, State.FAILED, dead=dead, problem=document, upload_kept=False, disk_bytes=0)
 
 
 def result_folder(job: Job) -> str:

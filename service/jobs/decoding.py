@@ -59,8 +59,7 @@ class Decoder:
         try:
             work = await run_sync(self.storage.new_work, job.id)
             await self._run(job, work)
-            await run_sync(self.storage.keep_decoded, work, job.id)
-            await run_sync(self._update_sizes, job)
+            await run_sync(self._keep, work, job)
         except (ProblemError, OSError) as error:
             current = await run_sync(self.store.get, job.id)
             if current is None or current.state != State.SUCCEEDED:
@@ -69,11 +68,21 @@ class Decoder:
         finally:
             if work is not None:
                 await run_sync(self.storage.discard, work)
+                if self.storage.shared:
+                    await run_sync(self.storage.remove_work, job.id)
             await run_sync(self.admission.release, size, 0)
 
-    def _update_sizes(self, job: Job) -> None:
+    def _keep(self, work: Path, job: Job) -> None:
+        self.store.take_claim(job.id)
+        self.storage.keep_decoded(work, job.id)
+        current = self.store.get(job.id)
+        if current is None or current.state != State.SUCCEEDED:  # another replica has removed the files before
+            self.storage.remove_job(job.id)
+            self.store.drop_claim(job.id)
+            raise _gone()
         reclaimable = self.storage.reclaimable_bytes(job.id)
         self.store.update(job.number, disk_bytes=self.storage.job_bytes(job.id), reclaimable_bytes=reclaimable)
+        self.store.drop_claim(job.id)
 
     def stop(self, job_id: str) -> None:
         """Kill the decoding of a job, if it is running."""

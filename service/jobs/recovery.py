@@ -23,7 +23,7 @@ def recover(context: ServiceContainer) -> None:
     known, failed = store.ids(), store.ids(State.FAILED)
     for job_id in sorted(storage.job_ids() & (known - store.ids(State.QUEUED, State.RUNNING, State.SUCCEEDED))):
         _finish_removal(storage, job_id, failed=job_id in failed)
-    storage.set_aside_unknown(known)
+    storage.set_aside_unknown(store.ids)
 
 
 def _recover_job(context: ServiceContainer, job: Job) -> None:

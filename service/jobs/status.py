@@ -16,12 +16,12 @@ class QueueEstimator:
 
     Args:
         store: job store.
-        workers: maximum number of running jobs.
+        workers: maximum number of running jobs of each replica.
     """
 
     def __init__(self, store: Store, workers: int) -> None:
         self.now = store.clock()
-        self._store, self._workers = store, workers
+        self._store, self._workers = store, workers * store.replica_count
         self._active: list[Job] | None = None
         self._rates: dict[tuple[str, bool], float | None] = {}
 

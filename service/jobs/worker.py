@@ -19,13 +19,17 @@ from ..core.settings import ServiceSettings
 from ..storage.database_health import error_text
 from ..storage.job_records import Store
 from ..storage.job_storage import RESULT, JobStorage
-from .completion import JobCompletion
+from ..storage.object_store import ObjectStoreError
+from .completion import LOST, JobCompletion
 from .runner import JobProcess, Outcome
 
 log = logging.getLogger("kissgs.service")
 
 IDLE_SECONDS = 1.0
 """Seconds after which an idle worker reads the queue even without a notification."""
+
+CANCEL_SECONDS, CANCEL_POLL_SECONDS = 10.0, 0.2
+"""Maximum wait for another replica to end a cancelled job, and the interval between looks, seconds."""
 
 QUEUE = "queue"
 """Name that is notified when a job is added to the queue."""
@@ -46,6 +50,8 @@ class Worker:
     _loops: list[asyncio.Task[None]] = field(default_factory=list)
     _last_poll: dict[int, float] = field(default_factory=dict)
     _logged: set[str] = field(default_factory=set)
+    _busy: int = 0
+    _abandoning: bool = False
 
     def start(self) -> None:
         """Start to run jobs."""
@@ -88,9 +94,38 @@ class Worker:
         if process is not None:
             process.kill()
             await process.ended.wait()
+        elif self.storage.shared:
+            await self._wait_for_other_replica(job.id)
         await run_sync(self.storage.remove_job, job.id)
         self.notifier.notify(job.id)
         self.notifier.notify(ended(job.id))
+
+    async def _wait_for_other_replica(self, job_id: str) -> None:
+        """Wait until the replica that runs a job has ended it; one that has died is not waited for."""
+        for _ in range(round(CANCEL_SECONDS / CANCEL_POLL_SECONDS)):
+            if not await run_sync(self.store.is_claimed, job_id):
+                return
+            await asyncio.sleep(CANCEL_POLL_SECONDS)
+
+    def running_ids(self) -> set[str]:
+        """Return the ids of all jobs with a process of this replica."""
+        return set(self._processes)
+
+    def kill(self, job_id: str) -> None:
+        """Kill the process of a job, if it is running."""
+        process = self._processes.get(job_id)
+        if process is not None:
+            process.kill()
+
+    async def abandon(self) -> None:
+        """End all jobs without recording it, because another replica has queued them again."""
+        self._abandoning = True
+        try:
+            while self._busy:
+                self.kill_running()
+                await asyncio.sleep(CANCEL_POLL_SECONDS)
+        finally:
+            self._abandoning = False
 
     # Running -------------------------------------------------------------------------------------------------------
 
@@ -110,7 +145,11 @@ class Worker:
             if job is None:
                 await wait(queued, IDLE_SECONDS)
             else:
-                await self._run(job)
+                self._busy += 1
+                try:
+                    await self._run(job)
+                finally:
+                    self._busy -= 1
 
     def _claim(self) -> Job | None:
         self.storage.check()  # else all queued jobs would fail, because their uploads cannot be read
@@ -142,10 +181,14 @@ class Worker:
         if current is None or current.state != State.RUNNING:
             return Outcome("stopped")
         work = await run_sync(self.storage.new_work, job.id)
+        try:
+            source = await run_sync(self.storage.fetch_scene, job.id, work)
+        except FileNotFoundError:
+            return Outcome("error", {"code": "internal", "detail": LOST})
         options = JobOptions.model_validate(job.options)
         task = {
             "kind": "compress",
-            "source": str(await run_sync(self.storage.fetch_scene, job.id, work)),
+            "source": str(source),
             "work": str(work),
             "settings": {name: value for name, value in job.options.items() if name not in ("format", "evaluate")},
             "format": options.format,
@@ -174,6 +217,9 @@ class Worker:
                 await run_sync(self._record, job, outcome)
                 break
             except (SQLAlchemyError, OSError) as error:
+                if self._abandoning:
+                    await run_sync(self.storage.remove_work, job.id)
+                    return
                 if outcome.kind == "done" and await run_sync(self._is_permanent, error):
                     log.error("job %s: its result cannot be kept: %s", job.id, error_text(error))
                     outcome = _outcome_of(error)
@@ -210,6 +256,7 @@ class Worker:
         current = self.store.get(job.id)
         if current is None or current.state != State.RUNNING:  # cancelled or deleted meanwhile
             self.storage.remove_work(job.id)
+            self.store.drop_claim(job.id)
             return
         folder = self.storage.keep_result(job.id) if outcome.kind == "done" else RESULT
         self.storage.remove_work(job.id)  # before requeueing, because another worker may then run the job
@@ -250,7 +297,7 @@ _INTERNAL_ERROR = Outcome(
 
 
 def _outcome_of(error: Exception) -> Outcome:
-    if isinstance(error, OSError) and error.errno in _TRANSIENT_ERRNOS:
+    if isinstance(error, ObjectStoreError) or (isinstance(error, OSError) and error.errno in _TRANSIENT_ERRNOS):
         return Outcome("postponed")
     if isinstance(error, OSError):
         reason = (error.strerror or str(error)).lower()

@@ -16,7 +16,6 @@ from ..core.models import SCHEMA_VERSION, Base, Job, Meta
 from ..core.settings import SettingsError
 from .database_health import (
     IDENTITY,
-    IDENTITY_BITS,
     check_pages,
     check_rows,
     check_writable,
@@ -24,6 +23,8 @@ from .database_health import (
     keep_open,
     sqlite_file,
 )
+from .machine import IDENTITY_BITS
+from .replicas import JOIN_LOCK, lock
 
 Sessions = sessionmaker[Session]
 
@@ -138,6 +139,7 @@ def _check(session: Session, *, create: bool) -> None:
     connection = session.connection()
     if connection.dialect.name == "postgresql":
         connection.exec_driver_sql(f"SET LOCAL lock_timeout = {int(1000 * START_SECONDS)}")
+        lock(session, JOIN_LOCK)  # of simultaneous first starts, one creates the tables
     required = set(Base.metadata.tables)
     existing = required & set(sa.inspect(connection).get_table_names())
     values = _meta_values(session) if "meta" in existing else {}

@@ -6,6 +6,7 @@ files of others.
 
 from __future__ import annotations
 
+import contextlib
 import secrets
 from collections.abc import Callable
 
@@ -14,9 +15,10 @@ from sqlalchemy.exc import SQLAlchemyError
 from ..core.models import ACTIVE
 from ..core.settings import ServiceSettings, SettingsError
 from .database import NewDatabaseError
-from .database_health import IDENTITY, IDENTITY_BITS, error_text
+from .database_health import IDENTITY, error_text
 from .job_records import Store
 from .job_storage import JobStorage
+from .machine import IDENTITY_BITS
 
 NEARLY_FULL_BYTES = 1 << 20
 """Free disk space below which a database may fail to open, bytes."""
@@ -34,8 +36,12 @@ def open_store(settings: ServiceSettings, storage: JobStorage, clock: Callable[[
     except NewDatabaseError as error:
         raise _unknown_jobs_error(storage, stored, "the job database is new and has none of them") from error
     try:
-        _bind(store, storage, stored)
-        store.acquire_database()
+        with store.starting() if storage.shared else contextlib.nullcontext():
+            _bind(store, storage, stored)
+            if storage.shared:
+                storage.replica = store.join()
+            else:
+                store.acquire_database()
     except BaseException as error:
         store.abandon()
         if isinstance(error, SQLAlchemyError):
@@ -75,6 +81,8 @@ def _bind(store: Store, storage: JobStorage, stored: set[str]) -> None:
         if its_database is not None:
             raise _unknown_jobs_error(storage, stored, "they belong to another database")
     active = store.ids(*ACTIVE)
+    if active and storage.shared:  # other replicas may have added and removed jobs meanwhile
+        stored = storage.job_ids() | (active - store.ids(*ACTIVE))
     if active and not active & stored:
         raise _missing_jobs_error(storage, active)
     folder_number = next(

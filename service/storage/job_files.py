@@ -26,6 +26,7 @@ import re
 import secrets
 import shutil
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
@@ -236,8 +237,8 @@ class FolderStorage(JobStorage):
             with contextlib.suppress(FileNotFoundError, NotADirectoryError):
                 path.unlink()
 
-    def remove_job(self, job_id: str) -> None:
-        """Remove all files of a job; files that cannot be removed stay, with a warning in the log.
+    def remove_job(self, job_id: str) -> bool:
+        """Remove all files of a job and return True; files that cannot be removed stay, with a warning in the log.
 
         If the job's path is not a folder, or has other content, it is moved to the orphaned folder instead.
         """
@@ -249,6 +250,7 @@ class FolderStorage(JobStorage):
                 log.warning("job %s: its folder cannot be removed", job_id)
         except OSError as error:
             log.warning("job %s: its folder cannot be removed: %s", job_id, (error.strerror or str(error)).lower())
+        return True
 
     def _remove(self, folder: Path) -> bool:
         """Remove the folder of a job, or move it to the orphaned folder; return False if it still exists."""
@@ -306,13 +308,13 @@ class FolderStorage(JobStorage):
         if os.path.lexists(self.jobs / job_id):
             self.move_to_orphaned(job_id, why)
 
-    def set_aside_unknown(self, known: set[str]) -> int:
+    def set_aside_unknown(self, known: Callable[[], set[str]]) -> int:
         """Move the folders of all jobs except ``known`` ones to the orphaned folder; call it before uploads start.
 
         Returns:
             The number of folders moved.
         """
-        unknown = sorted(self.job_ids() - known)
+        unknown = sorted(self.job_ids() - known())
         for job_id in unknown:
             self._move_to_orphaned(self.jobs / job_id)
         if unknown:

@@ -15,7 +15,7 @@ from sqlalchemy.exc import IntegrityError, SQLAlchemyError
 from sqlalchemy.orm import Session, load_only
 
 from ..core.models import ACTIVE, ENDED, NOTE_CHARS, Event, Job, Meta, State
-from . import database_lease
+from . import database_lease, replicas
 from .database import connect
 from .database_health import IDENTITY, DatabaseMonitor, DatabaseReplacedError
 
@@ -31,7 +31,7 @@ _PREDECESSORS: dict[State, tuple[State, ...]] = {
 
 
 class LimitExceeded(Exception):
-    """A job was not added because of a limit: ``"queue"``, ``"owner"`` or ``"key"``.
+    """A job was not added because of a limit: ``"queue"``, ``"owner"``, ``"disk"`` or ``"key"``.
 
     Attributes:
         limit: name of the limit.
@@ -58,6 +58,7 @@ class Store:
         self._engine, self._writing, self._reading = connect(url, create=create)
         self._monitor = DatabaseMonitor(self._engine)
         self._monitor.identity = self.meta_value(IDENTITY)
+        self.replica_count = 1
         self.clock = clock
 
     def close(self) -> None:
@@ -65,6 +66,9 @@ class Store:
         if self._monitor.owner is not None and self.health_problem() is None:
             with contextlib.suppress(SQLAlchemyError), self._write() as session:
                 database_lease.release(session)
+        if self._monitor.replica is not None:
+            with contextlib.suppress(SQLAlchemyError), self._writing.begin() as session:
+                replicas.remove(session, self._monitor.replica)
         self._engine.dispose()
         self._monitor.close()
 
@@ -108,6 +112,78 @@ class Store:
         """
         self._monitor.owner = database_lease.acquire(self._writing, self._reading)
 
+    # Replicas ------------------------------------------------------------------------------------------------------
+
+    @property
+    def replica(self) -> str | None:
+        """Id of this replica; None if the database belongs to one service."""
+        return self._monitor.replica
+
+    @contextlib.contextmanager
+    def starting(self) -> Iterator[None]:
+        """Let only one replica at a time start with this database, which must be PostgreSQL."""
+        with self._writing.begin() as session:
+            replicas.lock(session, replicas.START_LOCK)
+            yield
+
+    def join(self) -> str:
+        """Register this process as a replica, with a new id; return it."""
+        with self._writing.begin() as session:
+            replicas.lock(session, replicas.JOIN_LOCK)
+            replicas.create_tables(session)
+            self._monitor.replica = replicas.register(session)
+        return self._monitor.replica
+
+    def is_lapsed(self) -> bool:
+        """Return whether another replica has taken this one for dead."""
+        with self._reading() as session:
+            return self.replica is not None and session.get(replicas.Replica, self.replica) is None
+
+    def other_replicas(self) -> list[replicas.Replica]:
+        """Return the rows of all other replicas, and count them."""
+        with self._reading() as session:
+            found = list(session.scalars(sa.select(replicas.Replica).where(replicas.Replica.id != self.replica)))
+        self.replica_count = 1 + len(found)
+        return found
+
+    def bury(self, row: replicas.Replica) -> bool:
+        """Remove the row of a replica that has not changed it since it was read; return whether it was removed."""
+        with self._write() as session:
+            return replicas.remove(session, row.id, row.beats)
+
+    def claimed_ids(self) -> set[str]:
+        """Return the ids of all jobs that a replica writes files of."""
+        with self._reading() as session:
+            return set(session.scalars(sa.select(replicas.Claim.job)))
+
+    def claims_of_the_dead(self) -> list[tuple[str, str]]:
+        """Return job and replica of all claims whose replica has no row."""
+        with self._reading() as session:
+            return replicas.claims_of_the_dead(session)
+
+    def take_claim(self, job_id: str) -> None:
+        """Record that this replica writes files of a job; nothing without replicas."""
+        if self.replica is not None:
+            with self._write() as session:
+                replicas.take(session, job_id, self.replica)
+
+    def drop_claim(self, job_id: str, replica: str | None = None) -> None:
+        """Record that a replica, by default this one, writes files of a job no more; nothing without replicas."""
+        if (holder := replica or self.replica) is not None:
+            with self._write() as session:
+                replicas.drop(session, job_id, holder)
+
+    def is_claimed(self, job_id: str) -> bool:
+        """Return whether a running replica writes files of a job."""
+        with self._reading() as session:
+            return self.replica is not None and replicas.is_claimed(session, job_id)
+
+    def states(self, job_ids: Iterable[str]) -> dict[str, tuple[State, int]]:
+        """Return the state and the number of the last event of jobs, by id; those that do not exist are missing."""
+        query = sa.select(Job.id, Job.state, Job.last_event).where(Job.id.in_(list(job_ids)))
+        with self._reading() as session:
+            return {job_id: (State(state), last) for job_id, state, last in session.execute(query)}
+
     @contextlib.contextmanager
     def _write(self) -> Iterator[Session]:
         """Begin a transaction; raise an error if the database is removed or replaced before it ends."""
@@ -120,15 +196,22 @@ class Store:
 
     # Jobs ----------------------------------------------------------------------------------------------------------
 
-    def add(self, job: Job, *, max_queue: int, max_owner: int) -> Job:
-        """Queue a job.
+    def add(self, job: Job, *, max_queue: int, max_owner: int, max_disk: int | None = None) -> Job:
+        """Queue a job; of a replica, drop the claim of it.
 
         Raises:
-            LimitExceeded: ``max_queue`` jobs are queued, ``max_owner`` jobs of its owner are active, or its idempotency
-                key is in use.
+            LimitExceeded: ``max_queue`` jobs are queued, ``max_owner`` jobs of its owner are active, all jobs would
+                have more than ``max_disk`` bytes, or its idempotency key is in use.
+            DatabaseReplacedError: this replica has lost its claim.
         """
         try:
             with self._write() as session:
+                if self.replica is not None:
+                    replicas.lock(session, replicas.QUEUE_LOCK)  # counting and adding is one step for all replicas
+                    if not replicas.drop(session, job.id, self.replica):
+                        raise DatabaseReplacedError("another replica took this one for dead; send the request again")
+                if max_disk is not None and self._disk_bytes(session) + job.disk_bytes > max_disk:
+                    raise LimitExceeded("disk")
                 if self._count(session, Job.state == State.QUEUED) >= max_queue:
                     raise LimitExceeded("queue")
                 active = Job.owner == job.owner, Job.owner != "", Job.state.in_(ACTIVE)
@@ -187,6 +270,8 @@ class Store:
             job.started_at = self.clock()
             job.disk_bytes = job.upload_bytes + job.work_bytes
             job.state = State.RUNNING
+            if self.replica is not None:
+                replicas.take(session, job.id, self.replica)
             _add_event(session, job, "state", {"state": State.RUNNING, "start": job.starts})
             return job
 
@@ -199,15 +284,21 @@ class Store:
                 optional = {"note": job.note} if job.note else {}
                 _add_event(session, job, "progress", {"stage": stage, "fraction": fraction, **optional})
 
-    def move(self, number: int, state: State, **values: Any) -> bool:  # noqa: ANN401
+    def move(self, number: int, state: State, *, dead: str | None = None, **values: Any) -> bool:  # noqa: ANN401
         """Set a job's state and the columns ``values``; return False if its current state does not allow it.
 
-        A job that returns to the queue loses its progress.
+        A job that returns to the queue loses its progress. A replica drops its own claim of the job, or that of a
+        ``dead`` replica, without which the state does not change.
         """
         with self._write() as session:
             job = session.get(Job, number, with_for_update=True)
             if job is None or job.state not in _PREDECESSORS[state]:
                 return False
+            holder = dead or self.replica
+            if holder is not None and state != State.RUNNING:
+                dropped = replicas.drop(session, job.id, holder)
+                if dead is not None and not dropped:
+                    return False
             for name, value in values.items():
                 setattr(job, name, value)
             if state == State.QUEUED:
@@ -254,7 +345,7 @@ class Store:
     def disk_bytes(self) -> int:
         """Return the disk space of all jobs, bytes."""
         with self._reading() as session:
-            return int(session.scalar(sa.select(sa.func.coalesce(sa.func.sum(Job.disk_bytes), 0))) or 0)
+            return self._disk_bytes(session)
 
     def rates(self, preset: str, evaluate: bool, limit: int = 21) -> list[float]:
         """Return seconds per Gaussian of up to ``limit`` recent jobs of a preset, with or without evaluation."""
@@ -303,6 +394,12 @@ class Store:
         """Store the current time, which renews the lease and checks that the database is writable."""
         with self._write() as session:
             session.merge(Meta(name="time", value=self.clock()))
+            if self.replica is not None:
+                replicas.beat(session, self.replica)
+
+    @staticmethod
+    def _disk_bytes(session: Session) -> int:
+        return int(session.scalar(sa.select(sa.func.coalesce(sa.func.sum(Job.disk_bytes), 0))) or 0)
 
     @staticmethod
     def _count(session: Session, *where: sa.ColumnElement[bool]) -> int:

@@ -46,11 +46,13 @@ class JobStorage(ABC):
         place: where the files of jobs lie, for messages.
         setting: name of the setting that determines it.
         shared: whether other replicas use the files as well; then they are not on this machine's disk.
+        replica: id of this replica, which names the results that it stores; empty if they are not shared.
     """
 
     place: str
     setting: str
     shared: bool
+    replica: str = ""
 
     @abstractmethod
     def close(self) -> None:
@@ -171,8 +173,8 @@ class JobStorage(ABC):
         """Remove the upload and the decoded scene of an ended job."""
 
     @abstractmethod
-    def remove_job(self, job_id: str) -> None:
-        """Remove all files of a job."""
+    def remove_job(self, job_id: str) -> bool:
+        """Remove all files of a job; return whether there is no need to try again later."""
 
     @abstractmethod
     def job_bytes(self, job_id: str) -> int:
@@ -189,8 +191,11 @@ class JobStorage(ABC):
         """Put files of a failed job where nothing removes them; ``why`` continues "its folder ..." in the log."""
 
     @abstractmethod
-    def set_aside_unknown(self, known: set[str]) -> int:
+    def set_aside_unknown(self, known: Callable[[], set[str]]) -> int:
         """Put the files of all jobs except ``known`` ones where nothing removes them; call it before uploads start.
+
+        Args:
+            known: returns the ids of all jobs in the database.
 
         Returns:
             The number of these jobs.

@@ -12,9 +12,11 @@ import pytest
 import sqlalchemy as sa
 from helpers.data_folders import jobs_folder, no_variables, sample_folder  # noqa: F401
 from helpers.preview_browser import preview, software_browser  # noqa: F401
+from helpers.s3_server import S3Server
 from helpers.service import Service
 
 from service.core.models import Base
+from service.storage.replicas import ReplicaBase
 
 
 @pytest.fixture(scope="package")
@@ -82,5 +84,20 @@ def postgresql(postgresql_server):
     """URL of a database without tables."""
     yield postgresql_server
     engine = sa.create_engine(postgresql_server)
+    ReplicaBase.metadata.drop_all(engine)
     Base.metadata.drop_all(engine)
     engine.dispose()
+
+
+@pytest.fixture(scope="session")
+def s3_server(tmp_path_factory):
+    """A server with the interface of Amazon S3, if its program is installed."""
+    pytest.importorskip("obstore")
+    with S3Server(tmp_path_factory.mktemp("s3")) as server:
+        yield server
+
+
+@pytest.fixture
+def bucket(s3_server):
+    """A new bucket."""
+    return s3_server.bucket()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from pathlib import PurePath
 from typing import Annotated, Any
@@ -11,12 +12,15 @@ from fastapi import APIRouter, Path, Response
 
 from ...core.formats import CONTAINER_FILES, container_file
 from ...core.models import Job, State
-from ...core.problems import ProblemError
+from ...core.problems import ProblemError, unusable_storage
 from ...jobs.completion import result_folder
 from ...jobs.container import Service, ServiceContainer
 from ...storage.job_storage import StoredObject
-from ..file_response import StoredFile, described
+from ...storage.object_store import ObjectStoreError
+from ..file_response import StoredFile, described, removed
 from .common import RequestedJob, problems
+
+log = logging.getLogger("kissgs.service")
 
 router = APIRouter(prefix="/v1/jobs/{id}", tags=["results"])
 
@@ -29,7 +33,7 @@ _PRIVATE = {"Cache-Control": "private, no-cache"}
 _FOREVER = {"Cache-Control": "private, max-age=31536000, immutable"}
 """Headers of container files, which never change."""
 
-_UNREADY = ("not-found", "not-finished", "not-succeeded", "gone", "range")
+_UNREADY = ("not-found", "not-finished", "not-succeeded", "gone", "range", "storage")
 
 
 def _file_answers(media_types: str, *codes: str) -> dict[int | str, dict[str, Any]]:
@@ -116,8 +120,11 @@ async def container(context: ServiceContainer, job: Job) -> StoredFile:
 async def _open(context: ServiceContainer, job: Job, name: str) -> StoredObject:
     try:
         return await run_sync(context.storage.open, job.id, name)
-    except FileNotFoundError as error:  # expired, or deleted for a new upload, since the job was read
-        raise ProblemError("gone", "the file was removed during the request; submit the scene again") from error
+    except FileNotFoundError as error:
+        raise removed() from error
+    except ObjectStoreError as error:
+        log.error("job %s: %s cannot be read: %s", job.id, name, error)
+        raise unusable_storage() from error
 
 
 def _ready(job: Job) -> None:
