@@ -58,7 +58,6 @@ class Store:
         self._engine, self._writing, self._reading = connect(url, create=create)
         self._monitor = DatabaseMonitor(self._engine)
         self._monitor.identity = self.meta_value(IDENTITY)
-        self.replica_count = 1
         self.clock = clock
 
     def close(self) -> None:
@@ -140,11 +139,16 @@ class Store:
             return self.replica is not None and session.get(replicas.Replica, self.replica) is None
 
     def other_replicas(self) -> list[replicas.Replica]:
-        """Return the rows of all other replicas, and count them."""
+        """Return the rows of all other replicas."""
         with self._reading() as session:
-            found = list(session.scalars(sa.select(replicas.Replica).where(replicas.Replica.id != self.replica)))
-        self.replica_count = 1 + len(found)
-        return found
+            return list(session.scalars(sa.select(replicas.Replica).where(replicas.Replica.id != self.replica)))
+
+    def count_replicas(self) -> int:
+        """Return the number of replicas; 1 if the database belongs to one service."""
+        if self.replica is None:
+            return 1
+        with self._reading() as session:
+            return max(1, session.scalar(sa.select(sa.func.count()).select_from(replicas.Replica)) or 0)
 
     def bury(self, row: replicas.Replica) -> bool:
         """Remove the row of a replica that has not changed it since it was read; return whether it was removed."""

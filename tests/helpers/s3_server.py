@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import shutil
 import socket
 import subprocess
@@ -28,7 +29,7 @@ def program() -> str | None:
 
 
 class S3Server:
-    """Server for use as ``with S3Server(folder) as server``; ``server.stop()`` and ``server.start()`` lose all files."""
+    """Server for use as ``with S3Server(folder) as server``, with files in memory."""
 
     def __init__(self, folder: Path) -> None:
         self.log = folder / "s3.log"
@@ -80,10 +81,8 @@ class Bucket:
             **CREDENTIALS,
         }
 
-    def keys(self) -> list[str]:
+    def names(self) -> list[str]:
         """Return all keys, without the prefix."""
-        import re
-
         text = self._http.get("", params={"list-type": "2"}).text
         assert "<IsTruncated>true" not in text
         return [key.removeprefix("a/prefix/") for key in re.findall("<Key>([^<]*)</Key>", text)]

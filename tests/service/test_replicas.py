@@ -28,5 +28,3 @@ def test_one_replica(replica, bucket):
     job = it.ended(it.submit())
     assert job["state"] == "succeeded", (job, it.log.read_text()[-3000:])
     assert it.http.get(job["links"]["result"]).content == EXPECTED
-    print(bucket.keys())
-    print(it.log.read_text())
