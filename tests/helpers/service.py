@@ -178,9 +178,7 @@ class Replicas(Service):
         for replica in self.replicas:
             replica.start()
         self.url, self.port, self.process = self.replicas[0].url, self.replicas[0].port, self.replicas[0].process
-        self.http = httpx.Client(
-            base_url=self.url, timeout=300, trust_env=False, transport=_InTurn([it.port for it in self.replicas])
-        )
+        self.http = httpx.Client(base_url=self.url, timeout=300, trust_env=False, transport=_InTurn(self.replicas))
         return self
 
     def kill(self, number: int) -> int:
@@ -220,14 +218,14 @@ class Replicas(Service):
 
 
 class _InTurn(httpx.HTTPTransport):
-    """Transport that sends each request to the next one of several ports."""
+    """Transport that sends each request to the next replica."""
 
-    def __init__(self, ports: list[int]) -> None:
+    def __init__(self, replicas: list[Service]) -> None:
         super().__init__(trust_env=False)
-        self._ports = itertools.cycle(ports)
+        self._replicas = itertools.cycle(replicas)
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
-        request.url = request.url.copy_with(port=next(self._ports))
+        request.url = request.url.copy_with(port=next(self._replicas).port)
         return super().handle_request(request)
 
 
