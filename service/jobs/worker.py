@@ -12,7 +12,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from ..core.formats import CONTAINER_FILES
 from ..core.metrics import Metrics
-from ..core.models import Job, State
+from ..core.models import ACTIVE, Job, State
 from ..core.notifier import JobNotifier, ended, wait
 from ..core.schemas import JobOptions
 from ..core.settings import ServiceSettings
@@ -30,6 +30,9 @@ IDLE_SECONDS = 1.0
 
 CANCEL_SECONDS, CANCEL_POLL_SECONDS = 10.0, 0.2
 """Maximum wait for another replica to end a cancelled job, and the interval between looks, seconds."""
+
+CHECKPOINT_SECONDS = 30.0
+"""Minimum seconds between two looks for new checkpoints that other replicas may need."""
 
 QUEUE = "queue"
 """Name that is notified when a job is added to the queue."""
@@ -186,6 +189,8 @@ class Worker:
         except FileNotFoundError:
             return Outcome("error", {"code": "internal", "detail": LOST})
         options = JobOptions.model_validate(job.options)
+        if options.resumable:
+            await run_sync(self.storage.fetch_checkpoints, job.id)
         task = {
             "kind": "compress",
             "source": str(source),
@@ -206,7 +211,27 @@ class Worker:
                 self._log_once(f"job {job.id}: progress was not recorded", error)
             self.notifier.notify(job.id)
 
-        return await process.run(task, progress)
+        keeping = (
+            asyncio.create_task(self._keep_checkpoints(job)) if self.storage.shared and options.resumable else None
+        )
+        try:
+            return await process.run(task, progress)
+        finally:
+            if keeping is not None:
+                keeping.cancel()
+                await asyncio.gather(keeping, return_exceptions=True)
+
+    async def _keep_checkpoints(self, job: Job) -> None:
+        """Store the checkpoints of a running job for other replicas, in at most a tenth of the time."""
+        clock = asyncio.get_running_loop().time
+        while True:
+            await asyncio.sleep(CHECKPOINT_SECONDS)
+            begun = clock()
+            try:
+                await run_sync(self.storage.store_checkpoints, job.id)
+            except OSError as error:  # the job may succeed without
+                self._log_once(f"job {job.id}: its checkpoint was not stored", error)
+            await asyncio.sleep(9 * (clock() - begun))
 
     # How jobs end -----------------------------------------------------------------------------------------------------
 
@@ -259,6 +284,8 @@ class Worker:
             self.store.drop_claim(job.id)
             return
         folder = self.storage.keep_result(job.id) if outcome.kind == "done" else RESULT
+        if outcome.kind in ("stopped", "postponed", "crashed"):  # it may continue elsewhere
+            self.storage.store_checkpoints(job.id)
         self.storage.remove_work(job.id)  # before requeueing, because another worker may then run the job
         match outcome.kind:
             case "done":
@@ -275,6 +302,9 @@ class Worker:
                 self.store.move(job.number, State.QUEUED, crashes=1)
             case "crashed":
                 self.completion.fail(job, "crashed", outcome.data["detail"])
+        current = self.store.get(job.id)
+        if current is None or current.state not in ACTIVE:  # cancelled at the same moment, so the claim is still held
+            self.store.drop_claim(job.id)
 
     def _requeue(self, job: Job) -> None:
         """Return a job to the queue without counting its start."""

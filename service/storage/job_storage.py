@@ -117,6 +117,12 @@ class JobStorage(ABC):
             raise FileNotFoundError(2, "its upload is missing")
         return self.fetch(job_id, name, work)
 
+    def fetch_checkpoints(self, job_id: str) -> None:  # noqa: B027  nothing to do if they lie on this machine
+        """Copy the checkpoints of a job, which another replica may have made, to this machine."""
+
+    def store_checkpoints(self, job_id: str) -> None:  # noqa: B027
+        """Store the complete checkpoints of a job for other replicas, if they have changed."""
+
     @abstractmethod
     def keep_result(self, job_id: str) -> str:
         """Store the result in a job's work folder for good; do nothing if that is done already.

@@ -35,6 +35,8 @@ log = logging.getLogger("kissgs.service")
 HEALTH_SECONDS = 5.0
 """Seconds for which the health of the bucket is not asked for again."""
 
+_CHECKPOINT = re.compile(r"checkpoint[^/]*[.]npz")
+
 _JOB = re.compile("[0-9a-f]{32}")
 
 
@@ -58,6 +60,7 @@ class S3Storage(JobStorage):
         self._objects = ObjectStore(url)
         self._local = FolderStorage(root)
         self.place = f"{self._objects.url}/jobs"
+        self._stored: dict[Path, int] = {}
         self._unknown = 0
         self._identity: int | None = None
         self._checked, self._problem = -HEALTH_SECONDS, ""
@@ -92,7 +95,8 @@ class S3Storage(JobStorage):
         return self._local.checkpoint(job_id)
 
     def remove_work(self, job_id: str) -> None:
-        """Remove what this replica has of a job."""
+        """Remove what this replica has of a job; stored checkpoints stay."""
+        self._stored = {path: made for path, made in self._stored.items() if path.parent.name != job_id}
         self._local.remove_job(job_id)
 
     def discard(self, path: Path) -> None:
@@ -129,6 +133,19 @@ class S3Storage(JobStorage):
         path = work / Path(name).name
         self._objects.fetch(_key(job_id, name), path)
         return path
+
+    def fetch_checkpoints(self, job_id: str) -> None:
+        """Copy the checkpoints of a job, which another replica may have made, to this machine."""
+        for name in self._names(job_id):
+            if _CHECKPOINT.fullmatch(name):
+                self._objects.fetch(_key(job_id, name), self._local.jobs / job_id / name)
+
+    def store_checkpoints(self, job_id: str) -> None:
+        """Store the complete checkpoints of a job for other replicas, if they have changed."""
+        for path in sorted((self._local.jobs / job_id).glob("checkpoint*.npz")):
+            if self._stored.get(path) != (made := path.stat().st_mtime_ns):
+                self._objects.put(path, _key(job_id, path.name))
+                self._stored[path] = made
 
     def keep_result(self, job_id: str) -> str:
         """Store the result in a job's work folder for good; do nothing if that is done already.

@@ -8,8 +8,6 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import httpx
-
 import kissgs
 from helpers.s3_server import Bucket
 from helpers.service import Replicas, scene_bytes
@@ -42,8 +40,7 @@ def kill_at_random_moments(folder: Path, bucket: Bucket, database: str, *, kills
             time.sleep(rng.uniform(0.0, 2.5))
             dead, alive = rng.sample(it.replicas, 2)
             dead.kill(signal.SIGKILL)
-            with httpx.Client(base_url=alive.url, timeout=60, trust_env=False) as http:
-                listed = http.get("/v1/jobs", params={"limit": 100}).json()["jobs"]
+            listed = alive.http.get("/v1/jobs", params={"limit": 100}).json()["jobs"]
             assert len(listed) == jobs
             dead.restart()
             submitted.append(it.submit(scenes[0]))

@@ -181,6 +181,15 @@ class Replicas(Service):
         self.http = httpx.Client(base_url=self.url, timeout=300, trust_env=False, transport=_InTurn(self.replicas))
         return self
 
+    def __exit__(self, *error: object) -> None:
+        for replica in self.replicas:
+            replica.__exit__()
+        self.http.close()
+
+    def restart(self) -> Replicas:
+        self.__exit__()
+        return self.start()
+
     def kill(self, number: int) -> int:
         for replica in self.replicas:
             if replica.process.poll() is None:

@@ -5,10 +5,10 @@ import json
 import os
 import re
 import signal
+import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 
-import httpx
 import pytest
 from helpers.data_folders import add_a_job, command
 from helpers.job_rows import job as job_row
@@ -62,7 +62,7 @@ def test_jobs_run_once_and_on_both(two):
 
 def test_news_and_cancellation_reach_the_other_replica(two):
     """Oracle: the limits on delays that the guide states."""
-    first, second = (httpx.Client(base_url=it.url, timeout=60, trust_env=False) for it in two.replicas)
+    first, second = (replica.http for replica in two.replicas)
     (running, _) = two.occupy()
     waiting = two.submit()
     with second.stream("GET", f"/v1/jobs/{waiting['id']}/events") as answer:
@@ -76,8 +76,6 @@ def test_news_and_cancellation_reach_the_other_replica(two):
     assert time.monotonic() - begun < 3
     assert len(two.children()) == 1
     assert running["id"] not in two.stored()
-    first.close()
-    second.close()
 
 
 def test_a_killed_replica_s_job_continues_on_the_other(two):
@@ -86,13 +84,11 @@ def test_a_killed_replica_s_job_continues_on_the_other(two):
         two.running(job)
     dead, alive = two.replicas
     dead.kill(signal.SIGKILL)
-    with httpx.Client(base_url=alive.url, timeout=60, trust_env=False) as client:
-        alive.http = client
-        ended = [alive.ended(job, seconds=60) for job in jobs]
-        assert sorted((job["state"], job["starts"]) for job in ended) == [("succeeded", 1), ("succeeded", 2)]
-        expected = kissgs.compress(MEDIUM, settings=kissgs.Settings(preset="fast")).to_zip()
-        assert {client.get(job["links"]["result"]).content for job in ended} == {expected}
-    dead.start()
+    ended = [alive.ended(job, seconds=60) for job in jobs]
+    assert sorted((job["state"], job["starts"]) for job in ended) == [("succeeded", 1), ("succeeded", 2)]
+    expected = kissgs.compress(MEDIUM, settings=kissgs.Settings(preset="fast")).to_zip()
+    assert {alive.http.get(job["links"]["result"]).content for job in ended} == {expected}
+    dead.restart()
     assert two.leftovers() == []
 
 
@@ -106,9 +102,7 @@ def test_a_suspended_replica_joins_again(two):
     children = asleep.children()
     for process in (asleep.process.pid, *children):
         os.kill(process, signal.SIGSTOP)
-    with httpx.Client(base_url=awake.url, timeout=60, trust_env=False) as client:
-        awake.http = client
-        ended = [awake.ended(job, seconds=90) for job in jobs]
+    ended = [awake.ended(job, seconds=90) for job in jobs]
     assert sorted((job["state"], job["starts"]) for job in ended) == [("succeeded", 1), ("succeeded", 2)]
     for process in (*children, asleep.process.pid):
         os.kill(process, signal.SIGCONT)
@@ -135,8 +129,7 @@ def test_replicas_are_killed_at_random_moments(tmp_path, bucket, new_database, k
 def test_a_stopped_replica_leaves_no_row(two):
     two.ended(two.submit())
     assert two.kill(signal.SIGTERM) == 0
-    two.http.close()
-    two.start()
+    two.restart()
     assert result_of(two, two.submit()) == EXPECTED
     for replica in two.replicas:
         assert "have died" not in replica.log.read_text()
@@ -357,6 +350,31 @@ def test_jobs_are_claimed_once(member):
     assert sorted(job.id for job in claimed if job) == jobs
 
 
+def test_checkpoints_reach_other_replicas(member, bucket):
+    first, second = member(), member()
+    job_id = add(first)
+    first.store.claim()
+    first.storage.new_work(job_id)
+    for content in (b"one", b"two"):
+        first.storage.checkpoint(job_id).write_bytes(content)
+        first.storage.store_checkpoints(job_id)
+        first.storage.store_checkpoints(job_id)
+    first.storage.remove_work(job_id)
+    assert names(bucket, job_id) == ["checkpoint.npz", "scene.ply"]
+    second.storage.new_work(job_id)
+    second.storage.fetch_checkpoints(job_id)
+    assert second.storage.checkpoint(job_id).read_bytes() == b"two"
+    second.storage.remove_work(job_id)
+    second.storage.store_checkpoints(job_id)  # there are none any more
+    first.worker.completion.succeed(first.store.get(job_id), *result_in(first, job_id))
+    assert "checkpoint.npz" not in names(bucket, job_id)
+
+
+def result_in(context, job_id):
+    folder = write_result(context, job_id)
+    return context.storage.read_result(job_id, folder, "scene.zip"), folder
+
+
 def test_lapses():
     """Oracle: the definition, a number of readings without a change."""
     observer = LapseObserver()
@@ -424,9 +442,7 @@ def test_simultaneous_first_starts(tmp_path, bucket, new_database):
     with Replicas(tmp_path / "many", 3, bucket, new_database()) as it:
         it.kill(signal.SIGKILL)
         with ThreadPoolExecutor(3) as pool:
-            list(pool.map(lambda replica: replica.start(), it.replicas))
-        for replica in it.replicas:
-            replica.http.close()
+            list(pool.map(lambda replica: replica.restart(), it.replicas))
 
 
 # The bucket fails --------------------------------------------------------------------------------------------------
