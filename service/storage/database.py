@@ -34,6 +34,9 @@ START_SECONDS = 5.0
 LOCK_SECONDS = 30.0
 """Maximum wait for a lock after the start, seconds."""
 
+IDLE_TRANSACTION_SECONDS = 30.0
+"""Seconds after which a transaction that does nothing is ended by PostgreSQL."""
+
 _HINTS = {
     "locked": "another program has locked it; stop that program and start again",
     "lock timeout": "another program has locked it; stop that program and start again",
@@ -110,7 +113,19 @@ def _engine(url: str, wait: float, opened: list[Any] | None = None) -> sa.Engine
         raise SettingsError(f"KISSGS_DATABASE_URL: {error_text(error)}; set it to a SQLAlchemy URL") from error
     if engine.dialect.name == "sqlite":
         _tune_sqlite(engine, wait, opened)
+    elif engine.dialect.name == "postgresql":
+        _tune_postgresql(engine)
     return engine
+
+
+def _tune_postgresql(engine: sa.Engine) -> None:
+    """Let PostgreSQL end the transactions of a suspended service, which would make others wait for its locks."""
+
+    @sa.event.listens_for(engine, "connect")
+    def tune(connection: Any, record: object) -> None:  # noqa: ANN401
+        with connection.cursor() as cursor:
+            cursor.execute(f"SET idle_in_transaction_session_timeout = {int(1000 * IDLE_TRANSACTION_SECONDS)}")
+        connection.commit()
 
 
 def _tune_sqlite(engine: sa.Engine, wait: float, opened: list[Any] | None) -> None:

@@ -13,6 +13,7 @@ from collections.abc import AsyncIterator, Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 from urllib.parse import urlsplit
@@ -30,8 +31,8 @@ PARTS_AT_ONCE = 4
 FILES_AT_ONCE = 8
 """Number of small files that are sent simultaneously."""
 
-BLOCK_BYTES = 1 << 20
-"""Bytes of a block while receiving."""
+BLOCK_BYTES = 4 << 20
+"""Bytes of a block that is passed on to a client."""
 
 CONNECT_SECONDS = 5
 REQUEST_SECONDS = 300
@@ -159,18 +160,19 @@ class ObjectStore:
             FileNotFoundError: it does not exist.
         """
 
-        def copy() -> None:
-            found = self._api.get(self._store, key)
-            with path.open("wb") as file:
-                for block in found.stream(min_chunk_size=BLOCK_BYTES):
-                    file.write(block)
-            if path.stat().st_size != found.meta["size"]:
-                raise ObjectStoreError(f"{key} was received incompletely")
+        size = self.info(key).size
+        with path.open("wb") as file:
+            for first in range(0, size, PART_BYTES):
+                end = min(first + PART_BYTES, size)
+                file.write(self._try(partial(self._get_range, key, first, end)))
 
-        self._try(copy)
+    def _get_range(self, key: str, first: int, end: int) -> bytes:
+        return bytes(self._api.get_range(self._store, key, start=first, end=end))
 
     async def stream(self, key: str, first: int, end: int) -> AsyncIterator[bytes]:
         """Yield the bytes of a file from ``first`` to before ``end``; at least one block, which may be empty.
+
+        Each block is a request of its own, so that a slow client holds none open.
 
         Raises:
             FileNotFoundError: it does not exist.
@@ -180,9 +182,9 @@ class ObjectStore:
                 await self._api.head_async(self._store, key)
                 yield b""
                 return
-            found = await self._api.get_async(self._store, key, options={"range": (first, end)})
-            async for block in found.stream(min_chunk_size=BLOCK_BYTES):
-                yield bytes(block)
+            for start in range(first, end, BLOCK_BYTES):
+                stop = min(start + BLOCK_BYTES, end)
+                yield bytes(await self._api.get_range_async(self._store, key, start=start, end=stop))
         except self._errors as error:
             raise self._converted(error) from error
 
