@@ -85,8 +85,7 @@ class ReplicaWatch:
                 if await run_sync(self.context.store.is_lapsed, limiter=limiter):
                     await self._join_again()
                 await run_sync(self.context.store.heartbeat, limiter=limiter)
-                if await run_sync(self._bury, limiter=limiter):
-                    self.context.notifier.notify(QUEUE)
+                await run_sync(self._bury, limiter=limiter)
                 await run_sync(self.clear_up)
                 self.context.notifier.notify(QUEUE)
             except (SQLAlchemyError, OSError) as error:  # /readyz and the worker report it
@@ -100,14 +99,13 @@ class ReplicaWatch:
         self.context.storage.replica = await run_sync(self.context.store.join)
         self._observer = LapseObserver()
 
-    def _bury(self) -> int:
+    def _bury(self) -> None:
         """Remove the rows of dead replicas; the first time, only of those whose process has ended on this machine."""
         rows = self.context.store.other_replicas()
         found = self._observer.lapsed(rows)
         buried = sum(self.context.store.bury(row) for row in found)
         if buried:
             log.warning("replicas that have died: %d; their jobs are queued again", buried)
-        return buried
 
     # Clearing up ----------------------------------------------------------------------------------------------------
 

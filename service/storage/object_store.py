@@ -39,8 +39,8 @@ REQUEST_SECONDS = 300
 RETRY_SECONDS = 30
 """Seconds for which a failed request is repeated."""
 
-START_RETRY_SECONDS = 3
-"""Seconds for which it is repeated at the start, whose messages should come soon."""
+HASTY_SECONDS = 3
+"""Seconds for which it is repeated at the start and by checks of the health, whose messages should come soon."""
 
 _T = TypeVar("_T")
 
@@ -81,7 +81,7 @@ class ObjectStore:
         except ModuleNotFoundError as error:
             raise SettingsError(f"KISSGS_STORAGE: the package {error.name} is missing; install kissgs[s3]") from error
         self._api, self._errors = obstore, (obstore.exceptions.BaseError, OSError, ValueError)
-        self._store = self._connect(RETRY_SECONDS)
+        self._store, self._hasty = self._connect(RETRY_SECONDS), self._connect(HASTY_SECONDS)
 
     def _connect(self, retry_seconds: float) -> S3Store:
         from obstore.store import S3Store
@@ -108,7 +108,7 @@ class ObjectStore:
         Raises:
             SettingsError: that is not possible; the message says why.
         """
-        api, store = self._api, self._connect(START_RETRY_SECONDS)
+        api, store = self._api, self._hasty
         try:
             api.put(store, key, b"kissgs")
             found = bytes(api.get(store, key).bytes())
@@ -145,13 +145,14 @@ class ObjectStore:
         """Store a few bytes."""
         self._try(lambda: self._api.put(self._store, key, data))
 
-    def get_bytes(self, key: str) -> bytes:
-        """Return a small file.
+    def get_bytes(self, key: str, *, hasty: bool = False) -> bytes:
+        """Return a small file; with ``hasty``, fail soon if the bucket cannot be reached.
 
         Raises:
             FileNotFoundError: it does not exist.
         """
-        return self._try(lambda: bytes(self._api.get(self._store, key).bytes()))
+        store = self._hasty if hasty else self._store
+        return self._try(lambda: bytes(self._api.get(store, key).bytes()))
 
     def fetch(self, key: str, path: Path) -> None:
         """Copy a file to this machine.

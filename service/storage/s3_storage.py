@@ -275,7 +275,7 @@ class S3Storage(JobStorage):
 
     def _ask(self) -> str:
         try:
-            same = self._identity is None or self._objects.get_bytes("identity") == b"%d\n" % self._identity
+            same = self._identity is None or self._objects.get_bytes("identity", hasty=True) == b"%d\n" % self._identity
         except FileNotFoundError:
             same = False
         except OSError as error:

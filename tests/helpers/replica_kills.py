@@ -15,7 +15,7 @@ from helpers.service import Replicas, scene_bytes
 
 @dataclass
 class Kills:
-    """What was found afterwards.
+    """Findings after the kills.
 
     Attributes:
         lost: number of jobs that did not succeed.

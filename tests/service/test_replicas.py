@@ -13,7 +13,7 @@ import pytest
 from helpers.data_folders import add_a_job, command
 from helpers.job_rows import job as job_row
 from helpers.replica_kills import kill_at_random_moments
-from helpers.s3_server import CREDENTIALS
+from helpers.s3_server import CREDENTIALS, S3Server
 from helpers.service import FAST, SMALL, Replicas, problem, scene_bytes
 
 import kissgs
@@ -465,6 +465,20 @@ def test_an_emptied_bucket(two, bucket):
         while replica.http.get("/readyz").status_code != 200 and time.monotonic() < end:
             time.sleep(0.2)
     assert result_of(two, two.submit()) == two.http.get(job["links"]["result"]).content
+
+
+def test_a_bucket_that_cannot_be_reached(tmp_path, new_database):
+    with S3Server(tmp_path) as server, Replicas(tmp_path / "one", 1, server.bucket(), new_database()) as it:
+        job = it.ended(it.submit())
+        server.process.kill()
+        end = time.monotonic() + 30
+        while (ready := it.http.get("/readyz")).status_code == 200 and time.monotonic() < end:
+            time.sleep(0.2)
+        assert f"{server.url} cannot be reached" in ready.json()["checks"]["disk"]
+        problem(it.http.post("/v1/jobs", content=SMALL, params={"options": FAST}), 503, "storage")
+        problem(it.http.get(job["links"]["report"]), 503, "storage")
+        assert it.status(job)["state"] == "succeeded"
+        assert CREDENTIALS["AWS_SECRET_ACCESS_KEY"] not in it.log.read_text()
 
 
 def test_a_file_that_vanishes(two, bucket):
