@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, ByteSize, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ByteSize, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 PREFIX = "KISSGS_"
@@ -48,6 +48,13 @@ class ServiceSettings(BaseSettings):
     data_dir: Path = Field(Path("kissgs-data"), description="Folder of jobs and results; created if missing.")
     database_url: str | None = Field(
         None, description="SQLAlchemy URL of the job database; by default an SQLite file in the data folder."
+    )
+    storage: str | None = Field(
+        None,
+        validate_default=True,
+        description="s3://BUCKET/PREFIX for uploads and results, which several services with this setting and one "
+        "PostgreSQL database share; by default the data folder, of one service. The variables AWS_ACCESS_KEY_ID, "
+        "AWS_SECRET_ACCESS_KEY, AWS_REGION and AWS_ENDPOINT_URL apply.",
     )
     keys: Annotated[tuple[ApiKey, ...], NoDecode] = Field(
         (),
@@ -100,6 +107,19 @@ class ServiceSettings(BaseSettings):
     log_level: Annotated[str, Field(pattern="^(debug|info|warning|error)$")] = Field(
         "info", description="Log level: debug, info, warning or error."
     )
+
+    @field_validator("storage")
+    @classmethod
+    def _check_storage(cls, value: str | None, info: ValidationInfo) -> str | None:
+        if value is None:
+            return None
+        if not re.fullmatch(r"s3://[A-Za-z0-9][A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*/?", value):
+            raise ValueError(
+                "it is not s3://BUCKET or s3://BUCKET/PREFIX, of letters, digits, dots, dashes and underscores"
+            )
+        if not str(info.data.get("database_url") or "").startswith("postgres"):
+            raise ValueError("a storage that replicas share needs PostgreSQL; set KISSGS_DATABASE_URL, too")
+        return value
 
     @field_validator("keys", mode="before")
     @classmethod

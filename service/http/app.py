@@ -30,10 +30,12 @@ from ..jobs.decoding import Decoder
 from ..jobs.event_stream import EventStream
 from ..jobs.expiry import ExpiryTask
 from ..jobs.recovery import recover
+from ..jobs.replica_watch import ReplicaWatch
 from ..jobs.worker import Worker
 from ..storage.database_health import error_text
 from ..storage.folder_binding import open_store
-from ..storage.job_files import JobStorage
+from ..storage.job_files import FolderStorage
+from ..storage.s3_storage import S3Storage
 from .middleware import RequestMiddleware
 from .openapi import describe
 from .routes import facts, jobs, page, preview, results
@@ -88,7 +90,10 @@ def _build_and_recover(settings: ServiceSettings) -> ServiceContainer:
     try:
         context = build(settings)
         try:
-            recover(context)
+            if context.storage.shared:
+                ReplicaWatch(context).recover()
+            else:
+                recover(context)
         except BaseException:
             context.store.close()
             context.storage.close()
@@ -102,7 +107,8 @@ def _build_and_recover(settings: ServiceSettings) -> ServiceContainer:
 
 def build(settings: ServiceSettings) -> ServiceContainer:
     """Create all parts of a service without starting them."""
-    storage, clock = JobStorage(settings.data_dir), Clock()
+    storage = S3Storage(settings.storage, settings.data_dir) if settings.storage else FolderStorage(settings.data_dir)
+    clock = Clock()
     try:
         store = open_store(settings, storage, clock)
     except BaseException:
@@ -128,7 +134,9 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     context: ServiceContainer = app.state.context
     context.worker.start()
     expiry = ExpiryTask(context, context.clock())
-    tasks = [asyncio.create_task(expiry.run()), asyncio.create_task(expiry.heartbeat())]
+    watch = ReplicaWatch(context)
+    running = (watch.heartbeat(), watch.follow()) if context.storage.shared else (expiry.heartbeat(),)
+    tasks = [asyncio.create_task(task) for task in (expiry.run(), *running)]
     try:
         yield
     finally:

@@ -1,11 +1,11 @@
-"""Responses that send files from disk, with ranges, conditional requests and checksums."""
+"""Responses that send stored files, with ranges, conditional requests and checksums."""
 
 from __future__ import annotations
 
 import base64
+import os
 import re
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
@@ -14,13 +14,14 @@ from starlette.responses import FileResponse, Response
 from starlette.types import Message, Receive, Scope, Send
 
 from ..core.problems import ProblemError
+from ..storage.job_storage import StoredObject
 
 
 class StoredFile(FileResponse):
     """Immutable file with strong ETag, digests, ranges and ``If-None-Match``, for GET and HEAD.
 
     Args:
-        path: path of the file.
+        file: the file.
         sha256: SHA-256 of the file, as hexadecimal digits.
         media_type: media type of the file.
         download: file name for saving in a browser; None lets the browser show the file.
@@ -29,7 +30,7 @@ class StoredFile(FileResponse):
 
     def __init__(
         self,
-        path: Path,
+        file: StoredObject,
         *,
         sha256: str,
         media_type: str,
@@ -40,12 +41,9 @@ class StoredFile(FileResponse):
         fixed = {"ETag": f'"{sha256}"', "Content-Digest": digest, "Repr-Digest": digest, **(headers or {})}
         if download is not None:
             fixed["Content-Disposition"] = _attachment(download)
-        try:
-            stat = path.stat()
-        except FileNotFoundError as error:  # expired, or deleted for a new upload, since the job was read
-            raise ProblemError("gone", "the file was removed during the request; submit the scene again") from error
-        super().__init__(path, media_type=media_type, headers=fixed, stat_result=stat)
-        self._size = stat.st_size
+        facts = os.stat_result((0, 0, 0, 0, 0, 0, file.size, *[file.modified] * 3))
+        super().__init__(file.path or os.devnull, media_type=media_type, headers=fixed, stat_result=facts)
+        self._file = file
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send 304 if the client has the current file, else the file or the requested range of it."""
@@ -64,14 +62,39 @@ class StoredFile(FileResponse):
 
         wanted = asked.getlist("range") if conditions and self._is_same(asked) else []
         if len(wanted) == 1 and _is_range(wanted[0]):
-            if _is_outside(wanted[0], self._size):
-                text = f"the range is outside the file, which has {self._size} bytes; request a range within it"
-                raise ProblemError("range", text, headers={"Content-Range": f"bytes */{self._size}"})
+            if _is_outside(wanted[0], self._file.size):
+                text = f"the range is outside the file, which has {self._file.size} bytes; request a range within it"
+                raise ProblemError("range", text, headers={"Content-Range": f"bytes */{self._file.size}"})
             answered = {b"if-range"}
         else:
             answered = {b"if-range", b"range"}
+        if self._file.stream is not None:
+            await self._send_stream(scope, corrected, wanted[0] if b"range" not in answered else None)
+            return
         headers = [(name, value) for name, value in scope["headers"] if name not in answered]
         await super().__call__({**scope, "headers": headers}, receive, corrected)
+
+    async def _send_stream(self, scope: Scope, send: Send, wanted: str | None) -> None:
+        """Send a file that does not lie on this machine, or one valid range of it."""
+        size, headers, status = self._file.size, MutableHeaders(raw=list(self.raw_headers)), 200
+        first, end = 0, size
+        if wanted is not None:
+            first, end = _bounds(wanted, size)
+            headers["content-range"], status = f"bytes {first}-{end - 1}/{size}", 206
+            headers["content-length"] = str(end - first)
+        start: Message = {"type": "http.response.start", "status": status, "headers": headers.raw}
+        if scope["method"] != "HEAD" and self._file.stream is not None:
+            try:
+                async for block in self._file.stream(first, end):
+                    if start:  # only now, because opening the stream may fail
+                        await send(start)
+                        start = {}
+                    await send({"type": "http.response.body", "body": block, "more_body": True})
+            except FileNotFoundError as error:
+                raise removed() from error
+        if start:
+            await send(start)
+        await send({"type": "http.response.body", "body": b"", "more_body": False})
 
     def _is_same(self, asked: Headers) -> bool:
         """Return whether ``If-Range`` allows a range of this version of the file."""
@@ -93,6 +116,11 @@ def described(summary: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
             )
         entry = entry[name]
     return dict(entry)
+
+
+def removed() -> ProblemError:
+    """Return the problem of a file that has expired or was reclaimed since the job was read."""
+    return ProblemError("gone", "the file was removed during the request; submit the scene again")
 
 
 def _attachment(name: str) -> str:
@@ -118,3 +146,11 @@ def _is_outside(header: str, size: int) -> bool:
     """Return whether the range contains no byte of a file of this size."""
     first, _, last = header.partition("=")[2].strip().partition("-")
     return int(first) >= size if first.strip() else int(last) == 0 or size == 0
+
+
+def _bounds(header: str, size: int) -> tuple[int, int]:
+    """Return the first byte of a valid range within a file, and the byte after its last one."""
+    first, _, last = header.partition("=")[2].strip().partition("-")
+    if not first.strip():
+        return max(0, size - int(last)), size
+    return int(first), min(int(last) + 1, size) if last.strip() else size

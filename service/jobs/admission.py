@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from ..core.models import Job
 from ..core.problems import ProblemError
 from ..core.settings import ServiceSettings
-from ..storage.job_files import JobStorage
 from ..storage.job_records import LimitExceeded, Store
+from ..storage.job_storage import JobStorage
 from .status import QueueEstimator
 
 BUSY_SECONDS = 5.0
@@ -48,15 +48,21 @@ class Admission:
         """Queue a job.
 
         Raises:
-            ProblemError: ``queue-full`` or ``too-many-jobs``.
+            ProblemError: ``queue-full``, ``too-many-jobs`` or ``disk-full``.
             LimitExceeded: its idempotency key is in use.
         """
         try:
             with self._lock:  # counting and adding is one step with every database
-                return self.store.add(job, max_queue=self.settings.max_queue, max_owner=self.settings.max_jobs_per_key)
+                limits = self.settings
+                most = (
+                    limits.max_disk_bytes if self.storage.shared else None
+                )  # replicas do not see each other's uploads
+                return self.store.add(job, max_queue=limits.max_queue, max_owner=limits.max_jobs_per_key, max_disk=most)
         except LimitExceeded as refused:
             if refused.limit == "key":
                 raise
+            if refused.limit == "disk":
+                raise self._full(job.disk_bytes) from refused
             raise self._refused(refused.limit) from refused
 
     @contextlib.contextmanager
@@ -121,13 +127,13 @@ class Admission:
     def _reclaim(self, number: int, job_id: str) -> None:
         """Remove the upload of an ended job, and its decoded scene, which can be decoded again."""
         self.store.check()
-        for path in self.storage.reclaimable_files(job_id):
-            self.storage.discard(path)
+        self.storage.reclaim(job_id)
         self.store.update(number, upload_kept=False, reclaimable_bytes=0, disk_bytes=self.storage.job_bytes(job_id))
 
     def _fits(self, size: int, reclaimable: int = 0) -> bool:
         taken = self.store.disk_bytes() + self._reserved - reclaimable
-        free = self.storage.free_bytes() - (self._reserved - self._written) + reclaimable
+        free = self.storage.free_bytes() - (self._reserved - self._written)
+        free += 0 if self.storage.shared else reclaimable
         return taken + size <= self.settings.max_disk_bytes and free - size >= self.settings.min_free_bytes
 
     def _full(self, size: int) -> ProblemError:

@@ -11,10 +11,13 @@ from ..core.metrics import Metrics
 from ..core.models import Job, State
 from ..core.problems import PROBLEM_TYPES, problem
 from ..core.settings import ServiceSettings
-from ..storage.job_files import JobStorage
 from ..storage.job_records import Store
+from ..storage.job_storage import RESULT, JobStorage
 
 log = logging.getLogger("kissgs.service")
+
+
+LOST = "the upload is no longer on the server's disk; submit the scene again"
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,31 +30,34 @@ class JobCompletion:
     metrics: Metrics
     clock: Clock
 
-    def succeed(self, job: Job, summary: dict[str, Any]) -> None:
-        """Record success of a job whose result is in its final folder."""
-        upload = self.storage.upload(job.id)
-        self.storage.discard_checkpoints(job.id)
-        if not self.settings.keep_uploads:
-            self.storage.discard(upload)
-        kept = self.settings.keep_uploads and upload.is_file()
+    def succeed(self, job: Job, summary: dict[str, Any], folder: str, *, dead: str | None = None) -> None:
+        """Record success of a job whose result is complete, in a folder of its files; for ``dead``, see ``move``."""
+        keep, shared = self.settings.keep_uploads, self.storage.shared
+        if shared:  # another replica may have taken the job over, so nothing is removed before the end is recorded
+            kept = keep and self.storage.upload_name(job.id) is not None
+        else:
+            kept = self.storage.settle(job.id, folder, keep_upload=keep)
         values = {
-            "result": summary,
+            "result": summary if folder == RESULT else {**summary, "folder": folder},
             "upload_kept": kept,
             "reclaimable_bytes": job.upload_bytes if kept else 0,
             "disk_bytes": self.storage.job_bytes(job.id),
         }
-        if not self.end(job, State.SUCCEEDED, **values):
-            self.storage.discard(self.storage.result(job.id))
+        if not self.end(job, State.SUCCEEDED, dead=dead, **values):
+            self.storage.remove_result(job.id, folder)
+        elif shared:
+            self.storage.settle(job.id, folder, keep_upload=keep)
+            self.store.update(job.number, disk_bytes=self.storage.job_bytes(job.id))
 
-    def fail(self, job: Job, code: str, detail: str) -> None:
-        """Record failure of a job and remove its files."""
-        if self._failed(job, code, detail):
+    def fail(self, job: Job, code: str, detail: str, *, dead: str | None = None) -> None:
+        """Record failure of a job and remove its files; for ``dead``, see ``move``."""
+        if self._failed(job, code, detail, dead):
             self.storage.remove_job(job.id)
 
     def lose(self, job: Job) -> None:
         """Record failure of a job whose upload is missing; other files move to the orphaned folder."""
-        if self._failed(job, "internal", "the upload is no longer on the server's disk; submit the scene again"):
-            self.storage.move_to_orphaned_unless_empty(job.id, "has lost its upload")
+        if self._failed(job, "internal", LOST):
+            self.storage.set_aside(job.id, "has lost its upload")
 
     def end(self, job: Job, state: State, **values: Any) -> bool:  # noqa: ANN401
         """Set a job's final state and the columns ``values``; return False if it has already ended."""
@@ -64,6 +70,11 @@ class JobCompletion:
             log.info("job %s %s %s", job.id, state, when)
         return moved
 
-    def _failed(self, job: Job, code: str, detail: str) -> bool:
+    def _failed(self, job: Job, code: str, detail: str, dead: str | None = None) -> bool:
         document = problem(code if code in PROBLEM_TYPES else "internal", detail).model_dump(exclude_none=True)
-        return self.end(job, State.FAILED, problem=document, upload_kept=False, disk_bytes=0)
+        return self.end(job, State.FAILED, dead=dead, problem=document, upload_kept=False, disk_bytes=0)
+
+
+def result_folder(job: Job) -> str:
+    """Return the name of the folder of a succeeded job's result."""
+    return str((job.result or {}).get("folder", RESULT))

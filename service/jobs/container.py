@@ -15,8 +15,8 @@ from ..core.metrics import Metrics
 from ..core.notifier import JobNotifier
 from ..core.problems import ProblemError
 from ..core.settings import ServiceSettings
-from ..storage.job_files import JobStorage
 from ..storage.job_records import Store
+from ..storage.job_storage import JobStorage
 from .admission import Admission
 from .decoding import Decoder
 from .event_stream import EventStream

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,9 +14,10 @@ from ..core.formats import container_file
 from ..core.models import Job, State
 from ..core.problems import PROBLEM_TYPES, ProblemError
 from ..core.settings import ServiceSettings
-from ..storage.job_files import JobStorage
 from ..storage.job_records import Store
+from ..storage.job_storage import DECODED, JobStorage, StoredObject
 from .admission import Admission
+from .completion import result_folder
 from .runner import JobProcess
 
 
@@ -32,21 +32,25 @@ class Decoder:
     _lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     _processes: dict[str, JobProcess] = field(default_factory=dict)
 
-    async def scene(self, job: Job) -> tuple[Path, dict[str, Any]]:
+    async def scene(self, job: Job) -> tuple[StoredObject, dict[str, Any]]:
         """Return the decoded ``.ply`` of a succeeded job, and its size and SHA-256 by name.
 
         Raises:
             ProblemError: the disk is full, the decoding failed, or the job was deleted or has expired meanwhile.
         """
-        path, metadata = self.storage.decoded(job.id), self.storage.decoded(job.id).with_suffix(".json")
-        if not path.exists():
-            async with self._lock:
-                if not path.exists():
-                    await self._decode(job)
         try:
-            return path, json.loads(await run_sync(metadata.read_text))
+            described = await run_sync(self.storage.read_decoded, job.id)
+            if described is None:
+                async with self._lock:
+                    described = await run_sync(self.storage.read_decoded, job.id)
+                    if described is None:
+                        await self._decode(job)
+                        described = await run_sync(self.storage.read_decoded, job.id)
+            if described is not None:
+                return await run_sync(self.storage.open, job.id, DECODED), described
         except OSError as error:
             raise _gone() from error
+        raise _gone()
 
     async def _decode(self, job: Job) -> None:
         size = 2000 + BYTES_PER_GAUSSIAN[job.sh_degree] * job.gaussians
@@ -55,8 +59,7 @@ class Decoder:
         try:
             work = await run_sync(self.storage.new_work, job.id)
             await self._run(job, work)
-            await run_sync(self.storage.keep_decoded, work, job.id)
-            await run_sync(self._update_sizes, job)
+            await run_sync(self._keep, work, job)
         except (ProblemError, OSError) as error:
             current = await run_sync(self.store.get, job.id)
             if current is None or current.state != State.SUCCEEDED:
@@ -65,11 +68,21 @@ class Decoder:
         finally:
             if work is not None:
                 await run_sync(self.storage.discard, work)
+                if self.storage.shared:
+                    await run_sync(self.storage.remove_work, job.id)
             await run_sync(self.admission.release, size, 0)
 
-    def _update_sizes(self, job: Job) -> None:
-        reclaimable = sum(path.stat().st_size for path in self.storage.reclaimable_files(job.id))
+    def _keep(self, work: Path, job: Job) -> None:
+        self.store.take_claim(job.id)
+        self.storage.keep_decoded(work, job.id)
+        current = self.store.get(job.id)
+        if current is None or current.state != State.SUCCEEDED:  # another replica has removed the files before
+            self.storage.remove_job(job.id)
+            self.store.drop_claim(job.id)
+            raise _gone()
+        reclaimable = self.storage.reclaimable_bytes(job.id)
         self.store.update(job.number, disk_bytes=self.storage.job_bytes(job.id), reclaimable_bytes=reclaimable)
+        self.store.drop_claim(job.id)
 
     def stop(self, job_id: str) -> None:
         """Kill the decoding of a job, if it is running."""
@@ -81,9 +94,11 @@ class Decoder:
         async def ignore(stage: str, fraction: float, note: str) -> None:
             pass
 
+        name = f"{result_folder(job)}/{container_file(job.options).name}"
+        source = await run_sync(self.storage.fetch, job.id, name, work)
         task = {
             "kind": "decode",
-            "source": str(self.storage.result(job.id) / container_file(job.options).name),
+            "source": str(source),
             "work": str(work),
             "threads": self.settings.job_threads,
             "memory": int(self.settings.job_memory),

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import logging
 from dataclasses import dataclass
+from typing import Any
 
 from anyio.to_thread import run_sync
 from sqlalchemy.exc import SQLAlchemyError
@@ -20,6 +21,10 @@ log = logging.getLogger("kissgs.service")
 
 GRACE_SECONDS = 3600.0
 """Seconds after the start in which nothing expires, in case the machine's clock was wrong at the start."""
+
+
+RETRY_SECONDS = 600.0
+"""Seconds after which files that could not be removed are removed again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,14 +70,16 @@ class ExpiryTask:
             return []
         while due := store.due(ENDED, now):
             for number, job_id in due:
-                gone = {"upload_kept": False, "disk_bytes": 0, "reclaimable_bytes": 0}
+                gone: dict[str, Any] = {"upload_kept": False, "disk_bytes": 0, "reclaimable_bytes": 0}
                 if store.move(number, State.EXPIRED, expires_at=now + keep, **gone):
                     storage.remove_job(job_id)
                     expired.append(job_id)
         while due := store.due([State.EXPIRED], now):
             for number, job_id in due:
-                store.forget(number)
-                storage.remove_job(job_id)
+                if storage.remove_job(job_id):
+                    store.forget(number)
+                else:
+                    store.update(number, expires_at=now + RETRY_SECONDS)
         if expired:
             log.info("%d jobs expired", len(expired))
         return expired

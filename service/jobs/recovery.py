@@ -5,14 +5,11 @@ The database may be an older copy than the data folder, so files of jobs that it
 
 from __future__ import annotations
 
-import json
 import logging
-from pathlib import Path
-from typing import Any
 
 from ..core.formats import container_file
 from ..core.models import Job, State
-from ..storage.job_files import JobStorage
+from ..storage.job_storage import RESULT, JobStorage
 from .container import ServiceContainer
 
 log = logging.getLogger("kissgs.service")
@@ -26,23 +23,20 @@ def recover(context: ServiceContainer) -> None:
     known, failed = store.ids(), store.ids(State.FAILED)
     for job_id in sorted(storage.job_ids() & (known - store.ids(State.QUEUED, State.RUNNING, State.SUCCEEDED))):
         _finish_removal(storage, job_id, failed=job_id in failed)
-    if count := storage.move_orphans(known):
-        target = storage.orphaned
-        log.warning("folders of jobs that the database does not know were moved to %s: %d", target, count)
+    storage.set_aside_unknown(store.ids)
 
 
 def _recover_job(context: ServiceContainer, job: Job) -> None:
     store, storage, completion = context.store, context.storage, context.worker.completion
-    result = storage.result(job.id)
-    summary = read_summary(result, container_file(job.options).name)
-    if summary is None and result.exists():
+    summary = storage.read_result(job.id, RESULT, container_file(job.options).name)
+    if summary is None and storage.has_result(job.id):
         log.warning("job %s: its result is damaged", job.id)
     if summary is not None:
         if job.state == State.QUEUED:
             log.warning("job %s: its result exists, although it is queued in the database", job.id)
             store.move(job.number, State.RUNNING)
-        completion.succeed(job, summary)
-    elif not storage.upload(job.id).is_file():
+        completion.succeed(job, summary, RESULT)
+    elif storage.upload_name(job.id) is None:
         completion.lose(job)
     elif job.state == State.RUNNING and job.starts >= context.settings.job_starts:
         detail = f"the service was ended {job.starts} times while the job ran; submit a scene with fewer Gaussians"
@@ -53,25 +47,7 @@ def _recover_job(context: ServiceContainer, job: Job) -> None:
 
 def _finish_removal(storage: JobStorage, job_id: str, *, failed: bool) -> None:
     """Remove the files of an ended job; move them to the orphaned folder if a failed job has a result."""
-    if failed and storage.result(job_id).exists():
-        storage.move_to_orphaned_unless_empty(
-            job_id, "holds a result, although the job failed according to the database,"
-        )
+    if failed and storage.has_result(job_id):
+        storage.set_aside(job_id, "holds a result, although the job failed according to the database,")
     else:
         storage.remove_job(job_id)
-
-
-def read_summary(result: Path, container: str) -> dict[str, Any] | None:
-    """Return the summary of a complete result with this container file; None if there is none or it is damaged."""
-    try:
-        summary: dict[str, Any] = json.loads((result / "summary.json").read_text(encoding="utf-8"))
-        files = {name: entry["bytes"] for name, entry in summary["files"].items()}
-        sizes = {result / "files" / name: size for name, size in files.items()}
-        sizes |= {
-            result / container: summary["container"]["bytes"],
-            result / "report.json": summary["report"]["bytes"],
-        }
-        complete = all(path.stat().st_size == size for path, size in sizes.items())
-        return summary if complete and {"count", "seconds", "cpu_seconds"} <= summary.keys() else None
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
-        return None

@@ -161,6 +161,7 @@ class JobProcess:
 
 
 def _environment() -> dict[str, str]:
-    """Return this process's environment without the service's settings, some of which are secrets."""
-    inherited = {name: value for name, value in os.environ.items() if not name.upper().startswith("KISSGS_")}
+    """Return this process's environment without the settings of the service and its storage, some of them secrets."""
+    secret = ("KISSGS_", "AWS_")
+    inherited = {name: value for name, value in os.environ.items() if not name.upper().startswith(secret)}
     return {**inherited, "OMP_WAIT_POLICY": "PASSIVE", "PYTHONUNBUFFERED": "1"}

@@ -16,13 +16,14 @@ class QueueEstimator:
 
     Args:
         store: job store.
-        workers: maximum number of running jobs.
+        workers: maximum number of running jobs of each replica.
     """
 
     def __init__(self, store: Store, workers: int) -> None:
         self.now = store.clock()
         self._store, self._workers = store, workers
         self._active: list[Job] | None = None
+        self._replicas: int | None = None
         self._rates: dict[tuple[str, bool], float | None] = {}
 
     def position(self, job: Job) -> int:
@@ -32,12 +33,17 @@ class QueueEstimator:
     def seconds_left(self, job: Job) -> float:
         """Estimate the seconds until a queued or running job ends."""
         ahead = self._ahead(job) if job.state == State.QUEUED else []
-        return self._work(job) + sum(map(self._work, ahead)) / self._workers
+        return self._work(job) + sum(map(self._work, ahead)) / self._all_workers()
 
     def seconds_to_room(self) -> float:
         """Estimate the seconds until the queue has room, 1 to 300."""
         running = [self._work(job) for job in self._jobs() if job.state == State.RUNNING]
-        return min(300.0, max(1.0, min(running, default=1.0) / self._workers))
+        return min(300.0, max(1.0, min(running, default=1.0) / self._all_workers()))
+
+    def _all_workers(self) -> int:
+        if self._replicas is None:
+            self._replicas = self._store.count_replicas()
+        return self._workers * self._replicas
 
     def _jobs(self) -> list[Job]:
         if self._active is None:

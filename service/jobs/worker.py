@@ -12,20 +12,27 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from ..core.formats import CONTAINER_FILES
 from ..core.metrics import Metrics
-from ..core.models import Job, State
+from ..core.models import ACTIVE, Job, State
 from ..core.notifier import JobNotifier, ended, wait
 from ..core.schemas import JobOptions
 from ..core.settings import ServiceSettings
 from ..storage.database_health import error_text
-from ..storage.job_files import JobStorage
 from ..storage.job_records import Store
-from .completion import JobCompletion
+from ..storage.job_storage import RESULT, JobStorage
+from ..storage.object_store import ObjectStoreError
+from .completion import LOST, JobCompletion
 from .runner import JobProcess, Outcome
 
 log = logging.getLogger("kissgs.service")
 
 IDLE_SECONDS = 1.0
 """Seconds after which an idle worker reads the queue even without a notification."""
+
+CANCEL_SECONDS, CANCEL_POLL_SECONDS = 10.0, 0.2
+"""Maximum wait for another replica to end a cancelled job, and the interval between looks, seconds."""
+
+CHECKPOINT_SECONDS = 30.0
+"""Minimum seconds between two looks for new checkpoints that other replicas may need."""
 
 QUEUE = "queue"
 """Name that is notified when a job is added to the queue."""
@@ -46,6 +53,8 @@ class Worker:
     _loops: list[asyncio.Task[None]] = field(default_factory=list)
     _last_poll: dict[int, float] = field(default_factory=dict)
     _logged: set[str] = field(default_factory=set)
+    _busy: int = 0
+    _abandoning: bool = False
 
     def start(self) -> None:
         """Start to run jobs."""
@@ -88,9 +97,38 @@ class Worker:
         if process is not None:
             process.kill()
             await process.ended.wait()
+        elif self.storage.shared:
+            await self._wait_for_other_replica(job.id)
         await run_sync(self.storage.remove_job, job.id)
         self.notifier.notify(job.id)
         self.notifier.notify(ended(job.id))
+
+    async def _wait_for_other_replica(self, job_id: str) -> None:
+        """Wait until the replica that runs a job has ended it; one that has died is not waited for."""
+        for _ in range(round(CANCEL_SECONDS / CANCEL_POLL_SECONDS)):
+            if not await run_sync(self.store.is_claimed, job_id):
+                return
+            await asyncio.sleep(CANCEL_POLL_SECONDS)
+
+    def running_ids(self) -> set[str]:
+        """Return the ids of all jobs with a process of this replica."""
+        return set(self._processes)
+
+    def kill(self, job_id: str) -> None:
+        """Kill the process of a job, if it is running."""
+        process = self._processes.get(job_id)
+        if process is not None:
+            process.kill()
+
+    async def abandon(self) -> None:
+        """End all jobs without recording it, because another replica has queued them again."""
+        self._abandoning = True
+        try:
+            while self._busy:
+                self.kill_running()
+                await asyncio.sleep(CANCEL_POLL_SECONDS)
+        finally:
+            self._abandoning = False
 
     # Running -------------------------------------------------------------------------------------------------------
 
@@ -110,7 +148,11 @@ class Worker:
             if job is None:
                 await wait(queued, IDLE_SECONDS)
             else:
-                await self._run(job)
+                self._busy += 1
+                try:
+                    await self._run(job)
+                finally:
+                    self._busy -= 1
 
     def _claim(self) -> Job | None:
         self.storage.check()  # else all queued jobs would fail, because their uploads cannot be read
@@ -142,10 +184,16 @@ class Worker:
         if current is None or current.state != State.RUNNING:
             return Outcome("stopped")
         work = await run_sync(self.storage.new_work, job.id)
+        try:
+            source = await run_sync(self.storage.fetch_scene, job.id, work)
+        except FileNotFoundError:
+            return Outcome("error", {"code": "internal", "detail": LOST})
         options = JobOptions.model_validate(job.options)
+        if options.resumable:
+            await run_sync(self.storage.fetch_checkpoints, job.id)
         task = {
             "kind": "compress",
-            "source": str(self.storage.upload(job.id)),
+            "source": str(source),
             "work": str(work),
             "settings": {name: value for name, value in job.options.items() if name not in ("format", "evaluate")},
             "format": options.format,
@@ -163,7 +211,27 @@ class Worker:
                 self._log_once(f"job {job.id}: progress was not recorded", error)
             self.notifier.notify(job.id)
 
-        return await process.run(task, progress)
+        keeping = (
+            asyncio.create_task(self._keep_checkpoints(job)) if self.storage.shared and options.resumable else None
+        )
+        try:
+            return await process.run(task, progress)
+        finally:
+            if keeping is not None:
+                keeping.cancel()
+                await asyncio.gather(keeping, return_exceptions=True)
+
+    async def _keep_checkpoints(self, job: Job) -> None:
+        """Store the checkpoints of a running job for other replicas, in at most a tenth of the time."""
+        clock = asyncio.get_running_loop().time
+        while True:
+            await asyncio.sleep(CHECKPOINT_SECONDS)
+            begun = clock()
+            try:
+                await run_sync(self.storage.store_checkpoints, job.id)
+            except OSError as error:  # the job may succeed without
+                self._log_once(f"job {job.id}: its checkpoint was not stored", error)
+            await asyncio.sleep(9 * (clock() - begun))
 
     # How jobs end -----------------------------------------------------------------------------------------------------
 
@@ -174,6 +242,9 @@ class Worker:
                 await run_sync(self._record, job, outcome)
                 break
             except (SQLAlchemyError, OSError) as error:
+                if self._abandoning:
+                    await run_sync(self.storage.remove_work, job.id)
+                    return
                 if outcome.kind == "done" and await run_sync(self._is_permanent, error):
                     log.error("job %s: its result cannot be kept: %s", job.id, error_text(error))
                     outcome = _outcome_of(error)
@@ -210,13 +281,15 @@ class Worker:
         current = self.store.get(job.id)
         if current is None or current.state != State.RUNNING:  # cancelled or deleted meanwhile
             self.storage.remove_work(job.id)
+            self.store.drop_claim(job.id)
             return
-        if outcome.kind == "done":
-            self.storage.keep_result(job.id)
+        folder = self.storage.keep_result(job.id) if outcome.kind == "done" else RESULT
+        if outcome.kind in ("stopped", "postponed", "crashed"):  # it may continue elsewhere
+            self.storage.store_checkpoints(job.id)
         self.storage.remove_work(job.id)  # before requeueing, because another worker may then run the job
         match outcome.kind:
             case "done":
-                self.completion.succeed(job, outcome.data)
+                self.completion.succeed(job, outcome.data, folder)
             case "error":
                 self.completion.fail(job, outcome.data["code"], outcome.data["detail"])
             case "stopped" | "postponed":
@@ -229,6 +302,9 @@ class Worker:
                 self.store.move(job.number, State.QUEUED, crashes=1)
             case "crashed":
                 self.completion.fail(job, "crashed", outcome.data["detail"])
+        current = self.store.get(job.id)
+        if current is None or current.state not in ACTIVE:  # cancelled at the same moment, so the claim is still held
+            self.store.drop_claim(job.id)
 
     def _requeue(self, job: Job) -> None:
         """Return a job to the queue without counting its start."""
@@ -251,7 +327,7 @@ _INTERNAL_ERROR = Outcome(
 
 
 def _outcome_of(error: Exception) -> Outcome:
-    if isinstance(error, OSError) and error.errno in _TRANSIENT_ERRNOS:
+    if isinstance(error, ObjectStoreError) or (isinstance(error, OSError) and error.errno in _TRANSIENT_ERRNOS):
         return Outcome("postponed")
     if isinstance(error, OSError):
         reason = (error.strerror or str(error)).lower()

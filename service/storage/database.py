@@ -16,7 +16,6 @@ from ..core.models import SCHEMA_VERSION, Base, Job, Meta
 from ..core.settings import SettingsError
 from .database_health import (
     IDENTITY,
-    IDENTITY_BITS,
     check_pages,
     check_rows,
     check_writable,
@@ -24,6 +23,8 @@ from .database_health import (
     keep_open,
     sqlite_file,
 )
+from .machine import IDENTITY_BITS
+from .replicas import JOIN_LOCK, lock
 
 Sessions = sessionmaker[Session]
 
@@ -32,6 +33,9 @@ START_SECONDS = 5.0
 
 LOCK_SECONDS = 30.0
 """Maximum wait for a lock after the start, seconds."""
+
+IDLE_TRANSACTION_SECONDS = 30.0
+"""Seconds after which a transaction that does nothing is ended by PostgreSQL."""
 
 _HINTS = {
     "locked": "another program has locked it; stop that program and start again",
@@ -109,7 +113,19 @@ def _engine(url: str, wait: float, opened: list[Any] | None = None) -> sa.Engine
         raise SettingsError(f"KISSGS_DATABASE_URL: {error_text(error)}; set it to a SQLAlchemy URL") from error
     if engine.dialect.name == "sqlite":
         _tune_sqlite(engine, wait, opened)
+    elif engine.dialect.name == "postgresql":
+        _tune_postgresql(engine)
     return engine
+
+
+def _tune_postgresql(engine: sa.Engine) -> None:
+    """Let PostgreSQL end the transactions of a suspended service, which would make others wait for its locks."""
+
+    @sa.event.listens_for(engine, "connect")
+    def tune(connection: Any, record: object) -> None:  # noqa: ANN401
+        with connection.cursor() as cursor:
+            cursor.execute(f"SET idle_in_transaction_session_timeout = {int(1000 * IDLE_TRANSACTION_SECONDS)}")
+        connection.commit()
 
 
 def _tune_sqlite(engine: sa.Engine, wait: float, opened: list[Any] | None) -> None:
@@ -138,6 +154,7 @@ def _check(session: Session, *, create: bool) -> None:
     connection = session.connection()
     if connection.dialect.name == "postgresql":
         connection.exec_driver_sql(f"SET LOCAL lock_timeout = {int(1000 * START_SECONDS)}")
+        lock(session, JOIN_LOCK)  # of simultaneous first starts, one creates the tables
     required = set(Base.metadata.tables)
     existing = required & set(sa.inspect(connection).get_table_names())
     values = _meta_values(session) if "meta" in existing else {}

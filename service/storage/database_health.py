@@ -17,6 +17,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from ..core.models import Base, Meta
+from .replicas import hold
 
 WAIT_SECONDS = 2.0
 """Maximum wait for a lock during a check, seconds."""
@@ -29,9 +30,6 @@ IDENTITY = "identity"
 
 OWNER = "owner"
 """Row of ``meta`` with the number of the service that holds the lease."""
-
-IDENTITY_BITS = 48
-"""Bits of these numbers, which a float column holds exactly."""
 
 
 class DatabaseReplacedError(SQLAlchemyError):
@@ -95,11 +93,13 @@ class DatabaseMonitor:
     Attributes:
         identity: number that the database must have in ``meta``.
         owner: number of this service's lease; None without a lease.
+        replica: id of this replica; None if the database belongs to one service.
     """
 
     def __init__(self, engine: sa.Engine) -> None:
         self.identity: float | None = None
         self.owner: float | None = None
+        self.replica: str | None = None
         self._lock = threading.Lock()
         self._check_started, self._last_problem = 0.0, ""
         self._last_scan, self._scan_seconds = time.monotonic(), 0.0
@@ -144,6 +144,8 @@ class DatabaseMonitor:
             return "it was replaced by another database"
         if self.owner is not None and found.get(OWNER) != self.owner:
             return "another service has taken it over; stop one of the two and restart the other"
+        if self.replica is not None and not hold(connection, self.replica):
+            return "another replica took this one for dead; it will join again"
         return None
 
     def health_problem(self) -> str | None:

@@ -6,13 +6,10 @@ written every few seconds. Only a change of that row counts, so the clocks of ma
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import os
-import platform
 import secrets
 import time
-from pathlib import Path
 
 import sqlalchemy as sa
 from sqlalchemy.orm import Session
@@ -20,7 +17,8 @@ from sqlalchemy.orm import Session
 from ..core.models import Meta
 from ..core.settings import SettingsError
 from .database import Sessions
-from .database_health import IDENTITY, IDENTITY_BITS, OWNER
+from .database_health import IDENTITY, OWNER
+from .machine import IDENTITY_BITS, machine_number, may_run
 
 log = logging.getLogger("kissgs.service")
 
@@ -55,7 +53,7 @@ def acquire(writing: Sessions, reading: Sessions) -> float:
         session.get(Meta, IDENTITY, with_for_update=True)  # serialises simultaneous starts
         if _rows(session) != seen:
             raise _in_use_error(seen)
-        for name, value in {OWNER: number, PROCESS: os.getpid(), MACHINE: _machine()}.items():
+        for name, value in {OWNER: number, PROCESS: os.getpid(), MACHINE: machine_number()}.items():
             session.merge(Meta(name=name, value=value))
     return number
 
@@ -95,35 +93,11 @@ def _wait_for_heartbeat(seen: Rows, reading: Sessions) -> Rows:
 
 def _is_free(rows: Rows) -> bool:
     """Whether the owner certainly does not run."""
-    return OWNER not in rows or (rows.get(MACHINE) == _machine() and not _may_run(int(rows.get(PROCESS, 0))))
-
-
-def _may_run(process: int) -> bool:
-    """Whether another process of this machine may have this number."""
-    if process < 1 or process == os.getpid():
-        return False
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except OSError:
-        return True
-    return True
-
-
-def _machine() -> int:
-    """Return a number of this machine or container that changes with each start of it."""
-    try:
-        boot_id = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii")
-        namespace = Path("/proc/self/ns/pid").readlink()
-    except OSError:
-        boot_id, namespace = platform.node(), Path()
-    digest = hashlib.sha256(f"{boot_id} {namespace}".encode()).digest()
-    return int.from_bytes(digest[: IDENTITY_BITS // 8], "big")
+    return OWNER not in rows or (rows.get(MACHINE) == machine_number() and not may_run(int(rows.get(PROCESS, 0))))
 
 
 def _in_use_error(rows: Rows) -> SettingsError:
-    here = rows.get(MACHINE) == _machine()
+    here = rows.get(MACHINE) == machine_number()
     which = f"process {rows.get(PROCESS, 0):.0f}" if here else "on another machine or in another container"
     return SettingsError(
         f"KISSGS_DATABASE_URL: another service ({which}) is using the job database; stop that one, or use "

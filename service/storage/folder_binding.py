@@ -6,19 +6,19 @@ files of others.
 
 from __future__ import annotations
 
-import re
+import contextlib
 import secrets
 from collections.abc import Callable
-from pathlib import Path
 
 from sqlalchemy.exc import SQLAlchemyError
 
 from ..core.models import ACTIVE
 from ..core.settings import ServiceSettings, SettingsError
 from .database import NewDatabaseError
-from .database_health import IDENTITY, IDENTITY_BITS, error_text
-from .job_files import JobStorage, sync_folder
+from .database_health import IDENTITY, error_text
 from .job_records import Store
+from .job_storage import JobStorage
+from .machine import IDENTITY_BITS
 
 NEARLY_FULL_BYTES = 1 << 20
 """Free disk space below which a database may fail to open, bytes."""
@@ -36,8 +36,12 @@ def open_store(settings: ServiceSettings, storage: JobStorage, clock: Callable[[
     except NewDatabaseError as error:
         raise _unknown_jobs_error(storage, stored, "the job database is new and has none of them") from error
     try:
-        _bind(store, storage, stored)
-        store.acquire_database()
+        with store.starting() if storage.shared else contextlib.nullcontext():
+            _bind(store, storage, stored)
+            if storage.shared:
+                storage.replica = store.join()
+            else:
+                store.acquire_database()
     except BaseException as error:
         store.abandon()
         if isinstance(error, SQLAlchemyError):
@@ -62,14 +66,14 @@ def _bind(store: Store, storage: JobStorage, stored: set[str]) -> None:
     A missing number is restored if the other one, or common jobs, show that they belong together.
     """
     database, its_folder = store.meta_value(IDENTITY), store.meta_value("folder")
-    folder, its_database = read_number(storage.root, "identity"), read_number(storage.root, "database")
+    folder, its_database = storage.read_number("identity"), storage.read_number("database")
     share_jobs = bool(stored & store.ids())
     named = database is not None and its_database == database
     lost = folder is None and (named or share_jobs)  # only the file with the number is missing
     if its_folder not in (None, folder) and not lost:
         raise SettingsError(
-            "KISSGS_DATABASE_URL, KISSGS_DATA_DIR: this database belongs to another data folder; "
-            "use a separate database and data folder for each service"
+            f"KISSGS_DATABASE_URL, {storage.setting}: this database belongs to another {_kind(storage)}; "
+            f"use a separate database and {_kind(storage)} for each service"
         )
     if stored and not share_jobs and not named:
         if its_folder is None:
@@ -77,6 +81,8 @@ def _bind(store: Store, storage: JobStorage, stored: set[str]) -> None:
         if its_database is not None:
             raise _unknown_jobs_error(storage, stored, "they belong to another database")
     active = store.ids(*ACTIVE)
+    if active and storage.shared:  # other replicas may have added and removed jobs meanwhile
+        stored = storage.job_ids() | (active - store.ids(*ACTIVE))
     if active and not active & stored:
         raise _missing_jobs_error(storage, active)
     folder_number = next(
@@ -84,64 +90,33 @@ def _bind(store: Store, storage: JobStorage, stored: set[str]) -> None:
     )
     number = int(database) if database is not None else secrets.randbits(IDENTITY_BITS)
     if folder is None:
-        write_number(storage.root, "identity", folder_number)
+        storage.write_number("identity", folder_number)
     if (its_folder, database) != (folder_number, number):
         store.bind_to(folder_number, number)
     if its_database != number:
-        write_number(storage.root, "database", number)
+        storage.write_number("database", number)
 
 
 def _unknown_jobs_error(storage: JobStorage, stored: set[str], why: str) -> SettingsError:
     return SettingsError(
-        f"KISSGS_DATA_DIR, KISSGS_DATABASE_URL: {storage.jobs} has the files of {len(stored)} jobs, but {why}; restore "
-        "their database, set KISSGS_DATABASE_URL to it, choose another data folder, or move that folder away to start "
-        "without jobs"
+        f"{storage.setting}, KISSGS_DATABASE_URL: {storage.place} has the files of {len(stored)} jobs, but {why}; "
+        f"restore their database, set KISSGS_DATABASE_URL to it, choose another {_kind(storage)}, or move that "
+        "folder away to start without jobs"
     )
 
 
 def _missing_jobs_error(storage: JobStorage, active: set[str]) -> SettingsError:
+    lost = (
+        "restore them, or use another database"
+        if storage.shared
+        else "mount or restore that folder, or, if they are lost, create the empty folder "
+        f"{storage.place}/{min(active)} and start again, so that they are recorded as failed"
+    )
     return SettingsError(
-        f"KISSGS_DATA_DIR, KISSGS_DATABASE_URL: {storage.jobs} has none of the {len(active)} jobs that are queued or "
-        "running in the job database; mount or restore that folder, or, if they are lost, create the empty folder "
-        f"{storage.jobs / min(active)} and start again, so that they are recorded as failed"
+        f"{storage.setting}, KISSGS_DATABASE_URL: {storage.place} has none of the {len(active)} jobs that are "
+        f"queued or running in the job database; {lost}"
     )
 
 
-# Numbers -------------------------------------------------------------------------------------------------------------
-
-
-def read_number(root: Path, name: str) -> int | None:
-    """Read a number of the data folder: ``identity``, its own, or ``database``, that of its database.
-
-    Returns:
-        The number; None if the file is missing or empty.
-
-    Raises:
-        SettingsError: the file cannot be read or has other content.
-    """
-    path = root / name
-    try:
-        text = path.read_bytes().strip()
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise SettingsError(f"KISSGS_DATA_DIR: cannot read {path}: {(error.strerror or '').lower()}") from error
-    if text and not re.fullmatch(rb"[0-9]{1,18}", text):
-        raise SettingsError(f"KISSGS_DATA_DIR: {path} does not contain a number; restore it, or choose another folder")
-    return int(text) if text else None
-
-
-def write_number(root: Path, name: str, number: int) -> None:
-    """Write a number of the data folder atomically.
-
-    Raises:
-        SettingsError: it cannot be written.
-    """
-    path = root / name
-    part = path.with_name(f"{name}.part")
-    try:
-        part.write_text(f"{number}\n", encoding="ascii")
-        part.replace(path)
-        sync_folder(root)
-    except OSError as error:
-        raise SettingsError(f"KISSGS_DATA_DIR: cannot write {path}: {(error.strerror or '').lower()}") from error
+def _kind(storage: JobStorage) -> str:
+    return "storage" if storage.shared else "data folder"

@@ -1,4 +1,4 @@
-"""``JobStorage``: the data folder, with uploads in progress and one folder per job; clients choose no file names.
+"""``FolderStorage``: the data folder, with uploads in progress and one folder per job; clients choose no file names.
 
     incoming/TOKEN.part          an upload in progress
     jobs/ID/scene.ENDING         the complete upload: ply, sog, spz, splat, ksplat or glb
@@ -19,16 +19,20 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import json
 import logging
 import os
 import re
 import secrets
 import shutil
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from ..core.settings import SettingsError
+from .folder_numbers import read_number, sync_folder, write_number
+from .job_storage import DECODED, RESULT, JobStorage, StoredObject, complete_summary
 
 log = logging.getLogger("kissgs.service")
 
@@ -47,7 +51,7 @@ JOB_FILES = (*UNFINISHED, *UPLOAD_FILES, "result", "checkpoint*.npz", "decoded.p
 _JOB, _UPLOAD = re.compile("[0-9a-f]{32}"), re.compile(r"[0-9a-f]{16}\.part")
 
 
-class JobStorage:
+class FolderStorage(JobStorage):
     """Data folder, locked by one service at a time.
 
     Args:
@@ -57,9 +61,12 @@ class JobStorage:
         SettingsError: it cannot be created or written to, or another service uses it.
     """
 
+    setting, shared = "KISSGS_DATA_DIR", False
+
     def __init__(self, root: Path) -> None:
         self.root = root.absolute()
         self.incoming, self.jobs = self.root / "incoming", self.root / "jobs"
+        self.place = str(self.jobs)
         try:
             self.root.mkdir(mode=0o700, parents=True, exist_ok=True)
             for folder in (self.incoming, self.jobs):
@@ -105,11 +112,11 @@ class JobStorage:
 
     def result(self, job_id: str) -> Path:
         """Return the path of the job's result, a folder that exists only if the result is complete."""
-        return self.jobs / job_id / "result"
+        return self.jobs / job_id / RESULT
 
     def decoded(self, job_id: str) -> Path:
         """Return the path of the decoded scene, which exists after the first request."""
-        return self.jobs / job_id / "decoded.ply"
+        return self.jobs / job_id / DECODED
 
     def checkpoint(self, job_id: str) -> Path:
         """Return the path of the job's checkpoint."""
@@ -124,13 +131,41 @@ class JobStorage:
         """Return the files that an ended job can do without, if they exist: its upload and its decoded scene."""
         return [path for path in (self.upload(job_id), self.decoded(job_id)) if path.exists()]
 
+    def reclaimable_bytes(self, job_id: str) -> int:
+        """Return the bytes that an ended job can do without."""
+        return sum(path.stat().st_size for path in self.reclaimable_files(job_id))
+
+    def reclaim(self, job_id: str) -> None:
+        """Remove the upload and the decoded scene of an ended job."""
+        for path in self.reclaimable_files(job_id):
+            self.discard(path)
+
+    def upload_name(self, job_id: str) -> str | None:
+        """Return the name of the job's upload; None if there is none."""
+        path = self.upload(job_id)
+        return path.name if path.is_file() else None
+
+    def fetch(self, job_id: str, name: str, work: Path) -> Path:
+        """Return the path of a job's file."""
+        return self.jobs / job_id / name
+
+    def open(self, job_id: str, name: str) -> StoredObject:
+        """Return a file of a job.
+
+        Raises:
+            FileNotFoundError: it does not exist.
+        """
+        path = self.jobs / job_id / name
+        found = path.stat()
+        return StoredObject(found.st_size, found.st_mtime, path)
+
     def new_work(self, job_id: str) -> Path:
         """Create a new work folder for a job process."""
         folder = self.jobs / job_id / f"work-{secrets.token_hex(8)}"
         folder.mkdir()
         return folder
 
-    def keep_result(self, job_id: str) -> None:
+    def keep_result(self, job_id: str) -> str:
         """Move the result from a job's work folder to its final path; do nothing if that is done already.
 
         A previous result moves to the work folder.
@@ -146,12 +181,45 @@ class JobStorage:
             sync_folder(self.jobs / job_id)
         if not result.is_dir():
             raise FileNotFoundError(errno.ENOENT, "its result is missing")
+        return RESULT
+
+    def read_result(self, job_id: str, folder: str, container: str) -> dict[str, Any] | None:
+        """Return the summary of a complete result with this container; None if there is none or it is damaged."""
+        result = self.jobs / job_id / folder
+        try:
+            text = (result / "summary.json").read_bytes()
+            sizes = {str(path.relative_to(result)): path.stat().st_size for path in result.rglob("*")}
+        except OSError:
+            return None
+        return complete_summary(text, sizes, container)
+
+    def has_result(self, job_id: str) -> bool:
+        """Return whether there are files of a result, complete or not."""
+        return self.result(job_id).exists()
+
+    def remove_result(self, job_id: str, folder: str) -> None:
+        """Remove a result."""
+        self.discard(self.jobs / job_id / folder)
+
+    def settle(self, job_id: str, folder: str, *, keep_upload: bool) -> bool:
+        """Remove a job's checkpoints, and its upload unless ``keep_upload``; return whether there is an upload now."""
+        self.discard_checkpoints(job_id)
+        if not keep_upload:
+            self.discard(self.upload(job_id))
+        return keep_upload and self.upload(job_id).is_file()
 
     def keep_decoded(self, work: Path, job_id: str) -> None:
         """Move a decoded scene from a work folder to its final path."""
         (work / "decoded.json").rename(self.decoded(job_id).with_suffix(".json"))
         (work / "decoded.ply").rename(self.decoded(job_id))
         sync_folder(self.jobs / job_id)
+
+    def read_decoded(self, job_id: str) -> dict[str, Any] | None:
+        """Return the description of a job's decoded scene; None if it has not been decoded."""
+        if not self.decoded(job_id).exists():
+            return None
+        found: dict[str, Any] = json.loads(self.decoded(job_id).with_suffix(".json").read_text())
+        return found
 
     def remove_work(self, job_id: str) -> None:
         """Remove the incomplete files of a job; complete checkpoints stay."""
@@ -169,8 +237,8 @@ class JobStorage:
             with contextlib.suppress(FileNotFoundError, NotADirectoryError):
                 path.unlink()
 
-    def remove_job(self, job_id: str) -> None:
-        """Remove all files of a job; files that cannot be removed stay, with a warning in the log.
+    def remove_job(self, job_id: str) -> bool:
+        """Remove all files of a job and return True; files that cannot be removed stay, with a warning in the log.
 
         If the job's path is not a folder, or has other content, it is moved to the orphaned folder instead.
         """
@@ -182,6 +250,7 @@ class JobStorage:
                 log.warning("job %s: its folder cannot be removed", job_id)
         except OSError as error:
             log.warning("job %s: its folder cannot be removed: %s", job_id, (error.strerror or str(error)).lower())
+        return True
 
     def _remove(self, folder: Path) -> bool:
         """Remove the folder of a job, or move it to the orphaned folder; return False if it still exists."""
@@ -232,23 +301,32 @@ class JobStorage:
         self._move_to_orphaned(self.jobs / job_id)
         log.warning("job %s: its folder %s and was moved to %s", job_id, why, self.orphaned)
 
-    def move_to_orphaned_unless_empty(self, job_id: str, why: str) -> None:
+    def set_aside(self, job_id: str, why: str) -> None:
         """Move the folder of a job to the orphaned folder; remove it if it is empty."""
         with contextlib.suppress(OSError):  # not empty, not a folder, or missing
             (self.jobs / job_id).rmdir()
         if os.path.lexists(self.jobs / job_id):
             self.move_to_orphaned(job_id, why)
 
-    def move_orphans(self, known: set[str]) -> int:
+    def set_aside_unknown(self, known: Callable[[], set[str]]) -> int:
         """Move the folders of all jobs except ``known`` ones to the orphaned folder; call it before uploads start.
 
         Returns:
             The number of folders moved.
         """
-        unknown = sorted(self.job_ids() - known)
+        unknown = sorted(self.job_ids() - known())
         for job_id in unknown:
             self._move_to_orphaned(self.jobs / job_id)
+        if unknown:
+            log.warning(
+                "folders of jobs that the database does not know were moved to %s: %d", self.orphaned, len(unknown)
+            )
         return len(unknown)
+
+    def orphaned_note(self) -> str | None:
+        """Return a sentence about the entries of the orphaned folder; None if it is empty."""
+        count = self.count_orphaned()
+        return f"folders without a job in jobs/{ORPHANED} of the data folder: {count}" if count else None
 
     def count_orphaned(self) -> int:
         """Return the number of entries of the orphaned folder."""
@@ -282,15 +360,6 @@ class JobStorage:
                 )
         return None
 
-    def check(self) -> None:
-        """Check that files can be stored.
-
-        Raises:
-            OSError: they cannot.
-        """
-        if problem := self.health_problem():
-            raise OSError(problem)
-
     def free_bytes(self) -> int:
         """Return the free bytes of the disk."""
         return shutil.disk_usage(self.root).free
@@ -299,11 +368,23 @@ class JobStorage:
         """Return the size of all files of a job, bytes."""
         return sum(path.stat().st_size for path in (self.jobs / job_id).rglob("*") if path.is_file())
 
+    # Numbers -------------------------------------------------------------------------------------------------------
 
-def sync_folder(folder: Path) -> None:
-    """Flush a folder's entries to the disk, so that a power failure cannot undo a rename."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    def read_number(self, name: str) -> int | None:
+        """Read a number of the data folder: ``identity``, its own, or ``database``, that of its database.
+
+        Returns:
+            The number; None if the file is missing or empty.
+
+        Raises:
+            SettingsError: the file cannot be read or has other content.
+        """
+        return read_number(self.root / name)
+
+    def write_number(self, name: str, number: int) -> None:
+        """Write a number of the data folder atomically.
+
+        Raises:
+            SettingsError: it cannot be written.
+        """
+        write_number(self.root / name, number)

@@ -15,9 +15,10 @@ from sqlalchemy.exc import IntegrityError, SQLAlchemyError
 from sqlalchemy.orm import Session, load_only
 
 from ..core.models import ACTIVE, ENDED, NOTE_CHARS, Event, Job, Meta, State
-from . import database_lease
+from . import database_lease, replicas
 from .database import connect
 from .database_health import IDENTITY, DatabaseMonitor, DatabaseReplacedError
+from .replica_records import ReplicaRecords
 
 _PREDECESSORS: dict[State, tuple[State, ...]] = {
     State.RUNNING: (State.QUEUED,),
@@ -31,7 +32,7 @@ _PREDECESSORS: dict[State, tuple[State, ...]] = {
 
 
 class LimitExceeded(Exception):
-    """A job was not added because of a limit: ``"queue"``, ``"owner"`` or ``"key"``.
+    """A job was not added because of a limit: ``"queue"``, ``"owner"``, ``"disk"`` or ``"key"``.
 
     Attributes:
         limit: name of the limit.
@@ -42,7 +43,7 @@ class LimitExceeded(Exception):
         self.limit = limit
 
 
-class Store:
+class Store(ReplicaRecords):
     """Jobs and events in a database. Methods block for milliseconds and are safe in any thread.
 
     Args:
@@ -65,6 +66,9 @@ class Store:
         if self._monitor.owner is not None and self.health_problem() is None:
             with contextlib.suppress(SQLAlchemyError), self._write() as session:
                 database_lease.release(session)
+        if self._monitor.replica is not None:
+            with contextlib.suppress(SQLAlchemyError), self._writing.begin() as session:
+                replicas.remove(session, self._monitor.replica)
         self._engine.dispose()
         self._monitor.close()
 
@@ -108,6 +112,12 @@ class Store:
         """
         self._monitor.owner = database_lease.acquire(self._writing, self._reading)
 
+    def states(self, job_ids: Iterable[str]) -> dict[str, tuple[State, int]]:
+        """Return the state and the number of the last event of jobs, by id; those that do not exist are missing."""
+        query = sa.select(Job.id, Job.state, Job.last_event).where(Job.id.in_(list(job_ids)))
+        with self._reading() as session:
+            return {job_id: (State(state), last) for job_id, state, last in session.execute(query)}
+
     @contextlib.contextmanager
     def _write(self) -> Iterator[Session]:
         """Begin a transaction; raise an error if the database is removed or replaced before it ends."""
@@ -120,15 +130,22 @@ class Store:
 
     # Jobs ----------------------------------------------------------------------------------------------------------
 
-    def add(self, job: Job, *, max_queue: int, max_owner: int) -> Job:
-        """Queue a job.
+    def add(self, job: Job, *, max_queue: int, max_owner: int, max_disk: int | None = None) -> Job:
+        """Queue a job; of a replica, drop the claim of it.
 
         Raises:
-            LimitExceeded: ``max_queue`` jobs are queued, ``max_owner`` jobs of its owner are active, or its idempotency
-                key is in use.
+            LimitExceeded: ``max_queue`` jobs are queued, ``max_owner`` jobs of its owner are active, all jobs would
+                have more than ``max_disk`` bytes, or its idempotency key is in use.
+            DatabaseReplacedError: this replica has lost its claim.
         """
         try:
             with self._write() as session:
+                if self.replica is not None:
+                    replicas.lock(session, replicas.QUEUE_LOCK)  # counting and adding is one step for all replicas
+                    if not replicas.drop(session, job.id, self.replica):
+                        raise DatabaseReplacedError("another replica took this one for dead; send the request again")
+                if max_disk is not None and self._disk_bytes(session) + job.disk_bytes > max_disk:
+                    raise LimitExceeded("disk")
                 if self._count(session, Job.state == State.QUEUED) >= max_queue:
                     raise LimitExceeded("queue")
                 active = Job.owner == job.owner, Job.owner != "", Job.state.in_(ACTIVE)
@@ -187,6 +204,8 @@ class Store:
             job.started_at = self.clock()
             job.disk_bytes = job.upload_bytes + job.work_bytes
             job.state = State.RUNNING
+            if self.replica is not None:
+                replicas.take(session, job.id, self.replica)
             _add_event(session, job, "state", {"state": State.RUNNING, "start": job.starts})
             return job
 
@@ -199,15 +218,21 @@ class Store:
                 optional = {"note": job.note} if job.note else {}
                 _add_event(session, job, "progress", {"stage": stage, "fraction": fraction, **optional})
 
-    def move(self, number: int, state: State, **values: Any) -> bool:  # noqa: ANN401
+    def move(self, number: int, state: State, *, dead: str | None = None, **values: Any) -> bool:  # noqa: ANN401
         """Set a job's state and the columns ``values``; return False if its current state does not allow it.
 
-        A job that returns to the queue loses its progress.
+        A job that returns to the queue loses its progress. A replica drops its own claim of the job, or that of a
+        ``dead`` replica, without which the state does not change.
         """
         with self._write() as session:
             job = session.get(Job, number, with_for_update=True)
             if job is None or job.state not in _PREDECESSORS[state]:
                 return False
+            holder = dead or self.replica
+            if holder is not None and state != State.RUNNING:
+                dropped = replicas.drop(session, job.id, holder)
+                if dead is not None and not dropped:
+                    return False
             for name, value in values.items():
                 setattr(job, name, value)
             if state == State.QUEUED:
@@ -254,7 +279,7 @@ class Store:
     def disk_bytes(self) -> int:
         """Return the disk space of all jobs, bytes."""
         with self._reading() as session:
-            return int(session.scalar(sa.select(sa.func.coalesce(sa.func.sum(Job.disk_bytes), 0))) or 0)
+            return self._disk_bytes(session)
 
     def rates(self, preset: str, evaluate: bool, limit: int = 21) -> list[float]:
         """Return seconds per Gaussian of up to ``limit`` recent jobs of a preset, with or without evaluation."""
@@ -303,6 +328,12 @@ class Store:
         """Store the current time, which renews the lease and checks that the database is writable."""
         with self._write() as session:
             session.merge(Meta(name="time", value=self.clock()))
+            if self.replica is not None:
+                replicas.beat(session, self.replica)
+
+    @staticmethod
+    def _disk_bytes(session: Session) -> int:
+        return int(session.scalar(sa.select(sa.func.coalesce(sa.func.sum(Job.disk_bytes), 0))) or 0)
 
     @staticmethod
     def _count(session: Session, *where: sa.ColumnElement[bool]) -> int:

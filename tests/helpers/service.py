@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import json
 import os
 import re
@@ -17,6 +18,7 @@ from pathlib import Path
 import httpx
 
 import kissgs
+from helpers.s3_server import Bucket
 from kissgs.io.ply import write_ply
 
 ROOT = Path(__file__).parents[2]
@@ -120,6 +122,14 @@ class Service:
             time.sleep(0.02)
         raise AssertionError(f"job {job['id']} does not run: {status}\n{self.log.read_text()[-3000:]}")
 
+    workers = 1
+    """Number of jobs that run simultaneously."""
+
+    def occupy(self) -> list[dict]:
+        """Submit a long job for each worker, and return them once all are running."""
+        jobs = [self.submit(scene_bytes(20_000, 3), SLOW) for _ in range(self.workers)]
+        return [self.running(job) for job in jobs]
+
     def children(self) -> list[int]:
         """Return the ids of all job processes."""
         with contextlib.suppress(OSError):
@@ -132,6 +142,14 @@ class Service:
         text = Path(f"/proc/{self.process.pid}/status").read_text()
         return int(re.search(r"VmHWM:\s+([0-9]+) kB", text)[1]) << 10
 
+    def stored(self) -> set[str]:
+        """Return the ids of all jobs that have files."""
+        return {path.name for path in (self.folder / "jobs").iterdir()}
+
+    def uploads(self) -> list[str]:
+        """Return the names of uploads in progress."""
+        return [path.name for path in (self.folder / "incoming").iterdir()]
+
     def leftovers(self) -> list[str]:
         """Return the paths of temporary files."""
         jobs = self.folder / "jobs"
@@ -143,6 +161,81 @@ class Service:
         connection = socket.create_connection(("127.0.0.1", self.port), timeout=300)
         connection.sendall(data)
         return connection
+
+
+class Replicas(Service):
+    """Replicas on one PostgreSQL database and one bucket, each with a data folder; requests go to them in turn."""
+
+    def __init__(self, folder: Path, count: int, bucket: Bucket, database: str, **settings: object) -> None:
+        self.bucket, self.database = bucket, database
+        fixed = {"KISSGS_DATABASE_URL": database, **bucket.variables}
+        folder.mkdir()
+        self.replicas = [Service(folder / f"replica{i}", **fixed, **settings) for i in range(count)]
+        super().__init__(self.replicas[0].folder)
+        self.workers = count
+
+    def start(self) -> Replicas:
+        for replica in self.replicas:
+            replica.start()
+        self.url, self.port, self.process = self.replicas[0].url, self.replicas[0].port, self.replicas[0].process
+        self.http = httpx.Client(base_url=self.url, timeout=300, trust_env=False, transport=_InTurn(self.replicas))
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for replica in self.replicas:
+            replica.__exit__()
+        self.http.close()
+
+    def restart(self) -> Replicas:
+        self.__exit__()
+        return self.start()
+
+    def kill(self, number: int) -> int:
+        for replica in self.replicas:
+            if replica.process.poll() is None:
+                replica.process.send_signal(number)
+        return max((replica.kill(number) for replica in self.replicas), key=abs)
+
+    def children(self) -> list[int]:
+        return [child for replica in self.replicas for child in Service.children(replica)]
+
+    def memory(self) -> int:
+        return max(Service.memory(replica) for replica in self.replicas)
+
+    def stored(self) -> set[str]:
+        return {key.split("/")[1] for key in self.bucket.names() if key.startswith("jobs/")}
+
+    def uploads(self) -> list[str]:
+        return [name for replica in self.replicas for name in Service.uploads(replica)]
+
+    def leftovers(self) -> list[str]:
+        """Return the paths of files in the data folders, and the names of files that a succeeded job does not have."""
+        local = [
+            str(path)
+            for replica in self.replicas
+            for name in ("incoming", "jobs")
+            for path in (replica.folder / name).iterdir()
+        ]
+        kept = (
+            "scene[.][a-z]+|result-[0-9a-f]+/(summary.json|report.json|scene[.](zip|sog)|files/.+)|decoded.(ply|json)"
+        )
+        return local + [
+            key
+            for key in self.bucket.names()
+            if not re.fullmatch(f"identity|database|jobs/[0-9a-f]{{32}}/({kept})", key)
+        ]
+
+
+class _InTurn(httpx.HTTPTransport):
+    """Transport that sends each request to the next replica."""
+
+    def __init__(self, replicas: list[Service]) -> None:
+        super().__init__(trust_env=False)
+        self._replicas = itertools.cycle(replicas)
+
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        request.url = request.url.copy_with(port=next(self._replicas).port)
+        return super().handle_request(request)
 
 
 def read_response(connection: socket.socket) -> bytes:

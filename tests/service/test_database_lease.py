@@ -31,7 +31,7 @@ def on_machine(monkeypatch):
     """``on_machine(n)`` lets the lease take this process for one on machine ``n``."""
 
     def change(number):
-        monkeypatch.setattr(database_lease, "_machine", lambda: number)
+        monkeypatch.setattr(database_lease, "machine_number", lambda: number)
 
     return change
 
@@ -188,11 +188,13 @@ def test_simultaneous_starts(url):
 
 @pytest.mark.parametrize("process", [0, -1, 2.0**40, 1e300])
 def test_invalid_process_numbers(process):
-    assert database_lease._is_free({"owner": 5.0, "owner-process": process, "owner-machine": database_lease._machine()})
+    assert database_lease._is_free(
+        {"owner": 5.0, "owner-process": process, "owner-machine": database_lease.machine_number()}
+    )
 
 
 def test_processes_that_may_run():
-    rows = {"owner": 5.0, "owner-process": float(os.getppid()), "owner-machine": database_lease._machine()}
+    rows = {"owner": 5.0, "owner-process": float(os.getppid()), "owner-machine": database_lease.machine_number()}
     assert not database_lease._is_free(rows)
     assert not database_lease._is_free({**rows, "owner-machine": 1.0, "owner-process": 2.0**22})
     assert database_lease._is_free(

@@ -8,7 +8,7 @@ from helpers.data_folders import database, finish_a_job, listing, names, opened,
 
 from service.core.models import SCHEMA_VERSION, State
 from service.core.settings import SettingsError
-from service.storage import folder_binding
+from service.storage.job_files import FolderStorage
 from service.storage.job_records import Store
 
 pytestmark = pytest.mark.usefixtures("no_variables")
@@ -49,7 +49,7 @@ def test_an_interrupted_first_start(tmp_path, monkeypatch, step):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr({"write_number": folder_binding, "bind_to": Store}[step], step, end)
+        patch.setattr({"write_number": FolderStorage, "bind_to": Store}[step], step, end)
         with pytest.raises(KeyboardInterrupt):
             opened(tmp_path / "data")
     with service(tmp_path / "data") as context:

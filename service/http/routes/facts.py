@@ -17,7 +17,6 @@ from ...core.problems import PROBLEM_TYPES, ProblemError
 from ...core.schemas import Health, Limits, Presets, ProblemKind, Version
 from ...jobs.container import Service, ServiceContainer
 from ...storage.database_health import error_text
-from ...storage.job_files import ORPHANED
 from .common import MAX_WAIT_SECONDS, NO_STORE, problems
 
 router = APIRouter()
@@ -107,8 +106,8 @@ async def get_readyz(context: Service, response: Response) -> Health:
     }
     ready = not any(found.values())
     checks = {part: text or "ok" for part, text in found.items()}
-    if orphaned := await run_sync(context.storage.count_orphaned):
-        checks["orphaned"] = f"folders without a job in jobs/{ORPHANED} of the data folder: {orphaned}"
+    if orphaned := await run_sync(context.storage.orphaned_note):
+        checks["orphaned"] = orphaned
     response.status_code = 200 if ready else 503
     response.headers.update(NO_STORE)
     return Health(ready=ready, checks=checks)

@@ -11,7 +11,7 @@ from fastapi.responses import StreamingResponse
 
 from ...core.models import ACTIVE, Job, State
 from ...core.notifier import ended
-from ...core.problems import ProblemError
+from ...core.problems import ProblemError, unusable_storage
 from ...core.schemas import JobPage, JobStatus
 from ...jobs.container import Owner, Service, ServiceContainer
 from ..submission import RAW_TYPES, submit
@@ -62,7 +62,7 @@ Wait = Annotated[
 
 _REFUSALS = (
     *("invalid-scene", "unsupported", "key-reused", "media-type", "too-large", "upload-timeout", "upload-aborted"),
-    *("queue-full", "too-many-jobs", "too-many-uploads", "disk-full", "stopping"),
+    *("queue-full", "too-many-jobs", "too-many-uploads", "disk-full", "stopping", "storage"),
 )
 
 _BODY: dict[str, Any] = {
@@ -174,7 +174,7 @@ async def compress_now(
     job = await wait_for_end(context, job, context.settings.sync_seconds, request)
     if job.state == State.SUCCEEDED:
         result = f"/v1/jobs/{job.id}/result"
-        answer = container(context, job)
+        answer = await container(context, job)
         answer.headers["Content-Location"] = result
         answer.headers["Link"] = f'</v1/jobs/{job.id}>; rel="describedby"'
         return answer
@@ -292,15 +292,16 @@ async def cancel_job(context: Service, job: RequestedJob, response: Response) ->
     status_code=204,
     operation_id="delete",
     summary="Delete a job",
-    responses={204: {"description": "The job was deleted."}, **problems("not-found")},
+    responses={204: {"description": "The job was deleted."}, **problems("not-found", "storage")},
 )
 async def delete_job(context: Service, job: RequestedJob) -> Response:
     """Cancel a job if it has not ended, and remove all its data."""
     await context.worker.cancel(job)
     context.decoder.stop(job.id)
-    gone = {"upload_kept": False, "disk_bytes": 0, "reclaimable_bytes": 0}
+    gone: dict[str, Any] = {"upload_kept": False, "disk_bytes": 0, "reclaimable_bytes": 0}
     await run_sync(lambda: context.store.move(job.number, State.EXPIRED, **gone))
-    await run_sync(context.storage.remove_job, job.id)  # first, because a folder without a job would be kept
+    if not await run_sync(context.storage.remove_job, job.id):  # first, because a folder without a job would be kept
+        raise unusable_storage()
     await run_sync(context.store.forget, job.number)
     context.notifier.notify(job.id)
     context.notifier.notify(ended(job.id))

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
+from pathlib import PurePath
 from typing import Annotated, Any
 
+from anyio.to_thread import run_sync
 from fastapi import APIRouter, Path, Response
 
 from ...core.formats import CONTAINER_FILES, container_file
 from ...core.models import Job, State
-from ...core.problems import ProblemError
+from ...core.problems import ProblemError, unusable_storage
+from ...jobs.completion import result_folder
 from ...jobs.container import Service, ServiceContainer
-from ..file_response import StoredFile, described
+from ...storage.job_storage import StoredObject
+from ...storage.object_store import ObjectStoreError
+from ..file_response import StoredFile, described, removed
 from .common import RequestedJob, problems
+
+log = logging.getLogger("kissgs.service")
 
 router = APIRouter(prefix="/v1/jobs/{id}", tags=["results"])
 
@@ -25,7 +33,7 @@ _PRIVATE = {"Cache-Control": "private, no-cache"}
 _FOREVER = {"Cache-Control": "private, max-age=31536000, immutable"}
 """Headers of container files, which never change."""
 
-_UNREADY = ("not-found", "not-finished", "not-succeeded", "gone", "range")
+_UNREADY = ("not-found", "not-finished", "not-succeeded", "gone", "range", "storage")
 
 
 def _file_answers(media_types: str, *codes: str) -> dict[int | str, dict[str, Any]]:
@@ -54,7 +62,7 @@ def _file_answers(media_types: str, *codes: str) -> dict[int | str, dict[str, An
 
 async def get_result(context: Service, job: RequestedJob) -> Response:
     """The container, `.zip` (SOG-XT) or `.sog` as the options say, until the job expires."""
-    return container(context, job)
+    return await container(context, job)
 
 
 async def get_file(
@@ -63,39 +71,40 @@ async def get_file(
     """One file of the container, for readers that need only some. It never changes and may be cached."""
     _ready(job)
     entry = described(job.result or {}, ("files", name))
-    path = context.storage.result(job.id) / "files" / name
-    media_type = _MEDIA_TYPES.get(path.suffix, "application/octet-stream")
-    return StoredFile(path, sha256=entry["sha256"], media_type=media_type, headers=_FOREVER)
+    media_type = _MEDIA_TYPES.get(PurePath(name).suffix, "application/octet-stream")
+    file = await _open(context, job, f"{result_folder(job)}/files/{name}")
+    return StoredFile(file, sha256=entry["sha256"], media_type=media_type, headers=_FOREVER)
 
 
 async def get_decoded(context: Service, job: RequestedJob) -> Response:
     """The container decoded to a `.ply`, on the first request."""
     _ready(job)
-    path, entry = await context.decoder.scene(job)
+    file, entry = await context.decoder.scene(job)
     media_type = "application/octet-stream"
     download = f"{job.name}.decoded.ply"
-    return StoredFile(path, sha256=entry["sha256"], media_type=media_type, download=download, headers=_PRIVATE)
+    return StoredFile(file, sha256=entry["sha256"], media_type=media_type, download=download, headers=_PRIVATE)
 
 
 async def get_source(context: Service, job: RequestedJob) -> Response:
     """The uploaded scene, for comparisons, unless it was removed to free disk space."""
     _ready(job)
-    path = context.storage.upload(job.id)
-    if not job.upload_kept:
+    name = await run_sync(context.storage.upload_name, job.id) if job.upload_kept else None
+    if name is None:
         raise ProblemError("gone", "the upload was removed to free disk space; the result is still available")
-    media_type, download = "application/octet-stream", f"{job.name}{path.suffix}"
-    return StoredFile(path, sha256=job.upload_sha256, media_type=media_type, download=download, headers=_PRIVATE)
+    media_type, download = "application/octet-stream", f"{job.name}{PurePath(name).suffix}"
+    file = await _open(context, job, name)
+    return StoredFile(file, sha256=job.upload_sha256, media_type=media_type, download=download, headers=_PRIVATE)
 
 
 async def get_report(context: Service, job: RequestedJob) -> Response:
     """The report of the compression, as from the library."""
     _ready(job)
     entry = described(job.result or {}, ("report",))
-    path = context.storage.result(job.id) / "report.json"
-    return StoredFile(path, sha256=entry["sha256"], media_type="application/json", headers=_PRIVATE)
+    file = await _open(context, job, f"{result_folder(job)}/report.json")
+    return StoredFile(file, sha256=entry["sha256"], media_type="application/json", headers=_PRIVATE)
 
 
-def container(context: ServiceContainer, job: Job) -> StoredFile:
+async def container(context: ServiceContainer, job: Job) -> StoredFile:
     """Return the response with the container of a succeeded job.
 
     Raises:
@@ -103,9 +112,19 @@ def container(context: ServiceContainer, job: Job) -> StoredFile:
     """
     _ready(job)
     entry = described(job.result or {}, ("container",))
-    file = container_file(job.options)
-    path, download = context.storage.result(job.id) / file.name, f"{job.name}{file.ending}"
-    return StoredFile(path, sha256=entry["sha256"], media_type=file.media_type, download=download, headers=_PRIVATE)
+    kind = container_file(job.options)
+    file, download = await _open(context, job, f"{result_folder(job)}/{kind.name}"), f"{job.name}{kind.ending}"
+    return StoredFile(file, sha256=entry["sha256"], media_type=kind.media_type, download=download, headers=_PRIVATE)
+
+
+async def _open(context: ServiceContainer, job: Job, name: str) -> StoredObject:
+    try:
+        return await run_sync(context.storage.open, job.id, name)
+    except FileNotFoundError as error:
+        raise removed() from error
+    except ObjectStoreError as error:
+        log.error("job %s: %s cannot be read: %s", job.id, name, error)
+        raise unusable_storage() from error
 
 
 def _ready(job: Job) -> None:

@@ -1,0 +1,333 @@
+"""``S3Storage``: the files of jobs in a bucket that several replicas share.
+
+    PREFIX/identity, PREFIX/database            numbers of the storage and of its database
+    PREFIX/jobs/ID/scene.ENDING                 the complete upload
+    PREFIX/jobs/ID/checkpoint*.npz              checkpoints of training that another replica may continue
+    PREFIX/jobs/ID/result-REPLICA/              the result that a replica made; summary.json, the last, completes it
+    PREFIX/jobs/ID/decoded.ply                  the decoded scene; decoded.json, the last, completes it
+
+What a replica is working on lies in a data folder of its own: uploads in progress, the files of its job processes, and
+their checkpoints. Nothing else lies there, so that folder may be lost at any time.
+
+A replica holds a claim of the job (:mod:`service.storage.replicas`) while it writes files of a job that is not in the
+database yet, or that it runs; the claims of a replica that has died say what to remove. A result's folder has the name
+of the replica that made it, so one that was taken for dead cannot change the result of another one.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from ..core.settings import SettingsError
+from .folder_numbers import read_number
+from .job_files import UPLOAD_FILES, FolderStorage
+from .job_storage import DECODED, RESULT, JobStorage, StoredObject, complete_summary
+from .object_store import ObjectInfo, ObjectStore
+
+log = logging.getLogger("kissgs.service")
+
+HEALTH_SECONDS = 5.0
+"""Seconds for which the health of the bucket is not asked for again."""
+
+_CHECKPOINT = re.compile(r"checkpoint[^/]*[.]npz")
+
+_JOB = re.compile("[0-9a-f]{32}")
+
+
+class S3Storage(JobStorage):
+    """Bucket for the files of jobs, and a data folder for what this replica is working on.
+
+    Args:
+        url: ``s3://BUCKET`` or ``s3://BUCKET/PREFIX``.
+        root: the data folder; created if it does not exist.
+
+    Attributes:
+        replica: id of this replica, which names the folders of its results; set it before :meth:`keep_result`.
+
+    Raises:
+        SettingsError: the bucket or the folder cannot be used, or the folder holds jobs of a service without a bucket.
+    """
+
+    setting, shared = "KISSGS_STORAGE", True
+
+    def __init__(self, url: str, root: Path) -> None:
+        self._objects = ObjectStore(url)
+        self._local = FolderStorage(root)
+        self.place = f"{self._objects.url}/jobs"
+        self._stored: dict[Path, int] = {}
+        self._unknown = 0
+        self._identity: int | None = None
+        self._checked, self._problem = -HEALTH_SECONDS, ""
+        try:
+            if read_number(self._local.root / "identity") is not None:
+                raise SettingsError(
+                    f"KISSGS_DATA_DIR: {root} belongs to a service without KISSGS_STORAGE; use another folder, which "
+                    "will hold nothing but work in progress"
+                )
+            self._objects.check_usable(f"check-{time.time_ns():x}")
+        except BaseException:
+            self._local.close()
+            raise
+
+    def close(self) -> None:
+        """Release the data folder for other services."""
+        self._local.close()
+
+    # Files that this replica is working on --------------------------------------------------------------------------
+
+    def new_upload(self) -> Path:
+        """Return a new path for an upload."""
+        return self._local.new_upload()
+
+    def new_work(self, job_id: str) -> Path:
+        """Create a new work folder for a job process."""
+        (self._local.jobs / job_id).mkdir(exist_ok=True)
+        return self._local.new_work(job_id)
+
+    def checkpoint(self, job_id: str) -> Path:
+        """Return the path of the job's checkpoint."""
+        return self._local.checkpoint(job_id)
+
+    def remove_work(self, job_id: str) -> None:
+        """Remove what this replica has of a job; stored checkpoints stay."""
+        self._stored = {path: made for path, made in self._stored.items() if path.parent.name != job_id}
+        self._local.remove_job(job_id)
+
+    def discard(self, path: Path) -> None:
+        """Remove a file or folder of this machine if it exists; of a link, remove only the link."""
+        self._local.discard(path)
+
+    def free_bytes(self) -> int:
+        """Return the free bytes of this machine's disk."""
+        return self._local.free_bytes()
+
+    def remove_uploads(self) -> None:
+        """Remove incomplete uploads of a previous service."""
+        self._local.remove_uploads()
+
+    def remove_unfinished(self, known: set[str]) -> None:
+        """Remove what a previous service was working on in this folder."""
+        self._local.remove_uploads()
+        for job_id in self._local.job_ids():
+            self._local.remove_job(job_id)
+
+    # Files of jobs --------------------------------------------------------------------------------------------------
+
+    def adopt(self, upload: Path, job_id: str, name: str = UPLOAD_FILES[0]) -> None:
+        """Move a complete upload to the files of a job; ``name`` is one of ``UPLOAD_FILES``."""
+        self._objects.put(upload, _key(job_id, name))
+        self._local.discard(upload)
+
+    def upload_name(self, job_id: str) -> str | None:
+        """Return the name of the job's upload; None if there is none."""
+        return next((name for name in self._names(job_id) if name in UPLOAD_FILES), None)
+
+    def fetch(self, job_id: str, name: str, work: Path) -> Path:
+        """Copy a file of a job to the folder ``work``; return its path there."""
+        path = work / Path(name).name
+        self._objects.fetch(_key(job_id, name), path)
+        return path
+
+    def fetch_checkpoints(self, job_id: str) -> None:
+        """Copy the checkpoints of a job, which another replica may have made, to this machine."""
+        for name in self._names(job_id):
+            if _CHECKPOINT.fullmatch(name):
+                self._objects.fetch(_key(job_id, name), self._local.jobs / job_id / name)
+
+    def store_checkpoints(self, job_id: str) -> None:
+        """Store the complete checkpoints of a job for other replicas, if they have changed."""
+        for path in sorted((self._local.jobs / job_id).glob("checkpoint*.npz")):
+            if self._stored.get(path) != (made := path.stat().st_mtime_ns):
+                self._objects.put(path, _key(job_id, path.name))
+                self._stored[path] = made
+
+    def keep_result(self, job_id: str) -> str:
+        """Store the result in a job's work folder for good; do nothing if that is done already.
+
+        Returns:
+            The name of the result's folder.
+
+        Raises:
+            OSError: it cannot be stored, or there is none.
+        """
+        folder = f"{RESULT}-{self.replica}"
+        for written in (self._local.jobs / job_id).glob(f"work-*/{RESULT}"):
+            files = {str(path.relative_to(written)): path for path in written.rglob("*") if path.is_file()}
+            last = files.pop("summary.json")
+            self._objects.put_all((path, _key(job_id, folder, name)) for name, path in sorted(files.items()))
+            self._objects.put(last, _key(job_id, folder, "summary.json"))
+            return folder
+        if f"{folder}/summary.json" not in self._names(job_id):
+            raise FileNotFoundError(2, "its result is missing")
+        return folder
+
+    def read_result(self, job_id: str, folder: str, container: str) -> dict[str, Any] | None:
+        """Return the summary of a complete result with this container; None if there is none or it is damaged."""
+        sizes = {
+            name.removeprefix(f"{folder}/"): info.size
+            for name, info in self._names(job_id).items()
+            if name.startswith(f"{folder}/")
+        }
+        if "summary.json" not in sizes:
+            return None
+        return complete_summary(self._objects.get_bytes(_key(job_id, folder, "summary.json")), sizes, container)
+
+    def has_result(self, job_id: str) -> bool:
+        """Return whether there are files of a result, complete or not."""
+        return any(name.startswith(f"{RESULT}-") for name in self._names(job_id))
+
+    def remove_result(self, job_id: str, folder: str) -> None:
+        """Remove a result."""
+        self._remove(job_id, [name for name in self._names(job_id) if name.startswith(f"{folder}/")])
+
+    def settle(self, job_id: str, folder: str, *, keep_upload: bool) -> bool:
+        """Remove checkpoints, other results, and the upload unless ``keep_upload``; return whether there is one now."""
+        names = self._names(job_id)
+        upload = next((name for name in names if name in UPLOAD_FILES), None)
+        kept = {upload} if keep_upload else set()
+        self._remove(job_id, [name for name in names if not name.startswith(f"{folder}/") and name not in kept])
+        return keep_upload and upload is not None
+
+    def keep_decoded(self, work: Path, job_id: str) -> None:
+        """Store the decoded scene in a work folder, with its description, for good."""
+        self._objects.put(work / DECODED, _key(job_id, DECODED))
+        self._objects.put(work / "decoded.json", _key(job_id, "decoded.json"))
+
+    def read_decoded(self, job_id: str) -> dict[str, Any] | None:
+        """Return the description of a job's decoded scene; None if it has not been decoded."""
+        if not self._names(job_id).keys() >= {DECODED, "decoded.json"}:
+            return None
+        found: dict[str, Any] = json.loads(self._objects.get_bytes(_key(job_id, "decoded.json")))
+        return found
+
+    def open(self, job_id: str, name: str) -> StoredObject:
+        """Return a file of a job.
+
+        Raises:
+            FileNotFoundError: it does not exist.
+        """
+        key = _key(job_id, name)
+        info = self._objects.info(key)
+        return StoredObject(info.size, info.modified, stream=lambda first, end: self._objects.stream(key, first, end))
+
+    def reclaimable_bytes(self, job_id: str) -> int:
+        """Return the bytes that an ended job can do without: its upload and its decoded scene."""
+        return sum(info.size for name, info in self._names(job_id).items() if name in (*UPLOAD_FILES, DECODED))
+
+    def reclaim(self, job_id: str) -> None:
+        """Remove the upload and the decoded scene of an ended job."""
+        self._remove(job_id, [name for name in self._names(job_id) if name in (*UPLOAD_FILES, DECODED, "decoded.json")])
+
+    def remove_job(self, job_id: str) -> bool:
+        """Remove all files of a job; return False if that is not possible now, with a warning in the log."""
+        self._local.remove_job(job_id)
+        try:
+            self._remove(job_id, self._names(job_id))
+        except OSError as error:
+            log.warning("job %s: its files cannot be removed now: %s", job_id, error)
+            return False
+        return True
+
+    def job_bytes(self, job_id: str) -> int:
+        """Return the size of all files of a job, bytes."""
+        return sum(info.size for info in self._names(job_id).values())
+
+    # The storage itself ---------------------------------------------------------------------------------------------
+
+    def job_ids(self) -> set[str]:
+        """Return the ids of all jobs that have files."""
+        return {name for name in self._objects.folders("jobs") if _JOB.fullmatch(name)}
+
+    def set_aside(self, job_id: str, why: str) -> None:
+        """Leave the files of a failed job where they are, until it expires."""
+        log.warning("job %s: its folder %s; its files stay in %s until it expires", job_id, why, self.place)
+
+    def set_aside_unknown(self, known: Callable[[], set[str]]) -> int:
+        """Count the jobs that have files, but no row in the database: nothing removes them or changes them.
+
+        Returns:
+            Their number.
+        """
+        stored = self.job_ids()  # first, because other replicas may add jobs meanwhile
+        self._unknown = len(stored - known())
+        if note := self.orphaned_note():
+            log.warning("%s", note)
+        return self._unknown
+
+    def orphaned_note(self) -> str | None:
+        """Return a sentence about files of jobs that the database does not know; None if there are none."""
+        return f"jobs in {self.place} that the database does not know: {self._unknown}" if self._unknown else None
+
+    def health_problem(self) -> str | None:
+        """Return why files cannot be stored; None if they can. Asks the bucket again after :data:`HEALTH_SECONDS`."""
+        if problem := self._local.health_problem():
+            return problem
+        if time.monotonic() - self._checked >= HEALTH_SECONDS:
+            self._problem = self._ask()
+            self._checked = time.monotonic()
+        return self._problem or None
+
+    def _ask(self) -> str:
+        try:
+            same = self._identity is None or self._objects.get_bytes("identity", hasty=True) == b"%d\n" % self._identity
+        except FileNotFoundError:
+            same = False
+        except OSError as error:
+            return f"the storage cannot be used: {error}"
+        return "" if same else f"the storage cannot be used: {self._objects.url} was emptied or replaced; restore it"
+
+    def read_number(self, name: str) -> int | None:
+        """Read a number of the storage: ``identity``, its own, or ``database``, that of its database.
+
+        Returns:
+            The number; None if there is none.
+
+        Raises:
+            SettingsError: it cannot be read or is not a number.
+        """
+        try:
+            text = self._objects.get_bytes(name).strip()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise SettingsError(f"KISSGS_STORAGE: {error}") from error
+        if not re.fullmatch(rb"[0-9]{1,18}", text):
+            raise SettingsError(
+                f"KISSGS_STORAGE: {self._objects.url}/{name} is not a number; restore it, or use another prefix"
+            )
+        if name == "identity":
+            self._identity = int(text)
+        return int(text)
+
+    def write_number(self, name: str, number: int) -> None:
+        """Write a number of the storage.
+
+        Raises:
+            SettingsError: it cannot be written.
+        """
+        try:
+            self._objects.put_bytes(b"%d\n" % number, name)
+        except OSError as error:
+            raise SettingsError(f"KISSGS_STORAGE: {error}") from error
+        if name == "identity":
+            self._identity = number
+
+    def _names(self, job_id: str) -> dict[str, ObjectInfo]:
+        """Return all files of a job by name."""
+        folder = _key(job_id)
+        return {info.key.removeprefix(f"{folder}/"): info for info in self._objects.files(folder)}
+
+    def _remove(self, job_id: str, names: list[str] | dict[str, ObjectInfo]) -> None:
+        self._objects.delete(_key(job_id, name) for name in names)
+
+
+def _key(job_id: str, *names: str) -> str:
+    if not _JOB.fullmatch(job_id):
+        raise ValueError(f"{job_id!r} is not a job id")
+    return "/".join(("jobs", job_id, *names))
