@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         KissgsError,
         OutputError,
         RemoteError,
+        RunnerError,
         StopSearch,
         UnsupportedError,
     )
@@ -71,6 +72,7 @@ _HOMES = {
     "ReadOptions": "pipeline.read_options",
     "Remote": "client.remote",
     "RemoteError": "core.errors",
+    "RunnerError": "core.errors",
     "Report": "pipeline.report",
     "SceneInfo": "pipeline.inspect",
     "Settings": "settings",
@@ -119,6 +121,7 @@ __all__ = [
     "Remote",
     "RemoteError",
     "Report",
+    "RunnerError",
     "SceneInfo",
     "Sensitivity",
     "Settings",
