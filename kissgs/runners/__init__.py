@@ -5,6 +5,11 @@ Out: progress events and one :class:`Outcome`. Scenes and results never pass thr
 """
 
 from kissgs.runners.contract import (
+    INTERNAL,
+    LOST,
+    MEMORY_LIMIT,
+    TIME_LIMIT,
+    UNREACHABLE,
     NodeResources,
     Outcome,
     Resources,
@@ -17,6 +22,11 @@ from kissgs.runners.contract import (
 from kissgs.runners.factory import open_runner
 
 __all__ = [
+    "INTERNAL",
+    "LOST",
+    "MEMORY_LIMIT",
+    "TIME_LIMIT",
+    "UNREACHABLE",
     "NodeResources",
     "Outcome",
     "Resources",
