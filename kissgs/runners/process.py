@@ -12,6 +12,7 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -81,7 +82,8 @@ class ItemProcess:
                 process = self._start(errors)
             except OSError as error:
                 reason = (error.strerror or str(error)).lower()
-                yield Outcome("error", code="output", message=f"the work cannot be started in its folder: {reason}")
+                message = f"the machine {socket.gethostname()} cannot use the folder of the work: {reason}"
+                yield Outcome("error", code="output", message=message, log=str(self._item.folder))
                 return
             timer = threading.Timer(self._item.seconds or threading.TIMEOUT_MAX, self._time_out)
             timer.daemon = True
@@ -108,7 +110,7 @@ class ItemProcess:
             stdout=subprocess.PIPE,
             stderr=errors,
             cwd=self._item.folder,
-            env=_environment(),
+            env=child_environment(),
             start_new_session=True,
         )
         with self._lock:
@@ -168,7 +170,7 @@ class ItemProcess:
             return Outcome("error", code=MEMORY_LIMIT, message=f"the work needs more memory{of}", log=text)
         if status < 0:
             name = signal.Signals(-status).name
-            return Outcome("crashed", code=CRASHED, message=f"its process was ended by {name}", log=text)
+            return Outcome("crashed", code=CRASHED, message=f"the process was ended by {name}", log=text)
         message = "the work failed because of an error in kissgs; please report it"
         return Outcome("error", code=INTERNAL, message=message, log=text)
 
@@ -187,7 +189,7 @@ def _events_of(process: subprocess.Popen[bytes]) -> Iterator[ProgressEvent | Out
             yield Outcome("error", code=MEMORY_LIMIT)
 
 
-def _environment() -> dict[str, str]:
+def child_environment() -> dict[str, str]:
     """Return this process's environment without the settings of a service, some of which are secrets."""
     inherited = {name: value for name, value in os.environ.items() if not name.upper().startswith("KISSGS_")}
     return {**inherited, "OMP_WAIT_POLICY": "PASSIVE", "PYTHONUNBUFFERED": "1"}

@@ -34,6 +34,7 @@ from kissgs.runners.contract import (
     WorkItem,
     refusal_of,
 )
+from kissgs.runners.process import child_environment
 
 log = logging.getLogger("kissgs.runners")
 
@@ -162,7 +163,7 @@ class RayRunner:
             stderr=errors,
             text=True,
             encoding="utf-8",
-            env={**os.environ, "RAY_USAGE_STATS_ENABLED": "0"},
+            env={**child_environment(), "RAY_USAGE_STATS_ENABLED": "0"},
             start_new_session=True,  # Ctrl-C is for this process
         )
         self._reader = threading.Thread(target=self._read, args=(driver, errors), daemon=True)
