@@ -32,6 +32,7 @@ class RayCluster:
         self.folder = Path(tempfile.mkdtemp(prefix="kr-"))  # short: sockets below have paths of at most 107 bytes
         self.environment = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
         self.nodes: list[subprocess.Popen] = []
+        self.logs: list[Path] = []
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             self.address = f"127.0.0.1:{probe.getsockname()[1]}"
@@ -42,12 +43,6 @@ class RayCluster:
             *("--head", f"--port={self.address.rpartition(':')[2]}", "--num-cpus=0", "--include-dashboard=false"),
             f"--system-config={json.dumps(quick)}",
         )
-        for _ in range(600):
-            with contextlib.suppress(OSError):
-                socket.create_connection(("127.0.0.1", int(self.address.rpartition(":")[2])), 1).close()
-                break
-            assert self.head.poll() is None, (self.folder / "log").read_text()
-            time.sleep(0.1)
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -62,14 +57,20 @@ class RayCluster:
     def _start(self, *options: str) -> subprocess.Popen:
         kept = {name: value for name, value in os.environ.items() if not name.startswith(("KISSGS_", "RAY_"))}
         environment = {**kept, **self.environment, "RAY_TMPDIR": str(self.folder), "RAY_USAGE_STATS_ENABLED": "0"}
-        with (self.folder / "log").open("ab") as log:
-            return subprocess.Popen(
+        log = self.folder / f"log{len(self.logs)}"
+        self.logs.append(log)
+        with log.open("wb") as file:
+            process = subprocess.Popen(
                 [RAY, "start", "--block", "--object-store-memory=80000000", *options],
                 env={**environment, "PYTHONPATH": PATHS},
-                stdout=log,
-                stderr=log,
+                stdout=file,
+                stderr=file,
                 cwd=self.folder,
             )
+        while b"Ray runtime started" not in log.read_bytes():  # two at a time would choose the same names of sockets
+            assert process.poll() is None, log.read_text()
+            time.sleep(0.05)
+        return process
 
 
 def tree(pid: int) -> list[int]:

@@ -60,6 +60,7 @@ def test_files_and_reports_are_those_without_a_cluster(cluster, scenes, tmp_path
     assert sorted(path.name for path in (tmp_path / "there").iterdir()) == ["a.zip", "b.zip"]
 
 
+@pytest.mark.quick(0)
 def test_a_folder_is_written_shown_and_replaced_only_if_allowed(cluster, scenes, tmp_path):
     words = ["compress", scenes / "a.ply", "-p", "fast", "-o", tmp_path, "--unpacked", "--ray", cluster.address]
     done = run(*words)
@@ -138,6 +139,7 @@ def test_ctrl_c_ends_all_items_and_leaves_nothing(cluster, scenes, tmp_path):
         (["a.ply", "-o", "x/lod-meta.json"], "are made without --ray"),
     ],
 )
+@pytest.mark.quick(3)
 def test_one_sentence_for_what_a_cluster_cannot_do(cluster, scenes, words, expected):
     assert expected in failure("compress", *words, "-p", "fast", "--ray", cluster.address, cwd=scenes)
     assert not list(scenes.glob("*.zip"))

@@ -12,6 +12,7 @@ from helpers.running import is_alive, item, outcome_of, pid_in, wait_until
 
 from kissgs.core.errors import RunnerError
 from kissgs.runners import open_runner
+from kissgs.runners import ray_runner as ray_runner_module
 
 DRIVER = """
 import sys
@@ -49,6 +50,7 @@ def test_an_item_whose_node_is_killed_runs_elsewhere(whole_cluster, ray_runner, 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["output", "starts"]
 
 
+@pytest.mark.quick(0)
 def test_an_item_that_loses_all_of_its_nodes_is_lost(whole_cluster, ray_runner, tmp_path):
     work = item("write_slowly", starts=str(tmp_path / "starts"), output=str(tmp_path / "output"), text="", retries=0)
     handle = ray_runner.submit(work)
@@ -83,7 +85,8 @@ def test_items_end_with_whoever_submitted_them_and_run_again(ray_cluster, ray_ru
     assert len(starts.read_text().splitlines()) == 2
 
 
-def test_a_lost_connection_is_an_outcome_and_is_made_again(ray_cluster, tmp_path):
+def test_a_lost_connection_is_an_outcome_and_is_made_again(ray_cluster, tmp_path, monkeypatch):
+    monkeypatch.setattr(ray_runner_module, "RECONNECT_SECONDS", 0.5)
     runner = open_runner("ray", ray_cluster.address)
     try:
         handle = runner.submit(item("count", numbers=1, seconds_between=600, pid=str(tmp_path / "pid")))
@@ -109,6 +112,7 @@ def test_closing_ends_all_items(ray_cluster, tmp_path):
     wait_until(lambda: not is_alive(pid), seconds=5)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     ("address", "expected"),
     [
@@ -131,9 +135,7 @@ def test_a_cluster_with_another_token(ray_cluster, monkeypatch):
 
 
 def test_ray_is_not_installed(monkeypatch):
-    from kissgs.runners import ray_runner
-
-    monkeypatch.setattr(ray_runner, "find_spec", lambda name: None)
+    monkeypatch.setattr(ray_runner_module, "find_spec", lambda name: None)
     with pytest.raises(RunnerError, match=r"pip install 'kissgs\[ray\]'"):
         open_runner("ray")
 
