@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
 import re
 import shutil
 import sys
-import tempfile
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
@@ -132,8 +133,7 @@ class ClusterCompression:
         if not scene.is_dir():  # here, because a node would say of a missing file that it does not see it
             with open_scene_file(Path(name)):
                 pass
-        work = self._work[target] = Path(tempfile.mkdtemp(dir=target.parent, prefix=".kissgs.", suffix=".part"))
-        work.chmod(0o777)  # nodes may run as other users
+        work = self._work[target] = _new_work(target)
         size = scene.stat().st_size if scene.is_file() else 0
         available = max(node.total.memory for node in runner.stats().nodes)
         console = output()
@@ -179,3 +179,13 @@ class ClusterCompression:
         attempt = re.escape(str(self._work[target].absolute())) + r"/[^/]*/"
         message = re.sub(attempt, lambda found: f"{target.parent}/", outcome.message)
         return error_of(replace(outcome, message=message))
+
+
+def _new_work(target: Path) -> Path:
+    """Make the work folder of an output; a former command that was killed may have left one, with the same name."""
+    digest = hashlib.sha256(os.fsencode(target.name)).hexdigest()
+    work = target.parent / f".kissgs.{digest[:16]}.part"
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir()
+    work.chmod(0o777)  # nodes may run as other users
+    return work

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from concurrent.futures import Future
 from dataclasses import asdict, dataclass, field
@@ -10,15 +11,12 @@ from typing import Any, Literal, Protocol, Self
 from kissgs.core.errors import KissgsError, RunnerError
 from kissgs.core.progress import Progress, silent
 
-MEMORY_LIMIT, TIME_LIMIT, INTERNAL, CRASHED, LOST, UNREACHABLE = (
-    "memory-limit",
-    "time-limit",
-    "internal",
-    "crashed",
-    "node-lost",
-    "cluster-unreachable",
-)
-"""Codes of outcomes beside those of :class:`kissgs.KissgsError`."""
+log = logging.getLogger("kissgs.runners")
+
+MEMORY_LIMIT, TIME_LIMIT, INTERNAL, CRASHED = "memory-limit", "time-limit", "internal", "crashed"
+LOST, UNREACHABLE, NOT_STARTED = "node-lost", "cluster-unreachable", "not-started"
+"""Codes of outcomes beside those of :class:`kissgs.KissgsError`. The last two are of "lost" items that have not
+caused it: the cluster was lost, or a machine had no resources for one more process."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,8 +81,8 @@ class Outcome:
 
     Attributes:
         kind: "done" after success; "error" after an expected error, which another attempt would meet again; "crashed"
-            if its process was ended by a signal; "lost" if its node or the whole cluster was lost; "cancelled" after
-            :meth:`Runner.cancel`.
+            if its process was ended by a signal; "lost" if its node or the whole cluster was lost, or no process could
+            be started; "cancelled" after :meth:`Runner.cancel`.
         result: what the function returned, for "done".
         code: stable code of the error: that of a :class:`kissgs.KissgsError`, or one of this module.
         message: one sentence for the user.
@@ -184,6 +182,14 @@ class Runner(Protocol):
 
     def close(self) -> None:
         """Cancel all items, wait for their ends, and release everything; the runner cannot be used afterwards."""
+
+
+def report(progress: Progress, stage: str, fraction: float, note: str) -> None:
+    """Pass an event to a receiver; an exception of it is logged, and the work goes on."""
+    try:
+        progress(stage, fraction, note)
+    except Exception:
+        log.exception("a receiver of progress events failed")
 
 
 def refusal_of(resources: Resources, nodes: Iterable[NodeResources]) -> str | None:

@@ -10,13 +10,16 @@ from dataclasses import dataclass
 
 from kissgs.core.progress import Progress, silent
 from kissgs.runners.contract import (
+    INTERNAL,
     NodeResources,
     Outcome,
     Resources,
     RunHandle,
     RunnerStats,
     WorkItem,
+    log,
     refusal_of,
+    report,
 )
 from kissgs.runners.process import ItemProcess
 
@@ -121,16 +124,15 @@ class LocalRunner:
                 if isinstance(event, Outcome):
                     outcome = event
                 else:
-                    submitted.progress(*event)
-        except BaseException as error:
-            submitted.outcome.set_exception(error)
-            raise
+                    report(submitted.progress, *event)
+        except Exception as error:  # noqa: BLE001  a bug, of which whoever waits must hear
+            log.exception("an item could not be followed", exc_info=error)
+            outcome = Outcome("error", code=INTERNAL, message="the work could not be followed; please report it")
         finally:
             with self._changed:
                 del self._items[item_id]
                 self._start_those_that_fit()
-            if not submitted.outcome.done():
-                submitted.outcome.set_result(outcome)
+            submitted.outcome.set_result(outcome)
             with self._changed:
                 self._changed.notify_all()
 

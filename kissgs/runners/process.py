@@ -21,7 +21,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, NamedTuple
 
-from kissgs.runners.contract import CRASHED, INTERNAL, MEMORY_LIMIT, TIME_LIMIT, Outcome, WorkItem
+from kissgs.runners.contract import CRASHED, INTERNAL, MEMORY_LIMIT, NOT_STARTED, TIME_LIMIT, Outcome, WorkItem
 
 OUT_OF_MEMORY = re.compile(
     "MemoryError|bad_alloc|out of memory|memory allocation|cannot allocate memory", re.IGNORECASE
@@ -77,13 +77,12 @@ class ItemProcess:
         if self._killed:
             yield Outcome("cancelled")
             return
-        with tempfile.TemporaryFile() as errors:
+        with contextlib.ExitStack() as stack:
             try:
+                errors = stack.enter_context(tempfile.TemporaryFile())
                 process = self._start(errors)
             except OSError as error:
-                reason = (error.strerror or str(error)).lower()
-                message = f"the machine {socket.gethostname()} cannot use the folder of the work: {reason}"
-                yield Outcome("error", code="output", message=message, log=str(self._item.folder))
+                yield self._not_started(error)
                 return
             timer = threading.Timer(self._item.seconds or threading.TIMEOUT_MAX, self._time_out)
             timer.daemon = True
@@ -102,6 +101,14 @@ class ItemProcess:
                 timer.cancel()
                 status = self._finish(process, wait=final is not None)
             yield self._explain(final, status, errors)
+
+    def _not_started(self, error: OSError) -> Outcome:
+        reason, machine = (error.strerror or str(error)).lower(), socket.gethostname()
+        if isinstance(error, (FileNotFoundError, NotADirectoryError, PermissionError)):
+            message = f"the machine {machine} cannot use the folder of the work: {reason}"
+            return Outcome("error", code="output", message=message, log=str(self._item.folder))
+        message = f"the machine {machine} could not start a process: {reason}"
+        return Outcome("lost", code=NOT_STARTED, message=message)
 
     def _start(self, errors: IO[bytes]) -> subprocess.Popen[bytes]:
         process = subprocess.Popen(
@@ -134,7 +141,8 @@ class ItemProcess:
         if not wait:
             with self._lock:
                 self._kill()
-        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+        if hasattr(os, "waitid"):  # not on macOS
+            os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
         with self._lock:  # from here on, its id may be another process's
             self._ended.set()
             status = process.wait()

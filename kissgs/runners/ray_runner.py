@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import logging
 import os
 import secrets
 import subprocess
@@ -32,11 +31,11 @@ from kissgs.runners.contract import (
     RunHandle,
     RunnerStats,
     WorkItem,
+    log,
     refusal_of,
+    report,
 )
 from kissgs.runners.process import child_environment
-
-log = logging.getLogger("kissgs.runners")
 
 CONNECT_SECONDS = 60.0
 """Maximum seconds for the connection to a cluster, or the start of one on this machine."""
@@ -211,7 +210,7 @@ class RayRunner:
         item_id = event["id"]
         submitted = self._items[item_id]
         if "progress" in event:
-            submitted.progress(*event["progress"])
+            report(submitted.progress, *event["progress"])
         elif "started" in event:
             submitted.started = event["started"]
         else:

@@ -10,7 +10,17 @@ from typing import Any, Literal
 
 import kissgs
 from kissgs import runners
-from kissgs.runners import INTERNAL, MEMORY_LIMIT, TIME_LIMIT, UNREACHABLE, Resources, RunHandle, Runner, WorkItem
+from kissgs.runners import (
+    INTERNAL,
+    MEMORY_LIMIT,
+    NOT_STARTED,
+    TIME_LIMIT,
+    UNREACHABLE,
+    Resources,
+    RunHandle,
+    Runner,
+    WorkItem,
+)
 
 from ..core.settings import ServiceSettings
 
@@ -148,7 +158,7 @@ class JobProcess:
             return Outcome("done", outcome.result)
         if outcome.kind == "cancelled":
             return Outcome("stopped")
-        if outcome.code == UNREACHABLE:
+        if outcome.code in (UNREACHABLE, NOT_STARTED):
             return Outcome("postponed")
         if outcome.kind == "lost":
             log.warning("a job was lost: %s", outcome.message)

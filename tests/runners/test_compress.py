@@ -5,6 +5,7 @@ import json
 import os
 import signal
 import subprocess
+import time
 
 import pytest
 from helpers.command_line import KISSGS, failure, run
@@ -92,6 +93,37 @@ def test_a_scene_whose_node_is_killed_has_the_same_bytes(cluster, scenes, tmp_pa
         node, _ = working(cluster)
         kill_tree(node)
         assert command.wait(300) == 0
+    expected = kissgs.compress(scenes / "c.ply", settings=kissgs.Settings.from_preset("fast")).to_zip()
+    assert (tmp_path / "c.zip").read_bytes() == expected
+    assert [path.name for path in tmp_path.iterdir()] == ["c.zip"]
+
+
+@pytest.mark.quick(0)
+@pytest.mark.parametrize("moment", range(10))
+def test_a_node_is_killed_at_any_moment(cluster, scenes, tmp_path, moment):
+    inputs = [scenes / "b.ply", scenes / "c.ply"]
+    words = [KISSGS, "compress", *inputs, "-p", "fast", "-o", tmp_path / "out", "-q", "--ray", cluster.address]
+    with subprocess.Popen(words) as command:
+        node, _ = working(cluster)
+        time.sleep(0.15 * moment)
+        kill_tree(node)
+        assert command.wait(300) == 0
+    for scene in inputs:
+        expected = kissgs.compress(scene, settings=kissgs.Settings.from_preset("fast")).to_zip()
+        assert (tmp_path / "out" / f"{scene.stem}.zip").read_bytes() == expected
+    assert len(list((tmp_path / "out").iterdir())) == 2
+
+
+@pytest.mark.quick(1)
+@pytest.mark.parametrize("moment", range(10))
+def test_the_command_is_killed_at_any_moment_and_repeated(cluster, scenes, tmp_path, moment):
+    words = [KISSGS, "compress", scenes / "c.ply", "-p", "fast", "-o", tmp_path, "-q", "--ray", cluster.address]
+    with subprocess.Popen(words) as command:
+        _, pid = working(cluster)
+        time.sleep(0.15 * moment)
+        command.kill()
+    wait_until(lambda: not is_alive(pid), seconds=30)
+    assert subprocess.run([*words, "--force"], check=False).returncode == 0
     expected = kissgs.compress(scenes / "c.ply", settings=kissgs.Settings.from_preset("fast")).to_zip()
     assert (tmp_path / "c.zip").read_bytes() == expected
     assert [path.name for path in tmp_path.iterdir()] == ["c.zip"]

@@ -1,7 +1,9 @@
 """Ends of an item's process. Oracle: messages of libraries when memory is exhausted, and ends by signals."""
 
+import errno
 import io
 import signal
+import subprocess
 
 import pytest
 from helpers.running import item
@@ -45,6 +47,16 @@ def test_a_folder_that_this_machine_does_not_see(tmp_path):
     assert (outcome.kind, outcome.code) == ("error", "output")
     assert "cannot use the folder of the work: no such file" in outcome.message
     assert outcome.log == str(tmp_path / "none")
+
+
+def test_a_machine_without_resources_for_a_process(monkeypatch):
+    def refuse(*words, **options):
+        raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(subprocess, "Popen", refuse)
+    (outcome,) = ItemProcess(item("count", numbers=1)).events()
+    assert (outcome.kind, outcome.code) == ("lost", "not-started")
+    assert "could not start a process: resource temporarily unavailable" in outcome.message
 
 
 def test_a_process_killed_before_its_start():
