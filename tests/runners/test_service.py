@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -124,6 +125,17 @@ def test_a_service_that_ends_runs_its_jobs_again(service, number):
     pid = process_of(job)
     service.kill(number)
     wait_until(lambda: not is_alive(pid), seconds=30)
+    service.restart()
+    assert result_of(service, job) == compressed(MEDIUM)
+    assert service.leftovers() == []
+
+
+@pytest.mark.quick(0)
+@pytest.mark.parametrize("moment", range(10))
+def test_a_service_is_killed_at_any_moment(service, moment):
+    job = service.submit(MEDIUM, FAST)
+    time.sleep(0.15 * moment)
+    service.kill(signal.SIGKILL)
     service.restart()
     assert result_of(service, job) == compressed(MEDIUM)
     assert service.leftovers() == []
