@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         KissgsError,
         OutputError,
         RemoteError,
+        RunnerError,
         StopSearch,
         UnsupportedError,
     )
@@ -73,6 +74,7 @@ _HOMES = {
     "ReadOptions": "pipeline.read_options",
     "Remote": "client.remote",
     "RemoteError": "core.errors",
+    "RunnerError": "core.errors",
     "Report": "pipeline.report",
     "SceneInfo": "pipeline.inspect",
     "Settings": "settings",
@@ -122,6 +124,7 @@ __all__ = [
     "Remote",
     "RemoteError",
     "Report",
+    "RunnerError",
     "SceneInfo",
     "Sensitivity",
     "Settings",

@@ -33,6 +33,7 @@ PUBLIC = [
     "Remote",
     "RemoteError",
     "Report",
+    "RunnerError",
     "SceneInfo",
     "Sensitivity",
     "Settings",

@@ -21,7 +21,7 @@ from kissgs.cli.decompress import decompress
 from kissgs.cli.evaluate import evaluate
 from kissgs.cli.files import discard_stdout, write_stdout
 from kissgs.cli.info import info
-from kissgs.cli.options import with_finetune_value
+from kissgs.cli.options import with_default_values
 from kissgs.cli.remote import app as remote
 from kissgs.cli.render import render
 from kissgs.cli.sample import sample
@@ -51,7 +51,7 @@ def run() -> None:
 
 def _run() -> None:
     try:
-        app(with_finetune_value(sys.argv[1:]))
+        app(with_default_values(sys.argv[1:]))
     except KissgsError as error:
         _fail(error)
     except OSError as error:

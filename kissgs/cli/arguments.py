@@ -82,3 +82,13 @@ RenderDeviceOption = Annotated[str, typer.Option(help="Device of the rasteriser:
 RenderThreadsOption = Annotated[
     int, typer.Option(min=0, help="Number of threads; 0 for one per processor. The images do not depend on it.")
 ]
+RayOption = Annotated[
+    str | None,
+    typer.Option(
+        "--ray",
+        metavar="[HOST:PORT]",
+        help="Compress the scenes on the nodes of a Ray cluster: all machines must see scenes, outputs and --views at "
+        "the same paths, on shared storage. Default address: RAY_ADDRESS, a cluster on this machine, or a new one that "
+        "uses its processors. Needs kissgs[ray]; docs/guide/many-machines.md.",
+    ),
+]

@@ -19,6 +19,7 @@ from kissgs.cli.arguments import (
     PresetOption,
     QuietOption,
     RawAxesOption,
+    RayOption,
     ScenesArgument,
     SeedOption,
     SetOption,
@@ -113,6 +114,7 @@ def compress(
     raw_axes: RawAxesOption = False,
     device: Annotated[str, typer.Option(help="Device of --compact and --finetune: cpu or cuda.")] = "cpu",
     threads: ThreadsOption = 0,
+    ray: RayOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
@@ -144,12 +146,33 @@ def compress(
         sys.stderr.write(f"kissgs: --views has no effect: the preset {preset} renders no images; add --evaluate\n")
 
     if output is not None and output.name == LOD_NAME:
-        unused = {"--views": views, "--evaluate": evaluate, "--cache": cache, "--container": container}
+        unused = {"--views": views, "--evaluate": evaluate, "--cache": cache, "--container": container, "--ray": ray}
         if wrong := next((name for name, value in unused.items() if value), None):
             raise UnsupportedError(f"levels of detail ({LOD_NAME}) are made without {wrong}")
         for_each_input(
             scenes, output, ".json", as_json, partial(_streamed, settings, reading, force, threads, quiet or as_json)
         )
+        return
+
+    ending = "" if unpacked else ending_of(kind)
+    if ray is not None:
+        from kissgs.cli.compress_cluster import ClusterCompression
+
+        with ClusterCompression(
+            address=ray,
+            settings=settings,
+            reading=reading,
+            container=kind,
+            cache=cache,
+            evaluate=evaluate,
+            views=views,
+            checkpoint=checkpoint,
+            force=force,
+            threads=threads,
+            device=training_device,
+            quiet=quiet or as_json,
+        ) as cluster:
+            for_each_input(scenes, output, ending, as_json, cluster.result, before=cluster.submit)
         return
 
     def work(scene: str, target: Path) -> dict[str, Any]:
@@ -183,7 +206,7 @@ def compress(
             show(report_table(result.report, str(target)))
         return result.report.as_dict()
 
-    for_each_input(scenes, output, "" if unpacked else ending_of(kind), as_json, work)
+    for_each_input(scenes, output, ending, as_json, work)
 
 
 def _streamed(

@@ -31,6 +31,7 @@ def for_each_input(
     *,
     writes: bool = True,
     unreadable: type[KissgsError] = InvalidSceneError,
+    before: Callable[[list[tuple[str, Path]]], None] | None = None,
 ) -> None:
     """Call ``work`` for every input. If one of several fails, the others are still processed; the exit code is then 2.
 
@@ -42,11 +43,14 @@ def for_each_input(
         work: processes one input, given the path of its output, and returns the report.
         writes: whether the command writes outputs.
         unreadable: error class for an input that cannot be read.
+        before: receives all inputs and outputs before the first call of ``work``.
     """
     inputs = expand(names)
     if writes and as_json and str(output) == "-":
         raise OutputError("--json and -o - both write to standard output; choose one")
     targets = _targets(inputs, output, suffix) if writes else [Path("-")] * len(inputs)
+    if before is not None:
+        before(list(zip(inputs, targets, strict=True)))
     if len(inputs) == 1:
         check_input(inputs[0], unreadable)
         report = work(inputs[0], targets[0])

@@ -62,16 +62,19 @@ def chosen(
 
 FINETUNE = "--finetune"
 
+OPTIONAL_VALUES = {FINETUNE: r"[0-9]+|auto", "--ray": r"auto|[^\s/]+:[0-9]+|ray://\S+"}
+"""Options whose value may be left out, and what a value looks like."""
 
-def with_finetune_value(words: list[str]) -> list[str]:
-    """Insert ``auto`` after each ``--finetune`` without a number: typer has no options with an optional value."""
+
+def with_default_values(words: list[str]) -> list[str]:
+    """Insert ``auto`` after each ``--finetune`` and ``--ray`` without a value: typer has no optional values."""
     result = list[str]()
     for n, word in enumerate(words):
         if word == "--":
             return result + words[n:]
         result.append(word)
         following = words[n + 1] if n + 1 < len(words) else ""
-        if word == FINETUNE and not (following.isdecimal() or following == "auto"):
+        if word in OPTIONAL_VALUES and not re.fullmatch(OPTIONAL_VALUES[word], following):
             result.append("auto")
     return result
 

@@ -6,6 +6,7 @@ KissgsError
 ├─ InvalidViewsError        cameras or photographs that cannot be used: COLMAP, transforms.json, images
 ├─ UnsupportedError         valid input beyond a limit or a feature that kissgs does not have
 ├─ RemoteError              a kissgs service cannot be reached, or refuses the request
+├─ RunnerError              a cluster cannot be reached, or work on it, or in another process, was lost
 ├─ OutputError              the result could not be written: it exists already, no space, no permission
 └─ Cancelled                the caller stopped the work through its progress callback
    └─ StopSearch            the caller ended the search for a goal and accepts the best result so far
@@ -57,6 +58,12 @@ class RemoteError(KissgsError):
     code = "remote"
     retry_after: float | None = None
     unreachable: bool = False
+
+
+class RunnerError(KissgsError):
+    """A cluster cannot be reached, or work on it or in another process was lost or crashed."""
+
+    code = "runner"
 
 
 class OutputError(KissgsError):

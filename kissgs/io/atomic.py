@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -38,6 +39,27 @@ def atomic_file(path: Path, *, overwrite: bool = False) -> Iterator[BinaryIO]:
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
+
+
+def move_into_place(made: Path, path: Path) -> None:
+    """Rename a complete file or folder to ``path`` on the same file system, replacing what is there.
+
+    Raises:
+        OutputError: the file system refuses; what was there stays.
+    """
+    old: Path | None = None
+    try:
+        if path.is_dir():
+            old = path.rename(made.with_suffix(".old"))
+        made.replace(path)
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {reason_of(error)}") from error
+    finally:
+        # After any end of the block, also an interrupt: the old folder is removed only if the new one is there.
+        if old is not None and not path.exists():
+            old.rename(path)
+        elif old is not None:
+            shutil.rmtree(old)
 
 
 def refuse_existing(path: Path, *, overwrite: bool) -> None:

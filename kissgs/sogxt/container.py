@@ -11,7 +11,7 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from kissgs.core.errors import OutputError
-from kissgs.io.atomic import atomic_file, check_writable, path_state, reason_of, refuse_existing, umask
+from kissgs.io.atomic import atomic_file, check_writable, move_into_place, path_state, reason_of, refuse_existing, umask
 from kissgs.io.packed_files import open_source
 from kissgs.sogxt.names import FILES
 
@@ -97,7 +97,6 @@ def _names_in(folder: Path) -> set[str]:
 
 def _write_directory(files: Mapping[str, bytes], path: Path) -> None:
     temporary: Path | None = None
-    old: Path | None = None
     try:
         temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=".kissgs.", suffix=".part"))
         for name, data in files.items():
@@ -106,15 +105,9 @@ def _write_directory(files: Mapping[str, bytes], path: Path) -> None:
                 file.flush()
                 os.fsync(file.fileno())
         temporary.chmod(0o777 & ~umask())
-        if path.exists():
-            old = path.rename(temporary.with_suffix(".old"))
-        temporary.rename(path)
+        move_into_place(temporary, path)
     except OSError as error:
         raise OutputError(f"cannot write {path}: {reason_of(error)}") from error
     finally:
-        # After any end of the block, also an interrupt: the old container is removed only if the new one is there.
-        if old is not None and not path.exists():
-            old.rename(path)
-        for leftover in (temporary, old):
-            if leftover is not None and leftover.exists():
-                shutil.rmtree(leftover)
+        if temporary is not None and temporary.exists():
+            shutil.rmtree(temporary)

@@ -7,7 +7,7 @@ import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ByteSize, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
@@ -85,8 +85,23 @@ class ServiceSettings(BaseSettings):
     )
     min_free_bytes: ByteSize = Field(ByteSize(1 << 30), ge=0, description="Bytes that must stay free on the disk.")
 
-    workers: int = Field(1, gt=0, le=64, description="Number of jobs that run simultaneously.")
-    job_threads: int = Field(0, ge=0, description="Threads of one job; 0 uses one per processor.")
+    runner: Literal["local", "ray"] = Field(
+        "local", description="Where jobs run: local, on this machine, or ray, on the nodes of a Ray cluster."
+    )
+    ray_address: str = Field(
+        "auto",
+        description="Address of the Ray cluster's head, HOST:PORT; auto takes that of this machine, and starts one if "
+        "there is none.",
+    )
+    workers: int = Field(
+        1, gt=0, le=64, description="Number of jobs that run simultaneously, on all machines together."
+    )
+    job_threads: int = Field(
+        0, ge=0, description="Threads of one job; 0 uses one per processor, on a cluster those of its smallest node."
+    )
+    job_gpus: float = Field(
+        0, ge=0, le=64, description="GPUs of a job with training, which then runs on CUDA; 0 trains on processors."
+    )
     job_seconds: Seconds = Field(3600, description="Wall-clock seconds after which a job is stopped.")
     job_memory: ByteSize = Field(
         ByteSize(8 << 30), ge=256 << 20, description="Maximum bytes of memory of one job (Linux only)."

@@ -8,6 +8,7 @@ import logging
 from collections.abc import AsyncIterator
 from http import HTTPStatus
 
+from anyio.to_thread import run_sync
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
@@ -31,6 +32,7 @@ from ..jobs.event_stream import EventStream
 from ..jobs.expiry import ExpiryTask
 from ..jobs.recovery import recover
 from ..jobs.replica_watch import ReplicaWatch
+from ..jobs.runner import JobRunner
 from ..jobs.worker import Worker
 from ..storage.database_health import error_text
 from ..storage.folder_binding import open_store
@@ -95,9 +97,12 @@ def _build_and_recover(settings: ServiceSettings) -> ServiceContainer:
             else:
                 recover(context)
         except BaseException:
+            context.worker.runner.close()
             context.store.close()
             context.storage.close()
             raise
+    except kissgs.RunnerError as error:
+        raise SettingsError(f"KISSGS_RUNNER: jobs cannot run on a Ray cluster: {error}") from error
     except OSError as error:
         raise SettingsError(f"KISSGS_DATA_DIR: cannot use {settings.data_dir}: {str(error).lower()}") from error
     except SQLAlchemyError as error:
@@ -116,13 +121,18 @@ def build(settings: ServiceSettings) -> ServiceContainer:
         raise
     storage.remove_unfinished(store.ids())
     clock.start_after(store.latest_time())
+    try:
+        runner = JobRunner.open(settings)
+    except BaseException:
+        store.close()
+        storage.close()
+        raise
     notifier, metrics = JobNotifier(), Metrics()
     metrics.queue_limit.set(settings.max_queue)
-    worker = Worker(
-        settings, store, storage, notifier, metrics, JobCompletion(settings, store, storage, metrics, clock)
-    )
+    completion = JobCompletion(settings, store, storage, metrics, clock)
+    worker = Worker(settings, store, storage, notifier, metrics, completion, runner)
     admission = Admission(settings, store, storage)
-    decoder = Decoder(settings, store, storage, admission)
+    decoder = Decoder(settings, store, storage, admission, runner)
     event_stream = EventStream(store, notifier, settings.workers)
     return ServiceContainer(
         settings, store, storage, notifier, metrics, clock, worker, admission, decoder, event_stream
@@ -145,6 +155,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+        await run_sync(context.worker.runner.close)
         context.store.close()
         context.storage.close()
 

@@ -18,7 +18,7 @@ from ..storage.job_records import Store
 from ..storage.job_storage import DECODED, JobStorage, StoredObject
 from .admission import Admission
 from .completion import result_folder
-from .runner import JobProcess
+from .runner import JobProcess, JobRunner
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,7 @@ class Decoder:
     store: Store
     storage: JobStorage
     admission: Admission
+    runner: JobRunner
     _lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     _processes: dict[str, JobProcess] = field(default_factory=dict)
 
@@ -100,10 +101,8 @@ class Decoder:
             "kind": "decode",
             "source": str(source),
             "work": str(work),
-            "threads": self.settings.job_threads,
-            "memory": int(self.settings.job_memory),
         }
-        process = self._processes[job.id] = JobProcess(seconds=self.settings.job_seconds)
+        process = self._processes[job.id] = self.runner.process()
         try:
             outcome = await process.run(task, ignore)
         finally:

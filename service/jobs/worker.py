@@ -21,7 +21,7 @@ from ..storage.job_records import Store
 from ..storage.job_storage import RESULT, JobStorage
 from ..storage.object_store import ObjectStoreError
 from .completion import LOST, JobCompletion
-from .runner import JobProcess, Outcome
+from .runner import JobProcess, JobRunner, Outcome
 
 log = logging.getLogger("kissgs.service")
 
@@ -48,6 +48,7 @@ class Worker:
     notifier: JobNotifier
     metrics: Metrics
     completion: JobCompletion
+    runner: JobRunner
     draining: bool = False
     _processes: dict[str, JobProcess] = field(default_factory=dict)
     _loops: list[asyncio.Task[None]] = field(default_factory=list)
@@ -70,7 +71,7 @@ class Worker:
                 return f"worker {number} has ended"
             if now - self._last_poll.get(number, now) > 10 * IDLE_SECONDS and not self._processes:
                 return f"worker {number} has not read the queue for {now - self._last_poll[number]:.0f} s"
-        return None
+        return self.runner.health_problem()
 
     async def drain(self) -> None:
         """Start no more jobs, wait up to ``drain_seconds`` for running ones, and requeue those that need longer."""
@@ -143,7 +144,7 @@ class Worker:
                 await asyncio.sleep(IDLE_SECONDS)
                 continue
             if self._logged:
-                log.info("the job database and the data folder can be used again")
+                log.info("jobs can be started again")
                 self._logged.clear()
             if job is None:
                 await wait(queued, IDLE_SECONDS)
@@ -156,10 +157,12 @@ class Worker:
 
     def _claim(self) -> Job | None:
         self.storage.check()  # else all queued jobs would fail, because their uploads cannot be read
+        if problem := self.runner.health_problem():
+            raise ConnectionError(problem)
         return self.store.claim()
 
     async def _run(self, job: Job) -> None:
-        process = self._processes[job.id] = JobProcess(seconds=self.settings.job_seconds)
+        process = self._processes[job.id] = self.runner.process()
         log.info("job %s starts: %d Gaussians, %s", job.id, job.gaussians, job.preset)
         self.metrics.busy.inc()
         if job.starts == 1 and job.started_at is not None:
@@ -200,8 +203,6 @@ class Worker:
             "container": CONTAINER_FILES[options.format].name,
             "evaluate": options.evaluate,
             "checkpoint": str(self.storage.checkpoint(job.id)) if options.resumable else None,
-            "threads": self.settings.job_threads,
-            "memory": int(self.settings.job_memory),
         }
 
         async def progress(stage: str, fraction: float, note: str) -> None:
@@ -300,7 +301,11 @@ class Worker:
                 log.warning("job %s is started again", job.id)
                 self.metrics.restarts.inc()
                 self.store.move(job.number, State.QUEUED, crashes=1)
-            case "crashed":
+            case "lost" if self.draining or job.starts < self.settings.job_starts:
+                log.warning("job %s is started again elsewhere", job.id)
+                self.metrics.restarts.inc()
+                self.store.move(job.number, State.QUEUED)
+            case "crashed" | "lost":
                 self.completion.fail(job, "crashed", outcome.data["detail"])
         current = self.store.get(job.id)
         if current is None or current.state not in ACTIVE:  # cancelled at the same moment, so the claim is still held

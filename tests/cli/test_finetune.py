@@ -13,7 +13,7 @@ from helpers.command_line import KISSGS, failure, run
 from helpers.held_training import HeldTraining
 
 import kissgs
-from kissgs.cli.options import with_finetune_value
+from kissgs.cli.options import with_default_values
 
 SHORT = {"views": 24, "view_size": 48}
 OPTIONS = [word for name, value in SHORT.items() for word in ("--set", f"finetune.{name}={value}")]
@@ -63,10 +63,10 @@ def test_photographs_are_training_targets(folder: Path, tmp_path: Path) -> None:
 
 
 def test_the_default_number_of_steps_is_that_of_the_preset() -> None:
-    assert with_finetune_value(["compress", "a.ply", "--finetune"]) == ["compress", "a.ply", "--finetune", "auto"]
-    assert with_finetune_value(["--finetune", "a.ply", "-q"]) == ["--finetune", "auto", "a.ply", "-q"]
-    assert with_finetune_value(["--finetune", "70", "a.ply"]) == ["--finetune", "70", "a.ply"]
-    assert with_finetune_value(["--finetune", "auto"]) == ["--finetune", "auto"]
+    assert with_default_values(["compress", "a.ply", "--finetune"]) == ["compress", "a.ply", "--finetune", "auto"]
+    assert with_default_values(["--finetune", "a.ply", "-q"]) == ["--finetune", "auto", "a.ply", "-q"]
+    assert with_default_values(["--finetune", "70", "a.ply"]) == ["--finetune", "70", "a.ply"]
+    assert with_default_values(["--finetune", "auto"]) == ["--finetune", "auto"]
     for preset, steps in (("fast", 200), ("balanced", 1000), ("small", 2000), ("paper", 4000)):
         assert kissgs.Settings.from_preset(preset, finetune={"enabled": True}).finetune.steps == steps
 

@@ -15,7 +15,6 @@ import pytest
 from helpers.service import FAST, SLOW, SMALL, Service, problem, scene_bytes
 
 import kissgs
-from service.jobs.runner import JobProcess
 
 BIG = scene_bytes(20_000, 3)
 MEDIUM = scene_bytes(6_000, 2)
@@ -227,40 +226,6 @@ def test_a_job_beyond_the_memory_limit(start):
     assert not job["problem"]["retryable"]
     assert "fewer Gaussians" in job["problem"]["detail"]
     assert service.http.get("/readyz").status_code == 200
-
-
-@pytest.mark.parametrize(
-    "output",
-    [
-        "LLVM ERROR: out of memory\nBuffer allocation failed",
-        "OpenBLAS error: Memory allocation still failed after 10 retries, giving up.",
-        "terminate called after throwing an instance of 'std::bad_alloc'",
-        "numpy._core._exceptions._ArrayMemoryError: Unable to allocate 17 MiB",
-    ],
-)
-def test_messages_of_libraries_at_the_memory_limit(tmp_path, output):
-    stderr_file = tmp_path / "stderr.txt"
-    stderr_file.write_text(output)
-    assert JobProcess(seconds=1)._explain(-signal.SIGABRT, stderr_file, 1 << 30).data["code"] == "memory-limit"
-    stderr_file.write_text("Segmentation fault")
-    assert JobProcess(seconds=1)._explain(-signal.SIGSEGV, stderr_file, 1 << 30).kind == "crashed"
-
-
-@pytest.mark.parametrize(
-    ("status", "used", "expected"),
-    [
-        (-signal.SIGSEGV, 0.9, "memory-limit"),
-        (-signal.SIGSEGV, 0.7, "crashed"),
-        (-signal.SIGKILL, 0.9, "crashed"),  # killed from outside: by the system or by a person
-        (1, 0.9, "memory-limit"),
-        (1, 0.7, "internal"),
-    ],
-)
-def test_a_crash_without_a_message_near_the_memory_limit(tmp_path, status, used, expected):
-    process = JobProcess(seconds=1)
-    process._peak_data = int(used * (1 << 30))
-    outcome = process._explain(status, tmp_path / "stderr.txt", 1 << 30)
-    assert outcome.data.get("code", outcome.kind) == expected
 
 
 @pytest.mark.quick(0)

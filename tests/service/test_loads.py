@@ -179,13 +179,14 @@ def test_an_error_in_the_job_process_is_internal(tmp_path):
     """It once looked like a crash, because the interpreter could not exit while a thread read standard input."""
     import asyncio
 
-    from service.jobs.runner import JobProcess
+    from service.core.settings import ServiceSettings
+    from service.jobs.runner import JobRunner
 
     async def ignore(stage, fraction, note):
         pass
 
-    task = {"kind": "no such task", "work": str(tmp_path), "source": "", "memory": 1 << 30}
-    outcome = asyncio.run(JobProcess(seconds=30).run(task, ignore))
+    task = {"kind": "no such task", "work": str(tmp_path), "source": ""}
+    outcome = asyncio.run(JobRunner.open(ServiceSettings()).process().run(task, ignore))
     assert (outcome.kind, outcome.data["code"]) == ("error", "internal")
 
 

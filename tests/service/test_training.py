@@ -159,8 +159,9 @@ def test_a_full_disk_disables_checkpoints(tmp_path, monkeypatch, saved):
         "evaluate": False,
         "checkpoint": str(tmp_path / "checkpoint.npz"),
         "threads": 0,
+        "device": "cpu",
     }
-    job_process._compress(task, lambda event: None)
+    job_process.compress(task, lambda *event: None)
     result = (work / "result" / "scene.zip").read_bytes()
     assert result == kissgs.compress(SMALL, settings=kissgs.Settings.model_validate(BRIEF)).to_zip()
     report = (work / "result" / "report.json").read_text()

@@ -1,0 +1,191 @@
+"""``ClusterCompression``: ``kissgs compress --ray``, scenes as work items on the nodes of a Ray cluster."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import shutil
+import sys
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Self
+
+from kissgs.cli.compact import CHECKPOINT
+from kissgs.cli.console import output, progress_bar
+from kissgs.cli.files import show, sibling
+from kissgs.core.errors import KissgsError, OutputError, UnsupportedError
+from kissgs.core.progress import Progress, silent
+from kissgs.io.atomic import move_into_place
+from kissgs.io.scene_file import open_scene_file
+from kissgs.runners import INTERNAL, Outcome, Resources, RunHandle, Runner, WorkItem, error_of, open_runner
+from kissgs.sogxt.container import check_destination
+
+if TYPE_CHECKING:
+    from kissgs.io.container_names import ContainerName
+    from kissgs.pipeline.read_options import ReadOptions
+    from kissgs.settings import Settings
+
+PROCESS_BYTES = 500_000_000
+"""Memory that a scene of any size needs, bytes: mostly the libraries."""
+
+MEMORY_RATIO, TRAINING_RATIO, PACKED_RATIO = 4, 12, 10
+"""Memory that a scene needs for each byte of its ``.ply``: without and with training; and by how much the files of
+compressed formats are smaller than that. Measured: docs/benchmarks.md, "Seconds and memory of every stage"."""
+
+
+@dataclass
+class ClusterCompression:
+    """Compression of several scenes, for use as a context manager; its end cancels what has not ended.
+
+    All scenes are submitted at once, and their results are awaited in order. An item writes below a work folder beside
+    its output, and the result is moved from there when its outcome has arrived: a node may be lost at any moment, and
+    nothing is written twice or in part.
+
+    Attributes: those options of the command that concern one scene, and the address of the cluster.
+    """
+
+    address: str
+    settings: Settings
+    reading: ReadOptions
+    container: ContainerName
+    cache: bool
+    evaluate: bool
+    views: Path | None
+    checkpoint: bool
+    force: bool
+    threads: int
+    device: Literal["cpu", "cuda"]
+    quiet: bool
+    _runner: Runner | None = None
+    _handles: dict[Path, RunHandle | KissgsError] = field(default_factory=dict)
+    _work: dict[Path, Path] = field(default_factory=dict)
+    _bar: Progress = silent
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        try:
+            if self._runner is not None:
+                self._runner.close()
+        finally:
+            for work in self._work.values():
+                shutil.rmtree(work, ignore_errors=True)
+
+    def submit(self, inputs: list[tuple[str, Path]]) -> None:
+        """Connect to the cluster and submit all scenes, given each with the path of its output.
+
+        Raises:
+            UnsupportedError: an input or output has no path, or no node has the resources.
+            RunnerError: the cluster cannot be reached.
+        """
+        if any("-" in (name, str(target)) for name, target in inputs):
+            raise UnsupportedError("--ray needs files that all machines see, not standard input or output")
+        with progress_bar(self.quiet) as bar:
+            bar("cluster", 0.0)
+            self._runner = open_runner("ray", self.address)
+        requested = self._request(self._runner, len(inputs))
+        for name, target in inputs:
+            try:
+                self._handles[target] = self._submit(self._runner, name, target, requested)
+            except (KissgsError, OSError) as error:  # the command itself reports inputs that cannot be read
+                self._handles[target] = error if isinstance(error, KissgsError) else OutputError(str(error))
+
+    def result(self, name: str, target: Path) -> dict[str, Any]:
+        """Wait for the result of one scene, move it to its place, show its table and return its report.
+
+        Raises:
+            KissgsError: the scene could not be compressed.
+        """
+        handle = self._handles[target]
+        if isinstance(handle, KissgsError):
+            raise handle
+        with progress_bar(self.quiet) as self._bar:
+            outcome = handle.outcome.result()
+        self._bar = silent
+        if outcome.kind != "done":
+            raise self._error(outcome, target)
+        check_destination(target, overwrite=self.force)
+        move_into_place(Path(outcome.result["written"]), target)
+        if not self.quiet:
+            from rich.text import Text
+
+            show(Text.from_ansi(outcome.result["table"]))
+        report: dict[str, Any] = outcome.result["report"]
+        return report
+
+    def _request(self, runner: Runner, count: int) -> Resources:
+        """Return the processors and GPUs that each of ``count`` scenes requests.
+
+        Without ``--threads``, all processors of the cluster are shared among the scenes.
+        """
+        stats = runner.stats()
+        share = min(stats.smallest_cpus, stats.cpus // count)
+        requested = Resources(self.threads or max(1, int(share)), gpus=1 if self.device == "cuda" else 0)
+        if refusal := runner.refusal(requested):
+            raise UnsupportedError(f"{refusal}; choose another number with --threads, or --device cpu")
+        return requested
+
+    def _submit(self, runner: Runner, name: str, target: Path, requested: Resources) -> RunHandle:
+        check_destination(target, overwrite=self.force)
+        scene = Path(name).absolute()
+        if not scene.is_dir():  # here, because a node would say of a missing file that it does not see it
+            with open_scene_file(Path(name)):
+                pass
+        work = self._work[target] = _new_work(target)
+        size = scene.stat().st_size if scene.is_file() else 0
+        available = max(node.total.memory for node in runner.stats().nodes)
+        console = output()
+        arguments = {
+            "scene": str(scene),
+            "bytes": size,
+            "work": str(work.absolute()),
+            "target": str(target),
+            "settings": self.settings.model_dump(mode="json"),
+            "reading": asdict(self.reading),
+            "container": self.container,
+            "cache": str(sibling(name, ".sensitivity.npz")) if self.cache else None,
+            "evaluate": self.evaluate,
+            "views": None if self.views is None else str(self.views.absolute()),
+            "checkpoint": str(sibling(name, CHECKPOINT)) if self.checkpoint else None,
+            "threads": int(requested.cpus),
+            "device": self.device,
+            "width": console.width,
+            "color": console.is_terminal,
+        }
+        memory = min(self._memory(scene, size), available)
+        resources = Resources(requested.cpus, memory, requested.gpus)
+
+        def progress(stage: str, fraction: float, note: str = "") -> None:
+            ended = sum(isinstance(each, KissgsError) or each.outcome.done() for each in self._handles.values())
+            details = "; ".join(
+                filter(None, [f"{ended} of {len(self._handles)} scenes; {Path(name).name}: {stage}", note])
+            )
+            self._bar("scenes", ended / max(len(self._handles), 1), details)
+
+        return runner.submit(WorkItem("kissgs.cli.scene_item:compress_scene", arguments, resources), progress)
+
+    def _memory(self, scene: Path, size: int) -> int:
+        """Return an estimate of the memory that a scene needs, bytes."""
+        trains = self.settings.compact.enabled or self.settings.finetune.enabled
+        plain = size if scene.suffix.lower() == ".ply" else PACKED_RATIO * size
+        return PROCESS_BYTES + (TRAINING_RATIO if trains else MEMORY_RATIO) * plain
+
+    def _error(self, outcome: Outcome, target: Path) -> KissgsError:
+        """Return the exception of a scene that was not compressed, about its output and not about the work folder."""
+        if outcome.code == INTERNAL:  # a bug, which should look like one
+            sys.stderr.write(outcome.log)
+        attempt = re.escape(str(self._work[target].absolute())) + r"/[^/]*/"
+        message = re.sub(attempt, lambda found: f"{target.parent}/", outcome.message)
+        return error_of(replace(outcome, message=message))
+
+
+def _new_work(target: Path) -> Path:
+    """Make the work folder of an output; a former command that was killed may have left one, with the same name."""
+    digest = hashlib.sha256(os.fsencode(target.name)).hexdigest()
+    work = target.parent / f".kissgs.{digest[:16]}.part"
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir()
+    work.chmod(0o777)  # nodes may run as other users
+    return work

@@ -1,0 +1,41 @@
+"""Runners of work items: separate processes on this machine, or a Ray cluster.
+
+In: a :class:`WorkItem`, a function by name with JSON arguments that name files, and the resources that it requests.
+Out: progress events and one :class:`Outcome`. Scenes and results never pass through a runner, only their paths.
+"""
+
+from kissgs.runners.contract import (
+    INTERNAL,
+    LOST,
+    MEMORY_LIMIT,
+    NOT_STARTED,
+    TIME_LIMIT,
+    UNREACHABLE,
+    NodeResources,
+    Outcome,
+    Resources,
+    RunHandle,
+    Runner,
+    RunnerStats,
+    WorkItem,
+    error_of,
+)
+from kissgs.runners.factory import open_runner
+
+__all__ = [
+    "INTERNAL",
+    "LOST",
+    "MEMORY_LIMIT",
+    "NOT_STARTED",
+    "TIME_LIMIT",
+    "UNREACHABLE",
+    "NodeResources",
+    "Outcome",
+    "Resources",
+    "RunHandle",
+    "Runner",
+    "RunnerStats",
+    "WorkItem",
+    "error_of",
+    "open_runner",
+]

@@ -1,0 +1,127 @@
+"""Process of one work item, ``python -m kissgs.runners.item_process``.
+
+It reads its task, a JSON object, from the first line of standard input, and writes one line of JSON to standard output
+per event. When standard input closes, because whoever started it has ended, or when that process dies, it ends at once:
+no work goes on that nobody waits for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import importlib
+import json
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from kissgs.core.errors import KissgsError
+
+EVENT_SECONDS = 0.25
+"""Minimum seconds between progress events of a stage."""
+
+PR_SET_PDEATHSIG = 1
+"""Option of Linux' ``prctl``: the signal that a process gets when its parent dies."""
+
+Send = Callable[[dict[str, Any]], None]
+
+
+def main() -> None:
+    """Read the task, run it, and send its result or its error."""
+    task = json.loads(_first_line())
+    for number in (signal.SIGINT, signal.SIGTERM):  # sent to the parent, which ends this process if needed
+        signal.signal(number, signal.SIG_IGN)
+    _die_with(task["parent"])
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
+    send = _sender()
+    _limit_resources(task["memory_limit"])
+    try:
+        module, _, name = task["function"].partition(":")
+        function = getattr(importlib.import_module(module), name)
+        send({"done": function(task["arguments"], Throttle(send))})
+    except KissgsError as error:
+        send({"error": {"code": error.code, "message": str(error)}})
+    except MemoryError:
+        send({"out_of_memory": True})
+    except Exception:  # noqa: BLE001  a bug, reported by standard error and the exit status
+        traceback.print_exc()
+        os._exit(1)
+    os._exit(0)  # without waiting for threads of libraries
+
+
+class Throttle:
+    """Progress callback that sends the start and end of each stage, and between them one event per interval."""
+
+    def __init__(self, send: Send) -> None:
+        self._send = send
+        self._last, self._next = ("", -1.0, ""), 0.0
+
+    def __call__(self, stage: str, fraction: float, note: str = "") -> None:
+        """See :class:`kissgs.Progress`."""
+        now = time.monotonic()
+        event = stage, round(min(1.0, max(0.0, fraction)), 4), note
+        if event == self._last or (stage == self._last[0] and now < self._next):
+            return
+        self._last, self._next = event, now + EVENT_SECONDS
+        self._send({"stage": stage, "fraction": event[1], "note": note})
+
+
+def _sender() -> Send:
+    """Return a function that sends events on standard output, and redirect output of libraries to standard error."""
+    out = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    lock = threading.Lock()
+
+    def send(event: dict[str, Any]) -> None:
+        with lock:
+            out.write(json.dumps(event) + "\n")
+            out.flush()
+
+    return send
+
+
+def _limit_resources(memory: int | None) -> None:
+    """Lower the priority, limit memory to ``memory`` bytes, and become the first victim of the out-of-memory killer."""
+    os.nice(10)
+    if sys.platform == "linux":
+        import resource
+
+        if memory is not None:
+            resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        with contextlib.suppress(OSError):
+            Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
+
+
+def _first_line() -> bytes:
+    line = b""
+    while not line.endswith(b"\n"):
+        block = os.read(0, 65536)  # nothing follows the line, so no data is lost
+        if not block:
+            os._exit(1)
+        line += block
+    return line
+
+
+def _die_with(parent: int) -> None:
+    """Let Linux kill this process when its parent dies: a long call into a library would delay the exit."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
+        if os.getppid() != parent:  # it has died before
+            os._exit(1)
+
+
+def _exit_with_parent() -> None:
+    while os.read(0, 4096):  # sys.stdin has a lock that the interpreter needs at exit
+        pass
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main()

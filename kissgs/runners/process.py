@@ -1,0 +1,204 @@
+"""``ItemProcess``: start of an item's process, its progress events, its limits and its outcome.
+
+Both runners run every item in a process of its own, on Ray below the task that occupies the item's resources: only a
+process can be ended at any moment, be limited in its memory, and crash without ending anything else. Ray's own worker
+processes run many tasks, have no hard limit of memory, and take as long to start.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, NamedTuple
+
+from kissgs.runners.contract import CRASHED, INTERNAL, MEMORY_LIMIT, NOT_STARTED, TIME_LIMIT, Outcome, WorkItem
+
+OUT_OF_MEMORY = re.compile(
+    "MemoryError|bad_alloc|out of memory|memory allocation|cannot allocate memory", re.IGNORECASE
+)
+"""Messages of Python, C++, LLVM, OpenBLAS and the C library when an allocation fails; any of them may be the first."""
+
+NEAR_LIMIT = 0.8
+"""Share of the memory limit above which a crash without such a message is attributed to the limit."""
+
+SAMPLE_SECONDS = 0.1
+"""Seconds between samples of a process's memory."""
+
+LOG_BYTES = 4000
+"""Bytes of the end of standard error that are kept."""
+
+
+class ProgressEvent(NamedTuple):
+    """A progress event, see :class:`kissgs.Progress`."""
+
+    stage: str
+    fraction: float
+    note: str
+
+
+class ItemProcess:
+    """The process of one item; use :meth:`events` once."""
+
+    def __init__(self, item: WorkItem) -> None:
+        self._item = item
+        self._process: subprocess.Popen[bytes] | None = None
+        self._killed = self._timed_out = False
+        self._lock = threading.Lock()
+        self._ended = threading.Event()
+        self._peak_data = 0
+
+    def kill(self) -> None:
+        """Kill the process now, or as soon as it has started."""
+        with self._lock:
+            self._killed = True
+            self._kill()
+
+    def _kill(self) -> None:
+        if self._process is not None and not self._ended.is_set():
+            os.killpg(self._process.pid, signal.SIGKILL)
+
+    def _time_out(self) -> None:
+        with self._lock:
+            self._timed_out = True
+            self._kill()
+
+    def events(self) -> Iterator[ProgressEvent | Outcome]:
+        """Run the item: yield its progress, and its outcome last, once the process has ended."""
+        if self._killed:
+            yield Outcome("cancelled")
+            return
+        with contextlib.ExitStack() as stack:
+            try:
+                errors = stack.enter_context(tempfile.TemporaryFile())
+                process = self._start(errors)
+            except OSError as error:
+                yield self._not_started(error)
+                return
+            timer = threading.Timer(self._item.seconds or threading.TIMEOUT_MAX, self._time_out)
+            timer.daemon = True
+            sampler = threading.Thread(target=self._sample_memory, args=(process.pid,), daemon=True)
+            sampler.start()
+            if self._item.seconds is not None:
+                timer.start()
+            final: Outcome | None = None
+            try:
+                for event in _events_of(process):
+                    if isinstance(event, Outcome):
+                        final = event
+                    else:
+                        yield event
+            finally:  # also if the caller asks for no more events
+                timer.cancel()
+                status = self._finish(process, wait=final is not None)
+            yield self._explain(final, status, errors)
+
+    def _not_started(self, error: OSError) -> Outcome:
+        reason, machine = (error.strerror or str(error)).lower(), socket.gethostname()
+        if isinstance(error, (FileNotFoundError, NotADirectoryError, PermissionError)):
+            message = f"the machine {machine} cannot use the folder of the work: {reason}"
+            return Outcome("error", code="output", message=message, log=str(self._item.folder))
+        message = f"the machine {machine} could not start a process: {reason}"
+        return Outcome("lost", code=NOT_STARTED, message=message)
+
+    def _start(self, errors: IO[bytes]) -> subprocess.Popen[bytes]:
+        process = subprocess.Popen(
+            [sys.executable, "-P", "-m", f"{__package__}.item_process"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            cwd=self._item.folder,
+            env=child_environment(),
+            start_new_session=True,
+        )
+        with self._lock:
+            self._process = process
+            if self._killed:  # during the start
+                self._kill()
+        task = {
+            "parent": os.getpid(),
+            "function": self._item.function,
+            "arguments": self._item.arguments,
+            "memory_limit": self._item.memory_limit,
+        }
+        assert process.stdin is not None  # noqa: S101
+        with contextlib.suppress(BrokenPipeError):  # it has ended already, which the missing final event shows
+            process.stdin.write(json.dumps(task).encode() + b"\n")
+            process.stdin.flush()
+        return process
+
+    def _finish(self, process: subprocess.Popen[bytes], *, wait: bool) -> int:
+        """Wait for the end of the process, which is killed unless its final event has come, and return its status."""
+        if not wait:
+            with self._lock:
+                self._kill()
+        if hasattr(os, "waitid"):  # not on macOS
+            os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+        with self._lock:  # from here on, its id may be another process's
+            self._ended.set()
+            status = process.wait()
+        for pipe in (process.stdin, process.stdout):
+            assert pipe is not None  # noqa: S101
+            with contextlib.suppress(BrokenPipeError):  # a task that the process has not read
+                pipe.close()
+        return status
+
+    def _sample_memory(self, pid: int) -> None:
+        """Track the peak of the memory that the limit counts (``VmData``), unknown once the process has ended."""
+        while not self._ended.wait(SAMPLE_SECONDS):
+            try:
+                pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[5])
+            except OSError:  # the process has ended, or this is not Linux
+                return
+            self._peak_data = max(self._peak_data, pages * os.sysconf("SC_PAGE_SIZE"))
+
+    def _explain(self, final: Outcome | None, status: int, errors: IO[bytes]) -> Outcome:
+        if final is not None and final.code != MEMORY_LIMIT:
+            return final
+        if self._killed:
+            return Outcome("cancelled")
+        if self._timed_out:
+            message = f"the work took longer than its limit of {self._item.seconds:g} s"
+            return Outcome("error", code=TIME_LIMIT, message=message)
+        errors.seek(max(0, errors.seek(0, os.SEEK_END) - LOG_BYTES))
+        text = errors.read().decode(errors="replace")
+        limit = self._item.memory_limit
+        near_limit = limit is not None and self._peak_data >= NEAR_LIMIT * limit and status != -signal.SIGKILL
+        if final is not None or near_limit or OUT_OF_MEMORY.search(text):
+            of = "" if limit is None else f" than its limit of {limit / 1e9:.2g} GB"
+            return Outcome("error", code=MEMORY_LIMIT, message=f"the work needs more memory{of}", log=text)
+        if status < 0:
+            name = signal.Signals(-status).name
+            return Outcome("crashed", code=CRASHED, message=f"the process was ended by {name}", log=text)
+        message = "the work failed because of an error in kissgs; please report it"
+        return Outcome("error", code=INTERNAL, message=message, log=text)
+
+
+def _events_of(process: subprocess.Popen[bytes]) -> Iterator[ProgressEvent | Outcome]:
+    assert process.stdout is not None  # noqa: S101
+    for line in process.stdout:
+        event = json.loads(line)
+        if "stage" in event:
+            yield ProgressEvent(event["stage"], event["fraction"], event["note"])
+        elif "done" in event:
+            yield Outcome("done", event["done"])
+        elif "error" in event:
+            yield Outcome("error", code=event["error"]["code"], message=event["error"]["message"])
+        else:
+            yield Outcome("error", code=MEMORY_LIMIT)
+
+
+def child_environment() -> dict[str, str]:
+    """Return this process's environment without the settings of a service and its storage, some of them secrets."""
+    secret = ("KISSGS_", "AWS_")
+    inherited = {name: value for name, value in os.environ.items() if not name.upper().startswith(secret)}
+    return {**inherited, "OMP_WAIT_POLICY": "PASSIVE", "PYTHONUNBUFFERED": "1"}

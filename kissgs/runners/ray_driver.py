@@ -1,0 +1,332 @@
+"""Driver process of :class:`kissgs.runners.ray_runner.RayRunner`: ``python -m kissgs.runners.ray_driver``.
+
+Its argument is the address. It reads JSON lines from standard input, items to submit and to cancel, and writes JSON
+lines to standard output: the nodes whenever they change, and the events of each item. When standard input closes, it
+ends all items and exits.
+
+Every start of an item is one Ray task, a streaming generator whose values are the item's events; the values are small
+and come with the reply, not through Ray's object store. Retries are ours and not Ray's, because Ray continues such a
+generator behind the values that have been consumed, which only suits generators that yield the same values again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import os
+import secrets
+import shutil
+import signal
+import socket
+import sys
+import tempfile
+import threading
+import traceback
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from typing import Any, NoReturn
+
+import ray
+from ray.exceptions import RayError, RayTaskError, TaskCancelledError
+
+from kissgs._version import __version__
+from kissgs.core.errors import RunnerError
+from kissgs.runners.contract import INTERNAL, LOST, Outcome, WorkItem
+
+NODES_SECONDS = 1.0
+"""Seconds between two looks at the cluster's nodes."""
+
+RETRY_SECONDS = 1.0
+"""Seconds before an item whose node was lost is started again: Ray may not know of the loss yet."""
+
+CONNECT_SECONDS = 5.0
+"""Maximum seconds for a connection to the head's port."""
+
+OBJECT_STORE_BYTES = 80 << 20
+"""Size of the object store of a cluster that is started here: nearly the smallest; nothing is kept there."""
+
+LOCAL = "local"
+"""Argument instead of an address: start a cluster on this machine."""
+
+Send = Callable[[dict[str, Any]], None]
+
+
+def main() -> None:
+    """Connect, run items until standard input closes, and disconnect."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    out = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # for what Ray prints
+
+    def send(event: dict[str, Any]) -> None:
+        out.write(json.dumps(event) + "\n")
+        out.flush()
+
+    address = sys.argv[1]
+    folder = tempfile.mkdtemp(prefix="kissgs-ray-") if address == LOCAL else None
+    try:
+        connect(address) if folder is None else start_here(folder)
+        send({"nodes": _nodes()})
+        asyncio.run(Driver(send).run())
+    except NoCluster:
+        os.dup2(out.fileno(), 1)
+        _begin_again()
+    except RunnerError as error:
+        send({"failed": str(error)})
+    finally:
+        ray.shutdown()
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+class NoCluster(Exception):
+    """The address is "auto", and there is no cluster on this machine."""
+
+
+def connect(address: str) -> None:
+    """Connect this process to a cluster.
+
+    Raises:
+        NoCluster: there is none, and ``address`` is "auto".
+        RunnerError: the cluster cannot be reached.
+    """
+    given = address if address != "auto" else os.environ.get("RAY_ADDRESS", "")
+    if "://" in given:
+        raise RunnerError(
+            f"{given} is an address for Ray's client; give HOST:PORT of the cluster's head, on a machine of the cluster"
+        )
+    if given:
+        _check_port(given)
+    try:
+        ray.init(address=given or "auto", log_to_driver=False, configure_logging=False)
+    except ConnectionError as error:
+        if given:
+            raise RunnerError(_refused(given, error)) from error
+        raise NoCluster from error
+    except Exception as error:  # among them RuntimeError for another version of Ray or Python
+        raise RunnerError(_refused(given or "of this machine", error)) from error
+
+
+def _begin_again() -> NoReturn:
+    """Replace this process by one that starts a cluster on this machine, with a token of its own.
+
+    Without a token, Ray would let everyone in who reaches its ports, or write one to the home folder. It reads its
+    environment when it is imported, so that this process cannot set one.
+    """
+    protected = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+    os.execve(sys.executable, [sys.executable, "-P", "-m", f"{__package__}.ray_driver", LOCAL], protected)
+
+
+def start_here(folder: str) -> None:
+    """Start a cluster on this machine, with its files in ``folder``, which ends with this process.
+
+    Raises:
+        RunnerError: Ray cannot be started.
+    """
+    try:
+        ray.init(
+            address="local",
+            include_dashboard=False,
+            object_store_memory=OBJECT_STORE_BYTES,
+            log_to_driver=False,
+            configure_logging=False,
+            _temp_dir=folder,
+        )
+    except Exception as error:
+        raise RunnerError(f"Ray cannot be started on this machine: {_first_line(error)}") from error
+
+
+def _check_port(address: str) -> None:
+    host, colon, port = address.rpartition(":")
+    if not colon or not port.isdecimal():
+        raise RunnerError(f"{address} is no address of a Ray cluster; give HOST:PORT of its head, usually port 6379")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), CONNECT_SECONDS).close()
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise RunnerError(f"no Ray cluster answers at {address}: {reason}; is its head running there?") from error
+
+
+def _refused(address: str, error: Exception) -> str:
+    return (
+        f"cannot join the Ray cluster {address}: {_first_line(error)}; this machine must be one of its nodes "
+        f"(ray start --address={address} --num-cpus=0), and have its token if it has one (RAY_AUTH_MODE=token)"
+    )
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")[:300]
+
+
+def _nodes() -> list[dict[str, Any]]:
+    """Return address and resources of the nodes that can run items."""
+    return [
+        {
+            "address": node["NodeManagerAddress"],
+            "total": {
+                "cpus": found["CPU"],
+                "memory": int(found.get("memory", 0)),
+                "gpus": found.get("GPU", 0.0),
+            },
+        }
+        for node in ray.nodes()
+        if node["Alive"] and (found := node["Resources"]).get("CPU", 0) > 0
+    ]
+
+
+class Driver:
+    """All items of this process, each an asyncio task that follows its Ray task.
+
+    Args:
+        send: sends an event to the process that started this one.
+    """
+
+    def __init__(self, send: Send) -> None:
+        self._send = send
+        self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._generators: dict[str, Any] = {}
+        self._cancelled = set[str]()
+
+    async def run(self) -> None:
+        """Handle messages from standard input until that closes; then cancel all items."""
+        messages = _Messages()
+        watching = asyncio.create_task(self._watch_nodes())
+        while (message := await messages.get()) is not None:
+            if "submit" in message:
+                item_id = message["submit"]
+                self._tasks[item_id] = asyncio.create_task(self._run(item_id, WorkItem.from_dict(message["item"])))
+            else:
+                self._cancel(message["cancel"])
+        for item_id in list(self._tasks):
+            self._cancel(item_id)
+        await asyncio.gather(*self._tasks.values(), return_exceptions=True)
+        watching.cancel()
+
+    def _cancel(self, item_id: str) -> None:
+        if item_id in self._tasks:
+            self._cancelled.add(item_id)
+            if item_id in self._generators:
+                ray.cancel(self._generators[item_id], force=True)
+
+    async def _watch_nodes(self) -> None:
+        last: list[dict[str, Any]] = []
+        while True:
+            nodes = await asyncio.to_thread(_nodes)
+            if nodes != last:
+                self._send({"nodes": nodes})
+                last = nodes
+            await asyncio.sleep(NODES_SECONDS)
+
+    async def _run(self, item_id: str, item: WorkItem) -> None:
+        try:
+            outcome = await self._start_until_kept(item_id, item)
+        except Exception as error:  # noqa: BLE001  a request that Ray refuses, for example; the item must end
+            message = f"Ray cannot run the work: {_first_line(error)}"
+            outcome = Outcome("error", code=INTERNAL, message=message, log=traceback.format_exc()[-4000:])
+        self._generators.pop(item_id, None)
+        del self._tasks[item_id]
+        self._cancelled.discard(item_id)
+        self._send({"id": item_id, "outcome": asdict(outcome)})
+
+    async def _start_until_kept(self, item_id: str, item: WorkItem) -> Outcome:
+        """Start an item, and again as long as its node is lost and retries are left."""
+        task, outcome = _remote_task(item), Outcome("cancelled", starts=0)
+        for start in range(1, item.retries + 2):
+            if item_id not in self._cancelled:
+                self._generators[item_id] = task.remote(item.as_dict(), __version__)
+                outcome = await self._follow(item_id, start)
+            if outcome.kind != "lost":
+                return outcome
+            if item_id in self._cancelled:
+                return Outcome("cancelled", starts=outcome.starts)
+            self._send({"id": item_id, "started": False})
+            await asyncio.sleep(RETRY_SECONDS)
+        return outcome
+
+    async def _follow(self, item_id: str, start: int) -> Outcome:
+        """Forward the events of one start of an item and return its outcome."""
+        node = ""
+        try:
+            async for reference in self._generators[item_id]:
+                event = await reference
+                if "outcome" in event:
+                    return Outcome(**{**event["outcome"], "node": node, "starts": start})
+                if "node" in event:
+                    node = event["node"]
+                    self._send({"id": item_id, "started": True})
+                else:
+                    self._send({"id": item_id, "progress": event["progress"]})
+        except TaskCancelledError:
+            return Outcome("cancelled", node=node, starts=start)
+        except RayTaskError as error:  # raised by the task itself, outside the item's process
+            message = f"a node of the cluster cannot run kissgs: {_first_line(error.cause or error)}"
+            return Outcome("error", code=INTERNAL, message=message, log=str(error)[-4000:], node=node, starts=start)
+        except RayError as error:
+            message = f"the node {node or 'of the work'} was lost {start} times: {_first_line(error)}"
+            return Outcome("lost", code=LOST, message=message, node=node, starts=start)
+        return Outcome("lost", code=LOST, message="the work ended without an outcome", node=node, starts=start)
+
+
+class _Messages:
+    """Messages from standard input, read by a thread."""
+
+    def __init__(self) -> None:
+        self._queue: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
+        self._loop = asyncio.get_running_loop()
+        threading.Thread(target=self._read, daemon=True).start()
+
+    async def get(self) -> dict[str, Any] | None:
+        """Return the next message; None at the end."""
+        return await self._queue.get()
+
+    def _read(self) -> None:
+        for line in sys.stdin:
+            self._loop.call_soon_threadsafe(self._queue.put_nowait, json.loads(line))
+        self._loop.call_soon_threadsafe(self._queue.put_nowait, None)
+
+
+def _remote_task(item: WorkItem) -> Any:  # noqa: ANN401  Ray's decorated functions have no useful type
+    """Return the Ray task that runs an item, with its requests."""
+    wanted = item.resources
+    return ray.remote(function_for_nodes()).options(
+        num_cpus=wanted.cpus if wanted.cpus <= 1 else math.ceil(wanted.cpus),
+        num_gpus=wanted.gpus if wanted.gpus <= 1 else math.ceil(wanted.gpus),
+        memory=wanted.memory or None,
+        num_returns="streaming",
+        max_retries=0,
+        scheduling_strategy="SPREAD",
+        name=item.function,
+    )
+
+
+def function_for_nodes() -> Callable[[dict[str, Any], str], Iterator[dict[str, Any]]]:
+    """Return the function that nodes run, as a local one: Ray sends its code, and not its name as of a global one."""
+
+    def run(values: dict[str, Any], version: str) -> Iterator[dict[str, Any]]:
+        """Run an item in a process and yield its events; ``version`` is that of kissgs where it was submitted."""
+        from dataclasses import asdict
+
+        import ray
+
+        from kissgs._version import __version__
+        from kissgs.runners.contract import Outcome, WorkItem
+        from kissgs.runners.process import ItemProcess
+
+        node = ray.util.get_node_ip_address()
+        if __version__ != version:
+            message = f"the node {node} has kissgs {__version__}, and this machine {version}; install one version"
+            yield {"outcome": asdict(Outcome("error", code="runner", message=message))}
+            return
+        yield {"node": node}
+        process = ItemProcess(WorkItem.from_dict(values))
+        try:
+            for event in process.events():
+                yield {"outcome": asdict(event)} if isinstance(event, Outcome) else {"progress": list(event)}
+        finally:
+            process.kill()
+
+    return run
+
+
+if __name__ == "__main__":
+    main()

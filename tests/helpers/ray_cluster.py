@@ -1,0 +1,92 @@
+"""``RayCluster``: a head and nodes of a Ray cluster as processes on this machine, with all files in one folder."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import secrets
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+RAY = Path(sys.executable).with_name("ray")
+NODE_MEMORY = 1_000_000_000
+PATHS = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
+"""``PYTHONPATH`` of nodes and of items."""
+
+
+class RayCluster:
+    """Cluster for use as ``with RayCluster() as cluster``; the head runs no items, each node one at a time.
+
+    Whoever connects needs the variables ``environment``, a token.
+    """
+
+    def __init__(self) -> None:
+        self.folder = Path(tempfile.mkdtemp(prefix="kr-"))  # short: sockets below have paths of at most 107 bytes
+        self.environment = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+        self.nodes: list[subprocess.Popen] = []
+        self.logs: list[Path] = []
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.address = f"127.0.0.1:{probe.getsockname()[1]}"
+
+    def __enter__(self) -> RayCluster:
+        quick = {"health_check_period_ms": 500, "health_check_failure_threshold": 4, "health_check_initial_delay_ms": 0}
+        self.head = self._start(
+            *("--head", f"--port={self.address.rpartition(':')[2]}", "--num-cpus=0", "--include-dashboard=false"),
+            f"--system-config={json.dumps(quick)}",
+        )
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for node in [*self.nodes, self.head]:
+            kill_tree(node)
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def add_node(self) -> subprocess.Popen:
+        self.nodes.append(self._start(f"--address={self.address}", "--num-cpus=1", f"--memory={NODE_MEMORY}"))
+        return self.nodes[-1]
+
+    def _start(self, *options: str) -> subprocess.Popen:
+        kept = {name: value for name, value in os.environ.items() if not name.startswith(("KISSGS_", "RAY_"))}
+        environment = {**kept, **self.environment, "RAY_TMPDIR": str(self.folder), "RAY_USAGE_STATS_ENABLED": "0"}
+        log = self.folder / f"log{len(self.logs)}"
+        self.logs.append(log)
+        with log.open("wb") as file:
+            process = subprocess.Popen(
+                [RAY, "start", "--block", "--object-store-memory=80000000", *options],
+                env={**environment, "PYTHONPATH": PATHS},
+                stdout=file,
+                stderr=file,
+                cwd=self.folder,
+            )
+        while b"Ray runtime started" not in log.read_bytes():  # two at a time would choose the same names of sockets
+            assert process.poll() is None, log.read_text()
+            time.sleep(0.05)
+        return process
+
+
+def tree(pid: int) -> list[int]:
+    """Return the ids of a process and of all processes below it."""
+    found = [pid]
+    with contextlib.suppress(OSError):
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            for child in (task / "children").read_text().split():
+                found += tree(int(child))
+    return found
+
+
+def kill_tree(process: subprocess.Popen) -> None:
+    """Kill a node as if its machine had lost its power: all of its processes at once."""
+    pids = tree(process.pid)
+    for pid in pids:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    process.wait()

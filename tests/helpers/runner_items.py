@@ -1,0 +1,62 @@
+"""Functions of work items for the tests of the runners; their processes import this module by name."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import kissgs
+
+
+def count(arguments, progress):
+    """Report the numbers below ``numbers`` as stages, and write the process's id to the file ``pid`` if given."""
+    if "pid" in arguments:
+        Path(arguments["pid"]).write_text(str(os.getpid()))
+    for number in range(arguments["numbers"]):
+        progress(f"stage {number}", number / arguments["numbers"], f"note {number}")
+        time.sleep(arguments.get("seconds_between", 0.0))
+    return {"numbers": arguments["numbers"], "folder": str(Path.cwd())}
+
+
+def record(arguments, progress):
+    """Write the times of start and end to a file of this process in the folder ``times``."""
+    start = time.monotonic()
+    time.sleep(arguments["seconds_between"])
+    path = Path(arguments["times"]) / str(os.getpid())
+    path.with_suffix(".part").write_text(f"{start} {time.monotonic()}")
+    path.with_suffix(".part").rename(path)
+    return {}
+
+
+def refuse(arguments, progress):
+    raise kissgs.InvalidSceneError("this is no scene")
+
+
+def fail(arguments, progress):
+    raise LookupError("a bug")
+
+
+def environment(arguments, progress):
+    return {"names": [name for name in os.environ if name.startswith("KISSGS_")]}
+
+
+def crash(arguments, progress):
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def allocate(arguments, progress):
+    return {"bytes": len(bytearray(arguments["bytes"]))}
+
+
+def write_slowly(arguments, progress):
+    """Add a line to the file ``starts``, then wait, in the first start for long, and write ``output`` atomically."""
+    from kissgs.io.atomic import atomic_file
+
+    with Path(arguments["starts"]).open("a") as file:
+        file.write(f"{os.getpid()}\n")
+    first = len(Path(arguments["starts"]).read_text().splitlines()) == 1
+    progress("wait", 0.0, "first" if first else "again")
+    time.sleep(600 if first else 0.1)
+    with atomic_file(Path(arguments["output"])) as file:
+        file.write(arguments["text"].encode())
+    return {"bytes": len(arguments["text"])}

@@ -1,0 +1,222 @@
+"""``kissgs compress --ray``. Oracle: the files and reports of the command without it."""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import time
+
+import pytest
+from helpers.command_line import KISSGS, failure, run
+from helpers.ray_cluster import kill_tree, tree
+from helpers.running import is_alive, wait_until
+
+import kissgs
+from kissgs.cli.options import with_default_values
+from kissgs.cli.scene_item import compress_scene
+from kissgs.io.ply import write_ply
+
+TIMES = {"seconds", "cpu_seconds", "peak_memory", "output"}
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    """Folder of small scenes a.ply and b.ply, and c.ply, which takes about a second."""
+    folder = tmp_path_factory.mktemp("scenes")
+    for seed, (name, count) in enumerate({"a": 300, "b": 500, "c": 20_000}.items()):
+        with (folder / f"{name}.ply").open("wb") as file:
+            write_ply(file, kissgs.sample_scene(count, sh_degree=2, seed=seed))
+    return folder
+
+
+@pytest.fixture
+def cluster(ray_cluster, ray_runner):
+    """The cluster, with both nodes before and after the test."""
+    wait_until(lambda: ray_runner.stats().cpus == 2)
+    yield ray_cluster
+    for node in [node for node in ray_cluster.nodes if node.poll() is not None]:
+        ray_cluster.nodes.remove(node)
+        ray_cluster.add_node()
+
+
+def comparable(report):
+    return {name: value for name, value in report.items() if name not in TIMES}
+
+
+def test_files_and_reports_are_those_without_a_cluster(cluster, scenes, tmp_path):
+    (tmp_path / "broken.ply").write_bytes(b"ply\nnonsense\n")
+    inputs = [scenes / "a.ply", tmp_path / "broken.ply", scenes / "b.ply"]
+    for name, more in {"here": [], "there": ["--ray", cluster.address]}.items():
+        done = run("compress", *inputs, "-p", "fast", "-o", tmp_path / name, "--json", *more)
+        assert done.returncode == 2
+        (tmp_path / f"{name}.json").write_bytes(done.stdout)
+        (tmp_path / f"{name}.txt").write_bytes(done.stderr)
+    for scene in ("a.zip", "b.zip"):
+        assert (tmp_path / "there" / scene).read_bytes() == (tmp_path / "here" / scene).read_bytes()
+    here, there = (json.loads((tmp_path / name).read_text()) for name in ("here.json", "there.json"))
+    assert [comparable(report) for report in there] == [comparable(report) for report in here]
+    assert there[1]["error"]["code"] == "invalid-scene"
+    assert (tmp_path / "there.txt").read_text() == (tmp_path / "here.txt").read_text()
+    assert sorted(path.name for path in (tmp_path / "there").iterdir()) == ["a.zip", "b.zip"]
+
+
+@pytest.mark.quick(0)
+def test_a_folder_is_written_shown_and_replaced_only_if_allowed(cluster, scenes, tmp_path):
+    words = ["compress", scenes / "a.ply", "-p", "fast", "-o", tmp_path, "--unpacked", "--ray", cluster.address]
+    done = run(*words)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert b"Gaussians, SH degree 2" in done.stdout
+    files = {path.name: path.read_bytes() for path in (tmp_path / "a.container").iterdir()}
+    assert files == dict(kissgs.compress(scenes / "a.ply", settings=kissgs.Settings.from_preset("fast")).files)
+    assert "exists already" in failure(*words)
+    (tmp_path / "a.container" / "meta.json").unlink()
+    assert run(*words, "--force", "-q").returncode == 0
+    assert {path.name: path.read_bytes() for path in (tmp_path / "a.container").iterdir()} == files
+    assert [path.name for path in tmp_path.iterdir()] == ["a.container"]
+
+
+def test_a_scene_whose_node_is_killed_has_the_same_bytes(cluster, scenes, tmp_path):
+    words = [
+        KISSGS,
+        "compress",
+        scenes / "c.ply",
+        "-p",
+        "fast",
+        "-o",
+        tmp_path / "c.zip",
+        "-q",
+        "--ray",
+        cluster.address,
+    ]
+    with subprocess.Popen(words) as command:
+        node, _ = working(cluster)
+        kill_tree(node)
+        assert command.wait(300) == 0
+    expected = kissgs.compress(scenes / "c.ply", settings=kissgs.Settings.from_preset("fast")).to_zip()
+    assert (tmp_path / "c.zip").read_bytes() == expected
+    assert [path.name for path in tmp_path.iterdir()] == ["c.zip"]
+
+
+@pytest.mark.quick(0)
+@pytest.mark.parametrize("moment", range(10))
+def test_a_node_is_killed_at_any_moment(cluster, scenes, tmp_path, moment):
+    inputs = [scenes / "b.ply", scenes / "c.ply"]
+    words = [KISSGS, "compress", *inputs, "-p", "fast", "-o", tmp_path / "out", "-q", "--ray", cluster.address]
+    with subprocess.Popen(words) as command:
+        node, _ = working(cluster)
+        time.sleep(0.15 * moment)
+        kill_tree(node)
+        assert command.wait(300) == 0
+    for scene in inputs:
+        expected = kissgs.compress(scene, settings=kissgs.Settings.from_preset("fast")).to_zip()
+        assert (tmp_path / "out" / f"{scene.stem}.zip").read_bytes() == expected
+    assert len(list((tmp_path / "out").iterdir())) == 2
+
+
+@pytest.mark.quick(1)
+@pytest.mark.parametrize("moment", range(10))
+def test_the_command_is_killed_at_any_moment_and_repeated(cluster, scenes, tmp_path, moment):
+    words = [KISSGS, "compress", scenes / "c.ply", "-p", "fast", "-o", tmp_path, "-q", "--ray", cluster.address]
+    with subprocess.Popen(words) as command:
+        _, pid = working(cluster)
+        time.sleep(0.15 * moment)
+        command.kill()
+    wait_until(lambda: not is_alive(pid), seconds=30)
+    assert subprocess.run([*words, "--force"], check=False).returncode == 0
+    expected = kissgs.compress(scenes / "c.ply", settings=kissgs.Settings.from_preset("fast")).to_zip()
+    assert (tmp_path / "c.zip").read_bytes() == expected
+    assert [path.name for path in tmp_path.iterdir()] == ["c.zip"]
+
+
+def working(cluster):
+    """Wait for the process of an item; return its node and its id."""
+    found = []
+
+    def look():
+        for node in cluster.nodes:
+            for pid in tree(node.pid):
+                with contextlib.suppress(OSError), open(f"/proc/{pid}/cmdline", "rb") as file:  # noqa: PTH123
+                    if b"item_process" in file.read():
+                        found.append((node, pid))
+        return found
+
+    wait_until(look)
+    return found[0]
+
+
+def test_ctrl_c_ends_all_items_and_leaves_nothing(cluster, scenes, tmp_path):
+    words = [KISSGS, "compress", scenes / "c.ply", "-o", tmp_path / "c.zip", "--ray", cluster.address]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as command:
+        _, pid = working(cluster)
+        wait_until(lambda: any(path.is_dir() and any(path.iterdir()) for path in tmp_path.iterdir()))
+        os.kill(command.pid, signal.SIGINT)
+        _, said = command.communicate(timeout=60)
+    assert (command.returncode, said) == (130, "kissgs: interrupted; no partial file is left\n")
+    wait_until(lambda: not is_alive(pid), seconds=5)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (
+            ["a.ply", "--threads", "64"],
+            "no node has 64 CPUs; the largest has 1 CPUs and 1 GB of memory; choose another",
+        ),
+        (["a.ply", "--device", "cuda", "--finetune"], "no node has 1 CPUs and 1 GPUs; the largest has"),
+        (["-", "-o", "x.zip"], "--ray needs files that all machines see, not standard input or output"),
+        (["a.ply", "-o", "-"], "--ray needs files that all machines see, not standard input or output"),
+        (["none.ply"], "cannot read none.ply"),
+        (["a.ply", "-o", "x/lod-meta.json"], "are made without --ray"),
+    ],
+)
+@pytest.mark.quick(3)
+def test_one_sentence_for_what_a_cluster_cannot_do(cluster, scenes, words, expected):
+    assert expected in failure("compress", *words, "-p", "fast", "--ray", cluster.address, cwd=scenes)
+    assert not list(scenes.glob("*.zip"))
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"scene": "/nowhere/a.ply"}, "does not see /nowhere/a.ply; --ray needs storage"),
+        ({"bytes": 7}, "sees another file as"),
+        ({"work": "/nowhere/x"}, "does not see what this machine writes to /nowhere"),
+    ],
+)
+def test_a_machine_without_the_shared_storage(scenes, tmp_path, change, expected):
+    scene = scenes / "a.ply"
+    arguments = {"scene": str(scene), "bytes": scene.stat().st_size, "work": str(tmp_path)} | change
+    with pytest.raises(kissgs.UnsupportedError) as raised:
+        compress_scene(arguments, lambda *event: None)
+    assert expected in str(raised.value)
+
+
+def test_ray_is_not_installed(scenes, monkeypatch):
+    from kissgs.runners import ray_runner
+
+    monkeypatch.setattr(ray_runner, "find_spec", lambda name: None)
+    assert "pip install 'kissgs[ray]'" in failure("compress", scenes / "a.ply", "--ray")
+
+
+@pytest.mark.quick(0)
+def test_a_cluster_of_this_machine_is_started_where_there_is_none(scenes, tmp_path, monkeypatch):
+    monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))  # where a cluster of this machine would be found
+    for name in ("RAY_ADDRESS", "RAY_AUTH_MODE", "RAY_AUTH_TOKEN"):
+        monkeypatch.delenv(name, raising=False)
+    home = tmp_path / "home"
+    home.mkdir()
+    monkeypatch.setenv("HOME", str(home))
+    words = [KISSGS, "compress", scenes / "a.ply", "-p", "fast", "-o", tmp_path / "a.zip", "--ray", "-q"]
+    subprocess.run(words, check=True, timeout=120)
+    expected = kissgs.compress(scenes / "a.ply", settings=kissgs.Settings.from_preset("fast")).to_zip()
+    assert (tmp_path / "a.zip").read_bytes() == expected
+    assert list(home.iterdir()) == []
+
+
+def test_the_default_address_is_auto():
+    assert with_default_values(["a.ply", "--ray"]) == ["a.ply", "--ray", "auto"]
+    assert with_default_values(["--ray", "a.ply"]) == ["--ray", "auto", "a.ply"]
+    assert with_default_values(["--ray", "head:6379", "a.ply"]) == ["--ray", "head:6379", "a.ply"]
+    assert with_default_values(["--ray", "[::1]:6379"]) == ["--ray", "[::1]:6379"]

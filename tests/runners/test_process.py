@@ -1,0 +1,65 @@
+"""Ends of an item's process. Oracle: messages of libraries when memory is exhausted, and ends by signals."""
+
+import errno
+import io
+import signal
+import subprocess
+
+import pytest
+from helpers.running import item
+
+from kissgs.runners.process import ItemProcess
+
+
+@pytest.mark.parametrize(
+    "output",
+    [
+        "LLVM ERROR: out of memory\nBuffer allocation failed",
+        "OpenBLAS error: Memory allocation still failed after 10 retries, giving up.",
+        "terminate called after throwing an instance of 'std::bad_alloc'",
+        "numpy._core._exceptions._ArrayMemoryError: Unable to allocate 17 MiB",
+    ],
+)
+def test_messages_of_libraries_at_the_memory_limit(output):
+    process = ItemProcess(item("count", memory_limit=1 << 30))
+    assert process._explain(None, -signal.SIGABRT, io.BytesIO(output.encode())).code == "memory-limit"
+    assert process._explain(None, -signal.SIGSEGV, io.BytesIO(b"Segmentation fault")).kind == "crashed"
+
+
+@pytest.mark.parametrize(
+    ("status", "used", "expected"),
+    [
+        (-signal.SIGSEGV, 0.9, "memory-limit"),
+        (-signal.SIGSEGV, 0.7, "crashed"),
+        (-signal.SIGKILL, 0.9, "crashed"),  # killed from outside: by the system or by a person
+        (1, 0.9, "memory-limit"),
+        (1, 0.7, "internal"),
+    ],
+)
+def test_a_crash_without_a_message_near_the_memory_limit(status, used, expected):
+    process = ItemProcess(item("count", memory_limit=1 << 30))
+    process._peak_data = int(used * (1 << 30))
+    assert process._explain(None, status, io.BytesIO()).code == expected
+
+
+def test_a_folder_that_this_machine_does_not_see(tmp_path):
+    (outcome,) = ItemProcess(item("count", folder=str(tmp_path / "none"), numbers=1)).events()
+    assert (outcome.kind, outcome.code) == ("error", "output")
+    assert "cannot use the folder of the work: no such file" in outcome.message
+    assert outcome.log == str(tmp_path / "none")
+
+
+def test_a_machine_without_resources_for_a_process(monkeypatch):
+    def refuse(*words, **options):
+        raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(subprocess, "Popen", refuse)
+    (outcome,) = ItemProcess(item("count", numbers=1)).events()
+    assert (outcome.kind, outcome.code) == ("lost", "not-started")
+    assert "could not start a process: resource temporarily unavailable" in outcome.message
+
+
+def test_a_process_killed_before_its_start():
+    process = ItemProcess(item("count", numbers=1))
+    process.kill()
+    assert [outcome.kind for outcome in process.events()] == ["cancelled"]

@@ -1,0 +1,192 @@
+"""Conformance of the service with all runners. Oracle: the library's bytes, and the table of processes."""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from helpers.ray_cluster import NODE_MEMORY, PATHS, kill_tree, tree
+from helpers.running import is_alive, wait_until
+from helpers.service import FAST, SLOW, SMALL, Service, events, scene_bytes
+
+import kissgs
+
+MEDIUM = scene_bytes(4000, 2)
+
+
+def compressed(scene):
+    return kissgs.compress(scene, settings=kissgs.Settings(preset="fast")).to_zip()
+
+
+@pytest.fixture(scope="module")
+def settings_of(ray_cluster, ray_runner):
+    """Settings of a service by runner, with which two jobs run at a time."""
+    common = {"KISSGS_JOB_MEMORY": NODE_MEMORY, "KISSGS_WORKERS": 2, "KISSGS_JOB_THREADS": 1}
+    wait_until(lambda: ray_runner.stats().cpus == 2)
+    return {
+        "local": common,
+        "ray": {**common, "KISSGS_RUNNER": "ray", "KISSGS_RAY_ADDRESS": ray_cluster.address},
+    }
+
+
+@pytest.fixture(scope="module", params=["local", "ray"])
+def service(request, settings_of, tmp_path_factory):
+    with Service(tmp_path_factory.mktemp(request.param) / "data", **settings_of[request.param]) as it:
+        yield it
+
+
+@pytest.fixture
+def whole_cluster(ray_cluster, ray_runner):
+    """The cluster, with both nodes before and after the test."""
+    wait_until(lambda: ray_runner.stats().cpus == 2)
+    yield ray_cluster
+    for node in [node for node in ray_cluster.nodes if node.poll() is not None]:
+        ray_cluster.nodes.remove(node)
+        ray_cluster.add_node()
+    wait_until(lambda: ray_runner.stats().cpus == 2)
+
+
+def result_of(service, job):
+    status = service.ended(job)
+    assert status["state"] == "succeeded", status
+    return service.http.get(status["links"]["result"]).content
+
+
+def process_of(job):
+    """Wait for the process of a running job, which works in the job's folder; return its id."""
+    found = []
+
+    def look():
+        for link in Path("/proc").glob("[0-9]*/cwd"):
+            with contextlib.suppress(OSError):
+                if job["id"] in str(link.readlink()) and is_alive(link.parent.name):
+                    found.append(int(link.parent.name))
+        return found
+
+    wait_until(look)
+    return found[-1]
+
+
+def test_jobs_have_the_bytes_of_the_library_and_report_every_stage(service):
+    jobs = [service.submit(SMALL), service.submit(MEDIUM), service.submit(SMALL)]
+    with service.http.stream("GET", jobs[1]["links"]["events"]) as answer:
+        found = events(answer.read().decode())
+    stages = [data["stage"] for _, kind, data in found if kind == "progress"]
+    assert [result_of(service, job) for job in jobs] == [compressed(scene) for scene in (SMALL, MEDIUM, SMALL)]
+    assert [data["state"] for _, kind, data in found if kind == "state"] == ["queued", "running", "succeeded"]
+    assert stages[0] == "read"
+    assert stages.index("order") < stages.index("images")
+    assert [service.status(job)["starts"] for job in jobs] == [1, 1, 1]
+    decoded = service.http.get(service.status(jobs[0])["links"]["decoded"])
+    assert (decoded.status_code, decoded.content[:4]) == (200, b"ply\n")
+    assert service.leftovers() == []
+    assert service.http.get("/readyz").status_code == 200
+
+
+def test_an_expected_error_is_that_of_the_library_without_paths(service, tmp_path):
+    """Headers are checked on arrival; that a file is cut short is found by the job."""
+    kissgs.save(kissgs.sample_scene(300, sh_degree=1), tmp_path / "a.spz")
+    content = (tmp_path / "a.spz").read_bytes()[:-60]
+    answer = service.http.post("/v1/jobs", files={"file": ("a.spz", content)}, data={"options": FAST})
+    status = service.ended(answer.json())
+    assert (status["state"], status["problem"]["code"]) == ("failed", "invalid-scene")
+    assert "is cut short" in status["problem"]["detail"]
+    assert str(service.folder) not in status["problem"]["detail"]
+
+
+def test_a_waiting_and_a_running_job_are_cancelled(service):
+    running = [service.submit(MEDIUM, SLOW) for _ in range(2)]
+    pids = [process_of(job) for job in running]
+    waiting = service.submit(MEDIUM, SLOW)
+    for job in (waiting, *running):
+        assert service.http.delete(f"/v1/jobs/{job['id']}").status_code in (200, 204)
+        assert not (service.folder / "jobs" / job["id"]).exists()
+    wait_until(lambda: not any(map(is_alive, pids)), seconds=5)
+    assert result_of(service, service.submit()) == compressed(SMALL)
+
+
+def test_a_job_whose_process_is_killed_is_started_once_more(service):
+    job = service.submit(MEDIUM, FAST)
+    os.kill(process_of(job), signal.SIGKILL)
+    assert result_of(service, job) == compressed(MEDIUM)
+    assert service.status(job)["starts"] == 2
+    assert service.leftovers() == []
+
+
+@pytest.mark.quick(1)
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_a_service_that_ends_runs_its_jobs_again(service, number):
+    job = service.submit(MEDIUM, FAST)
+    pid = process_of(job)
+    service.kill(number)
+    wait_until(lambda: not is_alive(pid), seconds=30)
+    service.restart()
+    assert result_of(service, job) == compressed(MEDIUM)
+    assert service.leftovers() == []
+
+
+@pytest.mark.quick(0)
+@pytest.mark.parametrize("moment", range(10))
+def test_a_service_is_killed_at_any_moment(service, moment):
+    job = service.submit(MEDIUM, FAST)
+    time.sleep(0.15 * moment)
+    service.kill(signal.SIGKILL)
+    service.restart()
+    assert result_of(service, job) == compressed(MEDIUM)
+    assert service.leftovers() == []
+
+
+@pytest.mark.quick(0)
+@pytest.mark.parametrize("runner", ["local", "ray"])
+def test_the_limits_of_jobs(settings_of, tmp_path, runner):
+    with Service(tmp_path / "a", **{**settings_of[runner], "KISSGS_JOB_MEMORY": "256MiB"}) as service:
+        problem = service.ended(service.submit(scene_bytes(120_000, 3), json.dumps({"preset": "balanced"})))["problem"]
+        assert problem["code"] == "memory-limit"
+        assert "fewer Gaussians" in problem["detail"]
+    with Service(tmp_path / "b", **{**settings_of[runner], "KISSGS_JOB_SECONDS": 1.5}) as service:
+        problem = service.ended(service.submit(scene_bytes(20_000, 3), SLOW))["problem"]
+        assert problem["code"] == "time-limit"
+        assert "1.5 s" in problem["detail"]
+
+
+@pytest.mark.quick(0)
+def test_a_job_whose_node_is_killed_runs_elsewhere(settings_of, whole_cluster, tmp_path):
+    with Service(tmp_path / "data", **settings_of["ray"]) as service:
+        job = service.submit(MEDIUM, FAST)
+        pid = process_of(job)
+        kill_tree(next(node for node in whole_cluster.nodes if pid in tree(node.pid)))
+        assert result_of(service, job) == compressed(MEDIUM)
+        assert service.status(job)["starts"] == 2
+        assert service.leftovers() == []
+
+
+def test_no_job_starts_without_a_node_that_is_large_enough(settings_of, whole_cluster, tmp_path):
+    with Service(tmp_path / "data", **{**settings_of["ray"], "KISSGS_JOB_MEMORY": "2GB"}) as service:
+        job = service.submit()
+        ready = service.http.get("/readyz")
+        assert ready.status_code == 503
+        expected = "no node has 1 CPUs and 2 GB of memory; the largest has 1 CPUs and 1 GB of memory"
+        assert ready.json()["checks"]["worker"] == expected
+        assert service.status(job)["state"] == "queued"
+        wait_until(lambda: f"no job is started: {expected}" in service.log.read_text())
+
+
+def test_a_cluster_that_cannot_be_reached_is_a_problem_of_the_settings(ray_cluster, tmp_path):
+    variables = {"KISSGS_RUNNER": "ray", "KISSGS_RAY_ADDRESS": "127.0.0.1:1", "KISSGS_DATA_DIR": str(tmp_path / "data")}
+    command = [sys.executable, "-P", "-m", "service"]
+    done = subprocess.run(
+        command,
+        check=False,
+        env={**os.environ, **variables, "PYTHONPATH": PATHS},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 2
+    assert "no Ray cluster answers at 127.0.0.1:1" in done.stderr
+    assert "Traceback" not in done.stderr
