@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from dataclasses import asdict
 from functools import partial
@@ -146,11 +147,15 @@ def compress(
         sys.stderr.write(f"kissgs: --views has no effect: the preset {preset} renders no images; add --evaluate\n")
 
     if output is not None and output.name == LOD_NAME:
-        unused = {"--views": views, "--evaluate": evaluate, "--cache": cache, "--container": container, "--ray": ray}
+        unused = {"--views": views, "--evaluate": evaluate, "--cache": cache, "--container": container}
         if wrong := next((name for name, value in unused.items() if value), None):
             raise UnsupportedError(f"levels of detail ({LOD_NAME}) are made without {wrong}")
         for_each_input(
-            scenes, output, ".json", as_json, partial(_streamed, settings, reading, force, threads, quiet or as_json)
+            scenes,
+            output,
+            ".json",
+            as_json,
+            partial(_streamed, settings, reading, force, ray, threads, quiet or as_json),
         )
         return
 
@@ -210,12 +215,19 @@ def compress(
 
 
 def _streamed(
-    settings: Settings, reading: ReadOptions, force: bool, threads: int, quiet: bool, scene: str, target: Path
+    settings: Settings,
+    reading: ReadOptions,
+    force: bool,
+    ray: str | None,
+    threads: int,
+    quiet: bool,
+    scene: str,
+    target: Path,
 ) -> dict[str, Any]:
     """Compress one scene into a streamed SOG."""
     if scene == "-":
         raise UnsupportedError("levels of detail need a file: it is read more than once")
-    with progress_bar(quiet) as bar:
+    with progress_bar(quiet) as bar, contextlib.ExitStack() as ending:
 
         def progress(stage: str, fraction: float, note: str = "") -> None:
             if stage == "scratch" and not quiet:
@@ -227,8 +239,22 @@ def _streamed(
         progress("kernels", 0.0)
         from kissgs.streaming.compress import compress_streamed
 
+        runner = None
+        if ray is not None:
+            from kissgs.runners import open_runner
+
+            progress("cluster", 0.0)
+            runner = open_runner("ray", ray)
+            ending.callback(runner.close)
         report = compress_streamed(
-            Path(scene), target, settings, reading=reading, overwrite=force, threads=threads, progress=progress
+            Path(scene),
+            target,
+            settings,
+            reading=reading,
+            overwrite=force,
+            runner=runner,
+            threads=threads,
+            progress=progress,
         )
     if not quiet:
         from kissgs.cli.tables import streamed_table

@@ -27,7 +27,7 @@ from kissgs.sogxt.container import write_container
 from kissgs.streaming.levels import chunk_levels, level_count
 from kissgs.streaming.manifest import Leaf, lod_meta
 from kissgs.streaming.partition import Cuts, chunk_depth, sampled_positions
-from kissgs.streaming.rows import append_rows, from_rows, read_rows, to_rows
+from kissgs.streaming.rows import append_rows, from_rows, read_rows, to_rows, write_rows
 from kissgs.streaming.sensitivities import cameras_json, cameras_of, choose_cameras, measure_file
 
 Blocks = Callable[[], Iterable[Splats]]
@@ -100,6 +100,12 @@ class Layout:
         ]
 
 
+def read_layout(work: Path) -> Layout:
+    """Return the layout of a scene that is partitioned."""
+    found = json.loads((work / PARTITION).read_bytes())
+    return Layout(**{**found, "counts": tuple(found["counts"])})
+
+
 def partition(work: Path, blocks: Blocks, count: int, settings: EncodeSettings, progress: Progress = silent) -> Layout:
     """Split a scene into chunks, one file of rows each, in two passes; return the layout.
 
@@ -159,13 +165,11 @@ def make_levels(work: Path, layout: Layout, chunk: int, threads: int) -> None:
         from_rows(read_rows(_chunk_file(work, chunk), layout.sh_degree)), layout.levels, layout.leaf, threads
     )
     for level, splats in enumerate(made.levels):
-        path = _level_file(work, chunk, level)
-        path.unlink(missing_ok=True)
-        append_rows(path, to_rows(splats))
+        write_rows(_level_file(work, chunk, level), to_rows(splats))
     _write_json(
         _leaves_file(work, chunk), {"counts": made.counts, "bounds": made.bounds.tolist(), "errors": made.errors}
     )
-    _chunk_file(work, chunk).unlink()
+    _chunk_file(work, chunk).unlink(missing_ok=True)
 
 
 def has_file(work: Path, level: int, file: int) -> bool:
@@ -211,7 +215,7 @@ def make_file(work: Path, layout: Layout, settings: EncodeSettings, level: int, 
     _write_json(_rows_file(work, level, file), {"counts": stored})
     if level != layout.context:
         for chunk in members:
-            _level_file(work, chunk, level).unlink()
+            _level_file(work, chunk, level).unlink(missing_ok=True)
 
 
 def _read_level(work: Path, layout: Layout, level: int, chunks: Sequence[int]) -> Splats:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,10 +18,12 @@ from kissgs.io.ply import read_ply_blocks, read_ply_info
 from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.scene_files import read_scene
 from kissgs.pipeline.scene_formats import recognise
+from kissgs.runners import Runner
 from kissgs.settings import EncodeSettings, Settings
 from kissgs.sog.names import LOD_NAME
 from kissgs.streaming import build
 from kissgs.streaming.build import OUT, Blocks, Layout
+from kissgs.streaming.items import run_all, run_file, run_levels
 from kissgs.streaming.time_left import with_time_left
 from kissgs.streaming.work_folder import check_destination, check_space, claim, finish, needed_bytes, read_json
 
@@ -58,6 +61,7 @@ def compress_streamed(
     *,
     reading: ReadOptions = DEFAULT_READ_OPTIONS,
     overwrite: bool = False,
+    runner: Runner | None = None,
     threads: int = 0,
     progress: Progress = silent,
 ) -> StreamedReport:
@@ -73,7 +77,10 @@ def compress_streamed(
         settings: settings of the encoder, without goal, compaction and fine-tuning.
         reading: options of reading.
         overwrite: replace the folder if it holds a streamed scene.
-        threads: number of threads; 0 means one per processor. The bytes do not depend on it.
+        runner: engine for chunks and files, on machines that all see the folder; None to make one after another here.
+            The bytes do not depend on it.
+        threads: number of threads; 0 means one per processor, and one for each item of a runner. The bytes do not
+            depend on it.
         progress: receives "scratch", whose note is the size of the work folder, and the stages "partition", "merge",
             "cameras" and "images" with the time left; raise :class:`kissgs.Cancelled` from it to stop.
 
@@ -91,29 +98,43 @@ def compress_streamed(
     claim(work, _identity(source, settings, reading))
     if (found := read_json(work / REPORT)) is None:
         layout = _partition(work, source, reading, settings.encode, threads, progress)
-        found = asdict(_make(work, layout, settings, threads, progress))
+        found = asdict(_make(work, layout, settings, runner, threads, progress))
         with atomic_file(work / REPORT) as done:
             done.write(json.dumps(found).encode())
     finish(work, folder)
     return StreamedReport(**{**found, "counts": tuple(found["counts"]), "level_bytes": tuple(found["level_bytes"])})
 
 
-def _make(work: Path, layout: Layout, settings: Settings, threads: int, progress: Progress) -> StreamedReport:
+def _make(
+    work: Path, layout: Layout, settings: Settings, runner: Runner | None, threads: int, progress: Progress
+) -> StreamedReport:
     """Make all levels and files that are not in the work folder yet."""
     encode = settings.encode
     report = with_time_left(progress, encode.rate_distortion)
-    for at, chunk in enumerate(layout.filled):
-        if not build.has_levels(work, chunk):
-            report("merge", at / len(layout.filled))
-            build.make_levels(work, layout, chunk, threads)
+    path, stored = str(work.absolute()), encode.model_dump(mode="json")
+
+    def run(function: Callable[..., Any], stage: str, items: list[dict[str, Any]], total: int) -> None:
+        done = 1 - len(items) / total
+
+        def part(fraction: float) -> None:
+            report(stage, done + fraction * (1 - done))
+
+        if runner is not None:
+            run_all(runner, function.__name__, items, layout, threads, part)
+            return
+        for at, item in enumerate(items):
+            part(at / len(items))
+            function({**item, "threads": threads}, silent)
+
+    chunks = [chunk for chunk in layout.filled if not build.has_levels(work, chunk)]
+    run(run_levels, "merge", [{"work": path, "chunk": chunk} for chunk in chunks], len(layout.filled))
     if encode.rate_distortion and not build.has_cameras(work):
         report("cameras", 0.0)
         build.make_cameras(work, layout, encode, threads)
     files = layout.files()
-    for at, (level, file) in enumerate(files):
-        if not build.has_file(work, level, file):
-            report("images", at / len(files), f"level {level}")
-            build.make_file(work, layout, encode, level, file, threads)
+    missing = [each for each in files if not build.has_file(work, *each)]
+    items = [{"work": path, "level": level, "file": file, "settings": stored} for level, file in missing]
+    run(run_file, "images", items, len(files))
     report("images", 1.0)
     build.make_manifest(work, layout)
     return _report(work, layout, len(layout.filled))
@@ -165,9 +186,8 @@ def _partition(
     work: Path, source: Path, reading: ReadOptions, encode: EncodeSettings, threads: int, progress: Progress
 ) -> Layout:
     """Partition the scene, unless that has been done."""
-    found = read_json(work / build.PARTITION)
-    if found is not None:
-        layout = Layout(**{**found, "counts": tuple(found["counts"])})
+    if read_json(work / build.PARTITION) is not None:
+        layout = build.read_layout(work)
         _announce(work, layout.source_count, layout.sh_degree, progress)
         return layout
     try:

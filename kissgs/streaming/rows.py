@@ -9,7 +9,7 @@ import numpy as np
 from kissgs.core.array_types import Float32
 from kissgs.core.errors import OutputError
 from kissgs.core.splats import SH_REST_COUNTS, Splats
-from kissgs.io.atomic import reason_of
+from kissgs.io.atomic import atomic_file, reason_of
 
 
 def row_bytes(sh_degree: int) -> int:
@@ -44,6 +44,16 @@ def append_rows(path: Path, rows: Float32[np.ndarray, "N F"]) -> None:
             file.write(np.ascontiguousarray(rows).data)
     except OSError as error:
         raise OutputError(f"cannot write {path}: {reason_of(error)}") from error
+
+
+def write_rows(path: Path, rows: Float32[np.ndarray, "N F"]) -> None:
+    """Write rows to a file, atomically; an existing file is replaced.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    with atomic_file(path, overwrite=True) as file:
+        file.write(np.ascontiguousarray(rows).data)
 
 
 def read_rows(path: Path, sh_degree: int, first: int = 0, count: int = -1) -> Float32[np.ndarray, "N F"]:

@@ -1,0 +1,92 @@
+"""Streamed scenes on a runner. Oracle: what one process makes, one item after another."""
+
+import json
+
+import pytest
+from helpers.command_line import run
+from helpers.running import wait_until
+
+import kissgs
+from kissgs import Settings
+from kissgs.core.errors import KissgsError
+from kissgs.streaming import build
+from kissgs.streaming.compress import compress_streamed
+
+FAST = Settings.from_preset("fast")
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    for name, value in {"CHUNK": 1600, "LEAF": 300, "COARSEST": 1000}.items():
+        monkeypatch.setattr(build, name, value)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    path = tmp_path_factory.mktemp("streamed") / "scene.ply"
+    kissgs.save(kissgs.sample_scene(3000, sh_degree=1, seed=3), path)
+    return path
+
+
+def contents(folder):
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+@pytest.mark.parametrize("preset", ["fast", "balanced"])
+def test_a_runner_makes_the_same_bytes(runner, scene, tmp_path, preset):
+    settings = Settings.from_preset(preset)
+    events = []
+    here = compress_streamed(scene, tmp_path / "here" / "lod-meta.json", settings)
+    there = compress_streamed(
+        scene,
+        tmp_path / "there" / "lod-meta.json",
+        settings,
+        runner=runner,
+        progress=lambda *event: events.append(event),
+    )
+    assert there == here
+    assert contents(tmp_path / "there") == contents(tmp_path / "here")
+    assert {"merge", "images"} <= stages
+    assert runner.stats().running == 0
+
+
+def test_stopped_work_cancels_its_items_and_goes_on_elsewhere(local_runner, scene, tmp_path):
+    target = tmp_path / "city" / "lod-meta.json"
+
+    class Stop(Exception):
+        pass
+
+    def stop(stage, fraction, note=""):
+        if stage == "images" and fraction > 0:
+            raise Stop
+
+    with pytest.raises(Stop):
+        compress_streamed(scene, target, FAST, runner=local_runner, progress=stop)
+    wait_until(lambda: local_runner.stats().waiting + local_runner.stats().running == 0)
+    assert not target.exists()
+    compress_streamed(scene, target, FAST)
+    compress_streamed(scene, tmp_path / "whole" / "lod-meta.json", FAST)
+    assert contents(tmp_path / "city") == contents(tmp_path / "whole")
+
+
+def test_an_item_that_fails_ends_the_work(local_runner, scene, tmp_path):
+    """A level that another program has removed cannot be read, and the work folder stays as it is."""
+    target = tmp_path / "city" / "lod-meta.json"
+
+    def remove(stage, fraction, note=""):
+        if stage == "images" and fraction == 0:
+            (tmp_path / "city.partial" / "chunk_0_level_0.f32").unlink(missing_ok=True)
+
+    with pytest.raises(KissgsError, match=r"cannot read .*chunk_0_level_0"):
+        compress_streamed(scene, target, FAST, runner=local_runner, progress=remove)
+    assert local_runner.stats().running == 0
+
+
+def test_the_command_on_a_cluster(ray_cluster, ray_runner, scene, tmp_path):
+    wait_until(lambda: ray_runner.stats().cpus == 2)
+    words = ("compress", scene, "-p", "fast", "--json", "-o")
+    here = run(*words, tmp_path / "here" / "lod-meta.json")
+    there = run(*words, tmp_path / "there" / "lod-meta.json", "--ray", ray_cluster.address)
+    assert here.returncode == there.returncode == 0
+    assert json.loads(there.stdout)["counts"] == json.loads(here.stdout)["counts"]
+    assert contents(tmp_path / "there") == contents(tmp_path / "here")
