@@ -34,16 +34,13 @@ def contents(folder):
 
 @pytest.mark.parametrize("preset", ["fast", "balanced"])
 def test_a_runner_makes_the_same_bytes(runner, scene, tmp_path, preset):
-    settings = Settings.from_preset(preset)
-    events = []
+    settings, stages = Settings.from_preset(preset), set()
+
+    def progress(stage, fraction, note=""):
+        stages.add(stage)
+
     here = compress_streamed(scene, tmp_path / "here" / "lod-meta.json", settings)
-    there = compress_streamed(
-        scene,
-        tmp_path / "there" / "lod-meta.json",
-        settings,
-        runner=runner,
-        progress=lambda *event: events.append(event),
-    )
+    there = compress_streamed(scene, tmp_path / "there" / "lod-meta.json", settings, runner=runner, progress=progress)
     assert there == here
     assert contents(tmp_path / "there") == contents(tmp_path / "here")
     assert {"merge", "images"} <= stages
