@@ -158,7 +158,7 @@ class ClusterCompression:
         resources = Resources(requested.cpus, memory, requested.gpus)
 
         def progress(stage: str, fraction: float, note: str = "") -> None:
-            ended = sum(isinstance(each, KissgsError) or each.outcome.done() for each in self._handles.values())
+            ended = sum(isinstance(each, KissgsError) or each.outcome.done() for each in list(self._handles.values()))
             details = "; ".join(
                 filter(None, [f"{ended} of {len(self._handles)} scenes; {Path(name).name}: {stage}", note])
             )

@@ -48,15 +48,17 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class JobRunner:
-    """The runner of all jobs, and what each of them requests.
+    """The runners of all jobs, and what each of them requests.
 
     Attributes:
         settings: settings of the service.
-        runner: runner that starts everything at once, as far as the machines allow: the service counts its jobs.
+        runner: runner of compressions; it starts all at once, as far as the machines allow: the service counts its jobs.
+        local: runner of decoding, which is quick: a request that waits for it does not wait for jobs of a cluster.
     """
 
     settings: ServiceSettings
     runner: Runner
+    local: Runner
 
     @classmethod
     def open(cls, settings: ServiceSettings) -> JobRunner:
@@ -65,7 +67,10 @@ class JobRunner:
         Raises:
             kissgs.RunnerError: Ray is not installed or its cluster cannot be reached.
         """
-        return cls(settings, runners.open_runner(settings.runner, settings.ray_address, unlimited=True))
+        local = runners.open_runner("local", unlimited=True)
+        if settings.runner == "local":
+            return cls(settings, local, local)
+        return cls(settings, runners.open_runner("ray", settings.ray_address), local)
 
     def process(self) -> JobProcess:
         """Return a process for one task."""
@@ -78,6 +83,11 @@ class JobRunner:
     def close(self) -> None:
         """End all jobs and release everything."""
         self.runner.close()
+        self.local.close()
+
+    def runner_of(self, task: dict[str, Any]) -> Runner:
+        """Return the runner of a task."""
+        return self.local if task["kind"] == "decode" else self.runner
 
     def request(self, *, trains: bool = False) -> Resources:
         """Return what a job requests: on a cluster, by default all processors of its smallest node."""
@@ -93,7 +103,7 @@ class JobRunner:
         It is not started again when its node is lost: the database counts the starts of jobs.
         """
         requested = self.request(trains=_trains(task))
-        threads = self.settings.job_threads if self.settings.runner == "local" else int(requested.cpus)
+        threads = self.settings.job_threads if self.runner_of(task) is self.local else int(requested.cpus)
         return WorkItem(
             f"{__package__}.job_process:{task['kind']}",
             {**task, "threads": threads, "device": "cuda" if requested.gpus else "cpu"},
@@ -116,6 +126,7 @@ class JobProcess:
     def __init__(self, runner: JobRunner) -> None:
         self._runner = runner
         self._handle: RunHandle | None = None
+        self._used = runner.local
         self._killed = False
         self.ended = asyncio.Event()
 
@@ -123,7 +134,7 @@ class JobProcess:
         """Kill the process now, or as soon as it has started."""
         self._killed = True
         if self._handle is not None:
-            self._runner.runner.cancel(self._handle.id)
+            self._used.cancel(self._handle.id)
 
     async def run(self, task: dict[str, Any], on_progress: OnProgress) -> Outcome:
         """Run a task (see :mod:`service.jobs.job_process`) and return its outcome.
@@ -133,12 +144,17 @@ class JobProcess:
         if self._killed:
             self.ended.set()
             return Outcome("stopped")
+        item, self._used = self._runner.item(task), self._runner.runner_of(task)
+        if item.resources.gpus and (refusal := self._used.refusal(item.resources)):
+            self.ended.set()
+            detail = f"training is not possible at the moment: {refusal}; try again later"
+            return Outcome("error", {"code": "unsupported", "detail": detail})
         loop, events = asyncio.get_running_loop(), asyncio.Queue[tuple[str, float, str] | None]()
 
         def receive(stage: str, fraction: float, note: str = "") -> None:
             loop.call_soon_threadsafe(events.put_nowait, (stage, fraction, note))
 
-        self._handle = self._runner.runner.submit(self._runner.item(task), receive)
+        self._handle = self._used.submit(item, receive)
         outcome = asyncio.wrap_future(self._handle.outcome)
         outcome.add_done_callback(lambda _: events.put_nowait(None))
         try:

@@ -176,6 +176,14 @@ def test_no_job_starts_without_a_node_that_is_large_enough(settings_of, whole_cl
         wait_until(lambda: f"no job is started: {expected}" in service.log.read_text())
 
 
+def test_training_without_the_gpu_that_it_requests_fails_and_does_not_wait(settings_of, tmp_path):
+    with Service(tmp_path / "data", **settings_of["ray"], KISSGS_JOB_GPUS=1) as service:
+        status = service.ended(service.submit(SMALL, json.dumps({"preset": "fast", "finetune": {"enabled": True}})))
+        assert (status["state"], status["problem"]["code"]) == ("failed", "unsupported")
+        assert "no node has 1 CPUs and 1 GB of memory and 1 GPUs" in status["problem"]["detail"]
+        assert result_of(service, service.submit()) == compressed(SMALL)
+
+
 def test_a_cluster_that_cannot_be_reached_is_a_problem_of_the_settings(ray_cluster, tmp_path):
     variables = {"KISSGS_RUNNER": "ray", "KISSGS_RAY_ADDRESS": "127.0.0.1:1", "KISSGS_DATA_DIR": str(tmp_path / "data")}
     command = [sys.executable, "-P", "-m", "service"]
