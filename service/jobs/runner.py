@@ -52,8 +52,8 @@ class JobRunner:
 
     Attributes:
         settings: settings of the service.
-        runner: runner of compressions; it starts all at once, as far as the machines allow: the service counts its jobs.
-        local: runner of decoding, which is quick: a request that waits for it does not wait for jobs of a cluster.
+        runner: runner of compressions; it starts all at once where the machines allow: the service counts its jobs.
+        local: runner of decoding, which is quick and for which a request waits: no job of a cluster delays it.
     """
 
     settings: ServiceSettings

@@ -114,7 +114,7 @@ def test_a_node_is_killed_at_any_moment(cluster, scenes, tmp_path, moment):
     assert len(list((tmp_path / "out").iterdir())) == 2
 
 
-@pytest.mark.quick(1)
+@pytest.mark.quick(0)
 @pytest.mark.parametrize("moment", range(10))
 def test_the_command_is_killed_at_any_moment_and_repeated(cluster, scenes, tmp_path, moment):
     words = [KISSGS, "compress", scenes / "c.ply", "-p", "fast", "-o", tmp_path, "-q", "--ray", cluster.address]
