@@ -36,11 +36,12 @@ Blocks = Callable[[], Iterable[Splats]]
 CHUNK = 400_000
 """Largest number of Gaussians in a chunk, but for the scatter of estimated medians."""
 
-LEAF, MOST_LEAVES = 32_768, 1024
-"""Largest number of Gaussians in a leaf; and of leaves, so that large scenes have larger leaves."""
+LEAF, MOST_LEAVES = 32_768, 512
+"""Largest number of Gaussians in a leaf; and about that of leaves, so that large scenes have larger leaves. The manifest
+has to stay below some hundred kilobytes."""
 
-COARSEST = 70_000
-"""Largest number of Gaussians in the coarsest level."""
+COARSEST = 50_000
+"""Largest number of Gaussians in the coarsest level, which with the manifest makes a viewer's first image."""
 
 CONTEXT = 280_000
 """Largest number of Gaussians of the level that stands for other chunks where sensitivity is measured."""

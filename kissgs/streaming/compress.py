@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from kissgs._version import __version__
-from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
+from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import BLOCK
 from kissgs.io.atomic import atomic_file, reason_of
@@ -22,7 +22,7 @@ from kissgs.sog.names import LOD_NAME
 from kissgs.streaming import build
 from kissgs.streaming.build import OUT, Blocks, Layout
 from kissgs.streaming.time_left import with_time_left
-from kissgs.streaming.work_folder import check_destination, check_space, claim, finish, needed_bytes, read_json
+from kissgs.streaming.work_folder import check_destination, check_space, claimed, finish, needed_bytes, read_json
 
 REPORT = "report.json"
 """File of the work folder: the report, once everything is made."""
@@ -80,21 +80,22 @@ def compress_streamed(
     Raises:
         InvalidSceneError: the scene cannot be read, or has no Gaussians.
         OutputError: the folder cannot be written, holds something else, the disk has too little room, or the work
-            folder belongs to other work.
+            folder belongs to other work or is in use.
         UnsupportedError: a setting does not fit.
     """
     folder = destination.parent
-    work = folder.with_name(f"{folder.name}.partial")
+    folder = folder if folder.name not in ("", "..") else folder.resolve()
+    work = folder.parent / f"{folder.name}.partial"
     _check_settings(settings)
     if not (work / REPORT).exists():
         check_destination(folder, overwrite)
-    claim(work, _identity(source, settings, reading))
-    if (found := read_json(work / REPORT)) is None:
-        layout = _partition(work, source, reading, settings.encode, threads, progress)
-        found = asdict(_make(work, layout, settings, threads, progress))
-        with atomic_file(work / REPORT) as done:
-            done.write(json.dumps(found).encode())
-    finish(work, folder)
+    with claimed(work, _identity(source, settings, reading)):
+        if (found := read_json(work / REPORT)) is None:
+            layout = _partition(work, source, reading, settings.encode, threads, progress)
+            found = asdict(_make(work, layout, settings, threads, progress))
+            with atomic_file(work / REPORT) as done:
+                done.write(json.dumps(found).encode())
+        finish(work, folder)
     return StreamedReport(**{**found, "counts": tuple(found["counts"]), "level_bytes": tuple(found["level_bytes"])})
 
 
@@ -144,13 +145,13 @@ def _identity(source: Path, settings: Settings, reading: ReadOptions) -> dict[st
     """Return what the work depends on.
 
     Raises:
-        OutputError: the source cannot be read.
+        InvalidSceneError: the source cannot be read.
     """
     try:
         status = source.stat()
         path = str(source.resolve())
     except OSError as error:
-        raise OutputError(f"cannot read {source}: {reason_of(error)}") from error
+        raise InvalidSceneError(f"cannot read {source}: {reason_of(error)}") from error
     return {
         "version": __version__,
         "source": path,

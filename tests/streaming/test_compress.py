@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -162,12 +163,61 @@ def test_splat_transform_reads_every_level(scene, tmp_path):
 
 
 def test_other_files_are_never_replaced(scene, tmp_path):
+    """Neither in another folder, nor beside the files of a streamed scene, nor in the work folder."""
     folder = tmp_path / "city"
     folder.mkdir()
     (folder / "mine.txt").write_text("mine")
     with pytest.raises(OutputError, match="holds other files"):
         compress_streamed(scene, folder / "lod-meta.json", FAST, overwrite=True)
-    assert (folder / "mine.txt").read_text() == "mine"
+    (folder / "mine.txt").unlink()
+    compress_streamed(scene, folder / "lod-meta.json", FAST)
+    (folder / "0_0" / "mine.txt").write_text("mine")
+    with pytest.raises(OutputError, match=r"holds other files \(0_0/mine\.txt\)"):
+        compress_streamed(scene, folder / "lod-meta.json", FAST, overwrite=True)
+    assert (folder / "0_0" / "mine.txt").read_text() == "mine"
+    (tmp_path / "town.partial").mkdir()
+    (tmp_path / "town.partial" / "mine.txt").write_text("mine")
+    with pytest.raises(OutputError, match=r"town\.partial holds other files"):
+        compress_streamed(scene, tmp_path / "town" / "lod-meta.json", FAST)
+    assert [path.name for path in (tmp_path / "town.partial").iterdir()] == ["mine.txt"]
+
+
+def test_a_streamed_scene_is_replaced_only_if_allowed(scene, tmp_path):
+    target = tmp_path / "city" / "lod-meta.json"
+    compress_streamed(scene, target, FAST)
+    with pytest.raises(OutputError, match="exists already"):
+        compress_streamed(scene, target, FAST)
+    other = Settings.from_preset("fast", sh0_step=0.1)
+    compress_streamed(scene, target, other, overwrite=True)
+    compress_streamed(scene, tmp_path / "new" / "lod-meta.json", other)
+    assert files_of(tmp_path / "city") == files_of(tmp_path / "new")
+
+
+@pytest.mark.parametrize("name", ["lod-meta.json", "inner/../lod-meta.json"])
+def test_the_current_folder_is_not_replaced(scene, tmp_path, monkeypatch, name):
+    (tmp_path / "here" / "inner").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "here")
+    with pytest.raises(OutputError, match="in a new folder"):
+        compress_streamed(scene, Path(name), FAST)
+    assert [path.name for path in tmp_path.iterdir()] == ["here"]
+
+
+def test_two_processes_do_not_work_in_one_folder(scene, tmp_path):
+    target = tmp_path / "city" / "lod-meta.json"
+
+    def again(stage, fraction, note=""):
+        if stage == "merge":
+            with pytest.raises(OutputError, match="another process works in"):
+                compress_streamed(scene, target, FAST)
+
+    compress_streamed(scene, target, FAST, progress=again)
+    assert len(kissgs.load(target)) > 0
+
+
+def test_a_missing_folder_above_is_named(scene, tmp_path):
+    with pytest.raises(OutputError, match=r"cannot make .*none"):
+        compress_streamed(scene, tmp_path / "none" / "city" / "lod-meta.json", FAST)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("changes", [{"target_size": "1MB"}, {"compact": {"ratio": 0.5}}, {"order": "plas"}])
