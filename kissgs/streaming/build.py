@@ -37,8 +37,8 @@ CHUNK = 400_000
 """Largest number of Gaussians in a chunk, but for the scatter of estimated medians."""
 
 LEAF, MOST_LEAVES = 32_768, 512
-"""Largest number of Gaussians in a leaf; and about that of leaves, so that large scenes have larger leaves. The manifest
-has to stay below some hundred kilobytes."""
+"""Largest number of Gaussians in a leaf; and about that of leaves, because the manifest takes up to 700 bytes for each:
+large scenes have larger leaves."""
 
 COARSEST = 50_000
 """Largest number of Gaussians in the coarsest level, which with the manifest makes a viewer's first image."""

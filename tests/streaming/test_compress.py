@@ -215,7 +215,7 @@ def test_two_processes_do_not_work_in_one_folder(scene, tmp_path):
 
 
 def test_a_missing_folder_above_is_named(scene, tmp_path):
-    with pytest.raises(OutputError, match=r"cannot make .*none"):
+    with pytest.raises(OutputError, match="there is no folder"):
         compress_streamed(scene, tmp_path / "none" / "city" / "lod-meta.json", FAST)
     assert list(tmp_path.iterdir()) == []
 

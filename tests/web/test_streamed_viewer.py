@@ -50,7 +50,7 @@ def test_each_level_is_drawn_whole(playcanvas, tmp_path, monkeypatch):
 
 
 def test_the_first_image_needs_less_than_a_megabyte(playcanvas, tmp_path):
-    """The manifest and the coarsest level show the whole scene, with the sizes that users get; finer levels are late."""
+    """Manifest and coarsest level show the whole scene, with the sizes that users get; finer levels are late."""
     viewer, site = playcanvas
     source, url = streamed(scattered(140_000, 3), tmp_path, site)
     site.late.update({path: 5.0 for path in site.files if "/city/2_0/" not in path and "/city/lod" not in path})
