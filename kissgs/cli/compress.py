@@ -144,7 +144,13 @@ def compress(
         sys.stderr.write(f"kissgs: --views has no effect: the preset {preset} renders no images; add --evaluate\n")
 
     if output is not None and output.name == LOD_NAME:
-        unused = {"--views": views, "--evaluate": evaluate, "--cache": cache, "--container": container}
+        unused = {
+            "--views": views,
+            "--evaluate": evaluate,
+            "--cache": cache,
+            "--container": container,
+            "--unpacked": unpacked,
+        }
         if wrong := next((name for name, value in unused.items() if value), None):
             raise UnsupportedError(f"levels of detail ({LOD_NAME}) are made without {wrong}")
         for_each_input(
@@ -197,7 +203,7 @@ def _streamed(
         def progress(stage: str, fraction: float, note: str = "") -> None:
             if stage == "scratch" and not quiet:
                 sys.stderr.write(f"kissgs: {note}\n")
-            if stage == "merge":  # what is interrupted earlier begins anew
+            if stage in ("merge", "cameras", "images"):  # what is interrupted earlier begins anew
                 say_when_interrupted("the same command goes on where it was")
             bar(stage, fraction, note)
 
@@ -205,7 +211,7 @@ def _streamed(
         from kissgs.streaming.compress import compress_streamed
 
         report = compress_streamed(
-            Path(scene), target, settings, reading=reading, overwrite=force, threads=threads, progress=progress
+            scene, target, settings=settings, reading=reading, overwrite=force, threads=threads, progress=progress
         )
     if not quiet:
         from kissgs.cli.tables import streamed_table

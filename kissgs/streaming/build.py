@@ -27,7 +27,7 @@ from kissgs.sogxt.container import write_container
 from kissgs.streaming.levels import chunk_levels, level_count
 from kissgs.streaming.manifest import Leaf, lod_meta
 from kissgs.streaming.partition import Cuts, chunk_depth, sampled_positions
-from kissgs.streaming.rows import append_rows, from_rows, read_rows, to_rows
+from kissgs.streaming.rows import append_rows, from_rows, read_rows, sync, to_rows, write_rows
 from kissgs.streaming.sensitivities import cameras_json, cameras_of, choose_cameras, measure_file
 
 Blocks = Callable[[], Iterable[Splats]]
@@ -145,8 +145,14 @@ def partition(work: Path, blocks: Blocks, count: int, settings: EncodeSettings, 
         leaf=max(LEAF, -(-total // MOST_LEAVES)),
         changed=dict(changed),
     )
-    _write_json(work / PARTITION, asdict(layout))
+    for chunk in layout.filled:
+        sync(_chunk_file(work, chunk))
     return layout
+
+
+def keep_layout(work: Path, layout: Layout) -> None:
+    """Write the layout, which marks the partition as done."""
+    _write_json(work / PARTITION, asdict(layout))
 
 
 def has_levels(work: Path, chunk: int) -> bool:
@@ -156,13 +162,10 @@ def has_levels(work: Path, chunk: int) -> bool:
 
 def make_levels(work: Path, layout: Layout, chunk: int, threads: int) -> None:
     """Merge a chunk into its levels, one file of rows each."""
-    made = chunk_levels(
-        from_rows(read_rows(_chunk_file(work, chunk), layout.sh_degree)), layout.levels, layout.leaf, threads
-    )
+    rows = read_rows(_chunk_file(work, chunk), layout.sh_degree, layout.counts[chunk])
+    made = chunk_levels(from_rows(rows), layout.levels, layout.leaf, threads)
     for level, splats in enumerate(made.levels):
-        path = _level_file(work, chunk, level)
-        path.unlink(missing_ok=True)
-        append_rows(path, to_rows(splats))
+        write_rows(_level_file(work, chunk, level), to_rows(splats))
     _write_json(
         _leaves_file(work, chunk), {"counts": made.counts, "bounds": made.bounds.tolist(), "errors": made.errors}
     )
@@ -217,7 +220,10 @@ def make_file(work: Path, layout: Layout, settings: EncodeSettings, level: int, 
 
 def _read_level(work: Path, layout: Layout, level: int, chunks: Sequence[int]) -> Splats:
     """Return the Gaussians of a level of some chunks."""
-    rows = [read_rows(_level_file(work, chunk, level), layout.sh_degree) for chunk in chunks]
+    rows = [
+        read_rows(_level_file(work, chunk, level), layout.sh_degree, sum(_leaves(work, chunk)["counts"][level]))
+        for chunk in chunks
+    ]
     return from_rows(np.concatenate(rows)) if rows else empty_splats(0, SH_REST_COUNTS[layout.sh_degree])
 
 

@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from kissgs._version import __version__
-from kissgs.core.errors import InvalidSceneError, UnsupportedError
+from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import BLOCK
 from kissgs.io.atomic import atomic_file, reason_of
 from kissgs.io.ply import read_ply_blocks, read_ply_info
 from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
-from kissgs.pipeline.scene_files import read_scene
+from kissgs.pipeline.scene_files import AnyPath, read_scene
 from kissgs.pipeline.scene_formats import recognise
-from kissgs.settings import EncodeSettings, Settings
+from kissgs.settings import Settings
 from kissgs.sog.names import LOD_NAME
 from kissgs.streaming import build
 from kissgs.streaming.build import OUT, Blocks, Layout
@@ -52,10 +52,10 @@ class StreamedReport:
 
 
 def compress_streamed(
-    source: Path,
-    destination: Path,
-    settings: Settings,
+    source: AnyPath,
+    destination: AnyPath,
     *,
+    settings: Settings | None = None,
     reading: ReadOptions = DEFAULT_READ_OPTIONS,
     overwrite: bool = False,
     threads: int = 0,
@@ -64,15 +64,15 @@ def compress_streamed(
     """Compress a scene into a folder with ``lod-meta.json``, chunks and levels of detail.
 
     A ``.ply`` is read in blocks; other formats are decoded whole. Intermediate results are in a folder beside the
-    destination that ends in ``.partial``; interrupted work goes on from there. It takes up to twice the bytes of the
-    scene as float32 numbers, and those of the result.
+    destination that ends in ``.partial``; interrupted work goes on from there. It takes up to about twice the
+    bytes of the scene as float32 numbers, and those of the result.
 
     Args:
         source: a scene of any format.
         destination: ``lod-meta.json`` in the folder to write.
-        settings: settings of the encoder, without goal, compaction and fine-tuning.
+        settings: settings of the encoder, without goal, compaction and fine-tuning; by default the preset "balanced".
         reading: options of reading.
-        overwrite: replace the folder if it holds a streamed scene.
+        overwrite: replace the folder if it holds a streamed scene and nothing else.
         threads: number of threads; 0 means one per processor. The bytes do not depend on it.
         progress: receives "scratch", whose note is the size of the work folder, and the stages "partition", "merge",
             "cameras" and "images" with the time left; raise :class:`kissgs.Cancelled` from it to stop.
@@ -83,19 +83,23 @@ def compress_streamed(
             folder belongs to other work or is in use.
         UnsupportedError: a setting does not fit.
     """
+    source, destination = Path(source), Path(destination)
+    settings = Settings() if settings is None else settings
+    if destination.name != LOD_NAME:
+        raise OutputError(f"{destination} is no name of a streamed scene; viewers look for {LOD_NAME} in a folder")
     folder = destination.parent
     folder = folder if folder.name not in ("", "..") else folder.resolve()
     work = folder.parent / f"{folder.name}.partial"
     _check_settings(settings)
-    if not (work / REPORT).exists():
-        check_destination(folder, overwrite)
+    if read_json(work / REPORT) is None:
+        check_destination(folder, source, overwrite=overwrite)
     with claimed(work, _identity(source, settings, reading)):
         if (found := read_json(work / REPORT)) is None:
-            layout = _partition(work, source, reading, settings.encode, threads, progress)
+            layout = _partition(work, source, settings, reading, threads, progress)
             found = asdict(_make(work, layout, settings, threads, progress))
             with atomic_file(work / REPORT) as done:
                 done.write(json.dumps(found).encode())
-        finish(work, folder)
+        finish(work, folder, source, overwrite=overwrite)
     return StreamedReport(**{**found, "counts": tuple(found["counts"]), "level_bytes": tuple(found["level_bytes"])})
 
 
@@ -163,7 +167,7 @@ def _identity(source: Path, settings: Settings, reading: ReadOptions) -> dict[st
 
 
 def _partition(
-    work: Path, source: Path, reading: ReadOptions, encode: EncodeSettings, threads: int, progress: Progress
+    work: Path, source: Path, settings: Settings, reading: ReadOptions, threads: int, progress: Progress
 ) -> Layout:
     """Partition the scene, unless that has been done."""
     found = read_json(work / build.PARTITION)
@@ -171,15 +175,20 @@ def _partition(
         layout = Layout(**{**found, "counts": tuple(found["counts"])})
         _announce(work, layout.source_count, layout.sh_degree, progress)
         return layout
+    encode, before = settings.encode, _identity(source, settings, reading)
     try:
+        (work / OUT).mkdir(exist_ok=True)
         blocks, count, sh_degree = _reader(source, reading, threads)
         _announce(work, count, sh_degree, progress)
         layout = build.partition(work, blocks, count, encode, with_time_left(progress, encode.rate_distortion))
         if not any(layout.counts):
             raise InvalidSceneError(f"{source} has no Gaussian that is finite and visible; there is nothing to write")
+        if _identity(source, settings, reading) != before:
+            raise InvalidSceneError(f"{source} was changed while it was read; run the same command again")
     except BaseException:
         shutil.rmtree(work, ignore_errors=True)  # a partition that is not complete is of no use
         raise
+    build.keep_layout(work, layout)
     return layout
 
 

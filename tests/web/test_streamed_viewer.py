@@ -25,7 +25,7 @@ def playcanvas():
 def streamed(scene, folder, site):
     """Compress a scene, and return its folder and its address on the site."""
     kissgs.save(scene, folder / "scene.ply")
-    compress_streamed(folder / "scene.ply", folder / "city" / "lod-meta.json", Settings.from_preset("fast"))
+    compress_streamed(folder / "scene.ply", folder / "city" / "lod-meta.json", settings=Settings.from_preset("fast"))
     files = {str(path.relative_to(folder)): path.read_bytes() for path in (folder / "city").rglob("*.*")}
     return folder / "city" / "lod-meta.json", site.put(folder.name, files) + "city/lod-meta.json"
 
