@@ -117,7 +117,7 @@ def compress(
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Compress each scene into a SOG-XT container, or into SOG."""
+    """Compress each scene into a SOG-XT container, into SOG, or into streamed SOG."""
     from kissgs.io.container_names import ending_of, named_container
     from kissgs.pipeline.pipeline import compress as run
     from kissgs.pipeline.read_options import ReadOptions
