@@ -30,7 +30,7 @@ CAMERAS = WeightedCameras([seen_from((0, 0, -6)), seen_from((5, 1, 3))], [1.0, 1
 
 
 def test_a_file_has_the_sensitivity_that_its_gaussians_have_in_the_scene():
-    """With the Gaussians of the other files as they are, and without a prior, it is the same but for rounding."""
+    """The other files are given as they are, and there is no prior, so that only rounding differs."""
     own, others = blobs(40, seed=1), blobs(30, seed=2)
     expected = measure_sensitivity(concatenate([own, others]), CAMERAS)
     found = measure_file(own, others, CAMERAS, 0, PLAIN, 1)
