@@ -49,6 +49,9 @@ CONTEXT = 280_000
 COARSER_DB = 6.0
 """Decibels by which coarser levels are encoded less accurately, with rate-distortion planning."""
 
+COARSER_STEPS = 1.5
+"""Steps of coarser levels of SH degree 0 in units of the finest level's, without rate-distortion planning."""
+
 PARTITION, CAMERAS, OUT = "partition.json", "cameras.json", "out"
 """Names in the work folder: the marker of the partition, the cameras, and the folder of the result."""
 
@@ -196,7 +199,7 @@ def make_file(work: Path, layout: Layout, settings: EncodeSettings, level: int, 
     splats = _read_level(work, layout, level, members)
     counts = [count for chunk in members for count in _leaves(work, chunk)["counts"][level]]
     groups = np.repeat(np.arange(len(counts)), counts).astype(np.uint16)
-    settings = file_settings(settings, level)
+    settings = file_settings(settings, level, layout.sh_degree)
     stored = [0] * len(counts)
     if len(visible_gaussians(splats, settings)):  # merging may have made all of them invisible
         sensitivity = None
@@ -227,24 +230,26 @@ def _read_level(work: Path, layout: Layout, level: int, chunks: Sequence[int]) -
     return from_rows(np.concatenate(rows)) if rows else empty_splats(0, SH_REST_COUNTS[layout.sh_degree])
 
 
-def file_settings(settings: EncodeSettings, level: int) -> EncodeSettings:
+def file_settings(settings: EncodeSettings, level: int, sh_degree: int) -> EncodeSettings:
     """Return the settings of the files of a level.
 
     There is one class of steps: within each leaf, classes would have an order of their own, which costs 5 % of the
     bytes. Coarser levels are encoded less accurately, because the error of merging is larger than that of the finest
-    level's encoding; docs/method/streaming.md has what it saves and costs.
+    level's encoding; where there is no codebook that could be smaller, the steps are larger. docs/method/streaming.md
+    has what it saves and costs.
     """
     settings = settings.model_copy(update={"step_classes": 1})
     if level == 0:
         return settings
     if settings.rate_distortion:
         return settings.model_copy(update={"quality_offset_db": settings.quality_offset_db - COARSER_DB})
-    return settings.model_copy(
-        update={
-            "gaussians_per_codebook_entry": min(4096.0, 2 * settings.gaussians_per_codebook_entry),
-            "means_tolerance": min(1.0, 2 * settings.means_tolerance),
-        }
-    )
+    changes = {"means_tolerance": min(1.0, 2 * settings.means_tolerance)}
+    if sh_degree > 0:
+        changes["gaussians_per_codebook_entry"] = min(4096.0, 2 * settings.gaussians_per_codebook_entry)
+    else:
+        steps = ("opacity_step", "scale_step", "quat_step", "sh0_step")
+        changes |= {name: COARSER_STEPS * getattr(settings, name) for name in steps}
+    return settings.model_copy(update=changes)
 
 
 def make_manifest(work: Path, layout: Layout) -> None:
