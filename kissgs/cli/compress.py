@@ -120,7 +120,7 @@ def compress(
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Compress each scene into a SOG-XT container, or into SOG."""
+    """Compress each scene into a SOG-XT container, into SOG, or into streamed SOG."""
     from kissgs.io.container_names import ending_of, named_container
     from kissgs.pipeline.pipeline import compress as run
     from kissgs.pipeline.read_options import ReadOptions
@@ -147,7 +147,13 @@ def compress(
         sys.stderr.write(f"kissgs: --views has no effect: the preset {preset} renders no images; add --evaluate\n")
 
     if output is not None and output.name == LOD_NAME:
-        unused = {"--views": views, "--evaluate": evaluate, "--cache": cache, "--container": container}
+        unused = {
+            "--views": views,
+            "--evaluate": evaluate,
+            "--cache": cache,
+            "--container": container,
+            "--unpacked": unpacked,
+        }
         if wrong := next((name for name, value in unused.items() if value), None):
             raise UnsupportedError(f"levels of detail ({LOD_NAME}) are made without {wrong}")
         for_each_input(
@@ -232,7 +238,7 @@ def _streamed(
         def progress(stage: str, fraction: float, note: str = "") -> None:
             if stage == "scratch" and not quiet:
                 sys.stderr.write(f"kissgs: {note}\n")
-            if stage == "merge":  # what is interrupted earlier begins anew
+            if stage in ("merge", "cameras", "images"):  # what is interrupted earlier begins anew
                 say_when_interrupted("the same command goes on where it was")
             bar(stage, fraction, note)
 
@@ -247,9 +253,9 @@ def _streamed(
             runner = open_runner("ray", ray)
             ending.callback(runner.close)
         report = compress_streamed(
-            Path(scene),
+            scene,
             target,
-            settings,
+            settings=settings,
             reading=reading,
             overwrite=force,
             runner=runner,

@@ -39,6 +39,10 @@ def evaluate(
     resolution: ResolutionOption = None,
     split: SplitOption = "test",
     seed: Annotated[int, typer.Option(min=0, help="Seed of the virtual cameras.")] = 0,
+    distance: Annotated[
+        float,
+        typer.Option(metavar="FACTOR", help="Move the virtual cameras to this many times their distance, such as 4."),
+    ] = 1.0,
     lpips: Annotated[
         bool, typer.Option("--lpips", help="Also measure LPIPS; needs the extra kissgs\\[lpips].")
     ] = False,
@@ -80,6 +84,7 @@ def evaluate(
             capture,
             split=used_split,
             seed=seed,
+            distance=distance,
             lpips=lpips,
             device=render_device,
             threads=threads,

@@ -7,7 +7,8 @@ instead of optimised, and every Gaussian that can be visible may become a target
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -115,6 +116,28 @@ def evaluation_views(
         for n, one in enumerate(added, count)
     ]
     return Views((), tuple(views), _grey(0.5), f"drawn over the whole scene, seed {seed}")
+
+
+def farther(views: Views, distance: float) -> Views:
+    """Return drawn views with their cameras at ``distance`` times the distance from the points that they look at.
+
+    Raises:
+        InvalidViewsError: the distance is not positive and finite.
+    """
+    if not 0 < distance < math.inf:
+        raise InvalidViewsError(f"a distance of {distance} times that of the cameras is none; give a number above 0")
+    if distance == 1:
+        return views
+    source = f"{views.source}, at {distance:g} times the distance"
+    return replace(views, test=tuple(_farther(view, distance) for view in views.test), source=source)
+
+
+def _farther(view: View, distance: float) -> View:
+    assert view.target is not None  # noqa: S101  every drawn view has one
+    viewmat = view.camera.viewmat.copy()
+    # A point x has camera coordinates R x + t; the target's are in front of the camera, and scale with the distance.
+    viewmat[:3, 3] += (distance - 1) * (viewmat[:3, :3] @ view.target + viewmat[:3, 3])
+    return replace(view, camera=replace(view.camera, viewmat=viewmat))
 
 
 def _draw_poses(

@@ -17,7 +17,7 @@ from kissgs.core.array_types import Float32, Shaped
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats, clean
-from kissgs.evaluation.cameras import evaluation_views
+from kissgs.evaluation.cameras import evaluation_views, farther
 from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, Split, ViewComparison
 from kissgs.evaluation.visibility import share_shown
 from kissgs.rendering.camera import Camera
@@ -42,6 +42,7 @@ def evaluate(
     *,
     split: Split = "test",
     seed: int = 0,
+    distance: float = 1.0,
     lpips: bool = False,
     device: Device = "cpu",
     threads: int = 0,
@@ -60,20 +61,23 @@ def evaluate(
         views: views of a capture. Without photographs, the candidate is compared only with renderings of the reference.
         split: which of the views to use. If "test" is empty, "train" is used; see :attr:`Evaluation.split`.
         seed: seed of the drawn cameras.
+        distance: distance of the drawn cameras from what they look at, in units of that where they were drawn; a
+            coarse level of detail is meant for larger ones.
         lpips: compute LPIPS too; needs the extra ``kissgs[lpips]``.
         device: ``"cuda"`` needs the extra ``kissgs[cuda]``.
         threads: number of threads; 0 means one per processor. The results do not depend on it.
         progress: receives the stages ``"kernels"``, ``"cameras"`` (drawing them) and ``"evaluate"``.
 
     Raises:
-        InvalidViewsError: the split is empty, only some of its views have a photograph, or one cannot be read.
+        InvalidViewsError: the distance is not positive, the split is empty, only some of its views have a photograph,
+            or one cannot be read.
         UnsupportedError: an image would take too much memory, CUDA or LPIPS is missing, or the split is unknown.
     """
     reference, candidate = clean(reference)[0], clean(candidate)[0]
     measure = _measure(lpips, device)
     given = [] if views is None else [_select_split(views, split)]
     load_kernels(progress)
-    drawn = evaluation_views(reference, seed=seed, threads=threads, progress=progress)
+    drawn = farther(evaluation_views(reference, seed=seed, threads=threads, progress=progress), distance)
     groups = [*given, _select_split(drawn, "all")]
     total, done, evaluations = sum(len(group.views) for group in groups), 0, list[Evaluation]()
     for group in groups:

@@ -19,6 +19,9 @@ from kissgs.settings import EncodeSettings
 INVISIBLE_LOGIT = -5.5373
 """Logit of opacity 1/255, rounded up; no renderer draws Gaussians of this opacity or less."""
 
+MAX_GROUPS = 1 << 14
+"""Largest number of groups of Gaussians in a container: group and class of steps together are a number of 16 bits."""
+
 
 def plan_encoding(
     splats: Splats,
@@ -54,6 +57,8 @@ def plan_encoding(
     """
     if groups is not None and settings.order != "hilbert":
         raise UnsupportedError("a container with groups of Gaussians needs order=hilbert")
+    if groups is not None and int(groups.max(initial=0)) >= MAX_GROUPS:
+        raise UnsupportedError(f"a container holds up to {MAX_GROUPS:,} groups of Gaussians; make them larger")
     if sensitivity is not None:
         sensitivity.check(splats)
     load_kernels(progress)

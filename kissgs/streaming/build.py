@@ -27,7 +27,7 @@ from kissgs.sogxt.container import write_container
 from kissgs.streaming.levels import chunk_levels, level_count
 from kissgs.streaming.manifest import Leaf, lod_meta
 from kissgs.streaming.partition import Cuts, chunk_depth, sampled_positions
-from kissgs.streaming.rows import append_rows, from_rows, read_rows, to_rows, write_rows
+from kissgs.streaming.rows import append_rows, from_rows, read_rows, sync, to_rows, write_rows
 from kissgs.streaming.sensitivities import cameras_json, cameras_of, choose_cameras, measure_file
 
 Blocks = Callable[[], Iterable[Splats]]
@@ -36,17 +36,21 @@ Blocks = Callable[[], Iterable[Splats]]
 CHUNK = 400_000
 """Largest number of Gaussians in a chunk, but for the scatter of estimated medians."""
 
-LEAF, MOST_LEAVES = 32_768, 1024
-"""Largest number of Gaussians in a leaf; and of leaves, so that large scenes have larger leaves."""
+LEAF, MOST_LEAVES = 32_768, 512
+"""Largest number of Gaussians in a leaf; and about that of leaves, because the manifest takes up to 700 bytes for each:
+large scenes have larger leaves."""
 
-COARSEST = 70_000
-"""Largest number of Gaussians in the coarsest level."""
+COARSEST = 50_000
+"""Largest number of Gaussians in the coarsest level, which with the manifest makes a viewer's first image."""
 
 CONTEXT = 280_000
 """Largest number of Gaussians of the level that stands for other chunks where sensitivity is measured."""
 
 COARSER_DB = 6.0
 """Decibels by which coarser levels are encoded less accurately, with rate-distortion planning."""
+
+COARSER_STEPS = 1.5
+"""Steps of coarser levels of SH degree 0 in units of the finest level's, without rate-distortion planning."""
 
 PARTITION, CAMERAS, OUT = "partition.json", "cameras.json", "out"
 """Names in the work folder: the marker of the partition, the cameras, and the folder of the result."""
@@ -150,8 +154,14 @@ def partition(work: Path, blocks: Blocks, count: int, settings: EncodeSettings, 
         leaf=max(LEAF, -(-total // MOST_LEAVES)),
         changed=dict(changed),
     )
-    _write_json(work / PARTITION, asdict(layout))
+    for chunk in layout.filled:
+        sync(_chunk_file(work, chunk))
     return layout
+
+
+def keep_layout(work: Path, layout: Layout) -> None:
+    """Write the layout, which marks the partition as done."""
+    _write_json(work / PARTITION, asdict(layout))
 
 
 def has_levels(work: Path, chunk: int) -> bool:
@@ -161,9 +171,8 @@ def has_levels(work: Path, chunk: int) -> bool:
 
 def make_levels(work: Path, layout: Layout, chunk: int, threads: int) -> None:
     """Merge a chunk into its levels, one file of rows each."""
-    made = chunk_levels(
-        from_rows(read_rows(_chunk_file(work, chunk), layout.sh_degree)), layout.levels, layout.leaf, threads
-    )
+    rows = read_rows(_chunk_file(work, chunk), layout.sh_degree, layout.counts[chunk])
+    made = chunk_levels(from_rows(rows), layout.levels, layout.leaf, threads)
     for level, splats in enumerate(made.levels):
         write_rows(_level_file(work, chunk, level), to_rows(splats))
     _write_json(
@@ -196,7 +205,7 @@ def make_file(work: Path, layout: Layout, settings: EncodeSettings, level: int, 
     splats = _read_level(work, layout, level, members)
     counts = [count for chunk in members for count in _leaves(work, chunk)["counts"][level]]
     groups = np.repeat(np.arange(len(counts)), counts).astype(np.uint16)
-    settings = file_settings(settings, level)
+    settings = file_settings(settings, level, layout.sh_degree)
     stored = [0] * len(counts)
     if len(visible_gaussians(splats, settings)):  # merging may have made all of them invisible
         sensitivity = None
@@ -220,28 +229,33 @@ def make_file(work: Path, layout: Layout, settings: EncodeSettings, level: int, 
 
 def _read_level(work: Path, layout: Layout, level: int, chunks: Sequence[int]) -> Splats:
     """Return the Gaussians of a level of some chunks."""
-    rows = [read_rows(_level_file(work, chunk, level), layout.sh_degree) for chunk in chunks]
+    rows = [
+        read_rows(_level_file(work, chunk, level), layout.sh_degree, sum(_leaves(work, chunk)["counts"][level]))
+        for chunk in chunks
+    ]
     return from_rows(np.concatenate(rows)) if rows else empty_splats(0, SH_REST_COUNTS[layout.sh_degree])
 
 
-def file_settings(settings: EncodeSettings, level: int) -> EncodeSettings:
+def file_settings(settings: EncodeSettings, level: int, sh_degree: int) -> EncodeSettings:
     """Return the settings of the files of a level.
 
     There is one class of steps: within each leaf, classes would have an order of their own, which costs 5 % of the
     bytes. Coarser levels are encoded less accurately, because the error of merging is larger than that of the finest
-    level's encoding; docs/method/streaming.md has what it saves and costs.
+    level's encoding; where there is no codebook that could be smaller, the steps are larger. docs/method/streaming.md
+    has what it saves and costs.
     """
     settings = settings.model_copy(update={"step_classes": 1})
     if level == 0:
         return settings
     if settings.rate_distortion:
         return settings.model_copy(update={"quality_offset_db": settings.quality_offset_db - COARSER_DB})
-    return settings.model_copy(
-        update={
-            "gaussians_per_codebook_entry": min(4096.0, 2 * settings.gaussians_per_codebook_entry),
-            "means_tolerance": min(1.0, 2 * settings.means_tolerance),
-        }
-    )
+    changes = {"means_tolerance": min(1.0, 2 * settings.means_tolerance)}
+    if sh_degree > 0:
+        changes["gaussians_per_codebook_entry"] = min(4096.0, 2 * settings.gaussians_per_codebook_entry)
+    else:
+        steps = ("opacity_step", "scale_step", "quat_step", "sh0_step")
+        changes |= {name: COARSER_STEPS * getattr(settings, name) for name in steps}
+    return settings.model_copy(update=changes)
 
 
 def make_manifest(work: Path, layout: Layout) -> None:

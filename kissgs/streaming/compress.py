@@ -16,16 +16,16 @@ from kissgs.core.splats import BLOCK
 from kissgs.io.atomic import atomic_file, reason_of
 from kissgs.io.ply import read_ply_blocks, read_ply_info
 from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
-from kissgs.pipeline.scene_files import read_scene
+from kissgs.pipeline.scene_files import AnyPath, read_scene
 from kissgs.pipeline.scene_formats import recognise
 from kissgs.runners import Runner
-from kissgs.settings import EncodeSettings, Settings
+from kissgs.settings import Settings
 from kissgs.sog.names import LOD_NAME
 from kissgs.streaming import build
 from kissgs.streaming.build import OUT, Blocks, Layout
 from kissgs.streaming.items import run_all, run_file, run_levels
 from kissgs.streaming.time_left import with_time_left
-from kissgs.streaming.work_folder import check_destination, check_space, claim, finish, needed_bytes, read_json
+from kissgs.streaming.work_folder import check_destination, check_space, claimed, finish, needed_bytes, read_json
 
 REPORT = "report.json"
 """File of the work folder: the report, once everything is made."""
@@ -55,10 +55,10 @@ class StreamedReport:
 
 
 def compress_streamed(
-    source: Path,
-    destination: Path,
-    settings: Settings,
+    source: AnyPath,
+    destination: AnyPath,
     *,
+    settings: Settings | None = None,
     reading: ReadOptions = DEFAULT_READ_OPTIONS,
     overwrite: bool = False,
     runner: Runner | None = None,
@@ -68,15 +68,15 @@ def compress_streamed(
     """Compress a scene into a folder with ``lod-meta.json``, chunks and levels of detail.
 
     A ``.ply`` is read in blocks; other formats are decoded whole. Intermediate results are in a folder beside the
-    destination that ends in ``.partial``; interrupted work goes on from there. It takes up to twice the bytes of the
-    scene as float32 numbers, and those of the result.
+    destination that ends in ``.partial``; interrupted work goes on from there. It takes up to about twice the
+    bytes of the scene as float32 numbers, and those of the result.
 
     Args:
         source: a scene of any format.
         destination: ``lod-meta.json`` in the folder to write.
-        settings: settings of the encoder, without goal, compaction and fine-tuning.
+        settings: settings of the encoder, without goal, compaction and fine-tuning; by default the preset "balanced".
         reading: options of reading.
-        overwrite: replace the folder if it holds a streamed scene.
+        overwrite: replace the folder if it holds a streamed scene and nothing else.
         runner: engine for chunks and files, on machines that all see the folder; None to make one after another here.
             The bytes do not depend on it.
         threads: number of threads; 0 means one per processor, and one for each item of a runner. The bytes do not
@@ -87,21 +87,26 @@ def compress_streamed(
     Raises:
         InvalidSceneError: the scene cannot be read, or has no Gaussians.
         OutputError: the folder cannot be written, holds something else, the disk has too little room, or the work
-            folder belongs to other work.
+            folder belongs to other work or is in use.
         UnsupportedError: a setting does not fit.
     """
+    source, destination = Path(source), Path(destination)
+    settings = Settings() if settings is None else settings
+    if destination.name != LOD_NAME:
+        raise OutputError(f"{destination} is no name of a streamed scene; viewers look for {LOD_NAME} in a folder")
     folder = destination.parent
-    work = folder.with_name(f"{folder.name}.partial")
+    folder = folder if folder.name not in ("", "..") else folder.resolve()
+    work = folder.parent / f"{folder.name}.partial"
     _check_settings(settings)
-    if not (work / REPORT).exists():
-        check_destination(folder, overwrite)
-    claim(work, _identity(source, settings, reading))
-    if (found := read_json(work / REPORT)) is None:
-        layout = _partition(work, source, reading, settings.encode, threads, progress)
-        found = asdict(_make(work, layout, settings, runner, threads, progress))
-        with atomic_file(work / REPORT) as done:
-            done.write(json.dumps(found).encode())
-    finish(work, folder)
+    if read_json(work / REPORT) is None:
+        check_destination(folder, source, overwrite=overwrite)
+    with claimed(work, _identity(source, settings, reading)):
+        if (found := read_json(work / REPORT)) is None:
+            layout = _partition(work, source, settings, reading, threads, progress)
+            found = asdict(_make(work, layout, settings, runner, threads, progress))
+            with atomic_file(work / REPORT) as done:
+                done.write(json.dumps(found).encode())
+        finish(work, folder, source, overwrite=overwrite)
     return StreamedReport(**{**found, "counts": tuple(found["counts"]), "level_bytes": tuple(found["level_bytes"])})
 
 
@@ -165,13 +170,13 @@ def _identity(source: Path, settings: Settings, reading: ReadOptions) -> dict[st
     """Return what the work depends on.
 
     Raises:
-        OutputError: the source cannot be read.
+        InvalidSceneError: the source cannot be read.
     """
     try:
         status = source.stat()
         path = str(source.resolve())
     except OSError as error:
-        raise OutputError(f"cannot read {source}: {reason_of(error)}") from error
+        raise InvalidSceneError(f"cannot read {source}: {reason_of(error)}") from error
     return {
         "version": __version__,
         "source": path,
@@ -183,22 +188,27 @@ def _identity(source: Path, settings: Settings, reading: ReadOptions) -> dict[st
 
 
 def _partition(
-    work: Path, source: Path, reading: ReadOptions, encode: EncodeSettings, threads: int, progress: Progress
+    work: Path, source: Path, settings: Settings, reading: ReadOptions, threads: int, progress: Progress
 ) -> Layout:
     """Partition the scene, unless that has been done."""
     if read_json(work / build.PARTITION) is not None:
         layout = build.read_layout(work)
         _announce(work, layout.source_count, layout.sh_degree, progress)
         return layout
+    encode, before = settings.encode, _identity(source, settings, reading)
     try:
+        (work / OUT).mkdir(exist_ok=True)
         blocks, count, sh_degree = _reader(source, reading, threads)
         _announce(work, count, sh_degree, progress)
         layout = build.partition(work, blocks, count, encode, with_time_left(progress, encode.rate_distortion))
         if not any(layout.counts):
             raise InvalidSceneError(f"{source} has no Gaussian that is finite and visible; there is nothing to write")
+        if _identity(source, settings, reading) != before:
+            raise InvalidSceneError(f"{source} was changed while it was read; run the same command again")
     except BaseException:
         shutil.rmtree(work, ignore_errors=True)  # a partition that is not complete is of no use
         raise
+    build.keep_layout(work, layout)
     return layout
 
 

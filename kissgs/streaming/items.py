@@ -12,7 +12,7 @@ from concurrent.futures import FIRST_COMPLETED, wait
 from pathlib import Path
 from typing import Any
 
-from kissgs.core.errors import UnsupportedError
+from kissgs.core.errors import OutputError, UnsupportedError
 from kissgs.core.progress import Progress
 from kissgs.runners import Resources, Runner, WorkItem, error_of
 from kissgs.settings import EncodeSettings
@@ -33,18 +33,38 @@ POLL_SECONDS = 0.5
 def run_levels(arguments: dict[str, Any], progress: Progress) -> dict[str, Any]:
     """Make the levels of a chunk: "work", the work folder; "chunk"; "threads"."""
     work = _shared(arguments)
-    if not build.has_levels(work, arguments["chunk"]):
-        build.make_levels(work, build.read_layout(work), arguments["chunk"], arguments["threads"])
+    chunk = arguments["chunk"]
+    _make_once(
+        lambda: build.has_levels(work, chunk),
+        lambda: build.make_levels(work, build.read_layout(work), chunk, arguments["threads"]),
+    )
     return {}
 
 
 def run_file(arguments: dict[str, Any], progress: Progress) -> dict[str, Any]:
     """Encode a file: "work", the work folder; "level" and "file"; "settings" of the encoder; "threads"."""
     work, level, file = _shared(arguments), arguments["level"], arguments["file"]
-    if not build.has_file(work, level, file):
-        settings = EncodeSettings.model_validate(arguments["settings"])
-        build.make_file(work, build.read_layout(work), settings, level, file, arguments["threads"])
+    settings = EncodeSettings.model_validate(arguments["settings"])
+    _make_once(
+        lambda: build.has_file(work, level, file),
+        lambda: build.make_file(work, build.read_layout(work), settings, level, file, arguments["threads"]),
+    )
     return {}
+
+
+def _make_once(done: Callable[[], bool], make: Callable[[], None]) -> None:
+    """Make something unless it is there.
+
+    A node that was given up may still be at work: what it completes meanwhile, it takes the input of, and this item is
+    done.
+    """
+    if done():
+        return
+    try:
+        make()
+    except OutputError:
+        if not done():
+            raise
 
 
 def run_all(

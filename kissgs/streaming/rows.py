@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +48,7 @@ def append_rows(path: Path, rows: Float32[np.ndarray, "N F"]) -> None:
 
 
 def write_rows(path: Path, rows: Float32[np.ndarray, "N F"]) -> None:
-    """Write rows to a file, atomically; an existing file is replaced.
+    """Write a file of rows, atomically; an existing file is replaced.
 
     Raises:
         OutputError: the file cannot be written.
@@ -56,15 +57,30 @@ def write_rows(path: Path, rows: Float32[np.ndarray, "N F"]) -> None:
         file.write(np.ascontiguousarray(rows).data)
 
 
-def read_rows(path: Path, sh_degree: int, first: int = 0, count: int = -1) -> Float32[np.ndarray, "N F"]:
-    """Read ``count`` rows from row ``first``; all that follow by default.
+def sync(path: Path) -> None:
+    """Wait until a file is on the disk.
 
     Raises:
-        OutputError: the file cannot be read.
+        OutputError: the file cannot be written.
     """
-    width = row_bytes(sh_degree) // 4
     try:
-        values = np.fromfile(path, np.float32, count if count < 0 else count * width, offset=first * width * 4)
+        with path.open("ab") as file:
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {reason_of(error)}") from error
+
+
+def read_rows(path: Path, sh_degree: int, count: int) -> Float32[np.ndarray, "N F"]:
+    """Read a file of ``count`` rows.
+
+    Raises:
+        OutputError: the file cannot be read, or has another size.
+    """
+    try:
+        values = np.fromfile(path, np.float32)
+        size = path.stat().st_size
     except OSError as error:
         raise OutputError(f"cannot read {path}: {reason_of(error)}") from error
-    return values.reshape(-1, width)
+    if size != count * row_bytes(sh_degree):
+        raise OutputError(f"{path} is not complete; delete {path.parent} and start again")
+    return values.reshape(count, row_bytes(sh_degree) // 4)

@@ -26,7 +26,8 @@ def with_time_left(progress: Progress, rate_distortion: bool) -> Progress:
 
     def receive(stage: str, fraction: float, note: str = "") -> None:
         now, done = time.monotonic(), before[stage] + fraction * shares[stage]
-        first.append((now, done)) if not first else None
+        if not first:
+            first.append((now, done))
         elapsed, gained = now - first[0][0], done - first[0][1]
         left = [f"{duration(elapsed * (1 - done) / gained)} left"] if gained > 0 and elapsed > LEAST_SECONDS else []
         progress(stage, fraction, ", ".join([*filter(None, [note]), *left]))

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from kissgs.core.errors import OutputError
 from kissgs.io.atomic import atomic_file, path_state, reason_of
+from kissgs.sog.encode import FILES
 from kissgs.sog.names import LOD_NAME
-from kissgs.streaming.build import OUT
+from kissgs.streaming.build import CHUNK, OUT
 from kissgs.streaming.rows import row_bytes
 
-WORK = "work.json"
-"""File that says which work the folder belongs to."""
+WORK, LOCK = "work.json", "lock"
+"""Files: which work the folder belongs to; locked by the process that works in it."""
+
+TEMPORARY = ".kissgs."
+"""Beginning of the names of files that are being written."""
 
 REPLACED = "replaced"
 """Folder for what the result replaces, until the result is in place."""
@@ -23,49 +29,104 @@ ENCODED_BYTES = 30
 """Upper estimate of the encoded bytes of a Gaussian with all its levels."""
 
 
-def check_destination(folder: Path, overwrite: bool) -> None:
+def check_destination(folder: Path, source: Path, *, overwrite: bool) -> None:
     """Refuse to replace anything but a streamed scene, and that only if allowed.
 
     Raises:
-        OutputError: the folder holds something else, or a scene that may not be replaced.
+        OutputError: the folder cannot be replaced, holds something else, or a scene that may not be replaced.
     """
     present, is_folder = path_state(folder)
-    if present and not is_folder:
-        raise OutputError(f"{folder} is a file; name {LOD_NAME} in a new folder")
-    if present and any(folder.iterdir()):
-        if not (folder / LOD_NAME).is_file():
-            raise OutputError(f"{folder} holds other files; name {LOD_NAME} in a new folder")
-        if not overwrite:
-            raise OutputError(f"{folder / LOD_NAME} exists already; choose another name or allow overwriting (--force)")
+    if not folder.name:
+        raise OutputError(f"{folder} cannot be replaced; name {LOD_NAME} in a new folder")
+    if not present:
+        return
+    if not is_folder or folder.is_symlink() or folder.is_mount():
+        raise OutputError(f"{folder} cannot be replaced as a whole; name {LOD_NAME} in a new folder")
+    for inside in (Path.cwd(), source.resolve()):
+        if inside.is_relative_to(folder.resolve()):
+            raise OutputError(f"{folder} would be replaced, but {inside} is in it; name {LOD_NAME} in a new folder")
+    ours = _paths_of(folder / LOD_NAME)
+    if strange := next((path for path in folder.iterdir() if path.relative_to(folder) not in ours), None):
+        raise OutputError(f"{folder} holds other files ({strange.name}); name {LOD_NAME} in a new folder")
+    found = {path.relative_to(folder) for path in folder.rglob("*")}
+    if found - ours:
+        raise OutputError(f"{folder} holds other files ({min(found - ours)}); name {LOD_NAME} in a new folder")
+    if found and not overwrite:
+        raise OutputError(f"{folder / LOD_NAME} exists already; choose another name or allow overwriting (--force)")
 
 
-def claim(work: Path, mine: dict[str, Any]) -> None:
-    """Make the work folder, or check that the one that is there belongs to the same work, and tidy it.
+def _paths_of(manifest: Path) -> set[Path]:
+    """Return the relative paths of all files and folders of a streamed SOG; none if there is no manifest."""
+    document = read_json(manifest)
+    if not isinstance(document, dict) or not isinstance(document.get("filenames"), list):
+        return set()
+    folders = [Path(str(name)).parent for name in document["filenames"]]
+    files = {folder / name for folder in folders for name in FILES}
+    return {Path(LOD_NAME), *files, *folders, *(above for folder in folders for above in folder.parents)}
+
+
+@contextlib.contextmanager
+def claimed(work: Path, mine: dict[str, Any]) -> Iterator[None]:
+    """Make the work folder, or check that the one that is there belongs to the same work; keep others out meanwhile.
 
     Args:
         work: the work folder.
         mine: JSON that identifies the work: its input, settings and version.
 
     Raises:
-        OutputError: it belongs to other work, or cannot be written.
+        OutputError: it belongs to other work, another process works in it, or it cannot be written.
     """
     try:
-        if work.exists():
-            if read_json(work / WORK) != mine:
-                raise OutputError(f"{work} belongs to other or older work; delete it, or choose another name")
-            for left in (*work.glob(".kissgs.*"), *(work / OUT).glob(".kissgs.*")):  # of a process that was killed
-                shutil.rmtree(left) if left.is_dir() else left.unlink()
-            return
-        (work / OUT).mkdir(parents=True)
+        if work.is_symlink():
+            raise OutputError(f"{work} is a link; delete it, or choose another name")
+        if work.exists() and not (work / WORK).exists() and _names(work) - {LOCK}:
+            raise OutputError(f"{work} holds other files; choose another name")
+        work.mkdir(exist_ok=True)
+        lock = (work / LOCK).open("ab")
+    except OSError as error:
+        raise OutputError(f"cannot make {work}: {reason_of(error)}") from error
+    with lock:
+        if not _locked(lock):
+            raise OutputError(f"another process works in {work}; wait for it, or choose another name")
+        _take_over(work, mine)
+        yield
+
+
+def _names(work: Path) -> set[str]:
+    return {path.name for path in work.iterdir() if not path.name.startswith(TEMPORARY)}
+
+
+def _take_over(work: Path, mine: dict[str, Any]) -> None:
+    """Check whose work a work folder holds, and remove what a killed process was writing."""
+    try:
+        if (work / WORK).exists() and read_json(work / WORK) != mine:
+            raise OutputError(f"{work} belongs to other or older work; delete it, or choose another name")
+        for left in (*work.glob(f"{TEMPORARY}*"), *(work / OUT).glob(f"{TEMPORARY}*"), _discarded(work)):
+            shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"cannot use {work}: {reason_of(error)}") from error
-    with atomic_file(work / WORK) as file:
+    with atomic_file(work / WORK, overwrite=True) as file:
         file.write(json.dumps(mine).encode())
 
 
+def _locked(lock: BinaryIO) -> bool:
+    """Lock a file until it is closed, or the process ends; return False if another process has locked it."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return True
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a network file system without locks
+        return True
+    return True
+
+
 def needed_bytes(count: int, sh_degree: int) -> int:
-    """Return the most bytes that the work folder takes: the Gaussians of all levels as float32, and the result."""
-    return count * (2 * row_bytes(sh_degree) + ENCODED_BYTES)
+    """Return the most bytes that the work folder takes: all levels as float32, a chunk once more, and the result."""
+    return (2 * count + min(count, CHUNK)) * row_bytes(sh_degree) + count * ENCODED_BYTES
 
 
 def check_space(work: Path, needed: int) -> None:
@@ -83,21 +144,34 @@ def check_space(work: Path, needed: int) -> None:
         )
 
 
-def finish(work: Path, folder: Path) -> None:
+def finish(work: Path, folder: Path, source: Path, *, overwrite: bool) -> None:
     """Move the result into place, and delete the work folder; may be repeated after an interruption anywhere.
 
+    What the result replaces is in the work folder until the result is in place. The work folder is renamed before it is
+    deleted: a part of it would look like other work.
+
     Raises:
-        OutputError: the result cannot be moved.
+        OutputError: the result cannot be moved, or somebody has put other files into the folder meanwhile.
     """
-    out, replaced = work / OUT, work / REPLACED
+    result = work / OUT
+    if (result / LOD_NAME).exists():
+        check_destination(folder, source, overwrite=overwrite)
+    elif not (folder / LOD_NAME).exists():
+        raise OutputError(f"{work} was complete, but its result is gone; delete it and start again")
     try:
-        if out.exists():
+        if (result / LOD_NAME).exists():
             if folder.exists():
-                folder.rename(replaced)
-            out.rename(folder)
-        shutil.rmtree(work)
+                folder.rename(work / REPLACED)
+            result.rename(folder)
+        work.rename(_discarded(work))
+        shutil.rmtree(_discarded(work))
     except OSError as error:
         raise OutputError(f"cannot write {folder}: {reason_of(error)}") from error
+
+
+def _discarded(work: Path) -> Path:
+    """Return the name under which a work folder is deleted."""
+    return work.with_name(f"{TEMPORARY}{work.name}.old")
 
 
 def read_json(path: Path) -> Any:  # noqa: ANN401  any JSON

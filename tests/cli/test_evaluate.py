@@ -35,6 +35,16 @@ def test_json_is_the_evaluation_and_the_bytes(folder: Path) -> None:
     assert report == json.loads(json.dumps(found.as_dict()))
 
 
+def test_cameras_can_be_farther_away(folder: Path) -> None:
+    done = run("evaluate", folder / "a.ply", folder / "c.ply", "--distance", "3", "--json")
+    scenes = kissgs.load(folder / "a.ply"), kissgs.load(folder / "c.ply")
+    found = kissgs.evaluate(*scenes, distance=3.0)
+    assert json.loads(done.stdout)["mean"] == json.loads(json.dumps(found.as_dict()))["mean"]
+    assert found.mean != kissgs.evaluate(*scenes).mean
+    assert "give a number above 0" in failure("evaluate", folder / "a.ply", folder / "c.ply", "--distance", "0")
+    assert b"at 3 times the distance" in run("evaluate", folder / "a.ply", folder / "c.ply", "--distance", "3").stdout
+
+
 def test_the_table_says_what_was_compared(folder: Path) -> None:
     done = run("evaluate", folder / "a.ply", folder / "c.ply", "--views", folder / "capture", "--split", "all")
     text = done.stdout.decode()

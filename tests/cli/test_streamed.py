@@ -29,7 +29,7 @@ def test_the_command_writes_what_the_library_writes(scene, tmp_path):
     assert done.returncode == 0
     assert b"city.partial takes up to 0 MB" in done.stderr or b"city.partial takes up to 1 MB" in done.stderr
     assert b"2,000 Gaussians in 1 chunk, " in done.stdout
-    kissgs.compress_streamed(scene, tmp_path / "own" / "lod-meta.json", Settings.from_preset("fast"))
+    kissgs.compress_streamed(scene, tmp_path / "own" / "lod-meta.json", settings=Settings.from_preset("fast"))
     assert contents(tmp_path / "city") == contents(tmp_path / "own")
     report = run("compress", scene, "-o", tmp_path / "city" / "lod-meta.json", "-p", "fast", "--json", "--force")
     assert json.loads(report.stdout)["source_count"] == 2000

@@ -12,7 +12,7 @@ import kissgs
 from kissgs.core.errors import InvalidViewsError
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.evaluation.camera_sampling import BACKGROUNDS, MIN_DISTANCE
-from kissgs.evaluation.cameras import HEIGHT, KINDS, MIN_MEAN_ALPHA, WIDTH, evaluation_views
+from kissgs.evaluation.cameras import HEIGHT, KINDS, MIN_MEAN_ALPHA, WIDTH, evaluation_views, farther
 from kissgs.rendering.rasterizer import render
 
 ROOT = Path(__file__).parents[2]
@@ -45,6 +45,24 @@ def test_cameras_depend_on_the_seed_but_not_on_threads():
     other = cameras_of(evaluation_views(SCENE, seed=1))
     assert not set(first) & set(other)
     assert not set(first) & set(cameras_of(kissgs.virtual_views(SCENE, width=WIDTH, height=HEIGHT)))
+
+
+def test_farther_cameras_look_at_the_same_points_in_the_same_direction():
+    views = evaluation_views(SCENE, count=8)
+    for before, after in zip(views.test, farther(views, 4.0).test, strict=True):
+        (place, axes), (moved_place, moved_axes) = (
+            (-view.camera.viewmat[:3, :3].T @ view.camera.viewmat[:3, 3], view.camera.viewmat[:3, :3])
+            for view in (before, after)
+        )
+        np.testing.assert_allclose(moved_place - before.target, 4 * (place - before.target), rtol=1e-9, atol=1e-9)
+        np.testing.assert_array_equal(moved_axes, axes)
+        np.testing.assert_array_equal(after.camera.K, before.camera.K)
+
+
+@pytest.mark.parametrize("distance", [0.0, -1.0, float("inf"), float("nan")])
+def test_a_distance_that_is_none_is_refused(distance):
+    with pytest.raises(InvalidViewsError, match="give a number above 0"):
+        farther(evaluation_views(SCENE, count=1), distance)
 
 
 def test_kinds_and_backgrounds_alternate():

@@ -84,13 +84,13 @@ class Viewer:
 
 
 @contextlib.contextmanager
-def chromium():
+def chromium(arguments=SOFTWARE):
     """Yield a browser; skip the test where there is none."""
     playwright = pytest.importorskip("playwright.sync_api")
     if CHROMIUM is None:
         pytest.skip("no Chromium is installed")
     with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=arguments)
         yield browser
         browser.close()
 

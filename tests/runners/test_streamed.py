@@ -39,8 +39,10 @@ def test_a_runner_makes_the_same_bytes(runner, scene, tmp_path, preset):
     def progress(stage, fraction, note=""):
         stages.add(stage)
 
-    here = compress_streamed(scene, tmp_path / "here" / "lod-meta.json", settings)
-    there = compress_streamed(scene, tmp_path / "there" / "lod-meta.json", settings, runner=runner, progress=progress)
+    here = compress_streamed(scene, tmp_path / "here" / "lod-meta.json", settings=settings)
+    there = compress_streamed(
+        scene, tmp_path / "there" / "lod-meta.json", settings=settings, runner=runner, progress=progress
+    )
     assert there == here
     assert contents(tmp_path / "there") == contents(tmp_path / "here")
     assert {"merge", "images"} <= stages
@@ -58,11 +60,11 @@ def test_stopped_work_cancels_its_items_and_goes_on_elsewhere(local_runner, scen
             raise Stop
 
     with pytest.raises(Stop):
-        compress_streamed(scene, target, FAST, runner=local_runner, progress=stop)
+        compress_streamed(scene, target, settings=FAST, runner=local_runner, progress=stop)
     wait_until(lambda: local_runner.stats().waiting + local_runner.stats().running == 0)
     assert not target.exists()
-    compress_streamed(scene, target, FAST)
-    compress_streamed(scene, tmp_path / "whole" / "lod-meta.json", FAST)
+    compress_streamed(scene, target, settings=FAST)
+    compress_streamed(scene, tmp_path / "whole" / "lod-meta.json", settings=FAST)
     assert contents(tmp_path / "city") == contents(tmp_path / "whole")
 
 
@@ -75,7 +77,7 @@ def test_an_item_that_fails_ends_the_work(local_runner, scene, tmp_path):
             (tmp_path / "city.partial" / "chunk_0_level_0.f32").unlink(missing_ok=True)
 
     with pytest.raises(KissgsError, match=r"cannot read .*chunk_0_level_0"):
-        compress_streamed(scene, target, FAST, runner=local_runner, progress=remove)
+        compress_streamed(scene, target, settings=FAST, runner=local_runner, progress=remove)
     assert local_runner.stats().running == 0
 
 

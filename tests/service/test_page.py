@@ -2,16 +2,12 @@
 
 import hashlib
 import json
-import shutil
 
 import pytest
 from helpers.service import SLOW, SMALL, scene_bytes
+from helpers.viewers import chromium
 
 import kissgs
-
-playwright = pytest.importorskip("playwright.sync_api")
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
 
 QUIET = [
     "--no-sandbox",
@@ -24,10 +20,8 @@ QUIET = [
 
 @pytest.fixture(scope="module")
 def browser():
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=QUIET)
+    with chromium(QUIET) as browser:
         yield browser
-        browser.close()
 
 
 @pytest.fixture

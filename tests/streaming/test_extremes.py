@@ -44,9 +44,9 @@ def test_all_levels_of_an_extreme_scene_can_be_read(name, tmp_path):
     visible = int((cleaned.opacities > math.log(1 / 254)).sum())
     if not visible:
         with pytest.raises(InvalidSceneError, match="no Gaussian"):
-            compress_streamed(tmp_path / "scene.ply", target, FAST)
+            compress_streamed(tmp_path / "scene.ply", target, settings=FAST)
         return
-    report = compress_streamed(tmp_path / "scene.ply", target, FAST)
+    report = compress_streamed(tmp_path / "scene.ply", target, settings=FAST)
     assert report.counts[0] == visible
     for level, count in enumerate(report.counts):
         if count:
@@ -61,9 +61,9 @@ def test_few_gaussians(count, degree, tmp_path):
     target = tmp_path / "city" / "lod-meta.json"
     if count == 0:
         with pytest.raises(InvalidSceneError, match="no Gaussian"):
-            compress_streamed(tmp_path / "scene.ply", target, FAST)
+            compress_streamed(tmp_path / "scene.ply", target, settings=FAST)
         return
-    assert compress_streamed(tmp_path / "scene.ply", target, FAST).counts[0] == count
+    assert compress_streamed(tmp_path / "scene.ply", target, settings=FAST).counts[0] == count
     assert len(kissgs.load(target)) == count
 
 
@@ -73,4 +73,4 @@ def test_gaussians_at_one_place(tmp_path):
     values |= {"opacities": np.ones(40), "sh0": np.zeros((40, 3)), "shN": np.zeros((40, 0, 3))}
     kissgs.save(Splats(**{name: value.astype(np.float32) for name, value in values.items()}), tmp_path / "scene.ply")
     target = tmp_path / "city" / "lod-meta.json"
-    assert compress_streamed(tmp_path / "scene.ply", target, FAST).counts[0] == 40
+    assert compress_streamed(tmp_path / "scene.ply", target, settings=FAST).counts[0] == 40

@@ -1,9 +1,9 @@
 """Containers in pages and workers of Chromium; reference: Pillow for levels, kissgs' Python decoder for values."""
 
 import json
-import shutil
 
 import pytest
+from helpers.viewers import chromium
 from helpers.web_scenes import (
     IMAGES,
     assert_progress,
@@ -17,10 +17,6 @@ from helpers.web_scenes import (
 from helpers.web_tools import Site
 
 import kissgs
-
-playwright = pytest.importorskip("playwright.sync_api")
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
 
 ARGUMENTS = [
     *("--no-sandbox", "--disable-gpu", "--disable-background-networking"),
@@ -86,10 +82,8 @@ def site():
 
 @pytest.fixture(scope="module")
 def browser():
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+    with chromium(ARGUMENTS) as browser:
         yield browser
-        browser.close()
 
 
 @pytest.fixture

@@ -1,0 +1,159 @@
+"""The end of a streamed compression, interrupted anywhere. Oracle: the result of work that was not interrupted."""
+
+import contextlib
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+import kissgs
+from kissgs import Settings
+from kissgs.core.errors import OutputError
+from kissgs.streaming import build
+from kissgs.streaming.compress import compress_streamed
+
+FAST = Settings.from_preset("fast")
+OTHER = Settings.from_preset("fast", sh0_step=0.1)
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    for name, value in {"CHUNK": 800, "LEAF": 300, "COARSEST": 800}.items():
+        monkeypatch.setattr(build, name, value)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    path = tmp_path_factory.mktemp("streamed") / "scene.ply"
+    kissgs.save(kissgs.sample_scene(1500, sh_degree=0, seed=3), path)
+    return path
+
+
+def files_of(folder):
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+class Killed(BaseException):
+    pass
+
+
+def killed_at(step, monkeypatch):
+    """Let the process die before the n-th time that it renames or removes something outside of its own temporaries."""
+    left = [step]
+
+    def counted(function):
+        def call(*arguments, **options):
+            if ".kissgs." not in Path(str(arguments[0])).name:
+                left[0] -= 1
+                if left[0] < 0:
+                    raise Killed
+            return function(*arguments, **options)
+
+        return call
+
+    monkeypatch.setattr(Path, "rename", counted(Path.rename))
+    monkeypatch.setattr(os, "unlink", counted(os.unlink))  # rmtree
+    monkeypatch.setattr(os, "rmdir", counted(os.rmdir))
+    return left
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_it_may_be_killed_before_every_change_of_the_disk(scene, tmp_path, monkeypatch, force):
+    target = tmp_path / "city" / "lod-meta.json"
+    compress_streamed(scene, tmp_path / "whole" / "lod-meta.json", settings=FAST)
+    expected = files_of(tmp_path / "whole")
+    step = 0
+    while True:
+        shutil.rmtree(tmp_path / "city", ignore_errors=True)
+        if force:
+            compress_streamed(scene, target, settings=OTHER)
+        with monkeypatch.context() as patch:
+            left = killed_at(step, patch)
+            with contextlib.suppress(Killed):
+                compress_streamed(scene, target, settings=FAST, overwrite=force)
+            done = left[0] >= 0
+        if not done and (tmp_path / "city.partial").exists():
+            compress_streamed(scene, target, settings=FAST, overwrite=force)
+        assert files_of(tmp_path / "city") == expected
+        assert not (tmp_path / "city.partial").exists()
+        if done:
+            break
+        step += 1
+    assert step >= 4
+
+
+def test_files_that_appear_meanwhile_are_kept(scene, tmp_path):
+    target = tmp_path / "city" / "lod-meta.json"
+
+    def put(stage, fraction, note=""):
+        if stage == "images" and fraction == 1:
+            target.parent.mkdir(exist_ok=True)
+            (target.parent / "mine.txt").write_text("mine")
+
+    for overwrite in (False, True):
+        with pytest.raises(OutputError, match=r"holds other files \(mine\.txt\)"):
+            compress_streamed(scene, target, settings=FAST, overwrite=overwrite, progress=put)
+    (target.parent / "mine.txt").unlink()
+    compress_streamed(scene, target, settings=FAST)
+    assert len(kissgs.load(target)) > 1000
+
+
+def test_a_result_of_another_process_is_not_replaced(scene, tmp_path):
+    target = tmp_path / "city" / "lod-meta.json"
+    compress_streamed(scene, tmp_path / "other" / "lod-meta.json", settings=OTHER)
+    expected = files_of(tmp_path / "other")
+
+    def put(stage, fraction, note=""):
+        if stage == "images" and fraction == 1:
+            (tmp_path / "other").rename(tmp_path / "city")
+
+    with pytest.raises(OutputError, match="exists already"):
+        compress_streamed(scene, target, settings=FAST, progress=put)
+    assert files_of(tmp_path / "city") == expected
+
+
+@pytest.mark.parametrize("size", [0, 100, -8])
+@pytest.mark.parametrize(("stage", "name"), [("merge", "chunk_0.f32"), ("images", "chunk_0_level_0.f32")])
+def test_scratch_files_that_are_cut_are_noticed(scene, tmp_path, stage, name, size):
+    def cut(now, fraction, note=""):
+        path = tmp_path / "city.partial" / name
+        if now == stage and path.exists():
+            os.truncate(path, size if size >= 0 else path.stat().st_size + size)
+
+    with pytest.raises(OutputError, match=rf"{name} is not complete; delete .*city\.partial and start again"):
+        compress_streamed(scene, tmp_path / "city" / "lod-meta.json", settings=FAST, progress=cut)
+    assert not (tmp_path / "city").exists()
+
+
+def test_a_scene_that_changes_while_it_is_read_is_refused(scene, tmp_path):
+    shutil.copy(scene, tmp_path / "scene.ply")
+
+    def change(stage, fraction, note=""):
+        if stage == "partition" and fraction < 1:
+            os.utime(tmp_path / "scene.ply", (1, 1))
+
+    with pytest.raises(kissgs.InvalidSceneError, match="was changed while it was read"):
+        compress_streamed(tmp_path / "scene.ply", tmp_path / "city" / "lod-meta.json", settings=FAST, progress=change)
+    assert [path.name for path in tmp_path.iterdir()] == ["scene.ply"]
+
+
+def test_names_and_inputs_that_would_be_replaced_are_refused(scene, tmp_path, monkeypatch):
+    compress_streamed(str(scene), str(tmp_path / "city" / "lod-meta.json"), settings=FAST)
+    with pytest.raises(OutputError, match=r"viewers look for lod-meta\.json"):
+        compress_streamed(scene, tmp_path / "city" / "scene.json", settings=FAST)
+    target = tmp_path / "city" / "lod-meta.json"
+    for source in (target, tmp_path / "city" / "0_0" / "meta.json"):
+        with pytest.raises(OutputError, match="would be replaced, but"):
+            compress_streamed(source, target, settings=FAST, overwrite=True)
+    (tmp_path / "city" / "0_0" / "empty").mkdir()
+    with pytest.raises(OutputError, match=r"holds other files \(0_0/empty\)"):
+        compress_streamed(scene, target, settings=FAST, overwrite=True)
+    (tmp_path / "town.partial").symlink_to(tmp_path)
+    with pytest.raises(OutputError, match="is a link"):
+        compress_streamed(scene, tmp_path / "town" / "lod-meta.json", settings=FAST)
+    (tmp_path / "here" / "below").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "here" / "below")
+    with pytest.raises(OutputError, match="would be replaced, but"):
+        compress_streamed(scene, "../lod-meta.json", settings=FAST)
+    assert len(kissgs.load(target)) > 1000

@@ -1,0 +1,103 @@
+"""Sensitivity of files, and the preset balanced. Oracle: the sensitivity of the whole scene, files without it."""
+
+import json
+
+import numpy as np
+import pytest
+from helpers.render_scenes import blobs
+
+import kissgs
+from kissgs import Settings
+from kissgs.core.splats import concatenate
+from kissgs.rendering.camera import look_at
+from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
+from kissgs.settings import EncodeSettings
+from kissgs.streaming import build
+from kissgs.streaming.compress import compress_streamed
+from kissgs.streaming.sensitivities import cameras_json, cameras_of, measure_file
+from kissgs.streaming.time_left import duration, with_time_left
+
+BALANCED = Settings()
+PLAIN = EncodeSettings(view_uncertainty=0.0, sensitivity_view_size=96)
+
+
+def seen_from(position, target=(0, 0, 0)):
+    place, up = np.array(position, float), np.array([0.1, 1.0, 0.2])
+    return look_at(place, np.array(target, float), up, fov=0.8, width=96, height=72)
+
+
+CAMERAS = WeightedCameras([seen_from((0, 0, -6)), seen_from((5, 1, 3))], [1.0, 1.0], np.full(3, 0.4, np.float32))
+
+
+def test_a_file_has_the_sensitivity_that_its_gaussians_have_in_the_scene():
+    """The other files are given as they are, and there is no prior, so that only rounding differs."""
+    own, others = blobs(40, seed=1), blobs(30, seed=2)
+    expected = measure_sensitivity(concatenate([own, others]), CAMERAS)
+    found = measure_file(own, others, CAMERAS, 0, PLAIN, 1)
+    for name in ("position_hessian", "shape_hessian", "color_weight", "mean_sh_basis"):
+        wanted = getattr(expected, name)[:40]
+        np.testing.assert_allclose(getattr(found, name), wanted, rtol=1e-4, atol=1e-6 * np.abs(wanted).max())
+    alone = measure_file(own, others.select(slice(0)), CAMERAS, 0, PLAIN, 1)
+    assert not np.allclose(alone.color_weight, found.color_weight, rtol=0.05)
+
+
+def test_cameras_that_do_not_see_a_file_count_as_images_without_it():
+    own, others = blobs(40, seed=1), blobs(30, seed=2)
+    elsewhere = seen_from((0, 0, 50), (0, 0, 100))
+    more = WeightedCameras([*CAMERAS.cameras, elsewhere, elsewhere], [1.0] * 4, CAMERAS.background)
+    expected = measure_sensitivity(concatenate([own, others]), more)
+    found = measure_file(own, others, more, 0, PLAIN, 1)
+    np.testing.assert_allclose(found.color_weight, expected.color_weight[:40], rtol=1e-4)
+    np.testing.assert_allclose(found.position_hessian, expected.position_hessian[:40], rtol=1e-3, atol=1e-9)
+    unseen = WeightedCameras([elsewhere], [1.0], CAMERAS.background)
+    assert not measure_file(own, others, unseen, 0, PLAIN, 1).color_weight.any()
+
+
+def test_cameras_are_the_same_after_a_file():
+    read = cameras_of(json.loads(json.dumps(cameras_json(CAMERAS))))
+    for camera, other in zip(CAMERAS.cameras, read.cameras, strict=True):
+        np.testing.assert_array_equal(camera.viewmat, other.viewmat)
+        np.testing.assert_array_equal(camera.K, other.K)
+        assert (camera.width, camera.height) == (other.width, other.height)
+    np.testing.assert_array_equal(read.background, CAMERAS.background)
+
+
+class Stop(Exception):
+    pass
+
+
+def test_the_default_preset_spends_bits_by_sensitivity_and_goes_on_after_its_cameras(tmp_path, monkeypatch):
+    for name, value in {"CHUNK": 1600, "LEAF": 400, "COARSEST": 1000, "CONTEXT": 1500}.items():
+        monkeypatch.setattr(build, name, value)
+    kissgs.save(kissgs.sample_scene(3000, sh_degree=1, seed=3), tmp_path / "scene.ply")
+    report = compress_streamed(tmp_path / "scene.ply", tmp_path / "whole" / "lod-meta.json", settings=BALANCED)
+    assert len(report.counts) == 3
+    flat = BALANCED.model_copy(update={"encode": BALANCED.encode.model_copy(update={"rate_distortion": False})})
+    uniform = compress_streamed(tmp_path / "scene.ply", tmp_path / "uniform" / "lod-meta.json", settings=flat)
+    assert report.level_bytes != uniform.level_bytes
+    target = tmp_path / "city" / "lod-meta.json"
+
+    def stop(stage, fraction, note=""):
+        if stage == "images" and fraction > 0.3:
+            raise Stop
+
+    with pytest.raises(Stop):
+        compress_streamed(tmp_path / "scene.ply", target, settings=BALANCED, progress=stop)
+    assert (tmp_path / "city.partial" / "cameras.json").exists()
+    assert compress_streamed(tmp_path / "scene.ply", target, settings=BALANCED, threads=1) == report
+    for path in (tmp_path / "whole").rglob("*.*"):
+        assert path.read_bytes() == (tmp_path / "city" / path.relative_to(tmp_path / "whole")).read_bytes()
+
+
+def test_the_time_left_follows_the_pace(monkeypatch):
+    clock, notes = [0.0], []
+    monkeypatch.setattr("time.monotonic", lambda: clock[0])
+    receive = with_time_left(lambda stage, fraction, note="": notes.append(note), rate_distortion=False)
+    for seconds, stage, fraction in ((0, "partition", 0.0), (60, "merge", 0.6), (100, "images", 1.0)):
+        clock[0] = float(seconds)
+        receive(stage, fraction, "level 0")
+    assert notes[0] == "level 0"
+    assert notes[1].startswith("level 0, ")
+    assert notes[1].endswith(" left")
+    assert notes[2] == "level 0, 0 s left"
+    assert [duration(seconds) for seconds in (40, 100, 3000, 12600)] == ["40 s", "2 min", "50 min", "3.5 h"]
