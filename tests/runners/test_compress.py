@@ -168,7 +168,6 @@ def test_ctrl_c_ends_all_items_and_leaves_nothing(cluster, scenes, tmp_path):
         (["-", "-o", "x.zip"], "--ray needs files that all machines see, not standard input or output"),
         (["a.ply", "-o", "-"], "--ray needs files that all machines see, not standard input or output"),
         (["none.ply"], "cannot read none.ply"),
-        (["a.ply", "-o", "x/lod-meta.json"], "are made without --ray"),
     ],
 )
 @pytest.mark.quick(3)
