@@ -43,7 +43,7 @@ MaxGaussiansOption = Annotated[
     ),
 ]
 LevelOption = Annotated[
-    int, typer.Option(min=0, help="Level of detail of a streamed SOG scene; 0 is the finest.", show_default=True)
+    int, typer.Option(min=0, help="Level of detail of a streamed scene; 0 is the finest.", show_default=True)
 ]
 RawAxesOption = Annotated[
     bool,

@@ -33,7 +33,7 @@ from kissgs.cli.interrupts import say_when_interrupted
 from kissgs.cli.options import budget_of, chosen, device_of, open_views
 from kissgs.cli.signals import stoppable
 from kissgs.core.errors import UnsupportedError
-from kissgs.sog.names import LOD_NAME
+from kissgs.io.container_names import named_manifest
 
 if TYPE_CHECKING:
     from kissgs.pipeline.read_options import ReadOptions
@@ -47,8 +47,8 @@ def compress(
         typer.Option(
             "--output",
             "-o",
-            help="Output NAME.zip, NAME.sog, FOLDER/lod-meta.json for levels of detail, a folder, or '-' for standard "
-            "output. Default: next to the scene.",
+            help="Output NAME.zip, NAME.sog, FOLDER/lod-meta.json or NAME.sogxt/ for levels of detail, a folder, or "
+            "'-' for standard output. Default: next to the scene.",
         ),
     ] = None,
     container: ContainerOption = None,
@@ -120,7 +120,7 @@ def compress(
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Compress each scene into a SOG-XT container, into SOG, or into streamed SOG."""
+    """Compress each scene into a SOG-XT container, into SOG, or into a folder with levels of detail."""
     from kissgs.io.container_names import ending_of, named_container
     from kissgs.pipeline.pipeline import compress as run
     from kissgs.pipeline.read_options import ReadOptions
@@ -146,7 +146,8 @@ def compress(
     if views is not None and not renders and not quiet:
         sys.stderr.write(f"kissgs: --views has no effect: the preset {preset} renders no images; add --evaluate\n")
 
-    if output is not None and output.name == LOD_NAME:
+    manifest = None if output is None else named_manifest(output)
+    if manifest is not None:
         unused = {
             "--views": views,
             "--evaluate": evaluate,
@@ -155,10 +156,10 @@ def compress(
             "--unpacked": unpacked,
         }
         if wrong := next((name for name, value in unused.items() if value), None):
-            raise UnsupportedError(f"levels of detail ({LOD_NAME}) are made without {wrong}")
+            raise UnsupportedError(f"levels of detail ({manifest.name}) are made without {wrong}")
         for_each_input(
             scenes,
-            output,
+            manifest,
             ".json",
             as_json,
             partial(_streamed, settings, reading, force, ray, threads, quiet or as_json),
@@ -230,7 +231,7 @@ def _streamed(
     scene: str,
     target: Path,
 ) -> dict[str, Any]:
-    """Compress one scene into a streamed SOG."""
+    """Compress one scene into a streamed scene."""
     if scene == "-":
         raise UnsupportedError("levels of detail need a file: it is read more than once")
     with progress_bar(quiet) as bar, contextlib.ExitStack() as ending:

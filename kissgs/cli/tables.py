@@ -10,6 +10,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from kissgs.evaluation.metric_text import format_metric
+from kissgs.pipeline.scene_formats import CONTAINER_FORMATS, STREAMED_FORMATS
 
 if TYPE_CHECKING:
     from kissgs.compaction.result import CompactionReport
@@ -174,7 +175,7 @@ def info_table(info: Info) -> RenderableType:
     """Format the output of ``kissgs info``."""
     head = Text.assemble((info.path, "bold"), f"  {_kind(info)}, {size(info.bytes)}")
     body = f"{info.count:,} Gaussians, SH degree {info.sh_degree}, {info.bits_per_gaussian:.1f} bits per Gaussian"
-    stored = info.kind in ("sogxt", "sog", "streamed-sog")
+    stored = info.kind in CONTAINER_FORMATS
     of = "value of {} level" if stored else "{} value"  # channels share a step, so few reach the highest
     ends = [_right(of.format(end)) for end in ("lowest", "highest")]
     ranges = Table("attribute", *ends, box=None, pad_edge=False)
@@ -190,7 +191,7 @@ def info_table(info: Info) -> RenderableType:
             origin = f"kissgs {details['version']} from {details['source_count']:,} Gaussians"
         grid, codebook = details["grid_side"], details["codebook_side"]
         blocks.append(Text(f"grid {grid} x {grid}, codebook {codebook} x {codebook}; encoder: {origin}"))
-    if info.kind == "streamed-sog":
+    if info.kind in STREAMED_FORMATS:
         levels = ", ".join(f"{count:,}" for count in details["levels"])
         blocks.append(Text(f"Gaussians by level, finest first: {levels}; environment: {details['environment']:,}"))
     return Group(*blocks, *_changes(info.changed))
@@ -204,6 +205,7 @@ def _kind(info: Info) -> str:
         "sogxt": "SOG-XT container",
         "sog": "SOG container",
         "streamed-sog": "streamed SOG scene",
+        "streamed-sogxt": "streamed SOG-XT scene",
         "spz": "SPZ scene",
         "splat": ".splat scene",
         "ksplat": ".ksplat scene",
@@ -214,7 +216,7 @@ def _kind(info: Info) -> str:
         found = [details["encoding"], "compressed" if details["compressed"] else ""]
     elif info.kind == "sog":
         found = [f"version {details['version']}", details["model"] or "", details["generator"] or ""]
-    elif info.kind == "streamed-sog":
+    elif info.kind in STREAMED_FORMATS:
         found = [f"level {details['level']} of 0 to {len(details['levels']) - 1}"]
     elif info.kind == "spz":
         found = [f"version {details['version']}", "antialiased" if details["antialiased"] else ""]

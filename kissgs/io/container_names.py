@@ -15,6 +15,14 @@ CONTAINERS: tuple[ContainerName, ...] = get_args(ContainerName)
 ENDINGS: dict[str, ContainerName] = {".zip": "sogxt", ".sog": "sog"}
 """Container of a file by its ending."""
 
+LOD_NAME, LEVELS_NAME = "lod-meta.json", "levels.json"
+
+MANIFESTS: dict[str, ContainerName] = {LOD_NAME: "sog", LEVELS_NAME: "sogxt"}
+"""Containers of a streamed scene by the name of its manifest."""
+
+LEVELS_ENDING = ".sogxt"
+"""Ending of a folder for ``levels.json``."""
+
 SCENE_ENDINGS = (".ply", ".spz", ".splat", ".ksplat", ".glb", ".gltf")
 """Endings of scenes that are no containers."""
 
@@ -47,3 +55,13 @@ def named_container(requested: str | None, destination: Path | None) -> Containe
                 )
             return name
     raise UnsupportedError(f"there is no container {requested!r}; choose one of {', '.join(CONTAINERS)}")
+
+
+def named_manifest(destination: Path) -> Path | None:
+    """Return the manifest of the streamed scene that a destination names; None if it names something else.
+
+    It is the destination itself, or ``levels.json`` in a folder that ends in ``.sogxt``.
+    """
+    if destination.name in MANIFESTS:
+        return destination
+    return destination / LEVELS_NAME if destination.suffix.lower() == LEVELS_ENDING else None

@@ -185,6 +185,11 @@ def is_below(name: str) -> bool:
     return bool(name) and ".." not in parts and parts[0] != "" and ":" not in parts[0] and "\0" not in name
 
 
+def is_file_name(name: object) -> bool:
+    """Whether a value is the relative path of a file below its folder, fit for a message."""
+    return isinstance(name, str) and len(name) <= 255 and name.isprintable() and is_below(name)
+
+
 def sniff_format(file: io.BufferedIOBase) -> Literal["ply", "zip"] | None:
     """Return the format of a file, None for an unknown one; a zip may have data before it, a ``.ply`` may not."""
     file.seek(0)

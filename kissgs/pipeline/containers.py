@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from kissgs.core.progress import Progress
-from kissgs.core.splats import Cleaned
+from kissgs.core.progress import Progress, silent
+from kissgs.core.splats import NOTHING_CLEANED, Cleaned
 from kissgs.io.container_names import ContainerName
 from kissgs.planning.container_model import EVEN_LEVELS, ContainerModel
 from kissgs.planning.encoded import Encoded
@@ -31,11 +31,11 @@ def write_files(
     plan: EncodingPlan,
     settings: EncodeSettings,
     *,
-    cleaned: Cleaned,
-    compacted: int,
-    finetune_steps: int,
-    threads: int,
-    progress: Progress,
+    cleaned: Cleaned = NOTHING_CLEANED,
+    compacted: int = 0,
+    finetune_steps: int = 0,
+    threads: int = 0,
+    progress: Progress = silent,
 ) -> Encoded:
     """Make the files of a plan for a container.
 

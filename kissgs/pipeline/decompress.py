@@ -29,7 +29,7 @@ def decompress(
             :func:`kissgs.load` reads, except a ``.ply``.
         destination: ``.ply`` to write; by default nothing is written.
         max_gaussians: see :class:`kissgs.ReadOptions`, as for ``level`` and ``raw_axes``.
-        level: level of detail of a streamed SOG scene; 0 is the finest.
+        level: level of detail of a streamed scene; 0 is the finest.
         raw_axes: read ``.spz`` that stores the axes of a ``.ply`` without saying so.
         overwrite: replace ``destination`` if it exists.
         threads: number of threads; 0 means one per processor.

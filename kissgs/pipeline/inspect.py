@@ -4,33 +4,24 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kissgs.core.errors import InvalidContainerError
-from kissgs.core.signed_log import signed_exp
 from kissgs.core.splats import ATTRIBUTES, clean
-from kissgs.io.packed_files import Source, open_source
 from kissgs.io.scene_file import refuse_more_than
 from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.scene_files import read_scene, stored_bytes
-from kissgs.pipeline.scene_formats import SceneFormat, recognise, scene_root
-from kissgs.sogxt.metadata import CHANNELS, Layout
-from kissgs.sogxt.metadata_reader import read_layout
-from kissgs.sogxt.names import FILES, PLANES
+from kissgs.pipeline.scene_formats import CONTAINER_FORMATS, STREAMED_FORMATS, SceneFormat, recognise, scene_root
 
 if TYPE_CHECKING:
     from kissgs.io.gltf import GltfInfo
     from kissgs.io.ksplat import KsplatInfo
     from kissgs.io.ply import PlyInfo
     from kissgs.io.spz import SpzInfo
-    from kissgs.pipeline.inspect_sog import SogFacts
+    from kissgs.pipeline.container_facts import Facts
 
     Header = PlyInfo | SpzInfo | KsplatInfo | GltfInfo
-
-NAMES = {"quaternions": "quats", "f_dc": "sh0", "f_rest_centroids": "shN"}
-MAX_PLANE_BYTES = 1 << 30
 
 DETAILS: dict[SceneFormat, dict[str, str]] = {
     "ply": {"encoding": "encoding", "compressed": "compressed"},
@@ -58,9 +49,9 @@ class Info:
             reason; empty for SOG, whose images are not decoded for this.
         details: encoding and whether it is PlayCanvas' compressed layout (``.ply``); side of grid and codebook, version
             and settings of the encoder (SOG-XT); version, variant of the renderer, generator and size of the codebook
-            (SOG); the level that is described, and Gaussians per level and of the environment (streamed SOG); version,
-            antialiasing and precision of positions (``.spz``); compression level and sections (``.ksplat``); primitives
-            and compression (glTF).
+            (SOG); the level that is described, and Gaussians per level and of the environment (streamed scenes);
+            version, antialiasing and precision of positions (``.spz``); compression level and sections (``.ksplat``);
+            primitives and compression (glTF).
     """
 
     path: str
@@ -76,7 +67,7 @@ class Info:
     @property
     def bits_per_gaussian(self) -> float:
         """Bits of the whole file per Gaussian; of a streamed scene, those of the level's files."""
-        total = sum(self.parts.values()) if self.kind == "streamed-sog" else self.bytes
+        total = sum(self.parts.values()) if self.kind in STREAMED_FORMATS else self.bytes
         return 8 * total / max(self.count, 1)
 
     def as_dict(self) -> dict[str, Any]:
@@ -114,13 +105,8 @@ def read_scene_info(path: Path, *, name: str | None = None) -> SceneInfo:
         from kissgs.io.splat import count_splat
 
         return SceneInfo(format=kind, count=count_splat(path), sh_degree=0)
-    found: Header | SogFacts | Info
-    if kind == "sogxt":
-        found = _describe_sogxt(path)
-    elif kind == "sog" or kind == "streamed-sog":
-        found = _sog_facts(scene_root(path), kind, 0)
-    else:
-        found = _header(path, kind)
+    found: Header | Facts
+    found = _facts(path, kind, 0) if kind in CONTAINER_FORMATS else _header(path, kind)
     return SceneInfo(format=kind, count=found.count, sh_degree=found.sh_degree)
 
 
@@ -133,19 +119,10 @@ def describe(path: Path, reading: ReadOptions = DEFAULT_READ_OPTIONS) -> Info:
         KissgsError: the file is not a usable scene or container, or has more Gaussians than ``reading`` allows.
     """
     kind = recognise(path)
-    if kind == "sogxt":
-        found = _describe_sogxt(path)
-    elif kind == "sog" or kind == "streamed-sog":
-        found = _describe_sog(path, kind, reading.level)
-    else:
+    if kind not in CONTAINER_FORMATS:
         return _describe_file(path, kind, reading)
-    refuse_more_than(reading.max_gaussians, found.count, str(path))  # no default: no image is decoded
-    return found
-
-
-def _describe_sog(path: Path, kind: Literal["sog", "streamed-sog"], level: int) -> Info:
-    root = scene_root(path)
-    facts = _sog_facts(root, kind, level)
+    facts = _facts(path, kind, reading.level)
+    refuse_more_than(reading.max_gaussians, facts.count, str(path))  # no default: no image is decoded
     return Info(
         path=str(path),
         kind=kind,
@@ -154,15 +131,25 @@ def _describe_sog(path: Path, kind: Literal["sog", "streamed-sog"], level: int) 
         bytes=stored_bytes(path),
         parts=facts.parts,
         ranges=facts.ranges,
-        changed={},
+        changed=facts.changed,
         details=facts.details,
     )
 
 
-def _sog_facts(root: Path, kind: Literal["sog", "streamed-sog"], level: int) -> SogFacts:
-    from kissgs.pipeline.inspect_sog import sog_facts, streamed_facts
+def _facts(path: Path, kind: SceneFormat, level: int) -> Facts:
+    """Return the facts of a container, or of a level of a streamed scene."""
+    root = scene_root(path)
+    if kind == "sog":
+        from kissgs.pipeline.inspect_sog import sog_facts
 
-    return sog_facts(root) if kind == "sog" else streamed_facts(root, level)
+        return sog_facts(root)
+    if kind == "sogxt":
+        from kissgs.pipeline.inspect_sogxt import sogxt_facts
+
+        return sogxt_facts(root)
+    from kissgs.pipeline.inspect_streamed import streamed_sog_facts, streamed_sogxt_facts
+
+    return streamed_sog_facts(root, level) if kind == "streamed-sog" else streamed_sogxt_facts(root, level)
 
 
 def _describe_file(path: Path, kind: SceneFormat, reading: ReadOptions) -> Info:
@@ -213,53 +200,3 @@ def _extremes(values: np.ndarray) -> tuple[float, float]:
         values = values[np.isfinite(values)]
         low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
     return low, high
-
-
-def _describe_sogxt(path: Path) -> Info:
-    root = scene_root(path)
-    with open_source(root) as files:
-        layout = read_layout(files)
-        present = files.names()
-        missing = [name for name in PLANES if name not in present]
-        if missing:
-            raise InvalidContainerError(f"{path} is incomplete: missing {', '.join(missing)}")
-        parts = {name: files.size(name) for name in FILES if name in present}
-        count = layout.count if layout.count is not None else _count_mask(files, layout)
-    made = layout.provenance
-    return Info(
-        path=str(path),
-        kind="sogxt",
-        count=count,
-        sh_degree=layout.sh_degree,
-        bytes=sum(parts.values()) if root.is_dir() else path.stat().st_size,
-        parts=parts,
-        ranges=_stored_ranges(layout),
-        changed=made.changed if made else {},
-        details={
-            "grid_side": layout.grid_side,
-            "codebook_side": layout.codebook_side,
-            "version": made.version if made else None,
-            "source_count": made.source_count if made else None,
-            "settings": made.settings if made else {},
-        },
-    )
-
-
-def _stored_ranges(layout: Layout) -> dict[str, tuple[float, float]]:
-    ranges = {}
-    for field in CHANNELS:
-        ends = np.concatenate(layout.limits(field))
-        if field == "means":
-            ends = signed_exp(ends)
-        ranges[NAMES.get(field, field)] = float(ends.min()), float(ends.max())
-    if layout.sh_degree == 0:
-        del ranges["shN"]
-    return ranges
-
-
-def _count_mask(files: Source, layout: Layout) -> int:
-    from kissgs.io.webp import decode_plane
-
-    side, name = layout.grid_side, "active_mask.webp"
-    mask = decode_plane(files.read(name, MAX_PLANE_BYTES), name, width=side, height=side, channels=1)
-    return int(np.count_nonzero(mask))

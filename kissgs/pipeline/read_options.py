@@ -15,7 +15,7 @@ class ReadOptions:
         max_gaussians: largest number of Gaussians; more are refused before memory is allocated. By default 20 million
             for formats whose scene can take far more memory than the file; no limit for ``.ply``, ``.splat`` and
             ``.ksplat``, whose scene takes at most four times the bytes of the file.
-        level: level of detail of a streamed SOG scene; 0 is the finest.
+        level: level of detail of a streamed scene; 0 is the finest.
         raw_axes: read ``.spz`` that stores the axes of a ``.ply`` without saying so, as some tools write it.
     """
 

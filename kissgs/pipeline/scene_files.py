@@ -33,7 +33,7 @@ def load(
 
     Args:
         path: ``.ply``, ``.spz``, ``.splat``, ``.ksplat``, ``.glb`` or ``.gltf``; a SOG-XT or SOG container (zip,
-            folder, or its ``meta.json``); a streamed SOG scene (zip, folder, or its ``lod-meta.json``).
+            folder, or its ``meta.json``); a streamed scene (zip, folder, or its ``lod-meta.json`` or ``levels.json``).
         max_gaussians: see :class:`kissgs.ReadOptions`, as for ``level`` and ``raw_axes``.
         level: level of detail of a streamed scene; 0 is the finest.
         raw_axes: read ``.spz`` that stores the axes of a ``.ply`` without saying so.
@@ -136,6 +136,10 @@ def read_scene(
         from kissgs.sog import streamed
 
         return streamed.decode(root, level=reading.level, max_gaussians=most, threads=threads, progress=progress)
+    if found == "streamed-sogxt":
+        from kissgs.sogxt import streamed as streamed_sogxt
+
+        return streamed_sogxt.decode(root, level=reading.level, max_gaussians=most, threads=threads, progress=progress)
     if found == "sog":
         from kissgs.sog.decode import decode as decode_sog
 

@@ -4,21 +4,31 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Literal
 
 from kissgs.core.errors import InvalidContainerError
+from kissgs.io.container_names import LEVELS_NAME, LOD_NAME
 from kissgs.io.packed_files import ZIP_MAGICS, MemorySource, Source, open_source, sniff_format, zip_names
-from kissgs.sog.names import LOD_NAME, MAX_METADATA_BYTES, META_NAME
+from kissgs.sog.names import MAX_METADATA_BYTES, META_NAME
 from kissgs.sogxt.container import is_packed
 from kissgs.sogxt.names import YAML_NAME
 
-SceneFormat = Literal["ply", "sogxt", "sog", "streamed-sog", "spz", "splat", "ksplat", "gltf"]
+SceneFormat = Literal["ply", "sogxt", "sog", "streamed-sog", "streamed-sogxt", "spz", "splat", "ksplat", "gltf"]
 """All formats that are read. "ply" stands for unknown content too, about which its reader has the best messages."""
+
+STREAMED_FORMATS: frozenset[SceneFormat] = frozenset({"streamed-sog", "streamed-sogxt"})
+"""Formats with levels of detail."""
+
+CONTAINER_FORMATS: frozenset[SceneFormat] = STREAMED_FORMATS | {"sogxt", "sog"}
+"""Formats whose metadata describes them without decoding an image."""
 
 HEAD_BYTES = 512
 """Bytes at the beginning of a file that recognition needs."""
+
+_STREAMED: dict[str, SceneFormat] = {LOD_NAME: "streamed-sog", LEVELS_NAME: "streamed-sogxt"}
+"""Format of streamed scenes by the name of their manifest, the first of which decides."""
 
 _WITHOUT_MARK: dict[str, SceneFormat] = {".splat": "splat", ".ksplat": "ksplat"}
 
@@ -31,7 +41,8 @@ def recognise(
 ) -> SceneFormat:
     """Return the format of a scene: a file, a folder, the bytes of a file, or a container's files in memory.
 
-    The metadata file of a SOG container stands for its folder. ``.splat`` is recognised by its name only.
+    The metadata file of a container and the manifest of a streamed scene stand for their folder. ``.splat`` is
+    recognised by its name only.
 
     Args:
         source: the scene, or the first 512 bytes of a file, of which every zip then counts as "sogxt".
@@ -44,7 +55,7 @@ def recognise(
     name = name.lower()
     ending = Path(name).suffix
     if isinstance(source, Path) and (_is_folder(source) or scene_root(source) != source):
-        return "streamed-sog" if name == LOD_NAME else _packed_format(scene_root(source), "sogxt")
+        return _STREAMED.get(name) or _packed_format(scene_root(source), "sogxt")
     head, found_size = _beginning(source)
     if marked := _by_mark(head):
         return marked
@@ -62,8 +73,8 @@ def recognise(
 
 
 def scene_root(path: Path) -> Path:
-    """Return the folder of a SOG container if ``path`` is its metadata file, else ``path``."""
-    return path.parent if path.name in (META_NAME, LOD_NAME) and path.is_file() else path
+    """Return the folder of a container or streamed scene if ``path`` is its metadata or manifest, else ``path``."""
+    return path.parent if path.name in (META_NAME, *_STREAMED) and path.is_file() else path
 
 
 def is_container(source: Path | bytes) -> bool:
@@ -128,8 +139,9 @@ def _packed_format(source: Path | bytes, damaged: SceneFormat) -> SceneFormat:
     try:
         if isinstance(source, bytes) or not _is_folder(source):
             with _opened(source) as file:
-                if any(name.replace("\\", "/").rsplit("/", 1)[-1] == LOD_NAME for name in zip_names(file)):
-                    return "streamed-sog"
+                names = {name.replace("\\", "/").rsplit("/", 1)[-1] for name in zip_names(file)}
+            if found := _streamed_format(names):
+                return found
         with open_source(source) as files:
             return _container_format(files, damaged)
     except (InvalidContainerError, OSError, ValueError):
@@ -140,11 +152,15 @@ def _opened(source: Path | bytes) -> io.BufferedIOBase:
     return io.BytesIO(source) if isinstance(source, bytes) else source.open("rb")
 
 
+def _streamed_format(names: Collection[str]) -> SceneFormat | None:
+    return next((kind for manifest, kind in _STREAMED.items() if manifest in names), None)
+
+
 def _container_format(files: Source, unknown: SceneFormat = "sogxt") -> SceneFormat:
     """Tell the containers apart: only SOG-XT has a YAML file, and a mask in ``meta.json``."""
     names = files.names()
-    if LOD_NAME in names:
-        return "streamed-sog"
+    if found := _streamed_format(names):
+        return found
     if YAML_NAME in names or META_NAME not in names:
         return "sogxt" if YAML_NAME in names else unknown
     try:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +12,8 @@ from kissgs.core.array_types import Float32, Float64
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.io.activations import OPACITY_OF_BYTE
-from kissgs.io.packed_files import Source, is_below
+from kissgs.io.json_files import parse_json
+from kissgs.io.packed_files import Source, is_file_name
 from kissgs.sog.names import MAX_METADATA_BYTES, META_NAME
 
 ENTRIES_PER_ROW = 64
@@ -104,22 +104,6 @@ def read_layout(source: Source, name: str = META_NAME) -> SogLayout:
         return _read_v1(document) if version == 1 else _read_v2(document)
     except _MetadataError as error:
         raise InvalidContainerError(f"{name}: {error}") from error
-
-
-def parse_json(data: bytes, name: str) -> Any:  # noqa: ANN401
-    """Parse JSON; NaN and Infinity are refused, as browsers refuse them.
-
-    Raises:
-        InvalidContainerError: it is not JSON.
-    """
-    try:
-        return json.loads(data.decode("utf-8-sig"), parse_constant=_refuse_constant)
-    except (ValueError, RecursionError) as error:
-        raise InvalidContainerError(f"{name} is not readable JSON; export the scene again") from error
-
-
-def _refuse_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is not JSON")
 
 
 class _MetadataError(Exception):
@@ -262,11 +246,6 @@ def _names(part: dict[str, Any], key: str, count: int) -> list[str]:
             f"{key}.files does not name {count} image{'s' if count > 1 else ''}; export the scene again"
         )
     return names
-
-
-def is_file_name(name: object) -> bool:
-    """Whether a value is the relative path of a file below its folder, fit for a message."""
-    return isinstance(name, str) and len(name) <= 255 and name.isprintable() and is_below(name)
 
 
 def _whole(part: dict[str, Any], key: str, where: str, least: int, most: int) -> int:

@@ -63,6 +63,20 @@ def decode(
         return splats
 
 
+def decode_files(files: Source, layout: Layout, out: Splats, pool: Workers) -> None:
+    """Decode a container whose metadata states the number of Gaussians into ``out``, which has as many.
+
+    ``out`` may have more SH coefficients than the container; they become zero.
+
+    Raises:
+        InvalidContainerError: an image is missing, damaged or invalid.
+        UnsupportedError: the images are far larger than the Gaussians need.
+    """
+    planes = _Planes(files, layout, len(out))
+    planes.load(pool)
+    planes.look_up(pool, out)
+
+
 class _Planes:
     """Images of a container as rows of levels, and their tables of values."""
 
@@ -149,8 +163,11 @@ class _Planes:
         checksum = self.layout.crc32.get(file)
         return decode_plane(data, file, width=width, height=height, channels=channels, crc32=checksum)
 
-    def look_up(self, pool: Workers) -> Splats:
-        """Convert levels to values, some thousand Gaussians at a time, so that temporaries stay in the cache."""
+    def look_up(self, pool: Workers, out: Splats | None = None) -> Splats:
+        """Convert levels to values, some thousand Gaussians at a time, so that temporaries stay in the cache.
+
+        They are written to ``out`` if it is given, whose SH coefficients above the container's become zero.
+        """
         mask = self.mask[:, 0] > 0
         count = int(np.count_nonzero(mask))
         declared = self.layout.count
@@ -159,10 +176,12 @@ class _Planes:
         self.refuse_more_than(self.max_gaussians, count, "Gaussians")
         # No cell indices are needed if all padding is at the end.
         cells = None if mask[:count].all() else np.flatnonzero(mask)
-        splats = empty_splats(count, self.coefficients)
+        splats = empty_splats(count, self.coefficients) if out is None else out
         outputs = (splats.quats, splats.scales, splats.sh0, splats.opacities[:, None])
         plain = [(*self.plain[field], out) for field, out in zip(CHANNELS_OF_PLAIN, outputs, strict=True)]
-        shN = splats.shN.reshape(count, 3 * self.coefficients)
+        shN = splats.shN.reshape(count, 3 * splats.shN.shape[1])
+        more = shN.shape[1] - self.codebook.shape[1]
+        codebook = np.pad(self.codebook, ((0, 0), (0, more))) if more else self.codebook
 
         def work(first: int) -> None:
             rows = slice(first, min(first + CHUNK, count))
@@ -170,9 +189,9 @@ class _Planes:
             np.take(self.means_table, self.means[source], out=splats.means[rows], mode="clip")
             for levels, lookup, out in plain:
                 lookup(levels[source], out[rows])
-            if self.coefficients:
+            if shN.shape[1]:
                 entries = _entry(self.labels[source], self.layout.codebook_side)
-                np.take(self.codebook, entries, axis=0, out=shN[rows], mode="clip")
+                np.take(codebook, entries, axis=0, out=shN[rows], mode="clip")
 
         pool.map(work, range(0, count, CHUNK))
         return splats

@@ -17,7 +17,7 @@ from pydantic_core import PydanticCustomError
 
 from kissgs.core.limits import MAX_CODEBOOK_SIDE, MAX_GRID_SIDE
 from kissgs.core.splats import SH_REST_COUNTS
-from kissgs.sogxt.names import CHECKSUM, JSON_NAME
+from kissgs.sogxt.names import CHECKSUM, FORMAT, JSON_NAME
 
 TILE_ROWS, TILE_COLUMNS = 3, 5
 
@@ -165,7 +165,7 @@ class Layout(BaseModel):
         centroids = self._range_entry("f_rest_centroids", "centroidsMins", "centroidsMaxs")
         document = {
             "version": 3,
-            "format": "sog-xt",
+            "format": FORMAT,
             "profile": "SOG-XT",
             "count": self.count,
             "gridSide": self.grid_side,

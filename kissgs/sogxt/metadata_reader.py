@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
 from kissgs.io.packed_files import Source
 from kissgs.sogxt.metadata import CHANNELS, TILE_COLUMNS, TILE_ROWS, Layout
-from kissgs.sogxt.names import CHECKSUM, JSON_NAME, YAML_NAME
+from kissgs.sogxt.names import CHECKSUM, FORMAT, JSON_NAME, YAML_NAME
 
 MAX_METADATA_BYTES = 1 << 20
 """Largest size of a metadata file, bytes; kissgs writes about 4 kB each."""
@@ -173,7 +173,7 @@ def _check_dialect(document: Mapping[str, Any]) -> None:
     """Refuse formats that would decode to wrong values without an error."""
     quats, rest, files = document["quats"], document["shN"], document["mask"]["files"]
     for name, found, known in (
-        ("format", document.get("format", "sog-xt"), "sog-xt"),
+        ("format", document.get("format", FORMAT), FORMAT),
         ("version", document.get("version", 3), 3),
         ("quats.encoding", quats.get("encoding", "direct"), "direct"),
         ("shN.layout", rest.get("layout", "uv-codebook"), "uv-codebook"),

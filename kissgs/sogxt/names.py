@@ -2,6 +2,9 @@
 
 YAML_NAME, JSON_NAME, SCENE_NAME = "container_meta.yaml", "meta.json", "scene.json"
 
+FORMAT = "sog-xt"
+"""Name of the format in ``meta.json``."""
+
 CHECKSUM = "kissgs_crc32"
 """Key of the metadata's checksum, outside ``kissgs``, so that it shows a loss of that block."""
 

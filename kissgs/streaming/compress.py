@@ -1,4 +1,4 @@
-"""``compress_streamed``: a scene of any size becomes a streamed SOG, within the memory of one chunk."""
+"""``compress_streamed``: a scene of any size becomes a streamed scene, within the memory of one chunk."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import BLOCK
 from kissgs.io.atomic import atomic_file, reason_of
+from kissgs.io.container_names import LEVELS_ENDING, LOD_NAME, MANIFESTS, ContainerName, named_manifest
 from kissgs.io.ply import read_ply_blocks, read_ply_info
 from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
-from kissgs.pipeline.scene_files import AnyPath, read_scene
+from kissgs.pipeline.scene_files import AnyPath, read_scene, stored_bytes
 from kissgs.pipeline.scene_formats import recognise
 from kissgs.runners import Runner
 from kissgs.settings import Settings
-from kissgs.sog.names import LOD_NAME
 from kissgs.streaming import build
-from kissgs.streaming.build import OUT, Blocks, Layout
+from kissgs.streaming.build import Blocks
 from kissgs.streaming.items import run_all, run_file, run_levels
+from kissgs.streaming.layout import OUT, PARTITION, Layout, keep_layout, read_layout
 from kissgs.streaming.time_left import with_time_left
 from kissgs.streaming.work_folder import check_destination, check_space, claimed, finish, needed_bytes, read_json
 
@@ -65,7 +66,7 @@ def compress_streamed(
     threads: int = 0,
     progress: Progress = silent,
 ) -> StreamedReport:
-    """Compress a scene into a folder with ``lod-meta.json``, chunks and levels of detail.
+    """Compress a scene into a folder with a manifest, chunks and levels of detail.
 
     A ``.ply`` is read in blocks; other formats are decoded whole. Intermediate results are in a folder beside the
     destination that ends in ``.partial``; interrupted work goes on from there. It takes up to about twice the
@@ -73,7 +74,8 @@ def compress_streamed(
 
     Args:
         source: a scene of any format.
-        destination: ``lod-meta.json`` in the folder to write.
+        destination: ``lod-meta.json`` in the folder to write, for SOG; or a folder whose name ends in ``.sogxt``, or
+            ``levels.json`` in any folder, for SOG-XT.
         settings: settings of the encoder, without goal, compaction and fine-tuning; by default the preset "balanced".
         reading: options of reading.
         overwrite: replace the folder if it holds a streamed scene and nothing else.
@@ -90,23 +92,27 @@ def compress_streamed(
             folder belongs to other work or is in use.
         UnsupportedError: a setting does not fit.
     """
-    source, destination = Path(source), Path(destination)
+    source, manifest = Path(source), named_manifest(Path(destination))
     settings = Settings() if settings is None else settings
-    if destination.name != LOD_NAME:
-        raise OutputError(f"{destination} is no name of a streamed scene; viewers look for {LOD_NAME} in a folder")
-    folder = destination.parent
-    folder = folder if folder.name not in ("", "..") else folder.resolve()
+    if manifest is None:
+        raise OutputError(
+            f"{destination} is no name of a streamed scene; viewers look for {LOD_NAME} in a folder, and SOG-XT goes "
+            f"into a folder that ends in {LEVELS_ENDING}"
+        )
+    if manifest.parent.name in ("", ".."):
+        manifest = manifest.parent.resolve() / manifest.name
+    container, folder = MANIFESTS[manifest.name], manifest.parent
     work = folder.parent / f"{folder.name}.partial"
     _check_settings(settings)
     if read_json(work / REPORT) is None:
-        check_destination(folder, source, overwrite=overwrite)
-    with claimed(work, _identity(source, settings, reading)):
+        check_destination(manifest, source, overwrite=overwrite)
+    with claimed(work, {"container": container, **_identity(source, settings, reading)}):
         if (found := read_json(work / REPORT)) is None:
-            layout = _partition(work, source, settings, reading, threads, progress)
+            layout = _partition(work, source, container, settings, reading, threads, progress)
             found = asdict(_make(work, layout, settings, runner, threads, progress))
             with atomic_file(work / REPORT) as done:
                 done.write(json.dumps(found).encode())
-        finish(work, folder, source, overwrite=overwrite)
+        finish(work, manifest, source, overwrite=overwrite)
     return StreamedReport(**{**found, "counts": tuple(found["counts"]), "level_bytes": tuple(found["level_bytes"])})
 
 
@@ -188,11 +194,17 @@ def _identity(source: Path, settings: Settings, reading: ReadOptions) -> dict[st
 
 
 def _partition(
-    work: Path, source: Path, settings: Settings, reading: ReadOptions, threads: int, progress: Progress
+    work: Path,
+    source: Path,
+    container: ContainerName,
+    settings: Settings,
+    reading: ReadOptions,
+    threads: int,
+    progress: Progress,
 ) -> Layout:
     """Partition the scene, unless that has been done."""
-    if read_json(work / build.PARTITION) is not None:
-        layout = build.read_layout(work)
+    if read_json(work / PARTITION) is not None:
+        layout = read_layout(work)
         _announce(work, layout.source_count, layout.sh_degree, progress)
         return layout
     encode, before = settings.encode, _identity(source, settings, reading)
@@ -200,7 +212,8 @@ def _partition(
         (work / OUT).mkdir(exist_ok=True)
         blocks, count, sh_degree = _reader(source, reading, threads)
         _announce(work, count, sh_degree, progress)
-        layout = build.partition(work, blocks, count, encode, with_time_left(progress, encode.rate_distortion))
+        stages = with_time_left(progress, encode.rate_distortion)
+        layout = build.partition(work, blocks, count, container, encode, stages)
         if not any(layout.counts):
             raise InvalidSceneError(f"{source} has no Gaussian that is finite and visible; there is nothing to write")
         if _identity(source, settings, reading) != before:
@@ -208,7 +221,7 @@ def _partition(
     except BaseException:
         shutil.rmtree(work, ignore_errors=True)  # a partition that is not complete is of no use
         raise
-    build.keep_layout(work, layout)
+    keep_layout(work, layout)
     return layout
 
 
@@ -221,15 +234,16 @@ def _announce(work: Path, count: int, sh_degree: int, progress: Progress) -> Non
 
 def _report(work: Path, layout: Layout, chunks: int) -> StreamedReport:
     out = work / OUT
-    document = json.loads((out / LOD_NAME).read_bytes())
+    document = json.loads((out / layout.manifest).read_bytes())
     sizes = [0] * layout.levels
     for level, file in layout.files():
-        sizes[level] += sum(path.stat().st_size for path in (out / f"{level}_{file}").glob("*"))
+        path = out / layout.path(level, file)
+        sizes[level] += stored_bytes(path) if path.exists() else 0  # files without a visible Gaussian are not written
     return StreamedReport(
         source_count=layout.source_count,
         changed={**layout.changed, "pruned_by_rd": sum(layout.counts) - document["counts"][0]},
         counts=tuple(document["counts"]),
         level_bytes=tuple(sizes),
         chunks=chunks,
-        total_bytes=sum(sizes) + (out / LOD_NAME).stat().st_size,
+        total_bytes=sum(sizes) + (out / layout.manifest).stat().st_size,
     )

@@ -17,6 +17,7 @@ from kissgs.core.progress import Progress
 from kissgs.runners import Resources, Runner, WorkItem, error_of
 from kissgs.settings import EncodeSettings
 from kissgs.streaming import build
+from kissgs.streaming.layout import PARTITION, Layout, read_layout
 from kissgs.streaming.rows import row_bytes
 from kissgs.streaming.work_folder import read_json
 
@@ -36,7 +37,7 @@ def run_levels(arguments: dict[str, Any], progress: Progress) -> dict[str, Any]:
     chunk = arguments["chunk"]
     _make_once(
         lambda: build.has_levels(work, chunk),
-        lambda: build.make_levels(work, build.read_layout(work), chunk, arguments["threads"]),
+        lambda: build.make_levels(work, read_layout(work), chunk, arguments["threads"]),
     )
     return {}
 
@@ -47,7 +48,7 @@ def run_file(arguments: dict[str, Any], progress: Progress) -> dict[str, Any]:
     settings = EncodeSettings.model_validate(arguments["settings"])
     _make_once(
         lambda: build.has_file(work, level, file),
-        lambda: build.make_file(work, build.read_layout(work), settings, level, file, arguments["threads"]),
+        lambda: build.make_file(work, read_layout(work), settings, level, file, arguments["threads"]),
     )
     return {}
 
@@ -71,7 +72,7 @@ def run_all(
     runner: Runner,
     function: str,
     items: Sequence[dict[str, Any]],
-    layout: build.Layout,
+    layout: Layout,
     threads: int,
     report: Callable[[float], None],
 ) -> None:
@@ -118,7 +119,7 @@ def _shared(arguments: dict[str, Any]) -> Path:
         UnsupportedError: this machine does not see it.
     """
     work = Path(arguments["work"])
-    if read_json(work / build.PARTITION) is None:
+    if read_json(work / PARTITION) is None:
         raise UnsupportedError(
             f"the machine {socket.gethostname()} does not see {work}; --ray needs storage that all machines see at the "
             "same path"

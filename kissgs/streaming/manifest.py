@@ -1,4 +1,4 @@
-"""``lod-meta.json``: the tree of a streamed SOG."""
+"""The manifest of a streamed scene: a tree whose leaves name rows of containers."""
 
 from __future__ import annotations
 
@@ -28,17 +28,19 @@ class Leaf:
     errors: Sequence[float]
 
 
-def lod_meta(leaves: Sequence[Leaf], levels: int, filenames: Sequence[str]) -> bytes:
+def manifest(leaves: Sequence[Leaf], levels: int, filenames: Sequence[str], containers: str | None) -> bytes:
     """Return the manifest.
 
     Args:
         leaves: all leaves, neighbours after neighbours.
         levels: number of levels; 0 is the finest.
-        filenames: metadata file of each container, relative to the manifest.
+        filenames: file of each container, relative to the manifest.
+        containers: format of the containers; None for SOG, whose manifests do not name it.
     """
     counts = [sum(leaf.lods[level][2] for leaf in leaves if level in leaf.lods) for level in range(levels)]
     document = {
         "version": 1,
+        **({} if containers is None else {"format": containers}),
         "asset": {"generator": f"kissgs {__version__}"},
         "count": counts[0],
         "counts": counts,

@@ -11,9 +11,10 @@ from typing import Any, BinaryIO
 
 from kissgs.core.errors import OutputError
 from kissgs.io.atomic import atomic_file, path_state, reason_of
+from kissgs.io.container_names import MANIFESTS
 from kissgs.sog.encode import FILES
-from kissgs.sog.names import LOD_NAME
-from kissgs.streaming.build import CHUNK, OUT
+from kissgs.streaming.build import CHUNK
+from kissgs.streaming.layout import OUT
 from kissgs.streaming.rows import row_bytes
 
 WORK, LOCK = "work.json", "lock"
@@ -29,40 +30,52 @@ ENCODED_BYTES = 30
 """Upper estimate of the encoded bytes of a Gaussian with all its levels."""
 
 
-def check_destination(folder: Path, source: Path, *, overwrite: bool) -> None:
+def check_destination(manifest: Path, source: Path, *, overwrite: bool) -> None:
     """Refuse to replace anything but a streamed scene, and that only if allowed.
+
+    Args:
+        manifest: the manifest in the folder to write.
+        source: the input, which must not be replaced.
+        overwrite: whether a streamed scene may be replaced.
 
     Raises:
         OutputError: the folder cannot be replaced, holds something else, or a scene that may not be replaced.
     """
+    folder, remedy = manifest.parent, f"name {manifest.name} in a new folder"
     present, is_folder = path_state(folder)
     if not folder.name:
-        raise OutputError(f"{folder} cannot be replaced; name {LOD_NAME} in a new folder")
+        raise OutputError(f"{folder} cannot be replaced; {remedy}")
     if not present:
         return
     if not is_folder or folder.is_symlink() or folder.is_mount():
-        raise OutputError(f"{folder} cannot be replaced as a whole; name {LOD_NAME} in a new folder")
+        raise OutputError(f"{folder} cannot be replaced as a whole; {remedy}")
     for inside in (Path.cwd(), source.resolve()):
         if inside.is_relative_to(folder.resolve()):
-            raise OutputError(f"{folder} would be replaced, but {inside} is in it; name {LOD_NAME} in a new folder")
-    ours = _paths_of(folder / LOD_NAME)
+            raise OutputError(f"{folder} would be replaced, but {inside} is in it; {remedy}")
+    ours = _paths_of(folder)
     if strange := next((path for path in folder.iterdir() if path.relative_to(folder) not in ours), None):
-        raise OutputError(f"{folder} holds other files ({strange.name}); name {LOD_NAME} in a new folder")
+        raise OutputError(f"{folder} holds other files ({strange.name}); {remedy}")
     found = {path.relative_to(folder) for path in folder.rglob("*")}
     if found - ours:
-        raise OutputError(f"{folder} holds other files ({min(found - ours)}); name {LOD_NAME} in a new folder")
+        raise OutputError(f"{folder} holds other files ({min(found - ours)}); {remedy}")
     if found and not overwrite:
-        raise OutputError(f"{folder / LOD_NAME} exists already; choose another name or allow overwriting (--force)")
+        raise OutputError(f"{manifest} exists already; choose another name or allow overwriting (--force)")
 
 
-def _paths_of(manifest: Path) -> set[Path]:
-    """Return the relative paths of all files and folders of a streamed SOG; none if there is no manifest."""
-    document = read_json(manifest)
-    if not isinstance(document, dict) or not isinstance(document.get("filenames"), list):
-        return set()
-    folders = [Path(str(name)).parent for name in document["filenames"]]
-    files = {folder / name for folder in folders for name in FILES}
-    return {Path(LOD_NAME), *files, *folders, *(above for folder in folders for above in folder.parents)}
+def _paths_of(folder: Path) -> set[Path]:
+    """Return the relative paths of all files and folders of the streamed scenes whose manifests are in a folder."""
+    found: set[Path] = set()
+    for manifest, container in MANIFESTS.items():
+        document = read_json(folder / manifest)
+        if not isinstance(document, dict) or not isinstance(document.get("filenames"), list):
+            continue
+        named = [Path(str(name)) for name in document["filenames"]]
+        if container == "sog":
+            files = [path.parent / name for path in named for name in FILES]
+        else:
+            files = [path for path in named if path.suffix == ".zip"]
+        found |= {Path(manifest), *files, *(above for path in files for above in path.parents)}
+    return found
 
 
 @contextlib.contextmanager
@@ -144,7 +157,7 @@ def check_space(work: Path, needed: int) -> None:
         )
 
 
-def finish(work: Path, folder: Path, source: Path, *, overwrite: bool) -> None:
+def finish(work: Path, manifest: Path, source: Path, *, overwrite: bool) -> None:
     """Move the result into place, and delete the work folder; may be repeated after an interruption anywhere.
 
     What the result replaces is in the work folder until the result is in place. The work folder is renamed before it is
@@ -153,13 +166,13 @@ def finish(work: Path, folder: Path, source: Path, *, overwrite: bool) -> None:
     Raises:
         OutputError: the result cannot be moved, or somebody has put other files into the folder meanwhile.
     """
-    result = work / OUT
-    if (result / LOD_NAME).exists():
-        check_destination(folder, source, overwrite=overwrite)
-    elif not (folder / LOD_NAME).exists():
+    result, folder = work / OUT, manifest.parent
+    if (result / manifest.name).exists():
+        check_destination(manifest, source, overwrite=overwrite)
+    elif not manifest.exists():
         raise OutputError(f"{work} was complete, but its result is gone; delete it and start again")
     try:
-        if (result / LOD_NAME).exists():
+        if (result / manifest.name).exists():
             if folder.exists():
                 folder.rename(work / REPLACED)
             result.rename(folder)

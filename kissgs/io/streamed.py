@@ -1,0 +1,249 @@
+"""Streamed scenes: a manifest with a tree whose leaves name rows of containers, level by level.
+
+Level 0 is the finest. The environment, if there is one, belongs to every level. The package of a container's format
+says how its files are opened and decoded.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+
+from kissgs.core.errors import InvalidContainerError, UnsupportedError
+from kissgs.core.limits import MAX_GAUSSIANS
+from kissgs.core.progress import Progress, silent
+from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats, empty_splats
+from kissgs.core.threads import Workers
+from kissgs.io.json_files import parse_json
+from kissgs.io.packed_files import Source, is_file_name, open_source
+from kissgs.io.scene_file import refuse_more_than
+
+MAX_TREE_BYTES = 1 << 25
+"""Largest size of a manifest, bytes; one of a thousand leaves and five levels takes 330 kB."""
+
+MAX_LEVELS = 64
+"""Largest number of levels; each has a fraction of the Gaussians of the one before."""
+
+
+@runtime_checkable
+class Container(Protocol):
+    """Container of a streamed scene, whose metadata is read and checked."""
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians."""
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the SH coefficients, 0 to 3."""
+
+    def decode(self, out: Splats, pool: Workers) -> None:
+        """Decode all Gaussians into ``out``, whose SH coefficients above the container's degree become zero."""
+
+
+C = TypeVar("C", bound=Container)
+
+
+@dataclass(frozen=True, slots=True)
+class Manifest:
+    """Contents of a manifest.
+
+    Attributes:
+        levels: number of levels.
+        filenames: files of the containers: their metadata, or they themselves.
+        rows: per level, the row ranges ``(file, offset, count)`` of the leaves, by file and offset, without overlap.
+        environment: file of the environment; None without one.
+    """
+
+    levels: int
+    filenames: tuple[str, ...]
+    rows: tuple[tuple[tuple[int, int, int], ...], ...]
+    environment: str | None
+
+    def count(self, level: int) -> int:
+        """Return the number of Gaussians of a level, without the environment."""
+        return sum(count for _, _, count in self.rows[level])
+
+
+@dataclass(frozen=True, slots=True)
+class Part(Generic[C]):
+    """Container of which a level needs the row ranges ``rows``, offset and count; ``name`` is that of its file."""
+
+    name: str
+    container: C
+    rows: tuple[tuple[int, int], ...]
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians that the level needs."""
+        return sum(count for _, count in self.rows)
+
+    def decode(self, out: Splats, start: int, pool: Workers) -> int:
+        """Decode the container and write the rows to ``out`` from ``start``; return where they end."""
+        stop = start + self.count
+        if self.rows == ((0, self.container.count),):
+            self.container.decode(out.select(slice(start, stop)), pool)
+            return stop
+        whole = empty_splats(self.container.count, out.shN.shape[1])
+        self.container.decode(whole, pool)
+        for offset, count in self.rows:
+            for name in ATTRIBUTES:
+                getattr(out, name)[start : start + count] = getattr(whole, name)[offset : offset + count]
+            start += count
+        return stop
+
+
+@dataclass(frozen=True, slots=True)
+class StreamedFormat(Generic[C]):
+    """Format of streamed scenes.
+
+    Attributes:
+        manifest: file name of the manifest.
+        containers: value that the manifest's key "format" must have where it has one; None if any value is valid.
+        opened: reads and checks the metadata of the container of a file.
+    """
+
+    manifest: str
+    containers: str | None
+    opened: Callable[[Source, str], C]
+
+    def decode(
+        self,
+        source: Path | bytes | Mapping[str, bytes],
+        *,
+        level: int = 0,
+        max_gaussians: int = MAX_GAUSSIANS,
+        threads: int = 0,
+        progress: Progress = silent,
+    ) -> Splats:
+        """Decode one level of a streamed scene, the environment included.
+
+        Args:
+            source: the folder of the manifest, a zip of it, the bytes of one, or files in memory.
+            level: level of detail; 0 is the finest.
+            max_gaussians: largest number of Gaussians; more are refused before memory is allocated.
+            threads: number of threads; 0 means one per processor.
+            progress: receives "decode" events.
+
+        Returns:
+            The Gaussians in the order of the files and their rows, then those of the environment. Containers of a lower
+            SH degree have zeros for the coefficients above it.
+
+        Raises:
+            InvalidContainerError: a part is missing, damaged or invalid.
+            UnsupportedError: there is no such level, another version, or more Gaussians than ``max_gaussians``.
+        """
+        with open_source(source, self.manifest) as files, Workers(threads) as pool:
+            parts = list(self.parts(files, self.read_manifest(files), level))
+            count = sum(part.count for part in parts)
+            refuse_more_than(max_gaussians, count, f"level {level}")
+            splats = empty_splats(count, max((SH_REST_COUNTS[part.container.sh_degree] for part in parts), default=0))
+            start = 0
+            for part in parts:
+                refuse_more_than(max_gaussians, part.container.count, f"the file {part.name}")
+                progress("decode", start / max(count, 1))
+                start = part.decode(splats, start, pool)
+            progress("decode", 1.0)
+            return splats
+
+    def read_manifest(self, files: Source) -> Manifest:
+        """Read and check the manifest.
+
+        Raises:
+            InvalidContainerError: it is missing, damaged or invalid.
+            UnsupportedError: another version or format, or files elsewhere on the web.
+        """
+        name = self.manifest
+        document = parse_json(files.read(name, MAX_TREE_BYTES), name)
+        if not isinstance(document, dict):
+            raise _invalid(name, "it is no JSON object")
+        for key, known in (("version", 1), ("format", self.containers)):
+            if known is not None and (found := document.get(key, known)) != known:
+                raise UnsupportedError(f"{name} is of {key} {str(found)[:40]!r}; {key} {known} is read")
+        levels, names = document.get("lodLevels"), document.get("filenames")
+        if not isinstance(levels, int) or isinstance(levels, bool) or not 1 <= levels <= MAX_LEVELS:
+            raise _invalid(name, f"lodLevels is not a whole number from 1 to {MAX_LEVELS}")
+        if not isinstance(names, list):
+            raise _invalid(name, "it lacks the list 'filenames'")
+        environment = document.get("environment")
+        for each in (*names, *([] if environment is None else [environment])):
+            if isinstance(each, str) and "://" in each:
+                raise UnsupportedError(f"{name} names files on the web; download them beside it and name them there")
+            if not is_file_name(each):
+                raise _invalid(name, "it names a file that is not below its folder")
+        rows: list[list[tuple[int, int, int]]] = [[] for _ in range(levels)]
+        for level, row in _leaf_rows(name, document.get("tree"), levels, len(names)):
+            rows[level].append(row)
+        for own in rows:
+            own.sort()
+            for (file, offset, count), (next_file, next_offset, _) in itertools.pairwise(own):
+                if file == next_file and offset + count > next_offset:
+                    raise _invalid(name, f"two leaves share rows of {names[file]}")
+        return Manifest(levels, tuple(names), tuple(map(tuple, rows)), environment)
+
+    def parts(self, files: Source, manifest: Manifest, level: int) -> Iterator[Part[C]]:
+        """Yield the containers of a level, then the environment; their metadata is read and checked.
+
+        Raises:
+            InvalidContainerError: a container's metadata is missing or invalid, or has too few rows.
+            UnsupportedError: there is no such level, or a container is of another version.
+        """
+        last = manifest.levels - 1
+        if not 0 <= level <= last:
+            raise UnsupportedError(f"there is no level {level}; this scene has levels 0 (the finest) to {last}")
+        rows: dict[int, list[tuple[int, int]]] = {}
+        for file, offset, count in manifest.rows[level]:
+            merged = rows.setdefault(file, [])
+            if merged and sum(merged[-1]) == offset:  # leaves stand one after another
+                offset, count = merged[-1][0], merged.pop()[1] + count
+            merged.append((offset, count))
+        for file, found in rows.items():
+            name = manifest.filenames[file]
+            container, end = self.opened(files, name), sum(found[-1])
+            if end > container.count:
+                problem = f"a leaf names rows up to {end:,} of {name}, which has {container.count:,}"
+                raise _invalid(self.manifest, problem)
+            yield Part(name, container, tuple(found))
+        if manifest.environment is not None:
+            container = self.opened(files, manifest.environment)
+            yield Part(manifest.environment, container, ((0, container.count),))
+
+
+def _leaf_rows(
+    name: str,
+    tree: Any,  # noqa: ANN401  any JSON
+    levels: int,
+    files: int,
+) -> Iterator[tuple[int, tuple[int, int, int]]]:
+    """Yield level, file, offset and count of every leaf and level that has Gaussians."""
+    waiting = [tree]
+    while waiting:
+        node = waiting.pop()
+        if not isinstance(node, dict):
+            raise _invalid(name, "its tree has a node that is no JSON object")
+        lods, children = node.get("lods"), node.get("children")
+        if isinstance(lods, dict):
+            for key, lod in lods.items():
+                level = int(key) if key.isascii() and key.isdigit() and len(key) < 4 else levels
+                if level >= levels or not isinstance(lod, dict):
+                    raise _invalid(name, f"a leaf has a level that is not 0 to {levels - 1}")
+                file, offset, count = (_whole(lod.get(part)) for part in ("file", "offset", "count"))
+                if file is None or offset is None or count is None or file >= files:
+                    raise _invalid(name, "a leaf does not name a file, an offset and a count")
+                if count:
+                    yield level, (file, offset, count)
+        elif isinstance(children, list):
+            waiting.extend(children)
+        elif lods is not None or children is not None:
+            raise _invalid(name, "its tree has a node whose levels or children are of the wrong kind")
+
+
+def _whole(value: object) -> int | None:
+    return value if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 40 else None
+
+
+def _invalid(name: str, problem: str) -> InvalidContainerError:
+    return InvalidContainerError(f"{name}: {problem}; export the scene again")

@@ -1,0 +1,70 @@
+"""Describe SOG-XT containers, for ``kissgs info``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from kissgs.core.errors import InvalidContainerError
+from kissgs.core.signed_log import signed_exp
+from kissgs.io.packed_files import Source, open_source
+from kissgs.pipeline.container_facts import Facts
+from kissgs.sogxt.metadata import CHANNELS, Layout
+from kissgs.sogxt.metadata_reader import read_layout
+from kissgs.sogxt.names import FILES, PLANES
+
+NAMES = {"quaternions": "quats", "f_dc": "sh0", "f_rest_centroids": "shN"}
+MAX_PLANE_BYTES = 1 << 30
+
+
+def sogxt_facts(path: Path) -> Facts:
+    """Return the facts of a SOG-XT container; the mask is decoded if the metadata does not state the count.
+
+    Raises:
+        KissgsError: the container is damaged or incomplete.
+    """
+    with open_source(path) as files:
+        layout = read_layout(files)
+        present = files.names()
+        missing = [name for name in PLANES if name not in present]
+        if missing:
+            raise InvalidContainerError(f"{path} is incomplete: missing {', '.join(missing)}")
+        parts = {name: files.size(name) for name in FILES if name in present}
+        count = layout.count if layout.count is not None else _count_mask(files, layout)
+    made = layout.provenance
+    return Facts(
+        count=count,
+        sh_degree=layout.sh_degree,
+        parts=parts,
+        ranges=sogxt_ranges([layout]),
+        changed=made.changed if made else {},
+        details={
+            "grid_side": layout.grid_side,
+            "codebook_side": layout.codebook_side,
+            "version": made.version if made else None,
+            "source_count": made.source_count if made else None,
+            "settings": made.settings if made else {},
+        },
+    )
+
+
+def sogxt_ranges(layouts: Sequence[Layout]) -> dict[str, tuple[float, float]]:
+    """Return the values of the lowest and the highest level of every attribute, over all containers."""
+    ranges = {}
+    for field in CHANNELS:
+        having = [layout for layout in layouts if field != "f_rest_centroids" or layout.sh_degree > 0]
+        if having:
+            ends = np.concatenate([end for layout in having for end in layout.limits(field)])
+            ends = signed_exp(ends) if field == "means" else ends
+            ranges[NAMES.get(field, field)] = float(ends.min()), float(ends.max())
+    return ranges
+
+
+def _count_mask(files: Source, layout: Layout) -> int:
+    from kissgs.io.webp import decode_plane
+
+    side, name = layout.grid_side, "active_mask.webp"
+    mask = decode_plane(files.read(name, MAX_PLANE_BYTES), name, width=side, height=side, channels=1)
+    return int(np.count_nonzero(mask))

@@ -1,0 +1,118 @@
+"""``Layout``: sizes of a streamed scene; and the files of its work folder."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from kissgs.io.atomic import atomic_file
+from kissgs.io.container_names import MANIFESTS, ContainerName
+
+CONTEXT = 280_000
+"""Largest number of Gaussians of the level that stands for other chunks where sensitivity is measured."""
+
+PARTITION, CAMERAS, OUT = "partition.json", "cameras.json", "out"
+"""Names in the work folder: the marker of the partition, the cameras, and the folder of the result."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layout:
+    """Sizes of a streamed scene.
+
+    Attributes:
+        container: container of the files.
+        source_count: number of Gaussians before cleaning.
+        sh_degree: 0 to 3.
+        counts: number of Gaussians in each chunk.
+        depth: number of cuts one after another; there are 2^depth chunks.
+        levels: number of levels.
+        leaf: largest number of Gaussians in a leaf.
+        changed: number of Gaussians that cleaning removed or changed, by kind, and of those that are invisible.
+    """
+
+    container: ContainerName
+    source_count: int
+    sh_degree: int
+    counts: tuple[int, ...]
+    depth: int
+    levels: int
+    leaf: int
+    changed: dict[str, int]
+
+    @property
+    def filled(self) -> list[int]:
+        """Chunks that have Gaussians."""
+        return [chunk for chunk, count in enumerate(self.counts) if count]
+
+    @property
+    def manifest(self) -> str:
+        """File name of the manifest."""
+        return next(name for name, container in MANIFESTS.items() if container == self.container)
+
+    @property
+    def context(self) -> int:
+        """Level that stands for other chunks where sensitivity is measured: the finest of few Gaussians."""
+        total = sum(self.counts)
+        return next((level for level in range(self.levels) if total >> level <= CONTEXT), self.levels - 1)
+
+    def path(self, level: int, file: int) -> str:
+        """Return the name of a container in the folder of the result: that of a folder for SOG, else of a zip."""
+        return f"{level}_{file}" if self.container == "sog" else f"{level}_{file}.zip"
+
+    def members(self, level: int, file: int) -> range:
+        """Return the chunks in a file of a level: twice as many as in one of the level before, up to all."""
+        size = 1 << min(level, self.depth)
+        return range(file * size, (file + 1) * size)
+
+    def files(self) -> list[tuple[int, int]]:
+        """Return level and number of every file, the coarsest level first."""
+        return [
+            (level, file)
+            for level in reversed(range(self.levels))
+            for file in range(1 << (self.depth - min(level, self.depth)))
+            if any(self.counts[chunk] for chunk in self.members(level, file))
+        ]
+
+
+def read_layout(work: Path) -> Layout:
+    """Return the layout of a scene that is partitioned."""
+    found = json.loads((work / PARTITION).read_bytes())
+    return Layout(**{**found, "counts": tuple(found["counts"])})
+
+
+def keep_layout(work: Path, layout: Layout) -> None:
+    """Write the layout, which marks the partition as done."""
+    write_json(work / PARTITION, asdict(layout))
+
+
+def read_leaves(work: Path, chunk: int) -> dict[str, Any]:
+    """Return the bounds and errors of a chunk's leaves, and their counts by level."""
+    return json.loads(leaves_file(work, chunk).read_bytes())
+
+
+def chunk_file(work: Path, chunk: int) -> Path:
+    """Return the file of the Gaussians of a chunk, until its levels are made."""
+    return work / f"chunk_{chunk}.f32"
+
+
+def level_file(work: Path, chunk: int, level: int) -> Path:
+    """Return the file of the Gaussians of one level of a chunk."""
+    return work / f"chunk_{chunk}_level_{level}.f32"
+
+
+def leaves_file(work: Path, chunk: int) -> Path:
+    """Return the file of a chunk's leaves, which marks its levels as done."""
+    return work / f"chunk_{chunk}.json"
+
+
+def rows_file(work: Path, level: int, file: int) -> Path:
+    """Return the file of the number of rows of each leaf in a container, which marks the container as done."""
+    return work / f"file_{level}_{file}.json"
+
+
+def write_json(path: Path, values: object) -> None:
+    """Write JSON atomically."""
+    with atomic_file(path, overwrite=True) as file:
+        file.write(json.dumps(values, separators=(",", ":")).encode())
