@@ -89,7 +89,7 @@ class _Planes:
     def __init__(self, files: Source, layout: Layout, max_gaussians: int) -> None:
         self.files, self.layout, self.max_gaussians = files, layout, max_gaussians
         # Padding is less than half of any grid that follows the size rule, except for the smallest.
-        self.refuse_more_than(2 * max_gaussians + 64, layout.grid_side**2, "cells")
+        self.refuse_more_than(2 * max_gaussians + 128, layout.grid_side**2, "cells")
         self.refuse_more_than(max_gaussians, layout.count or 0, "Gaussians")
         self.coefficients = SH_REST_COUNTS[layout.sh_degree]
         self.plain: dict[str, tuple[UInt8[np.ndarray, "cells C"], _Lookup]] = {}

@@ -1,4 +1,4 @@
-"""``kissgs compress -o FOLDER/lod-meta.json``. Oracle: what the library writes, and the input."""
+"""``kissgs compress -o FOLDER/lod-meta.json``, ``-o NAME.sogxt/``. Oracle: what the library writes, and the input."""
 
 import json
 import signal
@@ -24,25 +24,31 @@ def contents(folder):
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
-def test_the_command_writes_what_the_library_writes(scene, tmp_path):
-    done = run("compress", scene, "-o", tmp_path / "city" / "lod-meta.json", "-p", "fast")
+@pytest.mark.parametrize("name", ["city/lod-meta.json", "city.sogxt/", "city/levels.json"])
+def test_the_command_writes_what_the_library_writes(scene, tmp_path, name):
+    target = f"{tmp_path}/{name}"
+    folder = Path(name).parts[0]
+    done = run("compress", scene, "-o", target, "-p", "fast")
     assert done.returncode == 0
-    assert b"city.partial takes up to 0 MB" in done.stderr or b"city.partial takes up to 1 MB" in done.stderr
+    assert f"{folder}.partial takes up to ".encode() in done.stderr
     assert b"2,000 Gaussians in 1 chunk, " in done.stdout
-    kissgs.compress_streamed(scene, tmp_path / "own" / "lod-meta.json", settings=Settings.from_preset("fast"))
-    assert contents(tmp_path / "city") == contents(tmp_path / "own")
-    report = run("compress", scene, "-o", tmp_path / "city" / "lod-meta.json", "-p", "fast", "--json", "--force")
-    assert json.loads(report.stdout)["source_count"] == 2000
-    assert report.stderr == b""
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["city", "own"]
+    (tmp_path / "own").mkdir()
+    kissgs.compress_streamed(scene, f"{tmp_path}/own/{name}", settings=Settings.from_preset("fast"))
+    assert contents(tmp_path / folder) == contents(tmp_path / "own" / folder)
+    report = json.loads(run("compress", scene, "-o", target, "-p", "fast", "--json", "--force").stdout)
+    assert report["source_count"] == 2000
+    for source in (folder, report["output"]):
+        assert b"level 0 of 0 to 0" in run("info", tmp_path / source).stdout
+    assert sorted(path.name for path in tmp_path.iterdir()) == [folder, "own"]
 
 
-def test_options_that_do_not_fit_are_refused(scene, tmp_path):
-    target = tmp_path / "city" / "lod-meta.json"
-    for words in (["--evaluate"], ["--cache"], ["--container", "sog"]):
-        assert f"levels of detail (lod-meta.json) are made without {words[0]}" in failure(
-            "compress", scene, "-o", target, *words
-        )
+@pytest.mark.parametrize("name", ["city/lod-meta.json", "city.sogxt"])
+def test_options_that_do_not_fit_are_refused(scene, tmp_path, name):
+    target = tmp_path / name
+    for words in (["--evaluate"], ["--cache"], ["--container", "sog"], ["--unpacked"]):
+        said = failure("compress", scene, "-o", target, *words)
+        assert "levels of detail (l" in said
+        assert f"are made without {words[0]}" in said
     assert "without goals" in failure("compress", scene, "-o", target, "--target-size", "1MB")
     assert "2 inputs cannot all become" in failure("compress", scene, scene, "-o", target)
     assert "levels of detail need a file" in failure("compress", "-", "-o", target, stdin=scene.read_bytes())

@@ -127,25 +127,33 @@ def write_folder(files, folder):
     return folder
 
 
-def streamed_files(levels, *, environment=None):
-    """Return the files of a streamed scene: per level a list of scenes, one file each; each file has two leaves."""
+def sog_folder(scene, name):
+    """Return the files of a container in a folder, and its file in a manifest."""
+    return {f"{name}/{key}": data for key, data in sog_files(scene).items()}, f"{name}/meta.json"
+
+
+def streamed_files(levels, *, environment=None, container=sog_folder, manifest="lod-meta.json"):
+    """Return the files of a streamed scene: per level a list of scenes, one container each, which has two leaves.
+
+    ``container`` returns the files of a scene under a name, and the file that the manifest names.
+    """
     files, names, leaves = {}, [], {}
     for level, scenes in enumerate(levels):
         for number, scene in enumerate(scenes):
-            name = f"{level}_{number}"
-            files |= {f"{name}/{key}": data for key, data in sog_files(scene).items()}
+            more, name = container(scene, f"{level}_{number}")
+            files |= more
             half = len(scene) // 2
             for part, (offset, count) in enumerate(((half, len(scene) - half), (0, half))):
                 lods = leaves.setdefault((number, part), {})
                 lods[str(level)] = {"file": len(names), "offset": offset, "count": count}
-            names.append(f"{name}/meta.json")
+            names.append(name)
     bound = {"min": [0, 0, 0], "max": [1, 1, 1]}
     children = [{"bound": bound, "lods": lods} for lods in leaves.values()]
     meta = {"version": 1, "lodLevels": len(levels), "filenames": names, "tree": {"bound": bound, "children": children}}
     if environment is not None:
-        files |= {f"env/{key}": data for key, data in sog_files(environment).items()}
-        meta["environment"] = "env/meta.json"
-    return {"lod-meta.json": json.dumps(meta).encode(), **files}
+        more, meta["environment"] = container(environment, "env")
+        files |= more
+    return {manifest: json.dumps(meta).encode(), **files}
 
 
 def read_files(files):

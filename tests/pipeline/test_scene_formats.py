@@ -8,9 +8,10 @@ from helpers.command_line import run
 from helpers.format_scenes import made_scene
 from helpers.reference_gltf import attributes, data_uri, document, glb_bytes
 from helpers.reference_ply import assert_identical
-from helpers.reference_sog import sog_files, streamed_files, write_folder, zip_of
+from helpers.reference_sog import sog_files, write_folder, zip_of
 from helpers.reference_splat import ksplat_bytes, splat_bytes
 from helpers.reference_spz import spz_bytes
+from helpers.streamed_scenes import KINDS
 from helpers.web_tools import DECODER
 
 import kissgs
@@ -24,7 +25,9 @@ from kissgs.pipeline.scene_formats import recognise
 SCENE = made_scene(30, 1, extremes=False)
 ROOT, BUFFER = document(attributes(SCENE))
 TEXT = {**ROOT, "buffers": [{"byteLength": len(BUFFER), "uri": data_uri(BUFFER)}]}
-STREAMED = streamed_files([[SCENE], [made_scene(5, 1)]], environment=made_scene(2, 0))
+STREAMED = {
+    name: kind.files([[SCENE], [made_scene(5, 1)]], environment=made_scene(2, 0)) for name, kind in KINDS.items()
+}
 
 FILES = {
     "a.splat": ("splat", splat_bytes(SCENE)),
@@ -35,7 +38,8 @@ FILES = {
     "a.gltf": ("gltf", json.dumps(TEXT, indent=1).encode()),
     "a.sog": ("sog", zip_of(sog_files(SCENE))),
     "a1.sog": ("sog", zip_of(sog_files(SCENE, version=1))),
-    "a.zip": ("streamed-sog", zip_of(STREAMED, folder="x/")),
+    "a.zip": ("streamed-sog", zip_of(STREAMED["streamed-sog"], folder="x/")),
+    "a2.zip": ("streamed-sogxt", zip_of(STREAMED["streamed-sogxt"], folder="x/")),
 }
 
 
@@ -54,7 +58,7 @@ def test_files_are_recognised_and_read_by_all(name, tmp_path):
     found = describe(path)
     assert (found.kind, found.count, found.sh_degree, found.bytes) == (kind, len(wanted), wanted.sh_degree, len(data))
     assert set(found.ranges) == {"means", "quats", "scales", "opacities", "sh0", "shN"} - (
-        {"quats"} if "sog" in kind else set()
+        {"quats"} if kind in ("sog", "streamed-sog") else set()
     ) - ({"shN"} if kind == "splat" else set())
     low, high = found.ranges["means"]
     assert low == pytest.approx(wanted.means.min(), rel=1e-4)
@@ -84,11 +88,11 @@ def test_a_ply_under_other_names_is_a_ply(tmp_path):
         assert len(kissgs.load(tmp_path / name)) == len(SCENE)
 
 
-@pytest.mark.parametrize("files", [sog_files(SCENE), STREAMED], ids=["sog", "streamed-sog"])
-def test_folders_and_their_metadata_file(files, tmp_path):
+@pytest.mark.parametrize("kind", ["sog", *STREAMED])
+def test_folders_and_their_metadata_file(kind, tmp_path):
+    files = STREAMED.get(kind) or sog_files(SCENE)
     folder = write_folder(files, tmp_path / "scene")
-    kind = "streamed-sog" if "lod-meta.json" in files else "sog"
-    meta = folder / ("lod-meta.json" if kind == "streamed-sog" else "meta.json")
+    meta = folder / (KINDS[kind].manifest if kind in KINDS else "meta.json")
     wanted = read_scene(folder)
     for path in (folder, meta):
         assert recognise(path) == kind
@@ -108,14 +112,16 @@ def test_folders_of_sog_xt_stay_what_they_are(tmp_path):
     assert len(kissgs.load(tmp_path / "folder/meta.json")) == len(kissgs.decompress(only_json))
 
 
-def test_levels_of_a_streamed_scene(tmp_path):
-    folder = write_folder(STREAMED, tmp_path / "scene")
+@pytest.mark.parametrize("kind", STREAMED)
+def test_levels_of_a_streamed_scene(kind, tmp_path):
+    folder, manifest = write_folder(STREAMED[kind], tmp_path / "scene"), KINDS[kind].manifest
+    ending = "/" if kind == "streamed-sog" else ".zip"
     assert [len(kissgs.load(folder, level=level)) for level in (0, 1)] == [32, 7]
     found = describe(folder)
     assert found.details == {"level": 0, "levels": [30, 5], "environment": 2, "files": 2}
-    assert set(found.parts) == {"lod-meta.json", "0_0/", "env/"}
+    assert set(found.parts) == {manifest, f"0_0{ending}", f"env{ending}"}
     coarse = describe(folder, ReadOptions(level=1))
-    assert (coarse.count, set(coarse.parts)) == (7, {"lod-meta.json", "1_0/", "env/"})
+    assert (coarse.count, set(coarse.parts)) == (7, {manifest, f"1_0{ending}", f"env{ending}"})
     assert coarse.details["level"] == 1
     assert coarse.bits_per_gaussian == 8 * sum(coarse.parts.values()) / 7
     message = r"there is no level 2; this scene has levels 0 \(the finest\) to 1"
@@ -225,12 +231,13 @@ READING = {
 }
 
 
+@pytest.mark.parametrize("kind", STREAMED)
 @pytest.mark.parametrize("command", READING)
-@pytest.mark.quick(2)
-def test_every_command_that_reads_scenes_has_the_options_for_it(command, tmp_path):
+@pytest.mark.quick(4)
+def test_every_command_that_reads_scenes_has_the_options_for_it(command, kind, tmp_path):
     """A limit that the coarse level meets and the finest does not: the level is chosen, and the limit is heeded."""
     packed = tmp_path / "lod.zip"
-    packed.write_bytes(zip_of(STREAMED))
+    packed.write_bytes(zip_of(STREAMED[kind]))
     words = [word.replace("IN", str(packed)).replace("OUT", str(tmp_path / "out")) for word in READING[command]]
     if command == "view" and not (DECODER / "vendor").exists():
         pytest.skip("scripts/vendor has not run")

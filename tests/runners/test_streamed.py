@@ -32,17 +32,17 @@ def contents(folder):
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
-@pytest.mark.parametrize("preset", ["fast", "balanced"])
-def test_a_runner_makes_the_same_bytes(runner, scene, tmp_path, preset):
+@pytest.mark.parametrize(
+    ("preset", "name"), [("fast", "lod-meta.json"), ("balanced", "lod-meta.json"), ("fast", "levels.json")]
+)
+def test_a_runner_makes_the_same_bytes(runner, scene, tmp_path, preset, name):
     settings, stages = Settings.from_preset(preset), set()
 
     def progress(stage, fraction, note=""):
         stages.add(stage)
 
-    here = compress_streamed(scene, tmp_path / "here" / "lod-meta.json", settings=settings)
-    there = compress_streamed(
-        scene, tmp_path / "there" / "lod-meta.json", settings=settings, runner=runner, progress=progress
-    )
+    here = compress_streamed(scene, tmp_path / "here" / name, settings=settings)
+    there = compress_streamed(scene, tmp_path / "there" / name, settings=settings, runner=runner, progress=progress)
     assert there == here
     assert contents(tmp_path / "there") == contents(tmp_path / "here")
     assert {"merge", "images"} <= stages

@@ -6,18 +6,21 @@ import zlib
 import pytest
 from helpers.format_scenes import made_scene
 from helpers.hostile import check_all
-from helpers.reference_sog import sog_files, streamed_files, zip_of
+from helpers.reference_sog import sog_files, zip_of
+from helpers.streamed_scenes import KINDS
 from PIL import Image
 
 from kissgs.pipeline.read_options import ReadOptions
 from kissgs.pipeline.scene_files import read_scene
-from kissgs.sog import streamed
 from kissgs.sog.decode import decode
 
 LIMIT = 100_000
 LIMITED = ReadOptions(max_gaussians=LIMIT)
 SOURCES = {version: sog_files(made_scene(20, 1), version=version) for version in (1, 2)}
-STREAMED = streamed_files([[made_scene(10, 1)], [made_scene(3, 0)]], environment=made_scene(2, 1))
+STREAMED = {
+    name: kind.files([[made_scene(10, 1)], [made_scene(3, 0)]], environment=made_scene(2, 1))
+    for name, kind in KINDS.items()
+}
 
 
 @pytest.mark.parametrize("version", [1, 2])
@@ -58,14 +61,22 @@ def test_damage_inside_png():
     check_all(rows, read)
 
 
-@pytest.mark.parametrize("source", [SOURCES[2], STREAMED], ids=["one scene", "streamed"])
+@pytest.mark.parametrize("source", [SOURCES[2], *STREAMED.values()], ids=["one scene", *STREAMED])
 def test_damaged_zips(source):
     check_all(zip_of(source), lambda damaged: read_scene(damaged, LIMITED, threads=1))
 
 
 @pytest.mark.parametrize("level", [0, 1])
-def test_damaged_trees(level):
-    def read(damaged):
-        return streamed.decode({**STREAMED, "lod-meta.json": damaged}, level=level, max_gaussians=LIMIT, threads=1)
+@pytest.mark.parametrize("name", STREAMED)
+def test_damaged_trees(name, level):
+    kind, files = KINDS[name], STREAMED[name]
 
-    check_all(STREAMED["lod-meta.json"], read)
+    def read(damaged):
+        return kind.decode({**files, kind.manifest: damaged}, level=level, max_gaussians=LIMIT, threads=1)
+
+    check_all(files[kind.manifest], read)
+
+
+def test_damaged_zips_of_a_streamed_scene():
+    files = STREAMED["streamed-sogxt"]
+    check_all(files["0_0.zip"], lambda damaged: read_scene({**files, "0_0.zip": damaged}, LIMITED, threads=1))

@@ -1,103 +1,17 @@
-"""Oracle: the chunks decoded one by one, splat-transform's files, and a reader of real data in NumPy."""
+"""Streamed SOG of others. Oracle: splat-transform, and a reader of real data in NumPy."""
 
 import json
 
 import numpy as np
 import pytest
 from helpers.format_scenes import assert_alike, made_scene
-from helpers.reference_sog import sog_files, streamed_files, write_folder, zip_of
+from helpers.reference_sog import streamed_files, write_folder
 from helpers.splat_transform import convert, needs_splat_transform
 from PIL import Image
 
-from kissgs.core.errors import InvalidContainerError, KissgsError, UnsupportedError
 from kissgs.core.splats import ATTRIBUTES
 from kissgs.io.ply import read_ply, write_ply
 from kissgs.sog import streamed
-from kissgs.sog.decode import decode
-
-LEVELS = [[made_scene(65, 2), made_scene(40, 1)], [made_scene(20, 1)], [made_scene(3, 0)]]
-ENVIRONMENT = made_scene(7, 1)
-FILES = streamed_files(LEVELS, environment=ENVIRONMENT)
-
-
-def joined(scenes):
-    """Return the decoded chunks one after another, lower degrees filled with zeros."""
-    found = [decode(sog_files(scene)) for scene in scenes]
-    most = max(s.shN.shape[1] for s in found)
-    arrays = {name: np.concatenate([getattr(s, name) for s in found]) for name in ATTRIBUTES if name != "shN"}
-    arrays["shN"] = np.concatenate([np.pad(s.shN, ((0, 0), (0, most - s.shN.shape[1]), (0, 0))) for s in found])
-    return arrays
-
-
-@pytest.mark.parametrize("level", [0, 1, 2])
-def test_every_level_with_the_environment(level):
-    found = streamed.decode(FILES, level=level)
-    for name, wanted in joined([*LEVELS[level], ENVIRONMENT]).items():
-        np.testing.assert_array_equal(getattr(found, name), wanted)
-
-
-def test_folders_and_zips(tmp_path):
-    wanted = streamed.decode(FILES)
-    packed = tmp_path / "a.zip"
-    packed.write_bytes(zip_of(FILES))
-    for source in (write_folder(FILES, tmp_path / "folder"), packed, zip_of(FILES, folder="a/b/")):
-        np.testing.assert_array_equal(streamed.decode(source).means, wanted.means)
-
-
-def edited(change, files=FILES):
-    meta = json.loads(files["lod-meta.json"])
-    change(meta)
-    return {**files, "lod-meta.json": json.dumps(meta).encode()}
-
-
-def leaf(meta, number=0, level="0"):
-    return meta["tree"]["children"][number]["lods"][level]
-
-
-def test_rows_that_no_leaf_names_are_left_out():
-    whole = streamed.decode(FILES)
-    found = streamed.decode(edited(lambda meta: leaf(meta, 1).update(offset=5, count=10)))
-    kept = np.r_[5:15, 32:112]
-    np.testing.assert_array_equal(found.means, whole.means[kept])
-    np.testing.assert_array_equal(found.shN, whole.shN[kept])
-
-
-def test_old_files_without_a_version():
-    found = streamed.decode(edited(lambda meta: (meta.pop("version"), meta.update(environment=None))))
-    assert len(found) == 105
-
-
-CHANGES = {
-    "there is no level 3; this scene has levels 0 (the finest) to 2": None,
-    "lod-meta.json is of version '2'; version 1 is read": lambda m: m.update(version=2),
-    "lodLevels is not a whole number from 1 to 64": lambda m: m.update(lodLevels=0),
-    "it lacks the list 'filenames'": lambda m: m.pop("filenames"),
-    "it names a file that is not below its folder": lambda m: m["filenames"].append("../x/meta.json"),
-    "names files on the web": lambda m: m.update(environment="https://example.org/meta.json"),
-    "two leaves share rows of 0_0/meta.json": lambda m: leaf(m).update(offset=10),
-    "a leaf names rows up to 1,000 of 0_0/meta.json, which has 65": lambda m: leaf(m).update(count=968),
-    "a leaf has a level that is not 0 to 2": lambda m: m["tree"]["children"][0]["lods"].update({"3": {}}),
-    "a leaf does not name a file, an offset and a count": lambda m: leaf(m).update(file=99),
-    "its tree has a node that is no JSON object": lambda m: m["tree"]["children"].append(1),
-    "levels or children are of the wrong kind": lambda m: m["tree"]["children"].append({"lods": []}),
-    "the container has no file 'x/meta.json'": lambda m: m["filenames"].__setitem__(0, "x/meta.json"),
-}
-
-
-@pytest.mark.parametrize(("message", "change"), list(CHANGES.items()), ids=list(CHANGES))
-def test_damaged_trees(message, change):
-    with pytest.raises(KissgsError) as error:
-        streamed.decode(edited(change) if change else FILES, level=0 if change else 3)
-    assert message in str(error.value)
-    assert "\n" not in str(error.value)
-
-
-def test_limits_and_depth():
-    with pytest.raises(UnsupportedError, match=r"level 0 has 112 Gaussians; the limit is 111"):
-        streamed.decode(FILES, max_gaussians=111)
-    deep = b'{"lodLevels": 1, "filenames": [], "tree": ' + b'{"children": [' * 100_000
-    with pytest.raises(InvalidContainerError, match=r"lod-meta\.json is not readable JSON"):
-        streamed.decode({"lod-meta.json": deep})
 
 
 @needs_splat_transform

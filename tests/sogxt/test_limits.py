@@ -85,3 +85,10 @@ def test_one_outlier_does_not_spoil_the_colours_of_all_others(field, value):
         errors.append(np.sqrt(np.mean((found - getattr(scene, field)[result.order[others]]) ** 2)))
     assert errors[1] < 1.05 * errors[0]
     assert dirty.report.clipped_colors == (1 if field == "sh0" else 0)
+
+
+@pytest.mark.parametrize("count", [1, 5, 64, 65, 100, 256, 257])
+def test_a_limit_of_as_many_gaussians_as_there_are_is_enough(count):
+    """The grids of few Gaussians have more padding than Gaussians."""
+    files = encode(random_scene(count, 0), EncodeSettings(prune_invisible=False)).files
+    assert len(kissgs.decompress(files, max_gaussians=count)) == count

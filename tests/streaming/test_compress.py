@@ -1,5 +1,6 @@
-"""Streamed scenes. Oracle: the reader of streamed SOG, the input's Gaussians, and work that is interrupted anywhere."""
+"""Streamed scenes. Oracle: the reader, the input's Gaussians, and work that is interrupted anywhere."""
 
+import itertools
 import json
 import shutil
 from dataclasses import replace
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from helpers.format_scenes import assert_alike
 from helpers.splat_transform import convert, needs_splat_transform
+from helpers.streamed_scenes import TARGETS, tree_leaves
 
 import kissgs
 from kissgs import Settings
@@ -35,52 +37,73 @@ def scene(tmp_path_factory):
     return path
 
 
-def tree_leaves(node):
-    return [node] if "lods" in node else [leaf for child in node["children"] for leaf in tree_leaves(child)]
+@pytest.fixture(params=TARGETS)
+def target(request, tmp_path):
+    return tmp_path / request.param
 
 
 def files_of(folder):
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
-def test_every_level_is_read_and_every_leaf_has_every_level(scene, tmp_path):
-    report = compress_streamed(scene, tmp_path / "city" / "lod-meta.json", settings=FAST)
+def test_every_level_is_read_and_every_leaf_has_every_level(scene, target):
+    report = compress_streamed(scene, target, settings=FAST)
     original = kissgs.load(scene)
-    document = json.loads((tmp_path / "city" / "lod-meta.json").read_bytes())
+    document = json.loads(target.read_bytes())
     assert document["lodLevels"] == len(report.counts) == 4
+    assert document.get("format") == ("sog-xt" if target.name == "levels.json" else None)
     leaves = tree_leaves(document["tree"])
     assert all(sorted(leaf["lods"]) == ["0", "1", "2", "3"] for leaf in leaves)
     for level in range(4):
-        found = kissgs.load(tmp_path / "city" / "lod-meta.json", level=level)
+        found = kissgs.load(target, level=level)
         assert len(found) == report.counts[level] == document["counts"][level]
         assert abs(len(found) - len(original) / 2**level) < 0.02 * COUNT + len(leaves)
-    assert report.total_bytes == sum(map(len, files_of(tmp_path / "city").values()))
-    assert not (tmp_path / "city.partial").exists()
+    assert report.total_bytes == sum(map(len, files_of(target.parent).values()))
+    assert not target.parent.with_name(f"{target.parent.name}.partial").exists()
 
 
-def test_rows_of_a_leaf_are_inside_its_bounds(scene, tmp_path):
-    compress_streamed(scene, tmp_path / "city" / "lod-meta.json", settings=FAST)
-    document = json.loads((tmp_path / "city" / "lod-meta.json").read_bytes())
-    decoded = [kissgs.load(tmp_path / "city" / name) for name in document["filenames"]]
-    for leaf in tree_leaves(document["tree"]):
-        rows = [
+@pytest.mark.parametrize("preset", ["fast", "balanced"])
+def test_rows_of_a_leaf_are_those_of_its_part_of_space(scene, target, preset):
+    """Leaves are cells between cuts, so that no Gaussian of a leaf, merged or not, is between those of another."""
+    report = compress_streamed(scene, target, settings=Settings.from_preset(preset))
+    document = json.loads(target.read_bytes())
+    decoded = [kissgs.load(target.parent / name) for name in document["filenames"]]
+    assert sum(map(len, decoded)) == sum(report.counts)
+    leaves = tree_leaves(document["tree"])
+    rows = [
+        [
             decoded[lod["file"]].select(slice(lod["offset"], lod["offset"] + lod["count"]))
             for lod in leaf["lods"].values()
         ]
-        low, high = bounds(concatenate(rows))
+        for leaf in leaves
+    ]
+    for leaf, own in zip(leaves, rows, strict=True):
+        low, high = bounds(concatenate(own))
         slack = 0.05 * (high - low) + 1e-3
         assert (low >= np.array(leaf["bound"]["min"]) - slack).all()
         assert (high <= np.array(leaf["bound"]["max"]) + slack).all()
+    boxes = np.array([[(part.means.min(axis=0), part.means.max(axis=0)) for part in own] for own in rows])
+    sides = (boxes[:, :, 1] - boxes[:, :, 0]).max(axis=2)
+    for one, other in itertools.combinations(range(len(leaves)), 2):
+        overlap = np.minimum(boxes[one, :, 1], boxes[other, :, 1]) - np.maximum(boxes[one, :, 0], boxes[other, :, 0])
+        assert (overlap.min(axis=1) < 0.05 * np.minimum(sides[one], sides[other])).all()
+
+
+def test_the_finest_level_has_every_gaussian_in_its_leaf(scene, target):
+    compress_streamed(scene, target, settings=FAST)
+    found, source = kissgs.load(target).means, kissgs.load(scene).means
+    distances = np.linalg.norm(found[:, None] - source[None], axis=2)
+    assert len(set(distances.argmin(axis=1))) > 0.98 * len(source)
+    assert np.median(distances.min(axis=1)) < 0.1 * np.median(np.sort(distances, axis=1)[:, 1])
 
 
 class Stop(Exception):
     pass
 
 
-def test_interrupted_work_goes_on_and_ends_with_the_same_bytes(scene, tmp_path, monkeypatch):
-    compress_streamed(scene, tmp_path / "whole" / "lod-meta.json", settings=FAST)
+def test_interrupted_work_goes_on_and_ends_with_the_same_bytes(scene, target, tmp_path):
+    compress_streamed(scene, tmp_path / "whole" / target.name, settings=FAST)
     expected = files_of(tmp_path / "whole")
-    target = tmp_path / "city" / "lod-meta.json"
     events = 0
     while True:
         left = [events]
@@ -98,7 +121,7 @@ def test_interrupted_work_goes_on_and_ends_with_the_same_bytes(scene, tmp_path, 
             continue
         break
     assert events > 6
-    assert files_of(tmp_path / "city") == expected
+    assert files_of(target.parent) == expected
 
 
 def test_work_of_other_settings_is_not_continued(scene, tmp_path):
@@ -162,38 +185,73 @@ def test_splat_transform_reads_every_level(scene, tmp_path):
         assert_alike(kissgs.load(target, level=level), theirs, rtol=1e-6, atol=1e-6)
 
 
-def test_other_files_are_never_replaced(scene, tmp_path):
+def test_other_files_are_never_replaced(scene, target, tmp_path):
     """Neither in another folder, nor beside the files of a streamed scene, nor in the work folder."""
-    folder = tmp_path / "city"
+    folder = target.parent
     folder.mkdir()
     (folder / "mine.txt").write_text("mine")
     with pytest.raises(OutputError, match="holds other files"):
-        compress_streamed(scene, folder / "lod-meta.json", settings=FAST, overwrite=True)
+        compress_streamed(scene, target, settings=FAST, overwrite=True)
     (folder / "mine.txt").unlink()
-    compress_streamed(scene, folder / "lod-meta.json", settings=FAST)
-    (folder / "0_0" / "mine.txt").write_text("mine")
-    with pytest.raises(OutputError, match=r"holds other files \(0_0/mine\.txt\)"):
-        compress_streamed(scene, folder / "lod-meta.json", settings=FAST, overwrite=True)
-    assert (folder / "0_0" / "mine.txt").read_text() == "mine"
+    compress_streamed(scene, target, settings=FAST)
+    mine = folder / "0_0" / "mine.txt"
+    mine.parent.mkdir(exist_ok=True)
+    mine.write_text("mine")
+    with pytest.raises(OutputError, match=r"holds other files \(0_0"):
+        compress_streamed(scene, target, settings=FAST, overwrite=True)
+    assert mine.read_text() == "mine"
     (tmp_path / "town.partial").mkdir()
     (tmp_path / "town.partial" / "mine.txt").write_text("mine")
     with pytest.raises(OutputError, match=r"town\.partial holds other files"):
-        compress_streamed(scene, tmp_path / "town" / "lod-meta.json", settings=FAST)
+        compress_streamed(scene, tmp_path / "town" / target.name, settings=FAST)
     assert [path.name for path in (tmp_path / "town.partial").iterdir()] == ["mine.txt"]
 
 
-def test_a_streamed_scene_is_replaced_only_if_allowed(scene, tmp_path):
-    target = tmp_path / "city" / "lod-meta.json"
+def test_what_a_manifest_names_beside_its_containers_is_never_replaced(scene, target):
+    compress_streamed(scene, target, settings=FAST)
+    document = json.loads(target.read_bytes())
+    document["filenames"] += ["mine.txt", "../mine.txt", "/etc/hosts", "sub/mine.txt"]
+    target.write_text(json.dumps(document))
+    (target.parent / "mine.txt").write_text("mine")
+    with pytest.raises(OutputError, match=r"holds other files \(mine\.txt\)"):
+        compress_streamed(scene, target, settings=FAST, overwrite=True)
+    assert (target.parent / "mine.txt").read_text() == "mine"
+
+
+def test_a_streamed_scene_is_replaced_only_if_allowed(scene, target, tmp_path):
+    """Also by one of the other kind in the same folder."""
     compress_streamed(scene, target, settings=FAST)
     with pytest.raises(OutputError, match="exists already"):
         compress_streamed(scene, target, settings=FAST)
     other = Settings.from_preset("fast", sh0_step=0.1)
-    compress_streamed(scene, target, settings=other, overwrite=True)
-    compress_streamed(scene, tmp_path / "new" / "lod-meta.json", settings=other)
-    assert files_of(tmp_path / "city") == files_of(tmp_path / "new")
+    for name in ("lod-meta.json", "levels.json", "lod-meta.json"):
+        compress_streamed(scene, target.parent / name, settings=other, overwrite=True)
+        shutil.rmtree(tmp_path / "new", ignore_errors=True)
+        compress_streamed(scene, tmp_path / "new" / name, settings=other)
+        assert files_of(target.parent) == files_of(tmp_path / "new")
 
 
-@pytest.mark.parametrize("name", ["lod-meta.json", "inner/../lod-meta.json"])
+def test_work_for_another_container_is_not_continued(scene, tmp_path):
+    def stop(stage, fraction, note=""):
+        if stage == "images":
+            raise Stop
+
+    with pytest.raises(Stop):
+        compress_streamed(scene, tmp_path / "city" / "lod-meta.json", settings=FAST, progress=stop)
+    with pytest.raises(OutputError, match=r"city\.partial belongs to other or older work"):
+        compress_streamed(scene, tmp_path / "city" / "levels.json", settings=FAST)
+
+
+def test_the_folder_of_levels_of_sogxt_is_named_by_its_ending(scene, tmp_path):
+    compress_streamed(scene, f"{tmp_path}/city.sogxt/", settings=FAST)
+    compress_streamed(scene, tmp_path / "city" / "levels.json", settings=FAST)
+    assert files_of(tmp_path / "city.sogxt") == files_of(tmp_path / "city")
+    assert "0_0.zip" in files_of(tmp_path / "city")
+    with pytest.raises(OutputError, match=r"town is no name of a streamed scene"):
+        compress_streamed(scene, tmp_path / "town", settings=FAST)
+
+
+@pytest.mark.parametrize("name", ["lod-meta.json", "levels.json", "inner/../lod-meta.json"])
 def test_the_current_folder_is_not_replaced(scene, tmp_path, monkeypatch, name):
     (tmp_path / "here" / "inner").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "here")
@@ -226,7 +284,8 @@ def test_settings_that_do_not_fit_are_refused(scene, tmp_path, changes):
         compress_streamed(scene, tmp_path / "city" / "lod-meta.json", settings=Settings.from_preset("fast", **changes))
 
 
-def test_the_number_of_threads_does_not_matter(scene, tmp_path):
+@pytest.mark.parametrize("name", ["lod-meta.json", "levels.json"])
+def test_the_number_of_threads_does_not_matter(scene, tmp_path, name):
     for threads in (1, 3):
-        compress_streamed(scene, tmp_path / str(threads) / "lod-meta.json", settings=FAST, threads=threads)
+        compress_streamed(scene, tmp_path / str(threads) / name, settings=FAST, threads=threads)
     assert files_of(tmp_path / "1") == files_of(tmp_path / "3")

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 from helpers.extreme_containers import BY_NAME, given, scene
+from helpers.streamed_scenes import TARGETS
 
 import kissgs
 from kissgs import Settings
@@ -32,15 +33,16 @@ def numbers(node):
     return [node] if isinstance(node, (int, float)) else []
 
 
+@pytest.mark.parametrize("manifest", TARGETS)
 @pytest.mark.parametrize("name", list(BY_NAME))
 @pytest.mark.quick(8)
-def test_all_levels_of_an_extreme_scene_can_be_read(name, tmp_path):
+def test_all_levels_of_an_extreme_scene_can_be_read(name, manifest, tmp_path):
     source = given(name)
     if isinstance(source, bytes):
         (tmp_path / "scene.ply").write_bytes(source)
     else:
         kissgs.save(source, tmp_path / "scene.ply")
-    cleaned, target = scene(name)[0], tmp_path / "city" / "lod-meta.json"
+    cleaned, target = scene(name)[0], tmp_path / manifest
     visible = int((cleaned.opacities > math.log(1 / 254)).sum())
     if not visible:
         with pytest.raises(InvalidSceneError, match="no Gaussian"):
@@ -54,11 +56,12 @@ def test_all_levels_of_an_extreme_scene_can_be_read(name, tmp_path):
     assert np.isfinite(numbers(json.loads(target.read_bytes()))).all()
 
 
+@pytest.mark.parametrize("manifest", TARGETS)
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 8, 9])
 @pytest.mark.parametrize("degree", [0, 3])
-def test_few_gaussians(count, degree, tmp_path):
+def test_few_gaussians(count, degree, manifest, tmp_path):
     kissgs.save(kissgs.sample_scene(count, sh_degree=degree), tmp_path / "scene.ply")
-    target = tmp_path / "city" / "lod-meta.json"
+    target = tmp_path / manifest
     if count == 0:
         with pytest.raises(InvalidSceneError, match="no Gaussian"):
             compress_streamed(tmp_path / "scene.ply", target, settings=FAST)

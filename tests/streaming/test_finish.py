@@ -58,10 +58,10 @@ def killed_at(step, monkeypatch):
     return left
 
 
-@pytest.mark.parametrize("force", [False, True])
-def test_it_may_be_killed_before_every_change_of_the_disk(scene, tmp_path, monkeypatch, force):
-    target = tmp_path / "city" / "lod-meta.json"
-    compress_streamed(scene, tmp_path / "whole" / "lod-meta.json", settings=FAST)
+@pytest.mark.parametrize(("name", "force"), [("lod-meta.json", False), ("lod-meta.json", True), ("levels.json", True)])
+def test_it_may_be_killed_before_every_change_of_the_disk(scene, tmp_path, monkeypatch, name, force):
+    target = tmp_path / "city" / name
+    compress_streamed(scene, tmp_path / "whole" / name, settings=FAST)
     expected = files_of(tmp_path / "whole")
     step = 0
     while True:

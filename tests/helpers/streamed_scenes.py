@@ -1,0 +1,52 @@
+"""Streamed scenes of both kinds of containers, made by hand around containers, and the leaves of a manifest."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import kissgs
+from helpers.reference_sog import sog_files, sog_folder, streamed_files
+from kissgs import Settings
+from kissgs.sog import streamed as streamed_sog
+from kissgs.sog.decode import decode as decode_sog
+from kissgs.sogxt import streamed as streamed_sogxt
+from kissgs.sogxt.decode import decode as decode_sogxt
+
+ALL = Settings.from_preset("fast", prune_invisible=False)
+
+
+def sogxt_zip(scene, name):
+    """Return a zip with every Gaussian of a scene, and its file in a manifest."""
+    return {f"{name}.zip": kissgs.compress(scene, settings=ALL).to_zip()}, f"{name}.zip"
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of streamed scenes: its format, manifest, reader, containers, and the reader of a single container."""
+
+    format: str
+    manifest: str
+    decode: Callable
+    container: Callable
+    decode_one: Callable
+
+    def files(self, levels, *, environment=None):
+        return streamed_files(levels, environment=environment, container=self.container, manifest=self.manifest)
+
+
+SOG = Kind("streamed-sog", "lod-meta.json", streamed_sog.decode, sog_folder, lambda scene: decode_sog(sog_files(scene)))
+SOGXT = Kind(
+    "streamed-sogxt",
+    "levels.json",
+    streamed_sogxt.decode,
+    sogxt_zip,
+    lambda scene: decode_sogxt(sogxt_zip(scene, "")[0][".zip"]),
+)
+KINDS = {kind.format: kind for kind in (SOG, SOGXT)}
+
+TARGETS = ("city/lod-meta.json", "city.sogxt/levels.json")
+"""Manifests to write, one of each kind."""
+
+
+def tree_leaves(node):
+    """Return the leaves of a manifest's tree."""
+    return [node] if "lods" in node else [leaf for child in node["children"] for leaf in tree_leaves(child)]
