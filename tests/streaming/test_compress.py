@@ -219,7 +219,7 @@ def test_what_a_manifest_names_beside_its_containers_is_never_replaced(scene, ta
 
 
 def test_a_streamed_scene_is_replaced_only_if_allowed(scene, target, tmp_path):
-    """Also by one of the other kind in the same folder."""
+    """A scene of the other kind in the same folder is one too."""
     compress_streamed(scene, target, settings=FAST)
     with pytest.raises(OutputError, match="exists already"):
         compress_streamed(scene, target, settings=FAST)
