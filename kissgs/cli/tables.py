@@ -96,6 +96,9 @@ def streamed_table(report: StreamedReport, target: str) -> RenderableType:
     table = Table("level", *map(_right, ("Gaussians", "bytes", "per Gaussian")), box=None, pad_edge=False)
     for level, (count, stored) in enumerate(zip(report.counts, report.level_bytes, strict=True)):
         table.add_row(str(level), f"{count:,}", f"{stored:,}", f"{stored / max(count, 1):.2f}")
+    if count := report.environment_count:
+        stored = report.environment_bytes
+        table.add_row("environment", f"{count:,}", f"{stored:,}", f"{stored / count:.2f}")
     return Group(head, table, *_changes(report.changed))
 
 

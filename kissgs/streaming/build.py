@@ -13,22 +13,25 @@ from pathlib import Path
 
 import numpy as np
 
+from kissgs.core.array_types import Float32, UInt16
 from kissgs.core.progress import Progress, silent
-from kissgs.core.splats import SH_REST_COUNTS, Splats, clean, empty_splats
+from kissgs.core.splats import SH_REST_COUNTS, Splats, clean, concatenate, empty_splats
 from kissgs.io.atomic import atomic_file
 from kissgs.io.container_names import ContainerName
 from kissgs.pipeline.containers import MODELS, write_files
 from kissgs.planning.planner import plan_encoding, visible_gaussians
 from kissgs.settings import EncodeSettings
-from kissgs.sog.names import META_NAME
 from kissgs.sogxt.container import write_container
 from kissgs.sogxt.names import FORMAT
+from kissgs.streaming.environment import Environment
 from kissgs.streaming.file_settings import file_settings
 from kissgs.streaming.layout import (
     CAMERAS,
     OUT,
     Layout,
     chunk_file,
+    environment_file,
+    environment_marker,
     leaves_file,
     level_file,
     read_leaves,
@@ -73,7 +76,7 @@ def partition(
         settings: settings of the encoder, which say whether invisible Gaussians are left out.
         progress: receives "partition".
     """
-    depth, done = chunk_depth(count, CHUNK), 0
+    done = 0
 
     def counted() -> Iterator[Splats]:
         nonlocal done
@@ -82,15 +85,25 @@ def partition(
             done += len(block)
             progress("partition", done / (2 * count))
 
-    cuts = Cuts.of(sampled_positions((clean(block)[0].means for block in counted()), count), depth)
-    for chunk in range(cuts.chunks):
-        chunk_file(work, chunk).unlink(missing_ok=True)
-    counts, sh_degree, changed = np.zeros(cuts.chunks, np.int64), 0, Counter[str]()
+    def visible_means(block: Splats) -> Float32[np.ndarray, "n 3"]:
+        splats = clean(block)[0]
+        return splats.means[visible_gaussians(splats, settings)]
+
+    positions = sampled_positions(map(visible_means, counted()), count)
+    environment = Environment.of(positions, count)
+    depth = chunk_depth(count, CHUNK)
+    cuts = Cuts.of(positions[~environment.contains(positions)], depth)
+    for path in (environment_file(work), *(chunk_file(work, chunk) for chunk in range(cuts.chunks))):
+        path.unlink(missing_ok=True)
+    far_count, counts, sh_degree, changed = 0, np.zeros(cuts.chunks, np.int64), 0, Counter[str]()
     for block in counted():
         splats, cleaned = clean(block)
         visible = visible_gaussians(splats, settings)
         changed.update({**cleaned.as_dict(), "invisible": len(splats) - len(visible)})
         splats, sh_degree = splats.select(visible), splats.sh_degree
+        far = environment.contains(splats.means)
+        append_rows(environment_file(work), to_rows(splats.select(far)))
+        far_count, splats = far_count + int(far.sum()), splats.select(~far)
         chunks = cuts.chunk_of(splats.means)
         rows = to_rows(splats)
         for chunk in np.unique(chunks):
@@ -106,10 +119,11 @@ def partition(
         depth=depth,
         levels=level_count(total, COARSEST),
         leaf=max(LEAF, -(-total // MOST_LEAVES)),
+        environment=far_count,
         changed=dict(changed),
     )
-    for chunk in layout.filled:
-        sync(chunk_file(work, chunk))
+    for path in (environment_file(work), *(chunk_file(work, chunk) for chunk in layout.filled)):
+        sync(path)
     return layout
 
 
@@ -135,8 +149,10 @@ def has_file(work: Path, level: int, file: int) -> bool:
 
 def make_cameras(work: Path, layout: Layout, settings: EncodeSettings, threads: int) -> None:
     """Choose the cameras that sensitivity is measured with, and write them to a file."""
-    coarsest = _read_level(work, layout, layout.levels - 1, layout.filled)
-    total = sum(layout.counts)
+    coarsest = concatenate(
+        [_read_level(work, layout, layout.levels - 1, layout.filled), read_environment(work, layout)]
+    )
+    total = sum(layout.counts) + layout.environment
     cameras = choose_cameras(coarsest, len(layout.filled), total, settings, threads)
     write_json(work / CAMERAS, cameras_json(cameras))
 
@@ -152,32 +168,84 @@ def make_file(work: Path, layout: Layout, settings: EncodeSettings, level: int, 
     splats = _read_level(work, layout, level, members)
     counts = [count for chunk in members for count in read_leaves(work, chunk)["counts"][level]]
     groups = np.repeat(np.arange(len(counts)), counts).astype(np.uint16)
-    settings = file_settings(settings, level, layout.sh_degree)
-    stored = [0] * len(counts)
-    if len(visible_gaussians(splats, settings)):  # merging may have made all of them invisible
-        sensitivity = None
-        if settings.rate_distortion:
-            others = _read_level(work, layout, layout.context, sorted({*layout.filled} - {*members}))
-            cameras = cameras_of(json.loads((work / CAMERAS).read_bytes()))
-            sensitivity = measure_file(splats, others, cameras, level, settings, threads)
-            del others
-        plan = plan_encoding(
-            splats,
-            settings,
-            sensitivity=sensitivity,
-            container=MODELS[layout.container],
-            groups=groups,
-            keep_costs=False,
-            threads=threads,
-        )
-        del sensitivity, splats
-        encoded = write_files(layout.container, plan, settings, threads=threads)
-        write_container(encoded.files, work / OUT / layout.path(level, file), overwrite=True)
-        stored = np.bincount(groups[encoded.order], minlength=len(counts)).tolist()
+    stored = _encode(work, layout, splats, groups, settings, level, members, layout.path(level, file), threads)
     write_json(rows_file(work, level, file), {"counts": stored})
     if level != layout.context:
         for chunk in members:
             level_file(work, chunk, level).unlink(missing_ok=True)
+
+
+def has_environment(work: Path) -> bool:
+    """Return whether the file of the environment is complete."""
+    return environment_marker(work).exists()
+
+
+def make_environment(work: Path, layout: Layout, settings: EncodeSettings, threads: int) -> None:
+    """Encode the Gaussians of the environment."""
+    splats = read_environment(work, layout)
+    groups = np.zeros(len(splats), np.uint16)
+    stored = _encode(work, layout, splats, groups, settings, 0, None, layout.environment_path, threads)
+    write_json(environment_marker(work), {"counts": stored})
+
+
+def _encode(
+    work: Path,
+    layout: Layout,
+    splats: Splats,
+    groups: UInt16[np.ndarray, " N"],
+    settings: EncodeSettings,
+    level: int,
+    members: Sequence[int] | None,
+    path: str,
+    threads: int,
+) -> list[int]:
+    """Write a container; return the number of rows of each group in it.
+
+    Args:
+        work: the work folder.
+        layout: sizes of the scene.
+        splats: the Gaussians.
+        groups: group of each, ascending; groups stay together.
+        settings: settings of the encoder, for the finest level.
+        level: level of the Gaussians.
+        members: chunks that they are from; None for the environment.
+        path: name of the container in the folder of the result.
+        threads: number of threads; 0 means one per processor.
+    """
+    settings, count = file_settings(settings, level, layout.sh_degree), int(groups[-1]) + 1
+    if not len(visible_gaussians(splats, settings)):  # merging may have made all of them invisible
+        return [0] * count
+    sensitivity = None
+    if settings.rate_distortion:
+        others = [_read_level(work, layout, layout.context, sorted({*layout.filled} - {*(members or ())}))]
+        if members is not None:
+            others.append(read_environment(work, layout))
+        cameras = cameras_of(json.loads((work / CAMERAS).read_bytes()))
+        sensitivity = measure_file(splats, concatenate(others), cameras, level, settings, threads)
+        del others
+    plan = plan_encoding(
+        splats,
+        settings,
+        sensitivity=sensitivity,
+        container=MODELS[layout.container],
+        groups=groups,
+        keep_costs=False,
+        threads=threads,
+    )
+    del sensitivity, splats
+    encoded = write_files(layout.container, plan, settings, threads=threads)
+    write_container(encoded.files, work / OUT / path, overwrite=True)
+    return np.bincount(groups[encoded.order], minlength=count).tolist()
+
+
+def environment_count(work: Path) -> int:
+    """Return the number of Gaussians in the file of the environment."""
+    return sum(json.loads(environment_marker(work).read_bytes())["counts"])
+
+
+def read_environment(work: Path, layout: Layout) -> Splats:
+    """Return the Gaussians of the environment."""
+    return from_rows(read_rows(environment_file(work), layout.sh_degree, layout.environment))
 
 
 def _read_level(work: Path, layout: Layout, level: int, chunks: Sequence[int]) -> Splats:
@@ -202,14 +270,15 @@ def make_manifest(work: Path, layout: Layout) -> None:
                     lods.setdefault((chunk, leaf), {})[level] = (len(filenames), offset, counts[at])
                 offset, at = offset + counts[at], at + 1
         if any(counts):
-            path = layout.path(level, file)
-            filenames.append(f"{path}/{META_NAME}" if layout.container == "sog" else path)
+            filenames.append(layout.entry(layout.path(level, file)))
     leaves = []
     for chunk in layout.filled:
         own = read_leaves(work, chunk)
         for leaf, (bounds, errors) in enumerate(zip(own["bounds"], own["errors"], strict=True)):
             if (chunk, leaf) in lods:  # some Gaussian of it is visible
                 leaves.append(Leaf(np.array(bounds), dict(sorted(lods[chunk, leaf].items())), errors))
+    path = layout.environment_path
+    environment = layout.entry(path) if (work / OUT / path).exists() else None
     containers = FORMAT if layout.container == "sogxt" else None
     with atomic_file(work / OUT / layout.manifest, overwrite=True) as out:
-        out.write(manifest(leaves, layout.levels, filenames, containers))
+        out.write(manifest(leaves, layout.levels, filenames, environment, containers))

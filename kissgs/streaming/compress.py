@@ -23,7 +23,7 @@ from kissgs.runners import Runner
 from kissgs.settings import Settings
 from kissgs.streaming import build
 from kissgs.streaming.build import Blocks
-from kissgs.streaming.items import run_all, run_file, run_levels
+from kissgs.streaming.items import run_all, run_environment, run_file, run_levels
 from kissgs.streaming.layout import OUT, PARTITION, Layout, keep_layout, read_layout
 from kissgs.streaming.time_left import with_time_left
 from kissgs.streaming.work_folder import check_destination, check_space, claimed, finish, needed_bytes, read_json
@@ -43,6 +43,8 @@ class StreamedReport:
             removal costs; the finest level has neither.
         counts: number of Gaussians of each level, the finest first.
         level_bytes: bytes of the files of each level.
+        environment_count, environment_bytes: number of Gaussians in the environment, and bytes of its files; 0 without
+            one. It belongs to every level, but is not counted there.
         chunks: number of chunks of the finest level.
         total_bytes: bytes of all files, the manifest included.
     """
@@ -51,6 +53,8 @@ class StreamedReport:
     changed: dict[str, int]
     counts: tuple[int, ...]
     level_bytes: tuple[int, ...]
+    environment_count: int
+    environment_bytes: int
     chunks: int
     total_bytes: int
 
@@ -142,6 +146,8 @@ def _make(
     if encode.rate_distortion and not build.has_cameras(work):
         report("cameras", 0.0)
         build.make_cameras(work, layout, encode, threads)
+    if layout.environment and not build.has_environment(work):
+        run(run_environment, "images", [{"work": path, "settings": stored}], 1)
     files = layout.files()
     missing = [each for each in files if not build.has_file(work, *each)]
     items = [{"work": path, "level": level, "file": file, "settings": stored} for level, file in missing]
@@ -239,11 +245,18 @@ def _report(work: Path, layout: Layout, chunks: int) -> StreamedReport:
     for level, file in layout.files():
         path = out / layout.path(level, file)
         sizes[level] += stored_bytes(path) if path.exists() else 0  # files without a visible Gaussian are not written
+    environment = out / layout.environment_path
+    environment_count, environment_bytes = 0, 0
+    if environment.exists():
+        environment_count, environment_bytes = build.environment_count(work), stored_bytes(environment)
+    pruned = sum(layout.counts) + layout.environment - document["counts"][0] - environment_count
     return StreamedReport(
         source_count=layout.source_count,
-        changed={**layout.changed, "pruned_by_rd": sum(layout.counts) - document["counts"][0]},
+        changed={**layout.changed, "pruned_by_rd": pruned},
         counts=tuple(document["counts"]),
         level_bytes=tuple(sizes),
+        environment_count=environment_count,
+        environment_bytes=environment_bytes,
         chunks=chunks,
-        total_bytes=sum(sizes) + (out / layout.manifest).stat().st_size,
+        total_bytes=sum(sizes) + environment_bytes + (out / layout.manifest).stat().st_size,
     )

@@ -53,6 +53,16 @@ def run_file(arguments: dict[str, Any], progress: Progress) -> dict[str, Any]:
     return {}
 
 
+def run_environment(arguments: dict[str, Any], progress: Progress) -> dict[str, Any]:
+    """Encode the environment: "work", the work folder; "settings" of the encoder; "threads"."""
+    work, settings = _shared(arguments), EncodeSettings.model_validate(arguments["settings"])
+    _make_once(
+        lambda: build.has_environment(work),
+        lambda: build.make_environment(work, read_layout(work), settings, arguments["threads"]),
+    )
+    return {}
+
+
 def _make_once(done: Callable[[], bool], make: Callable[[], None]) -> None:
     """Make something unless it is there.
 

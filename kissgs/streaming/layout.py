@@ -9,6 +9,7 @@ from typing import Any
 
 from kissgs.io.atomic import atomic_file
 from kissgs.io.container_names import MANIFESTS, ContainerName
+from kissgs.sog.names import META_NAME
 
 CONTEXT = 280_000
 """Largest number of Gaussians of the level that stands for other chunks where sensitivity is measured."""
@@ -29,6 +30,7 @@ class Layout:
         depth: number of cuts one after another; there are 2^depth chunks.
         levels: number of levels.
         leaf: largest number of Gaussians in a leaf.
+        environment: number of Gaussians in the environment; 0 without one.
         changed: number of Gaussians that cleaning removed or changed, by kind, and of those that are invisible.
     """
 
@@ -39,6 +41,7 @@ class Layout:
     depth: int
     levels: int
     leaf: int
+    environment: int
     changed: dict[str, int]
 
     @property
@@ -60,6 +63,15 @@ class Layout:
     def path(self, level: int, file: int) -> str:
         """Return the name of a container in the folder of the result: that of a folder for SOG, else of a zip."""
         return f"{level}_{file}" if self.container == "sog" else f"{level}_{file}.zip"
+
+    def entry(self, path: str) -> str:
+        """Return how the manifest names a container of this name."""
+        return f"{path}/{META_NAME}" if self.container == "sog" else path
+
+    @property
+    def environment_path(self) -> str:
+        """Name of the environment's container in the folder of the result, see :meth:`path`."""
+        return "environment" if self.container == "sog" else "environment.zip"
 
     def members(self, level: int, file: int) -> range:
         """Return the chunks in a file of a level: twice as many as in one of the level before, up to all."""
@@ -95,6 +107,16 @@ def read_leaves(work: Path, chunk: int) -> dict[str, Any]:
 def chunk_file(work: Path, chunk: int) -> Path:
     """Return the file of the Gaussians of a chunk, until its levels are made."""
     return work / f"chunk_{chunk}.f32"
+
+
+def environment_file(work: Path) -> Path:
+    """Return the file of the Gaussians of the environment."""
+    return work / "environment.f32"
+
+
+def environment_marker(work: Path) -> Path:
+    """Return the file of the number of Gaussians in the environment's container, which marks that as done."""
+    return work / "environment.json"
 
 
 def level_file(work: Path, chunk: int, level: int) -> Path:

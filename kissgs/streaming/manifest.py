@@ -28,13 +28,16 @@ class Leaf:
     errors: Sequence[float]
 
 
-def manifest(leaves: Sequence[Leaf], levels: int, filenames: Sequence[str], containers: str | None) -> bytes:
+def manifest(
+    leaves: Sequence[Leaf], levels: int, filenames: Sequence[str], environment: str | None, containers: str | None
+) -> bytes:
     """Return the manifest.
 
     Args:
         leaves: all leaves, neighbours after neighbours.
         levels: number of levels; 0 is the finest.
         filenames: file of each container, relative to the manifest.
+        environment: file of the environment; None without one.
         containers: format of the containers; None for SOG, whose manifests do not name it.
     """
     counts = [sum(leaf.lods[level][2] for leaf in leaves if level in leaf.lods) for level in range(levels)]
@@ -46,6 +49,7 @@ def manifest(leaves: Sequence[Leaf], levels: int, filenames: Sequence[str], cont
         "counts": counts,
         "lodLevels": levels,
         "lodErrors": True,
+        **({} if environment is None else {"environment": environment}),
         "filenames": list(filenames),
         "tree": _node(leaves),
     }

@@ -69,7 +69,8 @@ def _paths_of(folder: Path) -> set[Path]:
         document = read_json(folder / manifest)
         if not isinstance(document, dict) or not isinstance(document.get("filenames"), list):
             continue
-        named = [Path(str(name)) for name in document["filenames"]]
+        environment = document.get("environment")
+        named = [Path(str(name)) for name in (*document["filenames"], *([environment] if environment else ()))]
         if container == "sog":
             files = [path.parent / name for path in named for name in FILES]
         else:
