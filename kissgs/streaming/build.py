@@ -50,9 +50,9 @@ Blocks = Callable[[], Iterable[Splats]]
 CHUNK = 400_000
 """Largest number of Gaussians in a chunk, but for the scatter of estimated medians."""
 
-LEAF, MOST_LEAVES = 32_768, 512
-"""Largest number of Gaussians in a leaf; and about that of leaves, because the manifest takes up to 700 bytes for each:
-large scenes have larger leaves."""
+LEAF, MOST_ENTRIES = 32_768, 4096
+"""Largest number of Gaussians in a leaf; and about that of leaves times levels, because the manifest takes about 105 bytes
+for each level of each leaf, before the first image: large scenes have larger leaves."""
 
 COARSEST = 50_000
 """Largest number of Gaussians in the coarsest level, which with the manifest makes a viewer's first image."""
@@ -111,14 +111,15 @@ def partition(
             append_rows(chunk_file(work, int(chunk)), some)
             counts[chunk] += len(some)
     total = int(counts.sum())
+    levels = level_count(total, COARSEST)
     layout = Layout(
         container=container,
         source_count=count,
         sh_degree=sh_degree,
         counts=tuple(map(int, counts)),
         depth=depth,
-        levels=level_count(total, COARSEST),
-        leaf=max(LEAF, -(-total // MOST_LEAVES)),
+        levels=levels,
+        leaf=max(LEAF, -(-total * levels // MOST_ENTRIES)),
         environment=far_count,
         changed=dict(changed),
     )
