@@ -51,8 +51,8 @@ CHUNK = 400_000
 """Largest number of Gaussians in a chunk, but for the scatter of estimated medians."""
 
 LEAF, MOST_ENTRIES = 32_768, 4096
-"""Largest number of Gaussians in a leaf; and about that of leaves times levels, because the manifest takes about 105 bytes
-for each level of each leaf, before the first image: large scenes have larger leaves."""
+"""Largest number of Gaussians in a leaf; and about that of leaves times levels, because the manifest takes about 105
+bytes for each level of each leaf, before the first image: large scenes have larger leaves."""
 
 COARSEST = 50_000
 """Largest number of Gaussians in the coarsest level, which with the manifest makes a viewer's first image."""
