@@ -11,6 +11,8 @@ import { refiner } from "./preview/refine.js";
 import { STAGES, gaussianAt, lastStageOf, partsOf, stageOf } from "./preview/scene.js";
 import { addressed, download, jobIn, namesSource, standsAlone } from "./preview/sources.js";
 import { stage } from "./preview/stage.js";
+import { isManifest } from "./preview/lod_tree.js";
+import { openStreamed } from "./preview/streamed_page.js";
 import { fileStatisticsView, statisticsView } from "./preview/statistics.js";
 import { UserError, aborted, showProblem } from "./preview/problem.js";
 
@@ -115,6 +117,7 @@ async function openAddressed(load) {
   const source = await addressed(location, load.signal);
   const { name, container } = source;
   const type = fileTypeOf(name);
+  if (typeof container === "string" && isManifest(container)) return openStreamedScene(name, container, load);
   if (!type) return openContainer(source, load);
   const bytes =
     typeof container === "string"
@@ -123,17 +126,29 @@ async function openAddressed(load) {
   await openFile(name, type, bytes, load);
 }
 
+/** @param {string} name @param {string} address @param {Load} load */
+async function openStreamedScene(name, address, load) {
+  setTitle(name);
+  showPanel();
+  announce(`${name}: ${count(await openStreamed(address, load, view, showProblem))} Gaussians.`);
+}
+
+/** Show the panel of a scene that has no planes and cannot be compared, with its statistics. @param {...Node} statistics */
+function showPanel(...statistics) {
+  shown = null;
+  byId("statistics").replaceChildren(...statistics);
+  byId("planes").replaceChildren();
+  byId("panel").hidden = false;
+  byId("compare").hidden = true;
+}
+
 /** @param {string} name @param {FileType} type @param {Uint8Array} bytes @param {Load} load */
 async function openFile(name, type, bytes, load) {
   const size = bytes.length; // reading it may take the bytes away
   load.signal.throwIfAborted();
   const gaussians = await readable(name, view.showFile(type, bytes));
-  shown = null;
   setTitle(name);
-  byId("statistics").replaceChildren(...fileStatisticsView(gaussians, size));
-  byId("planes").replaceChildren();
-  byId("panel").hidden = false;
-  byId("compare").hidden = true;
+  showPanel(...fileStatisticsView(gaussians, size));
   announce(`${name}: ${count(gaussians)} Gaussians.`);
 }
 

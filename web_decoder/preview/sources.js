@@ -57,7 +57,7 @@ function ofElement(element) {
 function ofAddress(address, here) {
   try {
     const url = new URL(address, here);
-    const path = url.pathname.replace(/\/(meta\.json)?$/, "");
+    const path = url.pathname.replace(/\/((lod-)?meta\.json|levels\.json)?$/, "");
     const name = decodeURIComponent(path.slice(path.lastIndexOf("/") + 1));
     return { name: name || url.host, container: url.href, zipped: path === url.pathname };
   } catch {
@@ -94,10 +94,11 @@ async function ofJob(id, signal) {
 }
 
 /**
+ * Fetch a file; errors are sentences.
  * @param {string} url
  * @param {RequestInit} init
  */
-async function get(url, init) {
+export async function get(url, init) {
   const response = await fetch(url, init).catch((error) => {
     throw init.signal?.aborted
       ? error

@@ -1,0 +1,94 @@
+/** Showing a streamed scene on the page: it follows the camera, and tells what is drawn. */
+
+import { budgetOf } from "./device.js";
+import { byId } from "./dom.js";
+import { extentOfBoxes } from "./extent.js";
+import { parseTree } from "./lod_tree.js";
+import { UserError, sentenceOf } from "./problem.js";
+import { StreamedFiles } from "./streamed_files.js";
+import { streamedStatisticsView } from "./statistics.js";
+import { Streaming } from "./streaming.js";
+
+/** @typedef {import("./streamed_meshes.js").Content} Content */
+
+/** Shortest time between two choices of levels while the camera moves, milliseconds. */
+const INTERVAL = 100;
+
+/**
+ * Show a streamed scene; resolves when its coarsest level is drawn, and the scene goes on from there.
+ * @param {string} address of the manifest
+ * @param {import("./loading.js").Load} load
+ * @param {ReturnType<typeof import("./stage.js").stage>} view
+ * @param {(error: UserError) => void} failed called when a file cannot be loaded
+ * @returns {Promise<number>} the number of Gaussians of the finest level
+ */
+export async function openStreamed(address, load, view, failed) {
+  const begun = performance.now();
+  const files = new StreamedFiles(address);
+  const tree = parseTree(await files.manifest(load.signal));
+  const budget = budgetOf(location.search);
+  await view.settled;
+  if (view.failure) return tree.count; // the page says why nothing can be drawn
+  const { contentOf } = await import("./streamed_meshes.js");
+  load.signal.throwIfAborted();
+
+  /** @type {number | null} */
+  let seconds = null;
+  let timer = 0;
+  let closed = false;
+  /** @type {(error?: unknown) => void} */
+  let ended = () => {};
+
+  /** @param {number} file @param {unknown} error */
+  function lose(file, error) {
+    const what = streaming.base.includes(file) ? "part of the scene is missing" : "its part of the scene stays coarse";
+    failed(new UserError(`${tree.files[file]}: ${sentenceOf(error).replace(/[.]$/, "")}; ${what}.`));
+  }
+  /** @type {Streaming<Content>} */
+  const streaming = new Streaming(tree, {
+    budget,
+    load: async (file, signal) => contentOf(await files.load(file, tree.files[file], signal), signal),
+    draw: (parts) => viewer.setParts(parts),
+    changed: () => soon(0),
+    failed: lose,
+  });
+  const weights = tree.leaves.map((leaf) => leaf.levels.at(-1)?.count ?? 0);
+  const viewer = await view.stream(extentOfBoxes(tree.leaves, weights), close);
+
+  function soon(wait = INTERVAL) {
+    if (!timer && !closed) timer = setTimeout(look, wait);
+  }
+
+  function look() {
+    timer = 0;
+    streaming.look(viewer.sight);
+    load.progress({ received: files.received, total: 0 });
+    if (streaming.begun && seconds === null) {
+      seconds = (performance.now() - begun) / 1000;
+      ended();
+    }
+    const { drawn, complete } = streaming;
+    const facts = { tree, budget, drawn, complete, received: files.received, total: files.total(tree), seconds };
+    byId("statistics").replaceChildren(...streamedStatisticsView(facts));
+  }
+
+  function close() {
+    closed = true;
+    clearTimeout(timer);
+    viewer.afterFrame = () => {};
+    streaming.close();
+    files.close();
+    ended();
+  }
+
+  viewer.afterFrame = () => soon();
+  await new Promise((resolve, reject) => {
+    ended = resolve;
+    load.signal.addEventListener("abort", () => {
+      if (seconds === null) view.conceal();
+      reject(load.signal.reason);
+    });
+    look();
+  });
+  return tree.count;
+}
