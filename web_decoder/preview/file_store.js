@@ -71,7 +71,7 @@ export class FileStore {
   /** @param {number[]} files */
   #fitting(files) {
     let left = this.options.room;
-    return new Set(files.filter((file, i) => (left -= this.options.sizes[file]) >= 0 || i === 0));
+    return new Set(files.filter((file) => (left -= this.options.sizes[file]) >= 0));
   }
 
   /** @param {number} file */

@@ -66,9 +66,9 @@ export const fileStatisticsView = (gaussians, size) => [
  * @param {boolean} facts.complete whether nothing is to be loaded for this view
  * @param {number} facts.received bytes
  * @param {number} facts.total bytes, estimated
- * @param {number | null} facts.seconds until the first image; null before
+ * @param {{seconds: number, bytes: number} | null} facts.first when the first image was drawn; null before
  */
-export function streamedStatisticsView({ tree, budget, drawn, complete, received, total, seconds }) {
+export function streamedStatisticsView({ tree, budget, drawn, complete, received, total, first }) {
   const gaussians = drawn.reduce((sum, level) => sum + level.gaussians, 0);
   return [
     el("h2", { id: "statistics-title" }, "Statistics"),
@@ -76,7 +76,7 @@ export function streamedStatisticsView({ tree, budget, drawn, complete, received
       ["Gaussians drawn", count(gaussians), `of ${count(tree.count)}`],
       ["At most", count(budget), "on this device"],
       ["Loaded", bytes(received), `of about ${bytes(Math.max(received, total))}`],
-      ["First image", seconds === null ? "…" : duration(seconds)],
+      ["First image", first ? duration(first.seconds) : "…", first ? `after ${bytes(first.bytes)}` : undefined],
       ["Levels", count(tree.levels)],
       ["This view", complete ? "complete" : "loading"],
     ]),

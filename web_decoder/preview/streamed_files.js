@@ -23,9 +23,13 @@ export class StreamedFiles {
   #pool = new Pool();
   #manifest = 0;
 
-  /** @param {string} address of the manifest; the files lie in its folder */
-  constructor(address) {
+  /**
+   * @param {string} address of the manifest; the files lie in its folder
+   * @param {(received: number) => void} counted called when more bytes have arrived
+   */
+  constructor(address, counted) {
     this.address = new URL(address);
+    this.counted = counted;
   }
 
   /** @param {AbortSignal} signal */
@@ -56,6 +60,7 @@ export class StreamedFiles {
       onProgress: ({ received }) => {
         this.received += received - own;
         own = received;
+        this.counted(this.received);
       },
     });
     this.#sizes.set(file, own);

@@ -24,7 +24,7 @@ const INTERVAL = 100;
  */
 export async function openStreamed(address, load, view, failed) {
   const begun = performance.now();
-  const files = new StreamedFiles(address);
+  const files = new StreamedFiles(address, (received) => load.progress({ received, total: 0 }));
   const tree = parseTree(await files.manifest(load.signal));
   const budget = budgetOf(location.search);
   await view.settled;
@@ -32,8 +32,9 @@ export async function openStreamed(address, load, view, failed) {
   const { contentOf } = await import("./streamed_meshes.js");
   load.signal.throwIfAborted();
 
-  /** @type {number | null} */
-  let seconds = null;
+  /** Seconds and bytes until the first image. @type {{seconds: number, bytes: number} | null} */
+  let first = null;
+  let needed = 0;
   let timer = 0;
   let closed = false;
   /** @type {(error?: unknown) => void} */
@@ -62,13 +63,10 @@ export async function openStreamed(address, load, view, failed) {
   function look() {
     timer = 0;
     streaming.look(viewer.sight);
-    load.progress({ received: files.received, total: 0 });
-    if (streaming.begun && seconds === null) {
-      seconds = (performance.now() - begun) / 1000;
-      ended();
-    }
+    if (streaming.begun) needed ||= files.received;
+    if (streaming.begun && !streaming.drawn.some(({ leaves }) => leaves)) ended(); // no file could be loaded
     const { drawn, complete } = streaming;
-    const facts = { tree, budget, drawn, complete, received: files.received, total: files.total(tree), seconds };
+    const facts = { tree, budget, drawn, complete, received: files.received, total: files.total(tree), first };
     byId("statistics").replaceChildren(...streamedStatisticsView(facts));
   }
 
@@ -81,11 +79,17 @@ export async function openStreamed(address, load, view, failed) {
     ended();
   }
 
-  viewer.afterFrame = () => soon();
+  viewer.afterFrame = () => {
+    if (!first && streaming.begun && viewer.sorted) {
+      first = { seconds: (performance.now() - begun) / 1000, bytes: needed };
+      ended();
+    }
+    soon();
+  };
   await new Promise((resolve, reject) => {
     ended = resolve;
     load.signal.addEventListener("abort", () => {
-      if (seconds === null) view.conceal();
+      if (!first) view.conceal();
       reject(load.signal.reason);
     });
     look();

@@ -2,6 +2,7 @@
 
 import { chooseLevels } from "./choice.js";
 import { areaOf, isOutside } from "./coverage.js";
+import { planFiles } from "./file_plan.js";
 import { FileStore } from "./file_store.js";
 import { UserError } from "./problem.js";
 
@@ -16,7 +17,7 @@ import { UserError } from "./problem.js";
 const FILES_AT_ONCE = 2;
 
 /** Gaussians in memory for each that may be drawn: a file is loaded whole, even if one leaf of it is drawn. */
-const HELD_PER_DRAWN = 3;
+const HELD_PER_DRAWN = 4;
 
 /**
  * @template {{count: number}} T content of a file, with the number of its rows
@@ -52,9 +53,9 @@ export class Streaming {
     /** Files that are always held: those of the coarsest levels, and the environment. */
     this.base = [...new Set(this.levels.map(([coarsest]) => coarsest.file))];
     if (environment !== null) this.base.push(environment);
-    const room = Math.max(HELD_PER_DRAWN * budget, this.#rowsOf(this.base) + Math.max(...rows));
+    this.room = Math.max(HELD_PER_DRAWN * budget, this.#rowsOf(this.base) + Math.max(...rows));
     this.store = new FileStore({
-      ...{ sizes: rows, room, most: FILES_AT_ONCE, failed },
+      ...{ sizes: rows, room: this.room, most: FILES_AT_ONCE, failed },
       load: (file, signal) => load(file, signal).then((content) => this.#checked(file, content)),
       changed: () => {
         this.#stale = true;
@@ -107,7 +108,7 @@ export class Streaming {
     const visible = areas.map((area, leaf) => (outside[leaf] ? 0 : area));
     const budget = this.budget - (environment === null ? 0 : rows[environment]);
     this.#wanted = chooseLevels(this.levels, visible, budget, { current: this.#wanted });
-    this.store.want([...this.base, ...this.#byGain(visible)]);
+    this.store.want(this.begun ? [...this.base, ...this.#files(visible)] : this.base);
     const options = { available: (/** @type {Level} */ { file }) => this.store.has(file), current: this.#shown };
     const inside = chooseLevels(this.levels, visible, budget, options);
     // What the image does not show has what remains of the budget, so that it is at hand when the camera turns to it.
@@ -131,17 +132,11 @@ export class Streaming {
   /** @param {number[]} chosen */
   #countOf = (chosen) => chosen.reduce((sum, at, leaf) => sum + (this.levels[leaf][at]?.count ?? 0), 0);
 
-  /** Return the files of wanted levels, that with the largest gain per Gaussian first. @param {number[]} weights */
-  #byGain(weights) {
-    /** @type {Map<number, number>} */
-    const gains = new Map();
-    this.#wanted.forEach((at, leaf) => {
-      if (at <= 0) return;
-      const { file, error } = this.levels[leaf][at];
-      const gain = Math.max(0, this.levels[leaf][0].error ** 2 - error ** 2) * weights[leaf];
-      gains.set(file, (gains.get(file) ?? 0) + gain / this.tree.rows[file]);
-    });
-    return [...gains.keys()].sort((one, other) => (gains.get(other) ?? 0) - (gains.get(one) ?? 0) || one - other);
+  /** Return the files to hold beside those of `base`. @param {number[]} visible pixels of each leaf */
+  #files(visible) {
+    const { rows } = this.tree;
+    const { has, isLost } = this.store;
+    return planFiles(this.levels, this.#wanted, visible, rows, this.room - this.#rowsOf(this.base), has, isLost);
   }
 
   #redraw() {

@@ -8,6 +8,7 @@ import { pointsUp } from "./file_types.js";
 import { extentOfMesh, extentOfScene } from "./extent.js";
 import { marker } from "./marker.js";
 import { pack } from "./pack.js";
+import { readPixels } from "./pixels.js";
 import { meshOf } from "./streamed_meshes.js";
 
 /**
@@ -219,22 +220,19 @@ export class Viewer {
     this.#draw();
   }
 
+  /** Whether all Gaussians are drawn in the order of the latest frame's camera. */
+  get sorted() {
+    return !this.#spark.sorting && !this.#spark.sortDirty;
+  }
+
   async #sorted() {
-    while ((this.#spark.sorting || this.#spark.sortDirty) && !this.#renderer.getContext().isContextLost())
+    while (!this.sorted && !this.#renderer.getContext().isContextLost())
       await new Promise((resolve) => setTimeout(resolve, 4));
   }
 
   /** Return the pixels of the canvas: RGBA, top row first. */
   readPixels() {
-    this.#renderer.setRenderTarget(null);
-    const gl = this.#renderer.getContext();
-    const [width, height] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
-    const upward = new Uint8Array(4 * width * height);
-    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, upward);
-    const data = new Uint8Array(upward.length);
-    for (let y = 0; y < height; y++)
-      data.set(upward.subarray(4 * width * y, 4 * width * (y + 1)), 4 * width * (height - 1 - y));
-    return { width, height, data };
+    return readPixels(this.#renderer);
   }
 
   /** Free all resources, after Spark has finished sorting, which would otherwise fail with an error that cannot be caught. */
