@@ -172,5 +172,7 @@ def test_areas_and_the_frustum():
     }
     (((found,),)) = json.loads(run_node("choose_levels.mjs", json.dumps({"views": [job]})))["seen"]
     turns = [np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(2000)]
-    shadows = [np.abs(turn).sum(axis=1)[2] for turn in turns]  # area of a unit cube's shadow: sum of |normal components|
+    shadows = [
+        np.abs(turn).sum(axis=1)[2] for turn in turns
+    ]  # area of a unit cube's shadow: sum of |normal components|
     assert abs(found["area"] / (focal / 10) ** 2 - np.mean(shadows)) < 0.02

@@ -111,7 +111,7 @@ export class Streaming {
     this.store.want(this.begun ? [...this.base, ...this.#files(visible)] : this.base);
     const options = { available: (/** @type {Level} */ { file }) => this.store.has(file), current: this.#shown };
     const inside = chooseLevels(this.levels, visible, budget, options);
-    // What the image does not show has what remains of the budget, so that it is at hand when the camera turns to it.
+    // What the image does not show has what remains of the budget, for the moment when the camera turns to it.
     const others = areas.map((area, leaf) => (outside[leaf] ? area : 0));
     const coarsest = chooseLevels(this.levels, others, 0, options);
     const left = budget - this.#countOf(inside) + this.#countOf(coarsest);
