@@ -33,7 +33,12 @@ async function open(url, budget) {
     changed: () => changed(),
     failed: (file, error) => problems.push([tree.files[file], error.message]),
   });
-  viewer.setExtent(extentOfBoxes(tree.leaves, tree.leaves.map(() => 1)));
+  viewer.setExtent(
+    extentOfBoxes(
+      tree.leaves,
+      tree.leaves.map(() => 1),
+    ),
+  );
   const next = () => new Promise((resolve) => (changed = resolve));
   return { files, streaming, drawn, problems, next };
 }

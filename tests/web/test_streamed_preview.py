@@ -113,7 +113,7 @@ def test_a_small_budget_goes_to_what_is_near(viewer, city):
     folder, url = city
     asked = viewer[1].asked
     asked.clear()
-    far = draw(viewer, seen_from((1.2, -1.2, -40), (300, 200)), url=url, budget=420)
+    far = draw(viewer, seen_from((1.2, -1.2, -80), (300, 200)), url=url, budget=650)
     assert 0 not in levels_drawn(folder, far["ranges"])
     assert not any("/0_" in path for path in asked)
 
@@ -126,10 +126,10 @@ def test_a_small_budget_goes_to_what_is_near(viewer, city):
     near = draw(viewer, close)
     levels = levels_drawn(folder, near["ranges"])
     assert levels[nearest] == 0
-    assert max(levels) == 3
+    assert min(levels[:nearest] + levels[nearest + 1 :]) > 0
     assert f"/streamed/city/{leaves[nearest][1][0][0]}" in asked
     rows = rows_of(folder, near["ranges"])
-    assert len(rows) == sum(level["gaussians"] for level in near["levels"]) <= 420
+    assert len(rows) == sum(level["gaussians"] for level in near["levels"]) <= 650
     reached = psnr(near["image"], rendered(rows, close))
     log.info("leaves of levels %s together: %.1f dB to kissgs.render", sorted(levels), reached)
     assert reached > 36

@@ -93,17 +93,14 @@ function leavesOf(tree) {
 function levelsOf({ lods, errors }, levels, files) {
   const measured = Array.isArray(errors) && errors.length === levels && errors.every(Number.isFinite);
   const own = Object.entries(lods)
-    .map(([key, { file, offset, count }]) => ({
-      level: /^\d{1,2}$/.test(key) ? Number(key) : levels,
-      file,
-      offset,
-      count,
-    }))
-    .filter(({ level, file, offset, count }) => {
+    .map(([key, lod]) => {
+      const { file, offset, count } = lod ?? {};
+      const level = /^\d{1,2}$/.test(key) ? Number(key) : levels;
       if (level >= levels || ![file, offset, count].every(isWhole) || file >= files)
         fail("a leaf's levels are unclear");
-      return count > 0;
+      return { level, file, offset, count };
     })
+    .filter(({ count }) => count > 0)
     .sort((one, other) => other.level - one.level);
   const finest = own.at(-1)?.count ?? 1;
   const guess = (/** @type {number} */ count) => Math.sqrt(Math.max(0, Math.log2(finest / count)));
