@@ -74,7 +74,7 @@ def city(tmp_path, monkeypatch):
 
 @needs_viewer
 def test_a_streamed_scene(tmp_path, city):
-    """Its files are served one by one; ``--level`` and ``-o`` show one level, which was decoded."""
+    """The files of its folder are served one by one; ``--level`` and ``-o`` show one level, which was decoded."""
     environment = {**os.environ, "DISPLAY": ""}
 
     def served(*options):

@@ -29,7 +29,7 @@ GOOD = manifest([leaf(0, [40, 20, 10], [0, 0.1, 0.2]), leaf(1, [40, 20, 10], [0,
 
 
 def test_a_manifest():
-    """Also one that is older: without errors, version and inner bounds, with an environment."""
+    """One of ours; and an older one without errors and version, with an environment."""
     foreign = {**manifest([leaf(0, [40, 20, 10])], 3, environment="sky/meta.json"), "version": None}
     tree, other = ask(manifests=[json.dumps(GOOD), json.dumps(foreign)])["trees"]
     assert [tree[key] for key in ("levels", "count", "rows", "environment")] == [3, 80, [80, 40, 20], None]

@@ -80,7 +80,7 @@ export async function openStreamed(address, load, view, failed) {
   }
 
   viewer.afterFrame = () => {
-    if (!first && streaming.begun && viewer.sorted) {
+    if (!first && streaming.begun && viewer.hasDrawn) {
       first = { seconds: (performance.now() - begun) / 1000, bytes: needed };
       ended();
     }

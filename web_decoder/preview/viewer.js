@@ -220,13 +220,13 @@ export class Viewer {
     this.#draw();
   }
 
-  /** Whether all Gaussians are drawn in the order of the latest frame's camera. */
-  get sorted() {
-    return !this.#spark.sorting && !this.#spark.sortDirty;
+  /** Whether the latest frame has Gaussians in it: Spark sorts them before it draws them. */
+  get hasDrawn() {
+    return this.#spark.display.numSplats > 0;
   }
 
   async #sorted() {
-    while (!this.sorted && !this.#renderer.getContext().isContextLost())
+    while ((this.#spark.sorting || this.#spark.sortDirty) && !this.#renderer.getContext().isContextLost())
       await new Promise((resolve) => setTimeout(resolve, 4));
   }
 
