@@ -9,7 +9,7 @@ import { help, listen, switchFullScreen, switchPanels } from "./preview/keys.js"
 import { planesView } from "./preview/planes.js";
 import { refiner } from "./preview/refine.js";
 import { STAGES, gaussianAt, lastStageOf, partsOf, stageOf } from "./preview/scene.js";
-import { addressed, download, jobIn, namesSource, standsAlone } from "./preview/sources.js";
+import { addressed, download, jobIn, namesSource, refuse, standsAlone } from "./preview/sources.js";
 import { stage } from "./preview/stage.js";
 import { isManifest } from "./preview/lod_tree.js";
 import { openStreamed } from "./preview/streamed_page.js";
@@ -196,9 +196,7 @@ async function take(files) {
   if (container) {
     const source = { name: container.name.replace(/\.(zip|sog)$/i, ""), container, bytes: container.size };
     await during(`Opening ${container.name}`, async (load) => {
-      if (isGltf(container)) {
-        throw new UserError(`This page does not open glTF; "kissgs view ${container.name}" does.`);
-      }
+      refuse(container.name);
       await openContainer(source, load);
     });
   }
@@ -209,9 +207,6 @@ async function take(files) {
     await (shown ? compareWith(file.name, type, bytes) : openFile(file.name, type, bytes, load));
   });
 }
-
-/** @param {{name: string}} file */
-const isGltf = ({ name }) => /\.(glb|gltf)$/i.test(name);
 
 /** @param {string} accept */
 function pick(accept) {

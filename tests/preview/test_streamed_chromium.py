@@ -159,4 +159,7 @@ def test_a_missing_file_and_a_damaged_list(server, opened):
 
     (manifest,) = [path for path in server.contents if path.endswith("lod-meta.json")]
     server.contents[manifest] = b'{"lodLevels": 4}'
-    opened().error_message("list of this scene's files is damaged")
+    tab = opened()
+    tab.error_message("list of this scene's files is damaged")
+    tab.choose(("lod-meta.json", b"{}"))
+    tab.error_message("does not open the list of a scene's files alone", "kissgs view lod-meta.json")

@@ -1,6 +1,7 @@
 /** Sources of scenes: the page's address, the page itself, or a file. */
 
 import { fileTypeOfFormat } from "./file_types.js";
+import { isManifest } from "./lod_tree.js";
 import { UserError } from "./problem.js";
 
 /**
@@ -127,4 +128,14 @@ export async function download({ url, bytes: total }, load) {
     load.progress({ received: (received += part.value.length), total: Math.max(total, received) });
   }
   return new Uint8Array(await new Blob(parts).arrayBuffer());
+}
+
+/** Throw an error for files that say what they are by their names, but cannot be opened here. @param {string} name */
+export function refuse(name) {
+  const kind = isManifest(`/${name}`)
+    ? "the list of a scene's files alone"
+    : /\.(glb|gltf)$/i.test(name)
+      ? "glTF"
+      : null;
+  if (kind) throw new UserError(`This page does not open ${kind}; "kissgs view ${name}" does.`);
 }
