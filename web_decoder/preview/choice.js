@@ -29,8 +29,7 @@ export const IN_USE = 1.25;
  * @returns {number[]}
  */
 export function chooseLevels(leaves, areas, budget, { available = () => true, current = [] } = {}) {
-  const usable = leaves.map((levels) => levels.map((_, i) => i).filter((i) => available(levels[i])));
-  const chosen = usable.map(([coarsest = -1]) => coarsest);
+  const chosen = leaves.map((levels) => levels.findIndex(available));
   let left = chosen.reduce((rest, at, leaf) => (at < 0 ? rest : rest - leaves[leaf][at].count), budget);
 
   /** Return the best step of a leaf that fits, or null. @param {number} leaf @returns {Step | null} */
@@ -40,8 +39,8 @@ export function chooseLevels(leaves, areas, budget, { available = () => true, cu
     /** @type {Step | null} */
     let best = null;
     let before = from; // the level that makes this step superfluous if it has a Gaussian per pixel
-    for (const to of usable[leaf]) {
-      if (to <= chosen[leaf]) continue;
+    for (let to = chosen[leaf] + 1; to < levels.length; to++) {
+      if (!available(levels[to])) continue;
       const area = areas[leaf] * (to <= (current[leaf] ?? -1) ? IN_USE : 1);
       if (before.count >= area) break;
       before = levels[to];

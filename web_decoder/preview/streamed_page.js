@@ -11,8 +11,8 @@ import { Streaming } from "./streaming.js";
 
 /** @typedef {import("./streamed_meshes.js").Content} Content */
 
-/** Shortest time between two choices of levels while the camera moves, milliseconds. */
-const INTERVAL = 100;
+/** Shortest time between two choices of levels while the camera moves, milliseconds, and in units of what one takes. */
+const [INTERVAL, REST] = [100, 5];
 
 /**
  * Show a streamed scene; resolves when its coarsest level is drawn, and the scene goes on from there.
@@ -56,13 +56,16 @@ export async function openStreamed(address, load, view, failed) {
   const weights = tree.leaves.map((leaf) => leaf.levels.at(-1)?.count ?? 0);
   const viewer = await view.stream(extentOfBoxes(tree.leaves, weights), close);
 
-  function soon(wait = INTERVAL) {
+  let interval = INTERVAL;
+  function soon(wait = interval) {
     if (!timer && !closed) timer = setTimeout(look, wait);
   }
 
   function look() {
     timer = 0;
+    const before = performance.now();
     streaming.look(viewer.sight);
+    interval = Math.max(INTERVAL, REST * (performance.now() - before));
     if (streaming.begun) needed ||= files.received;
     if (streaming.begun && !streaming.drawn.some(({ leaves }) => leaves)) ended(); // no file could be loaded
     const { drawn, complete } = streaming;

@@ -109,11 +109,12 @@ export class Streaming {
     const budget = this.budget - (environment === null ? 0 : rows[environment]);
     this.#wanted = chooseLevels(this.levels, visible, budget, { current: this.#wanted });
     this.store.want(this.begun ? [...this.base, ...this.#files(visible)] : this.base);
-    const options = { available: (/** @type {Level} */ { file }) => this.store.has(file), current: this.#shown };
+    const loaded = rows.map((_, file) => this.store.has(file));
+    const options = { available: (/** @type {Level} */ { file }) => loaded[file], current: this.#shown };
     const inside = chooseLevels(this.levels, visible, budget, options);
     // What the image does not show has what remains of the budget, for the moment when the camera turns to it.
     const others = areas.map((area, leaf) => (outside[leaf] ? area : 0));
-    const coarsest = chooseLevels(this.levels, others, 0, options);
+    const coarsest = this.levels.map((levels) => levels.findIndex(options.available));
     const left = budget - this.#countOf(inside) + this.#countOf(coarsest);
     const turned = chooseLevels(this.levels, others, left, options);
     this.#shown = inside.map((at, leaf) => (outside[leaf] ? turned[leaf] : at));
