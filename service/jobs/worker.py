@@ -10,18 +10,17 @@ from dataclasses import dataclass, field
 from anyio.to_thread import run_sync
 from sqlalchemy.exc import SQLAlchemyError
 
-from ..core.formats import CONTAINER_FILES
 from ..core.metrics import Metrics
 from ..core.models import ACTIVE, Job, State
 from ..core.notifier import JobNotifier, ended, wait
-from ..core.schemas import JobOptions
 from ..core.settings import ServiceSettings
 from ..storage.database_health import error_text
 from ..storage.job_records import Store
-from ..storage.job_storage import RESULT, JobStorage
+from ..storage.job_storage import JobStorage
 from ..storage.object_store import ObjectStoreError
-from .completion import LOST, JobCompletion
+from .completion import LOST, JobCompletion, result_folder
 from .runner import JobProcess, JobRunner, Outcome
+from .workplace import Workplace, workplace
 
 log = logging.getLogger("kissgs.service")
 
@@ -168,8 +167,9 @@ class Worker:
         if job.starts == 1 and job.started_at is not None:
             self.metrics.waited.observe(job.started_at - job.created_at)
         self.notifier.notify(job.id)
+        place = workplace(self.settings, self.storage, job)
         try:
-            outcome = await self._follow(job, process)
+            outcome = await self._follow(job, process, place)
         except Exception as error:
             log.exception("job %s: its process could not be run", job.id)
             outcome = _outcome_of(error)
@@ -178,32 +178,18 @@ class Worker:
             process.ended.set()
             self.metrics.busy.dec()
         storage_problem = await run_sync(self.storage.health_problem)
-        if storage_problem and outcome.kind in ("error", "crashed"):
+        if storage_problem and outcome.kind in ("error", "crashed", "lost"):
             outcome = Outcome("postponed")  # not caused by the job
-        await self._finish(job, outcome)
+        await self._finish(job, outcome, place)
 
-    async def _follow(self, job: Job, process: JobProcess) -> Outcome:
+    async def _follow(self, job: Job, process: JobProcess, place: Workplace) -> Outcome:
         current = await run_sync(self.store.get, job.id)  # cancelled before its process was registered?
         if current is None or current.state != State.RUNNING:
             return Outcome("stopped")
-        work = await run_sync(self.storage.new_work, job.id)
         try:
-            source = await run_sync(self.storage.fetch_scene, job.id, work)
+            task = await run_sync(place.task)
         except FileNotFoundError:
             return Outcome("error", {"code": "internal", "detail": LOST})
-        options = JobOptions.model_validate(job.options)
-        if options.resumable:
-            await run_sync(self.storage.fetch_checkpoints, job.id)
-        task = {
-            "kind": "compress",
-            "source": str(source),
-            "work": str(work),
-            "settings": {name: value for name, value in job.options.items() if name not in ("format", "evaluate")},
-            "format": options.format,
-            "container": CONTAINER_FILES[options.format].name,
-            "evaluate": options.evaluate,
-            "checkpoint": str(self.storage.checkpoint(job.id)) if options.resumable else None,
-        }
 
         async def progress(stage: str, fraction: float, note: str) -> None:
             try:
@@ -212,9 +198,7 @@ class Worker:
                 self._log_once(f"job {job.id}: progress was not recorded", error)
             self.notifier.notify(job.id)
 
-        keeping = (
-            asyncio.create_task(self._keep_checkpoints(job)) if self.storage.shared and options.resumable else None
-        )
+        keeping = asyncio.create_task(self._keep_checkpoints(job, place)) if place.stores_checkpoints else None
         try:
             return await process.run(task, progress)
         finally:
@@ -222,25 +206,25 @@ class Worker:
                 keeping.cancel()
                 await asyncio.gather(keeping, return_exceptions=True)
 
-    async def _keep_checkpoints(self, job: Job) -> None:
+    async def _keep_checkpoints(self, job: Job, place: Workplace) -> None:
         """Store the checkpoints of a running job for other replicas, in at most a tenth of the time."""
         clock = asyncio.get_running_loop().time
         while True:
             await asyncio.sleep(CHECKPOINT_SECONDS)
             begun = clock()
             try:
-                await run_sync(self.storage.store_checkpoints, job.id)
+                await run_sync(place.store_checkpoints)
             except OSError as error:  # the job may succeed without
                 self._log_once(f"job {job.id}: its checkpoint was not stored", error)
             await asyncio.sleep(9 * (clock() - begun))
 
     # How jobs end -----------------------------------------------------------------------------------------------------
 
-    async def _finish(self, job: Job, outcome: Outcome) -> None:
+    async def _finish(self, job: Job, outcome: Outcome, place: Workplace) -> None:
         """Record how a job ended; retry while that fails, so that no job is lost because of a full disk."""
         while True:
             try:
-                await run_sync(self._record, job, outcome)
+                await run_sync(self._record, job, outcome, place)
                 break
             except (SQLAlchemyError, OSError) as error:
                 if self._abandoning:
@@ -276,23 +260,24 @@ class Worker:
             log.error("%s", reason)
             self._logged.add(reason)
 
-    def _record(self, job: Job, outcome: Outcome) -> None:
+    def _record(self, job: Job, outcome: Outcome, place: Workplace) -> None:
         self.store.check()  # else files would change without a record in the database
         self.storage.check()
         current = self.store.get(job.id)
         if current is None or current.state != State.RUNNING:  # cancelled or deleted meanwhile
-            self.storage.remove_work(job.id)
+            place.clear(kept=current is not None and result_folder(current) == place.folder)
             self.store.drop_claim(job.id)
             return
-        folder = self.storage.keep_result(job.id) if outcome.kind == "done" else RESULT
-        if outcome.kind in ("stopped", "postponed", "crashed"):  # it may continue elsewhere
-            self.storage.store_checkpoints(job.id)
-        self.storage.remove_work(job.id)  # before requeueing, because another worker may then run the job
+        if outcome.kind not in ("done", "error") and (summary := place.finished()) is not None:
+            outcome = Outcome("done", summary)
+        if outcome.kind == "done":
+            place.keep()
+        elif outcome.kind != "error":  # it may continue elsewhere
+            place.store_checkpoints()
+        place.clear(kept=outcome.kind == "done")  # before requeueing, because another worker may then run the job
         match outcome.kind:
             case "done":
-                self.completion.succeed(job, outcome.data, folder)
-            case "error":
-                self.completion.fail(job, outcome.data["code"], outcome.data["detail"])
+                self.completion.succeed(job, outcome.data, place.folder)
             case "stopped" | "postponed":
                 self._requeue(job)
             case "crashed" if self.draining:  # a supervisor may also have sent the signal to job processes
@@ -305,8 +290,8 @@ class Worker:
                 log.warning("job %s is started again elsewhere", job.id)
                 self.metrics.restarts.inc()
                 self.store.move(job.number, State.QUEUED)
-            case "crashed" | "lost":
-                self.completion.fail(job, "crashed", outcome.data["detail"])
+            case "error" | "crashed" | "lost":
+                self.completion.fail(job, outcome.data["code"], outcome.data["detail"])
         current = self.store.get(job.id)
         if current is None or current.state not in ACTIVE:  # cancelled at the same moment, so the claim is still held
             self.store.drop_claim(job.id)

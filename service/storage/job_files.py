@@ -30,6 +30,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
+from ..core.formats import UPLOAD_FILES
 from ..core.settings import SettingsError
 from .folder_numbers import read_number, sync_folder, write_number
 from .job_storage import DECODED, RESULT, JobStorage, StoredObject, complete_summary
@@ -41,9 +42,6 @@ ORPHANED = ".orphaned"
 
 UNFINISHED = ("work-*", ".*.part")
 """Patterns of incomplete files in a job's folder: work folders, and checkpoints that are being written."""
-
-UPLOAD_FILES = ("scene.ply", "scene.sog", "scene.spz", "scene.splat", "scene.ksplat", "scene.glb")
-"""Names of a job's upload, of which it has one: the ending tells formats that are not recognised by their content."""
 
 JOB_FILES = (*UNFINISHED, *UPLOAD_FILES, "result", "checkpoint*.npz", "decoded.ply", "decoded.json")
 """Patterns of all files that the service creates in a job's folder."""
@@ -165,7 +163,7 @@ class FolderStorage(JobStorage):
         folder.mkdir()
         return folder
 
-    def keep_result(self, job_id: str) -> str:
+    def keep_result(self, job_id: str, folder: str = RESULT) -> None:
         """Move the result from a job's work folder to its final path; do nothing if that is done already.
 
         A previous result moves to the work folder.
@@ -181,7 +179,6 @@ class FolderStorage(JobStorage):
             sync_folder(self.jobs / job_id)
         if not result.is_dir():
             raise FileNotFoundError(errno.ENOENT, "its result is missing")
-        return RESULT
 
     def read_result(self, job_id: str, folder: str, container: str) -> dict[str, Any] | None:
         """Return the summary of a complete result with this container; None if there is none or it is damaged."""
@@ -193,9 +190,9 @@ class FolderStorage(JobStorage):
             return None
         return complete_summary(text, sizes, container)
 
-    def has_result(self, job_id: str) -> bool:
-        """Return whether there are files of a result, complete or not."""
-        return self.result(job_id).exists()
+    def result_folders(self, job_id: str) -> list[str]:
+        """Return the name of the result's folder if it exists."""
+        return [RESULT] if self.result(job_id).exists() else []
 
     def remove_result(self, job_id: str, folder: str) -> None:
         """Remove a result."""

@@ -185,7 +185,7 @@ def test_an_error_in_the_job_process_is_internal(tmp_path):
     async def ignore(stage, fraction, note):
         pass
 
-    task = {"kind": "no such task", "work": str(tmp_path), "source": ""}
+    task = {"function": "job_process:nothing", "work": str(tmp_path), "source": ""}
     outcome = asyncio.run(JobRunner.open(ServiceSettings()).process().run(task, ignore))
     assert (outcome.kind, outcome.data["code"]) == ("error", "internal")
 

@@ -185,7 +185,8 @@ def write_result(context, job_id, complete=True):
         "count": 3, "seconds": {"total": 1.0}, "cpu_seconds": 1.0,
     }  # fmt: skip
     (folder / "summary.json").write_text(json.dumps(summary))
-    kept = context.storage.keep_result(job_id)
+    kept = context.storage.new_result()
+    context.storage.keep_result(job_id, kept)
     if not complete:
         context.storage._objects.delete([f"jobs/{job_id}/{kept}/summary.json"])
     return kept
