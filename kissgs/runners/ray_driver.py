@@ -40,6 +40,9 @@ NODES_SECONDS = 1.0
 RETRY_SECONDS = 1.0
 """Seconds before an item whose node was lost is started again: Ray may not know of the loss yet."""
 
+FORCE_SECONDS = 5.0
+"""Seconds after which a cancelled task that has not ended is killed."""
+
 CONNECT_SECONDS = 5.0
 """Maximum seconds for a connection to the head's port."""
 
@@ -206,7 +209,13 @@ class Driver:
         if item_id in self._tasks:
             self._cancelled.add(item_id)
             if item_id in self._generators:
-                ray.cancel(self._generators[item_id], force=True)
+                ray.cancel(self._generators[item_id])  # not by force, so that the task removes its temporary folder
+                asyncio.get_running_loop().call_later(FORCE_SECONDS, self._end, item_id)
+
+    def _end(self, item_id: str) -> None:
+        """Kill the process of a cancelled item's task, if it has not ended."""
+        if item_id in self._generators:
+            ray.cancel(self._generators[item_id], force=True)
 
     async def _watch_nodes(self) -> None:
         last: list[dict[str, Any]] = []

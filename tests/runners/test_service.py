@@ -40,17 +40,6 @@ def service(request, settings_of, tmp_path_factory):
         yield it
 
 
-@pytest.fixture
-def whole_cluster(ray_cluster, ray_runner):
-    """The cluster, with both nodes before and after the test."""
-    wait_until(lambda: ray_runner.stats().cpus == 2)
-    yield ray_cluster
-    for node in [node for node in ray_cluster.nodes if node.poll() is not None]:
-        ray_cluster.nodes.remove(node)
-        ray_cluster.add_node()
-    wait_until(lambda: ray_runner.stats().cpus == 2)
-
-
 def result_of(service, job):
     status = service.ended(job)
     assert status["state"] == "succeeded", status
