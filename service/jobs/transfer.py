@@ -25,8 +25,6 @@ PAUSES = (0.5, 1.0, 2.0, 4.0, 8.0, 14.0)
 CONNECT_SECONDS, IDLE_SECONDS = 10.0, 60.0
 """Maximum seconds for a connection, and without any bytes."""
 
-BLOCK_BYTES = 1 << 20
-
 MAX_PUT_BYTES = 5 << 30
 """Largest file that S3 stores by one request; there is no other kind of request here."""
 
@@ -85,7 +83,7 @@ def _fetch_rest(http: httpx.Client, url: str, file: BinaryIO, size: int) -> None
             if first and answer.status_code != httpx.codes.PARTIAL_CONTENT:  # all of it once more
                 file.seek(0)
                 file.truncate()
-            for block in answer.iter_raw(BLOCK_BYTES):
+            for block in answer.iter_raw():  # as they come: blocks of a fixed size would be lost by an error
                 file.write(block)
                 if file.tell() > size:
                     raise StorageAccessError(f"a file in the storage has more than its {size} bytes")
