@@ -12,6 +12,7 @@ generator behind the values that have been consumed, which only suits generators
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import math
 import os
@@ -62,8 +63,9 @@ def main() -> None:
     os.dup2(2, 1)  # for what Ray prints
 
     def send(event: dict[str, Any]) -> None:
-        out.write(json.dumps(event) + "\n")
-        out.flush()
+        with contextlib.suppress(BrokenPipeError):  # nobody listens any more, and standard input has closed, too
+            out.write(json.dumps(event) + "\n")
+            out.flush()
 
     address = sys.argv[1]
     folder = tempfile.mkdtemp(prefix="kissgs-ray-") if address == LOCAL else None
@@ -206,7 +208,7 @@ class Driver:
         watching.cancel()
 
     def _cancel(self, item_id: str) -> None:
-        if item_id in self._tasks:
+        if item_id in self._tasks and item_id not in self._cancelled:  # once: a second interrupt would hit the clean-up
             self._cancelled.add(item_id)
             if item_id in self._generators:
                 ray.cancel(self._generators[item_id])  # not by force, so that the task removes its temporary folder

@@ -10,6 +10,7 @@ from concurrent.futures import Future
 from pathlib import Path
 
 import pytest
+from helpers.data_folders import add_a_job, service
 from helpers.job_rows import job as job_row
 from helpers.service import FAST, SMALL
 
@@ -21,6 +22,7 @@ from kissgs.sogxt.names import FILES as SOGXT_FILES
 from kissgs.training.checkpoint import finetune_checkpoint_path
 from service.core.disk_estimates import RESULT_BYTES, RESULT_BYTES_PER_GAUSSIAN
 from service.core.formats import CHECKPOINT_FILES, CONTAINER_FILES
+from service.core.models import State
 from service.core.settings import ServiceSettings
 from service.jobs import bucket_job, transfer, workplace
 from service.jobs.runner import COMPRESS_IN_BUCKET, JobRunner, Outcome
@@ -311,3 +313,18 @@ def test_addresses_are_valid_for_the_time_limit_and_a_day(storage, new_job, seco
         *(f"result/files/{name}" for name in SOGXT_FILES),
         *CHECKPOINT_FILES,
     }
+
+
+def test_such_a_job_is_started_again_and_fails_with_the_reason_at_last(tmp_path, no_variables):
+    with service(tmp_path / "data") as context:
+        job_id = add_a_job(context)
+        limit = context.settings.job_starts
+        for start in range(1, limit + 1):
+            job = context.store.claim()
+            assert (job.id, job.starts) == (job_id, start)
+            place = workplace.workplace(context.settings, context.storage, job)
+            lost = Outcome("lost", {"code": "storage", "detail": "no machine can use the storage"})
+            asyncio.run(context.worker._finish(job, lost, place))
+        ended = context.store.get(job_id)
+        assert (ended.state, ended.problem["code"]) == (State.FAILED, "storage")
+        assert ended.problem["retryable"]
