@@ -1,4 +1,4 @@
-"""Transfers by signed addresses. Oracle: a small HTTP server with failures that a test chooses, and what it received."""
+"""Transfers by signed addresses. Oracle: a small HTTP server whose failures a test chooses, and what it received."""
 
 import errno
 import threading
