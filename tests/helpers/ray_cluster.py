@@ -67,7 +67,8 @@ class RayCluster:
 
     def left_by_items(self) -> list[str]:
         """Return the paths of temporary folders of items, on all nodes that run."""
-        return [str(path) for node in self.nodes for path in self._temporary[node.pid].glob("kissgs-*")]
+        running = [node for node in self.nodes if node.poll() is None]
+        return [str(path) for node in running for path in self._temporary[node.pid].glob("kissgs-*")]
 
     def restore(self) -> None:
         """Start a node for each one that was killed."""
