@@ -1,9 +1,8 @@
-"""Worker: runs queued jobs in order of submission, each in a job process, and records how they end."""
+"""Worker: runs queued jobs in order of submission, each in a job process, and sees that their ends are recorded."""
 
 from __future__ import annotations
 
 import asyncio
-import errno
 import logging
 from dataclasses import dataclass, field
 
@@ -11,14 +10,14 @@ from anyio.to_thread import run_sync
 from sqlalchemy.exc import SQLAlchemyError
 
 from ..core.metrics import Metrics
-from ..core.models import ACTIVE, Job, State
+from ..core.models import Job, State
 from ..core.notifier import JobNotifier, ended, wait
 from ..core.settings import ServiceSettings
 from ..storage.database_health import error_text
 from ..storage.job_records import Store
 from ..storage.job_storage import JobStorage
-from ..storage.object_store import ObjectStoreError
-from .completion import LOST, JobCompletion, result_folder
+from .completion import LOST, JobCompletion
+from .outcomes import INTERNAL_ERROR, OutcomeRecorder, outcome_of
 from .runner import JobProcess, JobRunner, Outcome
 from .workplace import Workplace, workplace
 
@@ -55,6 +54,9 @@ class Worker:
     _logged: set[str] = field(default_factory=set)
     _busy: int = 0
     _abandoning: bool = False
+
+    def __post_init__(self) -> None:
+        self._recorder = OutcomeRecorder(self.settings, self.store, self.storage, self.metrics, self.completion)
 
     def start(self) -> None:
         """Start to run jobs."""
@@ -172,7 +174,7 @@ class Worker:
             outcome = await self._follow(job, process, place)
         except Exception as error:
             log.exception("job %s: its process could not be run", job.id)
-            outcome = _outcome_of(error)
+            outcome = outcome_of(error)
         finally:
             del self._processes[job.id]
             process.ended.set()
@@ -224,15 +226,15 @@ class Worker:
         """Record how a job ended; retry while that fails, so that no job is lost because of a full disk."""
         while True:
             try:
-                await run_sync(self._record, job, outcome, place)
+                await run_sync(self._recorder.record, job, outcome, place, self.draining)
                 break
             except (SQLAlchemyError, OSError) as error:
                 if self._abandoning:
                     await run_sync(self.storage.remove_work, job.id)
                     return
-                if outcome.kind == "done" and await run_sync(self._is_permanent, error):
+                if outcome.kind == "done" and await run_sync(self._recorder.is_permanent, error):
                     log.error("job %s: its result cannot be kept: %s", job.id, error_text(error))
-                    outcome = _outcome_of(error)
+                    outcome = outcome_of(error)
                     continue
                 self._log_once(f"job {job.id}: its end was not recorded; trying again", error)
                 if self.draining:  # the next start of the service recovers the job
@@ -240,18 +242,14 @@ class Worker:
                 await asyncio.sleep(IDLE_SECONDS)
             except Exception:  # a bug: the job must end nevertheless, and the worker continue
                 log.exception("job %s: its outcome could not be recorded", job.id)
-                if outcome is _INTERNAL_ERROR:  # the next start of the service recovers the job
+                if outcome is INTERNAL_ERROR:  # the next start of the service recovers the job
                     return
-                outcome = _INTERNAL_ERROR
+                outcome = INTERNAL_ERROR
         self.notifier.notify(job.id)
         self.notifier.notify(ended(job.id))
         if outcome.kind == "postponed":
             await asyncio.sleep(IDLE_SECONDS)
         self.notifier.notify(QUEUE)
-
-    def _is_permanent(self, error: Exception) -> bool:
-        """Whether a retry would always fail, because of this job's folder alone."""
-        return isinstance(error, OSError) and error.errno in _PERMANENT_ERRNOS and self.storage.health_problem() is None
 
     def _log_once(self, what: str, error: Exception) -> None:
         """Log a repeated failure only once, until the queue can be read again."""
@@ -259,69 +257,3 @@ class Worker:
         if reason not in self._logged:
             log.error("%s", reason)
             self._logged.add(reason)
-
-    def _record(self, job: Job, outcome: Outcome, place: Workplace) -> None:
-        self.store.check()  # else files would change without a record in the database
-        self.storage.check()
-        current = self.store.get(job.id)
-        if current is None or current.state != State.RUNNING:  # cancelled or deleted meanwhile
-            place.clear(kept=current is not None and result_folder(current) == place.folder)
-            self.store.drop_claim(job.id)
-            return
-        if outcome.kind not in ("done", "error") and (summary := place.finished()) is not None:
-            outcome = Outcome("done", summary)
-        if outcome.kind == "done":
-            place.keep()
-        elif outcome.kind != "error":  # it may continue elsewhere
-            place.store_checkpoints()
-        place.clear(kept=outcome.kind == "done")  # before requeueing, because another worker may then run the job
-        match outcome.kind:
-            case "done":
-                self.completion.succeed(job, outcome.data, place.folder)
-            case "stopped" | "postponed":
-                self._requeue(job)
-            case "crashed" if self.draining:  # a supervisor may also have sent the signal to job processes
-                self._requeue(job)
-            case "crashed" if job.crashes == 0 and job.starts < self.settings.job_starts:
-                log.warning("job %s is started again", job.id)
-                self.metrics.restarts.inc()
-                self.store.move(job.number, State.QUEUED, crashes=1)
-            case "lost" if self.draining or job.starts < self.settings.job_starts:
-                log.warning("job %s is started again elsewhere", job.id)
-                self.metrics.restarts.inc()
-                self.store.move(job.number, State.QUEUED)
-            case "error" | "crashed" | "lost":
-                self.completion.fail(job, outcome.data["code"], outcome.data["detail"])
-        current = self.store.get(job.id)
-        if current is None or current.state not in ACTIVE:  # cancelled at the same moment, so the claim is still held
-            self.store.drop_claim(job.id)
-
-    def _requeue(self, job: Job) -> None:
-        """Return a job to the queue without counting its start."""
-        self.store.move(job.number, State.QUEUED, starts=job.starts - 1)
-
-
-_TRANSIENT_ERRNOS = (errno.EMFILE, errno.ENFILE, errno.EAGAIN, errno.ENOMEM, errno.ENOSPC, errno.EDQUOT)
-"""Errors from a temporary lack of resources, not caused by the job."""
-
-_PERMANENT_ERRNOS = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENOTEMPTY, errno.ELOOP)
-"""Errors from unexpected content of a job's folder, which do not go away."""
-
-_INTERNAL_ERROR = Outcome(
-    "error",
-    {
-        "code": "internal",
-        "detail": "the job could not be run because of an error in the service; please report it with the scene",
-    },
-)
-
-
-def _outcome_of(error: Exception) -> Outcome:
-    if isinstance(error, ObjectStoreError) or (isinstance(error, OSError) and error.errno in _TRANSIENT_ERRNOS):
-        return Outcome("postponed")
-    if isinstance(error, OSError):
-        reason = (error.strerror or str(error)).lower()
-        return Outcome(
-            "error", {"code": "output", "detail": f"the job's files cannot be written: {reason}; try again later"}
-        )
-    return _INTERNAL_ERROR

@@ -15,7 +15,6 @@ from helpers.service import SLOW, SMALL, problem, scene_bytes
 from service.core.models import State
 from service.jobs.expiry import ExpiryTask
 from service.jobs.runner import Outcome
-from service.jobs.worker import Worker
 from service.jobs.workplace import workplace
 
 
@@ -155,11 +154,11 @@ def test_a_permanent_error_fails_the_job(tmp_path, monkeypatch):
 def test_permanent_errors(tmp_path, monkeypatch, error):
     monkeypatch.setenv("KISSGS_DATA_DIR", str(tmp_path / "data"))
     with service(tmp_path / "data") as context:
-        worker: Worker = context.worker
-        assert worker._is_permanent(OSError(error, os.strerror(error)))
-        assert not worker._is_permanent(OSError(errno.ENOSPC, "no space left on device"))
+        recorder = context.worker._recorder
+        assert recorder.is_permanent(OSError(error, os.strerror(error)))
+        assert not recorder.is_permanent(OSError(errno.ENOSPC, "no space left on device"))
         context.storage.jobs.rename(tmp_path / "away")
-        assert not worker._is_permanent(OSError(error, os.strerror(error)))
+        assert not recorder.is_permanent(OSError(error, os.strerror(error)))
         (tmp_path / "away").rename(context.storage.jobs)
 
 
