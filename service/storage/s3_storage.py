@@ -13,7 +13,6 @@ database yet, or that it runs; the claims of a replica that has died say what to
 from __future__ import annotations
 
 import logging
-import re
 import secrets
 import time
 from collections.abc import Callable, Iterable
@@ -22,6 +21,7 @@ from typing import Any
 
 from ..core.formats import CHECKPOINT_FILES, UPLOAD_FILES
 from ..core.settings import SettingsError
+from .bucket_numbers import BucketNumbers
 from .folder_numbers import read_number
 from .job_files import FolderStorage
 from .job_objects import DECODED_SUMMARY, JOB, SUMMARY, JobObjects, reclaimable
@@ -29,9 +29,6 @@ from .job_storage import DECODED, RESULT, JobStorage, StoredObject
 from .object_store import ObjectStore
 
 log = logging.getLogger("kissgs.service")
-
-HEALTH_SECONDS = 5.0
-"""Seconds for which the health of the bucket is not asked for again."""
 
 
 class S3Storage(JobStorage):
@@ -56,8 +53,7 @@ class S3Storage(JobStorage):
         self.place = f"{self._objects.url}/jobs"
         self._stored: dict[Path, int] = {}
         self._unknown = 0
-        self._identity: int | None = None
-        self._checked, self._problem = -HEALTH_SECONDS, ""
+        self._numbers = BucketNumbers(self._objects)
         try:
             if read_number(self._local.root / "identity") is not None:
                 raise SettingsError(
@@ -254,55 +250,13 @@ class S3Storage(JobStorage):
         return f"jobs in {self.place} that the database does not know: {self._unknown}" if self._unknown else None
 
     def health_problem(self) -> str | None:
-        """Return why files cannot be stored; None if they can. Asks the bucket again after :data:`HEALTH_SECONDS`."""
-        if problem := self._local.health_problem():
-            return problem
-        if time.monotonic() - self._checked >= HEALTH_SECONDS:
-            self._problem = self._ask()
-            self._checked = time.monotonic()
-        return self._problem or None
-
-    def _ask(self) -> str:
-        try:
-            same = self._identity is None or self._objects.get_bytes("identity", hasty=True) == b"%d\n" % self._identity
-        except FileNotFoundError:
-            same = False
-        except OSError as error:
-            return f"the storage cannot be used: {error}"
-        return "" if same else f"the storage cannot be used: {self._objects.url} was emptied or replaced; restore it"
+        """Return why files cannot be stored; None if they can. Asks the bucket again after some seconds."""
+        return self._local.health_problem() or self._numbers.health_problem()
 
     def read_number(self, name: str) -> int | None:
-        """Read a number of the storage: ``identity``, its own, or ``database``, that of its database.
-
-        Returns:
-            The number; None if there is none.
-
-        Raises:
-            SettingsError: it cannot be read or is not a number.
-        """
-        try:
-            text = self._objects.get_bytes(name).strip()
-        except FileNotFoundError:
-            return None
-        except OSError as error:
-            raise SettingsError(f"KISSGS_STORAGE: {error}") from error
-        if not re.fullmatch(rb"[0-9]{1,18}", text):
-            raise SettingsError(
-                f"KISSGS_STORAGE: {self._objects.url}/{name} is not a number; restore it, or use another prefix"
-            )
-        if name == "identity":
-            self._identity = int(text)
-        return int(text)
+        """Read a number of the storage, see :class:`JobStorage`."""
+        return self._numbers.read(name)
 
     def write_number(self, name: str, number: int) -> None:
-        """Write a number of the storage.
-
-        Raises:
-            SettingsError: it cannot be written.
-        """
-        try:
-            self._objects.put_bytes(b"%d\n" % number, name)
-        except OSError as error:
-            raise SettingsError(f"KISSGS_STORAGE: {error}") from error
-        if name == "identity":
-            self._identity = number
+        """Write a number of the storage, see :class:`JobStorage`."""
+        self._numbers.write(name, number)
