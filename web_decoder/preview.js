@@ -9,8 +9,10 @@ import { help, listen, switchFullScreen, switchPanels } from "./preview/keys.js"
 import { planesView } from "./preview/planes.js";
 import { refiner } from "./preview/refine.js";
 import { STAGES, gaussianAt, lastStageOf, partsOf, stageOf } from "./preview/scene.js";
-import { addressed, download, jobIn, namesSource, standsAlone } from "./preview/sources.js";
+import { addressed, download, jobIn, namesSource, refuse, standsAlone } from "./preview/sources.js";
 import { stage } from "./preview/stage.js";
+import { isManifest } from "./preview/lod_tree.js";
+import { openStreamed } from "./preview/streamed_page.js";
 import { fileStatisticsView, statisticsView } from "./preview/statistics.js";
 import { UserError, aborted, showProblem } from "./preview/problem.js";
 
@@ -115,6 +117,7 @@ async function openAddressed(load) {
   const source = await addressed(location, load.signal);
   const { name, container } = source;
   const type = fileTypeOf(name);
+  if (typeof container === "string" && isManifest(container)) return openStreamedScene(name, container, load);
   if (!type) return openContainer(source, load);
   const bytes =
     typeof container === "string"
@@ -123,17 +126,29 @@ async function openAddressed(load) {
   await openFile(name, type, bytes, load);
 }
 
+/** @param {string} name @param {string} address @param {Load} load */
+async function openStreamedScene(name, address, load) {
+  setTitle(name);
+  showPanel();
+  announce(`${name}: ${count(await openStreamed(address, load, view, showProblem))} Gaussians.`);
+}
+
+/** Show the panel of a scene that has no planes and cannot be compared, with its statistics. @param {...Node} statistics */
+function showPanel(...statistics) {
+  shown = null;
+  byId("statistics").replaceChildren(...statistics);
+  byId("planes").replaceChildren();
+  byId("panel").hidden = false;
+  byId("compare").hidden = true;
+}
+
 /** @param {string} name @param {FileType} type @param {Uint8Array} bytes @param {Load} load */
 async function openFile(name, type, bytes, load) {
   const size = bytes.length; // reading it may take the bytes away
   load.signal.throwIfAborted();
   const gaussians = await readable(name, view.showFile(type, bytes));
-  shown = null;
   setTitle(name);
-  byId("statistics").replaceChildren(...fileStatisticsView(gaussians, size));
-  byId("planes").replaceChildren();
-  byId("panel").hidden = false;
-  byId("compare").hidden = true;
+  showPanel(...fileStatisticsView(gaussians, size));
   announce(`${name}: ${count(gaussians)} Gaussians.`);
 }
 
@@ -181,9 +196,7 @@ async function take(files) {
   if (container) {
     const source = { name: container.name.replace(/\.(zip|sog)$/i, ""), container, bytes: container.size };
     await during(`Opening ${container.name}`, async (load) => {
-      if (isGltf(container)) {
-        throw new UserError(`This page does not open glTF; "kissgs view ${container.name}" does.`);
-      }
+      refuse(container.name);
       await openContainer(source, load);
     });
   }
@@ -194,9 +207,6 @@ async function take(files) {
     await (shown ? compareWith(file.name, type, bytes) : openFile(file.name, type, bytes, load));
   });
 }
-
-/** @param {{name: string}} file */
-const isGltf = ({ name }) => /\.(glb|gltf)$/i.test(name);
 
 /** @param {string} accept */
 function pick(accept) {

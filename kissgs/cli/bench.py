@@ -19,6 +19,7 @@ from kissgs.cli.bench_arguments import (
     SupervisionOption,
     ThreadsOption,
 )
+from kissgs.cli.bench_capacity import capacity
 from kissgs.cli.bench_scenes import open_inputs, report
 from kissgs.cli.options import open_views
 
@@ -286,3 +287,6 @@ def rendering(
     from kissgs.cli import bench_rendering
 
     report(bench_rendering.rendering(inputs, counts or []), as_json)
+
+
+app.command()(capacity)

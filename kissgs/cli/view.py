@@ -7,6 +7,7 @@ import os
 import sys
 import threading
 import webbrowser
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,7 +15,6 @@ import typer
 
 from kissgs.cli.arguments import (
     ForceOption,
-    LevelOption,
     MaxGaussiansOption,
     QuietOption,
     RawAxesOption,
@@ -27,6 +27,8 @@ from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
 
 if TYPE_CHECKING:
     from kissgs.pipeline.read_options import ReadOptions
+    from kissgs.preview.page_scene import PageScene
+    from kissgs.preview.streamed_folder import StreamedFolder
 
 
 def view(
@@ -50,7 +52,14 @@ def view(
         bool, typer.Option("--fetch-viewer", help="Download Spark and three.js first, if they are not installed.")
     ] = False,
     max_gaussians: MaxGaussiansOption = None,
-    level: LevelOption = 0,
+    level: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            help="Show this level of detail of a streamed scene alone; 0 is the finest. Default: what the camera sees, "
+            "as it comes near; with -o, the finest level of at most a million Gaussians.",
+        ),
+    ] = None,
     raw_axes: RawAxesOption = False,
     threads: ThreadsOption = 0,
     force: ForceOption = False,
@@ -60,49 +69,71 @@ def view(
     from kissgs.pipeline.read_options import ReadOptions
     from kissgs.preview.page_files import fetch_viewer, page_files
 
-    reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes)
+    reading = ReadOptions(max_gaussians=max_gaussians, level=level or 0, raw_axes=raw_axes)
     check_input(scene, InvalidSceneError)
     if fetch:
         fetch_viewer()
     page_files()  # before the work
     if output is None:
-        _serve(scene, reading, port, browser, threads, quiet)
+        _serve(scene, reading, level is None, port, browser, threads, quiet)
     elif port or not browser:
         raise UnsupportedError("--port and --no-browser are for the server, which -o does not start")
     else:
-        _write(scene, reading, output, threads, force, quiet)
+        _write(scene, reading, level is None, output, threads, force, quiet)
 
 
-def _write(scene: str, reading: ReadOptions, output: Path, threads: int, force: bool, quiet: bool) -> None:
+def _write(
+    scene: str, reading: ReadOptions, any_level: bool, output: Path, threads: int, force: bool, quiet: bool
+) -> None:
     from kissgs.io.atomic import atomic_file, refuse_existing
     from kissgs.preview.page_scene import page_container
     from kissgs.preview.standalone_page import standalone_page
+    from kissgs.preview.streamed_folder import fitting_level, is_streamed
 
     if output.suffix.lower() not in (".html", ".htm"):
         raise OutputError(f"{output!s:.100} is not the name of a page: end it in .html")
     refuse_existing(output, overwrite=force)
+    content, chosen = source(scene), ""
+    if any_level and is_streamed(content):
+        level, levels = fitting_level(content)
+        reading = replace(reading, level=level)
+        chosen = f", level {level} of 0 to {levels - 1}"
     with progress_bar(quiet) as progress:
-        container = page_container(source(scene), reading, threads=threads, progress=progress)
+        container = page_container(content, reading, threads=threads, progress=progress)
     page = standalone_page(container)
     with atomic_file(output, overwrite=force) as file:
         file.write(page)
     if not quiet:
         made = f", compressed by the preset balanced to {len(container.data):,} bytes" if container.converted else ""
-        show(f"{output}  {len(page):,} bytes, holds {container.name}{made}")
+        show(f"{output}  {len(page):,} bytes, holds {container.name}{chosen}{made}")
 
 
-def _serve(scene: str, reading: ReadOptions, port: int, browser: bool, threads: int, quiet: bool) -> None:
-    from kissgs.preview.page_scene import page_scene
+def _serve(
+    scene: str, reading: ReadOptions, all_levels: bool, port: int, browser: bool, threads: int, quiet: bool
+) -> None:
     from kissgs.preview.server import PageServer
 
-    with progress_bar(quiet) as progress:
-        prepared = page_scene(source(scene), reading, threads=threads, progress=progress)
+    prepared = _prepare(scene, reading, all_levels, threads, quiet)
     with PageServer(prepared, port) as server, contextlib.suppress(Interrupted):
         sys.stdout.write(f"{server.url}  (Ctrl-C ends)\n")
         sys.stdout.flush()
         if browser and _has_display():
             threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()
         server.serve_forever()
+
+
+def _prepare(
+    scene: str, reading: ReadOptions, all_levels: bool, threads: int, quiet: bool
+) -> PageScene | StreamedFolder:
+    """Return what the server gets: a scene in memory, or the folder of a streamed one."""
+    from kissgs.preview.page_scene import page_scene
+    from kissgs.preview.streamed_folder import is_streamed_folder, streamed_folder
+
+    content = source(scene)
+    if all_levels and isinstance(content, Path) and is_streamed_folder(content):
+        return streamed_folder(content)
+    with progress_bar(quiet) as progress:
+        return page_scene(content, reading, threads=threads, progress=progress)
 
 
 def _has_display() -> bool:

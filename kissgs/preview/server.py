@@ -14,6 +14,7 @@ from kissgs.core.errors import UnsupportedError
 from kissgs.io.atomic import reason_of
 from kissgs.preview.page_files import PAGE, hash_source, import_map, page_files, read_page
 from kissgs.preview.page_scene import PageScene
+from kissgs.preview.streamed_folder import StreamedFolder
 
 HOST = "127.0.0.1"
 SLOWEST_SECONDS = 60
@@ -45,7 +46,7 @@ class PageServer(ThreadingHTTPServer):
     name resolves to 127.0.0.1 cannot read the scene.
 
     Args:
-        scene: the scene, held in memory.
+        scene: the scene, held in memory; or a streamed one, whose files are read as the page asks for them.
         port: TCP port; 0 for a free one.
 
     Raises:
@@ -55,12 +56,17 @@ class PageServer(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
 
-    def __init__(self, scene: PageScene, port: int = 0) -> None:
+    def __init__(self, scene: PageScene | StreamedFolder, port: int = 0) -> None:
         files = page_files()
         page = read_page(files)
-        scene_path = f"/scene/{quote(scene.name)}"
         self.contents: dict[str, bytes | Path] = {f"/{name}": path for name, path in files.items()}
-        self.contents |= {"/": page.encode(), f"/{PAGE}": page.encode(), unquote(scene_path): scene.data}
+        self.contents |= {"/": page.encode(), f"/{PAGE}": page.encode()}
+        address = f"scene/{scene.name}"
+        if isinstance(scene, StreamedFolder):
+            self.contents |= {f"/{address}/{name}": path for name, path in scene.files.items()}
+            address = f"{address}/{scene.manifest}"
+        else:
+            self.contents[f"/{address}"] = scene.data
         self.policy = _POLICY.format(hash=hash_source(import_map(page)))
         try:
             super().__init__((HOST, port), _Handler)
@@ -70,7 +76,7 @@ class PageServer(ThreadingHTTPServer):
             ) from error
         self.port: int = self.server_address[1]
         self.hosts = {f"{name}:{self.port}" for name in (HOST, "localhost")} | ({HOST} if self.port == 80 else set())
-        self.url = f"http://{HOST}:{self.port}/?src={quote(scene_path[1:])}"
+        self.url = f"http://{HOST}:{self.port}/?src={quote(quote(address))}"
 
     def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ANN401  as in the base class
         """Let a connection that breaks pass in silence."""
@@ -111,7 +117,10 @@ class _Handler(BaseHTTPRequestHandler):
         if found is None:
             return HTTPStatus.NOT_FOUND, b"there is no such file\n", _TYPES[""]
         suffix = ".html" if path == "/" else Path(path).suffix
-        content = found if isinstance(found, bytes) else found.read_bytes()
+        try:
+            content = found if isinstance(found, bytes) else found.read_bytes()
+        except OSError:  # a file of a streamed scene that has been removed meanwhile
+            return HTTPStatus.NOT_FOUND, b"there is no such file\n", _TYPES[""]
         return HTTPStatus.OK, content, _TYPES.get(suffix, "application/octet-stream")
 
     def version_string(self) -> str:

@@ -53,7 +53,8 @@ class WorkItem:
         resources: what the item requests.
         seconds: limit of its time since its process was started; None for no limit.
         memory_limit: limit of the memory of its process, bytes, enforced on Linux; None for no limit.
-        folder: current folder of its process; None for any.
+        folder: current folder of its process; None for a new temporary one on the machine that runs it, which is
+            removed when the process has ended, also after a kill.
         retries: number of times that it is started again after its node was lost.
     """
 

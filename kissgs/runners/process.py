@@ -17,11 +17,12 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import IO, NamedTuple
 
 from kissgs.runners.contract import CRASHED, INTERNAL, MEMORY_LIMIT, NOT_STARTED, TIME_LIMIT, Outcome, WorkItem
+from kissgs.runners.temporary_folder import temporary_folder
 
 OUT_OF_MEMORY = re.compile(
     "MemoryError|bad_alloc|out of memory|memory allocation|cannot allocate memory", re.IGNORECASE
@@ -80,43 +81,52 @@ class ItemProcess:
         with contextlib.ExitStack() as stack:
             try:
                 errors = stack.enter_context(tempfile.TemporaryFile())
-                process = self._start(errors)
+                folder = self._item.folder or stack.enter_context(temporary_folder())
+                process = self._start(errors, folder)
             except OSError as error:
-                yield self._not_started(error)
-                return
-            timer = threading.Timer(self._item.seconds or threading.TIMEOUT_MAX, self._time_out)
-            timer.daemon = True
-            sampler = threading.Thread(target=self._sample_memory, args=(process.pid,), daemon=True)
-            sampler.start()
-            if self._item.seconds is not None:
-                timer.start()
-            final: Outcome | None = None
-            try:
-                for event in _events_of(process):
-                    if isinstance(event, Outcome):
-                        final = event
-                    else:
-                        yield event
-            finally:  # also if the caller asks for no more events
-                timer.cancel()
-                status = self._finish(process, wait=final is not None)
-            yield self._explain(final, status, errors)
+                outcome = self._not_started(error)
+            else:
+                status, final = yield from self._follow(process)
+                outcome = self._explain(final, status, errors)
+        yield outcome  # now that no file is left
+
+    def _follow(self, process: subprocess.Popen[bytes]) -> Generator[ProgressEvent, None, tuple[int, Outcome | None]]:
+        """Yield the progress of the process; return its status and its own outcome, None if it has sent none."""
+        timer = threading.Timer(self._item.seconds or threading.TIMEOUT_MAX, self._time_out)
+        timer.daemon = True
+        sampler = threading.Thread(target=self._sample_memory, args=(process.pid,), daemon=True)
+        sampler.start()
+        if self._item.seconds is not None:
+            timer.start()
+        final: Outcome | None = None
+        try:
+            for event in _events_of(process):
+                if isinstance(event, Outcome):
+                    final = event
+                else:
+                    yield event
+        finally:  # also if the caller asks for no more events
+            timer.cancel()
+            status = self._finish(process, wait=final is not None)
+        return status, final
 
     def _not_started(self, error: OSError) -> Outcome:
         reason, machine = (error.strerror or str(error)).lower(), socket.gethostname()
-        if isinstance(error, (FileNotFoundError, NotADirectoryError, PermissionError)):
+        if self._item.folder is not None and isinstance(
+            error, (FileNotFoundError, NotADirectoryError, PermissionError)
+        ):
             message = f"the machine {machine} cannot use the folder of the work: {reason}"
             return Outcome("error", code="output", message=message, log=str(self._item.folder))
         message = f"the machine {machine} could not start a process: {reason}"
         return Outcome("lost", code=NOT_STARTED, message=message)
 
-    def _start(self, errors: IO[bytes]) -> subprocess.Popen[bytes]:
+    def _start(self, errors: IO[bytes], folder: Path | str) -> subprocess.Popen[bytes]:
         process = subprocess.Popen(
             [sys.executable, "-P", "-m", f"{__package__}.item_process"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=errors,
-            cwd=self._item.folder,
+            cwd=folder,
             env=child_environment(),
             start_new_session=True,
         )

@@ -12,6 +12,7 @@ generator behind the values that have been consumed, which only suits generators
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import math
 import os
@@ -40,6 +41,9 @@ NODES_SECONDS = 1.0
 RETRY_SECONDS = 1.0
 """Seconds before an item whose node was lost is started again: Ray may not know of the loss yet."""
 
+FORCE_SECONDS = 5.0
+"""Seconds after which a cancelled task that has not ended is killed."""
+
 CONNECT_SECONDS = 5.0
 """Maximum seconds for a connection to the head's port."""
 
@@ -59,8 +63,9 @@ def main() -> None:
     os.dup2(2, 1)  # for what Ray prints
 
     def send(event: dict[str, Any]) -> None:
-        out.write(json.dumps(event) + "\n")
-        out.flush()
+        with contextlib.suppress(BrokenPipeError):  # nobody listens any more, and standard input has closed, too
+            out.write(json.dumps(event) + "\n")
+            out.flush()
 
     address = sys.argv[1]
     folder = tempfile.mkdtemp(prefix="kissgs-ray-") if address == LOCAL else None
@@ -203,10 +208,16 @@ class Driver:
         watching.cancel()
 
     def _cancel(self, item_id: str) -> None:
-        if item_id in self._tasks:
+        if item_id in self._tasks and item_id not in self._cancelled:  # once: a second interrupt would hit the clean-up
             self._cancelled.add(item_id)
             if item_id in self._generators:
-                ray.cancel(self._generators[item_id], force=True)
+                ray.cancel(self._generators[item_id])  # not by force, so that the task removes its temporary folder
+                asyncio.get_running_loop().call_later(FORCE_SECONDS, self._end, item_id)
+
+    def _end(self, item_id: str) -> None:
+        """Kill the process of a cancelled item's task, if it has not ended."""
+        if item_id in self._generators:
+            ray.cancel(self._generators[item_id], force=True)
 
     async def _watch_nodes(self) -> None:
         last: list[dict[str, Any]] = []

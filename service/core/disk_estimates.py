@@ -5,6 +5,9 @@ from __future__ import annotations
 BYTES_PER_GAUSSIAN = (68, 104, 164, 248)
 """Bytes per Gaussian of a ``.ply``, by SH degree."""
 
+RESULT_BYTES_PER_GAUSSIAN, RESULT_BYTES = 64, 32 << 20
+"""Upper bound for a result, which has every file of its container twice: per Gaussian, and for codebooks and report."""
+
 STEPS_BYTES = 300_000
 """Upper bound for a checkpoint's record of completed steps, at the largest step count that the settings allow."""
 

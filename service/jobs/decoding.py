@@ -18,7 +18,7 @@ from ..storage.job_records import Store
 from ..storage.job_storage import DECODED, JobStorage, StoredObject
 from .admission import Admission
 from .completion import result_folder
-from .runner import JobProcess, JobRunner
+from .runner import DECODE, JobProcess, JobRunner
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Decoder:
         name = f"{result_folder(job)}/{container_file(job.options).name}"
         source = await run_sync(self.storage.fetch, job.id, name, work)
         task = {
-            "kind": "decode",
+            "function": DECODE,
             "source": str(source),
             "work": str(work),
         }

@@ -113,6 +113,11 @@ def decode(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
     return described
 
 
+def without_paths(message: str, task: Task) -> str:
+    """Return a message for clients, which does not say where the files of a task lie."""
+    return message.replace(str(task["source"]), "the scene").replace(str(task["work"]), "").replace(" /", " ")
+
+
 def _size_and_hash(path: Path) -> dict[str, Any]:
     with path.open("rb") as file:
         return {"bytes": path.stat().st_size, "sha256": hashlib.file_digest(file, "sha256").hexdigest()}

@@ -29,7 +29,7 @@ def recover(context: ServiceContainer) -> None:
 def _recover_job(context: ServiceContainer, job: Job) -> None:
     store, storage, completion = context.store, context.storage, context.worker.completion
     summary = storage.read_result(job.id, RESULT, container_file(job.options).name)
-    if summary is None and storage.has_result(job.id):
+    if summary is None and storage.result_folders(job.id):
         log.warning("job %s: its result is damaged", job.id)
     if summary is not None:
         if job.state == State.QUEUED:
@@ -47,7 +47,7 @@ def _recover_job(context: ServiceContainer, job: Job) -> None:
 
 def _finish_removal(storage: JobStorage, job_id: str, *, failed: bool) -> None:
     """Remove the files of an ended job; move them to the orphaned folder if a failed job has a result."""
-    if failed and storage.has_result(job_id):
+    if failed and storage.result_folders(job_id):
         storage.set_aside(job_id, "holds a result, although the job failed according to the database,")
     else:
         storage.remove_job(job_id)

@@ -115,29 +115,35 @@ class ReplicaWatch:
             job = self.context.store.get(job_id)
             if job is not None and job.state == State.RUNNING:
                 self._continue(job, replica)
-            elif self._remove_rest(job, job_id, f"{RESULT}-{replica}"):
+            elif self._remove_rest(job, job_id, replica):
                 self.context.store.drop_claim(job_id, replica)
 
     def _continue(self, job: Job, replica: str) -> None:
-        """Queue a job that a dead replica ran again; if its result is complete, record that."""
+        """Queue a job that a dead replica ran again; if a result of it is complete, record that."""
         store, storage, completion = self.context.store, self.context.storage, self.context.worker.completion
-        folder = f"{RESULT}-{replica}"
-        summary = storage.read_result(job.id, folder, container_file(job.options).name)
-        if summary is not None:
-            completion.succeed(job, summary, folder, dead=replica)
-            return
-        storage.remove_result(job.id, folder)
+        for folder in self._results_of(job.id, replica):
+            summary = storage.read_result(job.id, folder, container_file(job.options).name)
+            if summary is not None:
+                completion.succeed(job, summary, folder, dead=replica)
+                return
+            storage.remove_result(job.id, folder)
         if job.starts >= self.context.settings.job_starts:
             detail = f"the service was ended {job.starts} times while the job ran; submit a scene with fewer Gaussians"
             completion.fail(job, "crashed", detail, dead=replica)
         elif store.move(job.number, State.QUEUED, dead=replica):
             log.warning("job %s is queued again, because its replica has died", job.id)
 
-    def _remove_rest(self, job: Job | None, job_id: str, folder: str) -> bool:
+    def _remove_rest(self, job: Job | None, job_id: str, replica: str) -> bool:
         """Remove files of a job that is not running, but for its upload and its result; return whether that is done."""
         storage = self.context.storage
         if job is None or job.state not in (*ACTIVE, State.SUCCEEDED):
             return storage.remove_job(job_id)
-        if job.state == State.QUEUED or result_folder(job) != folder:
-            storage.remove_result(job_id, folder)
+        for folder in self._results_of(job_id, replica):
+            if job.state == State.QUEUED or result_folder(job) != folder:
+                storage.remove_result(job_id, folder)
         return True
+
+    def _results_of(self, job_id: str, replica: str) -> list[str]:
+        """Return the names of the folders of a job's results that were made for a replica."""
+        found = self.context.storage.result_folders(job_id)
+        return [folder for folder in found if folder.startswith(f"{RESULT}-{replica}-")]

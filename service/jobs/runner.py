@@ -23,8 +23,18 @@ from kissgs.runners import (
 )
 
 from ..core.settings import ServiceSettings
+from .job_process import without_paths
 
 log = logging.getLogger("kissgs.service")
+
+COMPRESS, COMPRESS_IN_BUCKET, DECODE = "job_process:compress", "bucket_job:compress", "job_process:decode"
+"""Functions of this package that tasks name. The second has no folder here: its node makes a temporary one."""
+
+NODE_ERRORS = {
+    "storage": "the machines that run jobs cannot use the storage of the jobs' files; try again later",
+    "disk-full": "the machines that run jobs have no disk space for this one; try again later",
+}
+"""Sentences for clients by code, for errors of a node that another start of the job may not meet."""
 
 OnProgress = Callable[[str, float, str], Awaitable[None]]
 """Callback with a stage, its completed fraction (0 to 1), and a note, which may be empty."""
@@ -36,10 +46,9 @@ class Outcome:
 
     Attributes:
         kind: "done" after success; "error" after an expected error; "crashed" if the process ended otherwise; "lost"
-            if its node was lost; "stopped" after :meth:`JobProcess.kill`; "postponed" if the job cannot run at the
-            moment.
-        data: the result for "done"; ``code`` and ``detail`` of the problem for "error"; ``detail`` for "crashed" and
-            "lost".
+            if its node was lost, or could not work; "stopped" after :meth:`JobProcess.kill`; "postponed" if the job
+            cannot run at the moment.
+        data: the result for "done"; ``code`` and ``detail`` of the problem for "error", "crashed" and "lost".
     """
 
     kind: Literal["done", "error", "crashed", "lost", "stopped", "postponed"]
@@ -87,7 +96,7 @@ class JobRunner:
 
     def runner_of(self, task: dict[str, Any]) -> Runner:
         """Return the runner of a task."""
-        return self.local if task["kind"] == "decode" else self.runner
+        return self.local if task["function"] == DECODE else self.runner
 
     def request(self, *, trains: bool = False) -> Resources:
         """Return what a job requests: on a cluster, by default all processors of its smallest node."""
@@ -105,12 +114,12 @@ class JobRunner:
         requested = self.request(trains=_trains(task))
         threads = self.settings.job_threads if self.runner_of(task) is self.local else int(requested.cpus)
         return WorkItem(
-            f"{__package__}.job_process:{task['kind']}",
+            f"{__package__}.{task['function']}",
             {**task, "threads": threads, "device": "cuda" if requested.gpus else "cpu"},
             requested,
             seconds=self.settings.job_seconds,
             memory_limit=int(self.settings.job_memory),
-            folder=task["work"],
+            folder=task.get("work"),
             retries=0,
         )
 
@@ -178,9 +187,13 @@ class JobProcess:
             return Outcome("postponed")
         if outcome.kind == "lost":
             log.warning("a job was lost: %s", outcome.message)
-            return Outcome("lost", {"detail": "the machine that ran the job was lost; submit the scene again"})
+            detail = "the machine that ran the job was lost; submit the scene again"
+            return Outcome("lost", {"code": "crashed", "detail": detail})
+        if outcome.code in NODE_ERRORS:
+            log.warning("a job could not run: %s", outcome.message)
+            return Outcome("lost", {"code": outcome.code, "detail": NODE_ERRORS[outcome.code]})
         if outcome.kind == "crashed":
-            return Outcome("crashed", {"detail": f"{outcome.message}; submit the scene again"})
+            return Outcome("crashed", {"code": "crashed", "detail": f"{outcome.message}; submit the scene again"})
         return Outcome("error", {"code": outcome.code, "detail": self._detail(outcome, task)})
 
     def _detail(self, outcome: runners.Outcome, task: dict[str, Any]) -> str:
@@ -191,5 +204,4 @@ class JobProcess:
             return "the job exceeded its memory limit; submit a scene with fewer Gaussians"
         if outcome.code == INTERNAL:
             return "the job failed because of an error in kissgs; please report it with the scene"
-        detail = outcome.message.replace(str(task["source"]), "the scene").replace(str(task["work"]), "")
-        return detail.replace(" /", " ")
+        return without_paths(outcome.message, task) if "work" in task else outcome.message

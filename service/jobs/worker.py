@@ -1,27 +1,25 @@
-"""Worker: runs queued jobs in order of submission, each in a job process, and records how they end."""
+"""Worker: runs queued jobs in order of submission, each in a job process, and sees that their ends are recorded."""
 
 from __future__ import annotations
 
 import asyncio
-import errno
 import logging
 from dataclasses import dataclass, field
 
 from anyio.to_thread import run_sync
 from sqlalchemy.exc import SQLAlchemyError
 
-from ..core.formats import CONTAINER_FILES
 from ..core.metrics import Metrics
-from ..core.models import ACTIVE, Job, State
+from ..core.models import Job, State
 from ..core.notifier import JobNotifier, ended, wait
-from ..core.schemas import JobOptions
 from ..core.settings import ServiceSettings
 from ..storage.database_health import error_text
 from ..storage.job_records import Store
-from ..storage.job_storage import RESULT, JobStorage
-from ..storage.object_store import ObjectStoreError
+from ..storage.job_storage import JobStorage
 from .completion import LOST, JobCompletion
+from .outcomes import INTERNAL_ERROR, OutcomeRecorder, outcome_of
 from .runner import JobProcess, JobRunner, Outcome
+from .workplace import Workplace, workplace
 
 log = logging.getLogger("kissgs.service")
 
@@ -56,6 +54,9 @@ class Worker:
     _logged: set[str] = field(default_factory=set)
     _busy: int = 0
     _abandoning: bool = False
+
+    def __post_init__(self) -> None:
+        self._recorder = OutcomeRecorder(self.settings, self.store, self.storage, self.metrics, self.completion)
 
     def start(self) -> None:
         """Start to run jobs."""
@@ -168,42 +169,29 @@ class Worker:
         if job.starts == 1 and job.started_at is not None:
             self.metrics.waited.observe(job.started_at - job.created_at)
         self.notifier.notify(job.id)
+        place = workplace(self.settings, self.storage, job)
         try:
-            outcome = await self._follow(job, process)
+            outcome = await self._follow(job, process, place)
         except Exception as error:
             log.exception("job %s: its process could not be run", job.id)
-            outcome = _outcome_of(error)
+            outcome = outcome_of(error)
         finally:
             del self._processes[job.id]
             process.ended.set()
             self.metrics.busy.dec()
         storage_problem = await run_sync(self.storage.health_problem)
-        if storage_problem and outcome.kind in ("error", "crashed"):
+        if storage_problem and outcome.kind in ("error", "crashed", "lost"):
             outcome = Outcome("postponed")  # not caused by the job
-        await self._finish(job, outcome)
+        await self._finish(job, outcome, place)
 
-    async def _follow(self, job: Job, process: JobProcess) -> Outcome:
+    async def _follow(self, job: Job, process: JobProcess, place: Workplace) -> Outcome:
         current = await run_sync(self.store.get, job.id)  # cancelled before its process was registered?
         if current is None or current.state != State.RUNNING:
             return Outcome("stopped")
-        work = await run_sync(self.storage.new_work, job.id)
         try:
-            source = await run_sync(self.storage.fetch_scene, job.id, work)
+            task = await run_sync(place.task)
         except FileNotFoundError:
             return Outcome("error", {"code": "internal", "detail": LOST})
-        options = JobOptions.model_validate(job.options)
-        if options.resumable:
-            await run_sync(self.storage.fetch_checkpoints, job.id)
-        task = {
-            "kind": "compress",
-            "source": str(source),
-            "work": str(work),
-            "settings": {name: value for name, value in job.options.items() if name not in ("format", "evaluate")},
-            "format": options.format,
-            "container": CONTAINER_FILES[options.format].name,
-            "evaluate": options.evaluate,
-            "checkpoint": str(self.storage.checkpoint(job.id)) if options.resumable else None,
-        }
 
         async def progress(stage: str, fraction: float, note: str) -> None:
             try:
@@ -212,9 +200,7 @@ class Worker:
                 self._log_once(f"job {job.id}: progress was not recorded", error)
             self.notifier.notify(job.id)
 
-        keeping = (
-            asyncio.create_task(self._keep_checkpoints(job)) if self.storage.shared and options.resumable else None
-        )
+        keeping = asyncio.create_task(self._keep_checkpoints(job, place)) if place.stores_checkpoints else None
         try:
             return await process.run(task, progress)
         finally:
@@ -222,33 +208,33 @@ class Worker:
                 keeping.cancel()
                 await asyncio.gather(keeping, return_exceptions=True)
 
-    async def _keep_checkpoints(self, job: Job) -> None:
+    async def _keep_checkpoints(self, job: Job, place: Workplace) -> None:
         """Store the checkpoints of a running job for other replicas, in at most a tenth of the time."""
         clock = asyncio.get_running_loop().time
         while True:
             await asyncio.sleep(CHECKPOINT_SECONDS)
             begun = clock()
             try:
-                await run_sync(self.storage.store_checkpoints, job.id)
+                await run_sync(place.store_checkpoints)
             except OSError as error:  # the job may succeed without
                 self._log_once(f"job {job.id}: its checkpoint was not stored", error)
             await asyncio.sleep(9 * (clock() - begun))
 
     # How jobs end -----------------------------------------------------------------------------------------------------
 
-    async def _finish(self, job: Job, outcome: Outcome) -> None:
+    async def _finish(self, job: Job, outcome: Outcome, place: Workplace) -> None:
         """Record how a job ended; retry while that fails, so that no job is lost because of a full disk."""
         while True:
             try:
-                await run_sync(self._record, job, outcome)
+                await run_sync(self._recorder.record, job, outcome, place, self.draining)
                 break
             except (SQLAlchemyError, OSError) as error:
                 if self._abandoning:
                     await run_sync(self.storage.remove_work, job.id)
                     return
-                if outcome.kind == "done" and await run_sync(self._is_permanent, error):
+                if outcome.kind == "done" and await run_sync(self._recorder.is_permanent, error):
                     log.error("job %s: its result cannot be kept: %s", job.id, error_text(error))
-                    outcome = _outcome_of(error)
+                    outcome = outcome_of(error)
                     continue
                 self._log_once(f"job {job.id}: its end was not recorded; trying again", error)
                 if self.draining:  # the next start of the service recovers the job
@@ -256,18 +242,14 @@ class Worker:
                 await asyncio.sleep(IDLE_SECONDS)
             except Exception:  # a bug: the job must end nevertheless, and the worker continue
                 log.exception("job %s: its outcome could not be recorded", job.id)
-                if outcome is _INTERNAL_ERROR:  # the next start of the service recovers the job
+                if outcome is INTERNAL_ERROR:  # the next start of the service recovers the job
                     return
-                outcome = _INTERNAL_ERROR
+                outcome = INTERNAL_ERROR
         self.notifier.notify(job.id)
         self.notifier.notify(ended(job.id))
         if outcome.kind == "postponed":
             await asyncio.sleep(IDLE_SECONDS)
         self.notifier.notify(QUEUE)
-
-    def _is_permanent(self, error: Exception) -> bool:
-        """Whether a retry would always fail, because of this job's folder alone."""
-        return isinstance(error, OSError) and error.errno in _PERMANENT_ERRNOS and self.storage.health_problem() is None
 
     def _log_once(self, what: str, error: Exception) -> None:
         """Log a repeated failure only once, until the queue can be read again."""
@@ -275,68 +257,3 @@ class Worker:
         if reason not in self._logged:
             log.error("%s", reason)
             self._logged.add(reason)
-
-    def _record(self, job: Job, outcome: Outcome) -> None:
-        self.store.check()  # else files would change without a record in the database
-        self.storage.check()
-        current = self.store.get(job.id)
-        if current is None or current.state != State.RUNNING:  # cancelled or deleted meanwhile
-            self.storage.remove_work(job.id)
-            self.store.drop_claim(job.id)
-            return
-        folder = self.storage.keep_result(job.id) if outcome.kind == "done" else RESULT
-        if outcome.kind in ("stopped", "postponed", "crashed"):  # it may continue elsewhere
-            self.storage.store_checkpoints(job.id)
-        self.storage.remove_work(job.id)  # before requeueing, because another worker may then run the job
-        match outcome.kind:
-            case "done":
-                self.completion.succeed(job, outcome.data, folder)
-            case "error":
-                self.completion.fail(job, outcome.data["code"], outcome.data["detail"])
-            case "stopped" | "postponed":
-                self._requeue(job)
-            case "crashed" if self.draining:  # a supervisor may also have sent the signal to job processes
-                self._requeue(job)
-            case "crashed" if job.crashes == 0 and job.starts < self.settings.job_starts:
-                log.warning("job %s is started again", job.id)
-                self.metrics.restarts.inc()
-                self.store.move(job.number, State.QUEUED, crashes=1)
-            case "lost" if self.draining or job.starts < self.settings.job_starts:
-                log.warning("job %s is started again elsewhere", job.id)
-                self.metrics.restarts.inc()
-                self.store.move(job.number, State.QUEUED)
-            case "crashed" | "lost":
-                self.completion.fail(job, "crashed", outcome.data["detail"])
-        current = self.store.get(job.id)
-        if current is None or current.state not in ACTIVE:  # cancelled at the same moment, so the claim is still held
-            self.store.drop_claim(job.id)
-
-    def _requeue(self, job: Job) -> None:
-        """Return a job to the queue without counting its start."""
-        self.store.move(job.number, State.QUEUED, starts=job.starts - 1)
-
-
-_TRANSIENT_ERRNOS = (errno.EMFILE, errno.ENFILE, errno.EAGAIN, errno.ENOMEM, errno.ENOSPC, errno.EDQUOT)
-"""Errors from a temporary lack of resources, not caused by the job."""
-
-_PERMANENT_ERRNOS = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENOTEMPTY, errno.ELOOP)
-"""Errors from unexpected content of a job's folder, which do not go away."""
-
-_INTERNAL_ERROR = Outcome(
-    "error",
-    {
-        "code": "internal",
-        "detail": "the job could not be run because of an error in the service; please report it with the scene",
-    },
-)
-
-
-def _outcome_of(error: Exception) -> Outcome:
-    if isinstance(error, ObjectStoreError) or (isinstance(error, OSError) and error.errno in _TRANSIENT_ERRNOS):
-        return Outcome("postponed")
-    if isinstance(error, OSError):
-        reason = (error.strerror or str(error)).lower()
-        return Outcome(
-            "error", {"code": "output", "detail": f"the job's files cannot be written: {reason}; try again later"}
-        )
-    return _INTERNAL_ERROR

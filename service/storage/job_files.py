@@ -1,101 +1,54 @@
-"""``FolderStorage``: the data folder, with uploads in progress and one folder per job; clients choose no file names.
+"""``FolderStorage``: the files of jobs in a data folder; clients choose no file names.
 
-    incoming/TOKEN.part          an upload in progress
     jobs/ID/scene.ENDING         the complete upload: ply, sog, spz, splat, ksplat or glb
     jobs/ID/work-TOKEN/          files of a running job process
     jobs/ID/checkpoint*.npz      checkpoints of training, kept until the job ends
     jobs/ID/result/              the result, renamed to this when it is complete and on the disk
         scene.zip or scene.sog  report.json  files/NAME
     jobs/ID/decoded.ply          the decoded scene, after the first request; decoded.json has its size and checksum
-    jobs/.orphaned/ID/           folders of jobs that the database does not know; never read or removed
-    lock, identity, database     lock of the service, number of the folder, number of its database
 
 Incomplete files of a killed service have names that are never read, and the next start removes them. Only files with
-names of this list are removed, and nothing behind a link in place of a job's folder.
+names of this list are removed.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import json
 import logging
 import os
-import re
 import secrets
-import shutil
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
-from ..core.settings import SettingsError
-from .folder_numbers import read_number, sync_folder, write_number
+from ..core.formats import UPLOAD_FILES
+from .data_folder import JOB, DataFolder
+from .folder_numbers import sync_folder
 from .job_storage import DECODED, RESULT, JobStorage, StoredObject, complete_summary
 
 log = logging.getLogger("kissgs.service")
 
-ORPHANED = ".orphaned"
-"""Name of the folder, within ``jobs``, for folders that no job of the database owns."""
-
 UNFINISHED = ("work-*", ".*.part")
 """Patterns of incomplete files in a job's folder: work folders, and checkpoints that are being written."""
-
-UPLOAD_FILES = ("scene.ply", "scene.sog", "scene.spz", "scene.splat", "scene.ksplat", "scene.glb")
-"""Names of a job's upload, of which it has one: the ending tells formats that are not recognised by their content."""
 
 JOB_FILES = (*UNFINISHED, *UPLOAD_FILES, "result", "checkpoint*.npz", "decoded.ply", "decoded.json")
 """Patterns of all files that the service creates in a job's folder."""
 
-_JOB, _UPLOAD = re.compile("[0-9a-f]{32}"), re.compile(r"[0-9a-f]{16}\.part")
 
-
-class FolderStorage(JobStorage):
-    """Data folder, locked by one service at a time.
+class FolderStorage(DataFolder, JobStorage):
+    """Files of jobs in the data folder of one service; for arguments and errors, see :class:`DataFolder`.
 
     Args:
-        root: the folder; created if it does not exist.
-
-    Raises:
-        SettingsError: it cannot be created or written to, or another service uses it.
+        root: the data folder.
     """
 
     setting, shared = "KISSGS_DATA_DIR", False
 
     def __init__(self, root: Path) -> None:
-        self.root = root.absolute()
-        self.incoming, self.jobs = self.root / "incoming", self.root / "jobs"
+        super().__init__(root)
         self.place = str(self.jobs)
-        try:
-            self.root.mkdir(mode=0o700, parents=True, exist_ok=True)
-            for folder in (self.incoming, self.jobs):
-                folder.mkdir(exist_ok=True)
-            self._lock: IO[str] = (self.root / "lock").open("a")
-        except OSError as error:
-            raise SettingsError(
-                f"KISSGS_DATA_DIR: cannot use {root}: {(error.strerror or str(error)).lower()}"
-            ) from error
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            self._lock.close()
-            raise SettingsError(f"KISSGS_DATA_DIR: another service is using {root}; use a separate folder") from error
-        # Kept open, so that no file system reuses their inode numbers.
-        self._opened = {folder: os.open(folder, os.O_RDONLY) for folder in (self.incoming, self.jobs)}
-        if os.path.lexists(self.orphaned) and not self.orphaned.is_dir():
-            self.close()
-            raise SettingsError(f"KISSGS_DATA_DIR: {self.orphaned} is not a folder; move it away")
-
-    def close(self) -> None:
-        """Release the folder for other services."""
-        while self._opened:
-            os.close(self._opened.popitem()[1])
-        self._lock.close()
-
-    def new_upload(self) -> Path:
-        """Return a new path for an upload."""
-        return self.incoming / f"{secrets.token_hex(8)}.part"
 
     def adopt(self, upload: Path, job_id: str, name: str = UPLOAD_FILES[0]) -> None:
         """Move a complete upload to the folder of a job; ``name`` is one of :data:`UPLOAD_FILES`."""
@@ -165,7 +118,7 @@ class FolderStorage(JobStorage):
         folder.mkdir()
         return folder
 
-    def keep_result(self, job_id: str) -> str:
+    def keep_result(self, job_id: str, folder: str = RESULT) -> None:
         """Move the result from a job's work folder to its final path; do nothing if that is done already.
 
         A previous result moves to the work folder.
@@ -181,7 +134,6 @@ class FolderStorage(JobStorage):
             sync_folder(self.jobs / job_id)
         if not result.is_dir():
             raise FileNotFoundError(errno.ENOENT, "its result is missing")
-        return RESULT
 
     def read_result(self, job_id: str, folder: str, container: str) -> dict[str, Any] | None:
         """Return the summary of a complete result with this container; None if there is none or it is damaged."""
@@ -193,9 +145,9 @@ class FolderStorage(JobStorage):
             return None
         return complete_summary(text, sizes, container)
 
-    def has_result(self, job_id: str) -> bool:
-        """Return whether there are files of a result, complete or not."""
-        return self.result(job_id).exists()
+    def result_folders(self, job_id: str) -> list[str]:
+        """Return the name of the result's folder if it exists."""
+        return [RESULT] if self.result(job_id).exists() else []
 
     def remove_result(self, job_id: str, folder: str) -> None:
         """Remove a result."""
@@ -227,23 +179,13 @@ class FolderStorage(JobStorage):
             for path in (self.jobs / job_id).glob(pattern):
                 self.discard(path)
 
-    def discard(self, path: Path) -> None:
-        """Remove a file or folder if it exists; of a link, remove only the link."""
-        if path.parent.parent == self.jobs and path.parent.is_symlink():
-            return
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-                path.unlink()
-
     def remove_job(self, job_id: str) -> bool:
         """Remove all files of a job and return True; files that cannot be removed stay, with a warning in the log.
 
         If the job's path is not a folder, or has other content, it is moved to the orphaned folder instead.
         """
         folder = self.jobs / job_id
-        if not _JOB.fullmatch(job_id):
+        if not JOB.fullmatch(job_id):
             raise ValueError(f"{job_id!r} is not a job id")
         try:
             if not self._remove(folder):
@@ -279,112 +221,6 @@ class FolderStorage(JobStorage):
         for job_id in self.job_ids() & known:
             self.remove_work(job_id)
 
-    def remove_uploads(self) -> None:
-        """Remove incomplete uploads of a previous service."""
-        for path in self.incoming.iterdir():
-            if _UPLOAD.fullmatch(path.name):
-                self.discard(path)
-
-    # Orphaned folders -----------------------------------------------------------------------------------------------
-
-    @property
-    def orphaned(self) -> Path:
-        """Folder for folders that no job of the database owns."""
-        return self.jobs / ORPHANED
-
-    def job_ids(self) -> set[str]:
-        """Return the ids of all jobs that have a folder."""
-        return {path.name for path in self.jobs.iterdir() if _JOB.fullmatch(path.name) and path.is_dir()}
-
-    def move_to_orphaned(self, job_id: str, why: str) -> None:
-        """Move the folder of a job to the orphaned folder and log why; ``why`` continues "its folder ..."."""
-        self._move_to_orphaned(self.jobs / job_id)
-        log.warning("job %s: its folder %s and was moved to %s", job_id, why, self.orphaned)
-
-    def set_aside(self, job_id: str, why: str) -> None:
-        """Move the folder of a job to the orphaned folder; remove it if it is empty."""
-        with contextlib.suppress(OSError):  # not empty, not a folder, or missing
-            (self.jobs / job_id).rmdir()
-        if os.path.lexists(self.jobs / job_id):
-            self.move_to_orphaned(job_id, why)
-
-    def set_aside_unknown(self, known: Callable[[], set[str]]) -> int:
-        """Move the folders of all jobs except ``known`` ones to the orphaned folder; call it before uploads start.
-
-        Returns:
-            The number of folders moved.
-        """
-        unknown = sorted(self.job_ids() - known())
-        for job_id in unknown:
-            self._move_to_orphaned(self.jobs / job_id)
-        if unknown:
-            log.warning(
-                "folders of jobs that the database does not know were moved to %s: %d", self.orphaned, len(unknown)
-            )
-        return len(unknown)
-
-    def orphaned_note(self) -> str | None:
-        """Return a sentence about the entries of the orphaned folder; None if it is empty."""
-        count = self.count_orphaned()
-        return f"folders without a job in jobs/{ORPHANED} of the data folder: {count}" if count else None
-
-    def count_orphaned(self) -> int:
-        """Return the number of entries of the orphaned folder."""
-        try:
-            return sum(1 for _ in self.orphaned.iterdir())
-        except OSError:
-            return 0
-
-    def _move_to_orphaned(self, folder: Path) -> None:
-        self.orphaned.mkdir(exist_ok=True)
-        target, number = self.orphaned / folder.name, 1
-        while os.path.lexists(target):
-            number += 1
-            target = self.orphaned / f"{folder.name}-{number}"
-        folder.rename(target)
-
-    # The disk ------------------------------------------------------------------------------------------------------
-
-    def health_problem(self) -> str | None:
-        """Return why files cannot be stored; None if they can. Takes microseconds."""
-        for folder, opened in self._opened.items():
-            try:
-                same = os.path.samestat(folder.stat(), os.fstat(opened))
-            except OSError:
-                return f"the data folder cannot be used: its folder {folder.name} is missing; restore it"
-            if not same:
-                return f"the data folder cannot be used: its folder {folder.name} was replaced; restart the service"
-            if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
-                return (
-                    f"the data folder cannot be used: its folder {folder.name} is not writable; change its permissions"
-                )
-        return None
-
-    def free_bytes(self) -> int:
-        """Return the free bytes of the disk."""
-        return shutil.disk_usage(self.root).free
-
     def job_bytes(self, job_id: str) -> int:
         """Return the size of all files of a job, bytes."""
         return sum(path.stat().st_size for path in (self.jobs / job_id).rglob("*") if path.is_file())
-
-    # Numbers -------------------------------------------------------------------------------------------------------
-
-    def read_number(self, name: str) -> int | None:
-        """Read a number of the data folder: ``identity``, its own, or ``database``, that of its database.
-
-        Returns:
-            The number; None if the file is missing or empty.
-
-        Raises:
-            SettingsError: the file cannot be read or has other content.
-        """
-        return read_number(self.root / name)
-
-    def write_number(self, name: str, number: int) -> None:
-        """Write a number of the data folder atomically.
-
-        Raises:
-            SettingsError: it cannot be written.
-        """
-        write_number(self.root / name, number)

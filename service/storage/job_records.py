@@ -1,4 +1,4 @@
-"""``Store``: all reading and writing of the tables of jobs and events; each change is one transaction.
+"""``Store``: all changes of the tables of jobs and events, each in one transaction; reading is in ``job_queries``.
 
 State transitions are limited to :data:`_PREDECESSORS`, and compared and set in one step, so that of a simultaneous
 cancellation and result only one takes effect. Each change of state or progress adds an event for clients.
@@ -7,17 +7,18 @@ cancellation and result only one takes effect. Each change of state or progress 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.exc import IntegrityError, SQLAlchemyError
-from sqlalchemy.orm import Session, load_only
+from sqlalchemy.orm import Session
 
 from ..core.models import ACTIVE, ENDED, NOTE_CHARS, Event, Job, Meta, State
 from . import database_lease, replicas
 from .database import connect
 from .database_health import IDENTITY, DatabaseMonitor, DatabaseReplacedError
+from .job_queries import JobQueries, count, disk_bytes
 from .replica_records import ReplicaRecords
 
 _PREDECESSORS: dict[State, tuple[State, ...]] = {
@@ -43,7 +44,7 @@ class LimitExceeded(Exception):
         self.limit = limit
 
 
-class Store(ReplicaRecords):
+class Store(JobQueries, ReplicaRecords):
     """Jobs and events in a database. Methods block for milliseconds and are safe in any thread.
 
     Args:
@@ -112,12 +113,6 @@ class Store(ReplicaRecords):
         """
         self._monitor.owner = database_lease.acquire(self._writing, self._reading)
 
-    def states(self, job_ids: Iterable[str]) -> dict[str, tuple[State, int]]:
-        """Return the state and the number of the last event of jobs, by id; those that do not exist are missing."""
-        query = sa.select(Job.id, Job.state, Job.last_event).where(Job.id.in_(list(job_ids)))
-        with self._reading() as session:
-            return {job_id: (State(state), last) for job_id, state, last in session.execute(query)}
-
     @contextlib.contextmanager
     def _write(self) -> Iterator[Session]:
         """Begin a transaction; raise an error if the database is removed or replaced before it ends."""
@@ -144,12 +139,12 @@ class Store(ReplicaRecords):
                     replicas.lock(session, replicas.QUEUE_LOCK)  # counting and adding is one step for all replicas
                     if not replicas.drop(session, job.id, self.replica):
                         raise DatabaseReplacedError("another replica took this one for dead; send the request again")
-                if max_disk is not None and self._disk_bytes(session) + job.disk_bytes > max_disk:
+                if max_disk is not None and disk_bytes(session) + job.disk_bytes > max_disk:
                     raise LimitExceeded("disk")
-                if self._count(session, Job.state == State.QUEUED) >= max_queue:
+                if count(session, Job.state == State.QUEUED) >= max_queue:
                     raise LimitExceeded("queue")
                 active = Job.owner == job.owner, Job.owner != "", Job.state.in_(ACTIVE)
-                if self._count(session, *active) >= max_owner:
+                if count(session, *active) >= max_owner:
                     raise LimitExceeded("owner")
                 job.created_at = self.clock()
                 session.add(job)
@@ -158,38 +153,6 @@ class Store(ReplicaRecords):
         except IntegrityError as error:
             raise LimitExceeded("key") from error
         return job
-
-    def get(self, job_id: str, owner: str | None = None) -> Job | None:
-        """Return a job by id; None if it does not exist or has another owner than ``owner``."""
-        with self._reading() as session:
-            job = session.scalar(sa.select(Job).where(Job.id == job_id))
-        return job if job is not None and owner in (None, job.owner) else None
-
-    def by_idempotency_key(self, owner: str, key: str) -> Job | None:
-        """Return the job that ``owner`` submitted with this key; None if there is none."""
-        with self._reading() as session:
-            return session.scalar(sa.select(Job).where(Job.owner == owner, Job.idempotency_key == key))
-
-    def listing(self, owner: str, *, limit: int, before: int | None = None, state: State | None = None) -> list[Job]:
-        """Return up to ``limit`` jobs of an owner with a number below ``before``, newest first."""
-        query = sa.select(Job).where(Job.owner == owner).order_by(Job.number.desc()).limit(limit)
-        if before is not None:
-            query = query.where(Job.number < before)
-        if state is not None:
-            query = query.where(Job.state == state)
-        with self._reading() as session:
-            return list(session.scalars(query))
-
-    def in_state(self, *states: State) -> list[Job]:
-        """Return all jobs in one of ``states``, oldest first."""
-        with self._reading() as session:
-            return list(session.scalars(sa.select(Job).where(Job.state.in_(states)).order_by(Job.number)))
-
-    def active(self) -> list[Job]:
-        """Return all queued and running jobs, with only the columns that estimates need."""
-        columns = load_only(Job.state, Job.preset, Job.evaluate, Job.gaussians, Job.started_at)
-        with self._reading() as session:
-            return list(session.scalars(sa.select(Job).where(Job.state.in_(ACTIVE)).options(columns)))
 
     # Changes -------------------------------------------------------------------------------------------------------
 
@@ -254,70 +217,6 @@ class Store(ReplicaRecords):
             session.execute(sa.delete(Event).where(Event.job == number))
             session.execute(sa.delete(Job).where(Job.number == number))
 
-    # Events --------------------------------------------------------------------------------------------------------
-
-    def events(self, number: int, after: int = 0) -> list[Event]:
-        """Return the events of a job with a ``seq`` above ``after``, in order."""
-        query = sa.select(Event).where(Event.job == number, Event.seq > after).order_by(Event.seq)
-        with self._reading() as session:
-            return list(session.scalars(query))
-
-    # Sums ----------------------------------------------------------------------------------------------------------
-
-    def counts(self) -> dict[State, int]:
-        """Return the number of jobs in each state."""
-        with self._reading() as session:
-            rows = session.execute(sa.select(Job.state, sa.func.count()).group_by(Job.state)).all()
-        found = {State(state): count for state, count in rows}
-        return {state: found.get(state, 0) for state in State}
-
-    def active_of(self, owner: str) -> int:
-        """Return the number of queued and running jobs of an owner."""
-        with self._reading() as session:
-            return self._count(session, Job.owner == owner, Job.state.in_(ACTIVE))
-
-    def disk_bytes(self) -> int:
-        """Return the disk space of all jobs, bytes."""
-        with self._reading() as session:
-            return self._disk_bytes(session)
-
-    def rates(self, preset: str, evaluate: bool, limit: int = 21) -> list[float]:
-        """Return seconds per Gaussian of up to ``limit`` recent jobs of a preset, with or without evaluation."""
-        kind = Job.preset == preset, Job.evaluate == evaluate, Job.state == State.SUCCEEDED
-        query = sa.select(Job.finished_at - Job.started_at, Job.gaussians).where(*kind)
-        with self._reading() as session:
-            latest = session.execute(query.order_by(Job.number.desc()).limit(5 * limit)).all()
-        # In jobs with small scenes, the start of the process dominates.
-        return [spent / count for spent, count in latest if spent and count >= 10_000][:limit]
-
-    def ids(self, *states: State) -> set[str]:
-        """Return the ids of all jobs in ``states``, by default of all jobs."""
-        with self._reading() as session:
-            return set(session.scalars(sa.select(Job.id).where(Job.state.in_(states or tuple(State)))))
-
-    def due(self, states: Iterable[State], before: float, limit: int = 200) -> list[tuple[int, str]]:
-        """Return number and id of up to ``limit`` jobs in ``states`` that expire before a time."""
-        query = sa.select(Job.number, Job.id).where(Job.state.in_(tuple(states)), Job.expires_at < before)
-        with self._reading() as session:
-            return [(number, job_id) for number, job_id in session.execute(query.limit(limit))]
-
-    def reclaimable(self, limit: int = 50) -> list[tuple[int, str]]:
-        """Return number and id of up to ``limit`` ended jobs with reclaimable files, oldest first."""
-        query = sa.select(Job.number, Job.id).where(Job.reclaimable_bytes > 0, Job.state.in_(ENDED))
-        with self._reading() as session:
-            return [(number, job_id) for number, job_id in session.execute(query.order_by(Job.number).limit(limit))]
-
-    def reclaimable_bytes(self) -> int:
-        """Return the bytes of all reclaimable files of ended jobs."""
-        query = sa.select(sa.func.coalesce(sa.func.sum(Job.reclaimable_bytes), 0)).where(Job.reclaimable_bytes > 0)
-        with self._reading() as session:
-            return int(session.scalar(query.where(Job.state.in_(ENDED))) or 0)
-
-    def waiting(self) -> int:
-        """Return the number of queued jobs."""
-        with self._reading() as session:
-            return self._count(session, Job.state == State.QUEUED)
-
     # The clock -----------------------------------------------------------------------------------------------------
 
     def latest_time(self) -> float:
@@ -330,14 +229,6 @@ class Store(ReplicaRecords):
             session.merge(Meta(name="time", value=self.clock()))
             if self.replica is not None:
                 replicas.beat(session, self.replica)
-
-    @staticmethod
-    def _disk_bytes(session: Session) -> int:
-        return int(session.scalar(sa.select(sa.func.coalesce(sa.func.sum(Job.disk_bytes), 0))) or 0)
-
-    @staticmethod
-    def _count(session: Session, *where: sa.ColumnElement[bool]) -> int:
-        return session.scalar(sa.select(sa.func.count()).select_from(Job).where(*where)) or 0
 
 
 def _add_event(session: Session, job: Job, kind: str, data: dict[str, Any]) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -123,12 +123,35 @@ class JobStorage(ABC):
     def store_checkpoints(self, job_id: str) -> None:  # noqa: B027
         """Store the complete checkpoints of a job for other replicas, if they have changed."""
 
+    def sizes(self, job_id: str) -> dict[str, int]:
+        """Return the bytes of all files of a job by name, if they lie in a bucket."""
+        raise NotImplementedError
+
+    def sign(self, job_id: str, method: str, names: Iterable[str], seconds: float) -> dict[str, str]:
+        """Return addresses by name with which anybody can read ("GET") or write ("PUT") files in a bucket for a time.
+
+        Args:
+            job_id: id of their job.
+            method: of HTTP.
+            names: of the files, which need not exist.
+            seconds: time for which the addresses are valid, at most seven days.
+
+        Raises:
+            OSError: there are no credentials to sign with.
+        """
+        raise NotImplementedError
+
+    def new_result(self) -> str:
+        """Return the name of a folder for the result of one start of a job."""
+        return RESULT
+
     @abstractmethod
-    def keep_result(self, job_id: str) -> str:
+    def keep_result(self, job_id: str, folder: str) -> None:
         """Store the result in a job's work folder for good; do nothing if that is done already.
 
-        Returns:
-            The name of the result's folder.
+        Args:
+            job_id: id of the job.
+            folder: name from :meth:`new_result`.
 
         Raises:
             OSError: it cannot be stored, or there is none.
@@ -139,8 +162,8 @@ class JobStorage(ABC):
         """Return the summary of a complete result with this container; None if there is none or it is damaged."""
 
     @abstractmethod
-    def has_result(self, job_id: str) -> bool:
-        """Return whether there are files of a result, complete or not."""
+    def result_folders(self, job_id: str) -> list[str]:
+        """Return the names of the folders of results, complete or not."""
 
     @abstractmethod
     def remove_result(self, job_id: str, folder: str) -> None:

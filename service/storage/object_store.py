@@ -213,6 +213,10 @@ class ObjectStore:
         if chosen := list(keys):
             self._try(lambda: self._api.delete(self._store, chosen))
 
+    def sign(self, method: str, keys: list[str], valid: timedelta) -> list[str]:
+        """Return addresses with which anybody can make a request of this method for these files; each is a secret."""
+        return self._try(lambda: self._api.sign(self._store, method, keys, valid))
+
     # Errors ---------------------------------------------------------------------------------------------------------
 
     def _try(self, request: Callable[[], _T]) -> _T:

@@ -1,43 +1,34 @@
 """``S3Storage``: the files of jobs in a bucket that several replicas share.
 
     PREFIX/identity, PREFIX/database            numbers of the storage and of its database
-    PREFIX/jobs/ID/scene.ENDING                 the complete upload
-    PREFIX/jobs/ID/checkpoint*.npz              checkpoints of training that another replica may continue
-    PREFIX/jobs/ID/result-REPLICA/              the result that a replica made; summary.json, the last, completes it
-    PREFIX/jobs/ID/decoded.ply                  the decoded scene; decoded.json, the last, completes it
+    PREFIX/jobs/ID/                             the files of a job (:mod:`service.storage.job_objects`)
 
 What a replica is working on lies in a data folder of its own: uploads in progress, the files of its job processes, and
 their checkpoints. Nothing else lies there, so that folder may be lost at any time.
 
 A replica holds a claim of the job (:mod:`service.storage.replicas`) while it writes files of a job that is not in the
-database yet, or that it runs; the claims of a replica that has died say what to remove. A result's folder has the name
-of the replica that made it, so one that was taken for dead cannot change the result of another one.
+database yet, or that it runs; the claims of a replica that has died say what to remove.
 """
 
 from __future__ import annotations
 
-import json
 import logging
-import re
+import secrets
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+from ..core.formats import CHECKPOINT_FILES, UPLOAD_FILES
 from ..core.settings import SettingsError
+from .bucket_numbers import BucketNumbers
 from .folder_numbers import read_number
-from .job_files import UPLOAD_FILES, FolderStorage
-from .job_storage import DECODED, RESULT, JobStorage, StoredObject, complete_summary
-from .object_store import ObjectInfo, ObjectStore
+from .job_files import FolderStorage
+from .job_objects import DECODED_SUMMARY, JOB, SUMMARY, JobObjects, reclaimable
+from .job_storage import DECODED, RESULT, JobStorage, StoredObject
+from .object_store import ObjectStore
 
 log = logging.getLogger("kissgs.service")
-
-HEALTH_SECONDS = 5.0
-"""Seconds for which the health of the bucket is not asked for again."""
-
-_CHECKPOINT = re.compile(r"checkpoint[^/]*[.]npz")
-
-_JOB = re.compile("[0-9a-f]{32}")
 
 
 class S3Storage(JobStorage):
@@ -48,7 +39,7 @@ class S3Storage(JobStorage):
         root: the data folder; created if it does not exist.
 
     Attributes:
-        replica: id of this replica, which names the folders of its results; set it before :meth:`keep_result`.
+        replica: id of this replica, which names the folders of its results; set it before :meth:`new_result`.
 
     Raises:
         SettingsError: the bucket or the folder cannot be used, or the folder holds jobs of a service without a bucket.
@@ -62,8 +53,7 @@ class S3Storage(JobStorage):
         self.place = f"{self._objects.url}/jobs"
         self._stored: dict[Path, int] = {}
         self._unknown = 0
-        self._identity: int | None = None
-        self._checked, self._problem = -HEALTH_SECONDS, ""
+        self._numbers = BucketNumbers(self._objects)
         try:
             if read_number(self._local.root / "identity") is not None:
                 raise SettingsError(
@@ -121,90 +111,82 @@ class S3Storage(JobStorage):
 
     def adopt(self, upload: Path, job_id: str, name: str = UPLOAD_FILES[0]) -> None:
         """Move a complete upload to the files of a job; ``name`` is one of ``UPLOAD_FILES``."""
-        self._objects.put(upload, _key(job_id, name))
+        self._objects.put(upload, self._job(job_id).key(name))
         self._local.discard(upload)
 
     def upload_name(self, job_id: str) -> str | None:
         """Return the name of the job's upload; None if there is none."""
-        return next((name for name in self._names(job_id) if name in UPLOAD_FILES), None)
+        found = self._job(job_id).upload()
+        return None if found is None else found.key.rpartition("/")[2]
 
     def fetch(self, job_id: str, name: str, work: Path) -> Path:
         """Copy a file of a job to the folder ``work``; return its path there."""
         path = work / Path(name).name
-        self._objects.fetch(_key(job_id, name), path)
+        self._objects.fetch(self._job(job_id).key(name), path)
         return path
 
     def fetch_checkpoints(self, job_id: str) -> None:
         """Copy the checkpoints of a job, which another replica may have made, to this machine."""
-        for name in self._names(job_id):
-            if _CHECKPOINT.fullmatch(name):
-                self._objects.fetch(_key(job_id, name), self._local.jobs / job_id / name)
+        self._job(job_id).fetch_all(CHECKPOINT_FILES, self._local.jobs / job_id)
 
     def store_checkpoints(self, job_id: str) -> None:
         """Store the complete checkpoints of a job for other replicas, if they have changed."""
         for path in sorted((self._local.jobs / job_id).glob("checkpoint*.npz")):
             if self._stored.get(path) != (made := path.stat().st_mtime_ns):
-                self._objects.put(path, _key(job_id, path.name))
+                self._objects.put(path, self._job(job_id).key(path.name))
                 self._stored[path] = made
 
-    def keep_result(self, job_id: str) -> str:
-        """Store the result in a job's work folder for good; do nothing if that is done already.
+    def sizes(self, job_id: str) -> dict[str, int]:
+        """Return the bytes of all files of a job by name."""
+        return {name: info.size for name, info in self._job(job_id).files().items()}
 
-        Returns:
-            The name of the result's folder.
+    def sign(self, job_id: str, method: str, names: Iterable[str], seconds: float) -> dict[str, str]:
+        """Return addresses by name with which anybody can read ("GET") or write ("PUT") these files for a time."""
+        return self._job(job_id).sign(method, names, seconds)
+
+    def new_result(self) -> str:
+        """Return the name of a folder for the result of one start of a job."""
+        return f"{RESULT}-{self.replica}-{secrets.token_hex(4)}"
+
+    def keep_result(self, job_id: str, folder: str) -> None:
+        """Store the result in a job's work folder for good; do nothing if that is done already.
 
         Raises:
             OSError: it cannot be stored, or there is none.
         """
-        folder = f"{RESULT}-{self.replica}"
-        for written in (self._local.jobs / job_id).glob(f"work-*/{RESULT}"):
-            files = {str(path.relative_to(written)): path for path in written.rglob("*") if path.is_file()}
-            last = files.pop("summary.json")
-            self._objects.put_all((path, _key(job_id, folder, name)) for name, path in sorted(files.items()))
-            self._objects.put(last, _key(job_id, folder, "summary.json"))
-            return folder
-        if f"{folder}/summary.json" not in self._names(job_id):
+        written = next((self._local.jobs / job_id).glob(f"work-*/{RESULT}"), None)
+        if written is not None:
+            self._job(job_id).put_result(written, folder)
+        elif f"{folder}/{SUMMARY}" not in self.sizes(job_id):
             raise FileNotFoundError(2, "its result is missing")
-        return folder
 
     def read_result(self, job_id: str, folder: str, container: str) -> dict[str, Any] | None:
         """Return the summary of a complete result with this container; None if there is none or it is damaged."""
-        sizes = {
-            name.removeprefix(f"{folder}/"): info.size
-            for name, info in self._names(job_id).items()
-            if name.startswith(f"{folder}/")
-        }
-        if "summary.json" not in sizes:
-            return None
-        return complete_summary(self._objects.get_bytes(_key(job_id, folder, "summary.json")), sizes, container)
+        return self._job(job_id).read_result(folder, container)
 
-    def has_result(self, job_id: str) -> bool:
-        """Return whether there are files of a result, complete or not."""
-        return any(name.startswith(f"{RESULT}-") for name in self._names(job_id))
+    def result_folders(self, job_id: str) -> list[str]:
+        """Return the names of the folders of results, complete or not."""
+        return self._job(job_id).result_folders()
 
     def remove_result(self, job_id: str, folder: str) -> None:
         """Remove a result."""
-        self._remove(job_id, [name for name in self._names(job_id) if name.startswith(f"{folder}/")])
+        self._job(job_id).remove(lambda name: name.startswith(f"{folder}/"))
 
     def settle(self, job_id: str, folder: str, *, keep_upload: bool) -> bool:
         """Remove checkpoints, other results, and the upload unless ``keep_upload``; return whether there is one now."""
-        names = self._names(job_id)
-        upload = next((name for name in names if name in UPLOAD_FILES), None)
-        kept = {upload} if keep_upload else set()
-        self._remove(job_id, [name for name in names if not name.startswith(f"{folder}/") and name not in kept])
-        return keep_upload and upload is not None
+        kept = self._job(job_id).remove(
+            lambda name: not name.startswith(f"{folder}/") and not (keep_upload and name in UPLOAD_FILES)
+        )
+        return any(name in UPLOAD_FILES for name in kept)
 
     def keep_decoded(self, work: Path, job_id: str) -> None:
         """Store the decoded scene in a work folder, with its description, for good."""
-        self._objects.put(work / DECODED, _key(job_id, DECODED))
-        self._objects.put(work / "decoded.json", _key(job_id, "decoded.json"))
+        for name in (DECODED, DECODED_SUMMARY):
+            self._objects.put(work / name, self._job(job_id).key(name))
 
     def read_decoded(self, job_id: str) -> dict[str, Any] | None:
         """Return the description of a job's decoded scene; None if it has not been decoded."""
-        if not self._names(job_id).keys() >= {DECODED, "decoded.json"}:
-            return None
-        found: dict[str, Any] = json.loads(self._objects.get_bytes(_key(job_id, "decoded.json")))
-        return found
+        return self._job(job_id).read_decoded()
 
     def open(self, job_id: str, name: str) -> StoredObject:
         """Return a file of a job.
@@ -212,23 +194,23 @@ class S3Storage(JobStorage):
         Raises:
             FileNotFoundError: it does not exist.
         """
-        key = _key(job_id, name)
+        key = self._job(job_id).key(name)
         info = self._objects.info(key)
         return StoredObject(info.size, info.modified, stream=lambda first, end: self._objects.stream(key, first, end))
 
     def reclaimable_bytes(self, job_id: str) -> int:
         """Return the bytes that an ended job can do without: its upload and its decoded scene."""
-        return sum(info.size for name, info in self._names(job_id).items() if name in (*UPLOAD_FILES, DECODED))
+        return sum(size for name, size in self.sizes(job_id).items() if reclaimable(name))
 
     def reclaim(self, job_id: str) -> None:
         """Remove the upload and the decoded scene of an ended job."""
-        self._remove(job_id, [name for name in self._names(job_id) if name in (*UPLOAD_FILES, DECODED, "decoded.json")])
+        self._job(job_id).remove(reclaimable)
 
     def remove_job(self, job_id: str) -> bool:
         """Remove all files of a job; return False if that is not possible now, with a warning in the log."""
         self._local.remove_job(job_id)
         try:
-            self._remove(job_id, self._names(job_id))
+            self._job(job_id).remove(lambda name: True)
         except OSError as error:
             log.warning("job %s: its files cannot be removed now: %s", job_id, error)
             return False
@@ -236,13 +218,16 @@ class S3Storage(JobStorage):
 
     def job_bytes(self, job_id: str) -> int:
         """Return the size of all files of a job, bytes."""
-        return sum(info.size for info in self._names(job_id).values())
+        return sum(self.sizes(job_id).values())
+
+    def _job(self, job_id: str) -> JobObjects:
+        return JobObjects(self._objects, job_id)
 
     # The storage itself ---------------------------------------------------------------------------------------------
 
     def job_ids(self) -> set[str]:
         """Return the ids of all jobs that have files."""
-        return {name for name in self._objects.folders("jobs") if _JOB.fullmatch(name)}
+        return {name for name in self._objects.folders("jobs") if JOB.fullmatch(name)}
 
     def set_aside(self, job_id: str, why: str) -> None:
         """Leave the files of a failed job where they are, until it expires."""
@@ -265,69 +250,13 @@ class S3Storage(JobStorage):
         return f"jobs in {self.place} that the database does not know: {self._unknown}" if self._unknown else None
 
     def health_problem(self) -> str | None:
-        """Return why files cannot be stored; None if they can. Asks the bucket again after :data:`HEALTH_SECONDS`."""
-        if problem := self._local.health_problem():
-            return problem
-        if time.monotonic() - self._checked >= HEALTH_SECONDS:
-            self._problem = self._ask()
-            self._checked = time.monotonic()
-        return self._problem or None
-
-    def _ask(self) -> str:
-        try:
-            same = self._identity is None or self._objects.get_bytes("identity", hasty=True) == b"%d\n" % self._identity
-        except FileNotFoundError:
-            same = False
-        except OSError as error:
-            return f"the storage cannot be used: {error}"
-        return "" if same else f"the storage cannot be used: {self._objects.url} was emptied or replaced; restore it"
+        """Return why files cannot be stored; None if they can. Asks the bucket again after some seconds."""
+        return self._local.health_problem() or self._numbers.health_problem()
 
     def read_number(self, name: str) -> int | None:
-        """Read a number of the storage: ``identity``, its own, or ``database``, that of its database.
-
-        Returns:
-            The number; None if there is none.
-
-        Raises:
-            SettingsError: it cannot be read or is not a number.
-        """
-        try:
-            text = self._objects.get_bytes(name).strip()
-        except FileNotFoundError:
-            return None
-        except OSError as error:
-            raise SettingsError(f"KISSGS_STORAGE: {error}") from error
-        if not re.fullmatch(rb"[0-9]{1,18}", text):
-            raise SettingsError(
-                f"KISSGS_STORAGE: {self._objects.url}/{name} is not a number; restore it, or use another prefix"
-            )
-        if name == "identity":
-            self._identity = int(text)
-        return int(text)
+        """Read a number of the storage, see :class:`JobStorage`."""
+        return self._numbers.read(name)
 
     def write_number(self, name: str, number: int) -> None:
-        """Write a number of the storage.
-
-        Raises:
-            SettingsError: it cannot be written.
-        """
-        try:
-            self._objects.put_bytes(b"%d\n" % number, name)
-        except OSError as error:
-            raise SettingsError(f"KISSGS_STORAGE: {error}") from error
-        if name == "identity":
-            self._identity = number
-
-    def _names(self, job_id: str) -> dict[str, ObjectInfo]:
-        """Return all files of a job by name."""
-        folder = _key(job_id)
-        return {info.key.removeprefix(f"{folder}/"): info for info in self._objects.files(folder)}
-
-    def _remove(self, job_id: str, names: list[str] | dict[str, ObjectInfo]) -> None:
-        self._objects.delete(_key(job_id, name) for name in names)
-
-
-def _key(job_id: str, *names: str) -> str:
-    if not _JOB.fullmatch(job_id):
-        raise ValueError(f"{job_id!r} is not a job id")
-    return "/".join(("jobs", job_id, *names))
+        """Write a number of the storage, see :class:`JobStorage`."""
+        self._numbers.write(name, number)

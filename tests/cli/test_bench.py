@@ -130,6 +130,19 @@ def test_invalid_options_of_scaling_are_refused(options: str, message: str) -> N
     assert message in failure("bench", "scaling", "--gaussians", 5, "-p", "fast", *options.split())
 
 
+def test_clusters_are_simulated(tmp_path: Path) -> None:
+    words = ("bench", "capacity", "-p", "fast", "--gaussians", 2000, "--degree", 1, "--cpus", 8, "--dollars", 0.3)
+    done = run(*words, "--json", "--plot", tmp_path / "capacity.svg")
+    costs, *runs = json.loads(done.stdout)
+    assert costs["node"] == {"cpus": 8, "network_bytes": 625e6, "dollars": 0.3}
+    assert [run["jobs_per_day"] for run in runs[16:]] == [1e3, 1e4, 1e5, 1e6]
+    assert all(run["longest_wait"] <= 60 and run["busy"] < 1 for run in runs[16:])
+    assert b"<svg" in (tmp_path / "capacity.svg").read_bytes()
+    shown = run(*words).stdout.decode()
+    assert "1,000,000,000" in shown
+    assert max(map(len, shown.splitlines())) <= 120
+
+
 @pytest.mark.quick(0)
 def test_images_are_compared_and_the_rasteriser_is_measured(scene: Path) -> None:
     rows = json.loads(run("bench", "codecs", scene, "-p", "fast", "--evaluate", "--json").stdout)

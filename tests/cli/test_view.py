@@ -11,6 +11,7 @@ from helpers.command_line import KISSGS, failure, run
 
 import kissgs
 from kissgs.preview import page_files
+from kissgs.streaming import build
 
 
 @pytest.fixture
@@ -59,6 +60,42 @@ def test_a_page_of_a_ply(tmp_path):
     kissgs.save(kissgs.sample_scene(65, sh_degree=0), tmp_path / "scene.ply")
     done = run("view", tmp_path / "scene.ply", "-o", tmp_path / "page.html")
     assert re.search(r"holds scene\.zip, compressed by the preset balanced to [\d,]+\s+bytes", done.stdout.decode())
+
+
+@pytest.fixture
+def city(tmp_path, monkeypatch):
+    """A streamed scene of few Gaussians and several levels."""
+    folder = tmp_path / "streamed"
+    monkeypatch.setattr(build, "COARSEST", 50)
+    kissgs.save(kissgs.sample_scene(200, sh_degree=0), tmp_path / "large.ply")
+    kissgs.compress_streamed(tmp_path / "large.ply", folder / "lod-meta.json", settings=kissgs.Settings(preset="fast"))
+    return folder
+
+
+@needs_viewer
+def test_a_streamed_scene(tmp_path, city):
+    """The files of its folder are served one by one; ``--level`` and ``-o`` show one level, which was decoded."""
+    environment = {**os.environ, "DISPLAY": ""}
+
+    def served(*options):
+        words = [KISSGS, "view", city, "--no-browser", *options]
+        with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment) as process:
+            base, query = re.match(r"(http://[\d.:]+/)\?src=(\S+)", process.stdout.readline().decode()).groups()
+            with urllib.request.urlopen(base + query) as answer:
+                content = answer.read()
+            process.send_signal(signal.SIGINT)
+            process.communicate(timeout=30)
+        return query, content
+
+    query, manifest = served()
+    assert query == "scene/streamed/lod-meta.json"
+    assert manifest == (city / "lod-meta.json").read_bytes()
+    query, ply = served("--level", "1")
+    assert query == "scene/streamed.ply"
+    assert ply.startswith(b"ply")
+    assert b"element vertex %d\n" % len(kissgs.load(city, level=1)) in ply
+    done = run("view", city, "-o", tmp_path / "page.html")
+    assert "holds streamed.zip, level 0 of 0 to 2, compressed" in " ".join(done.stdout.decode().split())
 
 
 @needs_viewer

@@ -33,6 +33,7 @@ class RayCluster:
         self.environment = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
         self.nodes: list[subprocess.Popen] = []
         self.logs: list[Path] = []
+        self._temporary: dict[int, Path] = {}
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             self.address = f"127.0.0.1:{probe.getsockname()[1]}"
@@ -54,9 +55,33 @@ class RayCluster:
         self.nodes.append(self._start(f"--address={self.address}", "--num-cpus=1", f"--memory={NODE_MEMORY}"))
         return self.nodes[-1]
 
+    def items(self) -> list[int]:
+        """Return the ids of the processes of all items."""
+        found = []
+        for node in self.nodes:
+            for pid in tree(node.pid):
+                with contextlib.suppress(OSError):
+                    if b"item_process" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                        found.append(pid)
+        return found
+
+    def left_by_items(self) -> list[str]:
+        """Return the paths of temporary folders of items, on all nodes that run."""
+        running = [node for node in self.nodes if node.poll() is None]
+        return [str(path) for node in running for path in self._temporary[node.pid].glob("kissgs-*")]
+
+    def restore(self) -> None:
+        """Start a node for each one that was killed."""
+        for node in [node for node in self.nodes if node.poll() is not None]:
+            self.nodes.remove(node)
+            self.add_node()
+
     def _start(self, *options: str) -> subprocess.Popen:
         kept = {name: value for name, value in os.environ.items() if not name.startswith(("KISSGS_", "RAY_"))}
         environment = {**kept, **self.environment, "RAY_TMPDIR": str(self.folder), "RAY_USAGE_STATS_ENABLED": "0"}
+        temporary = self.folder / f"temporary{len(self.logs)}"  # of its own, as on a machine of its own
+        temporary.mkdir()
+        environment["TMPDIR"] = str(temporary)
         log = self.folder / f"log{len(self.logs)}"
         self.logs.append(log)
         with log.open("wb") as file:
@@ -67,6 +92,7 @@ class RayCluster:
                 stderr=file,
                 cwd=self.folder,
             )
+        self._temporary[process.pid] = temporary
         while b"Ray runtime started" not in log.read_bytes():  # two at a time would choose the same names of sockets
             assert process.poll() is None, log.read_text()
             time.sleep(0.05)

@@ -28,6 +28,14 @@ def record(arguments, progress):
     return {}
 
 
+def leave_a_file(arguments, progress):
+    """Write a file to the current folder, report it, and wait for ``seconds_between`` if given."""
+    Path("file").write_text(arguments["text"])
+    progress("written", 1.0, "")
+    time.sleep(arguments.get("seconds_between", 0.0))
+    return {"folder": str(Path.cwd())}
+
+
 def refuse(arguments, progress):
     raise kissgs.InvalidSceneError("this is no scene")
 

@@ -216,9 +216,8 @@ class Replicas(Service):
             for name in ("incoming", "jobs")
             for path in (replica.folder / name).iterdir()
         ]
-        kept = (
-            "scene[.][a-z]+|result-[0-9a-f]+/(summary.json|report.json|scene[.](zip|sog)|files/.+)|decoded.(ply|json)"
-        )
+        result = "result-[0-9a-f]+-[0-9a-f]+/(summary.json|report.json|scene[.](zip|sog)|files/.+)"
+        kept = f"scene[.][a-z]+|{result}|decoded.(ply|json)"
         return local + [
             key
             for key in self.bucket.names()

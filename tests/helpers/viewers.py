@@ -95,10 +95,18 @@ def chromium(arguments=SOFTWARE):
         browser.close()
 
 
+def is_failure(message):
+    """Return whether a line of the console is an error of a script; that of a missing file is not."""
+    return message.type == "error" and "status of 404" not in message.text
+
+
 @contextlib.contextmanager
 def opened(name, browser):
-    """Yield a viewer, "spark" or "playcanvas", and the site that its page is from; no script may fail meanwhile."""
-    needed, how = {"spark": (SPARK, "scripts/vendor"), "playcanvas": (PLAYCANVAS, "scripts/setup dev")}[name]
+    """Yield a viewer, "spark", "playcanvas" or our "streaming", and the site that its page is from.
+
+    No script may fail meanwhile.
+    """
+    needed, how = (PLAYCANVAS, "scripts/setup dev") if name == "playcanvas" else (SPARK, "scripts/vendor")
     if not (DECODER / needed).exists():
         pytest.skip(f"{how} has not run")
     errors = []
@@ -107,7 +115,7 @@ def opened(name, browser):
     site.headers["/"] = {"Content-Type": "text/html"}
     page = browser.new_page()
     page.on("pageerror", lambda error: errors.append(str(error)))
-    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    page.on("console", lambda message: errors.append(message.text) if is_failure(message) else None)
     page.goto(f"{site.url}/")
     page.wait_for_function("() => 'draw' in window")
     yield Viewer(name, page), site

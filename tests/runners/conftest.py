@@ -1,9 +1,7 @@
 """Fixtures: a runner on this machine, and one on a Ray cluster of two nodes."""
 
-from importlib.util import find_spec
-
 import pytest
-from helpers.ray_cluster import NODE_MEMORY, PATHS, RayCluster
+from helpers.ray_cluster import NODE_MEMORY, PATHS
 from helpers.running import wait_until
 
 from kissgs.runners.contract import Resources
@@ -19,25 +17,21 @@ def _find_helpers():
 
 
 @pytest.fixture(scope="session")
-def ray_cluster(_find_helpers):
-    """A Ray cluster of two nodes of one processor each."""
-    if find_spec("ray") is None:
-        pytest.skip("Ray is not installed (pip install 'kissgs[ray]')")
-    with RayCluster() as cluster, pytest.MonkeyPatch.context() as patch:
-        for name, value in cluster.environment.items():
-            patch.setenv(name, value)
-        cluster.add_node()
-        cluster.add_node()
-        yield cluster
-
-
-@pytest.fixture(scope="session")
 def ray_runner(ray_cluster):
     from kissgs.runners.ray_runner import RayRunner
 
     runner = RayRunner(ray_cluster.address)
     yield runner
     runner.close()
+
+
+@pytest.fixture
+def whole_cluster(ray_cluster, ray_runner):
+    """The cluster, with both nodes before and after the test."""
+    wait_until(lambda: ray_runner.stats().cpus == 2)
+    yield ray_cluster
+    ray_cluster.restore()
+    wait_until(lambda: ray_runner.stats().cpus == 2)
 
 
 @pytest.fixture(scope="session")

@@ -35,9 +35,7 @@ def cluster(ray_cluster, ray_runner):
     """The cluster, with both nodes before and after the test."""
     wait_until(lambda: ray_runner.stats().cpus == 2)
     yield ray_cluster
-    for node in [node for node in ray_cluster.nodes if node.poll() is not None]:
-        ray_cluster.nodes.remove(node)
-        ray_cluster.add_node()
+    ray_cluster.restore()
 
 
 def comparable(report):

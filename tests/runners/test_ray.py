@@ -24,16 +24,6 @@ print(handle.outcome.result())
 """
 
 
-@pytest.fixture
-def whole_cluster(ray_cluster, ray_runner):
-    """The cluster with both nodes, also after the test."""
-    yield ray_cluster
-    for node in [node for node in ray_cluster.nodes if node.poll() is not None]:
-        ray_cluster.nodes.remove(node)
-        ray_cluster.add_node()
-    wait_until(lambda: ray_runner.stats().cpus == 2)
-
-
 def test_an_item_whose_node_is_killed_runs_elsewhere(whole_cluster, ray_runner, tmp_path):
     starts, output, notes = tmp_path / "starts", tmp_path / "output", []
     work = item("write_slowly", starts=str(starts), output=str(output), text="the same bytes")

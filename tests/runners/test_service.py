@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from helpers.ray_cluster import NODE_MEMORY, PATHS, kill_tree, tree
+from helpers.ray_service import RayReplicas
 from helpers.running import is_alive, wait_until
 from helpers.service import FAST, SLOW, SMALL, Service, events, scene_bytes
 
@@ -34,21 +35,17 @@ def settings_of(ray_cluster, ray_runner):
     }
 
 
-@pytest.fixture(scope="module", params=["local", "ray"])
+@pytest.fixture(scope="module", params=["local", "ray", pytest.param("bucket", marks=pytest.mark.exhaustive)])
 def service(request, settings_of, tmp_path_factory):
-    with Service(tmp_path_factory.mktemp(request.param) / "data", **settings_of[request.param]) as it:
+    """A service with each runner, and replicas whose jobs run on a cluster without a folder that all see."""
+    folder = tmp_path_factory.mktemp(request.param) / "data"
+    if request.param != "bucket":
+        made = Service(folder, **settings_of[request.param])
+    else:
+        cluster, server, new_database = map(request.getfixturevalue, ("ray_cluster", "s3_server", "new_database"))
+        made = RayReplicas(folder, cluster, server.bucket(), new_database())
+    with made as it:
         yield it
-
-
-@pytest.fixture
-def whole_cluster(ray_cluster, ray_runner):
-    """The cluster, with both nodes before and after the test."""
-    wait_until(lambda: ray_runner.stats().cpus == 2)
-    yield ray_cluster
-    for node in [node for node in ray_cluster.nodes if node.poll() is not None]:
-        ray_cluster.nodes.remove(node)
-        ray_cluster.add_node()
-    wait_until(lambda: ray_runner.stats().cpus == 2)
 
 
 def result_of(service, job):
@@ -57,19 +54,24 @@ def result_of(service, job):
     return service.http.get(status["links"]["result"]).content
 
 
-def process_of(job):
-    """Wait for the process of a running job, which works in the job's folder; return its id."""
-    found = []
+def processes_of(service, *jobs):
+    """Wait for the processes of running jobs, the only ones of the service; return their ids."""
 
     def look():
+        if isinstance(service, RayReplicas):
+            return service.children()
+        found = []
         for link in Path("/proc").glob("[0-9]*/cwd"):
             with contextlib.suppress(OSError):
-                if job["id"] in str(link.readlink()) and is_alive(link.parent.name):
+                folder = str(link.readlink())
+                if any(job["id"] in folder for job in jobs) and is_alive(link.parent.name):
                     found.append(int(link.parent.name))
         return found
 
-    wait_until(look)
-    return found[-1]
+    for job in jobs:
+        wait_until(lambda job=job: service.status(job)["state"] == "running")
+    wait_until(lambda: len(look()) == len(jobs))
+    return look()
 
 
 def test_jobs_have_the_bytes_of_the_library_and_report_every_stage(service):
@@ -101,18 +103,18 @@ def test_an_expected_error_is_that_of_the_library_without_paths(service, tmp_pat
 
 def test_a_waiting_and_a_running_job_are_cancelled(service):
     running = [service.submit(MEDIUM, SLOW) for _ in range(2)]
-    pids = [process_of(job) for job in running]
+    pids = processes_of(service, *running)
     waiting = service.submit(MEDIUM, SLOW)
     for job in (waiting, *running):
         assert service.http.delete(f"/v1/jobs/{job['id']}").status_code in (200, 204)
-        assert not (service.folder / "jobs" / job["id"]).exists()
+        assert job["id"] not in service.stored()
     wait_until(lambda: not any(map(is_alive, pids)), seconds=5)
     assert result_of(service, service.submit()) == compressed(SMALL)
 
 
 def test_a_job_whose_process_is_killed_is_started_once_more(service):
     job = service.submit(MEDIUM, FAST)
-    os.kill(process_of(job), signal.SIGKILL)
+    os.kill(*processes_of(service, job), signal.SIGKILL)
     assert result_of(service, job) == compressed(MEDIUM)
     assert service.status(job)["starts"] == 2
     assert service.leftovers() == []
@@ -122,7 +124,7 @@ def test_a_job_whose_process_is_killed_is_started_once_more(service):
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_a_service_that_ends_runs_its_jobs_again(service, number):
     job = service.submit(MEDIUM, FAST)
-    pid = process_of(job)
+    (pid,) = processes_of(service, job)
     service.kill(number)
     wait_until(lambda: not is_alive(pid), seconds=30)
     service.restart()
@@ -158,7 +160,7 @@ def test_the_limits_of_jobs(settings_of, tmp_path, runner):
 def test_a_job_whose_node_is_killed_runs_elsewhere(settings_of, whole_cluster, tmp_path):
     with Service(tmp_path / "data", **settings_of["ray"]) as service:
         job = service.submit(MEDIUM, FAST)
-        pid = process_of(job)
+        (pid,) = processes_of(service, job)
         kill_tree(next(node for node in whole_cluster.nodes if pid in tree(node.pid)))
         assert result_of(service, job) == compressed(MEDIUM)
         assert service.status(job)["starts"] == 2

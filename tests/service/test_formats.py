@@ -7,10 +7,11 @@ import zipfile
 import pytest
 from helpers.format_scenes import made_scene
 from helpers.reference_gltf import attributes, data_uri, document, glb_bytes
-from helpers.reference_sog import sog_files, streamed_files, zip_of
+from helpers.reference_sog import sog_files, zip_of
 from helpers.reference_splat import ksplat_bytes, splat_bytes
 from helpers.reference_spz import spz_bytes
 from helpers.service import FAST, problem
+from helpers.streamed_scenes import KINDS
 
 import kissgs
 from kissgs import Settings
@@ -61,7 +62,7 @@ ROOT, BUFFER = document(attributes(SCENE))
 TEXT = json.dumps({**ROOT, "buffers": [{"byteLength": len(BUFFER), "uri": data_uri(BUFFER)}]}).encode()
 
 REFUSED = {
-    "a zip of levels": ("a.zip", zip_of(streamed_files([[SCENE]]))),
+    **{f"a zip of levels, {name}": ("a.zip", zip_of(kind.files([[SCENE]]))) for name, kind in KINDS.items()},
     "a container": ("a.zip", kissgs.compress(SCENE, settings=Settings.from_preset("fast")).to_zip()),
     "another zip": ("a.sog", zip_of({"notes.txt": b"hello"})),
     "text": ("a.gltf", TEXT),

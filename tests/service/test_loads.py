@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import resource
 import signal
 import socket
@@ -13,6 +14,8 @@ import uuid
 
 import pytest
 from helpers.service import SLOW, SMALL, events, problem, read_response, scene_bytes
+
+from kissgs.benchmark import service_load
 
 BIG = scene_bytes(20_000, 3)
 
@@ -26,6 +29,18 @@ def slowest(service, count=60):
         spent.append(time.perf_counter() - begun)
         time.sleep(0.01)
     return max(spent)
+
+
+@pytest.mark.quick(0)
+def test_the_load_of_a_service_is_measured(start, monkeypatch, capsys):
+    """Oracle: the service's processor time so far, which no part of it exceeds."""
+    service = start()
+    monkeypatch.setattr(service_load, "JOBS", 2)
+    monkeypatch.setattr(sys, "argv", ["service_load", service.url, str(service.process.pid)])
+    service_load.main()
+    found = re.fullmatch(r"(-?[0-9.]+) CPU s per job, (-?[0-9.]+) CPU s per GB\n", capsys.readouterr().out)
+    assert float(found[1]) < service_load._cpu_seconds(service.process.pid)
+    assert service.http.get("/v1/jobs").json()["jobs"] == []
 
 
 @pytest.mark.quick(0)
@@ -185,7 +200,7 @@ def test_an_error_in_the_job_process_is_internal(tmp_path):
     async def ignore(stage, fraction, note):
         pass
 
-    task = {"kind": "no such task", "work": str(tmp_path), "source": ""}
+    task = {"function": "job_process:nothing", "work": str(tmp_path), "source": ""}
     outcome = asyncio.run(JobRunner.open(ServiceSettings()).process().run(task, ignore))
     assert (outcome.kind, outcome.data["code"]) == ("error", "internal")
 

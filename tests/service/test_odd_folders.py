@@ -15,7 +15,7 @@ from helpers.service import SLOW, SMALL, problem, scene_bytes
 from service.core.models import State
 from service.jobs.expiry import ExpiryTask
 from service.jobs.runner import Outcome
-from service.jobs.worker import Worker
+from service.jobs.workplace import workplace
 
 
 def a_file(folder, elsewhere):
@@ -136,14 +136,15 @@ def test_recovery_follows_no_links(tmp_path):
 def test_a_permanent_error_fails_the_job(tmp_path, monkeypatch):
     """A folder that was not empty once blocked its worker for ever."""
 
-    def refuse(job_id):
+    def refuse(job_id, folder):
         raise OSError(errno.ENOTEMPTY, "Directory not empty")
 
     with service(tmp_path / "data") as context:
         job = context.store.get(add_a_job(context))
         context.store.claim()
         monkeypatch.setattr(context.storage, "keep_result", refuse)
-        asyncio.run(asyncio.wait_for(context.worker._finish(job, Outcome("done", {})), 10))
+        place = workplace(context.settings, context.storage, job)
+        asyncio.run(asyncio.wait_for(context.worker._finish(job, Outcome("done", {}), place), 10))
         found = context.store.get(job.id)
         assert (found.state, found.problem["code"]) == (State.FAILED, "output")
         assert found.problem["detail"].endswith("cannot be written: directory not empty; try again later")
@@ -153,11 +154,11 @@ def test_a_permanent_error_fails_the_job(tmp_path, monkeypatch):
 def test_permanent_errors(tmp_path, monkeypatch, error):
     monkeypatch.setenv("KISSGS_DATA_DIR", str(tmp_path / "data"))
     with service(tmp_path / "data") as context:
-        worker: Worker = context.worker
-        assert worker._is_permanent(OSError(error, os.strerror(error)))
-        assert not worker._is_permanent(OSError(errno.ENOSPC, "no space left on device"))
+        recorder = context.worker._recorder
+        assert recorder.is_permanent(OSError(error, os.strerror(error)))
+        assert not recorder.is_permanent(OSError(errno.ENOSPC, "no space left on device"))
         context.storage.jobs.rename(tmp_path / "away")
-        assert not worker._is_permanent(OSError(error, os.strerror(error)))
+        assert not recorder.is_permanent(OSError(error, os.strerror(error)))
         (tmp_path / "away").rename(context.storage.jobs)
 
 

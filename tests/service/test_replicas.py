@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from helpers.data_folders import add_a_job, command
 from helpers.job_rows import job as job_row
-from helpers.replica_kills import kill_at_random_moments
+from helpers.replica_kills import SETTINGS, kill_a_replica, kill_at_random_moments
 from helpers.s3_server import CREDENTIALS, S3Server
 from helpers.service import FAST, SMALL, Replicas, problem, scene_bytes
 
@@ -120,7 +120,8 @@ def test_a_suspended_replica_joins_again(two):
 @pytest.mark.parametrize("kills", [2, 10])
 @pytest.mark.quick(1)
 def test_replicas_are_killed_at_random_moments(tmp_path, bucket, new_database, kills):
-    found = kill_at_random_moments(tmp_path / "kills", bucket, new_database(), kills=kills, jobs=4, seed=kills)
+    two = Replicas(tmp_path / "kills", 2, bucket, new_database(), **SETTINGS)
+    found = kill_at_random_moments(two, kill_a_replica, kills=kills, jobs=4, seed=kills)
     sys.stdout.write(f"starts of the jobs: {found.starts}\n")
     assert found.lost == found.different == 0
     assert found.leftovers == []
@@ -185,7 +186,8 @@ def write_result(context, job_id, complete=True):
         "count": 3, "seconds": {"total": 1.0}, "cpu_seconds": 1.0,
     }  # fmt: skip
     (folder / "summary.json").write_text(json.dumps(summary))
-    kept = context.storage.keep_result(job_id)
+    kept = context.storage.new_result()
+    context.storage.keep_result(job_id, kept)
     if not complete:
         context.storage._objects.delete([f"jobs/{job_id}/{kept}/summary.json"])
     return kept

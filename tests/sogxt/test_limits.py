@@ -51,14 +51,14 @@ def test_a_swap_that_is_interrupted_leaves_the_old_container(tmp_path, monkeypat
     """An interrupt between the two renames once deleted the old folder as well as the new one."""
     folder, files = tmp_path / "folder", dict(encode(random_scene(5, 0), EncodeSettings()).files)
     container.write_container(files, folder)
-    rename = type(folder).rename
+    replace = type(folder).replace
 
     def interrupted(self, target):
         if self.suffix == ".part":
             raise KeyboardInterrupt
-        return rename(self, target)
+        return replace(self, target)
 
-    monkeypatch.setattr(type(folder), "rename", interrupted)
+    monkeypatch.setattr(type(folder), "replace", interrupted)
     with pytest.raises(KeyboardInterrupt):
         container.write_container(files, folder, overwrite=True)
     assert sorted(entry.name for entry in folder.iterdir()) == sorted(files)

@@ -145,7 +145,7 @@ def test_interrupted_work_ends_with_the_same_bytes_and_is_replaced_as_a_whole(sc
 
 
 def test_an_environment_that_nobody_sees_is_left_out(tmp_path):
-    """With an opacity that every renderer skips, nothing of the sky reaches the output."""
+    """Nothing of a sky reaches the output if every renderer skips its opacity."""
     original = kissgs.sample_scene(3000, sh_degree=0, seed=3)
     away = np.linalg.norm(original.means - np.median(original.means, axis=0), axis=1)
     original.opacities[away > 8 * np.median(away)] = -9.0
@@ -157,7 +157,7 @@ def test_an_environment_that_nobody_sees_is_left_out(tmp_path):
 
 @needs_splat_transform
 def test_splat_transform_reads_what_is_not_in_the_environment(scene, tmp_path):
-    """Its option for levels leaves the environment out."""
+    """The option for levels leaves the environment out."""
     target = tmp_path / "city" / "lod-meta.json"
     report = compress_streamed(scene, target, settings=FAST)
     theirs = kissgs.load(convert(target, tmp_path / "0.ply", "-L", "0"))

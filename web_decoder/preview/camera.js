@@ -1,6 +1,7 @@
 /** Camera poses. Scenes are in COLMAP's frame, with y down and z forward; three.js has y up and z backward. */
 
 import { Matrix4, Vector3 } from "three";
+import { viewOf } from "./coverage.js";
 
 /**
  * @typedef {{viewmat: number[][], K: number[][], width: number, height: number}} Pinhole `viewmat`: world to camera, as
@@ -48,6 +49,21 @@ export function setPinhole(camera, { viewmat, K, width, height }, [x, y, z]) {
     ...[0, 0, -1, 0],
   ]);
   camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
+}
+
+/**
+ * Return what a camera sees of a scene.
+ * @param {import("three").PerspectiveCamera} camera
+ * @param {number[]} centre of the scene, which is the origin of the viewer
+ * @param {number} width pixels
+ * @param {number} height
+ */
+export function sightOf(camera, [x, y, z], width, height) {
+  camera.updateMatrixWorld();
+  const toViewer = new Matrix4().makeTranslation(-x, -y, -z).premultiply(FLIP);
+  const eye = camera.position.clone().applyMatrix4(toViewer.clone().invert());
+  const matrix = toViewer.premultiply(camera.matrixWorldInverse).premultiply(camera.projectionMatrix);
+  return viewOf(matrix.elements, eye.toArray(), (camera.projectionMatrix.elements[5] * height) / 2, width * height);
 }
 
 /** @param {number[]} values */

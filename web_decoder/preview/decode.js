@@ -8,7 +8,7 @@ import { SogxtError } from "../sogxt.js";
 /** Only SOG-XT has a mask and a grid. @param {any} meta */
 const isSog = (meta) => meta?.means && !("mask" in meta) && !("gridSide" in meta);
 
-/** @type {(source: string | Blob, options: import("../types.js").Options) => Promise<import("../types.js").Scene>} */
+/** @type {(source: string | Blob, options: import("../types.js").Options & {pool?: import("../pool.js").Pool}) => Promise<import("../types.js").Scene>} */
 export const decode = (source, options) =>
   load(source, options, {
     name: "SOG-XT or SOG",

@@ -40,6 +40,24 @@ export const extentOfScene = ({ count, means, opacities }) =>
     (i) => sigmoid(opacities[i]),
   );
 
+/** Ends of the points that stand for a box, as shares of its sides: they spread as far as points all over it. */
+const SPREAD = [0.5 - Math.sqrt(1 / 12), 0.5 + Math.sqrt(1 / 12)];
+
+/**
+ * Return the extent of a scene of which only boxes are known.
+ * @param {import("./coverage.js").Box[]} boxes
+ * @param {number[]} weights
+ */
+export const extentOfBoxes = (boxes, weights) =>
+  extentOf(
+    8 * boxes.length,
+    (i) => {
+      const { low, high } = boxes[i >> 3];
+      return low.map((start, axis) => start + SPREAD[(i >> axis) & 1] * (high[axis] - start));
+    },
+    (i) => weights[i >> 3],
+  );
+
 /**
  * Return the extent of a mesh, with y down and z ahead.
  * @param {import("@sparkjsdev/spark").SplatMesh} mesh

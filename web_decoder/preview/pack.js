@@ -16,45 +16,110 @@ const BANDS = [
 const SMALLEST_LOG_SCALE = -14;
 
 /**
+ * @typedef {object} Packed arrays of Spark's texture and of its spherical harmonics, by row
+ * @property {number} count
+ * @property {Uint32Array} words four of each Gaussian
+ * @property {Record<string, Uint32Array>} extra
+ * @property {Encoding} encoding
+ */
+
+/** Gaussians that are converted before other events get a turn: some 10 ms. */
+const TURN = 10_000;
+
+/**
  * @param {Scene} scene
  * @param {number[]} centre subtracted from all positions, which are half floats, accurate only near zero
  * @param {object} how
  * @param {number | null} how.size standard deviation of all Gaussians until scales have arrived; null afterwards
  * @param {boolean} how.spherical whether the spherical harmonics have arrived
  */
-export function pack(scene, centre, { size, spherical }) {
+export function pack(scene, centre, how) {
+  const { packed, rows } = packing(scene, centre, how);
+  rows(0, scene.count);
+  return splatsOf(packed);
+}
+
+/**
+ * Convert a whole scene without stopping the page for long.
+ * @param {Scene} scene
+ * @param {number[]} centre as of `pack`
+ * @param {AbortSignal} signal
+ */
+export async function packInTurns(scene, centre, signal) {
+  const { packed, rows } = packing(scene, centre, { size: null, spherical: true });
+  for (let from = 0; from < scene.count; from += TURN) {
+    await new Promise((resolve) => setTimeout(resolve));
+    signal.throwIfAborted();
+    rows(from, Math.min(scene.count, from + TURN));
+  }
+  return packed;
+}
+
+/**
+ * Return Spark's form of some rows.
+ * @param {Packed} packed
+ * @param {[offset: number, count: number][]} ranges
+ */
+export function packedRows({ count: all, words, extra, encoding }, ranges) {
+  const kept = ranges.map(([offset, count]) => [offset, Math.min(all, offset + count)]);
+  const count = kept.reduce((sum, [from, to]) => sum + to - from, 0);
+  const room = utils.computeMaxSplats(count);
+  const gather = (/** @type {Uint32Array} */ array) => {
+    const [size, out] = [
+      array.length / utils.computeMaxSplats(all),
+      new Uint32Array((array.length / utils.computeMaxSplats(all)) * room),
+    ];
+    let at = 0;
+    for (const [from, to] of kept) {
+      out.set(array.subarray(size * from, size * to), size * at);
+      at += to - from;
+    }
+    return out;
+  };
+  const gathered = Object.fromEntries(Object.entries(extra).map(([name, array]) => [name, gather(array)]));
+  return splatsOf({ count, words: gather(words), extra: gathered, encoding });
+}
+
+/** @param {Packed} packed */
+const splatsOf = ({ count, words, extra, encoding }) => ({
+  splats: new PackedSplats({ packedArray: words, numSplats: count, extra, splatEncoding: encoding }),
+  encoding,
+});
+
+/** @param {Scene} scene @param {number[]} centre @param {{size: number | null, spherical: boolean}} how */
+function packing(scene, centre, { size, spherical }) {
   const { count, means, quats } = scene;
   const encoding = encodingOf(scene, size);
   // Spark shows whole rows of its texture only: shorter arrays would lose Gaussians.
   const room = utils.computeMaxSplats(count);
-  const packed = new Uint32Array(4 * room);
-  for (let i = 0, a = 0, q = 0; i < count; i++, a += 3, q += 4) {
-    const length = Math.hypot(quats[q], quats[q + 1], quats[q + 2], quats[q + 3]) || 1;
-    utils.setPackedSplat(
-      packed,
-      i,
-      means[a] - centre[0],
-      means[a + 1] - centre[1],
-      means[a + 2] - centre[2],
-      size ?? Math.exp(Math.max(SMALLEST_LOG_SCALE, scene.scales[a])),
-      size ?? Math.exp(Math.max(SMALLEST_LOG_SCALE, scene.scales[a + 1])),
-      size ?? Math.exp(Math.max(SMALLEST_LOG_SCALE, scene.scales[a + 2])),
-      quats[q + 1] / length,
-      quats[q + 2] / length,
-      quats[q + 3] / length,
-      quats[q] / length,
-      sigmoid(scene.opacities[i]),
-      baseColour(scene.sh0[a]),
-      baseColour(scene.sh0[a + 1]),
-      baseColour(scene.sh0[a + 2]),
-      encoding,
-    );
+  const words = new Uint32Array(4 * room);
+  /** @param {number} from @param {number} to */
+  function rows(from, to) {
+    for (let i = from, a = 3 * from, q = 4 * from; i < to; i++, a += 3, q += 4) {
+      const length = Math.hypot(quats[q], quats[q + 1], quats[q + 2], quats[q + 3]) || 1;
+      utils.setPackedSplat(
+        words,
+        i,
+        means[a] - centre[0],
+        means[a + 1] - centre[1],
+        means[a + 2] - centre[2],
+        size ?? Math.exp(Math.max(SMALLEST_LOG_SCALE, scene.scales[a])),
+        size ?? Math.exp(Math.max(SMALLEST_LOG_SCALE, scene.scales[a + 1])),
+        size ?? Math.exp(Math.max(SMALLEST_LOG_SCALE, scene.scales[a + 2])),
+        quats[q + 1] / length,
+        quats[q + 2] / length,
+        quats[q + 3] / length,
+        quats[q] / length,
+        sigmoid(scene.opacities[i]),
+        baseColour(scene.sh0[a]),
+        baseColour(scene.sh0[a + 1]),
+        baseColour(scene.sh0[a + 2]),
+        encoding,
+      );
+    }
   }
   const extra = spherical ? sphericalHarmonics(scene, encoding, room) : {};
-  return {
-    splats: new PackedSplats({ packedArray: packed, numSplats: count, extra, splatEncoding: encoding }),
-    encoding,
-  };
+  return { packed: { count, words, extra, encoding }, rows };
 }
 
 /**

@@ -19,8 +19,8 @@ export function showProblem(error) {
   place.replaceChildren(el("p", {}, sentenceOf(error)), close);
 }
 
-/** @param {unknown} error */
-function sentenceOf(error) {
+/** Return the message for users. @param {unknown} error */
+export function sentenceOf(error) {
   if (error instanceof UserError || error instanceof SogxtError) return sentence(error.message);
   const reason = error instanceof Error ? error.message : String(error);
   return `This page failed because of a bug in it: ${reason || "no reason was given"}.`;

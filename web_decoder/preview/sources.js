@@ -1,6 +1,7 @@
 /** Sources of scenes: the page's address, the page itself, or a file. */
 
 import { fileTypeOfFormat } from "./file_types.js";
+import { isManifest } from "./lod_tree.js";
 import { UserError } from "./problem.js";
 
 /**
@@ -57,7 +58,7 @@ function ofElement(element) {
 function ofAddress(address, here) {
   try {
     const url = new URL(address, here);
-    const path = url.pathname.replace(/\/(meta\.json)?$/, "");
+    const path = url.pathname.replace(/\/((lod-)?meta\.json|levels\.json)?$/, "");
     const name = decodeURIComponent(path.slice(path.lastIndexOf("/") + 1));
     return { name: name || url.host, container: url.href, zipped: path === url.pathname };
   } catch {
@@ -94,10 +95,11 @@ async function ofJob(id, signal) {
 }
 
 /**
+ * Fetch a file; errors are sentences.
  * @param {string} url
  * @param {RequestInit} init
  */
-async function get(url, init) {
+export async function get(url, init) {
   const response = await fetch(url, init).catch((error) => {
     throw init.signal?.aborted
       ? error
@@ -126,4 +128,14 @@ export async function download({ url, bytes: total }, load) {
     load.progress({ received: (received += part.value.length), total: Math.max(total, received) });
   }
   return new Uint8Array(await new Blob(parts).arrayBuffer());
+}
+
+/** Throw an error for files that say what they are by their names, but cannot be opened here. @param {string} name */
+export function refuse(name) {
+  const kind = isManifest(`/${name}`)
+    ? "the list of a scene's files alone"
+    : /\.(glb|gltf)$/i.test(name)
+      ? "glTF"
+      : null;
+  if (kind) throw new UserError(`This page does not open ${kind}; "kissgs view ${name}" does.`);
 }

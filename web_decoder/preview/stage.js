@@ -32,6 +32,7 @@ export function stage(failed) {
   let live = null;
   /** @type {Awaited<ReturnType<typeof import("./compare.js").comparison>> | null} */
   let beside = null;
+  let endStream = () => {};
   let white = false;
 
   const ready = modules().then(([{ Viewer }, { navigation }, { comparison }]) => {
@@ -76,6 +77,13 @@ export function stage(failed) {
     beside = null;
   }
 
+  /** End what belongs to the former scene. */
+  function endFormer() {
+    endComparison();
+    endStream();
+    endStream = () => {};
+  }
+
   return {
     /** Resolves when a scene can be shown; never if that is impossible. @type {Promise<void>} */
     ready: new Promise((resolve) =>
@@ -96,17 +104,30 @@ export function stage(failed) {
      * @param {boolean} fresh
      */
     show(scene, parts, fresh) {
-      if (fresh) endComparison();
+      if (fresh) endFormer();
       live?.viewer.setScene(scene, parts, live.camera.moved);
       reveal(fresh);
     },
     /** @param {import("./file_types.js").FileType} type @param {Uint8Array} bytes */
     async showFile(type, bytes) {
       const { viewer } = await ready;
-      endComparison();
+      endFormer();
       const count = await viewer.setFile(type, bytes);
       reveal(true);
       return count;
+    },
+    /**
+     * Begin a scene that the caller draws in parts, and return the viewer.
+     * @param {import("./extent.js").Extent} extent
+     * @param {() => void} ended called when another scene is shown, or none
+     */
+    async stream(extent, ended) {
+      const { viewer } = await ready;
+      endFormer();
+      endStream = ended;
+      viewer.setExtent(extent);
+      reveal(true);
+      return viewer;
     },
     /** @param {import("./file_types.js").FileType} type @param {Uint8Array} bytes */
     async compare(type, bytes) {
@@ -119,7 +140,7 @@ export function stage(failed) {
     endComparison,
     /** Show nothing until the next scene. */
     conceal() {
-      endComparison();
+      endFormer();
       canvas.hidden = true;
       byId("tools").hidden = true;
     },

@@ -57,6 +57,41 @@ export const fileStatisticsView = (gaussians, size) => [
   ]),
 ];
 
+/**
+ * Return what is drawn and loaded of a streamed scene.
+ * @param {object} facts
+ * @param {import("./lod_tree.js").LodTree} facts.tree
+ * @param {number} facts.budget largest number of Gaussians that are drawn
+ * @param {{leaves: number, gaussians: number}[]} facts.drawn by level
+ * @param {boolean} facts.complete whether nothing is to be loaded for this view
+ * @param {number} facts.received bytes
+ * @param {number} facts.total bytes, estimated
+ * @param {{seconds: number, bytes: number} | null} facts.first when the first image was drawn; null before
+ */
+export function streamedStatisticsView({ tree, budget, drawn, complete, received, total, first }) {
+  const gaussians = drawn.reduce((sum, level) => sum + level.gaussians, 0);
+  return [
+    el("h2", { id: "statistics-title" }, "Statistics"),
+    list([
+      ["Gaussians drawn", count(gaussians), `of ${count(tree.count)}`],
+      ["At most", count(budget), "on this device"],
+      ["Loaded", bytes(received), `of about ${bytes(Math.max(received, total))}`],
+      ["First image", first ? duration(first.seconds) : "…", first ? `after ${bytes(first.bytes)}` : undefined],
+      ["Levels", count(tree.levels)],
+      ["This view", complete ? "complete" : "loading"],
+    ]),
+    levelTable(drawn, tree.leaves.length),
+  ];
+}
+
+/** @param {{leaves: number, gaussians: number}[]} drawn @param {number} leaves */
+function levelTable(drawn, leaves) {
+  const rows = drawn.map(({ leaves: own, gaussians }, level) =>
+    tableRow(level ? `Level ${level}` : "Level 0, finest", own / leaves, count(own), count(gaussians)),
+  );
+  return barTable("What is drawn", ["Level", "Parts", "Gaussians"], rows);
+}
+
 /** @param {[string, string, string?][]} pairs */
 function list(pairs) {
   const items = pairs.map(([name, value, remark]) =>
@@ -72,25 +107,33 @@ function list(pairs) {
 function table(sizes, total) {
   const rows = attributes(sizes);
   const largest = Math.max(...rows.map(([, size]) => size));
-  const lines = rows.map(([name, size]) => {
-    const bar = el("span");
-    bar.style.inlineSize = `${(100 * size) / largest}%`;
-    return el(
-      "tr",
-      {},
-      el("th", { scope: "row" }, name),
-      el("td", { class: "bar", "aria-hidden": "true" }, bar),
-      el("td", {}, bytes(size)),
-      el("td", { class: "muted" }, share(size / total)),
-    );
-  });
+  const lines = rows.map(([name, size]) => tableRow(name, size / largest, bytes(size), share(size / total)));
+  return barTable("Where the bytes go", ["Attribute", "Size", "Share"], lines);
+}
+
+/** @param {string} name @param {number} part length of the bar, 0 to 1 @param {string} value @param {string} remark */
+function tableRow(name, part, value, remark) {
+  const bar = el("span");
+  bar.style.inlineSize = `${100 * part}%`;
+  return el(
+    "tr",
+    {},
+    el("th", { scope: "row" }, name),
+    el("td", { class: "bar", "aria-hidden": "true" }, part ? bar : null),
+    el("td", {}, value),
+    el("td", { class: "muted" }, remark),
+  );
+}
+
+/** @param {string} caption @param {string[]} heads of the columns but that of bars @param {HTMLElement[]} rows */
+function barTable(caption, [first, ...others], rows) {
   const head = (/** @type {string} */ text) =>
     el("th", { scope: "col" }, el("span", { class: "visually-hidden" }, text));
   return el(
     "table",
     { class: "bytes" },
-    el("caption", {}, "Where the bytes go"),
-    el("thead", {}, el("tr", {}, head("Attribute"), el("td", { "aria-hidden": "true" }), head("Size"), head("Share"))),
-    el("tbody", {}, ...lines),
+    el("caption", {}, caption),
+    el("thead", {}, el("tr", {}, head(first), el("td", { "aria-hidden": "true" }), ...others.map(head))),
+    el("tbody", {}, ...rows),
   );
 }

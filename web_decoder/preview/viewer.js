@@ -2,17 +2,20 @@
 
 import * as THREE from "three";
 import { SparkRenderer, SplatFileType, SplatMesh } from "@sparkjsdev/spark";
-import { lookAtAll, setPinhole } from "./camera.js";
+import { lookAtAll, setPinhole, sightOf } from "./camera.js";
 import { CLASSIC, WIDE_RANGES, drawFromOutside } from "./classic.js";
 import { pointsUp } from "./file_types.js";
 import { extentOfMesh, extentOfScene } from "./extent.js";
 import { marker } from "./marker.js";
 import { pack } from "./pack.js";
+import { readPixels } from "./pixels.js";
+import { meshOf } from "./streamed_meshes.js";
 
 /**
  * @typedef {import("./scene.js").Scene} Scene
  * @typedef {import("./camera.js").Pinhole} Pinhole
  * @typedef {import("./extent.js").Extent} Extent
+ * @typedef {{content: import("./streamed_meshes.js").Content, ranges: [number, number][]}} Part
  */
 
 export class Viewer {
@@ -20,8 +23,8 @@ export class Viewer {
   #spark;
   #scene = new THREE.Scene();
   #marker = marker();
-  /** @type {SplatMesh | null} */
-  #mesh = null;
+  /** All meshes: of a scene that is streamed, by file; of others, one. @type {Map<number, SplatMesh>} */
+  #meshes = new Map();
   /** @type {Scene | null} */
   #shown = null;
   /** Whether the extent is final, because all images that it depends on have arrived. */
@@ -102,16 +105,50 @@ export class Viewer {
     return mesh.numSplats;
   }
 
+  /**
+   * Begin a scene that will be drawn in parts, and has none yet.
+   * @param {Extent} extent
+   */
+  setExtent(extent) {
+    this.#shown = null;
+    this.#extent = extent;
+    this.setParts(new Map([...this.#meshes.keys()].map((key) => [key, null])));
+  }
+
+  /**
+   * Show other parts of the scene, or none instead of what they were; Spark sorts the Gaussians of all parts together.
+   * @param {Map<number, Part | null>} parts
+   */
+  setParts(parts) {
+    for (const [key, part] of parts) this.#put(key, part && meshOf(part.content, part.ranges, this.#extent.centre));
+    this.invalidate();
+  }
+
+  /** What the camera sees, in the scene's frame. */
+  get sight() {
+    const { width, height } = this.canvas;
+    return sightOf(this.camera, this.#extent.centre, width, height);
+  }
+
   /** @param {SplatMesh} mesh @param {boolean} [up] whether its y points up, as in three.js */
   #replace(mesh, up = false) {
-    if (!up) mesh.quaternion.set(1, 0, 0, 0); // scenes have y down and z ahead
-    if (this.#mesh) {
-      this.#scene.remove(this.#mesh);
-      this.#mesh.dispose();
-    }
-    this.#mesh = mesh;
-    this.#scene.add(mesh);
+    for (const key of [...this.#meshes.keys()]) this.#put(key, null);
+    this.#put(0, mesh, up);
     this.invalidate();
+  }
+
+  /** @param {number} key @param {SplatMesh | null} mesh @param {boolean} [up] */
+  #put(key, mesh, up = false) {
+    const former = this.#meshes.get(key);
+    if (former) {
+      this.#scene.remove(former);
+      former.dispose();
+      this.#meshes.delete(key);
+    }
+    if (!mesh) return;
+    if (!up) mesh.quaternion.set(1, 0, 0, 0); // scenes have y down and z ahead
+    this.#meshes.set(key, mesh);
+    this.#scene.add(mesh);
   }
 
   /** Move the camera so that the whole scene is visible. */
@@ -183,6 +220,11 @@ export class Viewer {
     this.#draw();
   }
 
+  /** Whether the latest frame has Gaussians in it: Spark sorts them before it draws them. */
+  get hasDrawn() {
+    return this.#spark.display.numSplats > 0;
+  }
+
   async #sorted() {
     while ((this.#spark.sorting || this.#spark.sortDirty) && !this.#renderer.getContext().isContextLost())
       await new Promise((resolve) => setTimeout(resolve, 4));
@@ -190,15 +232,7 @@ export class Viewer {
 
   /** Return the pixels of the canvas: RGBA, top row first. */
   readPixels() {
-    this.#renderer.setRenderTarget(null);
-    const gl = this.#renderer.getContext();
-    const [width, height] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
-    const upward = new Uint8Array(4 * width * height);
-    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, upward);
-    const data = new Uint8Array(upward.length);
-    for (let y = 0; y < height; y++)
-      data.set(upward.subarray(4 * width * y, 4 * width * (y + 1)), 4 * width * (height - 1 - y));
-    return { width, height, data };
+    return readPixels(this.#renderer);
   }
 
   /** Free all resources, after Spark has finished sorting, which would otherwise fail with an error that cannot be caught. */
@@ -207,7 +241,7 @@ export class Viewer {
     cancelAnimationFrame(this.#requested);
     this.#spark.sortDirty = false;
     await this.#sorted();
-    this.#mesh?.dispose();
+    for (const mesh of this.#meshes.values()) mesh.dispose();
     this.#spark.dispose();
     this.#renderer.dispose();
     this.#renderer.forceContextLoss(); // browsers keep few contexts

@@ -1,0 +1,103 @@
+"""Costs of a Gaussian in a streamed scene, measured: CPU seconds by stage, and bytes that are read and written."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from kissgs.benchmark.isolation import isolated
+from kissgs.io.container_names import LOD_NAME
+from kissgs.pipeline.pipeline import compress
+from kissgs.pipeline.scene_files import save
+from kissgs.settings import Settings
+from kissgs.streaming.compress import compress_streamed
+from kissgs.synthetic.scene import sample_scene
+
+STAGES = ("partition", "merge", "cameras", "images")
+"""Stages of a streamed scene, in order; only planning by sensitivity has cameras."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamingCosts:
+    """Costs of a streamed scene.
+
+    Attributes:
+        gaussians: number of Gaussians of the scene that was measured.
+        partition_seconds: CPU seconds of a Gaussian in the partition, which one process does.
+        merge_seconds: CPU seconds of a Gaussian of the finest level in the merging of its chunk.
+        camera_seconds: CPU seconds for the choice of cameras, which one process does, whatever the scene's size; 0
+            without sensitivity.
+        file_seconds: CPU seconds of a Gaussian of any level in its file.
+        container_seconds: CPU seconds of a Gaussian in one container, without levels.
+        source_bytes: size of a Gaussian in the ``.ply``, and about that in the work folder.
+        file_bytes: size of a Gaussian of any level in its file.
+    """
+
+    gaussians: int
+    partition_seconds: float
+    merge_seconds: float
+    camera_seconds: float
+    file_seconds: float
+    container_seconds: float
+    source_bytes: float
+    file_bytes: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all attributes by name, for JSON."""
+        return asdict(self)
+
+
+def measure_costs(source: Path | int, settings: Settings, gaussians: int, threads: int = 0) -> StreamingCosts:
+    """Compress a scene to streamed SOG and to one ``.sog`` in a process of its own, and return the costs.
+
+    Args:
+        source: a scene file, or an SH degree, 0 to 3, for a sample scene.
+        settings: settings of the encoder.
+        gaussians: number of Gaussians of the sample scene.
+        threads: number of threads; 0 means one per processor.
+
+    Raises:
+        KissgsError: the scene cannot be compressed.
+    """
+    with tempfile.TemporaryDirectory(prefix="kissgs-bench-") as folder:
+        path = Path(folder, "scene.ply")
+        if isinstance(source, Path):
+            path = source
+        else:
+            isolated(partial(_write_sample, path, gaussians, source), f"the scene of {gaussians:,} Gaussians")
+        return isolated(partial(_measure, path, Path(folder), settings, threads), str(path))
+
+
+def _write_sample(path: Path, gaussians: int, sh_degree: int) -> None:
+    save(sample_scene(gaussians, sh_degree=sh_degree), path)
+
+
+def _measure(path: Path, folder: Path, settings: Settings, threads: int) -> StreamingCosts:
+    seconds, last, begun = dict.fromkeys(STAGES, 0.0), "", 0.0
+
+    def progress(stage: str, fraction: float, note: str = "") -> None:
+        nonlocal last, begun
+        now = time.process_time()
+        if last in seconds:
+            seconds[last] += now - begun
+        last, begun = stage, now
+
+    report = compress_streamed(path, folder / "scene" / LOD_NAME, settings=settings, threads=threads, progress=progress)
+    begun = time.process_time()
+    compress(path, settings=settings, container="sog", threads=threads)
+    container = time.process_time() - begun
+    stored, finest = sum(report.counts), max(report.counts[0], 1)
+    return StreamingCosts(
+        gaussians=report.source_count,
+        partition_seconds=seconds["partition"] / report.source_count,
+        merge_seconds=seconds["merge"] / finest,
+        camera_seconds=seconds["cameras"],
+        file_seconds=seconds["images"] / stored,
+        container_seconds=container / report.source_count,
+        source_bytes=path.stat().st_size / report.source_count,
+        file_bytes=sum(report.level_bytes) / stored,
+    )

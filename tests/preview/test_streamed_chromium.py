@@ -1,0 +1,165 @@
+"""``kissgs view`` of a streamed scene in Chromium: what is loaded when, and what the page says about it."""
+
+import json
+import re
+import threading
+import urllib.parse
+
+import pytest
+from helpers.preview_browser import colours, preview, psnr, software_browser  # noqa: F401  fixtures
+from helpers.viewers import scattered
+
+import kissgs
+from kissgs.preview import server as server_module
+from kissgs.preview.server import PageServer
+from kissgs.preview.streamed_folder import streamed_folder
+from kissgs.streaming import build
+
+NAME = "city 100%41 \N{SNOWMAN}"
+
+
+@pytest.fixture(scope="module")
+def city(tmp_path_factory):
+    """A folder with levels of 1,200, 600, 300 and 150 Gaussians in 16 leaves."""
+    folder = tmp_path_factory.mktemp("streamed")
+    kissgs.save(scattered(1200, 1), folder / "scene.ply")
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in {"CHUNK": 400, "LEAF": 80, "COARSEST": 200}.items():
+            patch.setattr(build, name, value)
+        settings = kissgs.Settings(preset="fast")
+        kissgs.compress_streamed(folder / "scene.ply", folder / NAME / "lod-meta.json", settings=settings)
+    return folder / NAME
+
+
+@pytest.fixture
+def server(city, monkeypatch):
+    """A server whose files of other levels than the coarsest wait for ``server.gate``."""
+    find = server_module._Handler._find
+
+    def held(handler):
+        if re.search(r"/[0-2]_\d/", handler.path) and not handler.server.gate.wait(100):
+            raise TimeoutError(handler.path)
+        return find(handler)
+
+    monkeypatch.setattr(server_module._Handler, "_find", held)
+    with PageServer(streamed_folder(city)) as server:
+        server.gate = threading.Event()
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        yield server
+        server.gate.set()
+        server.shutdown()
+        thread.join()
+
+
+@pytest.fixture
+def opened(server, preview):  # noqa: F811
+    """``opened(budget)`` opens the scene in a tab."""
+
+    def begin(budget=None, **options):
+        tab = preview(**options)
+        tab.origin = server.url.partition("?")[0]
+        tab.page.goto(server.url + (f"&gaussians={budget}" if budget else ""))
+        return tab
+
+    return begin
+
+
+def facts(tab):
+    """Return what the statistics say, by name, each with its remark."""
+    found = tab.page.locator("#statistics .facts > div").all_inner_texts()
+    return {name: tuple(rest) for name, *rest in (text.split("\n") for text in found)}
+
+
+def asked(tab):
+    """Return the files of the scene that the page has asked for."""
+    paths = (urllib.parse.unquote(urllib.parse.urlsplit(url).path) for _, url in tab.requests)
+    return [path.removeprefix(f"/scene/{NAME}/") for path in paths if path.startswith("/scene/")]
+
+
+def settle(tab):
+    tab.page.locator("#statistics .facts > div").filter(has_text=re.compile("^This viewcomplete$")).wait_for()
+
+
+def test_coarse_first_then_what_the_camera_sees(server, city, opened):
+    tab = opened()
+    tab.page.locator("#loading").wait_for(state="hidden")
+    coarse = tab.still_image()
+    assert colours(coarse) > 500
+    assert tab.page.locator("#title").inner_text() == NAME
+    first = facts(tab)
+    counts = json.loads((city / "lod-meta.json").read_bytes())["counts"]
+    assert first["Gaussians drawn"] == (f"{counts[3]:,}", f"of {counts[0]:,}")
+    assert first["At most"] == ("1,500,000", "on this device")
+    assert first["This view"] == ("loading",)
+    files = {path.relative_to(city).as_posix(): path.stat().st_size for path in city.rglob("*.*")}
+    needed = sum(size for name, size in files.items() if name.startswith("3_0/") or name == "lod-meta.json")
+    assert first["First image"][1] == f"after {needed / 1000:.3g} kB"
+    assert {name for name in asked(tab) if not name.startswith("3_0/")} - {"lod-meta.json"}  # they wait
+
+    server.gate.set()
+    settle(tab)
+    last = facts(tab)
+    assert last["Gaussians drawn"] == (f"{counts[0]:,}", f"of {counts[0]:,}")
+    received = sum(files[name] for name in asked(tab))
+    assert last["Loaded"][0] == f"{received / 1000:.3g} kB"
+    assert psnr(tab.still_image()[:-80], coarse[:-80]) < 32
+    assert len(asked(tab)) == len(set(asked(tab)))
+    assert not tab.page.locator("#compare").is_visible()
+    assert not tab.page.locator("#planes .thumb").count()
+    rows = tab.page.locator("#statistics tbody tr")
+    assert rows.first.inner_text().split()[-2:] == ["16", f"{counts[0]:,}"]
+
+
+def test_a_phone_and_another_scene_afterwards(server, opened):
+    """Phones draw fewer; a file that is opened later ends the streaming."""
+    server.gate.set()
+    tab = opened(has_touch=True, is_mobile=True)
+    settle(tab)
+    assert facts(tab)["At most"] == ("500,000", "on this device")
+    tab.choose(("other.zip", kissgs.compress(scattered(100, 0), settings=kissgs.Settings(preset="fast")).to_zip()))
+    tab.shown(100)
+    before = len(asked(tab))
+    tab.page.keyboard.press("w")
+    tab.still_image()
+    assert len(asked(tab)) == before
+    tab.fact("Gaussians", "100")
+
+
+def test_a_small_budget(server, opened):
+    """Nothing of the finest level is loaded from afar; near one end, some of its files are."""
+    server.gate.set()
+    tab = opened(budget=400)
+    settle(tab)
+    far = asked(tab)
+    drawn = int(facts(tab)["Gaussians drawn"][0].replace(",", ""))
+    assert 150 < drawn <= 400
+    assert facts(tab)["At most"] == ("400", "on this device")
+    assert not any(name.startswith("0_") for name in far)
+    tab.page.locator("#viewport").focus()
+    for _ in range(95):  # to the far end of the scene
+        tab.page.keyboard.press("w")
+    tab.page.wait_for_timeout(300)
+    settle(tab)
+    finest = {name[:3] for name in asked(tab) if name.startswith("0_")}
+    assert 0 < len(finest) < 4
+    assert int(facts(tab)["Gaussians drawn"][0].replace(",", "")) <= 400
+
+
+def test_a_missing_file_and_a_damaged_list(server, opened):
+    server.gate.set()
+    (lost,) = [path for path in server.contents if path.endswith("0_1/scales.webp")]
+    content = server.contents.pop(lost)
+    tab = opened()
+    tab.error_message("0_1/meta.json", "scales.webp cannot be fetched", "stays coarse")
+    settle(tab)
+    assert asked(tab).count("0_1/scales.webp") == 2
+    tab.expect_errors("404 .*0_1/scales.webp", "Failed to load resource.*404")
+    server.contents[lost] = content
+
+    (manifest,) = [path for path in server.contents if path.endswith("lod-meta.json")]
+    server.contents[manifest] = b'{"lodLevels": 4}'
+    tab = opened()
+    tab.error_message("list of this scene's files is damaged")
+    tab.choose(("lod-meta.json", b"{}"))
+    tab.error_message("does not open the list of a scene's files alone", "kissgs view lod-meta.json")

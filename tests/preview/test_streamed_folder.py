@@ -1,0 +1,141 @@
+"""Folders of streamed scenes behind the server of ``kissgs view``; oracle: the files of the folder."""
+
+import json
+import shutil
+import threading
+from pathlib import Path
+
+import pytest
+from helpers.small_page import FILES
+from helpers.viewers import scattered
+
+import kissgs
+from kissgs.core.errors import InvalidContainerError
+from kissgs.preview import streamed_folder as module
+from kissgs.preview.server import PageServer
+from kissgs.preview.streamed_folder import fitting_level, is_streamed_folder, streamed_folder
+from kissgs.streaming import build
+from kissgs.streaming.compress import compress_streamed
+
+from .test_server import ask
+
+NAME = "two words % & ü"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("made")
+    kissgs.save(scattered(300, 1), folder / "scene.ply")
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in {"CHUNK": 200, "LEAF": 50, "COARSEST": 100}.items():
+            patch.setattr(build, name, value)
+        compress_streamed(
+            folder / "scene.ply", folder / NAME / "lod-meta.json", settings=kissgs.Settings(preset="fast")
+        )
+    return folder / NAME
+
+
+@pytest.fixture
+def city(made, tmp_path):
+    """A streamed scene with files that do not belong to it, one of them outside its folder."""
+    shutil.copytree(made, tmp_path / NAME)
+    (tmp_path / "secret.webp").write_bytes(b"secret")
+    for name in ("notes.txt", "0_0/notes.txt", "0_0/other.webp", "lod-meta.json.bak"):
+        (tmp_path / NAME / name).write_bytes(b"secret")
+    return tmp_path / NAME
+
+
+def served(folder):
+    return {name: path.read_bytes() for name, path in streamed_folder(folder).files.items()}
+
+
+def test_the_files_of_the_manifest_and_no_others(made, city):
+    expected = {path.relative_to(made).as_posix(): path.read_bytes() for path in made.rglob("*") if path.is_file()}
+    assert served(city) == served(city / "lod-meta.json") == expected
+    assert len(expected) > 15
+    assert streamed_folder(city).name == NAME
+
+
+def test_links_out_of_the_folder_are_left_out(city):
+    (city / "0_0" / "quats.webp").unlink()
+    (city / "0_0" / "quats.webp").symlink_to(city.parent / "secret.webp")
+    (city / "0_1" / "quats.webp").unlink()
+    found = served(city)
+    assert "0_0/quats.webp" not in found
+    assert "0_1/quats.webp" not in found
+    assert "0_0/sh0.webp" in found
+
+
+def test_a_container_whose_metadata_is_damaged(city):
+    (city / "0_0" / "meta.json").write_text("{")
+    found = served(city)
+    assert [name for name in found if name.startswith("0_0/")] == ["0_0/meta.json"]
+
+
+@pytest.mark.parametrize("name", ["../secret.webp", "/etc/passwd", "https://other/meta.json", "a/../../secret.webp"])
+def test_manifests_that_name_other_files(city, name):
+    document = json.loads((city / "lod-meta.json").read_bytes())
+    document["filenames"][0] = name
+    (city / "lod-meta.json").write_text(json.dumps(document))
+    with pytest.raises(kissgs.KissgsError):
+        streamed_folder(city)
+
+
+def test_containers_that_are_one_file(city):
+    document = json.loads((city / "lod-meta.json").read_bytes())
+    document["filenames"][0] = "LEVEL_0.zip"
+    document["environment"] = "sky.sog"
+    (city / "lod-meta.json").write_text(json.dumps(document))
+    (city / "LEVEL_0.zip").write_bytes(b"zip")
+    (city / "sky.sog").write_bytes(b"sog")
+    found = served(city)
+    assert (found["LEVEL_0.zip"], found["sky.sog"]) == (b"zip", b"sog")
+
+
+@pytest.fixture
+def server(page_folder, city):
+    with PageServer(streamed_folder(city)) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        yield server
+        server.shutdown()
+        thread.join()
+
+
+def test_the_server(server, city):
+    source = server.url.partition("?src=")[2].replace("%25", "%")
+    base = source.removesuffix("lod-meta.json")
+    answer, body = ask(server, f"/{source}")
+    assert (answer.status, body) == (200, (city / "lod-meta.json").read_bytes())
+    answer, body = ask(server, f"/{base}0_0/means_l.webp")
+    assert (answer.status, body) == (200, (city / "0_0" / "means_l.webp").read_bytes())
+    assert ask(server, "/")[1].decode() == FILES["preview.html"]
+    in_memory = {path for path, content in server.contents.items() if isinstance(content, bytes)}
+    assert in_memory == {"/", "/preview.html"}
+    others = ("notes.txt", "0_0/notes.txt", "0_0/other.webp", "0_0/", "", "../secret.webp", "0_0/%2e%2e/notes.txt")
+    for path in others:
+        assert ask(server, f"/{base}{path}")[0].status == 404
+    assert ask(server, f"/{base}0_0/meta.json", Host="evil.example")[0].status == 403
+    (city / "0_0" / "sh0.webp").unlink()
+    assert ask(server, f"/{base}0_0/sh0.webp")[0].status == 404
+
+
+def test_the_level_for_a_page_of_one_file(made, city, monkeypatch):
+    counts = json.loads((made / "lod-meta.json").read_bytes())["counts"]
+    assert fitting_level(made) == (0, len(counts))
+    for most, level in ((counts[0], 0), (counts[0] - 1, 1), (counts[2], 2), (1, len(counts) - 1)):
+        monkeypatch.setattr(module, "PAGE_GAUSSIANS", most)
+        assert fitting_level(made)[0] == level
+    shutil.make_archive(str(city.parent / "zipped"), "zip", city)
+    assert fitting_level(city.parent / "zipped.zip") == fitting_level(made)
+    assert not is_streamed_folder(city.parent / "zipped.zip")
+    assert is_streamed_folder(made)
+    assert is_streamed_folder(made / "lod-meta.json")
+    assert not is_streamed_folder(made / "0_0")
+    assert not is_streamed_folder(Path("none"))
+
+
+def test_a_manifest_that_is_no_json(city):
+    (city / "lod-meta.json").write_text("{")
+    with pytest.raises(InvalidContainerError, match="not readable JSON"):
+        streamed_folder(city)

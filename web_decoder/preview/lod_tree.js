@@ -1,0 +1,108 @@
+/** The manifest of a streamed scene: its leaves, and the files that hold their levels. */
+
+import { UserError } from "./problem.js";
+
+/** @typedef {import("./choice.js").Level} Level */
+
+/**
+ * @typedef {object} LodTree
+ * @property {number} levels number of levels
+ * @property {string[]} files relative to the manifest
+ * @property {number[]} rows Gaussians of each file that the leaves name
+ * @property {number | null} environment index of the file that is drawn always
+ * @property {(import("./coverage.js").Box & {levels: Level[]})[]} leaves levels: the coarsest first
+ * @property {number} count Gaussians of the finest level of all leaves
+ */
+
+const MAX_LEVELS = 64;
+
+/** Whether an address is that of a manifest, not of a container. @param {string} address */
+export const isManifest = (address) => /\/(lod-meta|levels)\.json([?#]|$)/.test(address);
+
+/** @type {(why: string) => never} */
+const fail = (why) => {
+  throw new UserError(`The list of this scene's files is damaged: ${why}.`);
+};
+
+const isWhole = (/** @type {unknown} */ value) => Number.isSafeInteger(value) && Number(value) >= 0;
+const isPoint = (/** @type {unknown} */ value) =>
+  Array.isArray(value) && value.length === 3 && value.every(Number.isFinite);
+
+/** Whether a name is a path below the manifest's folder: no other site, no folder above. @param {unknown} name */
+const isBelow = (name) =>
+  typeof name === "string" && /^(?!\.{1,2}(\/|$))[^/\\:?#%]+(\/(?!\.{1,2}(\/|$))[^/\\:?#%]+)*$/.test(name);
+
+/**
+ * @param {Uint8Array} json
+ * @returns {LodTree}
+ */
+export function parseTree(json) {
+  const document = parse(json);
+  if ((document?.version ?? 1) !== 1) fail(`it is of version ${document.version}, and 1 is read`);
+  const { lodLevels: levels, filenames, environment, tree } = document ?? {};
+  if (!isWhole(levels) || levels < 1 || levels > MAX_LEVELS) fail("its number of levels is missing");
+  const files = Array.isArray(filenames) ? [...filenames] : fail("it names no files");
+  if (environment ?? null) files.push(environment);
+  if (!files.every(isBelow)) fail("it names a file that is not below its folder");
+  const rows = files.map(() => 0);
+  const leaves = leavesOf(tree).map((node) => {
+    const { min: low, max: high } = node.bound ?? {};
+    if (!isPoint(low) || !isPoint(high)) fail("a leaf has no bounds");
+    const own = levelsOf(node, levels, filenames.length);
+    for (const { file, offset, count } of own) rows[file] = Math.max(rows[file], offset + count);
+    return { low, high, levels: own };
+  });
+  const filled = leaves.filter((leaf) => leaf.levels.length);
+  if (!filled.length) fail("it has no leaves");
+  return {
+    ...{ levels, files, rows, leaves: filled },
+    environment: (environment ?? null) ? files.length - 1 : null,
+    count: filled.reduce((sum, leaf) => sum + leaf.levels[leaf.levels.length - 1].count, 0),
+  };
+}
+
+/** @param {Uint8Array} json */
+function parse(json) {
+  try {
+    return JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(json));
+  } catch {
+    return fail("it is not readable JSON");
+  }
+}
+
+/** Return the nodes with levels, in the order of the tree. @param {any} tree @returns {any[]} */
+function leavesOf(tree) {
+  const [leaves, waiting] = [[], [tree]];
+  while (waiting.length) {
+    const node = waiting.pop();
+    if (typeof node !== "object" || node === null) fail("its tree has a node that is none");
+    if (node.lods) leaves.push(/** @type {never} */ (node));
+    else if (Array.isArray(node.children)) waiting.push(...[...node.children].reverse());
+  }
+  return leaves;
+}
+
+/**
+ * Return the levels of a leaf, the coarsest first. Without measured errors, the square grows with each halving of the
+ * Gaussians, as it does in scenes whose errors were measured.
+ * @param {any} node
+ * @param {number} levels
+ * @param {number} files
+ * @returns {Level[]}
+ */
+function levelsOf({ lods, errors }, levels, files) {
+  const measured = Array.isArray(errors) && errors.length === levels && errors.every(Number.isFinite);
+  const own = Object.entries(lods)
+    .map(([key, lod]) => {
+      const { file, offset, count } = lod ?? {};
+      const level = /^\d{1,2}$/.test(key) ? Number(key) : levels;
+      if (level >= levels || ![file, offset, count].every(isWhole) || file >= files)
+        fail("a leaf's levels are unclear");
+      return { level, file, offset, count };
+    })
+    .filter(({ count }) => count > 0)
+    .sort((one, other) => other.level - one.level);
+  const finest = own.at(-1)?.count ?? 1;
+  const guess = (/** @type {number} */ count) => Math.sqrt(Math.max(0, Math.log2(finest / count)));
+  return own.map((level) => ({ ...level, error: measured ? errors[level.level] : guess(level.count) }));
+}
