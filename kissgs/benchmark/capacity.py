@@ -80,7 +80,7 @@ class SceneRun:
 
     @property
     def limit(self) -> str:
-        """Part that takes most of the time: "partition" or "cameras", which one process does; "processors"; "network"."""
+        """Part that takes most of the time: "partition", "cameras" (both by one process), "processors" or "network"."""
         items = self.seconds["merge"] + self.seconds["images"]
         parts = {
             "partition": self.seconds["partition"],
