@@ -176,7 +176,8 @@ class Worker:
             log.exception("job %s: its process could not be run", job.id)
             outcome = outcome_of(error)
         finally:
-            del self._processes[job.id]
+            if self._processes.get(job.id) is process:  # else another start of the job is running
+                del self._processes[job.id]
             process.ended.set()
             self.metrics.busy.dec()
         storage_problem = await run_sync(self.storage.health_problem)
