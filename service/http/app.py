@@ -115,18 +115,18 @@ def build(settings: ServiceSettings) -> ServiceContainer:
     storage = S3Storage(settings.storage, settings.data_dir) if settings.storage else FolderStorage(settings.data_dir)
     clock = Clock()
     try:
+        runner = JobRunner.open(settings)  # first, because a replica that connects for long has no heartbeat meanwhile
+    except BaseException:
+        storage.close()
+        raise
+    try:
         store = open_store(settings, storage, clock)
     except BaseException:
+        runner.close()
         storage.close()
         raise
     storage.remove_unfinished(store.ids())
     clock.start_after(store.latest_time())
-    try:
-        runner = JobRunner.open(settings)
-    except BaseException:
-        store.close()
-        storage.close()
-        raise
     notifier, metrics = JobNotifier(), Metrics()
     metrics.queue_limit.set(settings.max_queue)
     completion = JobCompletion(settings, store, storage, metrics, clock)

@@ -15,6 +15,7 @@ task has a signed address for every file that it may read or write:
 from __future__ import annotations
 
 import contextlib
+import logging
 import shutil
 import socket
 import threading
@@ -27,10 +28,12 @@ from typing import TYPE_CHECKING, Any
 import kissgs
 
 from . import job_process
-from .transfer import FULL, NodeDiskError, NodeError, StorageAccessError, client, disk_error, fetch, store
+from .transfer import FULL, NodeDiskError, NodeError, RefusedError, StorageAccessError, client, disk_error, fetch, store
 
 if TYPE_CHECKING:
     import httpx
+
+log = logging.getLogger("kissgs.service")
 
 CHECKPOINT_SECONDS = 30.0
 """Minimum seconds between two looks for new checkpoints."""
@@ -63,8 +66,7 @@ def compress(task: job_process.Task, progress: kissgs.Progress) -> dict[str, Any
         fetch(http, task["scene"]["url"], source, task["scene"]["bytes"])
         if task["checkpoint"] is not None:
             local["checkpoint"] = str(folder / task["checkpoint"])
-            for name, stored in task["checkpoints"].items():
-                fetch(http, stored["url"], folder / name, stored["bytes"])
+            _fetch_checkpoints(http, task["checkpoints"], folder)
         with _checkpoints_stored(http, task, folder):
             try:
                 summary = job_process.compress(local, progress)
@@ -76,6 +78,17 @@ def compress(task: job_process.Task, progress: kissgs.Progress) -> dict[str, Any
                 raise disk_error(error) from error
             _store_result(http, task["store"], folder)
     return summary
+
+
+def _fetch_checkpoints(http: httpx.Client, checkpoints: dict[str, dict[str, Any]], folder: Path) -> None:
+    """Fetch all checkpoints, or none: a start that was given up may still replace them, and the job can do without."""
+    try:
+        for name, stored in checkpoints.items():
+            fetch(http, stored["url"], folder / name, stored["bytes"])
+    except RefusedError as error:
+        log.warning("the job begins without its checkpoints: %s", error)
+        for name in checkpoints:
+            (folder / name).unlink(missing_ok=True)
 
 
 def _raise_if_full(error: kissgs.KissgsError) -> None:

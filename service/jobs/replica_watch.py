@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 
 from anyio import CapacityLimiter
@@ -79,19 +80,35 @@ class ReplicaWatch:
     async def heartbeat(self) -> None:
         """Show that this replica lives, and clear up after those that have died, until cancelled."""
         limiter = CapacityLimiter(1)  # transfers of files must not delay it
-        while True:
-            await asyncio.sleep(HEARTBEAT_SECONDS)
-            try:
-                if await run_sync(self.context.store.is_lapsed, limiter=limiter):
-                    await self._join_again()
-                await run_sync(self.context.store.heartbeat, limiter=limiter)
-                await run_sync(self._bury, limiter=limiter)
-                await run_sync(self.clear_up)
-                self.context.notifier.notify(QUEUE)
-            except (SQLAlchemyError, OSError) as error:  # /readyz and the worker report it
-                log.debug("no heartbeat: %s", error_text(error))
-            except Exception:
-                log.exception("the replicas could not be watched; trying again")
+        clearing: asyncio.Task[None] | None = None
+        try:
+            while True:
+                await asyncio.sleep(HEARTBEAT_SECONDS)
+                await self._attempt(lambda: self._beat(limiter))
+                if clearing is None or clearing.done():  # requests of a storage that hangs must not delay the beats
+                    clearing = asyncio.create_task(self._attempt(self._clear_up))
+        finally:
+            if clearing is not None:
+                clearing.cancel()
+                await asyncio.gather(clearing, return_exceptions=True)
+
+    async def _attempt(self, action: Callable[[], Awaitable[None]]) -> None:
+        try:
+            await action()
+        except (SQLAlchemyError, OSError) as error:  # /readyz and the worker report it
+            log.debug("the replicas could not be watched: %s", error_text(error))
+        except Exception:
+            log.exception("the replicas could not be watched; trying again")
+
+    async def _beat(self, limiter: CapacityLimiter) -> None:
+        if await run_sync(self.context.store.is_lapsed, limiter=limiter):
+            await self._join_again()
+        await run_sync(self.context.store.heartbeat, limiter=limiter)
+        await run_sync(self._bury, limiter=limiter)
+
+    async def _clear_up(self) -> None:
+        await run_sync(self.clear_up)
+        self.context.notifier.notify(QUEUE)
 
     async def _join_again(self) -> None:
         log.warning("another replica took this one for dead and has queued its jobs again; it ends them and joins anew")

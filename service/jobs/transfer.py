@@ -1,7 +1,7 @@
 """Files to and from a bucket by signed addresses, without credentials: the requests of a node.
 
 Addresses are secrets until they expire, so no message has one. Connection errors, 429 and 5xx are tried again with
-growing pauses, half a minute in all; a download goes on where it stopped.
+growing pauses, half a minute in all; a download goes on where it stopped, unless the file has changed since.
 """
 
 from __future__ import annotations
@@ -41,6 +41,10 @@ class StorageAccessError(kissgs.KissgsError):
     code = "storage"
 
 
+class RefusedError(StorageAccessError):
+    """The storage answers, but refuses an address, or has a file of another size: another attempt meets the same."""
+
+
 class NodeDiskError(kissgs.KissgsError):
     """This machine has no space for the files of a job."""
 
@@ -72,33 +76,48 @@ def fetch(http: httpx.Client, url: str, path: Path, size: int) -> None:
         NodeDiskError: the disk is full.
         NodeError: the file cannot be written.
     """
+    version: list[str] = []
     try:
         with path.open("wb") as file:
-            _repeat(lambda: _fetch_rest(http, url, file, size), file.tell)
+            _repeat(lambda: _fetch_rest(http, url, file, size, version), file.tell)
     except OSError as error:
         raise disk_error(error) from error
 
 
-def _fetch_rest(http: httpx.Client, url: str, file: BinaryIO, size: int) -> None:
-    """Append the bytes that ``file`` does not have yet."""
+def _fetch_rest(http: httpx.Client, url: str, file: BinaryIO, size: int, version: list[str]) -> None:
+    """Append the bytes that ``file`` does not have yet; ``version`` has the entity tag of those that it has, if any."""
     first = file.tell()
     if first == size > 0:
         return
-    headers = {"Range": f"bytes={first}-"} if first else {}
+    if first and not version:  # nothing tells whether the rest would belong to the same file
+        first = _empty(file)
+    headers = {"Range": f"bytes={first}-", "If-Match": version[0]} if first else {}
     try:
         with http.stream("GET", url, headers=headers) as answer:
+            if first and answer.status_code == httpx.codes.PRECONDITION_FAILED:
+                _empty(file)
+                raise _TryAgainError("a file changed while it was read")
             _check(answer)
-            if first and answer.status_code != httpx.codes.PARTIAL_CONTENT:  # all of it once more
-                file.seek(0)
-                file.truncate()
+            if answer.status_code != httpx.codes.PARTIAL_CONTENT:  # all of it, perhaps once more
+                _empty(file)
+                tag = answer.headers.get("ETag", "")
+                version[:] = [tag] if tag.startswith('"') else []  # not a weak one
             for block in answer.iter_raw():  # as they come: blocks of a fixed size would be lost by an error
                 file.write(block)
                 if file.tell() > size:
-                    raise StorageAccessError(f"a file in the storage has more than its {size} bytes")
+                    raise RefusedError(f"a file in the storage has more than its {size} bytes")
+            complete = "Content-Length" in answer.headers  # else the end of the connection was that of the file
     except httpx.HTTPError as error:
         raise _TryAgainError(_reason(error)) from None
     if file.tell() != size:
-        raise _TryAgainError(f"it sent {file.tell()} of {size} bytes")
+        sent = f"it sent {file.tell()} of {size} bytes"
+        raise RefusedError(f"a file in the storage has another size: {sent}") if complete else _TryAgainError(sent)
+
+
+def _empty(file: BinaryIO) -> int:
+    file.seek(0)
+    file.truncate()
+    return 0
 
 
 def store(http: httpx.Client, path: Path, url: str) -> None:
@@ -153,8 +172,8 @@ def _check(answer: httpx.Response) -> None:
     if answer.status_code in _AGAIN or code in ("RequestTimeout", "SlowDown", "InternalError"):
         raise _TryAgainError(f"it answers {what}")
     if answer.status_code in (401, 403) or code in ("ExpiredToken", "InvalidToken", "TokenRefreshRequired"):
-        raise StorageAccessError(f"the storage does not accept the signed addresses of the job any more: {what}")
-    raise StorageAccessError(f"the storage refused a request: {what}")
+        raise RefusedError(f"the storage does not accept the signed addresses of the job any more: {what}")
+    raise RefusedError(f"the storage refused a request: {what}")
 
 
 def _reason(error: httpx.HTTPError) -> str:

@@ -28,6 +28,9 @@ JOB = re.compile("[0-9a-f]{32}")
 
 SUMMARY, DECODED_SUMMARY = "summary.json", "decoded.json"
 
+MAX_SUMMARY_BYTES = 1 << 20
+"""Maximum bytes of a result's summary that are read."""
+
 
 @dataclass(frozen=True, slots=True)
 class JobObjects:
@@ -85,7 +88,7 @@ class JobObjects:
         sizes = {
             name.removeprefix(f"{folder}/"): info.size for name, info in found.items() if name.startswith(f"{folder}/")
         }
-        if SUMMARY not in sizes:
+        if not 0 < sizes.get(SUMMARY, 0) <= MAX_SUMMARY_BYTES:  # a node could have stored anything there
             return None
         return complete_summary(self.objects.get_bytes(self.key(folder, SUMMARY)), sizes, container)
 

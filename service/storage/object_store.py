@@ -100,7 +100,7 @@ class ObjectStore:
                 **options,
             )
         except self._errors as error:
-            raise SettingsError(f"KISSGS_STORAGE: {self._explain(error)}") from error
+            raise SettingsError(f"KISSGS_STORAGE: {self._explain(error)}") from None
 
     def check_usable(self, key: str) -> None:
         """Write, list, read and remove a key, to find wrong settings at the start.
@@ -115,7 +115,7 @@ class ObjectStore:
             listed = [entry["path"] for batch in api.list(store, key) for entry in batch]
             api.delete(store, [key])
         except self._errors as error:
-            raise SettingsError(f"KISSGS_STORAGE: {self._explain(error)}") from error
+            raise SettingsError(f"KISSGS_STORAGE: {self._explain(error)}") from None
         if found != b"kissgs" or len(listed) > 1:
             raise SettingsError(f"KISSGS_STORAGE: {self.url} does not give back what was written; use another bucket")
 
@@ -187,7 +187,7 @@ class ObjectStore:
                 stop = min(start + BLOCK_BYTES, end)
                 yield bytes(await self._api.get_range_async(self._store, key, start=start, end=stop))
         except self._errors as error:
-            raise self._converted(error) from error
+            raise self._converted(error) from None  # its text may have an access key
 
     def info(self, key: str) -> ObjectInfo:
         """Return size and time of a file.
@@ -225,7 +225,7 @@ class ObjectStore:
         except ObjectStoreError:
             raise
         except self._errors as error:
-            raise self._converted(error) from error
+            raise self._converted(error) from None  # its text may have an access key
 
     def _converted(self, error: BaseException) -> OSError:
         if isinstance(error, OSError) and (error.errno is not None or isinstance(error, ObjectStoreError)):
@@ -244,6 +244,8 @@ class ObjectStore:
             return f"there is no bucket {self._bucket!r} at {where}; create it, or correct the name"
         if reason in ("InvalidAccessKeyId", "SignatureDoesNotMatch", "InvalidToken", "ExpiredToken"):
             return f"{where} does not accept the credentials ({reason}); check AWS_ACCESS_KEY_ID and others"
+        if reason == "RequestTimeTooSkewed":
+            return f"{where} refuses requests because the clock of this machine is wrong ({reason}); set the clock"
         if reason in ("AccessDenied", "AllAccessDisabled") or "403 Forbidden" in text or "401 Unauthorized" in text:
             return (
                 f"access to the bucket {self._bucket!r} at {where} is denied; check AWS_ACCESS_KEY_ID and others, and "

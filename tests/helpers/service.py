@@ -194,7 +194,7 @@ class Replicas(Service):
         for replica in self.replicas:
             if replica.process.poll() is None:
                 replica.process.send_signal(number)
-        return max((replica.kill(number) for replica in self.replicas), key=abs)
+        return max((replica.process.wait(timeout=300) for replica in self.replicas), key=abs)  # one signal for each
 
     def children(self) -> list[int]:
         return [child for replica in self.replicas for child in Service.children(replica)]

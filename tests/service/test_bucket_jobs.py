@@ -235,6 +235,33 @@ def test_checkpoints_are_stored_meanwhile_and_continued(bucket, new_job, place_o
     assert bucket.get(key) == b"three"  # stored at the end, because the job is started again
 
 
+@pytest.mark.parametrize("change", ["removed", "larger", "smaller"])
+def test_a_checkpoint_that_another_start_has_changed(bucket, new_job, place_of, node, monkeypatch, change):
+    """Nodes that were given up may store checkpoints while the next start fetches them."""
+    job = new_job(TRAINED)
+    first, second = (f"jobs/{job.id}/{name}" for name in CHECKPOINT_FILES)
+    bucket.put(first, b"0123456789")
+    bucket.put(second, b"0123456789")
+    task = task_of(place_of(job))
+    match change:
+        case "removed":
+            bucket.delete(second)
+        case "larger":
+            bucket.put(second, b"0123456789+")
+        case "smaller":
+            bucket.put(second, b"012345678")
+
+    def compress(task, progress):
+        found.append([path.name for path in node.iterdir()])
+        raise kissgs.InvalidSceneError("enough")
+
+    found = []
+    monkeypatch.setattr(bucket_job.job_process, "compress", compress)
+    with pytest.raises(kissgs.InvalidSceneError):
+        bucket_job.compress(task, silent)
+    assert found == [["scene.ply"]]
+
+
 def test_training_continues_from_a_stored_checkpoint(bucket, new_job, place_of, node, tmp_path, monkeypatch):
     pytest.importorskip("torch")
     from kissgs.training import checkpoint

@@ -19,11 +19,12 @@ class Storage:
     """Server whose answers a test chooses: each request takes the next of ``answers``, and the last ones succeed.
 
     An answer is a status with a body, "truncate" for half of the rest of the bytes, "close" for no answer at all,
-    "wait" for one that comes too late, or "whole" for all bytes in spite of a range.
+    "wait" for one that comes too late, or "whole" for all bytes in spite of a range. Before "change", the file changes.
     """
 
     def __init__(self):
         self.answers, self.stored, self.requests = [], {}, []
+        self.data, self.tag = DATA, '"1"'
         storage = self
 
         class Handler(BaseHTTPRequestHandler):
@@ -35,7 +36,12 @@ class Storage:
             def do_GET(self):
                 storage.requests.append(("GET", self.headers.get("Range")))
                 first = int((self.headers.get("Range") or "bytes=0-")[6:-1])
-                rest, answer = DATA[first:], storage.next()
+                answer = storage.next()
+                if answer == "change":
+                    storage.data, storage.tag, answer = storage.data[::-1], f'{storage.tag[:-1]}x"', None
+                if self.headers.get("If-Match") not in (None, storage.tag):
+                    answer = 412, b""
+                rest = storage.data[first:]
                 match answer:
                     case "close":
                         self.close_connection = True
@@ -46,7 +52,7 @@ class Storage:
                         self.reply(206 if first else 200, rest[: len(rest) // 2], len(rest))
                         self.close_connection = True
                     case "whole":
-                        self.reply(200, DATA)
+                        self.reply(200, storage.data)
                     case None:
                         self.reply(206 if first else 200, rest)
                     case _:
@@ -73,6 +79,8 @@ class Storage:
             def reply(self, status, body, length=None):
                 self.send_response(status)
                 self.send_header("Content-Length", str(len(body) if length is None else length))
+                if storage.tag:
+                    self.send_header("ETag", storage.tag)
                 self.end_headers()
                 self.wfile.write(body)
 
@@ -148,6 +156,21 @@ def test_a_server_that_ignores_ranges(storage, http, tmp_path):
     storage.answers = ["truncate", "whole"]
     fetch(http, storage.url, tmp_path / "file", len(DATA))
     assert (tmp_path / "file").read_bytes() == DATA
+
+
+def test_a_file_that_changes_meanwhile_is_not_mixed(storage, http, tmp_path):
+    storage.answers = ["truncate", "change"]
+    fetch(http, storage.url, tmp_path / "file", len(DATA))
+    assert (tmp_path / "file").read_bytes() == DATA[::-1]
+
+
+@pytest.mark.parametrize("tag", ["", 'W/"1"'])
+def test_a_server_that_does_not_tell_versions_apart(storage, http, tmp_path, tag):
+    storage.tag = tag
+    storage.answers = ["truncate", "truncate", None]
+    fetch(http, storage.url, tmp_path / "file", len(DATA))
+    assert (tmp_path / "file").read_bytes() == DATA
+    assert storage.requests == [("GET", None)] * 3
 
 
 def test_a_server_that_does_not_answer_in_time(storage, tmp_path, monkeypatch):
