@@ -211,7 +211,7 @@ def names(bucket, job_id):
 
 
 @pytest.mark.parametrize(
-    "moment", ["before the row", "half a result", "a whole result", "cancelled", "deleted", "decoded"]
+    "moment", ["before the row", "half a result", "a whole result", "recorded", "cancelled", "deleted", "decoded"]
 )
 def test_what_a_dead_replica_leaves(member, bucket, moment):
     first = member()
@@ -231,6 +231,9 @@ def test_what_a_dead_replica_leaves(member, bucket, moment):
             second.store.move(number, State.CANCELLED)
         case "deleted":
             second.store.forget(number)
+        case "recorded":  # but not settled: neither the upload nor the checkpoint is needed
+            bucket.put(f"jobs/{job_id}/checkpoint.npz", b"half")
+            first.store.move(number, State.SUCCEEDED, result={"folder": kept}, upload_kept=False)
         case "decoded":
             summary = first.storage.read_result(job_id, kept, "scene.zip")
             first.worker.completion.succeed(first.store.get(job_id), summary, kept)
@@ -253,6 +256,8 @@ def test_what_a_dead_replica_leaves(member, bucket, moment):
         case "a whole result":
             assert (job.state, after) == (State.SUCCEEDED, before)
             assert second.storage.open(job_id, f"{job.result['folder']}/scene.zip").size == 2
+        case "recorded":
+            assert (job.state, after) == (State.SUCCEEDED, [name for name in before if name.startswith(kept)])
         case "cancelled":
             assert (job.state, after) == (State.CANCELLED, [])
         case "decoded":
