@@ -70,6 +70,6 @@ def write_slowly(arguments, progress):
     return {"bytes": len(arguments["text"])}
 
 
-def environment(arguments, progress):
+def variables(arguments, progress):
     """Return the variables of the environment."""
     return {"environment": dict(os.environ)}

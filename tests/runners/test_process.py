@@ -76,7 +76,7 @@ def test_a_line_that_a_process_was_killed_in_is_no_event():
 def test_items_see_no_secrets(monkeypatch):
     for name in ("KISSGS_KEYS", "AWS_SECRET_ACCESS_KEY", "RAY_AUTH_TOKEN", "PGPASSWORD"):
         monkeypatch.setenv(name, "secret")
-    events = list(ItemProcess(WorkItem("helpers.runner_items:environment")).events())
+    events = list(ItemProcess(WorkItem("helpers.runner_items:variables")).events())
     assert "secret" not in events[-1].result["environment"].values()
 
 
