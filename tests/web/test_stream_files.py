@@ -181,6 +181,22 @@ def test_the_store_of_files():
     assert states[-1]["held"] == [0, 3]
 
 
+def test_a_failure_before_a_success_is_forgotten():
+    """A file fails, arrives, makes room for another one, and fails again: it is asked for once more."""
+    steps = [{"want": [0]}, {"fail": 0}, {"want": [0]}, {"arrive": 0}, {"want": [1]}, {"arrive": 1}]
+    steps += [{"want": [0]}, {"fail": 0}, {"want": [0]}, {"arrive": 0}]
+    states = ask(store={"sizes": [5, 5], "room": 5, "most": 1, "steps": steps})["states"]
+    assert [state["log"] for state in states[6:]] == [["load 0"], ["changed"], ["load 0"], ["changed"]]
+    assert states[-1]["held"] == [0]
+
+
+def test_workers_keep_nothing_of_their_tasks():
+    """Each task has a listener while it runs; afterwards there is none, whether the worker answers or fails."""
+    good, broken = ask(pooled=[True, False])["pools"]
+    assert good == {"ends": ["a", "b", "c"], "most": 3, "now": 0}
+    assert broken == {"ends": ["a:", "b:", "c:"], "most": 3, "now": 0}
+
+
 def camera(eye, width=200, height=100, focal=100.0):
     """Return a camera that looks along z, with y up, in the form of the page."""
     projection = np.array(
