@@ -8,7 +8,7 @@ import { isManifest, parseTree } from "../../web_decoder/preview/lod_tree.js";
 import { viewOf } from "../../web_decoder/preview/coverage.js";
 import { Streaming } from "../../web_decoder/preview/streaming.js";
 
-const { manifests = [], addresses = [], plans = [], store, flight, pooled = [] } = JSON.parse(readFileSync(0, "utf8"));
+const { manifests = [], addresses = [], plans = [], store, flight, pooled = [], rooms = [] } = JSON.parse(readFileSync(0, "utf8"));
 const turn = () => new Promise((resolve) => setTimeout(resolve, 2));
 
 const trees = manifests.map((text) => {
@@ -131,6 +131,7 @@ const done = {
   pools,
   trees,
   planned,
+  rooms: rooms.map((text) => new Streaming(parseTree(new TextEncoder().encode(text)), { budget: 1 }).room),
   streamed: addresses.map(isManifest),
   states: store && (await drive(store)),
   flown: flight && (await fly(flight)),

@@ -60,9 +60,12 @@ LEAF = ("tree", "children", 0)
         (("filenames",), None, "names no files"),
         *(
             (("filenames", 0), name, "not below its folder")
-            for name in ("../a", "/a", "https://x/a", "a/../b", 5, "a\\b")
+            for name in ("../a", "/a", "https://x/a", "a/../b", 5, "a\\b", " ../a", "a/.. ", "a/.\t./.\n./b")
         ),
         (("environment",), "../sky", "not below its folder"),
+        (("filenames", 0), "1_0/meta.json", "names a file twice"),
+        (("filenames",), ["a", "\ud800", "\ud801"], "names a file twice"),
+        (("environment",), "0_0/meta.json", "names a file twice"),
         (("tree",), None, "none"),
         (("tree", "children"), [], "no leaves"),
         (LEAF, 5, "none"),
@@ -72,6 +75,7 @@ LEAF = ("tree", "children", 0)
         ((*LEAF, "lods", "0", "file"), 3, "levels are unclear"),
         ((*LEAF, "lods", "0", "count"), -1, "levels are unclear"),
         ((*LEAF, "lods", "0"), None, "levels are unclear"),
+        ((*LEAF, "lods", "0", "offset"), 2**50, "more rows than a file may have"),
     ],
 )
 def test_damaged_manifests(path, value, why):
@@ -82,6 +86,15 @@ def test_damaged_manifests(path, value, why):
     (found,) = ask(manifests=[json.dumps(document)])["trees"]
     assert why in found["error"]
     assert found["error"].startswith("The list of this scene's files is damaged: ")
+
+
+def test_a_manifest_of_very_many_leaves_and_files():
+    """The whole is one flat list of leaves, each with its own file."""
+    count = 200_000
+    leaves = [{"bound": GOOD["tree"]["children"][0]["bound"], "lods": {"0": {"file": n, "offset": 0, "count": 1}}}
+              for n in range(count)]  # fmt: skip
+    document = {"lodLevels": 1, "filenames": [f"{n}" for n in range(count)], "tree": {"children": leaves}}
+    assert ask(rooms=[json.dumps(document)])["rooms"] == [count + 1]
 
 
 def test_what_is_no_manifest():
