@@ -8,7 +8,8 @@ import { isManifest, parseTree } from "../../web_decoder/preview/lod_tree.js";
 import { viewOf } from "../../web_decoder/preview/coverage.js";
 import { Streaming } from "../../web_decoder/preview/streaming.js";
 
-const { manifests = [], addresses = [], plans = [], store, flight, pooled = [], rooms = [] } = JSON.parse(readFileSync(0, "utf8"));
+const job = JSON.parse(readFileSync(0, "utf8"));
+const { manifests = [], addresses = [], plans = [], store, flight, pooled = [], rooms = [] } = job;
 const turn = () => new Promise((resolve) => setTimeout(resolve, 2));
 
 const trees = manifests.map((text) => {
