@@ -15,8 +15,10 @@ log = logging.getLogger("kissgs.runners")
 
 MEMORY_LIMIT, TIME_LIMIT, INTERNAL, CRASHED = "memory-limit", "time-limit", "internal", "crashed"
 LOST, UNREACHABLE, NOT_STARTED = "node-lost", "cluster-unreachable", "not-started"
-"""Codes of outcomes beside those of :class:`kissgs.KissgsError`. The last two are of "lost" items that have not
-caused it: the cluster was lost, or a machine had no resources for one more process."""
+NODE_UNUSABLE = "node-unusable"
+"""Codes of outcomes beside those of :class:`kissgs.KissgsError`. UNREACHABLE and NOT_STARTED are of "lost" items that
+have not caused it: the cluster was lost, or a machine had no resources for one more process. NODE_UNUSABLE is of an
+"error" that only another node may not meet: this one cannot use the item's folder, or this version of kissgs."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,16 @@ from collections.abc import Generator, Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
-from kissgs.runners.contract import CRASHED, INTERNAL, MEMORY_LIMIT, NOT_STARTED, TIME_LIMIT, Outcome, WorkItem
+from kissgs.runners.contract import (
+    CRASHED,
+    INTERNAL,
+    MEMORY_LIMIT,
+    NODE_UNUSABLE,
+    NOT_STARTED,
+    TIME_LIMIT,
+    Outcome,
+    WorkItem,
+)
 from kissgs.runners.temporary_folder import temporary_folder
 
 OUT_OF_MEMORY = re.compile(
@@ -116,7 +125,7 @@ class ItemProcess:
             error, (FileNotFoundError, NotADirectoryError, PermissionError)
         ):
             message = f"the machine {machine} cannot use the folder of the work: {reason}"
-            return Outcome("error", code="output", message=message, log=str(self._item.folder))
+            return Outcome("error", code=NODE_UNUSABLE, message=message, log=str(self._item.folder))
         message = f"the machine {machine} could not start a process: {reason}"
         return Outcome("lost", code=NOT_STARTED, message=message)
 

@@ -34,7 +34,7 @@ from ray.exceptions import RayError, RayTaskError, TaskCancelledError
 
 from kissgs._version import __version__
 from kissgs.core.errors import RunnerError
-from kissgs.runners.contract import INTERNAL, LOST, Outcome, WorkItem
+from kissgs.runners.contract import INTERNAL, LOST, NODE_UNUSABLE, Outcome, WorkItem
 
 NODES_SECONDS = 1.0
 """Seconds between two looks at the cluster's nodes."""
@@ -273,7 +273,8 @@ class Driver:
             return Outcome("cancelled", node=node, starts=start)
         except RayTaskError as error:  # raised by the task itself, outside the item's process
             message = f"a node of the cluster cannot run kissgs: {_first_line(error.cause or error)}"
-            return Outcome("error", code=INTERNAL, message=message, log=str(error)[-4000:], node=node, starts=start)
+            text = str(error)[-4000:]
+            return Outcome("error", code=NODE_UNUSABLE, message=message, log=text, node=node, starts=start)
         except RayError as error:
             message = f"the node {node or 'of the work'} was lost {start} times: {_first_line(error)}"
             return Outcome("lost", code=LOST, message=message, node=node, starts=start)
@@ -320,6 +321,7 @@ def _remote_task(item: WorkItem) -> Any:  # noqa: ANN401  Ray's decorated functi
 
 def function_for_nodes() -> Callable[[dict[str, Any], str], Iterator[dict[str, Any]]]:
     """Return the function that nodes run, as a local one: Ray sends its code, and not its name as of a global one."""
+    unusable = NODE_UNUSABLE  # an older version of kissgs on the node does not have it
 
     def run(values: dict[str, Any], version: str) -> Iterator[dict[str, Any]]:
         """Run an item in a process and yield its events; ``version`` is that of kissgs where it was submitted."""
@@ -334,7 +336,7 @@ def function_for_nodes() -> Callable[[dict[str, Any], str], Iterator[dict[str, A
         node = ray.util.get_node_ip_address()
         if __version__ != version:
             message = f"the node {node} has kissgs {__version__}, and this machine {version}; install one version"
-            yield {"outcome": asdict(Outcome("error", code="runner", message=message))}
+            yield {"outcome": asdict(Outcome("error", code=unusable, message=message))}
             return
         yield {"node": node}
         process = ItemProcess(WorkItem.from_dict(values))

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any
 import kissgs
 
 from . import job_process
-from .transfer import FULL, NodeDiskError, StorageAccessError, client, disk_error, fetch, store
+from .transfer import FULL, NodeDiskError, NodeError, StorageAccessError, client, disk_error, fetch, store
 
 if TYPE_CHECKING:
     import httpx
@@ -48,6 +48,7 @@ def compress(task: job_process.Task, progress: kissgs.Progress) -> dict[str, Any
         kissgs.KissgsError: the scene cannot be compressed.
         StorageAccessError: the storage cannot be reached, or the signed addresses have expired.
         NodeDiskError: the disk is full.
+        NodeError: this machine cannot write the job's files.
     """
     folder = Path.cwd()
     free = shutil.disk_usage(folder).free
@@ -122,7 +123,7 @@ def _checkpoints_stored(http: httpx.Client, task: job_process.Task, folder: Path
     thread.start()
     try:
         yield
-    except (StorageAccessError, NodeDiskError):  # the job is started again
+    except (StorageAccessError, NodeDiskError, NodeError):  # the job is started again
         ended.set()
         thread.join()
         store_changed()

@@ -43,10 +43,16 @@ class JobCompletion:
             "reclaimable_bytes": job.upload_bytes if kept else 0,
             "disk_bytes": self.storage.job_bytes(job.id),
         }
-        if not self.end(job, State.SUCCEEDED, dead=dead, **values):
+        if self.end(job, State.SUCCEEDED, dead=dead, **values):
+            self.settle(job, folder, keep_upload=kept)
+            self.store.drop_claim(job.id)
+        elif not has_result(self.store.get(job.id), folder):  # else another replica has recorded this very result
             self.storage.remove_result(job.id, folder)
-        elif shared:
-            self.storage.settle(job.id, folder, keep_upload=keep)
+
+    def settle(self, job: Job, folder: str, *, keep_upload: bool) -> None:
+        """Remove what a succeeded job does not need beside its result; the call can be repeated."""
+        if self.storage.shared:
+            self.storage.settle(job.id, folder, keep_upload=keep_upload)
             self.store.update(job.number, disk_bytes=self.storage.job_bytes(job.id))
 
     def fail(self, job: Job, code: str, detail: str, *, dead: str | None = None) -> None:
@@ -78,3 +84,8 @@ class JobCompletion:
 def result_folder(job: Job) -> str:
     """Return the name of the folder of a succeeded job's result."""
     return str((job.result or {}).get("folder", RESULT))
+
+
+def has_result(job: Job | None, folder: str) -> bool:
+    """Return whether a job has succeeded with the result in this folder."""
+    return job is not None and job.state == State.SUCCEEDED and result_folder(job) == folder

@@ -12,7 +12,7 @@ from ..core.settings import ServiceSettings
 from ..storage.job_records import Store
 from ..storage.job_storage import JobStorage
 from ..storage.object_store import ObjectStoreError
-from .completion import JobCompletion, result_folder
+from .completion import JobCompletion, has_result
 from .runner import Outcome
 from .workplace import Workplace
 
@@ -60,9 +60,17 @@ class OutcomeRecorder:
         self.store.check()  # else files would change without a record in the database
         self.storage.check()
         current = self.store.get(job.id)
-        if current is None or current.state != State.RUNNING:  # cancelled or deleted meanwhile
-            place.clear(kept=current is not None and result_folder(current) == place.folder)
+        if current is None or current.state not in ACTIVE:  # cancelled or deleted meanwhile, or recorded already
+            kept = has_result(current, place.folder)
+            place.clear(kept=kept)
+            if current is not None and kept:
+                self.completion.settle(current, place.folder, keep_upload=current.upload_kept)
+            elif current is not None and current.state == State.FAILED:
+                self.storage.remove_job(job.id)
             self.store.drop_claim(job.id)
+            return
+        if current.state == State.QUEUED or current.started_at != job.started_at:  # recorded already: started again
+            place.abandon()
             return
         if outcome.kind not in ("done", "error") and (summary := place.finished()) is not None:
             outcome = Outcome("done", summary)

@@ -138,9 +138,11 @@ class ReplicaWatch:
         storage = self.context.storage
         if job is None or job.state not in (*ACTIVE, State.SUCCEEDED):
             return storage.remove_job(job_id)
+        if job.state == State.SUCCEEDED:  # its replica may have died before it had removed what is not needed any more
+            self.context.worker.completion.settle(job, result_folder(job), keep_upload=job.upload_kept)
+            return True
         for folder in self._results_of(job_id, replica):
-            if job.state == State.QUEUED or result_folder(job) != folder:
-                storage.remove_result(job_id, folder)
+            storage.remove_result(job_id, folder)
         return True
 
     def _results_of(self, job_id: str, replica: str) -> list[str]:

@@ -13,6 +13,7 @@ from kissgs import runners
 from kissgs.runners import (
     INTERNAL,
     MEMORY_LIMIT,
+    NODE_UNUSABLE,
     NOT_STARTED,
     TIME_LIMIT,
     UNREACHABLE,
@@ -36,6 +37,10 @@ NODE_ERRORS = {
 }
 """Sentences for clients by code, for errors of a node that another start of the job may not meet."""
 
+UNUSABLE_NODES = "the machines that run jobs cannot work on this one; try again later"
+UNUSABLE_MACHINE = "the job's files cannot be used on this machine; try again later"
+"""Sentences for clients about nodes of a cluster, and about this machine, whose names and faults are in the log."""
+
 OnProgress = Callable[[str, float, str], Awaitable[None]]
 """Callback with a stage, its completed fraction (0 to 1), and a note, which may be empty."""
 
@@ -48,7 +53,8 @@ class Outcome:
         kind: "done" after success; "error" after an expected error; "crashed" if the process ended otherwise; "lost"
             if its node was lost, or could not work; "stopped" after :meth:`JobProcess.kill`; "postponed" if the job
             cannot run at the moment.
-        data: the result for "done"; ``code`` and ``detail`` of the problem for "error", "crashed" and "lost".
+        data: the result for "done"; ``code`` and ``detail`` of the problem for "error", "crashed" and "lost"; for
+            "postponed", a ``reason`` for the log, if it is not known otherwise.
     """
 
     kind: Literal["done", "error", "crashed", "lost", "stopped", "postponed"]
@@ -139,9 +145,17 @@ class JobProcess:
         self._killed = False
         self.ended = asyncio.Event()
 
+    @property
+    def killed(self) -> bool:
+        """Whether :meth:`kill` was called."""
+        return self._killed
+
     def kill(self) -> None:
         """Kill the process now, or as soon as it has started."""
         self._killed = True
+        self._end()
+
+    def _end(self) -> None:
         if self._handle is not None:
             self._used.cancel(self._handle.id)
 
@@ -154,10 +168,9 @@ class JobProcess:
             self.ended.set()
             return Outcome("stopped")
         item, self._used = self._runner.item(task), self._runner.runner_of(task)
-        if item.resources.gpus and (refusal := self._used.refusal(item.resources)):
+        if item.resources.gpus and self._used.refusal(item.resources):
             self.ended.set()
-            detail = f"training is not possible at the moment: {refusal}; try again later"
-            return Outcome("error", {"code": "unsupported", "detail": detail})
+            return self._refused(item.resources)
         loop, events = asyncio.get_running_loop(), asyncio.Queue[tuple[str, float, str] | None]()
 
         def receive(stage: str, fraction: float, note: str = "") -> None:
@@ -170,10 +183,20 @@ class JobProcess:
             while (event := await events.get()) is not None:
                 await on_progress(*event)
         finally:
-            self.kill()
+            self._end()
             await asyncio.wait([outcome])
             self.ended.set()
         return self._outcome(outcome.result(), task)
+
+    def _refused(self, resources: Resources) -> Outcome:
+        """Return the outcome of training that no node can run: an error only if the cluster answers and has nodes."""
+        if problem := self._runner.health_problem():
+            return Outcome("postponed", {"reason": problem})
+        refusal = self._used.refusal(resources)  # once more, because the cluster may have been connected again only now
+        if refusal is None or self._runner.health_problem():
+            return Outcome("postponed")
+        detail = f"training is not possible at the moment: {refusal}; try again later"
+        return Outcome("error", {"code": "unsupported", "detail": detail})
 
     def _outcome(self, outcome: runners.Outcome, task: dict[str, Any]) -> Outcome:
         """Return the outcome in the words of the service, without paths of its files."""
@@ -184,7 +207,9 @@ class JobProcess:
         if outcome.kind == "cancelled":
             return Outcome("stopped")
         if outcome.code in (UNREACHABLE, NOT_STARTED):
-            return Outcome("postponed")
+            return Outcome("postponed", {"reason": outcome.message})
+        if outcome.code == NODE_UNUSABLE:
+            return self._unusable(outcome)
         if outcome.kind == "lost":
             log.warning("a job was lost: %s", outcome.message)
             detail = "the machine that ran the job was lost; submit the scene again"
@@ -195,6 +220,13 @@ class JobProcess:
         if outcome.kind == "crashed":
             return Outcome("crashed", {"code": "crashed", "detail": f"{outcome.message}; submit the scene again"})
         return Outcome("error", {"code": outcome.code, "detail": self._detail(outcome, task)})
+
+    def _unusable(self, outcome: runners.Outcome) -> Outcome:
+        """Return the outcome on a machine that cannot work: another node of a cluster may be able to."""
+        log.warning("a job could not run on %s: %s", outcome.node or "its machine", outcome.message)
+        if self._used is self._runner.local:
+            return Outcome("error", {"code": "output", "detail": UNUSABLE_MACHINE})
+        return Outcome("lost", {"code": "internal", "detail": UNUSABLE_NODES})
 
     def _detail(self, outcome: runners.Outcome, task: dict[str, Any]) -> str:
         if outcome.code == TIME_LIMIT:

@@ -18,6 +18,7 @@ from typing import BinaryIO
 import httpx
 
 import kissgs
+from kissgs.runners import NODE_UNUSABLE
 
 PAUSES = (0.5, 1.0, 2.0, 4.0, 8.0, 14.0)
 """Seconds before each repetition of a request; of a download, since the last bytes that have come."""
@@ -46,6 +47,12 @@ class NodeDiskError(kissgs.KissgsError):
     code = "disk-full"
 
 
+class NodeError(kissgs.KissgsError):
+    """This machine cannot work on a job, and another one may."""
+
+    code = NODE_UNUSABLE
+
+
 class _TryAgainError(Exception):
     """A request failed in a way that may pass."""
 
@@ -63,6 +70,7 @@ def fetch(http: httpx.Client, url: str, path: Path, size: int) -> None:
     Raises:
         StorageAccessError: the storage cannot be reached, refuses the address, or has a file of another size.
         NodeDiskError: the disk is full.
+        NodeError: the file cannot be written.
     """
     try:
         with path.open("wb") as file:
@@ -159,4 +167,4 @@ def disk_error(error: OSError) -> kissgs.KissgsError:
     reason, machine = (error.strerror or str(error)).lower(), socket.gethostname()
     if error.errno in FULL:
         return NodeDiskError(f"the disk of the machine {machine} is full: {reason}")
-    return kissgs.OutputError(f"the machine {machine} cannot write the job's files: {reason}; try again later")
+    return NodeError(f"the machine {machine} cannot write the job's files: {reason}")

@@ -29,6 +29,16 @@ IDLE_SECONDS = 1.0
 CANCEL_SECONDS, CANCEL_POLL_SECONDS = 10.0, 0.2
 """Maximum wait for another replica to end a cancelled job, and the interval between looks, seconds."""
 
+LOST_SECONDS, MOST_LOST_SECONDS = 5.0, 60.0
+"""Pause before a job is started again whose first start was lost, which doubles with every start; the longest one. On a
+bad node that is free, starts fail at once: without pauses, the job would soon have none left."""
+
+MOST_POSTPONED_SECONDS = 8.0
+"""Longest pause of a worker after jobs that could not be started; the first is IDLE_SECONDS."""
+
+REST_POLL_SECONDS = 0.1
+"""Interval between looks whether a pause must end, seconds."""
+
 CHECKPOINT_SECONDS = 30.0
 """Minimum seconds between two looks for new checkpoints that other replicas may need."""
 
@@ -54,6 +64,8 @@ class Worker:
     _logged: set[str] = field(default_factory=set)
     _busy: int = 0
     _abandoning: bool = False
+    _postponed: int = 0
+    _postponed_reason: str = ""
 
     def __post_init__(self) -> None:
         self._recorder = OutcomeRecorder(self.settings, self.store, self.storage, self.metrics, self.completion)
@@ -172,17 +184,27 @@ class Worker:
         place = workplace(self.settings, self.storage, job)
         try:
             outcome = await self._follow(job, process, place)
+            if outcome.kind == "lost" and job.starts < self.settings.job_starts:
+                await self._rest(min(MOST_LOST_SECONDS, LOST_SECONDS * 2 ** (job.starts - 1)), process)
         except Exception as error:
             log.exception("job %s: its process could not be run", job.id)
             outcome = outcome_of(error)
         finally:
-            del self._processes[job.id]
+            if self._processes.get(job.id) is process:  # else another start of the job is running
+                del self._processes[job.id]
             process.ended.set()
             self.metrics.busy.dec()
         storage_problem = await run_sync(self.storage.health_problem)
         if storage_problem and outcome.kind in ("error", "crashed", "lost"):
             outcome = Outcome("postponed")  # not caused by the job
         await self._finish(job, outcome, place)
+
+    async def _rest(self, seconds: float, process: JobProcess | None = None) -> None:
+        """Wait, but not while all jobs are being ended, or once the process of a job has been killed."""
+        clock = asyncio.get_running_loop().time
+        end = clock() + seconds
+        while clock() < end and not (self.draining or self._abandoning or (process is not None and process.killed)):
+            await asyncio.sleep(min(REST_POLL_SECONDS, seconds))
 
     async def _follow(self, job: Job, process: JobProcess, place: Workplace) -> Outcome:
         current = await run_sync(self.store.get, job.id)  # cancelled before its process was registered?
@@ -248,8 +270,19 @@ class Worker:
         self.notifier.notify(job.id)
         self.notifier.notify(ended(job.id))
         if outcome.kind == "postponed":
-            await asyncio.sleep(IDLE_SECONDS)
+            await self._rest_after_postponed(str(outcome.data.get("reason", "")))
+        else:
+            self._postponed, self._postponed_reason = 0, ""
         self.notifier.notify(QUEUE)
+
+    async def _rest_after_postponed(self, reason: str) -> None:
+        """Wait before the same job is tried again, longer each time; log every new reason once."""
+        if reason and reason != self._postponed_reason:
+            log.warning("jobs cannot be started and wait: %s", reason)
+            self._postponed_reason = reason
+        seconds = min(MOST_POSTPONED_SECONDS, IDLE_SECONDS * 2**self._postponed)
+        self._postponed += 1
+        await self._rest(seconds)
 
     def _log_once(self, what: str, error: Exception) -> None:
         """Log a repeated failure only once, until the queue can be read again."""

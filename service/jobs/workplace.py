@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 from ..core.disk_estimates import RESULT_BYTES, RESULT_BYTES_PER_GAUSSIAN
@@ -74,6 +75,10 @@ class Workplace(ABC):
         """Remove what the process has left, but for checkpoints, and for its result if that is ``kept``."""
         self._storage.remove_work(self._job.id)
 
+    @abstractmethod
+    def abandon(self) -> None:
+        """Remove what belongs to this start alone, because another start of the job may be running."""
+
     def _common(self) -> dict[str, Any]:
         left_out = ("format", "evaluate")
         return {
@@ -87,9 +92,11 @@ class Workplace(ABC):
 class FolderWorkplace(Workplace):
     """A folder on this machine's disk, which the nodes of a cluster see as well."""
 
+    _work: Path | None = None
+
     def task(self) -> dict[str, Any]:
         """See :class:`Workplace`."""
-        work = self._storage.new_work(self._job.id)
+        work = self._work = self._storage.new_work(self._job.id)
         source = self._storage.fetch_scene(self._job.id, work)
         checkpoint = None
         if self._options.resumable:
@@ -113,7 +120,14 @@ class FolderWorkplace(Workplace):
 
     def keep(self) -> None:
         """See :class:`Workplace`."""
-        self._storage.keep_result(self._job.id, self.folder)
+        if self._work is None:
+            raise FileNotFoundError(2, "its result is missing")
+        self._storage.keep_result(self._job.id, self.folder, self._work)
+
+    def abandon(self) -> None:
+        """See :class:`Workplace`."""
+        if self._work is not None:
+            self._storage.discard(self._work)
 
 
 class BucketWorkplace(Workplace):
@@ -178,6 +192,10 @@ class BucketWorkplace(Workplace):
         """See :class:`Workplace`."""
         if not kept:
             self._storage.remove_result(self._job.id, self.folder)
+
+    def abandon(self) -> None:
+        """See :class:`Workplace`."""
+        self._storage.remove_result(self._job.id, self.folder)
 
 
 def workplace(settings: ServiceSettings, storage: JobStorage, job: Job) -> Workplace:

@@ -118,16 +118,16 @@ class FolderStorage(DataFolder, JobStorage):
         folder.mkdir()
         return folder
 
-    def keep_result(self, job_id: str, folder: str = RESULT) -> None:
-        """Move the result from a job's work folder to its final path; do nothing if that is done already.
+    def keep_result(self, job_id: str, folder: str, work: Path) -> None:
+        """Move the result from a work folder to its final path; do nothing if that is done already.
 
         A previous result moves to the work folder.
 
         Raises:
             OSError: the result cannot be moved, or there is none.
         """
-        result = self.result(job_id)
-        for written in (self.jobs / job_id).glob("work-*/result"):
+        result, written = self.result(job_id), work / RESULT
+        if written.is_dir():
             if os.path.lexists(result):
                 result.rename(written.with_name("former"))
             written.rename(result)

@@ -185,7 +185,8 @@ class Store(JobQueries, ReplicaRecords):
         """Set a job's state and the columns ``values``; return False if its current state does not allow it.
 
         A job that returns to the queue loses its progress. A replica drops its own claim of the job, or that of a
-        ``dead`` replica, without which the state does not change.
+        ``dead`` replica, without which the state does not change. One of a job that has succeeded it keeps, or takes,
+        until the job's files are settled.
         """
         with self._write() as session:
             job = session.get(Job, number, with_for_update=True)
@@ -196,6 +197,8 @@ class Store(JobQueries, ReplicaRecords):
                 dropped = replicas.drop(session, job.id, holder)
                 if dead is not None and not dropped:
                     return False
+                if state == State.SUCCEEDED and self.replica is not None:
+                    replicas.take(session, job.id, self.replica)
             for name, value in values.items():
                 setattr(job, name, value)
             if state == State.QUEUED:

@@ -146,12 +146,13 @@ class JobStorage(ABC):
         return RESULT
 
     @abstractmethod
-    def keep_result(self, job_id: str, folder: str) -> None:
-        """Store the result in a job's work folder for good; do nothing if that is done already.
+    def keep_result(self, job_id: str, folder: str, work: Path) -> None:
+        """Store the result in a work folder for good; do nothing if that is done already.
 
         Args:
             job_id: id of the job.
             folder: name from :meth:`new_result`.
+            work: folder from :meth:`new_work`.
 
         Raises:
             OSError: it cannot be stored, or there is none.
@@ -172,6 +173,8 @@ class JobStorage(ABC):
     @abstractmethod
     def settle(self, job_id: str, folder: str, *, keep_upload: bool) -> bool:
         """Remove what a job does not need beside its result: checkpoints, and the upload unless ``keep_upload``.
+
+        A decoded scene stays.
 
         Returns:
             Whether there is an upload now.

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import logging
 import secrets
+import threading
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -52,6 +53,7 @@ class S3Storage(JobStorage):
         self._local = FolderStorage(root)
         self.place = f"{self._objects.url}/jobs"
         self._stored: dict[Path, int] = {}
+        self._stored_lock = threading.Lock()
         self._unknown = 0
         self._numbers = BucketNumbers(self._objects)
         try:
@@ -86,7 +88,8 @@ class S3Storage(JobStorage):
 
     def remove_work(self, job_id: str) -> None:
         """Remove what this replica has of a job; stored checkpoints stay."""
-        self._stored = {path: made for path, made in self._stored.items() if path.parent.name != job_id}
+        with self._stored_lock:
+            self._stored = {path: made for path, made in self._stored.items() if path.parent.name != job_id}
         self._local.remove_job(job_id)
 
     def discard(self, path: Path) -> None:
@@ -132,9 +135,12 @@ class S3Storage(JobStorage):
     def store_checkpoints(self, job_id: str) -> None:
         """Store the complete checkpoints of a job for other replicas, if they have changed."""
         for path in sorted((self._local.jobs / job_id).glob("checkpoint*.npz")):
-            if self._stored.get(path) != (made := path.stat().st_mtime_ns):
+            with self._stored_lock:
+                known = self._stored.get(path)
+            if known != (made := path.stat().st_mtime_ns):
                 self._objects.put(path, self._job(job_id).key(path.name))
-                self._stored[path] = made
+                with self._stored_lock:
+                    self._stored[path] = made
 
     def sizes(self, job_id: str) -> dict[str, int]:
         """Return the bytes of all files of a job by name."""
@@ -148,15 +154,14 @@ class S3Storage(JobStorage):
         """Return the name of a folder for the result of one start of a job."""
         return f"{RESULT}-{self.replica}-{secrets.token_hex(4)}"
 
-    def keep_result(self, job_id: str, folder: str) -> None:
-        """Store the result in a job's work folder for good; do nothing if that is done already.
+    def keep_result(self, job_id: str, folder: str, work: Path) -> None:
+        """Store the result in a work folder for good; do nothing if that is done already.
 
         Raises:
             OSError: it cannot be stored, or there is none.
         """
-        written = next((self._local.jobs / job_id).glob(f"work-*/{RESULT}"), None)
-        if written is not None:
-            self._job(job_id).put_result(written, folder)
+        if (work / RESULT).is_dir():
+            self._job(job_id).put_result(work / RESULT, folder)
         elif f"{folder}/{SUMMARY}" not in self.sizes(job_id):
             raise FileNotFoundError(2, "its result is missing")
 
@@ -174,9 +179,8 @@ class S3Storage(JobStorage):
 
     def settle(self, job_id: str, folder: str, *, keep_upload: bool) -> bool:
         """Remove checkpoints, other results, and the upload unless ``keep_upload``; return whether there is one now."""
-        kept = self._job(job_id).remove(
-            lambda name: not name.startswith(f"{folder}/") and not (keep_upload and name in UPLOAD_FILES)
-        )
+        wanted = (DECODED, DECODED_SUMMARY, *(UPLOAD_FILES if keep_upload else ()))
+        kept = self._job(job_id).remove(lambda name: not name.startswith(f"{folder}/") and name not in wanted)
         return any(name in UPLOAD_FILES for name in kept)
 
     def keep_decoded(self, work: Path, job_id: str) -> None:

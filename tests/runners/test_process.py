@@ -48,7 +48,7 @@ def test_a_crash_without_a_message_near_the_memory_limit(status, used, expected)
 
 def test_a_folder_that_this_machine_does_not_see(tmp_path):
     (outcome,) = ItemProcess(item("count", folder=str(tmp_path / "none"), numbers=1)).events()
-    assert (outcome.kind, outcome.code) == ("error", "output")
+    assert (outcome.kind, outcome.code) == ("error", "node-unusable")
     assert "cannot use the folder of the work: no such file" in outcome.message
     assert outcome.log == str(tmp_path / "none")
 

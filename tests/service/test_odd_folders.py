@@ -136,14 +136,15 @@ def test_recovery_follows_no_links(tmp_path):
 def test_a_permanent_error_fails_the_job(tmp_path, monkeypatch):
     """A folder that was not empty once blocked its worker for ever."""
 
-    def refuse(job_id, folder):
+    def refuse(job_id, folder, work):
         raise OSError(errno.ENOTEMPTY, "Directory not empty")
 
     with service(tmp_path / "data") as context:
-        job = context.store.get(add_a_job(context))
-        context.store.claim()
+        add_a_job(context)
+        job = context.store.claim()
         monkeypatch.setattr(context.storage, "keep_result", refuse)
         place = workplace(context.settings, context.storage, job)
+        place.task()
         asyncio.run(asyncio.wait_for(context.worker._finish(job, Outcome("done", {}), place), 10))
         found = context.store.get(job.id)
         assert (found.state, found.problem["code"]) == (State.FAILED, "output")

@@ -191,9 +191,11 @@ def test_a_damaged_result(two_jobs, damage, state, caplog):
     with service(folder) as context:
         assert state_of(context, job) == State.QUEUED
         assert f"job {job}: its result is damaged" in caplog.text
-        summary = write_result(context, job, context.storage.new_work(job) / "result")
-        context.storage.keep_result(job)
-        context.storage.keep_result(job)  # repeated if the end could not be recorded
+        (context.storage.new_work(job) / "result").mkdir()  # of a former start, and not complete
+        work = context.storage.new_work(job)
+        summary = write_result(context, job, work / "result")
+        context.storage.keep_result(job, "result", work)
+        context.storage.keep_result(job, "result", work)  # repeated if the end could not be recorded
         context.storage.remove_work(job)
         assert sorted(path.name for path in (folder / "jobs" / job).iterdir()) == ["result", "scene.ply"]
         assert json.loads((context.storage.result(job) / "summary.json").read_text()) == summary
@@ -202,4 +204,4 @@ def test_a_damaged_result(two_jobs, damage, state, caplog):
 def test_a_missing_result(two_jobs):
     folder, waiting, _ = two_jobs
     with service(folder) as context, pytest.raises(FileNotFoundError, match="its result is missing"):
-        context.storage.keep_result(waiting)
+        context.storage.keep_result(waiting, "result", folder / "jobs" / waiting)

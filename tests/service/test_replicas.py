@@ -174,7 +174,8 @@ def member(tmp_path, bucket, new_database, monkeypatch):
 
 def write_result(context, job_id, complete=True):
     """Store a result as the worker does, but for the last file if it is not ``complete``."""
-    folder = context.storage.new_work(job_id) / "result"
+    work = context.storage.new_work(job_id)
+    folder = work / "result"
     (folder / "files").mkdir(parents=True)
     contents = {"scene.zip": b"PK", "report.json": b"{}", "files/meta.json": b"{} "}
     for name, content in contents.items():
@@ -187,7 +188,7 @@ def write_result(context, job_id, complete=True):
     }  # fmt: skip
     (folder / "summary.json").write_text(json.dumps(summary))
     kept = context.storage.new_result()
-    context.storage.keep_result(job_id, kept)
+    context.storage.keep_result(job_id, kept, work)
     if not complete:
         context.storage._objects.delete([f"jobs/{job_id}/{kept}/summary.json"])
     return kept

@@ -8,7 +8,7 @@ import pytest
 
 import kissgs
 from service.jobs import transfer
-from service.jobs.transfer import NodeDiskError, StorageAccessError, client, fetch, store
+from service.jobs.transfer import NodeDiskError, NodeError, StorageAccessError, client, fetch, store
 
 DATA = bytes(range(256)) * 4000
 SECRET = "?X-Amz-Signature=secret"
@@ -218,5 +218,5 @@ def test_a_full_disk(storage, http, tmp_path, monkeypatch):
     monkeypatch.setattr(transfer, "_fetch_rest", full)
     with pytest.raises(NodeDiskError, match="is full: no space left on device"):
         fetch(http, storage.url, tmp_path / "file", len(DATA))
-    with pytest.raises(kissgs.OutputError, match="cannot write the job's files: no such file"):
+    with pytest.raises(NodeError, match="cannot write the job's files: no such file"):
         fetch(http, storage.url, tmp_path / "none" / "file", len(DATA))
