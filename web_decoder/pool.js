@@ -52,19 +52,24 @@ export class Pool {
     this.workers.set(worker, (this.workers.get(worker) ?? 0) + size);
     return new Promise((resolve, reject) => {
       const { port1, port2 } = new MessageChannel();
-      port1.onmessage = ({ data: { plane, error } }) => {
+      // The worker could not be loaded: the page's policy forbids it, or a bundler omitted it.
+      const failed = () => {
+        end();
+        this.workers.delete(worker);
+        this.maxWorkers = 0;
+        resolve(this.inCaller(task));
+      };
+      const end = () => {
         port1.close();
+        worker.removeEventListener("error", failed); // it would keep the task's bytes and plane in memory
+      };
+      port1.onmessage = ({ data: { plane, error } }) => {
+        end();
         this.workers.set(worker, (this.workers.get(worker) ?? size) - size);
         if (plane) resolve(plane);
         else reject(new Error(error));
       };
-      // The worker could not be loaded: the page's policy forbids it, or a bundler omitted it.
-      worker.addEventListener("error", () => {
-        port1.close();
-        this.workers.delete(worker);
-        this.maxWorkers = 0;
-        resolve(this.inCaller(task));
-      });
+      worker.addEventListener("error", failed);
       worker.postMessage({ task: { ...task, bytes: task.bytes.slice() }, port: port2 }, [port2]);
     });
   }

@@ -16,7 +16,7 @@ import numpy as np
 
 from kissgs.benchmark.streaming_costs import StreamingCosts
 from kissgs.core.array_types import Float64
-from kissgs.streaming.build import CHUNK, COARSEST, LEAF, MOST_ENTRIES
+from kissgs.streaming.build import CHUNK, COARSEST, leaf_size
 from kissgs.streaming.layout import CONTEXT
 from kissgs.streaming.levels import level_count
 from kissgs.streaming.partition import chunk_depth
@@ -24,11 +24,15 @@ from kissgs.streaming.partition import chunk_depth
 MANIFEST_BYTES = 105
 """Size of one level of one leaf in ``lod-meta.json``, bytes: 535,211 bytes for 512 leaves and 10 levels."""
 
-ITEM_SECONDS = 0.18
-"""Seconds for the start of a work item (``python -m kissgs.benchmark.runner_overhead``, one node of Ray)."""
+ITEM_SECONDS = 1.5
+"""Seconds for the start of a work item: 0.18 by Ray (``python -m kissgs.benchmark.runner_overhead``, one node), and 1.3
+of its process, for ``import kissgs.streaming.items``."""
+
+EVENTS = 4.0
+"""Progress events of a job per second, each a transaction (:data:`kissgs.runners.item_process.EVENT_SECONDS`)."""
 
 FRONT_SECONDS, FRONT_SECONDS_PER_BYTE, TRANSACTIONS = 0.168, 8.31e-9, 102
-"""CPU seconds of the service for each job and each byte of its upload, and transactions of its database for each job
+"""CPU seconds of the service for each job and each byte of its upload, and transactions of its database for a short job
 (``python -m kissgs.benchmark.service_load``, one replica with PostgreSQL and a bucket)."""
 
 JOBS = 20_000
@@ -123,7 +127,8 @@ def simulate_scene(costs: StreamingCosts, node: Node, nodes: int, gaussians: int
         "cameras": costs.camera_seconds,
         "images": makespan((sum(each) + ITEM_SECONDS for each in images), slots),
     }
-    leaves = max(files[0], math.ceil(gaussians / max(LEAF, gaussians * levels / MOST_ENTRIES)))
+    parts = sizes[0] / leaf_size(gaussians, files[0], levels)
+    leaves = files[0] << max(0, math.ceil(math.log2(parts)))
     return SceneRun(
         gaussians=gaussians,
         nodes=nodes,
@@ -203,7 +208,7 @@ def simulate_jobs(costs: JobCosts, node: Node, nodes: int, jobs_per_day: float, 
         longest_wait=float(np.quantile(waits, 0.95)),
         front_cpus=rate * (FRONT_SECONDS + costs.upload_bytes * FRONT_SECONDS_PER_BYTE),
         upload_bytes=rate * costs.upload_bytes,
-        transactions=rate * TRANSACTIONS,
+        transactions=rate * (TRANSACTIONS + EVENTS * mean),
     )
 
 

@@ -10,9 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from kissgs.benchmark.isolation import isolated
+from kissgs.core.errors import UnsupportedError
 from kissgs.io.container_names import LOD_NAME
+from kissgs.io.ply import read_ply_info
 from kissgs.pipeline.pipeline import compress
 from kissgs.pipeline.scene_files import save
+from kissgs.pipeline.scene_formats import recognise
 from kissgs.settings import Settings
 from kissgs.streaming.compress import compress_streamed
 from kissgs.synthetic.scene import sample_scene
@@ -55,7 +58,7 @@ def measure_costs(source: Path | int, settings: Settings, gaussians: int, thread
     """Compress a scene to streamed SOG and to one ``.sog`` in a process of its own, and return the costs.
 
     Args:
-        source: a scene file, or an SH degree, 0 to 3, for a sample scene.
+        source: an uncompressed ``.ply``, or an SH degree, 0 to 3, for a sample scene.
         settings: settings of the encoder.
         gaussians: number of Gaussians of the sample scene.
         threads: number of threads; 0 means one per processor.
@@ -67,6 +70,8 @@ def measure_costs(source: Path | int, settings: Settings, gaussians: int, thread
         path = Path(folder, "scene.ply")
         if isinstance(source, Path):
             path = source
+            if recognise(path) != "ply" or read_ply_info(path).compressed:
+                raise UnsupportedError(f"{path} is no uncompressed .ply, whose size costs depend on; convert it first")
         else:
             isolated(partial(_write_sample, path, gaussians, source), f"the scene of {gaussians:,} Gaussians")
         return isolated(partial(_measure, path, Path(folder), settings, threads), str(path))
@@ -82,15 +87,16 @@ def _measure(path: Path, folder: Path, settings: Settings, threads: int) -> Stre
     def progress(stage: str, fraction: float, note: str = "") -> None:
         nonlocal last, begun
         now = time.process_time()
-        if last in seconds:
-            seconds[last] += now - begun
+        of = "partition" if last == "scratch" else last  # until the first block is read
+        if of in seconds:
+            seconds[of] += now - begun
         last, begun = stage, now
 
     report = compress_streamed(path, folder / "scene" / LOD_NAME, settings=settings, threads=threads, progress=progress)
     begun = time.process_time()
     compress(path, settings=settings, container="sog", threads=threads)
     container = time.process_time() - begun
-    stored, finest = sum(report.counts), max(report.counts[0], 1)
+    stored, finest = sum(report.counts) + report.environment_count, max(report.counts[0], 1)
     return StreamingCosts(
         gaussians=report.source_count,
         partition_seconds=seconds["partition"] / report.source_count,
@@ -99,5 +105,5 @@ def _measure(path: Path, folder: Path, settings: Settings, threads: int) -> Stre
         file_seconds=seconds["images"] / stored,
         container_seconds=container / report.source_count,
         source_bytes=path.stat().st_size / report.source_count,
-        file_bytes=sum(report.level_bytes) / stored,
+        file_bytes=(sum(report.level_bytes) + report.environment_bytes) / stored,
     )

@@ -13,6 +13,7 @@ from kissgs.cli.arguments import PresetOption, SetOption
 from kissgs.cli.bench_arguments import JsonOption, ThreadsOption
 from kissgs.cli.bench_scenes import BenchInputs, BenchOutput, open_inputs, report
 from kissgs.cli.options import chosen
+from kissgs.core.errors import UnsupportedError
 
 if TYPE_CHECKING:
     from kissgs.benchmark.capacity import Node
@@ -43,6 +44,8 @@ def capacity(
 ) -> None:
     """Measure what a Gaussian costs here, and simulate what clusters do with large scenes and many jobs."""
     inputs = open_inputs(scene or [], None, threads, plot)
+    if len(inputs.scenes) > 1:
+        raise UnsupportedError("bench capacity measures one scene; give one FILE")
     settings = chosen(preset, changes)
     from kissgs.benchmark.capacity import Node
 

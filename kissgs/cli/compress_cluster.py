@@ -135,7 +135,7 @@ class ClusterCompression:
                 pass
         work = self._work[target] = _new_work(target)
         size = scene.stat().st_size if scene.is_file() else 0
-        available = max(node.total.memory for node in runner.stats().nodes)
+        resources = self._with_memory(runner, requested, self._memory(scene, size))
         console = output()
         arguments = {
             "scene": str(scene),
@@ -154,8 +154,6 @@ class ClusterCompression:
             "width": console.width,
             "color": console.is_terminal,
         }
-        memory = min(self._memory(scene, size), available)
-        resources = Resources(requested.cpus, memory, requested.gpus)
 
         def progress(stage: str, fraction: float, note: str = "") -> None:
             ended = sum(isinstance(each, KissgsError) or each.outcome.done() for each in list(self._handles.values()))
@@ -165,6 +163,18 @@ class ClusterCompression:
             self._bar("scenes", ended / max(len(self._handles), 1), details)
 
         return runner.submit(WorkItem("kissgs.cli.scene_item:compress_scene", arguments, resources), progress)
+
+    def _with_memory(self, runner: Runner, requested: Resources, memory: int) -> Resources:
+        """Return a request with memory, at most that of the largest node that has the rest of it.
+
+        Raises:
+            UnsupportedError: no node has the resources any more.
+        """
+        nodes = [node.total.memory for node in runner.stats().nodes if requested.fits(node.total)]
+        resources = Resources(requested.cpus, min(memory, max(nodes, default=0)), requested.gpus)
+        if refusal := runner.refusal(resources):
+            raise UnsupportedError(refusal)
+        return resources
 
     def _memory(self, scene: Path, size: int) -> int:
         """Return an estimate of the memory that a scene needs, bytes."""
@@ -186,6 +196,5 @@ def _new_work(target: Path) -> Path:
     digest = hashlib.sha256(os.fsencode(target.name)).hexdigest()
     work = target.parent / f".kissgs.{digest[:16]}.part"
     shutil.rmtree(work, ignore_errors=True)
-    work.mkdir()
-    work.chmod(0o777)  # nodes may run as other users
+    work.mkdir(mode=0o700)
     return work

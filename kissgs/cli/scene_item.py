@@ -8,8 +8,9 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from kissgs.core.errors import UnsupportedError
+from kissgs.core.errors import OutputError, UnsupportedError
 from kissgs.core.progress import Progress
+from kissgs.io.atomic import reason_of
 
 
 def compress_scene(arguments: dict[str, Any], progress: Progress) -> dict[str, Any]:
@@ -33,7 +34,13 @@ def compress_scene(arguments: dict[str, Any], progress: Progress) -> dict[str, A
 
     scene, work = Path(arguments["scene"]), Path(arguments["work"])
     _check_shared(scene, arguments["bytes"], work)
-    attempt = tempfile.mkdtemp(dir=work)  # of its own: a node that was given up may go on for a while
+    try:
+        attempt = tempfile.mkdtemp(dir=work)  # of its own: a node that was given up may go on for a while
+    except OSError as error:
+        raise OutputError(
+            f"the machine {socket.gethostname()} cannot write to {work}: {reason_of(error)}; Ray must run there as the "
+            "same user as this command, on storage with room"
+        ) from error
     written = Path(attempt) / Path(arguments["target"]).name
     if arguments["evaluate"]:  # reported here, because evaluation reports only one stage
         from kissgs.rendering.rasterizer import load_kernels

@@ -95,7 +95,7 @@ def _write(
     refuse_existing(output, overwrite=force)
     content, chosen = source(scene), ""
     if any_level and is_streamed(content):
-        level, levels = fitting_level(content)
+        level, levels = fitting_level(content, reading.max_gaussians)
         reading = replace(reading, level=level)
         chosen = f", level {level} of 0 to {levels - 1}"
     with progress_bar(quiet) as progress:
@@ -131,6 +131,11 @@ def _prepare(
 
     content = source(scene)
     if all_levels and isinstance(content, Path) and is_streamed_folder(content):
+        if reading.max_gaussians is not None:
+            raise UnsupportedError(
+                "--max-gaussians does not apply to a streamed scene that the page loads in parts; "
+                "add &gaussians=N to the page's address, or name a --level"
+            )
         return streamed_folder(content)
     with progress_bar(quiet) as progress:
         return page_scene(content, reading, threads=threads, progress=progress)

@@ -7,6 +7,7 @@ says how its files are opened and decoded.
 from __future__ import annotations
 
 import itertools
+import posixpath
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -169,11 +170,15 @@ class StreamedFormat(Generic[C]):
         if not isinstance(names, list):
             raise _invalid(name, "it lacks the list 'filenames'")
         environment = document.get("environment")
+        paths: set[str] = set()
         for each in (*names, *([] if environment is None else [environment])):
             if isinstance(each, str) and "://" in each:
                 raise UnsupportedError(f"{name} names files on the web; download them beside it and name them there")
             if not is_file_name(each):
                 raise _invalid(name, "it names a file that is not below its folder")
+            if (path := posixpath.normpath(each.replace("\\", "/"))) in paths:
+                raise _invalid(name, f"it names the file {each} twice")
+            paths.add(path)
         rows: list[list[tuple[int, int, int]]] = [[] for _ in range(levels)]
         for level, row in _leaf_rows(name, document.get("tree"), levels, len(names)):
             rows[level].append(row)

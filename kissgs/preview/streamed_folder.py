@@ -48,8 +48,8 @@ def is_streamed_folder(source: Path) -> bool:
 def streamed_folder(source: Path) -> StreamedFolder:
     """Return the files of a streamed scene.
 
-    Files that the scene lacks, and links that lead out of the folder, are left out: the page names them, and shows the
-    rest.
+    Files that the scene lacks or that cannot be reached, and links that lead out of the folder, are left out: the page
+    names them, and shows the rest.
 
     Args:
         source: the folder, or its manifest.
@@ -64,9 +64,17 @@ def streamed_folder(source: Path) -> StreamedFolder:
         for name in (*tree.filenames, *([tree.environment] if tree.environment else [])):
             names += _container_files(opened, name)
     root = folder.resolve()
-    files = {name: (root / name).resolve() for name in names}
-    inside = {name: path for name, path in files.items() if path.is_relative_to(root) and path.is_file()}
+    inside = {name: path for name in names if (path := _file_inside(root, name)) is not None}
     return StreamedFolder(os.fsencode(root.name).decode(errors="replace") or "scene", kind.manifest, inside)
+
+
+def _file_inside(root: Path, name: str) -> Path | None:
+    """Return a file of a folder without links; None if it is missing, out of the folder, or out of reach."""
+    try:
+        path = (root / name).resolve()
+        return path if path.is_relative_to(root) and path.is_file() else None
+    except (OSError, RuntimeError):  # a closed folder; a link to itself
+        return None
 
 
 def _format(source: Path | bytes) -> StreamedFormat[Any]:
@@ -86,14 +94,20 @@ def _container_files(files: Source, name: str) -> list[str]:
     return [name, *(f"{parent}/{image}" if parent else image for image in images)]
 
 
-def fitting_level(source: Path | bytes) -> tuple[int, int]:
-    """Return the finest level of at most ``PAGE_GAUSSIANS``, or else the coarsest, and the number of levels.
+def fitting_level(source: Path | bytes, max_gaussians: int | None = None) -> tuple[int, int]:
+    """Return the finest level that fits into a page of one file, or else the coarsest, and the number of levels.
+
+    Args:
+        source: the folder of a streamed scene, its manifest, or a zip of it.
+        max_gaussians: largest number of Gaussians of a level with the environment, if below ``PAGE_GAUSSIANS``.
 
     Raises:
-        KissgsError: the manifest is missing or damaged.
+        KissgsError: the manifest or the environment is missing or damaged.
     """
     kind = _format(source)
     with open_source(scene_root(source) if isinstance(source, Path) else source, kind.manifest) as files:
         tree = kind.read_manifest(files)
-    fitting = (level for level in range(tree.levels) if tree.count(level) <= PAGE_GAUSSIANS)
+        environment = 0 if tree.environment is None else kind.opened(files, tree.environment).count
+    most = (PAGE_GAUSSIANS if max_gaussians is None else min(max_gaussians, PAGE_GAUSSIANS)) - environment
+    fitting = (level for level in range(tree.levels) if tree.count(level) <= most)
     return next(fitting, tree.levels - 1), tree.levels

@@ -17,9 +17,9 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO, Any, NamedTuple
 
 from kissgs.runners.contract import (
     CRASHED,
@@ -136,7 +136,7 @@ class ItemProcess:
             stdout=subprocess.PIPE,
             stderr=errors,
             cwd=folder,
-            env=child_environment(),
+            env=child_environment(("KISSGS_", "AWS_", "RAY_AUTH", "PG")),
             start_new_session=True,
         )
         with self._lock:
@@ -204,8 +204,7 @@ class ItemProcess:
 
 def _events_of(process: subprocess.Popen[bytes]) -> Iterator[ProgressEvent | Outcome]:
     assert process.stdout is not None  # noqa: S101
-    for line in process.stdout:
-        event = json.loads(line)
+    for event in json_lines(process.stdout):
         if "stage" in event:
             yield ProgressEvent(event["stage"], event["fraction"], event["note"])
         elif "done" in event:
@@ -216,8 +215,20 @@ def _events_of(process: subprocess.Popen[bytes]) -> Iterator[ProgressEvent | Out
             yield Outcome("error", code=MEMORY_LIMIT)
 
 
-def child_environment() -> dict[str, str]:
-    """Return this process's environment without the settings of a service and its storage, some of them secrets."""
-    secret = ("KISSGS_", "AWS_")
+def json_lines(lines: Iterable[str | bytes]) -> Iterator[dict[str, Any]]:
+    """Yield the events that a process writes, until it ends; a line that it was killed in is none."""
+    for line in lines:
+        try:
+            event = json.loads(line)
+        except ValueError:
+            return
+        yield event
+
+
+def child_environment(secret: tuple[str, ...] = ("KISSGS_", "AWS_")) -> dict[str, str]:
+    """Return this process's environment without variables whose names begin so.
+
+    By default, these are the settings of a service and its storage, some of them secrets.
+    """
     inherited = {name: value for name, value in os.environ.items() if not name.upper().startswith(secret)}
     return {**inherited, "OMP_WAIT_POLICY": "PASSIVE", "PYTHONUNBUFFERED": "1"}

@@ -26,6 +26,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
+from functools import cache
 from typing import Any, NoReturn
 
 import ray
@@ -71,6 +72,7 @@ def main() -> None:
     folder = tempfile.mkdtemp(prefix="kissgs-ray-") if address == LOCAL else None
     try:
         connect(address) if folder is None else start_here(folder)
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # standard input closes when items shall end; Ray sets a handler
         send({"nodes": _nodes()})
         asyncio.run(Driver(send).run())
     except NoCluster:
@@ -297,10 +299,16 @@ class _Messages:
         self._loop.call_soon_threadsafe(self._queue.put_nowait, None)
 
 
+@cache
+def _exported_function() -> Any:  # noqa: ANN401
+    """Return the function for nodes as Ray's; each call of ``ray.remote`` would store one more in the cluster."""
+    return ray.remote(function_for_nodes())
+
+
 def _remote_task(item: WorkItem) -> Any:  # noqa: ANN401  Ray's decorated functions have no useful type
     """Return the Ray task that runs an item, with its requests."""
     wanted = item.resources
-    return ray.remote(function_for_nodes()).options(
+    return _exported_function().options(
         num_cpus=wanted.cpus if wanted.cpus <= 1 else math.ceil(wanted.cpus),
         num_gpus=wanted.gpus if wanted.gpus <= 1 else math.ceil(wanted.gpus),
         memory=wanted.memory or None,

@@ -35,7 +35,7 @@ from kissgs.runners.contract import (
     refusal_of,
     report,
 )
-from kissgs.runners.process import child_environment
+from kissgs.runners.process import child_environment, json_lines
 
 CONNECT_SECONDS = 60.0
 """Maximum seconds for the connection to a cluster, or the start of one on this machine."""
@@ -178,8 +178,7 @@ class RayRunner:
         """Handle the events of a driver process until it ends."""
         assert driver.stdout is not None  # noqa: S101
         failure = "the connection to the Ray cluster was lost"
-        for line in driver.stdout:
-            event = json.loads(line)
+        for event in json_lines(driver.stdout):
             if "failed" in event:
                 failure = event["failed"]
             elif "nodes" in event:

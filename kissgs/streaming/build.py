@@ -7,6 +7,7 @@ work goes on where it was, and items may run in any process that sees the folder
 from __future__ import annotations
 
 import json
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -54,6 +55,9 @@ LEAF, MOST_ENTRIES = 32_768, 4096
 """Largest number of Gaussians in a leaf; and about that of leaves times levels, because the manifest takes about 105
 bytes for each level of each leaf, before the first image: large scenes have larger leaves."""
 
+UNEVEN = 1.1
+"""Ratio of the largest to the mean size of chunks: their cuts are medians of a sample."""
+
 COARSEST = 50_000
 """Largest number of Gaussians in the coarsest level, which with the manifest makes a viewer's first image."""
 
@@ -76,7 +80,7 @@ def partition(
         settings: settings of the encoder, which say whether invisible Gaussians are left out.
         progress: receives "partition".
     """
-    done = 0
+    done = visible_count = 0
 
     def counted() -> Iterator[Splats]:
         nonlocal done
@@ -86,11 +90,14 @@ def partition(
             progress("partition", done / (2 * count))
 
     def visible_means(block: Splats) -> Float32[np.ndarray, "n 3"]:
+        nonlocal visible_count
         splats = clean(block)[0]
-        return splats.means[visible_gaussians(splats, settings)]
+        visible = visible_gaussians(splats, settings)
+        visible_count += len(visible)
+        return splats.means[visible]
 
     positions = sampled_positions(map(visible_means, counted()), count)
-    environment = Environment.of(positions, count)
+    environment = Environment.of(positions, visible_count)
     depth = chunk_depth(count, CHUNK)
     cuts = Cuts.of(positions[~environment.contains(positions)], depth)
     for path in (environment_file(work), *(chunk_file(work, chunk) for chunk in range(cuts.chunks))):
@@ -119,13 +126,19 @@ def partition(
         counts=tuple(map(int, counts)),
         depth=depth,
         levels=levels,
-        leaf=max(LEAF, -(-total * levels // MOST_ENTRIES)),
+        leaf=leaf_size(total, cuts.chunks, levels),
         environment=far_count,
         changed=dict(changed),
     )
     for path in (environment_file(work), *(chunk_file(work, chunk) for chunk in layout.filled)):
         sync(path)
     return layout
+
+
+def leaf_size(total: int, chunks: int, levels: int) -> int:
+    """Return the largest number of Gaussians in a leaf; chunks are halved until their leaves are not larger."""
+    parts = 1 << (max(1, MOST_ENTRIES // (levels * chunks)).bit_length() - 1)
+    return max(LEAF, math.ceil(UNEVEN * total / (chunks * parts)))
 
 
 def has_levels(work: Path, chunk: int) -> bool:

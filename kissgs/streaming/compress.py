@@ -28,6 +28,9 @@ from kissgs.streaming.layout import OUT, PARTITION, Layout, keep_layout, read_la
 from kissgs.streaming.time_left import with_time_left
 from kissgs.streaming.work_folder import check_destination, check_space, claimed, finish, needed_bytes, read_json
 
+WORK_LAYOUT = 2
+"""Version of the files in the work folder; another one's are not continued."""
+
 REPORT = "report.json"
 """File of the work folder: the report, once everything is made."""
 
@@ -191,6 +194,7 @@ def _identity(source: Path, settings: Settings, reading: ReadOptions) -> dict[st
         raise InvalidSceneError(f"cannot read {source}: {reason_of(error)}") from error
     return {
         "version": __version__,
+        "layout": WORK_LAYOUT,
         "source": path,
         "bytes": status.st_size,
         "modified_ns": status.st_mtime_ns,

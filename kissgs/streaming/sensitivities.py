@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from kissgs.cameras.virtual.sensitivity_cameras import default_view_count, sensitivity_cameras
+from kissgs.cameras.virtual.sensitivity_cameras import MAX_VIEWS, default_view_count, sensitivity_cameras
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats, concatenate
 from kissgs.rendering.camera import Camera
@@ -20,8 +20,9 @@ from kissgs.settings import EncodeSettings
 VIEW_UNCERTAINTY = 0.55
 """Default of the setting ``view_uncertainty``, as for all virtual cameras."""
 
-VIEWS_PER_CHUNK = 2
-"""Least number of cameras per chunk: a large scene needs more than the default, which falls with its size."""
+VIEWS_PER_CHUNK, MOST_VIEWS = 2, 1024
+"""Least number of cameras per chunk, because a large scene needs more than the default, which falls with its size; and
+the largest number of all cameras, whose choice would take hours."""
 
 MIN_SIZE = 64
 """Smallest side of the images in which coarse levels are measured, pixels."""
@@ -40,7 +41,7 @@ def choose_cameras(scene: Splats, chunks: int, count: int, settings: EncodeSetti
         settings: settings of the encoder.
         threads: number of threads; 0 means one per processor.
     """
-    views = settings.sensitivity_views or max(default_view_count(count), VIEWS_PER_CHUNK * chunks)
+    views = settings.sensitivity_views or max(default_view_count(count), min(MOST_VIEWS, VIEWS_PER_CHUNK * chunks))
     return sensitivity_cameras(scene, None, count=views, size=settings.sensitivity_view_size, threads=threads)
 
 
@@ -77,7 +78,9 @@ def measure_file(
         threads: number of threads; 0 means one per processor. The result does not depend on it.
     """
     size = max(MIN_SIZE, settings.sensitivity_view_size >> level)
-    seeing = [camera.at_most(size) for camera in cameras.cameras if _sees(camera, splats)]
+    shown = [_shown(camera, splats) for camera in cameras.cameras]
+    best = sorted(np.argsort(np.negative(shown), kind="stable")[:MAX_VIEWS])  # else each file would take more and more
+    seeing = [cameras.cameras[n].at_most(size) for n in best if shown[n] > 0]
     if not seeing:
         return Sensitivity.none(len(splats), splats.sh_degree)
     uncertainty = VIEW_UNCERTAINTY if settings.view_uncertainty is None else settings.view_uncertainty
@@ -94,13 +97,14 @@ def measure_file(
     return own
 
 
-def _sees(camera: Camera, splats: Splats) -> bool:
-    """Return whether a sampled Gaussian is in the image, or a little outside."""
+def _shown(camera: Camera, splats: Splats) -> float:
+    """Return how large sampled Gaussians in the image, or a little outside, appear in it; 0 if there is none."""
     points = splats.means[:: max(1, len(splats) // 4096)].astype(np.float64) @ camera.viewmat[:3, :3].T
     points += camera.viewmat[:3, 3]
     ahead = points[points[:, 2] > 0]
     pixels = ahead[:, :2] / ahead[:, 2:] * camera.K[[0, 1], [0, 1]]
-    return bool((np.abs(pixels) < REACH / 2 * np.array([camera.width, camera.height])).all(axis=1).any())
+    inside = (np.abs(pixels) < REACH / 2 * np.array([camera.width, camera.height])).all(axis=1)
+    return float(np.square(camera.K[0, 0] / ahead[inside, 2]).sum())
 
 
 def _rows(sensitivity: Sensitivity, rows: slice) -> Sensitivity:

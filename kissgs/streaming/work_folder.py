@@ -12,6 +12,7 @@ from typing import Any, BinaryIO
 from kissgs.core.errors import OutputError
 from kissgs.io.atomic import atomic_file, path_state, reason_of
 from kissgs.io.container_names import MANIFESTS
+from kissgs.io.streamed import MAX_TREE_BYTES
 from kissgs.sog.encode import FILES
 from kissgs.streaming.build import CHUNK
 from kissgs.streaming.layout import OUT
@@ -189,8 +190,10 @@ def _discarded(work: Path) -> Path:
 
 
 def read_json(path: Path) -> Any:  # noqa: ANN401  any JSON
-    """Return the JSON of a file; None if it is missing or incomplete."""
+    """Return the JSON of a file; None if it is missing, incomplete, or larger than a manifest may be."""
     try:
-        return json.loads(path.read_bytes())
-    except (OSError, ValueError):
+        with path.open("rb") as file:
+            data = file.read(MAX_TREE_BYTES + 1)
+        return json.loads(data) if len(data) <= MAX_TREE_BYTES else None
+    except (OSError, ValueError, RecursionError):
         return None

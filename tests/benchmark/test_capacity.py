@@ -69,8 +69,8 @@ def test_more_nodes_are_faster_until_the_partition_remains():
 
 
 def test_the_first_image_takes_the_coarsest_level_and_the_manifest_of_all_leaves():
-    """10 levels of 410 leaves (512 gave 535,211 bytes), and half of the 81,496 Gaussians of the level before."""
-    expected = 535_211 * 410 / 512 + 40_960 * COSTS.file_bytes
+    """512 leaves of 10 levels gave 535,211 bytes; 64 chunks have four leaves each now."""
+    expected = 535_211 * 256 / 512 + 40_960 * COSTS.file_bytes
     assert simulate_scene(COSTS, NODE, 1, 20_971_520).first_bytes == pytest.approx(expected, rel=0.03)
 
 

@@ -94,8 +94,10 @@ def test_a_streamed_scene(tmp_path, city):
     assert query == "scene/streamed.ply"
     assert ply.startswith(b"ply")
     assert b"element vertex %d\n" % len(kissgs.load(city, level=1)) in ply
-    done = run("view", city, "-o", tmp_path / "page.html")
-    assert "holds streamed.zip, level 0 of 0 to 2, compressed" in " ".join(done.stdout.decode().split())
+    for options, level in (((), 0), (("--max-gaussians", len(kissgs.load(city)) - 1, "--force"), 1)):
+        done = run("view", city, "-o", tmp_path / "page.html", *options)
+        assert f"holds streamed.zip, level {level} of 0 to 2, compressed" in " ".join(done.stdout.decode().split())
+    assert "--max-gaussians does not apply" in failure("view", city, "--no-browser", "--max-gaussians", "9")
 
 
 @needs_viewer

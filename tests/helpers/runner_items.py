@@ -68,3 +68,8 @@ def write_slowly(arguments, progress):
     with atomic_file(Path(arguments["output"])) as file:
         file.write(arguments["text"].encode())
     return {"bytes": len(arguments["text"])}
+
+
+def variables(arguments, progress):
+    """Return the variables of the environment."""
+    return {"environment": dict(os.environ)}

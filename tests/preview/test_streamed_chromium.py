@@ -126,6 +126,19 @@ def test_a_phone_and_another_scene_afterwards(server, opened):
     tab.fact("Gaussians", "100")
 
 
+def test_a_damaged_file_leaves_the_scene_as_it_is(server, city, opened):
+    """The streaming goes on behind the message."""
+    tab = opened()
+    tab.page.locator("#loading").wait_for(state="hidden")
+    tab.choose(("other.ply", b"ply\nno scene"))
+    tab.error_message("other.ply", "damaged")
+    server.gate.set()
+    settle(tab)
+    counts = json.loads((city / "lod-meta.json").read_bytes())["counts"]
+    assert facts(tab)["Gaussians drawn"] == (f"{counts[0]:,}", f"of {counts[0]:,}")
+    assert tab.page.locator("#title").inner_text() == NAME
+
+
 def test_a_small_budget(server, opened):
     """Nothing of the finest level is loaded from afar; near one end, some of its files are."""
     server.gate.set()

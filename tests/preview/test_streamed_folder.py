@@ -6,7 +6,9 @@ import threading
 from pathlib import Path
 
 import pytest
+from helpers.reference_sog import write_folder
 from helpers.small_page import FILES
+from helpers.streamed_scenes import SOG
 from helpers.viewers import scattered
 
 import kissgs
@@ -64,6 +66,24 @@ def test_links_out_of_the_folder_are_left_out(city):
     assert "0_0/quats.webp" not in found
     assert "0_1/quats.webp" not in found
     assert "0_0/sh0.webp" in found
+
+
+def test_files_out_of_reach_are_left_out(city, monkeypatch):
+    """One is a link to itself, another one in a closed folder, which is simulated, because root may read those."""
+    (city / "0_0" / "quats.webp").unlink()
+    (city / "0_0" / "quats.webp").symlink_to("quats.webp")
+    is_file = Path.is_file
+
+    def closed(path):
+        if path.name == "sh0.webp" and path.parent.name == "0_1":
+            raise PermissionError(13, "Permission denied", str(path))
+        return is_file(path)
+
+    monkeypatch.setattr(Path, "is_file", closed)
+    found = streamed_folder(city).files
+    assert "0_0/quats.webp" not in found
+    assert "0_1/sh0.webp" not in found
+    assert {"0_0/sh0.webp", "0_1/quats.webp"} <= set(found)
 
 
 def test_a_container_whose_metadata_is_damaged(city):
@@ -133,6 +153,13 @@ def test_the_level_for_a_page_of_one_file(made, city, monkeypatch):
     assert is_streamed_folder(made / "lod-meta.json")
     assert not is_streamed_folder(made / "0_0")
     assert not is_streamed_folder(Path("none"))
+
+
+def test_the_level_for_a_page_counts_the_environment(tmp_path):
+    """Levels of 60 and 30 Gaussians, and an environment of 9."""
+    sky = scattered(9, 0)
+    folder = write_folder(SOG.files([[scattered(60, 0)], [scattered(30, 0)]], environment=sky), tmp_path / "city")
+    assert [fitting_level(folder, most)[0] for most in (None, 69, 68, 39, 0)] == [0, 0, 1, 1, 1]
 
 
 def test_a_manifest_that_is_no_json(city):

@@ -8,7 +8,11 @@ import subprocess
 import pytest
 from helpers.running import item
 
-from kissgs.runners.process import ItemProcess
+import kissgs
+from kissgs.cli.compress_cluster import ClusterCompression
+from kissgs.runners import Resources, WorkItem
+from kissgs.runners.contract import NodeResources, RunnerStats, refusal_of
+from kissgs.runners.process import ItemProcess, json_lines
 
 
 @pytest.mark.parametrize(
@@ -63,3 +67,33 @@ def test_a_process_killed_before_its_start():
     process = ItemProcess(item("count", numbers=1))
     process.kill()
     assert [outcome.kind for outcome in process.events()] == ["cancelled"]
+
+
+def test_a_line_that_a_process_was_killed_in_is_no_event():
+    assert list(json_lines(['{"a": 1}\n', '{"b": 2}\n', '{"c": '])) == [{"a": 1}, {"b": 2}]
+
+
+def test_items_see_no_secrets(monkeypatch):
+    for name in ("KISSGS_KEYS", "AWS_SECRET_ACCESS_KEY", "RAY_AUTH_TOKEN", "PGPASSWORD"):
+        monkeypatch.setenv(name, "secret")
+    events = list(ItemProcess(WorkItem("helpers.runner_items:variables")).events())
+    assert "secret" not in events[-1].result["environment"].values()
+
+
+def test_a_request_is_that_of_a_node_which_has_all_of_it():
+    """The largest memory of a cluster may be that of a node without a GPU."""
+
+    class Cluster:
+        nodes = (NodeResources("a", Resources(8, 20, 1)), NodeResources("b", Resources(16, 200, 0)))
+
+        def stats(self):
+            return RunnerStats(0, 0, self.nodes)
+
+        def refusal(self, resources):
+            return refusal_of(resources, self.nodes)
+
+    chosen = ClusterCompression._with_memory
+    assert chosen(None, Cluster(), Resources(4, gpus=1), 120) == Resources(4, 20, 1)
+    assert chosen(None, Cluster(), Resources(4), 120) == Resources(4, 120, 0)
+    with pytest.raises(kissgs.UnsupportedError, match="no node has 32 CPUs"):
+        chosen(None, Cluster(), Resources(32), 120)

@@ -16,6 +16,7 @@ import kissgs
 from kissgs import Settings
 from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
 from kissgs.core.splats import concatenate
+from kissgs.io.streamed import MAX_TREE_BYTES
 from kissgs.streaming import build
 from kissgs.streaming.compress import compress_streamed
 from kissgs.streaming.levels import bounds
@@ -205,6 +206,17 @@ def test_other_files_are_never_replaced(scene, target, tmp_path):
     with pytest.raises(OutputError, match=r"town\.partial holds other files"):
         compress_streamed(scene, tmp_path / "town" / target.name, settings=FAST)
     assert [path.name for path in (tmp_path / "town.partial").iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.parametrize("problem", ["too deep", "too large"])
+def test_what_is_no_manifest_is_never_replaced(scene, target, problem):
+    deep, large = b"[" * 100_000, b'{"filenames": []}' + b" " * MAX_TREE_BYTES
+    target.parent.mkdir()
+    target.write_bytes(deep if problem == "too deep" else large)
+    size = target.stat().st_size
+    with pytest.raises(OutputError, match=f"holds other files .{target.name}"):
+        compress_streamed(scene, target, settings=FAST, overwrite=True)
+    assert target.stat().st_size == size
 
 
 def test_what_a_manifest_names_beside_its_containers_is_never_replaced(scene, target):

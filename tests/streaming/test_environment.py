@@ -10,6 +10,7 @@ from helpers.streamed_scenes import TARGETS
 
 import kissgs
 from kissgs import Settings
+from kissgs.evaluation.attributes import sigmoid
 from kissgs.streaming import build, environment
 from kissgs.streaming.compress import compress_streamed
 from kissgs.streaming.environment import FEWEST, MOST, Environment
@@ -162,3 +163,21 @@ def test_splat_transform_reads_what_is_not_in_the_environment(scene, tmp_path):
     report = compress_streamed(scene, target, settings=FAST)
     theirs = kissgs.load(convert(target, tmp_path / "0.ply", "-L", "0"))
     assert_alike(kissgs.load(target).select(slice(report.counts[0])), theirs, rtol=1e-6, atol=1e-6)
+
+
+@needs_splat_transform
+def test_splat_transform_reads_the_environment(scene, tmp_path):
+    """It writes the coarsest level and the environment as another streamed scene, with other steps of positions."""
+    target = tmp_path / "city" / "lod-meta.json"
+    report = compress_streamed(scene, target, settings=FAST)
+    coarsest = str(len(report.counts) - 1)
+    written = convert(target, tmp_path / "theirs" / "lod-meta.json", "-L", coarsest, "-i", "1", "--webp-effort", "0")
+    theirs = kissgs.load(written.parent / json.loads(written.read_bytes())["environment"])
+    ours = kissgs.load(target.parent / "environment" / "meta.json")
+    apart = np.linalg.norm(ours.means[:, None] - theirs.means, axis=2)
+    same = apart.argmin(axis=1)
+    assert sorted(same) == list(range(len(ours))) == list(range(len(theirs)))
+    assert (apart.min(axis=1) < 3e-4 * np.linalg.norm(ours.means, axis=1)).all()
+    np.testing.assert_array_equal(ours.scales, theirs.scales[same])
+    np.testing.assert_array_equal(ours.sh0, theirs.sh0[same])
+    np.testing.assert_allclose(sigmoid(ours.opacities), sigmoid(theirs.opacities[same]), atol=1 / 255)

@@ -1,13 +1,15 @@
-/** Parses manifests, plans files, and drives the store of files and the streaming of a scene by scripts; JSON out. */
+/** Parses manifests, plans files, and drives workers, the store of files and the streaming of a scene; JSON out. */
 
 import { readFileSync } from "node:fs";
 import { planFiles } from "../../web_decoder/preview/file_plan.js";
+import { Pool } from "../../web_decoder/pool.js";
 import { FileStore } from "../../web_decoder/preview/file_store.js";
 import { isManifest, parseTree } from "../../web_decoder/preview/lod_tree.js";
 import { viewOf } from "../../web_decoder/preview/coverage.js";
 import { Streaming } from "../../web_decoder/preview/streaming.js";
 
-const { manifests = [], addresses = [], plans = [], store, flight } = JSON.parse(readFileSync(0, "utf8"));
+const job = JSON.parse(readFileSync(0, "utf8"));
+const { manifests = [], addresses = [], plans = [], store, flight, pooled = [], rooms = [] } = job;
 const turn = () => new Promise((resolve) => setTimeout(resolve, 2));
 
 const trees = manifests.map((text) => {
@@ -99,9 +101,38 @@ async function fly({ manifest, budget, cameras, environmentRows = 0, short = [] 
   return states;
 }
 
+/** Decode images in a worker that answers or cannot be loaded; return how many listeners it had, and has at the end. */
+async function pool(loads) {
+  let [now, most] = [0, 0];
+  globalThis.Worker = class extends EventTarget {
+    addEventListener(...own) {
+      super.addEventListener(...own);
+      most = Math.max(most, ++now);
+    }
+    removeEventListener(...own) {
+      super.removeEventListener(...own);
+      now--;
+    }
+    postMessage({ task, port }) {
+      if (loads) setTimeout(() => port.postMessage({ plane: { file: task.file } }));
+      else setTimeout(() => this.dispatchEvent(new Event("error")));
+    }
+    terminate() {}
+  };
+  const workers = new Pool(1);
+  const tasks = ["a", "b", "c"].map((file) => ({ file, bytes: new Uint8Array(9), pixels: 1, width: 128, height: 128 }));
+  const ends = await Promise.allSettled(tasks.map((task) => workers.decode(task)));
+  workers.close();
+  return { ends: ends.map(({ value, reason }) => value?.file ?? reason.message.slice(0, 2)), most, now };
+}
+
+const pools = [];
+for (const loads of pooled) pools.push(await pool(loads)); // one stub after the other
 const done = {
+  pools,
   trees,
   planned,
+  rooms: rooms.map((text) => new Streaming(parseTree(new TextEncoder().encode(text)), { budget: 1 }).room),
   streamed: addresses.map(isManifest),
   states: store && (await drive(store)),
   flown: flight && (await fly(flight)),

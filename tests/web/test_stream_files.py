@@ -60,9 +60,12 @@ LEAF = ("tree", "children", 0)
         (("filenames",), None, "names no files"),
         *(
             (("filenames", 0), name, "not below its folder")
-            for name in ("../a", "/a", "https://x/a", "a/../b", 5, "a\\b")
+            for name in ("../a", "/a", "https://x/a", "a/../b", 5, "a\\b", " ../a", "a/.. ", "a/.\t./.\n./b")
         ),
         (("environment",), "../sky", "not below its folder"),
+        (("filenames", 0), "1_0/meta.json", "names a file twice"),
+        (("filenames",), ["a", "\ud800", "\ud801"], "names a file twice"),
+        (("environment",), "0_0/meta.json", "names a file twice"),
         (("tree",), None, "none"),
         (("tree", "children"), [], "no leaves"),
         (LEAF, 5, "none"),
@@ -72,6 +75,7 @@ LEAF = ("tree", "children", 0)
         ((*LEAF, "lods", "0", "file"), 3, "levels are unclear"),
         ((*LEAF, "lods", "0", "count"), -1, "levels are unclear"),
         ((*LEAF, "lods", "0"), None, "levels are unclear"),
+        ((*LEAF, "lods", "0", "offset"), 2**50, "more rows than a file may have"),
     ],
 )
 def test_damaged_manifests(path, value, why):
@@ -82,6 +86,15 @@ def test_damaged_manifests(path, value, why):
     (found,) = ask(manifests=[json.dumps(document)])["trees"]
     assert why in found["error"]
     assert found["error"].startswith("The list of this scene's files is damaged: ")
+
+
+def test_a_manifest_of_very_many_leaves_and_files():
+    """The whole is one flat list of leaves, each with its own file."""
+    count = 200_000
+    leaves = [{"bound": GOOD["tree"]["children"][0]["bound"], "lods": {"0": {"file": n, "offset": 0, "count": 1}}}
+              for n in range(count)]  # fmt: skip
+    document = {"lodLevels": 1, "filenames": [f"{n}" for n in range(count)], "tree": {"children": leaves}}
+    assert ask(rooms=[json.dumps(document)])["rooms"] == [count + 1]
 
 
 def test_what_is_no_manifest():
@@ -179,6 +192,22 @@ def test_the_store_of_files():
     assert [state["held"] for state in states][5:7] == [[0, 1, 3], [0, 3]]
     assert states[-1]["idle"]
     assert states[-1]["held"] == [0, 3]
+
+
+def test_a_failure_before_a_success_is_forgotten():
+    """A file fails, arrives, makes room for another one, and fails again: it is asked for once more."""
+    steps = [{"want": [0]}, {"fail": 0}, {"want": [0]}, {"arrive": 0}, {"want": [1]}, {"arrive": 1}]
+    steps += [{"want": [0]}, {"fail": 0}, {"want": [0]}, {"arrive": 0}]
+    states = ask(store={"sizes": [5, 5], "room": 5, "most": 1, "steps": steps})["states"]
+    assert [state["log"] for state in states[6:]] == [["load 0"], ["changed"], ["load 0"], ["changed"]]
+    assert states[-1]["held"] == [0]
+
+
+def test_workers_keep_nothing_of_their_tasks():
+    """Each task has a listener while it runs; afterwards there is none, whether the worker answers or fails."""
+    good, broken = ask(pooled=[True, False])["pools"]
+    assert good == {"ends": ["a", "b", "c"], "most": 3, "now": 0}
+    assert broken == {"ends": ["a:", "b:", "c:"], "most": 3, "now": 0}
 
 
 def camera(eye, width=200, height=100, focal=100.0):

@@ -8,7 +8,8 @@ from helpers.viewers import chromium, opened, scattered, seen_from
 
 import kissgs
 from kissgs import Settings
-from kissgs.streaming import build
+from kissgs.core.splats import concatenate
+from kissgs.streaming import build, environment
 from kissgs.streaming.compress import compress_streamed
 
 FIRST_IMAGE_BYTES = 1_000_000
@@ -47,6 +48,32 @@ def test_each_level_is_drawn_whole(playcanvas, tmp_path, monkeypatch):
         log.info("level %d: %s dB to kissgs.render", level, ", ".join(f"{value:.1f}" for value in reached))
         assert min(reached) > TO_RASTERISER
         assert all(psnr(image[:, ::-1], image) < 30 for image in wanted)
+
+
+def with_sky(scene):
+    """Return a scene with 300 large Gaussians all around it, far away."""
+    sky = scattered(300, 2)
+    sky.means[:] = 20 * sky.means / np.linalg.norm(sky.means, axis=1, keepdims=True)
+    sky.scales[:] += 3
+    return concatenate([scene, sky])
+
+
+def test_the_environment_is_drawn_at_every_level(playcanvas, tmp_path, monkeypatch):
+    for name, value in {"CHUNK": 400, "LEAF": 80, "COARSEST": 200}.items():
+        monkeypatch.setattr(build, name, value)
+    monkeypatch.setattr(environment, "FEWEST", 100)
+    viewer, site = playcanvas
+    source, url = streamed(with_sky(scattered(1000, 2)), tmp_path, site)
+    assert any(path.endswith("environment/meta.json") for path in site.files)
+    view = seen_from((1.2, -1.2, -4.2), (300, 200))
+    for level in (0, 2):
+        scene = kissgs.load(source, level=level)
+        town = scene.select(np.linalg.norm(scene.means, axis=1) < 5)
+        whole, without = (np.clip(kissgs.render(each, view)[0], 0, 1) for each in (scene, town))
+        (drawn,) = viewer.draw_level(url, level, [view])
+        log.info("level %d: %.1f dB, without the environment %.1f dB", level, psnr(drawn, whole), psnr(drawn, without))
+        assert psnr(drawn, whole) > TO_RASTERISER
+        assert psnr(whole, without) < 20
 
 
 def test_the_first_image_needs_less_than_a_megabyte(playcanvas, tmp_path):

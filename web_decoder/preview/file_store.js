@@ -8,7 +8,7 @@ export class FileStore {
   #held = new Map();
   /** @type {Map<number, AbortController>} */
   #loading = new Map();
-  /** Number of failures of each file. @type {Map<number, number>} */
+  /** Number of failures of each file since it was loaded last. @type {Map<number, number>} */
   #failures = new Map();
   #closed = false;
 
@@ -105,6 +105,7 @@ export class FileStore {
       const content = await this.options.load(file, stop.signal);
       if (!current()) return;
       this.#held.set(file, content);
+      this.#failures.delete(file);
     } catch (error) {
       if (!current()) return;
       this.#failures.set(file, (this.#failures.get(file) ?? 0) + 1);

@@ -16,6 +16,9 @@ import { UserError } from "./problem.js";
 
 const MAX_LEVELS = 64;
 
+/** Files with more rows are refused: encoders of streamed scenes write some 500,000. */
+export const MAX_FILE_GAUSSIANS = 10_000_000;
+
 /** Whether an address is that of a manifest, not of a container. @param {string} address */
 export const isManifest = (address) => /\/(lod-meta|levels)\.json([?#]|$)/.test(address);
 
@@ -28,9 +31,18 @@ const isWhole = (/** @type {unknown} */ value) => Number.isSafeInteger(value) &&
 const isPoint = (/** @type {unknown} */ value) =>
   Array.isArray(value) && value.length === 3 && value.every(Number.isFinite);
 
-/** Whether a name is a path below the manifest's folder: no other site, no folder above. @param {unknown} name */
+/**
+ * Whether a name is a path below the manifest's folder: no other site, no folder above. Addresses lose spaces at their
+ * ends and control characters, which may hide a folder above.
+ * @param {unknown} name
+ */
 const isBelow = (name) =>
-  typeof name === "string" && /^(?!\.{1,2}(\/|$))[^/\\:?#%]+(\/(?!\.{1,2}(\/|$))[^/\\:?#%]+)*$/.test(name);
+  typeof name === "string" &&
+  name === name.trim() &&
+  /^(?!\.{1,2}(\/|$))[^/\\:?#%\p{Cc}]+(\/(?!\.{1,2}(\/|$))[^/\\:?#%\p{Cc}]+)*$/u.test(name);
+
+/** Whether two names lead to the same file. @param {string[]} names */
+const isRepeated = (names) => new Set(names.map((name) => new URL(name, "http://x/").href)).size < names.length;
 
 /**
  * @param {Uint8Array} json
@@ -44,12 +56,14 @@ export function parseTree(json) {
   const files = Array.isArray(filenames) ? [...filenames] : fail("it names no files");
   if (environment ?? null) files.push(environment);
   if (!files.every(isBelow)) fail("it names a file that is not below its folder");
+  if (isRepeated(files)) fail("it names a file twice");
   const rows = files.map(() => 0);
   const leaves = leavesOf(tree).map((node) => {
     const { min: low, max: high } = node.bound ?? {};
     if (!isPoint(low) || !isPoint(high)) fail("a leaf has no bounds");
     const own = levelsOf(node, levels, filenames.length);
     for (const { file, offset, count } of own) rows[file] = Math.max(rows[file], offset + count);
+    if (own.some(({ file }) => rows[file] > MAX_FILE_GAUSSIANS)) fail("a leaf names more rows than a file may have");
     return { low, high, levels: own };
   });
   const filled = leaves.filter((leaf) => leaf.levels.length);
@@ -77,7 +91,7 @@ function leavesOf(tree) {
     const node = waiting.pop();
     if (typeof node !== "object" || node === null) fail("its tree has a node that is none");
     if (node.lods) leaves.push(/** @type {never} */ (node));
-    else if (Array.isArray(node.children)) waiting.push(...[...node.children].reverse());
+    else if (Array.isArray(node.children)) for (const child of [...node.children].reverse()) waiting.push(child);
   }
   return leaves;
 }

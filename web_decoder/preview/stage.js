@@ -111,8 +111,8 @@ export function stage(failed) {
     /** @param {import("./file_types.js").FileType} type @param {Uint8Array} bytes */
     async showFile(type, bytes) {
       const { viewer } = await ready;
+      const count = await viewer.setFile(type, bytes); // the former scene goes on if this fails
       endFormer();
-      const count = await viewer.setFile(type, bytes);
       reveal(true);
       return count;
     },

@@ -3,6 +3,7 @@
 import { Pool } from "../pool.js";
 import { collect } from "../zip.js";
 import { decode } from "./decode.js";
+import { MAX_FILE_GAUSSIANS } from "./lod_tree.js";
 import { UserError } from "./problem.js";
 import { get } from "./sources.js";
 
@@ -10,9 +11,6 @@ import { get } from "./sources.js";
 
 /** Largest manifest; one of a thousand leaves and ten levels takes 700 kB. */
 const MAX_MANIFEST_BYTES = 1 << 25;
-
-/** Files with more rows are refused: encoders of streamed scenes write some 500,000. */
-const MAX_FILE_GAUSSIANS = 10_000_000;
 
 /** Files of one scene, decoded in workers that they share. */
 export class StreamedFiles {

@@ -53,7 +53,10 @@ export class Streaming {
     /** Files that are always held: those of the coarsest levels, and the environment. */
     this.base = [...new Set(this.levels.map(([coarsest]) => coarsest.file))];
     if (environment !== null) this.base.push(environment);
-    this.room = Math.max(HELD_PER_DRAWN * budget, this.#rowsOf(this.base) + Math.max(...rows));
+    this.room = Math.max(
+      HELD_PER_DRAWN * budget,
+      this.#rowsOf(this.base) + rows.reduce((most, own) => Math.max(most, own), 0),
+    );
     this.store = new FileStore({
       ...{ sizes: rows, room: this.room, most: FILES_AT_ONCE, failed },
       load: (file, signal) => load(file, signal).then((content) => this.#checked(file, content)),
