@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -26,18 +24,10 @@ from kissgs.cli.arguments import (
     SetOption,
     ThreadsOption,
 )
-from kissgs.cli.compact import CHECKPOINT
-from kissgs.cli.console import progress_bar
-from kissgs.cli.files import for_each_input, show, sibling, source, write_stdout
-from kissgs.cli.interrupts import say_when_interrupted
+from kissgs.cli.files import for_each_input
 from kissgs.cli.options import budget_of, chosen, device_of, open_views
-from kissgs.cli.signals import stoppable
 from kissgs.core.errors import UnsupportedError
 from kissgs.io.container_names import named_manifest
-
-if TYPE_CHECKING:
-    from kissgs.pipeline.read_options import ReadOptions
-    from kissgs.settings import Settings
 
 
 def compress(
@@ -121,150 +111,53 @@ def compress(
     quiet: QuietOption = False,
 ) -> None:
     """Compress each scene into a SOG-XT container, into SOG, or into a folder with levels of detail."""
+    from kissgs.cli.compress_options import CompressOptions
     from kissgs.io.container_names import ending_of, named_container
-    from kissgs.pipeline.pipeline import compress as run
     from kissgs.pipeline.read_options import ReadOptions
-    from kissgs.training.checkpoint import delete_checkpoints
 
     kind = named_container(container, output)
     reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes)
-    budget = None if compact is None else budget_of(compact)
     settings = chosen(
         preset,
         changes,
-        budget=budget,
+        budget=None if compact is None else budget_of(compact),
         finetune=finetune,
         seed=seed,
         psnr=psnr,
         target_size=target_size,
         max_psnr_drop=max_psnr_drop,
     )
-    if not (settings.compact.enabled or settings.finetune.enabled) and (checkpoint or device != "cpu"):
+    trains = settings.compact.enabled or settings.finetune.enabled
+    if not trains and (checkpoint or device != "cpu"):
         raise UnsupportedError("--checkpoint and --device only apply to training: add --compact or --finetune")
-    renders = evaluate or settings.encode.rate_distortion or settings.compact.enabled or settings.finetune.enabled
     capture, training_device = open_views(views), device_of(device)
-    if views is not None and not renders and not quiet:
+    if views is not None and not (evaluate or settings.encode.rate_distortion or trains or quiet):
         sys.stderr.write(f"kissgs: --views has no effect: the preset {preset} renders no images; add --evaluate\n")
-
-    manifest = None if output is None else named_manifest(output)
-    if manifest is not None:
-        unused = {
-            "--views": views,
-            "--evaluate": evaluate,
-            "--cache": cache,
-            "--container": container,
-            "--unpacked": unpacked,
-        }
-        if wrong := next((name for name, value in unused.items() if value), None):
-            raise UnsupportedError(f"levels of detail ({manifest.name}) are made without {wrong}")
-        for_each_input(
-            scenes,
-            manifest,
-            ".json",
-            as_json,
-            partial(_streamed, settings, reading, force, ray, threads, quiet or as_json),
-        )
-        return
-
+    options = CompressOptions(
+        settings=settings,
+        reading=reading,
+        container=kind,
+        cache=cache,
+        evaluate=evaluate,
+        views=views,
+        checkpoint=checkpoint,
+        force=force,
+        threads=threads,
+        device=training_device,
+        quiet=quiet or as_json,
+    )
     ending = "" if unpacked else ending_of(kind)
-    if ray is not None:
+    if output is not None and (manifest := named_manifest(output)) is not None:
+        from kissgs.cli.compress_streamed import compress_streamed, refuse_options
+
+        refuse_options(manifest, options, container=container, unpacked=unpacked)
+        for_each_input(scenes, manifest, ".json", as_json, partial(compress_streamed, options, ray))
+    elif ray is not None:
         from kissgs.cli.compress_cluster import ClusterCompression
 
-        with ClusterCompression(
-            address=ray,
-            settings=settings,
-            reading=reading,
-            container=kind,
-            cache=cache,
-            evaluate=evaluate,
-            views=views,
-            checkpoint=checkpoint,
-            force=force,
-            threads=threads,
-            device=training_device,
-            quiet=quiet or as_json,
-        ) as cluster:
+        with ClusterCompression(ray, options) as cluster:
             for_each_input(scenes, output, ending, as_json, cluster.result, before=cluster.submit)
-        return
+    else:
+        from kissgs.cli.compress_here import compress_here
 
-    def work(scene: str, target: Path) -> dict[str, Any]:
-        piped = str(target) == "-"
-        with progress_bar(quiet or as_json) as bar, stoppable(bar, settings.searches) as progress:
-            if evaluate:  # reported here, because evaluation reports only one stage
-                from kissgs.rendering.rasterizer import load_kernels
-
-                load_kernels(progress)
-            result = run(
-                source(scene),
-                None if piped else target,
-                settings=settings,
-                reading=reading,
-                container=kind,
-                cache=sibling(scene, ".sensitivity.npz") if cache else None,
-                evaluate=evaluate,
-                views=capture,
-                checkpoint=sibling(scene, CHECKPOINT) if checkpoint else None,
-                overwrite=force,
-                threads=threads,
-                device=training_device,
-                progress=progress,
-            )
-        if piped:
-            write_stdout(result.to_zip())
-            delete_checkpoints(*result.checkpoints)
-        elif not (quiet or as_json):
-            from kissgs.cli.tables import report_table
-
-            show(report_table(result.report, str(target)))
-        return result.report.as_dict()
-
-    for_each_input(scenes, output, ending, as_json, work)
-
-
-def _streamed(
-    settings: Settings,
-    reading: ReadOptions,
-    force: bool,
-    ray: str | None,
-    threads: int,
-    quiet: bool,
-    scene: str,
-    target: Path,
-) -> dict[str, Any]:
-    """Compress one scene into a streamed scene."""
-    if scene == "-":
-        raise UnsupportedError("levels of detail need a file: it is read more than once")
-    with progress_bar(quiet) as bar, contextlib.ExitStack() as ending:
-
-        def progress(stage: str, fraction: float, note: str = "") -> None:
-            if stage == "scratch" and not quiet:
-                sys.stderr.write(f"kissgs: {note}\n")
-            if stage in ("merge", "cameras", "images"):  # what is interrupted earlier begins anew
-                say_when_interrupted("the same command goes on where it was")
-            bar(stage, fraction, note)
-
-        progress("kernels", 0.0)
-        from kissgs.streaming.compress import compress_streamed
-
-        runner = None
-        if ray is not None:
-            from kissgs.runners import open_runner
-
-            progress("cluster", 0.0)
-            runner = open_runner("ray", ray)
-            ending.callback(runner.close)
-        report = compress_streamed(
-            scene,
-            target,
-            settings=settings,
-            reading=reading,
-            overwrite=force,
-            runner=runner,
-            threads=threads,
-            progress=progress,
-        )
-    if not quiet:
-        from kissgs.cli.tables import streamed_table
-
-        show(streamed_table(report, str(target)))
-    return asdict(report)
+        for_each_input(scenes, output, ending, as_json, partial(compress_here, options, capture))

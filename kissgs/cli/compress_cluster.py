@@ -9,7 +9,7 @@ import shutil
 import sys
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from kissgs.cli.compact import CHECKPOINT
 from kissgs.cli.console import output, progress_bar
@@ -22,9 +22,7 @@ from kissgs.runners import INTERNAL, Outcome, Resources, RunHandle, Runner, Work
 from kissgs.sogxt.container import check_destination
 
 if TYPE_CHECKING:
-    from kissgs.io.container_names import ContainerName
-    from kissgs.pipeline.read_options import ReadOptions
-    from kissgs.settings import Settings
+    from kissgs.cli.compress_options import CompressOptions
 
 PROCESS_BYTES = 500_000_000
 """Memory that a scene of any size needs, bytes: mostly the libraries."""
@@ -42,21 +40,13 @@ class ClusterCompression:
     its output, and the result is moved from there when its outcome has arrived: a node may be lost at any moment, and
     nothing is written twice or in part.
 
-    Attributes: those options of the command that concern one scene, and the address of the cluster.
+    Attributes:
+        address: address of the cluster.
+        options: the command's options.
     """
 
     address: str
-    settings: Settings
-    reading: ReadOptions
-    container: ContainerName
-    cache: bool
-    evaluate: bool
-    views: Path | None
-    checkpoint: bool
-    force: bool
-    threads: int
-    device: Literal["cpu", "cuda"]
-    quiet: bool
+    options: CompressOptions
     _runner: Runner | None = None
     _handles: dict[Path, RunHandle | KissgsError] = field(default_factory=dict)
     _work: dict[Path, Path] = field(default_factory=dict)
@@ -82,7 +72,7 @@ class ClusterCompression:
         """
         if any("-" in (name, str(target)) for name, target in inputs):
             raise UnsupportedError("--ray needs files that all machines see, not standard input or output")
-        with progress_bar(self.quiet) as bar:
+        with progress_bar(self.options.quiet) as bar:
             bar("cluster", 0.0)
             self._runner = open_runner("ray", self.address)
         requested = self._request(self._runner, len(inputs))
@@ -101,14 +91,14 @@ class ClusterCompression:
         handle = self._handles[target]
         if isinstance(handle, KissgsError):
             raise handle
-        with progress_bar(self.quiet) as self._bar:
+        with progress_bar(self.options.quiet) as self._bar:
             outcome = handle.outcome.result()
         self._bar = silent
         if outcome.kind != "done":
             raise self._error(outcome, target)
-        check_destination(target, overwrite=self.force)
+        check_destination(target, overwrite=self.options.force)
         move_into_place(Path(outcome.result["written"]), target)
-        if not self.quiet:
+        if not self.options.quiet:
             from rich.text import Text
 
             show(Text.from_ansi(outcome.result["table"]))
@@ -122,13 +112,15 @@ class ClusterCompression:
         """
         stats = runner.stats()
         share = min(stats.smallest_cpus, stats.cpus // count)
-        requested = Resources(self.threads or max(1, int(share)), gpus=1 if self.device == "cuda" else 0)
+        cpus = self.options.threads or max(1, int(share))
+        requested = Resources(cpus, gpus=1 if self.options.device == "cuda" else 0)
         if refusal := runner.refusal(requested):
             raise UnsupportedError(f"{refusal}; choose another number with --threads, or --device cpu")
         return requested
 
     def _submit(self, runner: Runner, name: str, target: Path, requested: Resources) -> RunHandle:
-        check_destination(target, overwrite=self.force)
+        options = self.options
+        check_destination(target, overwrite=options.force)
         scene = Path(name).absolute()
         if not scene.is_dir():  # here, because a node would say of a missing file that it does not see it
             with open_scene_file(Path(name)):
@@ -142,15 +134,15 @@ class ClusterCompression:
             "bytes": size,
             "work": str(work.absolute()),
             "target": str(target),
-            "settings": self.settings.model_dump(mode="json"),
-            "reading": asdict(self.reading),
-            "container": self.container,
-            "cache": str(sibling(name, ".sensitivity.npz")) if self.cache else None,
-            "evaluate": self.evaluate,
-            "views": None if self.views is None else str(self.views.absolute()),
-            "checkpoint": str(sibling(name, CHECKPOINT)) if self.checkpoint else None,
+            "settings": options.settings.model_dump(mode="json"),
+            "reading": asdict(options.reading),
+            "container": options.container,
+            "cache": str(sibling(name, ".sensitivity.npz")) if options.cache else None,
+            "evaluate": options.evaluate,
+            "views": None if options.views is None else str(options.views.absolute()),
+            "checkpoint": str(sibling(name, CHECKPOINT)) if options.checkpoint else None,
             "threads": int(requested.cpus),
-            "device": self.device,
+            "device": options.device,
             "width": console.width,
             "color": console.is_terminal,
         }
@@ -178,7 +170,7 @@ class ClusterCompression:
 
     def _memory(self, scene: Path, size: int) -> int:
         """Return an estimate of the memory that a scene needs, bytes."""
-        trains = self.settings.compact.enabled or self.settings.finetune.enabled
+        trains = self.options.settings.compact.enabled or self.options.settings.finetune.enabled
         plain = size if scene.suffix.lower() == ".ply" else PACKED_RATIO * size
         return PROCESS_BYTES + (TRAINING_RATIO if trains else MEMORY_RATIO) * plain
 

@@ -1,0 +1,98 @@
+"""``compress_streamed``: ``kissgs compress -o FOLDER/lod-meta.json`` of one scene, into levels of detail."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from kissgs.cli.console import progress_bar
+from kissgs.cli.files import show
+from kissgs.cli.interrupts import say_when_interrupted
+from kissgs.core.errors import UnsupportedError
+from kissgs.core.progress import Progress
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from kissgs.cli.compress_options import CompressOptions
+
+
+def refuse_options(manifest: Path, options: CompressOptions, *, container: str | None, unpacked: bool) -> None:
+    """Raise UnsupportedError for options that levels of detail do not have.
+
+    Args:
+        manifest: path of the manifest to write.
+        options: the command's options.
+        container: value of ``--container``; None if not given.
+        unpacked: whether ``--unpacked`` was given.
+    """
+    unused = {
+        "--views": options.views,
+        "--evaluate": options.evaluate,
+        "--cache": options.cache,
+        "--container": container,
+        "--unpacked": unpacked,
+    }
+    if wrong := next((name for name, value in unused.items() if value), None):
+        raise UnsupportedError(f"levels of detail ({manifest.name}) are made without {wrong}")
+
+
+def compress_streamed(options: CompressOptions, ray: str | None, scene: str, target: Path) -> dict[str, Any]:
+    """Compress a scene into a streamed scene, show a table of the result and return its report.
+
+    Args:
+        options: the command's options.
+        ray: address of a Ray cluster that does the work; None for this machine.
+        scene: path of the scene.
+        target: path of the manifest.
+
+    Raises:
+        UnsupportedError: the scene is standard input.
+        KissgsError: as :func:`kissgs.compress_streamed`, or the cluster cannot be reached.
+    """
+    if scene == "-":
+        raise UnsupportedError("levels of detail need a file: it is read more than once")
+    with _stages(options.quiet) as progress, contextlib.ExitStack() as ending:
+        progress("kernels", 0.0)
+        from kissgs.streaming.compress import compress_streamed as run
+
+        runner = None
+        if ray is not None:
+            from kissgs.runners import open_runner
+
+            progress("cluster", 0.0)
+            runner = open_runner("ray", ray)
+            ending.callback(runner.close)
+        report = run(
+            scene,
+            target,
+            settings=options.settings,
+            reading=options.reading,
+            overwrite=options.force,
+            runner=runner,
+            threads=options.threads,
+            progress=progress,
+        )
+    if not options.quiet:
+        from kissgs.cli.tables import streamed_table
+
+        show(streamed_table(report, str(target)))
+    return asdict(report)
+
+
+@contextlib.contextmanager
+def _stages(quiet: bool) -> Iterator[Progress]:
+    """Yield a receiver of progress that announces the scratch folder, and says what an interruption leaves."""
+    with progress_bar(quiet) as bar:
+
+        def receive(stage: str, fraction: float, note: str = "") -> None:
+            if stage == "scratch" and not quiet:
+                sys.stderr.write(f"kissgs: {note}\n")
+            if stage in ("merge", "cameras", "images"):  # what is interrupted earlier begins anew
+                say_when_interrupted("the same command goes on where it was")
+            bar(stage, fraction, note)
+
+        yield receive
