@@ -19,7 +19,7 @@ from kissgs.cli.arguments import (
     ThreadsOption,
 )
 from kissgs.cli.files import for_each_input, show, sibling, source, stdout
-from kissgs.cli.options import chosen, count_of, device_of, open_views, share_of
+from kissgs.cli.options import chosen, count_of, device_of, open_views, refuse_without_training, share_of
 from kissgs.core.errors import UnsupportedError
 
 CHECKPOINT = ".checkpoint.npz"
@@ -108,6 +108,7 @@ def compact(
         raise UnsupportedError(
             "missing the number of Gaussians to keep: give -n 200k, --ratio 0.2 or --max-psnr-drop 0.2"
         )
+    refuse_without_training(settings, checkpoint=checkpoint, device=device)
     if output is None:
         raise UnsupportedError("missing -o: by default the output would overwrite the input")
     reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes)

@@ -25,8 +25,7 @@ from kissgs.cli.arguments import (
     ThreadsOption,
 )
 from kissgs.cli.files import for_each_input
-from kissgs.cli.options import budget_of, chosen, device_of, open_views
-from kissgs.core.errors import UnsupportedError
+from kissgs.cli.options import budget_of, chosen, device_of, open_views, refuse_without_training
 from kissgs.io.container_names import named_manifest
 
 
@@ -127,11 +126,10 @@ def compress(
         target_size=target_size,
         max_psnr_drop=max_psnr_drop,
     )
-    trains = settings.compact.enabled or settings.finetune.enabled
-    if not trains and (checkpoint or device != "cpu"):
-        raise UnsupportedError("--checkpoint and --device only apply to training: add --compact or --finetune")
+    refuse_without_training(settings, checkpoint=checkpoint, device=device)
+    renders = evaluate or settings.encode.rate_distortion or settings.compact.enabled or settings.finetune.enabled
     capture, training_device = open_views(views), device_of(device)
-    if views is not None and not (evaluate or settings.encode.rate_distortion or trains or quiet):
+    if views is not None and not renders and not quiet:
         sys.stderr.write(f"kissgs: --views has no effect: the preset {preset} renders no images; add --evaluate\n")
     options = CompressOptions(
         settings=settings,

@@ -157,6 +157,23 @@ def device_of(name: str) -> Literal["cpu", "cuda"]:
     return cast(Literal["cpu", "cuda"], choice("--device", name, Literal["cpu", "cuda"]))
 
 
+def refuse_without_training(settings: Settings, *, checkpoint: bool, device: str) -> None:
+    """Raise UnsupportedError if ``--checkpoint`` or ``--device`` is given where nothing could train.
+
+    Args:
+        settings: the settings of the command.
+        checkpoint: whether ``--checkpoint`` was given.
+        device: value of ``--device``.
+    """
+    prunes = settings.compact.enabled and settings.compact.method == "prune"
+    if prunes or settings.finetune.enabled or not (checkpoint or device != "cpu"):
+        return
+    remedy = "leave them out, the method merge does not train"
+    if not settings.compact.enabled:
+        remedy = "add --compact or --finetune"
+    raise UnsupportedError(f"--checkpoint and --device only apply to training: {remedy}")
+
+
 def choice(option: str, value: str, allowed: Any) -> str:  # noqa: ANN401  a Literal has no type of its own
     """Check that the value of an option is one of ``allowed``, a Literal."""
     names = get_args(allowed)

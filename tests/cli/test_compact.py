@@ -159,6 +159,9 @@ def test_ctrl_c_leaves_a_checkpoint_to_resume_from(tmp_path: Path, tmp_path_fact
     assert same(kissgs.load(target), kissgs.clean(whole.splats)[0])
 
 
+MERGE = ["-n", "9", "-o", "b.ply", "--method", "merge"]
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
@@ -176,6 +179,11 @@ def test_ctrl_c_leaves_a_checkpoint_to_resume_from(tmp_path: Path, tmp_path_fact
         (["-n", "9", "-o", "b.zip/"], "b.zip"),
         (["--max-psnr-drop", "1", "-o", "b.ply", "--checkpoint"], "keeps no checkpoint"),
         (["-n", "9", "-o", "b.ply", "--device", "tpu"], "--device tpu: choose cpu or cuda"),
+        (
+            [*MERGE, "--checkpoint"],
+            "--checkpoint and --device only apply to training: leave them out, the method merge",
+        ),
+        ([*MERGE, "--device", "cuda"], "--checkpoint and --device only apply to training: leave them out"),
     ],
 )
 def test_impossible_requests_are_refused(folder: Path, tmp_path: Path, words: list[str], sentence: str) -> None:
@@ -190,6 +198,8 @@ def test_options_of_training_need_training(folder: Path, tmp_path: Path) -> None
         assert "add --compact or --finetune" in failure(
             "compress", folder / "a.ply", "-o", "b.zip", *word, cwd=tmp_path
         )
+        merging = ["--compact", "20%", "--set", "compact.method=merge", "-o", "b.zip"]
+        assert "the method merge does not train" in failure("compress", folder / "a.ply", *merging, *word, cwd=tmp_path)
 
 
 def test_a_pipe_leaves_no_checkpoint(folder: Path, tmp_path: Path) -> None:
