@@ -153,8 +153,8 @@ def compress(
     elif ray is not None:
         from kissgs.cli.compress_cluster import ClusterCompression
 
-        with ClusterCompression(ray, options) as cluster:
-            for_each_input(scenes, output, ending, as_json, cluster.result, before=cluster.submit)
+        cluster = ClusterCompression(ray, options)
+        for_each_input(scenes, output, ending, as_json, cluster.result, during=cluster.submitted)
     else:
         from kissgs.cli.compress_here import compress_here
 

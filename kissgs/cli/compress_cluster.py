@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import re
 import shutil
 import sys
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 from kissgs.cli.compact import CHECKPOINT
 from kissgs.cli.console import output, progress_bar
@@ -34,7 +36,7 @@ compressed formats are smaller than that. Measured: docs/benchmarks.md, "Seconds
 
 @dataclass
 class ClusterCompression:
-    """Compression of several scenes, for use as a context manager; its end cancels what has not ended.
+    """Compression of several scenes: :meth:`submitted` begins it, and :meth:`result` awaits each scene.
 
     All scenes are submitted at once, and their results are awaited in order. An item writes below a work folder beside
     its output, and the result is moved from there when its outcome has arrived: a node may be lost at any moment, and
@@ -47,24 +49,15 @@ class ClusterCompression:
 
     address: str
     options: CompressOptions
-    _runner: Runner | None = None
     _handles: dict[Path, RunHandle | KissgsError] = field(default_factory=dict)
     _work: dict[Path, Path] = field(default_factory=dict)
     _bar: Progress = silent
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        try:
-            if self._runner is not None:
-                self._runner.close()
-        finally:
-            for work in self._work.values():
-                shutil.rmtree(work, ignore_errors=True)
-
-    def submit(self, inputs: list[tuple[str, Path]]) -> None:
+    @contextlib.contextmanager
+    def submitted(self, inputs: list[tuple[str, Path]]) -> Iterator[None]:
         """Connect to the cluster and submit all scenes, given each with the path of its output.
+
+        The end of the context cancels what has not ended.
 
         Raises:
             UnsupportedError: an input or output has no path, or no node has the resources.
@@ -74,13 +67,21 @@ class ClusterCompression:
             raise UnsupportedError("--ray needs files that all machines see, not standard input or output")
         with progress_bar(self.options.quiet) as bar:
             bar("cluster", 0.0)
-            self._runner = open_runner("ray", self.address)
-        requested = self._request(self._runner, len(inputs))
-        for name, target in inputs:
+            runner = open_runner("ray", self.address)
+        try:
+            requested = self._request(runner, len(inputs))
+            for name, target in inputs:
+                try:
+                    self._handles[target] = self._submit(runner, name, target, requested)
+                except (KissgsError, OSError) as error:  # the command itself reports inputs that cannot be read
+                    self._handles[target] = error if isinstance(error, KissgsError) else OutputError(str(error))
+            yield
+        finally:
             try:
-                self._handles[target] = self._submit(self._runner, name, target, requested)
-            except (KissgsError, OSError) as error:  # the command itself reports inputs that cannot be read
-                self._handles[target] = error if isinstance(error, KissgsError) else OutputError(str(error))
+                runner.close()
+            finally:
+                for work in self._work.values():
+                    shutil.rmtree(work, ignore_errors=True)
 
     def result(self, name: str, target: Path) -> dict[str, Any]:
         """Wait for the result of one scene, move it to its place, show its table and return its report.

@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,9 +32,11 @@ def for_each_input(
     *,
     writes: bool = True,
     unreadable: type[KissgsError] = InvalidSceneError,
-    before: Callable[[list[tuple[str, Path]]], None] | None = None,
+    during: Callable[[list[tuple[str, Path]]], AbstractContextManager[object]] | None = None,
 ) -> None:
     """Call ``work`` for every input. If one of several fails, the others are still processed; the exit code is then 2.
+
+    A folder that is made for the outputs is removed again if it is empty at the end, because all inputs failed.
 
     Args:
         names: inputs as given: paths, patterns or "-".
@@ -43,22 +46,38 @@ def for_each_input(
         work: processes one input, given the path of its output, and returns the report.
         writes: whether the command writes outputs.
         unreadable: error class for an input that cannot be read.
-        before: receives all inputs and outputs before the first call of ``work``.
+        during: receives all inputs and outputs; its context is entered before the first call of ``work``, and left
+            after the last one.
     """
     inputs = expand(names)
     if writes and as_json and str(output) == "-":
         raise OutputError("--json and -o - both write to standard output; choose one")
     targets = _targets(inputs, output, suffix) if writes else [Path("-")] * len(inputs)
-    if before is not None:
-        before(list(zip(inputs, targets, strict=True)))
-    if len(inputs) == 1:
+    pairs = list(zip(inputs, targets, strict=True))
+    with contextlib.ExitStack() as ending:
+        if writes and output is not None and output not in targets:
+            ending.enter_context(_folder(output))
+        if during is not None:
+            ending.enter_context(during(pairs))
+        if len(pairs) > 1:
+            _each(pairs, writes, as_json, work, unreadable)
+            return
         check_input(inputs[0], unreadable)
-        report = work(inputs[0], targets[0])
+        report = work(*pairs[0])
         if as_json:
-            print_json(_entry(inputs[0], targets[0], writes, report))
-        return
+            print_json(_entry(*pairs[0], writes, report))
+
+
+def _each(
+    pairs: list[tuple[str, Path]],
+    writes: bool,
+    as_json: bool,
+    work: Callable[[str, Path], dict[str, Any]],
+    unreadable: type[KissgsError],
+) -> None:
+    """Process several inputs, print the errors of those that fail, and exit with code 2 if there are any."""
     reports, failed = [], False
-    for name, target in zip(inputs, targets, strict=True):
+    for name, target in pairs:
         try:
             check_input(name, unreadable)
             reports.append(_entry(name, target, writes, work(name, target)))
@@ -113,8 +132,6 @@ def _targets(inputs: list[str], output: Path | None, suffix: str) -> list[Path]:
         targets.append(folder / (stem + (suffix or ".container")))
     if len(set(targets)) < len(targets):
         raise OutputError("two inputs have the same name and would become one file; process them one by one")
-    if output is not None:
-        make_folder(output)
     return targets
 
 
@@ -167,14 +184,22 @@ def is_folder(path: Path) -> bool:
     return os.path.isdir(path)  # noqa: PTH112  Path.is_dir raises where a name is too long
 
 
-def make_folder(folder: Path) -> None:
-    """Make a folder and its parents, if they do not exist."""
+@contextlib.contextmanager
+def _folder(folder: Path) -> Iterator[None]:
+    """Make a folder and its parents, if they do not exist; at the end, those of them that are empty are removed."""
     from kissgs.io.atomic import reason_of
 
+    made = [path for path in (folder, *folder.parents) if not is_folder(path)]
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:
-        raise OutputError(f"cannot make the folder {folder!s:.100}: {reason_of(error)}") from error
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except (OSError, ValueError) as error:
+            raise OutputError(f"cannot make the folder {folder!s:.100}: {reason_of(error)}") from error
+        yield
+    finally:
+        for path in made:
+            with contextlib.suppress(OSError, ValueError):
+                path.rmdir()
 
 
 def expand(names: list[str]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -184,6 +185,23 @@ def test_no_folder_gets_the_name_of_a_file(scene: Path, tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == []
     (tmp_path / "c.sog").mkdir()
     assert run("compress", scene, "-o", tmp_path / "c.sog", "-p", "fast", "-q", "--unpacked").returncode == 0
+
+
+@pytest.mark.parametrize("option", ["--unpacked", "--quiet"])
+def test_a_disk_that_fills_up_leaves_no_new_folder(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str
+) -> None:
+    """A folder that was there stays."""
+    (tmp_path / "mine").mkdir()
+
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    for folder in ("new/inner", "mine"):
+        words = ["compress", scene, "-p", "fast", "-o", tmp_path / folder, option]
+        assert "no space left on device" in failure(*words)
+    assert sorted(tmp_path.rglob("*")) == [tmp_path / "mine"]
 
 
 def test_names_are_printed_as_they_are(scene: Path, tmp_path: Path) -> None:
