@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING
 
 from kissgs.cli.bench_codecs import ExternalCodecs, all_settings, command_words
 from kissgs.cli.bench_scenes import BenchInputs, BenchOutput, distinct_names
+from kissgs.cli.files import is_folder
 from kissgs.cli.interrupts import Interrupted
 from kissgs.core.errors import UnsupportedError
+from kissgs.io.scene_file import open_scene_file
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -40,6 +42,10 @@ def scaling(
         raise UnsupportedError("--views needs the FILE of its scene; sample scenes have no photographs")
     if plotted and len(set(degrees)) > 1:
         raise UnsupportedError("--plot takes one scene; give one --degree")
+    for scene in inputs.scenes:  # before the first measurement, which may take hours
+        if not is_folder(scene):
+            with open_scene_file(scene):
+                pass
     from kissgs.benchmark.comparison import BenchmarkPlan
     from kissgs.benchmark.scaling_plot import scaling_plot
     from kissgs.cli.scaling_tables import scaling_tables

@@ -123,7 +123,7 @@ def test_an_interrupt_keeps_what_is_measured(
         ("scene.ply --degree 1", "--degree is for sample scenes"),
         ("--degree 1 --degree 2 --plot p.svg", "--plot takes one scene; give one --degree"),
         ("--external spz --splat-transform no-such-tool", "cannot start no-such-tool"),
-        ("none.ply", "none.ply: there is no such file"),
+        ("none.ply -p small --gaussians 7", "none.ply: there is no such file"),
     ],
 )
 def test_invalid_options_of_scaling_are_refused(options: str, message: str) -> None:
