@@ -64,6 +64,7 @@ class Worker:
     _logged: set[str] = field(default_factory=set)
     _busy: int = 0
     _abandoning: bool = False
+    _waits: bool = False
     _postponed: int = 0
     _postponed_reason: str = ""
 
@@ -87,10 +88,14 @@ class Worker:
         return self.runner.health_problem()
 
     async def drain(self) -> None:
-        """Start no more jobs, wait up to ``drain_seconds`` for running ones, and requeue those that need longer."""
+        """Start no more jobs, wait up to ``drain_seconds`` for running ones, and requeue those that need longer.
+
+        The server calls it, and so does the end of the application, which another server could run.
+        """
         self.draining = True
         self.notifier.notify(QUEUE)
-        if self._processes:
+        if self._processes and not self._waits:
+            self._waits = True
             seconds, count = self.settings.drain_seconds, len(self._processes)
             log.info("waiting up to %g s for %d running jobs; Ctrl-C again ends them now", seconds, count)
         if self._loops:

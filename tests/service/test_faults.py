@@ -283,6 +283,7 @@ def test_a_short_job_ends_before_the_service_stops(start):
     job = service.submit(MEDIUM)
     service.running(job)
     assert service.kill(signal.SIGTERM) == 0
+    assert service.log.read_text().count("Ctrl-C again ends them now") == 1
     service.restart()
     status = service.status(job)
     assert (status["state"], status["starts"]) == ("succeeded", 1)
