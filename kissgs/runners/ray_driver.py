@@ -19,7 +19,6 @@ import os
 import secrets
 import shutil
 import signal
-import socket
 import sys
 import tempfile
 import threading
@@ -35,6 +34,7 @@ from ray.exceptions import RayError, RayTaskError, TaskCancelledError
 from kissgs._version import __version__
 from kissgs.core.errors import RunnerError
 from kissgs.runners.contract import INTERNAL, LOST, NODE_UNUSABLE, Outcome, WorkItem
+from kissgs.runners.ray_connection import NoCluster, connect, first_line, start_here
 
 NODES_SECONDS = 1.0
 """Seconds between two looks at the cluster's nodes."""
@@ -44,12 +44,6 @@ RETRY_SECONDS = 1.0
 
 FORCE_SECONDS = 5.0
 """Seconds after which a cancelled task that has not ended is killed."""
-
-CONNECT_SECONDS = 5.0
-"""Maximum seconds for a connection to the head's port."""
-
-OBJECT_STORE_BYTES = 80 << 20
-"""Size of the object store of a cluster that is started here: nearly the smallest; nothing is kept there."""
 
 LOCAL = "local"
 """Argument instead of an address: start a cluster on this machine."""
@@ -86,34 +80,6 @@ def main() -> None:
             shutil.rmtree(folder, ignore_errors=True)
 
 
-class NoCluster(Exception):
-    """The address is "auto", and there is no cluster on this machine."""
-
-
-def connect(address: str) -> None:
-    """Connect this process to a cluster.
-
-    Raises:
-        NoCluster: there is none, and ``address`` is "auto".
-        RunnerError: the cluster cannot be reached.
-    """
-    given = address if address != "auto" else os.environ.get("RAY_ADDRESS", "")
-    if "://" in given:
-        raise RunnerError(
-            f"{given} is an address for Ray's client; give HOST:PORT of the cluster's head, on a machine of the cluster"
-        )
-    if given:
-        _check_port(given)
-    try:
-        ray.init(address=given or "auto", log_to_driver=False, configure_logging=False)
-    except ConnectionError as error:
-        if given:
-            raise RunnerError(_refused(given, error)) from error
-        raise NoCluster from error
-    except Exception as error:  # among them RuntimeError for another version of Ray or Python
-        raise RunnerError(_refused(given or "of this machine", error)) from error
-
-
 def _begin_again() -> NoReturn:
     """Replace this process by one that starts a cluster on this machine, with a token of its own.
 
@@ -122,47 +88,6 @@ def _begin_again() -> NoReturn:
     """
     protected = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
     os.execve(sys.executable, [sys.executable, "-P", "-m", f"{__package__}.ray_driver", LOCAL], protected)
-
-
-def start_here(folder: str) -> None:
-    """Start a cluster on this machine, with its files in ``folder``, which ends with this process.
-
-    Raises:
-        RunnerError: Ray cannot be started.
-    """
-    try:
-        ray.init(
-            address="local",
-            include_dashboard=False,
-            object_store_memory=OBJECT_STORE_BYTES,
-            log_to_driver=False,
-            configure_logging=False,
-            _temp_dir=folder,
-        )
-    except Exception as error:
-        raise RunnerError(f"Ray cannot be started on this machine: {_first_line(error)}") from error
-
-
-def _check_port(address: str) -> None:
-    host, colon, port = address.rpartition(":")
-    if not colon or not port.isdecimal():
-        raise RunnerError(f"{address} is no address of a Ray cluster; give HOST:PORT of its head, usually port 6379")
-    try:
-        socket.create_connection((host.strip("[]"), int(port)), CONNECT_SECONDS).close()
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise RunnerError(f"no Ray cluster answers at {address}: {reason}; is its head running there?") from error
-
-
-def _refused(address: str, error: Exception) -> str:
-    return (
-        f"cannot join the Ray cluster {address}: {_first_line(error)}; this machine must be one of its nodes "
-        f"(ray start --address={address} --num-cpus=0), and have its token if it has one (RAY_AUTH_MODE=token)"
-    )
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")[:300]
 
 
 def _nodes() -> list[dict[str, Any]]:
@@ -234,7 +159,7 @@ class Driver:
         try:
             outcome = await self._start_until_kept(item_id, item)
         except Exception as error:  # noqa: BLE001  a request that Ray refuses, for example; the item must end
-            message = f"Ray cannot run the work: {_first_line(error)}"
+            message = f"Ray cannot run the work: {first_line(error)}"
             outcome = Outcome("error", code=INTERNAL, message=message, log=traceback.format_exc()[-4000:])
         self._generators.pop(item_id, None)
         del self._tasks[item_id]
@@ -272,11 +197,11 @@ class Driver:
         except TaskCancelledError:
             return Outcome("cancelled", node=node, starts=start)
         except RayTaskError as error:  # raised by the task itself, outside the item's process
-            message = f"a node of the cluster cannot run kissgs: {_first_line(error.cause or error)}"
+            message = f"a node of the cluster cannot run kissgs: {first_line(error.cause or error)}"
             text = str(error)[-4000:]
             return Outcome("error", code=NODE_UNUSABLE, message=message, log=text, node=node, starts=start)
         except RayError as error:
-            message = f"the node {node or 'of the work'} was lost {start} times: {_first_line(error)}"
+            message = f"the node {node or 'of the work'} was lost {start} times: {first_line(error)}"
             return Outcome("lost", code=LOST, message=message, node=node, starts=start)
         return Outcome("lost", code=LOST, message="the work ended without an outcome", node=node, starts=start)
 
