@@ -110,6 +110,12 @@ class Service:
                 return status
         raise AssertionError(f"job {job['id']} has not ended: {status}")
 
+    def result(self, job: dict) -> bytes:
+        """Return the container of a job, which must succeed."""
+        status = self.ended(job)
+        assert status["state"] == "succeeded", status
+        return self.http.get(status["links"]["result"]).content
+
     def running(self, job: dict, stage: str | None = None, seconds: float = 300) -> dict:
         """Wait until the job's process runs, in ``stage`` if given; return the status."""
         end = time.monotonic() + seconds

@@ -1,5 +1,8 @@
 """Fixtures: a shared service, and new services, for each deployment."""
 
+import contextlib
+import os
+
 import pytest
 import sqlalchemy as sa
 from helpers.data_folders import jobs_folder, no_variables, sample_folder  # noqa: F401
@@ -8,7 +11,9 @@ from helpers.ray_service import RayReplicas
 from helpers.service import Replicas, Service
 
 from service.core.models import Base
-from service.storage.replicas import ReplicaBase
+from service.core.settings import ServiceSettings
+from service.http.app import build
+from service.storage.replicas import Replica, ReplicaBase
 
 CONFORMANCE = {"test_jobs": True, "test_refusals": False, "test_keys": False, "test_format_option": False}
 """Modules whose tests run for each deployment; whether ``make test`` runs them with two replicas."""
@@ -87,3 +92,43 @@ def postgresql(postgresql_server):
 def bucket(s3_server):
     """A new bucket."""
     return s3_server.bucket()
+
+
+@pytest.fixture
+def two(tmp_path, bucket, new_database):
+    """Two replicas."""
+    with Replicas(tmp_path / "two", 2, bucket, new_database()) as it:
+        yield it
+
+
+@pytest.fixture
+def member(tmp_path, bucket, new_database, monkeypatch):
+    """``member()`` opens a replica in this process; ``member.die(context)`` makes it one of an ended process."""
+    for name in os.environ:
+        if name.startswith(("KISSGS_", "AWS_")):
+            monkeypatch.delenv(name)
+    variables = {**bucket.variables, "KISSGS_DATABASE_URL": new_database()}
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    opened = []
+
+    def join():
+        context = build(ServiceSettings(data_dir=tmp_path / f"member{len(opened)}"))
+        opened.append(context)
+        set_process(context, os.getppid())  # else it would be taken for a former process with the same number
+        return context
+
+    def set_process(context, number):
+        with context.store._writing.begin() as session:
+            session.get(Replica, context.store.replica).process = number
+
+    def die(context):
+        set_process(context, 2**22 + 1)
+        return context.store.replica
+
+    join.die = die
+    yield join
+    for context in opened:
+        with contextlib.suppress(Exception):
+            context.store.close()
+        context.storage.close()

@@ -32,12 +32,6 @@ def replicas(cluster, bucket, new_database, tmp_path):
         yield it
 
 
-def result_of(service, job):
-    status = service.ended(job)
-    assert status["state"] == "succeeded", status
-    return service.http.get(status["links"]["result"]).content
-
-
 def compressed(scene):
     return kissgs.compress(scene, settings=kissgs.Settings(preset="fast")).to_zip()
 
@@ -64,7 +58,7 @@ def test_nodes_need_no_folder_and_no_secret_is_seen(replicas, cluster):
     replicas.http.post(job["links"]["cancel"])
     assert not is_alive(process)
     assert replicas.leftovers() == []
-    assert result_of(replicas, replicas.submit(MEDIUM)) == compressed(MEDIUM)
+    assert replicas.result(replicas.submit(MEDIUM)) == compressed(MEDIUM)
     assert replicas.leftovers() == []
     logs = [replica.log for replica in replicas.replicas] + [
         path for path in cluster.folder.rglob("*") if path.is_file()
@@ -78,7 +72,7 @@ def test_a_job_whose_node_is_killed_runs_on_the_other_one(replicas, cluster):
     replicas.running(job)
     (process,) = replicas.children()
     kill_tree(next(node for node in cluster.nodes if process in tree(node.pid)))
-    assert result_of(replicas, job) == compressed(MEDIUM)
+    assert replicas.result(job) == compressed(MEDIUM)
     assert replicas.status(job)["starts"] == 2
     assert replicas.leftovers() == []
 
@@ -93,7 +87,7 @@ def test_a_replica_that_is_killed_takes_its_items_along(replicas):
     wait_until(lambda: replicas.cluster.left_by_items() == [], seconds=30)
     replicas.restart()
     replicas.http.post(job["links"]["cancel"])
-    assert result_of(replicas, replicas.submit(MEDIUM)) == compressed(MEDIUM)
+    assert replicas.result(replicas.submit(MEDIUM)) == compressed(MEDIUM)
     assert replicas.leftovers() == []
 
 
