@@ -116,6 +116,12 @@ class Service:
         assert status["state"] == "succeeded", status
         return self.http.get(status["links"]["result"]).content
 
+    def only_result(self, job: dict) -> bytes:
+        """Return the container of a job, which must succeed and leave no temporary files."""
+        content = self.result(job)
+        assert self.leftovers() == []
+        return content
+
     def running(self, job: dict, stage: str | None = None, seconds: float = 300) -> dict:
         """Wait until the job's process runs, in ``stage`` if given; return the status."""
         end = time.monotonic() + seconds

@@ -8,14 +8,18 @@ import sqlalchemy as sa
 from helpers.data_folders import jobs_folder, no_variables, sample_folder  # noqa: F401
 from helpers.preview_browser import preview, software_browser  # noqa: F401
 from helpers.ray_service import RayReplicas
-from helpers.service import Replicas, Service
+from helpers.service import SMALL, Replicas, Service
 
+import kissgs
 from service.core.models import Base
 from service.core.settings import ServiceSettings
 from service.http.app import build
 from service.storage.replicas import Replica, ReplicaBase
 
-CONFORMANCE = {"test_jobs": True, "test_refusals": False, "test_keys": False, "test_format_option": False}
+CONFORMANCE = {
+    **dict.fromkeys(("test_jobs", "test_job_results", "test_job_states", "test_synchronous"), True),
+    **dict.fromkeys(("test_refusals", "test_keys", "test_format_option"), False),
+}
 """Modules whose tests run for each deployment; whether ``make test`` runs them with two replicas."""
 
 DEPLOYMENTS = {"folder": 0, "bucket": 1, "replicas": 2, "ray": 2}
@@ -61,6 +65,18 @@ def service(tmp_path_factory, deploy):
         tmp_path_factory.mktemp("shared") / "data", KISSGS_MAX_UPLOAD_BYTES="4MB", KISSGS_MAX_GAUSSIANS=20000
     ) as it:
         yield it
+
+
+@pytest.fixture(scope="module")
+def job(service):
+    """Status of a job that has succeeded."""
+    return service.ended(service.submit())
+
+
+@pytest.fixture(scope="module")
+def local():
+    """Compress the scene without a service."""
+    return kissgs.compress(SMALL, settings=kissgs.Settings(preset="fast"))
 
 
 @pytest.fixture

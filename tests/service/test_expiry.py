@@ -1,0 +1,87 @@
+"""Jobs that expire, and clocks that jump; oracle: the settings, and the times of the jobs."""
+
+import asyncio
+import time
+import uuid
+
+import pytest
+from helpers.running import wait_until
+from helpers.service import SMALL, problem
+
+import kissgs
+from service.core.models import Job, State
+from service.core.settings import ServiceSettings
+from service.http.app import build
+from service.jobs.expiry import ExpiryTask
+
+
+@pytest.mark.quick(0)
+def test_expiry(start):
+    service = start(KISSGS_KEEP_SECONDS=3, KISSGS_SWEEP_SECONDS=0.2)
+    job = service.ended(service.submit())
+    assert service.only_result(job) == kissgs.compress(SMALL, settings=kissgs.Settings(preset="fast")).to_zip()
+    wait_until(lambda: service.status(job)["state"] == "expired")
+    problem(service.http.get(f"/v1/jobs/{job['id']}/result"), 410, "gone")
+    wait_until(lambda: not (service.folder / "jobs" / job["id"]).exists())  # removed after this is recorded
+    assert list((service.folder / "jobs").iterdir()) == []
+    wait_until(lambda: service.http.get(f"/v1/jobs/{job['id']}").status_code == 404)  # deleted after as long again
+
+
+def test_uploads_can_be_removed_after_success(start):
+    service = start(KISSGS_KEEP_UPLOADS="false")
+    job = service.ended(service.submit())
+    assert "source" not in job["links"]
+    assert not (service.folder / "jobs" / job["id"] / "scene.ply").exists()
+
+
+def test_clock_jumps(tmp_path, monkeypatch):
+    """A jump of the clock by a year neither expires jobs early nor makes durations negative."""
+    monkeypatch.setenv("KISSGS_DATA_DIR", str(tmp_path / "data"))
+    context = build(ServiceSettings.from_environment())
+    upload = context.storage.new_upload()
+    upload.write_bytes(SMALL)
+    job = make_job(upload, context)
+    real = time.time
+    for jump in (365 * 86400, -365 * 86400):
+        monkeypatch.setattr(time, "time", lambda jump=jump: real() + jump)
+        asyncio.run(run_one(context))
+        ExpiryTask(context, 0.0).sweep()
+        found = context.store.get(job.id)
+        assert found.state == State.SUCCEEDED
+        assert 0 <= found.finished_at - found.started_at < 60
+        assert 0 <= found.started_at - found.created_at < 60
+    context.store.close()
+    context.storage.close()
+    restarted = build(ServiceSettings.from_environment())  # a year back: the time continues
+    assert 0 <= restarted.clock() - found.finished_at < 60
+    restarted.storage.close()
+
+
+def make_job(upload, context):
+    job = Job(
+        id=uuid.uuid4().hex,
+        owner="",
+        name="scene",
+        options={"preset": "fast", "evaluate": False},
+        preset="fast",
+        evaluate=False,
+        gaussians=300,
+        sh_degree=1,
+        upload_bytes=len(SMALL),
+        upload_sha256="0" * 64,
+        fingerprint="0",
+        disk_bytes=0,
+    )
+    context.storage.adopt(upload, job.id)
+    return context.admission.add(job)
+
+
+async def run_one(context):
+    context.worker.start()
+    for _ in range(600):
+        await asyncio.sleep(0.05)
+        if not context.store.counts()["queued"] and not context.store.counts()["running"]:
+            break
+    context.worker.draining = True
+    await context.worker.drain()
+    context.worker.draining = False

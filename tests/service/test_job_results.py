@@ -1,0 +1,146 @@
+"""Files of succeeded jobs over HTTP; oracles: kissgs.compress of the scene, and the specifications of HTTP headers."""
+
+import base64
+import hashlib
+import io
+import json
+import zipfile
+
+import pytest
+from helpers.service import SMALL, problem
+
+import kissgs
+
+
+def test_the_status_equals_the_report(service, job, local):
+    report = local.report
+    assert (job["state"], job["kept"], job["invisible"]) == ("succeeded", report.count, report.invisible)
+    assert job["cleaned"] == report.as_dict()["cleaned"]
+    assert job["sizes"]["files"] == report.file_bytes
+    assert job["sizes"]["container"] == report.container_bytes
+    assert job["upload_bytes"] == len(SMALL)
+    assert job["sizes"]["ratio"] == pytest.approx(report.ratio)
+    assert set(job["timings"]["stages"]) >= {"read", "order", "images"}
+    assert job["timings"]["created_at"] <= job["timings"]["started_at"] <= job["timings"]["finished_at"]
+    assert job["timings"]["finished_at"] < job["expires_at"]
+    assert "progress" not in job
+    assert "estimate" not in job
+    assert "cancel" not in job["links"]
+
+
+def test_every_link_works(service, job):
+    for name, link in job["links"].items():
+        for file in job["sizes"]["files"] if name == "files" else [""]:
+            answer = service.http.get(link.replace("{name}", file))
+            assert answer.status_code == 200, (name, answer.text)
+
+
+def test_the_result_is_the_container_of_the_library(service, job, local):
+    answer = service.http.get(job["links"]["result"])
+    assert answer.content == local.to_zip()
+    assert answer.headers["content-type"] == "application/zip"
+    assert (
+        answer.headers["content-disposition"] == "attachment; filename=\"a scene.zip\"; filename*=UTF-8''a%20scene.zip"
+    )
+    digest = hashlib.sha256(answer.content)
+    assert answer.headers["etag"] == f'"{digest.hexdigest()}"'
+    expected = f"sha-256=:{base64.b64encode(digest.digest()).decode()}:"
+    assert answer.headers["content-digest"] == answer.headers["repr-digest"] == expected
+    with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
+        assert archive.testzip() is None
+
+
+@pytest.mark.parametrize("name", ["result", "report", "source", "decoded"])
+def test_head_equals_get_without_a_body(service, job, name):
+    get, head = service.http.get(job["links"][name]), service.http.head(job["links"][name])
+    assert head.content == b""
+    volatile = ("date", "x-request-id")
+    assert {k: v for k, v in head.headers.items() if k not in volatile} == {
+        k: v for k, v in get.headers.items() if k not in volatile
+    }
+    assert int(head.headers["content-length"]) == len(get.content)
+
+
+@pytest.mark.parametrize(
+    ("requested", "slice_"),
+    [
+        ("bytes=0-3", slice(0, 4)),
+        ("bytes=10-", slice(10, None)),
+        ("bytes=-7", slice(-7, None)),
+        ("bytes=5-99999999", slice(5, None)),
+    ],
+)
+def test_ranges(service, job, local, requested, slice_):
+    answer = service.http.get(job["links"]["result"], headers={"Range": requested})
+    full = local.to_zip()
+    assert (answer.status_code, answer.content) == (206, full[slice_])
+    start = slice_.indices(len(full))[0]
+    assert answer.headers["content-range"] == f"bytes {start}-{start + len(answer.content) - 1}/{len(full)}"
+    assert "content-digest" not in answer.headers  # it would be the digest of the range
+    assert "repr-digest" in answer.headers
+
+
+def test_if_range(service, job, local):
+    tag = service.http.head(job["links"]["result"]).headers["etag"]
+    same = service.http.get(job["links"]["result"], headers={"Range": "bytes=0-3", "If-Range": tag})
+    other = service.http.get(job["links"]["result"], headers={"Range": "bytes=0-3", "If-Range": '"other"'})
+    assert (same.status_code, other.status_code) == (206, 200)
+    assert other.content == local.to_zip()
+
+
+@pytest.mark.parametrize(
+    "requested", ["bytes=3-1", "bytes=a-b", "lines=1-2", "bytes=0-1,4-5", "bytes", "bytes=-", "bytes=" + "9" * 50 + "-"]
+)
+def test_invalid_ranges_are_ignored(service, job, local, requested):
+    answer = service.http.get(job["links"]["result"], headers={"Range": requested})
+    assert (answer.status_code, answer.content) == (200, local.to_zip())
+
+
+@pytest.mark.parametrize("requested", ["bytes=99999999-", "bytes=-0"])
+def test_ranges_outside_the_file(service, job, requested):
+    answer = service.http.get(job["links"]["result"], headers={"Range": requested})
+    problem(answer, 416, "range")
+    assert answer.headers["content-range"] == f"bytes */{job['sizes']['container']}"
+
+
+def test_if_none_match(service, job):
+    tag = service.http.head(job["links"]["result"]).headers["etag"]
+    for sent in (tag, f'"x", W/{tag}', "*"):
+        answer = service.http.get(job["links"]["result"], headers={"If-None-Match": sent})
+        assert (answer.status_code, answer.content, answer.headers["etag"]) == (304, b"", tag)
+    assert service.http.get(job["links"]["result"], headers={"If-None-Match": '"x"'}).status_code == 200
+
+
+def test_files_by_name(service, job, local):
+    for name, data in local.files.items():
+        answer = service.http.get(job["links"]["files"].replace("{name}", name))
+        assert answer.content == data
+        assert "immutable" in answer.headers["cache-control"]
+        kinds = {"webp": "image/webp", "json": "application/json", "yaml": "application/yaml"}
+        assert answer.headers["content-type"].split(";")[0] == kinds[name.rsplit(".")[-1]]
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["summary.json", "..%2fscene.zip", "..%2Freport.json", "%2e%2e%2f%2e%2e", "nothing", "META.JSON", "files", "%00"],
+)
+def test_unknown_file_names(service, job, name):
+    problem(service.http.get(f"/v1/jobs/{job['id']}/files/{name}"), 404, "not-found")
+
+
+def test_the_decoded_scene(service, job, local, tmp_path):
+    answer = service.http.get(job["links"]["decoded"])
+    kissgs.decompress(local.files, tmp_path / "expected.ply")
+    assert answer.content == (tmp_path / "expected.ply").read_bytes()
+    again = service.http.get(job["links"]["decoded"])
+    assert again.headers["etag"] == answer.headers["etag"] == f'"{hashlib.sha256(again.content).hexdigest()}"'
+
+
+def test_the_source_and_the_report(service, job, local):
+    assert service.http.get(job["links"]["source"]).content == SMALL
+    report = service.http.get(job["links"]["report"]).json()
+    expected = json.loads(json.dumps(local.report.as_dict()))
+    volatile = ("seconds", "cpu_seconds", "peak_memory")
+    assert {k: v for k, v in report.items() if k not in volatile} == {
+        k: v for k, v in expected.items() if k not in volatile
+    }

@@ -1,0 +1,130 @@
+"""Jobs that are followed, listed, cancelled and deleted; oracle: the order of what was asked and of what happened."""
+
+import json
+import time
+
+from helpers.service import SLOW, events, problem, scene_bytes
+
+
+def test_following_an_event_stream(service):
+    job = service.submit()
+    answer = service.http.get(job["links"]["events"])
+    assert answer.headers["content-type"].startswith("text/event-stream")
+    found = events(answer.text)
+    assert [number for number, _, _ in found] == list(range(1, len(found) + 1))
+    states = [data["state"] for _, kind, data in found if kind == "state"]
+    assert states == ["queued", "running", "succeeded"]
+    stages = [data["stage"] for _, kind, data in found if kind == "progress"]
+    assert stages[0] == "read"
+    assert "images" in stages
+    assert all(0 <= data["fraction"] <= 1 for _, kind, data in found if kind == "progress")
+    assert found[-1][2]["job"]["sizes"] == service.status(job)["sizes"]
+
+
+def test_events_resume_after_the_last_id(service, job):
+    all_events = events(service.http.get(job["links"]["events"]).text)
+    for last in range(1, len(all_events)):
+        rest = service.http.get(job["links"]["events"], headers={"Last-Event-ID": str(last)})
+        assert events(rest.text) == all_events[last:]
+    over = service.http.get(job["links"]["events"], headers={"Last-Event-ID": str(len(all_events))})
+    assert (over.status_code, over.content) == (204, b"")
+    problem(service.http.get(job["links"]["events"], headers={"Last-Event-ID": "x"}), 422, "invalid-request")
+
+
+def test_events_arrive_as_they_happen(start):
+    service = start()
+    job = service.submit(scene_bytes(20_000, 3), SLOW)
+    with service.http.stream("GET", job["links"]["events"]) as answer:
+        for line in answer.iter_lines():
+            if line.startswith("data: ") and json.loads(line[6:]).get("stage") == "order":
+                break
+        assert service.status(job)["state"] == "running"
+    service.http.post(job["links"]["cancel"])
+
+
+def test_a_long_poll_ends_with_the_job(service):
+    job = service.submit()
+    assert service.status(job, wait=30)["state"] == "succeeded"
+    begun = time.monotonic()
+    assert service.status(job, wait=30)["state"] == "succeeded"
+    assert time.monotonic() - begun < 30
+
+
+def test_a_long_poll_ends_with_its_time(start):
+    service = start()
+    job = service.submit(scene_bytes(20_000, 3), SLOW)
+    begun = time.monotonic()
+    assert service.status(job, wait=1)["state"] in ("queued", "running")
+    assert time.monotonic() - begun > 0.9
+
+
+def test_listing(start):
+    service = start()
+    submitted = [service.ended(service.submit())["id"] for _ in range(3)]
+    page = service.http.get("/v1/jobs", params={"limit": 2}).json()
+    assert [job["id"] for job in page["jobs"]] == submitted[:0:-1]
+    rest = service.http.get("/v1/jobs", params={"limit": 2, "cursor": page["next"]}).json()
+    assert [job["id"] for job in rest["jobs"]] == submitted[:1]
+    assert "next" not in rest
+    assert service.http.get("/v1/jobs", params={"state": "failed"}).json() == {"jobs": []}
+    assert len(service.http.get("/v1/jobs", params={"state": "succeeded"}).json()["jobs"]) == 3
+    for wrong in ({"limit": 0}, {"limit": 101}, {"cursor": "x"}, {"state": "lost"}):
+        problem(service.http.get("/v1/jobs", params=wrong), 422, "invalid-request")
+
+
+def test_the_queue_is_in_order_and_has_positions(start):
+    service = start()
+    first, *others = service.occupy()
+    waiting = [service.submit() for _ in range(3)]
+    assert [service.status(job)["position"] for job in waiting] == [1, 2, 3]
+    left = [service.status(job)["estimate"]["seconds_left"] for job in (first, *waiting)]
+    assert left == sorted(left)
+    for job in (first, *others):
+        service.http.post(job["links"]["cancel"])
+    ended = [service.ended(job) for job in waiting]
+    started = [job["timings"]["started_at"] for job in ended]
+    assert started == sorted(started)
+
+
+def test_cancelling_stops_the_work(start):
+    service = start()
+    job = service.submit(scene_bytes(20_000, 3), SLOW)
+    service.running(job)
+    answer = service.http.post(job["links"]["cancel"])
+    assert answer.json()["state"] == "cancelled"
+    assert service.children() == []
+    assert "problem" not in answer.json()
+    assert service.http.post(job["links"]["cancel"] or "").json()["state"] == "cancelled"  # no change
+    problem(service.http.get(f"/v1/jobs/{job['id']}/result"), 409, "not-succeeded")
+    assert job["id"] not in service.stored()
+    assert service.ended(service.submit())["state"] == "succeeded"  # the worker continues
+
+
+def test_cancelling_queued_and_ended_jobs(start):
+    service = start()
+    running, waiting = service.submit(scene_bytes(20_000, 3), SLOW), service.submit()
+    assert service.http.post(waiting["links"]["cancel"]).json()["state"] == "cancelled"
+    service.http.post(running["links"]["cancel"])
+    done = service.ended(service.submit())
+    assert service.http.post(f"/v1/jobs/{done['id']}/cancel").json() == service.status(done)
+
+
+def test_deleting(start):
+    service = start()
+    done, running = service.ended(service.submit()), service.submit(scene_bytes(20_000, 3), SLOW)
+    service.running(running)
+    for job in (done, running):
+        assert service.http.delete(f"/v1/jobs/{job['id']}").status_code == 204
+        problem(service.http.get(f"/v1/jobs/{job['id']}"), 404, "not-found")
+        problem(service.http.delete(f"/v1/jobs/{job['id']}"), 404, "not-found")
+    assert service.children() == []
+    assert service.stored() == set()
+
+
+def test_results_of_active_jobs(start):
+    service = start()
+    job = service.submit(scene_bytes(20_000, 3), SLOW)
+    for name in ("result", "report", "decoded", "source", "files/meta.json"):
+        answer = service.http.get(f"/v1/jobs/{job['id']}/{name}")
+        assert problem(answer, 409, "not-finished")["retryable"]
+        assert int(answer.headers["retry-after"]) >= 1
