@@ -10,8 +10,10 @@ from kissgs.sog import streamed as streamed_sog
 from kissgs.sog.decode import decode as decode_sog
 from kissgs.sogxt import streamed as streamed_sogxt
 from kissgs.sogxt.decode import decode as decode_sogxt
+from kissgs.streaming import build
 
 ALL = Settings.from_preset("fast", prune_invisible=False)
+FAST = Settings.from_preset("fast")
 
 
 def sogxt_zip(scene, name):
@@ -50,3 +52,21 @@ TARGETS = ("city/lod-meta.json", "city.sogxt/levels.json")
 def tree_leaves(node):
     """Return the leaves of a manifest's tree."""
     return [node] if "lods" in node else [leaf for child in node["children"] for leaf in tree_leaves(child)]
+
+
+def small_sizes(patch, *, chunk, leaf, coarsest):
+    """Make chunks, leaves and coarsest levels of so few Gaussians that small scenes have several of each."""
+    for name, value in {"CHUNK": chunk, "LEAF": leaf, "COARSEST": coarsest}.items():
+        patch.setattr(build, name, value)
+
+
+def saved_sample(tmp_path_factory, count, sh_degree):
+    """Return the path of a sample scene in a new folder."""
+    path = tmp_path_factory.mktemp("streamed") / "scene.ply"
+    kissgs.save(kissgs.sample_scene(count, sh_degree=sh_degree, seed=3), path)
+    return path
+
+
+def files_of(folder):
+    """Return the bytes of all files below a folder, by their paths within it."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}

@@ -7,13 +7,13 @@ import urllib.parse
 
 import pytest
 from helpers.preview_browser import colours, preview, psnr, software_browser  # noqa: F401  fixtures
+from helpers.streamed_scenes import small_sizes
 from helpers.viewers import scattered
 
 import kissgs
 from kissgs.preview import server as server_module
 from kissgs.preview.server import PageServer
 from kissgs.preview.streamed_folder import streamed_folder
-from kissgs.streaming import build
 
 NAME = "city 100%41 \N{SNOWMAN}"
 
@@ -24,8 +24,7 @@ def city(tmp_path_factory):
     folder = tmp_path_factory.mktemp("streamed")
     kissgs.save(scattered(1200, 1), folder / "scene.ply")
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in {"CHUNK": 400, "LEAF": 80, "COARSEST": 200}.items():
-            patch.setattr(build, name, value)
+        small_sizes(patch, chunk=400, leaf=80, coarsest=200)
         settings = kissgs.Settings(preset="fast")
         kissgs.compress_streamed(folder / "scene.ply", folder / NAME / "lod-meta.json", settings=settings)
     return folder / NAME

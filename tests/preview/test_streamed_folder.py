@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from helpers.reference_sog import write_folder
 from helpers.small_page import FILES
-from helpers.streamed_scenes import SOG
+from helpers.streamed_scenes import SOG, small_sizes
 from helpers.viewers import scattered
 
 import kissgs
@@ -16,7 +16,6 @@ from kissgs.core.errors import InvalidContainerError
 from kissgs.preview import streamed_folder as module
 from kissgs.preview.server import PageServer
 from kissgs.preview.streamed_folder import fitting_level, is_streamed_folder, streamed_folder
-from kissgs.streaming import build
 from kissgs.streaming.compress import compress_streamed
 
 from .test_server import ask
@@ -29,8 +28,7 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("made")
     kissgs.save(scattered(300, 1), folder / "scene.ply")
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in {"CHUNK": 200, "LEAF": 50, "COARSEST": 100}.items():
-            patch.setattr(build, name, value)
+        small_sizes(patch, chunk=200, leaf=50, coarsest=100)
         compress_streamed(
             folder / "scene.ply", folder / NAME / "lod-meta.json", settings=kissgs.Settings(preset="fast")
         )

@@ -5,31 +5,21 @@ import json
 import pytest
 from helpers.command_line import run
 from helpers.running import wait_until
+from helpers.streamed_scenes import FAST, files_of, saved_sample, small_sizes
 
-import kissgs
 from kissgs import Settings
 from kissgs.core.errors import KissgsError
-from kissgs.streaming import build
 from kissgs.streaming.compress import compress_streamed
-
-FAST = Settings.from_preset("fast")
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    for name, value in {"CHUNK": 1600, "LEAF": 300, "COARSEST": 1000}.items():
-        monkeypatch.setattr(build, name, value)
+    small_sizes(monkeypatch, chunk=1600, leaf=300, coarsest=1000)
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    path = tmp_path_factory.mktemp("streamed") / "scene.ply"
-    kissgs.save(kissgs.sample_scene(3000, sh_degree=1, seed=3), path)
-    return path
-
-
-def contents(folder):
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+    return saved_sample(tmp_path_factory, 3000, 1)
 
 
 @pytest.mark.parametrize(
@@ -44,7 +34,7 @@ def test_a_runner_makes_the_same_bytes(runner, scene, tmp_path, preset, name):
     here = compress_streamed(scene, tmp_path / "here" / name, settings=settings)
     there = compress_streamed(scene, tmp_path / "there" / name, settings=settings, runner=runner, progress=progress)
     assert there == here
-    assert contents(tmp_path / "there") == contents(tmp_path / "here")
+    assert files_of(tmp_path / "there") == files_of(tmp_path / "here")
     assert {"merge", "images"} <= stages
     assert runner.stats().running == 0
 
@@ -65,7 +55,7 @@ def test_stopped_work_cancels_its_items_and_goes_on_elsewhere(local_runner, scen
     assert not target.exists()
     compress_streamed(scene, target, settings=FAST)
     compress_streamed(scene, tmp_path / "whole" / "lod-meta.json", settings=FAST)
-    assert contents(tmp_path / "city") == contents(tmp_path / "whole")
+    assert files_of(tmp_path / "city") == files_of(tmp_path / "whole")
 
 
 def test_an_item_that_fails_ends_the_work(local_runner, scene, tmp_path):
@@ -88,4 +78,4 @@ def test_the_command_on_a_cluster(ray_cluster, ray_runner, scene, tmp_path):
     there = run(*words, tmp_path / "there" / "lod-meta.json", "--ray", ray_cluster.address)
     assert here.returncode == there.returncode == 0
     assert json.loads(there.stdout)["counts"] == json.loads(here.stdout)["counts"]
-    assert contents(tmp_path / "there") == contents(tmp_path / "here")
+    assert files_of(tmp_path / "there") == files_of(tmp_path / "here")

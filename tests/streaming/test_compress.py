@@ -10,41 +10,32 @@ import numpy as np
 import pytest
 from helpers.format_scenes import assert_alike
 from helpers.splat_transform import convert, needs_splat_transform
-from helpers.streamed_scenes import TARGETS, tree_leaves
+from helpers.streamed_scenes import FAST, TARGETS, files_of, saved_sample, small_sizes, tree_leaves
 
 import kissgs
 from kissgs import Settings
 from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
 from kissgs.core.splats import concatenate
 from kissgs.io.streamed import MAX_TREE_BYTES
-from kissgs.streaming import build
 from kissgs.streaming.compress import compress_streamed
 from kissgs.streaming.levels import bounds
 
-FAST = Settings.from_preset("fast")
 COUNT = 3000
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    for name, value in {"CHUNK": 800, "LEAF": 150, "COARSEST": 500}.items():
-        monkeypatch.setattr(build, name, value)
+    small_sizes(monkeypatch, chunk=800, leaf=150, coarsest=500)
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    path = tmp_path_factory.mktemp("streamed") / "scene.ply"
-    kissgs.save(kissgs.sample_scene(COUNT, sh_degree=1, seed=3), path)
-    return path
+    return saved_sample(tmp_path_factory, COUNT, 1)
 
 
 @pytest.fixture(params=TARGETS)
 def target(request, tmp_path):
     return tmp_path / request.param
-
-
-def files_of(folder):
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
 def test_every_level_is_read_and_every_leaf_has_every_level(scene, target):

@@ -6,22 +6,19 @@ import numpy as np
 import pytest
 from helpers.format_scenes import assert_alike
 from helpers.splat_transform import convert, needs_splat_transform
-from helpers.streamed_scenes import TARGETS
+from helpers.streamed_scenes import FAST, TARGETS, files_of, small_sizes
 
 import kissgs
 from kissgs import Settings
 from kissgs.evaluation.attributes import sigmoid
-from kissgs.streaming import build, environment
+from kissgs.streaming import environment
 from kissgs.streaming.compress import compress_streamed
 from kissgs.streaming.environment import FEWEST, MOST, Environment
-
-FAST = Settings.from_preset("fast")
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    for name, value in {"CHUNK": 800, "LEAF": 150, "COARSEST": 500}.items():
-        monkeypatch.setattr(build, name, value)
+    small_sizes(monkeypatch, chunk=800, leaf=150, coarsest=500)
     monkeypatch.setattr(environment, "FEWEST", 100)
 
 
@@ -121,9 +118,6 @@ class Stop(Exception):
 @pytest.mark.quick(1)
 @pytest.mark.parametrize("name", TARGETS)
 def test_interrupted_work_ends_with_the_same_bytes_and_is_replaced_as_a_whole(scene, tmp_path, name):
-    def files(folder):
-        return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
     for folder in ("whole", "parts"):
         (tmp_path / folder).mkdir()
     compress_streamed(scene, tmp_path / "whole" / name, settings=FAST)
@@ -140,7 +134,7 @@ def test_interrupted_work_ends_with_the_same_bytes_and_is_replaced_as_a_whole(sc
         with pytest.raises(Stop):
             compress_streamed(scene, target, settings=FAST, progress=stop)
     compress_streamed(scene, target, settings=FAST)
-    assert files(target.parent) == files((tmp_path / "whole" / name).parent)
+    assert files_of(target.parent) == files_of((tmp_path / "whole" / name).parent)
     compress_streamed(scene, target, settings=Settings.from_preset("fast", sh0_step=0.1), overwrite=True)
     assert not list(target.parent.parent.glob("*.partial"))
 

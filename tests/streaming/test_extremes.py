@@ -6,22 +6,17 @@ import math
 import numpy as np
 import pytest
 from helpers.extreme_containers import BY_NAME, given, scene
-from helpers.streamed_scenes import TARGETS
+from helpers.streamed_scenes import FAST, TARGETS, small_sizes
 
 import kissgs
-from kissgs import Settings
 from kissgs.core.errors import InvalidSceneError
 from kissgs.core.splats import Splats
-from kissgs.streaming import build
 from kissgs.streaming.compress import compress_streamed
-
-FAST = Settings.from_preset("fast")
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    for name, value in {"CHUNK": 6, "LEAF": 3, "COARSEST": 3}.items():
-        monkeypatch.setattr(build, name, value)
+    small_sizes(monkeypatch, chunk=6, leaf=3, coarsest=3)
 
 
 def numbers(node):

@@ -6,32 +6,24 @@ import shutil
 from pathlib import Path
 
 import pytest
+from helpers.streamed_scenes import FAST, files_of, saved_sample, small_sizes
 
 import kissgs
 from kissgs import Settings
 from kissgs.core.errors import OutputError
-from kissgs.streaming import build
 from kissgs.streaming.compress import compress_streamed
 
-FAST = Settings.from_preset("fast")
 OTHER = Settings.from_preset("fast", sh0_step=0.1)
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    for name, value in {"CHUNK": 800, "LEAF": 300, "COARSEST": 800}.items():
-        monkeypatch.setattr(build, name, value)
+    small_sizes(monkeypatch, chunk=800, leaf=300, coarsest=800)
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    path = tmp_path_factory.mktemp("streamed") / "scene.ply"
-    kissgs.save(kissgs.sample_scene(1500, sh_degree=0, seed=3), path)
-    return path
-
-
-def files_of(folder):
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+    return saved_sample(tmp_path_factory, 1500, 0)
 
 
 class Killed(BaseException):

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from helpers.render_scenes import blobs
+from helpers.streamed_scenes import small_sizes
 
 import kissgs
 from kissgs import Settings
@@ -12,7 +13,7 @@ from kissgs.core.splats import concatenate
 from kissgs.rendering.camera import look_at
 from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
 from kissgs.settings import EncodeSettings
-from kissgs.streaming import build, layout
+from kissgs.streaming import layout
 from kissgs.streaming.compress import compress_streamed
 from kissgs.streaming.sensitivities import cameras_json, cameras_of, measure_file
 from kissgs.streaming.time_left import duration, with_time_left
@@ -67,8 +68,7 @@ class Stop(Exception):
 
 
 def test_the_default_preset_spends_bits_by_sensitivity_and_goes_on_after_its_cameras(tmp_path, monkeypatch):
-    for name, value in {"CHUNK": 1600, "LEAF": 400, "COARSEST": 1000}.items():
-        monkeypatch.setattr(build, name, value)
+    small_sizes(monkeypatch, chunk=1600, leaf=400, coarsest=1000)
     monkeypatch.setattr(layout, "CONTEXT", 1500)
     kissgs.save(kissgs.sample_scene(3000, sh_degree=1, seed=3), tmp_path / "scene.ply")
     report = compress_streamed(tmp_path / "scene.ply", tmp_path / "whole" / "lod-meta.json", settings=BALANCED)

@@ -5,16 +5,14 @@ import logging
 
 import numpy as np
 import pytest
+from helpers.streamed_scenes import FAST, small_sizes
 from helpers.viewers import chromium, image_of, opened, pinhole, scattered, seen_from
 
 import kissgs
-from kissgs import Settings
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.rendering.camera import look_at
-from kissgs.streaming import build
 from kissgs.streaming.compress import compress_streamed
 
-FAST = Settings.from_preset("fast")
 CAMERA = seen_from((1.2, -1.2, -4.2), (300, 200))
 MANY = 100_000
 log = logging.getLogger(__name__)
@@ -32,8 +30,7 @@ def city(viewer, tmp_path_factory):
     folder = tmp_path_factory.mktemp("streamed")
     kissgs.save(scattered(1200, 2), folder / "scene.ply")
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in {"CHUNK": 400, "LEAF": 80, "COARSEST": 200}.items():
-            patch.setattr(build, name, value)
+        small_sizes(patch, chunk=400, leaf=80, coarsest=200)
         compress_streamed(folder / "scene.ply", folder / "city" / "lod-meta.json", settings=FAST)
     files = {str(path.relative_to(folder)): path.read_bytes() for path in (folder / "city").rglob("*.*")}
     return folder / "city", viewer[1].put("streamed", files) + "city/lod-meta.json"

@@ -4,12 +4,13 @@ import logging
 
 import numpy as np
 import pytest
+from helpers.streamed_scenes import small_sizes
 from helpers.viewers import chromium, opened, scattered, seen_from
 
 import kissgs
 from kissgs import Settings
 from kissgs.core.splats import concatenate
-from kissgs.streaming import build, environment
+from kissgs.streaming import environment
 from kissgs.streaming.compress import compress_streamed
 
 FIRST_IMAGE_BYTES = 1_000_000
@@ -36,8 +37,7 @@ def psnr(a, b):
 
 
 def test_each_level_is_drawn_whole(playcanvas, tmp_path, monkeypatch):
-    for name, value in {"CHUNK": 400, "LEAF": 80, "COARSEST": 200}.items():
-        monkeypatch.setattr(build, name, value)
+    small_sizes(monkeypatch, chunk=400, leaf=80, coarsest=200)
     viewer, site = playcanvas
     source, url = streamed(scattered(1200, 2), tmp_path, site)
     cameras = [seen_from((1.2, -1.2, -4.2), (300, 200)), seen_from((-3.5, -2.6, 2.0), (200, 180))]
@@ -59,8 +59,7 @@ def with_sky(scene):
 
 
 def test_the_environment_is_drawn_at_every_level(playcanvas, tmp_path, monkeypatch):
-    for name, value in {"CHUNK": 400, "LEAF": 80, "COARSEST": 200}.items():
-        monkeypatch.setattr(build, name, value)
+    small_sizes(monkeypatch, chunk=400, leaf=80, coarsest=200)
     monkeypatch.setattr(environment, "FEWEST", 100)
     viewer, site = playcanvas
     source, url = streamed(with_sky(scattered(1000, 2)), tmp_path, site)
