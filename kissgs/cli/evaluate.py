@@ -59,7 +59,7 @@ def evaluate(
     as_json: Annotated[bool, typer.Option("--json", help="Print a JSON report.")] = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Compare the renderings of a scene with those of its original, and with photographs: PSNR and SSIM."""
+    """Compare the renderings of a scene with those of its original, and with photographs: PSNR, SSIM and MS-SSIM."""
     from kissgs.cli.console import progress_bar
     from kissgs.evaluation.evaluate import evaluate as measure
     from kissgs.evaluation.html import ReportScene, html_report

@@ -1,4 +1,4 @@
-"""PSNR, SSIM and LPIPS of a candidate scene's renderings against photographs and the reference's renderings.
+"""PSNR, SSIM, MS-SSIM and LPIPS of a candidate scene's renderings against photographs and the reference's renderings.
 
 Renderings are clamped to [0, 1], as a screen does, but not rounded to 8 bits: rounding would limit every PSNR to about
 59 dB. (Published values often come from 8-bit files; near 30 dB the difference is below 0.01 dB.)
@@ -22,7 +22,7 @@ from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, Spli
 from kissgs.evaluation.visibility import share_shown
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.lpips import Lpips
-from kissgs.rendering.metrics import psnr, ssim
+from kissgs.rendering.metrics import ms_ssim, psnr, ssim
 from kissgs.rendering.rasterizer import Device, load_kernels, render
 
 NOTHING_VISIBLE = (
@@ -208,7 +208,9 @@ def _measure(lpips: bool, device: Device) -> Measure:
 
     def measure(image: np.ndarray, target: np.ndarray) -> ImageMetrics:
         distance = None if perceptual is None else perceptual(image, target)
-        return ImageMetrics(psnr=psnr(image, target), ssim=ssim(image, target), lpips=distance)
+        return ImageMetrics(
+            psnr=psnr(image, target), ssim=ssim(image, target), ms_ssim=ms_ssim(image, target), lpips=distance
+        )
 
     return measure
 

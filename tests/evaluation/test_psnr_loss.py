@@ -18,7 +18,7 @@ VIEW = View(
 
 
 def metrics(psnr):
-    return ImageMetrics(psnr=psnr, ssim=0.5)
+    return ImageMetrics(psnr=psnr, ssim=0.5, ms_ssim=0.5)
 
 
 def evaluation_of(psnrs, photo_psnrs=None):
