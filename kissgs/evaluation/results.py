@@ -31,12 +31,14 @@ class ImageMetrics:
             infinite only if all images are equal.
         ssim: -1 to 1; 1 for equal images.
         ms_ssim: 0 to 1; 1 for equal images.
+        flip: 0 for equal images, up to 1; None if not requested.
         lpips: 0 for equal images, up to about 1; None if not requested.
     """
 
     psnr: float
     ssim: float
     ms_ssim: float
+    flip: float | None = None
     lpips: float | None = None
 
     def as_dict(self) -> dict[str, float | str | None]:
@@ -45,7 +47,7 @@ class ImageMetrics:
 
     def texts(self) -> dict[str, str]:
         """Return the metrics as text, by the names that tables give them; without those not requested."""
-        values = {"SSIM": self.ssim, "MS-SSIM": self.ms_ssim, "LPIPS": self.lpips}
+        values = {"SSIM": self.ssim, "MS-SSIM": self.ms_ssim, "FLIP": self.flip, "LPIPS": self.lpips}
         others = {name: format_metric(value, 4) for name, value in values.items() if value is not None}
         return {"PSNR": format_metric(self.psnr, 2), **others}
 
@@ -250,13 +252,18 @@ class Evaluation:
 
 
 def _mean(values: Sequence[ImageMetrics]) -> ImageMetrics:
-    distances = [value.lpips for value in values if value.lpips is not None]
     return ImageMetrics(
         psnr=_mean_decibels([value.psnr for value in values]),
         ssim=sum(value.ssim for value in values) / len(values),
         ms_ssim=sum(value.ms_ssim for value in values) / len(values),
-        lpips=sum(distances) / len(values) if distances else None,
+        flip=_mean_if_measured([value.flip for value in values]),
+        lpips=_mean_if_measured([value.lpips for value in values]),
     )
+
+
+def _mean_if_measured(values: Sequence[float | None]) -> float | None:
+    measured = [value for value in values if value is not None]
+    return sum(measured) / len(measured) if measured else None
 
 
 def _mean_decibels(values: Sequence[float]) -> float:

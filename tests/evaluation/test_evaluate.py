@@ -250,14 +250,16 @@ def test_progress_is_reported_and_can_cancel():
         evaluate(SCENE, SCENE, cameras(test=4), progress=stop)
 
 
-def test_lpips_is_measured_on_request(monkeypatch, capture):
+def test_flip_and_lpips_are_measured_on_request(monkeypatch, capture):
+    monkeypatch.setattr(evaluation_module, "Flip", lambda: lambda image, target: float(np.abs(image - target).mean()))
     monkeypatch.setattr(
         evaluation_module, "Lpips", lambda device: lambda image, target: float(np.abs(image - target).max())
     )
-    found = evaluate(SCENE, WORSE, cameras(), lpips=True)
-    each = [np.abs(rendered_view(WORSE, view) - rendered_view(SCENE, view)).max() for view in cameras().test]
-    assert found.mean.candidate_vs_reference.lpips == pytest.approx(np.mean(each))
-    assert set(found.as_dict()["mean"]["candidate_vs_reference"]) == {"psnr", "ssim", "ms_ssim", "lpips"}
+    found = evaluate(SCENE, WORSE, cameras(), flip=True, lpips=True)
+    each = [np.abs(rendered_view(WORSE, view) - rendered_view(SCENE, view)) for view in cameras().test]
+    assert found.mean.candidate_vs_reference.lpips == pytest.approx(np.mean([image.max() for image in each]))
+    assert found.mean.candidate_vs_reference.flip == pytest.approx(np.mean([image.mean() for image in each]))
+    assert set(found.as_dict()["mean"]["candidate_vs_reference"]) == {"psnr", "ssim", "ms_ssim", "flip", "lpips"}
 
 
 def test_missing_cuda_is_an_error():
