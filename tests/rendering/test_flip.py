@@ -72,11 +72,11 @@ def features(image):
     sigma = 0.5 * 0.082 * PIXELS_PER_DEGREE
     radius = math.ceil(3 * sigma)
     offsets = np.arange(-radius, radius + 1)
-    bell = np.exp(-(offsets**2) / (2 * sigma**2))
+    profile = np.exp(-(offsets**2) / (2 * sigma**2))
     strengths = []
-    for weights in (-offsets * bell, (offsets**2 / sigma**2 - 1) * bell):
+    for weights in (-offsets * profile, (offsets**2 / sigma**2 - 1) * profile):
         weights = np.where(weights < 0, weights / -weights[weights < 0].sum(), weights / weights[weights > 0].sum())
-        kernel = np.outer(bell / bell.sum(), weights)
+        kernel = np.outer(profile / profile.sum(), weights)
         strengths.append(np.hypot(*(correlate(lightness, each, mode="nearest") for each in (kernel, kernel.T))))
     return strengths
 
