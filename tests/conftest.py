@@ -50,6 +50,7 @@ CHECKED = [
     "rendering/coverage",
     "rendering/cpu/frame",
     "rendering/differentiable",
+    "rendering/flip",
     "rendering/local_scale",
     "rendering/losses",
     "rendering/lpips",

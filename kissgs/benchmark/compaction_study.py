@@ -33,6 +33,7 @@ class CompactionPoint:
         count: number of Gaussians left.
         psnr: decibels, mean over held-out views, to photographs or, without those, to renderings of the input.
         ssim: SSIM of the same images, mean over views.
+        ms_ssim: MS-SSIM of the same images, mean over views.
         bytes: size of its container with the preset ``fast``.
         seconds: wall time, without the rendering of training targets, which all strategies share.
         cpu_seconds: CPU time of all threads in that time.
@@ -42,6 +43,7 @@ class CompactionPoint:
     count: int
     psnr: float
     ssim: float
+    ms_ssim: float
     bytes: int
     seconds: float
     cpu_seconds: float
@@ -184,6 +186,7 @@ def _point(
         count=len(scene),
         psnr=metrics.psnr,
         ssim=metrics.ssim,
+        ms_ssim=metrics.ms_ssim,
         bytes=size,
         seconds=seconds,
         cpu_seconds=cpu_seconds,

@@ -35,6 +35,7 @@ class RatePoint:
         bytes: size of the zip.
         psnr: decibels, mean over held-out views, to photographs or, without those, to renderings of the scene.
         ssim: SSIM of the same images, mean over views.
+        ms_ssim: MS-SSIM of the same images, mean over views.
         psnr_to_scene: decibels, mean over the same views, to renderings of the scene before compaction.
         seconds: wall time of compression.
         cpu_seconds: CPU time of compression, all threads.
@@ -47,6 +48,7 @@ class RatePoint:
     bytes: int
     psnr: float
     ssim: float
+    ms_ssim: float
     psnr_to_scene: float
     seconds: float
     cpu_seconds: float
@@ -130,6 +132,7 @@ def _point(
         bytes=result.report.container_bytes,
         psnr=mean.candidate.psnr,
         ssim=mean.candidate.ssim,
+        ms_ssim=mean.candidate.ms_ssim,
         psnr_to_scene=mean.candidate_vs_reference.psnr,
         seconds=wall,
         cpu_seconds=cpu,
@@ -154,7 +157,7 @@ def bytes_saved(points: Sequence[RatePoint], metric: str = "psnr") -> float | No
 
     Args:
         points: points of both variants.
-        metric: "psnr", "ssim" or "psnr_to_scene".
+        metric: "psnr", "ssim", "ms_ssim" or "psnr_to_scene".
 
     Returns:
         See :meth:`kissgs.benchmark.bd_rate.RateCurve.saving`.

@@ -148,7 +148,12 @@ def finetuning_table(rows: list[tuple[str, RatePoint]]) -> RenderableType:
                 *quality,
                 *resources,
             )
-        metrics = {"PSNR": "psnr", "SSIM": "ssim", "PSNR to renderings of the scene": "psnr_to_scene"}
+        metrics = {
+            "PSNR": "psnr",
+            "SSIM": "ssim",
+            "MS-SSIM": "ms_ssim",
+            "PSNR to renderings of the scene": "psnr_to_scene",
+        }
         if all(point.psnr == point.psnr_to_scene for point in points):
             metrics.pop("PSNR to renderings of the scene")
         for metric, name in metrics.items():

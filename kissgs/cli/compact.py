@@ -69,7 +69,7 @@ def compact(
         typer.Option(help="Seed of the image order and the virtual cameras; same seed, same result. Default: 0."),
     ] = None,
     evaluate: Annotated[
-        bool, typer.Option("--evaluate", help="Measure PSNR, SSIM and compressed size after every step.")
+        bool, typer.Option("--evaluate", help="Measure PSNR, SSIM, MS-SSIM and compressed size after every step.")
     ] = False,
     checkpoint: Annotated[
         bool,

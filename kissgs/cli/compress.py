@@ -60,6 +60,13 @@ def compress(
             help="Find the smallest container that loses at most this PSNR, such as 0.1. Best with --views.",
         ),
     ] = None,
+    max_ssim_drop: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SSIM",
+            help="Find the smallest container that loses at most this SSIM, such as 0.003; also with --max-psnr-drop.",
+        ),
+    ] = None,
     compact: Annotated[
         str | None,
         typer.Option(
@@ -125,6 +132,7 @@ def compress(
         psnr=psnr,
         target_size=target_size,
         max_psnr_drop=max_psnr_drop,
+        max_ssim_drop=max_ssim_drop,
     )
     refuse_without_training(settings, checkpoint=checkpoint, device=device)
     renders = evaluate or settings.encode.rate_distortion or settings.compact.enabled or settings.finetune.enabled

@@ -43,6 +43,7 @@ def evaluate(
         float,
         typer.Option(metavar="FACTOR", help="Move the virtual cameras to this many times their distance, such as 4."),
     ] = 1.0,
+    flip: Annotated[bool, typer.Option("--flip", help="Also measure FLIP; needs the extra kissgs\\[flip].")] = False,
     lpips: Annotated[
         bool, typer.Option("--lpips", help="Also measure LPIPS; needs the extra kissgs\\[lpips].")
     ] = False,
@@ -59,7 +60,7 @@ def evaluate(
     as_json: Annotated[bool, typer.Option("--json", help="Print a JSON report.")] = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Compare the renderings of a scene with those of its original, and with photographs: PSNR and SSIM."""
+    """Compare the renderings of a scene with those of its original, and with photographs: PSNR, SSIM and MS-SSIM."""
     from kissgs.cli.console import progress_bar
     from kissgs.evaluation.evaluate import evaluate as measure
     from kissgs.evaluation.html import ReportScene, html_report
@@ -85,6 +86,7 @@ def evaluate(
             split=used_split,
             seed=seed,
             distance=distance,
+            flip=flip,
             lpips=lpips,
             device=render_device,
             threads=threads,

@@ -11,7 +11,7 @@ from rich.text import Text
 from kissgs.benchmark.render_speed import RenderingCost
 from kissgs.cli.tables import size, surroundings_summary
 from kissgs.evaluation.html import ReportScene
-from kissgs.evaluation.results import Evaluation
+from kissgs.evaluation.results import Comparison, Evaluation
 
 
 def evaluation_table(
@@ -22,7 +22,8 @@ def evaluation_table(
     notes = [Text(evaluation.note, "yellow")] if evaluation.note else []
     if evaluation.split == "train" != asked:
         notes.append(Text("no view is held out: the scene may have been trained on these views", "yellow"))
-    found: list[RenderableType] = [_views(evaluation), Text(), Text(_sentence(evaluation.extremes))]
+    views = [_views(evaluation), *_other_means(evaluation.mean)]
+    found: list[RenderableType] = [*views, Text(), Text(_sentence(evaluation.extremes))]
     if evaluation.surroundings is not None:
         found.append(Text(_sentence(f"beyond the capture: {surroundings_summary(evaluation.surroundings)}")))
     return Group(_sizes(evaluation, reference, candidate), what, *notes, Text(), *found)
@@ -43,7 +44,7 @@ def _sizes(evaluation: Evaluation, reference: ReportScene, candidate: ReportScen
 
 def _views(evaluation: Evaluation) -> Table:
     mean = evaluation.mean
-    parts = ["PSNR", "SSIM"] + (["LPIPS"] if mean.candidate_vs_reference.lpips is not None else [])
+    parts = list(mean.candidate_vs_reference.texts())[: 2 if mean.reference is not None else None]
     groups = ["reference\nto photo", "candidate\nto photo"] if mean.reference is not None else []
     columns = [_group(group, parts) for group in groups]
     changes = [Column("change\n\ndB", justify="right")] if groups else []
@@ -55,9 +56,21 @@ def _views(evaluation: Evaluation) -> Table:
         pad_edge=False,
     )
     for compared in evaluation.views:
-        table.add_row(Text(compared.view.name), *compared.comparison.cells())
-    table.add_row("mean", *mean.cells(), style="bold")
+        table.add_row(Text(compared.view.name), *compared.comparison.cells(parts))
+    table.add_row("mean", *mean.cells(parts), style="bold")
     return table
+
+
+def _other_means(mean: Comparison) -> list[RenderableType]:
+    """Return the means of the metrics for which the table of views is too narrow; nothing without photographs."""
+    if mean.reference is None:
+        return []
+    rows = mean.reference.texts(), mean.candidate.texts(), mean.candidate_vs_reference.texts()
+    names = list(rows[0])[2:]
+    table = Table("", *(Column(name, justify="right") for name in names), box=None, pad_edge=False)
+    for title, row in zip(("reference to photo", "candidate to photo", "candidate to reference"), rows, strict=True):
+        table.add_row(title, *(row[name] for name in names))
+    return [Text(), table]
 
 
 def _group(title: str, parts: list[str]) -> list[Column]:

@@ -54,6 +54,13 @@ def compress(
         float | None,
         typer.Option(metavar="DB", help="Find the smallest container that loses at most this PSNR, such as 0.1."),
     ] = None,
+    max_ssim_drop: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SSIM",
+            help="Find the smallest container that loses at most this SSIM, such as 0.003; also with --max-psnr-drop.",
+        ),
+    ] = None,
     compact: Annotated[
         str | None,
         typer.Option(
@@ -89,6 +96,7 @@ def compress(
         psnr=psnr,
         target_size=target_size,
         max_psnr_drop=max_psnr_drop,
+        max_ssim_drop=max_ssim_drop,
     )
     with Remote(server, key=key) as remote:
 

@@ -114,12 +114,15 @@ def _compaction(report: CompactionReport) -> list[RenderableType]:
     if report.source:
         lines.append(Text(f"{trained.get(report.target_source, 'scored with')}: {report.source}"))
     evaluated = report.steps[0].bytes is not None
-    columns = [_right(name) for name in ("Gaussians", "seconds", *(("PSNR", "SSIM", "bytes") if evaluated else ()))]
+    columns = [
+        _right(name) for name in ("Gaussians", "seconds", *(("PSNR", "SSIM", "MS-SSIM", "bytes") if evaluated else ()))
+    ]
     table = Table("step", *columns, box=None, pad_edge=False)
     for step in report.steps:
         cells = [f"{step.count:,}", f"{step.seconds:.1f}"]
         if step.psnr is not None and step.ssim is not None and step.bytes is not None:
-            cells += [format_metric(step.psnr, 2), format_metric(step.ssim, 4), f"{step.bytes:,}"]
+            coarse = "" if step.ms_ssim is None else format_metric(step.ms_ssim, 4)
+            cells += [format_metric(step.psnr, 2), format_metric(step.ssim, 4), coarse, f"{step.bytes:,}"]
         table.add_row(step.name, *cells)
     return [*lines, table]
 
@@ -146,11 +149,11 @@ def _trials(trials: Sequence[Trial]) -> str:
 
 def _evaluation(evaluation: Evaluation) -> Text:
     mean = evaluation.mean
-    metrics = f"PSNR {format_metric(mean.candidate.psnr, 2)} dB, SSIM {format_metric(mean.candidate.ssim, 4)}"
+    metrics = "PSNR {PSNR} dB, SSIM {SSIM}, MS-SSIM {MS-SSIM}".format_map(mean.candidate.texts())
     if mean.reference is None:
         against = f"to the scene's own renderings from {evaluation.views_used}"
     else:
-        own = f"{format_metric(mean.reference.psnr, 2)} dB, {format_metric(mean.reference.ssim, 4)}"
+        own = "{PSNR} dB, {SSIM}, {MS-SSIM}".format_map(mean.reference.texts())
         against = f"to {evaluation.views_used}; the scene itself {own}"
     surroundings = evaluation.surroundings
     rest = "" if surroundings is None else f"\nbeyond the capture: {surroundings_summary(surroundings)}"

@@ -64,7 +64,7 @@ def compact_scene(
         settings: settings with a budget; a scene with no more Gaussians than that is returned unchanged.
         views: a capture: its training views train and score, its held-out views evaluate. By default, virtual views
             train and score with renderings of the scene as targets, and cameras drawn over the whole scene evaluate.
-        evaluate: measure PSNR, SSIM and compressed bytes after every step. Ignored with ``max_psnr_drop``.
+        evaluate: measure PSNR, SSIM, MS-SSIM and compressed bytes after every step. Ignored with ``max_psnr_drop``.
         checkpoint: file for the state of the training, see :class:`kissgs.compaction.popspa.Popspa`.
         threads: number of threads; 0 means one per processor. The result does not depend on it.
         device: device of the training, see :class:`kissgs.compaction.popspa.Popspa`.

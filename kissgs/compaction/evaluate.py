@@ -31,7 +31,8 @@ def evaluate_scene(
         progress: receives the stage ``"evaluate"``.
 
     Returns:
-        PSNR (decibels) and SSIM, means over the views, and the bytes of a container with the preset ``fast``, as a zip.
+        Metrics to photographs if there are any, means over the views, and the bytes of a container with the preset
+        ``fast``, as a zip.
 
     Raises:
         InvalidViewsError: a photograph cannot be read.

@@ -71,7 +71,7 @@ class Popspa:
 
         Args:
             count: number of Gaussians to keep, from 1 to that of the scene.
-            evaluate: measure PSNR, SSIM and compressed bytes after every step.
+            evaluate: measure PSNR, SSIM, MS-SSIM and compressed bytes after every step.
             checkpoint: file for the state of the training, saved every half minute. If it exists and belongs to this
                 work, training continues from it, on the CPU with the same result as without an interruption. It stays
                 at the end; delete it once the result is saved.

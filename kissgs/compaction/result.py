@@ -23,6 +23,7 @@ class CompactionStep:
         psnr: decibels, mean over held-out views, to their photographs; without photographs, over cameras drawn over the
             whole scene, to renderings of the input, so that the input itself has infinity. None if not requested.
         ssim: SSIM of the same images, mean over views. None if not requested.
+        ms_ssim: MS-SSIM of the same images, mean over views. None if not requested.
         bytes: size of its container with the preset ``fast``. None if not requested.
     """
 
@@ -31,6 +32,7 @@ class CompactionStep:
     seconds: float
     psnr: float | None = None
     ssim: float | None = None
+    ms_ssim: float | None = None
     bytes: int | None = None
 
 

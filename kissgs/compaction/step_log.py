@@ -41,6 +41,7 @@ class StepLog:
                 seconds=seconds,
                 psnr=None if metrics is None else metrics.psnr,
                 ssim=None if metrics is None else metrics.ssim,
+                ms_ssim=None if metrics is None else metrics.ms_ssim,
                 bytes=size,
             )
         )

@@ -1,4 +1,4 @@
-"""PSNR, SSIM and LPIPS of a candidate scene's renderings against photographs and the reference's renderings.
+"""Image metrics of a candidate scene's renderings against photographs and against the reference's renderings.
 
 Renderings are clamped to [0, 1], as a screen does, but not rounded to 8 bits: rounding would limit every PSNR to about
 59 dB. (Published values often come from 8-bit files; near 30 dB the difference is below 0.01 dB.)
@@ -21,8 +21,9 @@ from kissgs.evaluation.cameras import evaluation_views, farther
 from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, Split, ViewComparison
 from kissgs.evaluation.visibility import share_shown
 from kissgs.rendering.camera import Camera
+from kissgs.rendering.flip import Flip
 from kissgs.rendering.lpips import Lpips
-from kissgs.rendering.metrics import psnr, ssim
+from kissgs.rendering.metrics import ms_ssim, psnr, ssim
 from kissgs.rendering.rasterizer import Device, load_kernels, render
 
 NOTHING_VISIBLE = (
@@ -43,6 +44,7 @@ def evaluate(
     split: Split = "test",
     seed: int = 0,
     distance: float = 1.0,
+    flip: bool = False,
     lpips: bool = False,
     device: Device = "cpu",
     threads: int = 0,
@@ -63,6 +65,7 @@ def evaluate(
         seed: seed of the drawn cameras.
         distance: distance of the drawn cameras from what they look at, in units of that where they were drawn; a
             coarse level of detail is meant for larger ones.
+        flip: compute FLIP too; needs the extra ``kissgs[flip]``.
         lpips: compute LPIPS too; needs the extra ``kissgs[lpips]``.
         device: ``"cuda"`` needs the extra ``kissgs[cuda]``.
         threads: number of threads; 0 means one per processor. The results do not depend on it.
@@ -71,10 +74,10 @@ def evaluate(
     Raises:
         InvalidViewsError: the distance is not positive, the split is empty, only some of its views have a photograph,
             or one cannot be read.
-        UnsupportedError: an image would take too much memory, CUDA or LPIPS is missing, or the split is unknown.
+        UnsupportedError: an image would take too much memory, CUDA, FLIP or LPIPS is missing, or the split is unknown.
     """
     reference, candidate = clean(reference)[0], clean(candidate)[0]
-    measure = _measure(lpips, device)
+    measure = _measure(flip, lpips, device)
     given = [] if views is None else [_select_split(views, split)]
     load_kernels(progress)
     drawn = farther(evaluation_views(reference, seed=seed, threads=threads, progress=progress), distance)
@@ -128,7 +131,7 @@ def compare_images(
     group = _select_split(views, "test")
     if device == "cpu":
         load_kernels(progress)
-    measure = _measure(False, device)
+    measure = _measure(False, False, device)
     evaluation = _compare_views(
         reference, candidate, group, measure, device, threads, reference_images, progress=progress
     )
@@ -203,12 +206,20 @@ def render_clamped(
     return np.clip(image, 0, 1)
 
 
-def _measure(lpips: bool, device: Device) -> Measure:
-    perceptual = Lpips(device) if lpips else None
+def _measure(flip: bool, lpips: bool, device: Device) -> Measure:
+    perceptual: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {}
+    if flip:
+        perceptual["flip"] = Flip()
+    if lpips:
+        perceptual["lpips"] = Lpips(device)
 
     def measure(image: np.ndarray, target: np.ndarray) -> ImageMetrics:
-        distance = None if perceptual is None else perceptual(image, target)
-        return ImageMetrics(psnr=psnr(image, target), ssim=ssim(image, target), lpips=distance)
+        return ImageMetrics(
+            psnr=psnr(image, target),
+            ssim=ssim(image, target),
+            ms_ssim=ms_ssim(image, target),
+            **{name: distance(image, target) for name, distance in perceptual.items()},
+        )
 
     return measure
 

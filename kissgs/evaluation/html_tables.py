@@ -22,8 +22,10 @@ def metric_cards(evaluation: Evaluation, before: int | None, after: int | None) 
     if mean.reference is not None:
         change = f"{psnr_change(mean)} dB: the reference has {format_metric(mean.reference.psnr, 2)} dB"
         yield _card("PSNR, candidate to photographs", f"{format_metric(mean.candidate.psnr, 2)} dB", change)
-        ssim = f"the reference has {format_metric(mean.reference.ssim, 4)}"
-        yield _card("SSIM, candidate to photographs", format_metric(mean.candidate.ssim, 4), ssim)
+        of_reference, of_candidate = mean.reference.texts(), mean.candidate.texts()
+        for name in list(of_candidate)[1:]:
+            remark = f"the reference has {of_reference[name]}"
+            yield _card(f"{name}, candidate to photographs", of_candidate[name], remark)
     remark = f"of their renderings; {other_metrics(mean.candidate_vs_reference)}"
     yield _card("PSNR, candidate to reference", f"{format_metric(mean.candidate_vs_reference.psnr, 2)} dB", remark)
     fifth = f"{format_metric(evaluation.fifth_percentile, 2)} dB is the 5th percentile"
@@ -44,7 +46,7 @@ def worst_views_text(evaluation: Evaluation) -> str:
     if surroundings is None:
         return text
     metrics = surroundings.mean.candidate_vs_reference
-    mean = f"PSNR {format_metric(metrics.psnr, 2)} dB, SSIM {format_metric(metrics.ssim, 4)}"
+    mean = f"PSNR {format_metric(metrics.psnr, 2)} dB, {other_metrics(metrics)}"
     return f"{text} Surroundings, {surroundings.views_used} ({surroundings.source}): {mean}; {surroundings.extremes}."
 
 
@@ -54,8 +56,7 @@ def _card(name: str, value: str, remark: str) -> str:
 
 def other_metrics(metrics: ImageMetrics) -> str:
     """Return all metrics but the PSNR, as text."""
-    lpips = "" if metrics.lpips is None else f", LPIPS {format_metric(metrics.lpips, 4)}"
-    return f"SSIM {format_metric(metrics.ssim, 4)}{lpips}"
+    return ", ".join(f"{name} {text}" for name, text in list(metrics.texts().items())[1:])
 
 
 def psnr_change(comparison: Comparison) -> str:
@@ -67,7 +68,7 @@ def psnr_change(comparison: Comparison) -> str:
 def views_table(evaluation: Evaluation, shown: Sequence[int]) -> str:
     """Return a table with a row for each view, linked to its images if it is among ``shown``, and the means."""
     mean = evaluation.mean
-    metrics = ["PSNR", "SSIM", "LPIPS"][: len(mean.candidate_vs_reference.cells())]
+    metrics = list(mean.candidate_vs_reference.texts())
     renderings = [("candidate to reference", metrics)]
     photographs = [("reference to photograph", metrics), ("candidate to photograph", metrics), ("change", ["dB"])]
     groups = renderings if mean.reference is None else photographs + renderings

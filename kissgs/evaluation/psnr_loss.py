@@ -1,4 +1,4 @@
-"""PSNR and PSNR loss of an evaluation, as goals of rate control and compaction define them."""
+"""PSNR of an evaluation, and its loss of PSNR and of SSIM, as goals of rate control and compaction define them."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ WORST_SHARE = 0.05
 """Share of the views, the worst ones, that a goal limits separately."""
 
 MAX_ERROR_RATIO = 20.0
-"""Largest ratio of the worst views' squared error to that of the goal. The mean alone would accept the loss of a part
-that few views show: there the ratio is in the hundreds, in views that are merely difficult below ten."""
+"""Largest ratio of the worst views' squared error, or loss of SSIM, to that of the goal. The mean alone would accept
+the loss of a part that few views show: there the ratio of squared errors is in the hundreds, in views that are merely
+difficult below ten."""
 
 
 def psnr_of(evaluation: Evaluation) -> float:
@@ -60,6 +61,20 @@ def drop_of(evaluation: Evaluation) -> float:
         drop, errors = -mean.change, _errors_added(evaluation)
     worst = _mean_of_worst(errors) / MAX_ERROR_RATIO
     return drop if math.isnan(drop) or worst <= 0 else max(drop, _drop_by(worst))
+
+
+def ssim_drop_of(evaluation: Evaluation) -> float:
+    """Return the drop of SSIM from reference to candidate as goals define it; NaN if a rendering failed.
+
+    With photographs it is the drop of the mean SSIM to them, without photographs 1 - SSIM to the renderings of the
+    reference. The worst views limit it: it is at least their mean drop divided by :data:`MAX_ERROR_RATIO`.
+    """
+    drops = [
+        (1.0 if view.reference is None else view.reference.ssim) - view.candidate.ssim
+        for view in (compared.comparison for compared in evaluation.views)
+    ]
+    mean, worst = sum(drops) / len(drops), _mean_of_worst(drops) / MAX_ERROR_RATIO
+    return mean if math.isnan(mean) or worst <= 0 else max(mean, worst)
 
 
 def _errors_added(evaluation: Evaluation) -> list[float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -30,22 +30,26 @@ class ImageMetrics:
         psnr: decibels; infinite for equal images. In a mean, each view counts for at most :data:`MAX_VIEW_PSNR`; it is
             infinite only if all images are equal.
         ssim: -1 to 1; 1 for equal images.
+        ms_ssim: 0 to 1; 1 for equal images.
+        flip: 0 for equal images, up to 1; None if not requested.
         lpips: 0 for equal images, up to about 1; None if not requested.
     """
 
     psnr: float
     ssim: float
+    ms_ssim: float
+    flip: float | None = None
     lpips: float | None = None
 
     def as_dict(self) -> dict[str, float | str | None]:
         """Return the metrics for JSON: an infinite value is None (null), NaN the string ``"NaN"``."""
-        values = {"psnr": as_json(self.psnr), "ssim": as_json(self.ssim)}
-        return values if self.lpips is None else {**values, "lpips": as_json(self.lpips)}
+        return {name: as_json(value) for name, value in asdict(self).items() if value is not None}
 
-    def cells(self) -> list[str]:
-        """Return the metrics as cells of a table."""
-        values = [format_metric(self.psnr, 2), format_metric(self.ssim, 4)]
-        return values if self.lpips is None else [*values, format_metric(self.lpips, 4)]
+    def texts(self) -> dict[str, str]:
+        """Return the metrics as text, by the names that tables give them; without those not requested."""
+        values = {"SSIM": self.ssim, "MS-SSIM": self.ms_ssim, "FLIP": self.flip, "LPIPS": self.lpips}
+        others = {name: format_metric(value, 4) for name, value in values.items() if value is not None}
+        return {"PSNR": format_metric(self.psnr, 2), **others}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,12 +84,17 @@ class Comparison:
             "candidate_vs_reference": self.candidate_vs_reference.as_dict(),
         }
 
-    def cells(self) -> list[str]:
-        """Return a table row: reference, candidate, change, candidate to reference; without photographs the last."""
+    def cells(self, names: Sequence[str] | None = None) -> list[str]:
+        """Return a table row: reference, candidate, change, candidate to reference; without photographs the last.
+
+        ``names`` are the metrics to take, of those that :meth:`ImageMetrics.texts` returns, by default all.
+        """
+        names = list(self.candidate.texts()) if names is None else names
+        to_reference = [self.candidate_vs_reference.texts()[name] for name in names]
         if self.reference is None or self.change is None:
-            return self.candidate_vs_reference.cells()
-        change = format_metric(self.change, 2, signed=True)
-        return [*self.reference.cells(), *self.candidate.cells(), change, *self.candidate_vs_reference.cells()]
+            return to_reference
+        to_photo = [metrics.texts()[name] for metrics in (self.reference, self.candidate) for name in names]
+        return [*to_photo, format_metric(self.change, 2, signed=True), *to_reference]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -243,12 +252,18 @@ class Evaluation:
 
 
 def _mean(values: Sequence[ImageMetrics]) -> ImageMetrics:
-    distances = [value.lpips for value in values if value.lpips is not None]
     return ImageMetrics(
         psnr=_mean_decibels([value.psnr for value in values]),
         ssim=sum(value.ssim for value in values) / len(values),
-        lpips=sum(distances) / len(values) if distances else None,
+        ms_ssim=sum(value.ms_ssim for value in values) / len(values),
+        flip=_mean_if_measured([value.flip for value in values]),
+        lpips=_mean_if_measured([value.lpips for value in values]),
     )
+
+
+def _mean_if_measured(values: Sequence[float | None]) -> float | None:
+    measured = [value for value in values if value is not None]
+    return sum(measured) / len(measured) if measured else None
 
 
 def _mean_decibels(values: Sequence[float]) -> float:

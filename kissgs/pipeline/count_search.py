@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 from kissgs.core.errors import StopSearch, UnsupportedError
 from kissgs.core.root_finding import minimize_unimodal
 from kissgs.core.splats import Splats
-from kissgs.evaluation.psnr_loss import drop_of, psnr_of
-from kissgs.pipeline.rate_control import Goal, RateControl
+from kissgs.evaluation.psnr_loss import drop_of
+from kissgs.pipeline.goal import Goal
+from kissgs.pipeline.rate_control import RateControl
 from kissgs.pipeline.trial import Trial
 from kissgs.sogxt.container import stored_sizes
 
@@ -23,10 +24,10 @@ BYTES_GROWTH = 1.4
 """Bytes per Gaussian expected after compaction, relative to the uncompacted scene; only for the first guess."""
 
 QUALITY_START_LOG2 = -2.0
-"""log2 of the share of the Gaussians that is tried first where the goal is a PSNR or a drop of it."""
+"""log2 of the share of the Gaussians that is tried first where the goal is no size."""
 
 FIRST_STEP_LOG2 = {True: 0.5, False: 1.0}
-"""First change of log2(count): True where the goal is a size, False where it is a PSNR or a drop of it."""
+"""First change of log2(count): True where the goal is a size."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,9 +140,9 @@ class CountSearch:
         compacted = self.compactor(count)
         evaluation = self.compactor.evaluate(compacted)
         self._drops[count] = drop_of(evaluation)
-        encode = self.encoding.settings.encode
-        infeasible = encode.max_psnr_drop is not None and self._drops[count] > encode.max_psnr_drop
-        infeasible |= encode.psnr is not None and psnr_of(evaluation) < encode.psnr
+        infeasible = (
+            not self.goal.by_size and self.goal.margin(self.goal.measured(Trial(count, None, 0), evaluation)) < 0
+        )
         candidate = (
             CountCandidate(math.inf, None, compacted) if infeasible else self._encode(compacted.splats, compacted)
         )

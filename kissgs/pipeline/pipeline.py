@@ -91,7 +91,7 @@ def compact(
         settings: their group ``compact`` says how many Gaussians to keep, and how: for example
             ``Settings.from_preset("balanced", compact={"ratio": 0.2})``.
         reading: options for a ``source`` that is a file.
-        evaluate: measure PSNR, SSIM and bytes after every step, for the report.
+        evaluate: measure PSNR, SSIM, MS-SSIM and bytes after every step, for the report.
         views: capture whose training photographs are the targets, and whose held-out views are for evaluation; by
             default renderings of the scene from virtual cameras.
         checkpoint: file in which the state of the training is saved every half minute. An identical call resumes from

@@ -1,9 +1,9 @@
-"""Rate control: search for the lambda whose container meets a goal, which is a size, a PSNR or a drop of it."""
+"""Rate control: search for the lambda whose container meets a goal."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -14,8 +14,8 @@ from kissgs.core.progress import SearchNote
 from kissgs.core.root_finding import StopRule, find_root
 from kissgs.core.splats import Splats
 from kissgs.evaluation.psnr_loss import SEARCH_SEED
-from kissgs.evaluation.results import MAX_VIEW_PSNR
 from kissgs.finetuning.result import FinetuneReport
+from kissgs.pipeline.goal import Goal
 from kissgs.pipeline.read_options import ReadOptions
 from kissgs.pipeline.scene_files import read_scene
 from kissgs.pipeline.trial import Trial
@@ -71,78 +71,6 @@ class Container:
 Encoder = Callable[[EncodeSettings], Container]
 
 
-@dataclass(frozen=True, slots=True)
-class Goal:
-    """A goal for a container: a size, a PSNR, or a drop of PSNR.
-
-    Attributes:
-        settings: settings that name exactly one goal.
-        slope: typical change of :meth:`margin` per doubling of lambda.
-        near: margin that is small enough to stop the search.
-    """
-
-    settings: EncodeSettings
-    slope: float
-    near: float
-
-    @classmethod
-    def of(cls, settings: EncodeSettings) -> Goal:
-        """Return the goal of these settings; near is 3 % of a size, 0.1 dB of a PSNR or 0.02 dB of a drop."""
-        if settings.target_size is not None:
-            return cls(settings, 0.2, -math.log2(0.97))
-        if settings.psnr is not None:
-            return cls(settings, -1.5, 0.1)
-        return cls(settings, -0.5, -math.log2(max(1 - 0.02 / (settings.max_psnr_drop or 1.0), 0.5)))
-
-    @property
-    def by_size(self) -> bool:
-        """Whether the goal is a size, so that no rendering is needed to evaluate it."""
-        return self.settings.target_size is not None
-
-    def margin(self, trial: Trial) -> float:
-        """Return by how much a trial exceeds the goal: at least 0 where it is met.
-
-        The unit is log2 of a ratio for sizes and drops, and decibels for a PSNR. Infinite where no PSNR is lost at all:
-        then the distance to the goal is unknown.
-        """
-        if self.settings.target_size is not None:
-            return math.log2(self.settings.target_size / trial.bytes)
-        if self.settings.psnr is not None:
-            return (trial.psnr or 0.0) - self.settings.psnr
-        if (
-            trial.drop is None or trial.drop == math.inf
-        ):  # infinite where the photographs equal the renderings of the scene
-            return -math.inf
-        if trial.drop <= 0:  # a container may even be closer to the photographs than the scene
-            return math.inf
-        return math.log2((self.settings.max_psnr_drop or 1.0) / trial.drop)
-
-    def failure_message(self, trials: Sequence[Trial], *, suggest_compaction: bool) -> str:
-        """Return why no trial meets the goal; ``suggest_compaction``: whether fewer Gaussians might, untried so far."""
-        lambdas = [trial.rd_lambda for trial in trials if trial.rd_lambda]
-        extreme = (max if self.by_size else min)(lambdas, default=None)
-        trials = [trial for trial in trials if trial.rd_lambda in (None, extreme)]  # those at the extreme lambda
-        if self.settings.target_size is not None:
-            smallest, target = min(trial.bytes for trial in trials), int(self.settings.target_size)
-            return (
-                f"target_size {target:,} byte{'' if target == 1 else 's'} cannot be met: the smallest container found "
-                f"has {smallest:,}; ask for at least that"
-                + (", or for fewer Gaussians: --compact auto" * suggest_compaction)
-            )
-        if self.settings.psnr is not None:
-            highest = math.floor(100 * max(trial.psnr or 0.0 for trial in trials)) / 100
-            return (
-                f"psnr {self.settings.psnr:g} dB cannot be met: the finest container found has {highest:.2f} dB; "
-                "ask for at most that"
-                + (f"; each view counts for at most {MAX_VIEW_PSNR:g} dB" if self.settings.psnr > MAX_VIEW_PSNR else "")
-            )
-        smallest_drop = 1.005 * min(math.inf if trial.drop is None else trial.drop for trial in trials)
-        return (
-            f"max_psnr_drop {self.settings.max_psnr_drop:g} dB cannot be met: the finest container found loses "
-            f"{smallest_drop:.3g} dB; allow at least that"
-        )
-
-
 class RateControl:
     """Search for the lambda at which a container just meets the goal of the settings.
 
@@ -175,13 +103,13 @@ class RateControl:
 
         Args:
             original: reference scene of the evaluation.
-            settings: settings with one goal.
+            settings: settings with a goal.
             views: views of the evaluation; None for cameras drawn over the whole scene.
             threads: number of threads; 0 means one per processor.
             progress: receives events; its note is set to the latest trial.
             count: number of Gaussians of the scene that is encoded, if it is not ``original``.
             packed: whether the files become a zip, whose size then counts; False for a folder.
-            byte_limit: for a PSNR or a drop: the search ends if a container of this size or more misses the goal.
+            byte_limit: for a goal that is no size: the search ends if a container of this size or more misses the goal.
         """
         self.original, self.settings, self.goal = original, settings, Goal.of(settings)
         self.views, self.threads, self.progress = views, threads, progress
@@ -367,7 +295,7 @@ class RateControl:
         size, sizes = stored_sizes(encoded.files, packed=self.packed)
         trial = Trial(self.count, encoded.rd_lambda, size)
         if not self.goal.by_size:
-            trial = trial.with_evaluation(self.evaluate(encoded))
+            trial = self.goal.measured(trial, self.evaluate(encoded))
         self.trials.append(trial)
         self.overhead = size - sum(stored for name, stored in sizes.items() if name.endswith(".webp"))
         self.progress.note = f"try {len(self.trials) + 1}, last: {trial.summary()}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from kissgs.evaluation.psnr_loss import drop_of, psnr_of
+from kissgs.evaluation.psnr_loss import drop_of, psnr_of, ssim_drop_of
 from kissgs.evaluation.results import as_json
 
 if TYPE_CHECKING:
@@ -23,6 +23,8 @@ class Trial:
         psnr: PSNR of its renderings to those of the scene as goals count it, decibels
             (:func:`kissgs.evaluation.psnr_loss.psnr_of`); None, as all that follow, where the goal is a size.
         drop: loss of PSNR as goals count it, decibels (:func:`kissgs.evaluation.psnr_loss.drop_of`).
+        ssim_drop: loss of SSIM as goals count it (:func:`kissgs.evaluation.psnr_loss.ssim_drop_of`); None where that is
+            no goal.
         worst: PSNR of the worst view, decibels.
         fifth_percentile: fifth percentile of the views' PSNR, decibels.
     """
@@ -32,20 +34,29 @@ class Trial:
     bytes: int
     psnr: float | None = None
     drop: float | None = None
+    ssim_drop: float | None = None
     worst: float | None = None
     fifth_percentile: float | None = None
 
-    def with_evaluation(self, evaluation: Evaluation) -> Trial:
-        """Return a copy with the figures of an evaluation."""
+    def with_evaluation(self, evaluation: Evaluation, *, ssim: bool = False) -> Trial:
+        """Return a copy with the figures of an evaluation, also those of SSIM if requested."""
         worst, fifth = evaluation.worst.comparison.candidate_vs_reference.psnr, evaluation.fifth_percentile
-        return replace(self, psnr=psnr_of(evaluation), drop=drop_of(evaluation), worst=worst, fifth_percentile=fifth)
+        return replace(
+            self,
+            psnr=psnr_of(evaluation),
+            drop=drop_of(evaluation),
+            ssim_drop=ssim_drop_of(evaluation) if ssim else None,
+            worst=worst,
+            fifth_percentile=fifth,
+        )
 
     def summary(self) -> str:
         """Return size and quality in one phrase: "812 kB at 41.20 dB, drop 0.12 dB, worst view 35.1 dB"."""
         psnr = "" if self.psnr is None else f" at {self.psnr:.2f} dB"
         drop = "" if self.drop is None else f", drop {self.drop:.2f} dB"
+        ssim = "" if self.ssim_drop is None else f", SSIM drop {self.ssim_drop:.4f}"
         worst = "" if self.worst is None else f", worst view {self.worst:.1f} dB"
-        return f"{self.bytes / 1000:,.0f} kB{psnr}{drop}{worst}"
+        return f"{self.bytes / 1000:,.0f} kB{psnr}{drop}{ssim}{worst}"
 
     def as_dict(self) -> dict[str, Any]:
         """Return all fields for JSON: infinity as null, NaN (a failed rendering) as the string ``"NaN"``."""

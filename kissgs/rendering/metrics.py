@@ -1,4 +1,4 @@
-"""Image metrics as in the 3DGS literature: PSNR and SSIM.
+"""Image metrics as in the 3DGS literature: PSNR, SSIM and MS-SSIM.
 
 Images are ``(H, W, 3)``, floats in [0, 1] or uint8. Values outside [0, 1] are not clamped here; clamp renderings first.
 A NaN in either image makes the result NaN, so that no average hides a failed rendering.
@@ -14,6 +14,12 @@ import numpy as np
 from kissgs.core.array_types import Float32, Float64, Shaped
 from kissgs.core.errors import InvalidViewsError
 from kissgs.core.threads import Workers
+
+WINDOW = 11
+"""Side of the Gaussian window of SSIM and MS-SSIM, pixels."""
+
+SCALE_WEIGHTS = 0.0448, 0.2856, 0.3001, 0.2363, 0.1333
+"""Exponents of MS-SSIM's five scales, from full resolution to a sixteenth of it, as published."""
 
 TILE_PIXELS = 160
 """Width of a tile, pixels: the largest that the ring buffers of the kernel hold."""
@@ -49,6 +55,58 @@ def ssim(image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "..."])
     with Workers(1) as pool:
         sums = difference_and_ssim(a[None], b[None], pool)
     return float(sums[1]) / a.size
+
+
+def ms_ssim(image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "..."]) -> float:
+    """Return the multi-scale structural similarity, from 0 to 1; exactly 1 for equal images.
+
+    The product over five scales, each of half the resolution of the one before (means of 2x2 pixels; an odd last row or
+    column is dropped), of means raised to :data:`SCALE_WEIGHTS`: of SSIM at the last scale, of its factor that compares
+    contrast and structure at the others. Negative means count as 0. It is computed for each channel and averaged. Wang,
+    Simoncelli and Bovik, "Multiscale Structural Similarity for Image Quality Assessment", Asilomar Conference on
+    Signals, Systems and Computers 2003.
+
+    The window and constants are those of :func:`ssim`. As in the publication only windows inside the image count, since
+    at the coarsest scale zeros beyond the border would reach a large share of the windows. A shorter side below 176
+    pixels has less than :data:`WINDOW` pixels at the last scale: only the scales that hold a window are used, and their
+    exponents are divided by their sum. Below 11 pixels, the result is :func:`ssim`, at least 0.
+
+    Raises:
+        InvalidViewsError: the arrays are not two images of the same size.
+    """
+    a, b = (np.clip(pixels, -1e9, 1e9) for pixels in image_pair(image, reference))
+    scales = min((min(a.shape[:2]) // WINDOW).bit_length(), len(SCALE_WEIGHTS))
+    if scales == 0:
+        return float(np.maximum(ssim(a, b), 0))
+    exponents = np.array(SCALE_WEIGHTS[:scales])
+    if scales < len(SCALE_WEIGHTS):
+        exponents /= exponents.sum()
+    product = np.ones(3)
+    for scale, exponent in enumerate(exponents):
+        similarity, structure = _mean_similarities(a, b)
+        product *= np.maximum(similarity if scale == scales - 1 else structure, 0) ** exponent
+        a, b = _halved(a), _halved(b)
+    return float(product.mean())
+
+
+def _mean_similarities(a: Float32[np.ndarray, "H W 3"], b: Float32[np.ndarray, "H W 3"]) -> Float64[np.ndarray, "2 3"]:
+    """Return the means of SSIM and of its second factor over all windows inside the images, for each channel."""
+    from kissgs.rendering import ssim_kernels
+
+    height, width = a.shape[0] - WINDOW + 1, a.shape[1] - WINDOW + 1
+    sums = np.zeros((2, 3))
+    for tile in _tiles(height, width):
+        ssim_kernels.similarity_tile(
+            a.reshape(len(a), -1), b.reshape(len(b), -1), tile + np.repeat([WINDOW // 2, WINDOW // 2 * 3], 2), sums
+        )
+    return sums / (height * width)
+
+
+def _halved(image: Float32[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "h w 3"]:
+    """Return the means of 2x2 pixels, without an odd last row or column."""
+    height, width = len(image) // 2 * 2, image.shape[1] // 2 * 2
+    rows = image[0:height:2, :width] + image[1:height:2, :width]  # faster than one mean over two axes
+    return (rows[:, ::2] + rows[:, 1::2]) * np.float32(0.25)
 
 
 def image_pair(

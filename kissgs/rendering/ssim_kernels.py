@@ -1,4 +1,4 @@
-"""Numba kernels of SSIM: its sum over a tile of an image and, in the same pass, its gradient.
+"""Numba kernels of SSIM: its sum over a tile of an image and, in the same pass, its gradient; sums for MS-SSIM.
 
 SSIM needs the images x and y only as their sum s = x + y and difference d = x - y. With G the blur, S = G s,
 D = G d, p = G s² - S² and q = G d² - D² (four blurs instead of five),
@@ -109,6 +109,26 @@ def _maps(moments: np.ndarray, values: np.ndarray, ring: np.ndarray) -> None:
         ring[j + 17920] = dq
 
 
+@compiled("void(float32[::1], float32[::1], float32[::1])", fastmath=_FAST)
+def _similarities(moments: np.ndarray, values: np.ndarray, structures: np.ndarray) -> None:
+    """Blur the moments horizontally; write SSIM into ``values`` and its second factor into ``structures``."""
+    c1 = np.float32(2 * 0.01**2)
+    c2 = np.float32(2 * 0.03**2)
+    zero = np.float32(0)
+    for j in range(len(values)):
+        S = _blur(moments, j, 3)
+        D = _blur(moments, j + 576, 3)
+        SS = S * S
+        DD = D * D
+        p = _blur(moments, j + 1152, 3) - SS
+        q = _blur(moments, j + 1728, 3) - DD
+        p = zero if p < zero else p  # a variance may be negative by rounding
+        q = zero if q < zero else q
+        structure = (p - q + c2) / (p + q + c2)
+        values[j] = (SS - DD + c1) / (SS + DD + c1) * structure
+        structures[j] = structure
+
+
 @compiled("void(float32[::1], int64, float32[::1])", fastmath=_FAST)
 def _blur_maps(ring: np.ndarray, count: int, out: np.ndarray) -> None:
     """Blur ``count`` columns of the maps vertically, over the first eleven rows of ``ring``."""
@@ -204,3 +224,32 @@ def ssim_tile(
         y -= 5  # row of the gradient
         _blur_maps(map_ring[oldest * 1536 :], count + 30, blurred)
         _gradient(blurred, ring[oldest * 1152 + 30 :], l1, ssim, gradient[y, left:right])
+
+
+@compiled("void(float32[:, ::1], float32[:, ::1], int64[::1], float64[:, ::1])")
+def similarity_tile(image: np.ndarray, target: np.ndarray, tile: np.ndarray, sums: np.ndarray) -> None:
+    """Add the sums of SSIM and of its factor structure over one tile, for each channel.
+
+    Args:
+        image: ``(H, 3 W)``, interleaved channels of any values.
+        target: ``(H, 3 W)``, interleaved channels of any values.
+        tile: top, bottom, left, right, ends exclusive; columns count channels, at most 480. The tile lies at least five
+            pixels inside the image, so that all windows do.
+        sums: ``(2, 3)``; Σ SSIM and Σ structure are added.
+    """
+    top, bottom, left, right = tile
+    ring = np.zeros(22 * 1152, dtype=np.float32)
+    moments = np.zeros(4 * 576, dtype=np.float32)
+    maps = np.zeros((2, right - left), dtype=np.float32)
+    for step in range(bottom - top + 10):
+        y = top - 5 + step
+        row = slice(left - 15, right + 15)
+        _sum_and_difference(image[y, row], target[y, row], ring[step % 11 * 1152 :])
+        if step < 10:
+            continue
+        _moments(ring[(step + 1) % 11 * 1152 :], right - left + 30, moments)
+        _similarities(moments, maps[0], maps[1])
+        for j in range(0, right - left, 3):
+            for channel in range(3):
+                sums[0, channel] += np.float64(maps[0, j + channel])
+                sums[1, channel] += np.float64(maps[1, j + channel])

@@ -24,8 +24,8 @@ class CompactSettings(TrainingViewSettings):
     )
     auto_count: bool = Field(
         False,
-        description="Choose the number of Gaussians that meets the goal of encode best. Needs target_size, psnr or "
-        "max_psnr_drop of encode.",
+        description="Choose the number of Gaussians that meets the goal of encode best. Needs target_size, psnr, "
+        "max_psnr_drop or max_ssim_drop of encode.",
     )
     method: Literal["prune", "merge"] = Field(
         "prune",

@@ -71,6 +71,15 @@ class EncodeSettings(BaseModel):
         "lose at most this PSNR, decibels. Takes a few encodings. Without photographs, the loss is estimated at random "
         "cameras, other ones than those of 'evaluate', as if the original scene had 30 dB to photographs.",
     )
+    max_ssim_drop: float | None = Field(
+        None,
+        gt=0,
+        le=1,
+        description="With rate_distortion: search for the smallest container whose renderings of the held-out views "
+        "lose at most this SSIM to the photographs; without photographs, SSIM to renderings of the scene is at least 1 "
+        "minus this, at random cameras other than those of 'evaluate'. With max_psnr_drop, both must hold. Takes a few "
+        "encodings.",
+    )
     max_encodes: int = Field(
         10,
         ge=1,
@@ -243,7 +252,7 @@ class EncodeSettings(BaseModel):
 
     @property
     def has_goal(self) -> bool:
-        """Whether a PSNR, a maximum PSNR loss or a size is to be met."""
+        """Whether a size, a PSNR or a maximum loss of PSNR or SSIM is to be met."""
         return any(getattr(self, name) is not None for name in GOALS)
 
     @model_validator(mode="after")
@@ -259,7 +268,7 @@ class EncodeSettings(BaseModel):
     @model_validator(mode="after")
     def _one_goal(self) -> Self:
         goals = [name for name in ("rd_lambda", *GOALS) if getattr(self, name) is not None]
-        if len(goals) > 1:
+        if len(goals) > 1 and goals != ["max_psnr_drop", "max_ssim_drop"]:
             raise ValueError(f"{goals[0]} and {goals[1]} cannot both be met; give one")
         if goals and not self.rate_distortion:
             raise ValueError(
@@ -268,7 +277,7 @@ class EncodeSettings(BaseModel):
         return self
 
 
-GOALS = ("psnr", "target_size", "max_psnr_drop")
+GOALS = ("psnr", "target_size", "max_psnr_drop", "max_ssim_drop")
 
 UNIFORM_ONLY = (
     *("shared_step_size", "means_bits", "means_tolerance", "opacity_step", "scale_step", "quat_step", "sh0_step"),

@@ -39,7 +39,8 @@ class Settings(BaseModel):
     def _a_goal_to_go_by(self) -> Self:
         if self.compact.auto_count and not self.encode.has_goal:
             raise ValueError(
-                "auto_count needs a goal: give target_size, max_psnr_drop or psnr, or the number of Gaussians to keep"
+                "auto_count needs a goal: give target_size, max_psnr_drop, max_ssim_drop or psnr, or the number of "
+                "Gaussians to keep"
             )
         return self
 

@@ -40,7 +40,7 @@ class JobOptions(kissgs.Settings):
         description="Format of the container: sogxt (.zip), or sog, which other viewers open (.sog, SOG version 2).",
     )
     evaluate: bool = Field(
-        False, description="Also render both scenes and compare the images (PSNR, SSIM), which takes longer."
+        False, description="Also render both scenes and compare the images (PSNR, SSIM, MS-SSIM), which takes longer."
     )
 
     @property
@@ -156,9 +156,9 @@ class JobStatus(ApiModel):
     )
     evaluation: dict[str, Any] | None = Field(
         None,
-        description="PSNR and SSIM against renderings of the upload, from cameras sampled over the whole scene: means, "
-        "the worst view and its camera position, the fifth percentile of PSNR, and the share of the scene that the "
-        "views show. A PSNR of null is infinite.",
+        description="PSNR, SSIM and MS-SSIM against renderings of the upload, from cameras sampled over the whole "
+        "scene: means, the worst view and its camera position, the fifth percentile of PSNR, and the share of the "
+        "scene that the views show. A PSNR of null is infinite.",
     )
     finetuning: dict[str, Any] | None = Field(
         None, description="PSNR and bytes before and after fine-tuning, and whether its result was kept."

@@ -14,7 +14,7 @@
  *   finetuning?: {kept: boolean, psnr_before: number | null, psnr_after: number | null, bytes_before: number,
  *     bytes_after: number},
  *   upload_bytes: number, gaussians: number, sh_degree: number, kept?: number, compacted?: number, invisible?: number, cleaned?: Record<string, number>,
- *   evaluation?: {psnr?: number | null, ssim: number, worst?: {psnr: number | string | null, position: number[]}}, sizes?: Sizes, timings: Timings, starts: number,
+ *   evaluation?: {psnr?: number | null, ssim: number, ms_ssim?: number, worst?: {psnr: number | string | null, position: number[]}}, sizes?: Sizes, timings: Timings, starts: number,
  *   problem?: ProblemDocument, links: Record<string, string>, expires_at?: string}} Status
  * @typedef {{jobs: Status[], next: string | null}} JobPage
  * @typedef {{max_upload_bytes: number, max_header_bytes: number, max_gaussians: number,

@@ -59,13 +59,14 @@ function figures(status) {
   ];
   if (finetuning) pairs.push(["Fine-tuning", gain(finetuning), "on held-out views"]);
   if (evaluation) {
-    const { psnr, ssim, worst } = evaluation; // no PSNR if the images are identical
+    const { psnr, ssim, ms_ssim, worst } = evaluation; // no PSNR if the images are identical
     pairs.push([
       "PSNR",
       typeof psnr === "number" ? `${psnr.toFixed(2)} dB` : "identical",
       "to the upload's renderings",
     ]);
     pairs.push(["SSIM", ssim.toFixed(4), "1 is identical"]);
+    if (typeof ms_ssim === "number") pairs.push(["MS-SSIM", ms_ssim.toFixed(4), "1 is identical"]);
     if (typeof worst?.psnr === "number") {
       pairs.push(["Worst view", `${worst.psnr.toFixed(2)} dB`, `from ${point(worst.position)}`]);
     }

@@ -17,6 +17,7 @@ POINT = RatePoint(
     bytes=1,
     psnr=0,
     ssim=0,
+    ms_ssim=0,
     psnr_to_scene=0,
     seconds=0,
     cpu_seconds=0,

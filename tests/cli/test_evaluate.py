@@ -54,8 +54,12 @@ def test_the_table_says_what_was_compared(folder: Path) -> None:
     assert "1.0x smaller" in text
     assert "1,500 of 1,500 Gaussians" in text
     rows = {row.split()[0]: row.split()[1:] for row in text.splitlines() if row.startswith(("images/", "mean"))}
-    assert rows["images/a.png"] == found.views[0].comparison.cells()
-    assert rows["mean"] == found.mean.cells()
+    assert rows["images/a.png"] == found.views[0].comparison.cells(["PSNR", "SSIM"])
+    assert rows["mean"] == found.mean.cells(["PSNR", "SSIM"])
+    means = found.mean.reference, found.mean.candidate, found.mean.candidate_vs_reference
+    titles = ("reference to photo", "candidate to photo", "candidate to reference")
+    below = {row[:22].strip(): row[22:].split() for row in text.splitlines() if row.startswith(titles)}
+    assert below == {title: [f"{mean.ms_ssim:.4f}"] for title, mean in zip(titles, means, strict=True)}
 
 
 def test_without_views_it_draws_cameras_and_folders_are_scenes_too(folder: Path, tmp_path: Path) -> None:
@@ -159,8 +163,10 @@ def test_compressing_can_evaluate(folder: Path, tmp_path: Path) -> None:
     assert report == json.loads(json.dumps(found.as_dict()))
     assert (tmp_path / "a.zip").read_bytes() == kissgs.compress(folder / "a.ply", views=views).to_zip()
     text = run(*words, "--force").stdout.decode()
-    psnr, ssim = found.mean.candidate.cells()
-    assert f"PSNR {psnr} dB, SSIM {ssim} to 1 held-out photograph; the scene itself" in text
+    own, mean = found.mean.reference, found.mean.candidate
+    figures = f"PSNR {mean.psnr:.2f} dB, SSIM {mean.ssim:.4f}, MS-SSIM {mean.ms_ssim:.4f}"
+    scene = f"{own.psnr:.2f} dB, {own.ssim:.4f}, {own.ms_ssim:.4f}"
+    assert f"{figures} to 1 held-out photograph; the scene itself {scene};" in text
     run(*[word for word in words if word != "--evaluate"], "--force")
     assert (tmp_path / "a.zip").read_bytes() == kissgs.compress(folder / "a.ply", views=views).to_zip()
 

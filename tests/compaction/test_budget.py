@@ -123,7 +123,7 @@ def test_without_photographs_the_drop_assumes_errors_of_a_usual_capture():
 
 def evaluation_of(psnr):
     evaluation = evaluate(cloud(5), cloud(5), Views((), around(1), black(), ""))
-    metrics = ImageMetrics(psnr=psnr, ssim=1.0)
+    metrics = ImageMetrics(psnr=psnr, ssim=1.0, ms_ssim=1.0)
     comparison = Comparison(reference=None, candidate=metrics, candidate_vs_reference=metrics)
     (view,) = evaluation.views
     changed = ViewComparison(view=view.view, comparison=comparison)

@@ -97,8 +97,10 @@ def test_steps_are_reported():
     assert [step.count for step in result.report.steps] == [100, 45, 45, 30, 30, 20, 20]
     first, *others = result.report.steps
     assert first.psnr == float("inf")
-    assert first.ssim == 1
-    assert all(0 < step.psnr < 100 and step.ssim < 1 and step.bytes < first.bytes for step in others)
+    assert first.ssim == first.ms_ssim == 1
+    assert all(
+        0 < step.psnr < 100 and step.ssim < 1 and 0 < step.ms_ssim < 1 and step.bytes < first.bytes for step in others
+    )
     assert result.report.as_dict()["steps"][0]["psnr"] is None
 
 

@@ -23,7 +23,7 @@ from kissgs.evaluation.metric_text import format_metric
 from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, ViewComparison
 from kissgs.evaluation.visibility import share_shown
 from kissgs.rendering.camera import look_at
-from kissgs.rendering.metrics import ssim
+from kissgs.rendering.metrics import ms_ssim, ssim
 from kissgs.rendering.rasterizer import render
 
 WORSE = damaged()
@@ -41,6 +41,7 @@ def photo_of(view):
 def assert_metrics(found, image, target):
     assert found.psnr == pytest.approx(decibels(image, target), abs=1e-5)
     assert found.ssim == pytest.approx(ssim(image, target), abs=1e-7)
+    assert found.ms_ssim == pytest.approx(ms_ssim(image, target), abs=1e-7)
     assert found.lpips is None
 
 
@@ -81,15 +82,16 @@ def test_means_are_means_of_decibels(capture):
         mean, each = getattr(found.mean, side), [getattr(view.comparison, side) for view in found.views]
         assert mean.psnr == pytest.approx(np.mean([value.psnr for value in each]))
         assert mean.ssim == pytest.approx(np.mean([value.ssim for value in each]))
+        assert mean.ms_ssim == pytest.approx(np.mean([value.ms_ssim for value in each]))
         assert mean.lpips is None
 
 
 def test_equal_scenes_have_infinite_psnr(capture):
     found = evaluate(SCENE, SCENE, capture, split="train")
-    assert found.mean.candidate_vs_reference == ImageMetrics(psnr=math.inf, ssim=1.0)
+    assert found.mean.candidate_vs_reference == ImageMetrics(psnr=math.inf, ssim=1.0, ms_ssim=1.0)
     assert found.mean.change == 0
     report = json.loads(json.dumps(found.as_dict(), allow_nan=False))
-    assert report["mean"]["candidate_vs_reference"] == {"psnr": None, "ssim": 1.0}
+    assert report["mean"]["candidate_vs_reference"] == {"psnr": None, "ssim": 1.0, "ms_ssim": 1.0}
     assert report["mean"]["reference"] == report["mean"]["candidate"]
 
 
@@ -103,7 +105,7 @@ def test_the_json_has_the_documented_layout(capture):
     (view,) = report["views"]
     assert (view["name"], view["width"], view["height"]) == ("images/a.png", 60, 40)
     assert report["mean"] == {side: view[side] for side in ("reference", "candidate", "candidate_vs_reference")}
-    assert set(view["reference"]) == {"psnr", "ssim"}
+    assert set(view["reference"]) == {"psnr", "ssim", "ms_ssim"}
     without = evaluate(SCENE, WORSE, cameras()).as_dict()
     assert without["mean"]["reference"] is None
     assert without["mean"]["candidate"] == without["mean"]["candidate_vs_reference"]
@@ -248,14 +250,16 @@ def test_progress_is_reported_and_can_cancel():
         evaluate(SCENE, SCENE, cameras(test=4), progress=stop)
 
 
-def test_lpips_is_measured_on_request(monkeypatch, capture):
+def test_flip_and_lpips_are_measured_on_request(monkeypatch, capture):
+    monkeypatch.setattr(evaluation_module, "Flip", lambda: lambda image, target: float(np.abs(image - target).mean()))
     monkeypatch.setattr(
         evaluation_module, "Lpips", lambda device: lambda image, target: float(np.abs(image - target).max())
     )
-    found = evaluate(SCENE, WORSE, cameras(), lpips=True)
-    each = [np.abs(rendered_view(WORSE, view) - rendered_view(SCENE, view)).max() for view in cameras().test]
-    assert found.mean.candidate_vs_reference.lpips == pytest.approx(np.mean(each))
-    assert set(found.as_dict()["mean"]["candidate_vs_reference"]) == {"psnr", "ssim", "lpips"}
+    found = evaluate(SCENE, WORSE, cameras(), flip=True, lpips=True)
+    each = [np.abs(rendered_view(WORSE, view) - rendered_view(SCENE, view)) for view in cameras().test]
+    assert found.mean.candidate_vs_reference.lpips == pytest.approx(np.mean([image.max() for image in each]))
+    assert found.mean.candidate_vs_reference.flip == pytest.approx(np.mean([image.mean() for image in each]))
+    assert set(found.as_dict()["mean"]["candidate_vs_reference"]) == {"psnr", "ssim", "ms_ssim", "flip", "lpips"}
 
 
 def test_missing_cuda_is_an_error():
@@ -282,7 +286,7 @@ def test_a_failed_rendering_is_not_hidden(monkeypatch):
     found = evaluate(SCENE, SCENE.select(slice(0, 900)), views)
     report = json.loads(json.dumps(found.as_dict(), allow_nan=False))
     assert [view["candidate_vs_reference"]["psnr"] for view in report["views"]] == [None, "NaN", None]
-    assert report["mean"]["candidate_vs_reference"] == {"psnr": "NaN", "ssim": "NaN"}
+    assert report["mean"]["candidate_vs_reference"] == {"psnr": "NaN", "ssim": "NaN", "ms_ssim": "NaN"}
 
 
 PSNRS = st.floats(0, 100) | st.sampled_from([math.inf, math.nan])
@@ -291,7 +295,7 @@ PSNRS = st.floats(0, 100) | st.sampled_from([math.inf, math.nan])
 @given(st.lists(st.tuples(PSNRS, PSNRS, PSNRS), min_size=1, max_size=5))
 def test_any_metrics_are_averaged_and_valid_json(psnrs):
     view = View("a", cameras(test=1).test[0].camera)
-    rows = [[ImageMetrics(psnr=value, ssim=0.5) for value in row] for row in psnrs]
+    rows = [[ImageMetrics(psnr=value, ssim=0.5, ms_ssim=0.5) for value in row] for row in psnrs]
     compared = tuple(
         ViewComparison(view=view, comparison=Comparison(reference=a, candidate=b, candidate_vs_reference=c))
         for a, b, c in rows
@@ -310,7 +314,7 @@ def test_any_metrics_are_averaged_and_valid_json(psnrs):
         column = [row[i] for row in psnrs]
         mean = None if set(column) == {math.inf} else pytest.approx(np.mean(np.minimum(column, 60)))
         assert report["mean"][side]["psnr"] == ("NaN" if any(map(math.isnan, column)) else mean)
-    assert all(len(each.comparison.cells()) == 7 for each in compared)
+    assert all(len(each.comparison.cells()) == 10 for each in compared)
     same = [a == b for a, b, _ in psnrs]
     assert all(each.comparison.change == 0 for each, equal in zip(compared, same, strict=True) if equal)
 
@@ -323,7 +327,7 @@ def evaluation_of(psnrs):
             view=View(f"{number}", camera),
             comparison=Comparison(reference=None, candidate=metrics, candidate_vs_reference=metrics),
         )
-        for number, metrics in enumerate(ImageMetrics(psnr=psnr, ssim=0.5) for psnr in psnrs)
+        for number, metrics in enumerate(ImageMetrics(psnr=psnr, ssim=0.5, ms_ssim=0.5) for psnr in psnrs)
     ]
     return Evaluation(
         against="renderings",

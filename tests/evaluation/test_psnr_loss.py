@@ -1,4 +1,4 @@
-"""PSNR and its drop as goals define them. Oracle: squared errors, added and averaged one by one."""
+"""PSNR, its drop and that of SSIM as goals define them. Oracle: errors, added and averaged one by one."""
 
 import math
 
@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kissgs.cameras.views import View
-from kissgs.evaluation.psnr_loss import ASSUMED_PSNR, MAX_ERROR_RATIO, drop_of, psnr_of
+from kissgs.evaluation.psnr_loss import ASSUMED_PSNR, MAX_ERROR_RATIO, drop_of, psnr_of, ssim_drop_of
 from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, ViewComparison
 from kissgs.rendering.camera import look_at
 
@@ -17,8 +17,8 @@ VIEW = View(
 )
 
 
-def metrics(psnr):
-    return ImageMetrics(psnr=psnr, ssim=0.5)
+def metrics(psnr, ssim=0.5):
+    return ImageMetrics(psnr=psnr, ssim=ssim, ms_ssim=0.5)
 
 
 def evaluation_of(psnrs, photo_psnrs=None):
@@ -31,14 +31,49 @@ def evaluation_of(psnrs, photo_psnrs=None):
             Comparison(reference=metrics(one), candidate=metrics(other), candidate_vs_reference=metrics(psnr))
             for (one, other), psnr in zip(photo_psnrs, psnrs, strict=True)
         ]
+    return evaluation_with(compared)
+
+
+def evaluation_with(compared):
     return Evaluation(
-        against="renderings" if photo_psnrs is None else "photos",
+        against="photos" if compared[0].reference else "renderings",
         split="all",
         source="",
         background=np.zeros(3, np.float32),
         reference_count=1,
         candidate_count=1,
         views=tuple(ViewComparison(view=VIEW, comparison=each) for each in compared),
+    )
+
+
+def similarities(*ssims):
+    """Return an evaluation with these SSIMs: to renderings, or pairs of reference and candidate to photographs."""
+    pairs = [ssim if isinstance(ssim, tuple) else (None, ssim) for ssim in ssims]
+    return evaluation_with(
+        [
+            Comparison(
+                reference=None if own is None else metrics(30.0, own),
+                candidate=metrics(30.0, ssim),
+                candidate_vs_reference=metrics(30.0, ssim if own is None else 0.2),
+            )
+            for own, ssim in pairs
+        ]
+    )
+
+
+def test_a_drop_of_ssim_is_that_to_photographs_or_to_renderings():
+    assert ssim_drop_of(similarities(0.99, 0.98, 1.0)) == pytest.approx(0.01)
+    assert ssim_drop_of(similarities((0.94, 0.93), (0.9, 0.91), (0.8, 0.77))) == pytest.approx(0.01)
+    assert ssim_drop_of(similarities((0.94, 0.95), (0.9, 0.9))) == pytest.approx(-0.005)
+    assert ssim_drop_of(similarities(1.0, 1.0)) == 0
+    assert math.isnan(ssim_drop_of(similarities(0.9, math.nan)))
+
+
+def test_the_mean_of_ssim_does_not_hide_a_lost_part():
+    """The worst twentieth of 40 views is two: their mean drop is 0.5, the mean of all of them 0.025."""
+    assert ssim_drop_of(similarities(*[1.0] * 38, 0.4, 0.6)) == pytest.approx(0.025)
+    assert ssim_drop_of(similarities(*[(0.9, 0.91)] * 38, (0.9, 0.5), (0.9, 0.3))) == pytest.approx(
+        0.5 / MAX_ERROR_RATIO
     )
 
 

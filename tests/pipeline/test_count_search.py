@@ -96,14 +96,34 @@ def test_a_drop_is_met(allowed):
     assert nearest > allowed - 0.02 or len(tried) == chosen.encode.max_encodes
 
 
-def test_a_drop_is_measured_to_photographs_if_there_are_any(tmp_path):
-    """A scene with low PSNR to its photographs loses less by the same errors than the model of 30 dB predicts."""
-    scene, held_out = cloud(200), []
+@pytest.mark.parametrize("limits", [{"max_ssim_drop": 0.01}, {"max_ssim_drop": 0.01, "max_psnr_drop": 0.15}])
+@pytest.mark.quick(1)
+def test_a_drop_of_ssim_is_met(limits):
+    chosen = Settings.from_preset("balanced", **limits, **FEW_VIEWS)
+    found = kissgs.compress(SCENE, settings=chosen, evaluate=True)
+    assert 1 - found.report.evaluation.mean.candidate.ssim < 2 * 0.01  # from other cameras
+    allowed_psnr = limits.get("max_psnr_drop", math.inf)
+    met = [trial for trial in found.report.trials if trial.ssim_drop <= 0.01 and trial.drop <= allowed_psnr]
+    (kept,) = {trial for trial in met if trial.bytes == len(found.to_zip())}
+    assert kept.bytes == min(trial.bytes for trial in met)
+    near = kept.ssim_drop > 0.95 * 0.01 or kept.drop > allowed_psnr - 0.02
+    assert near or len(found.report.trials) == chosen.encode.max_encodes
+    assert f"SSIM drop {kept.ssim_drop:.4f}" in kept.summary()
+
+
+def capture_with_photographs(scene, tmp_path):
+    held_out = []
     for view in around(3):
         image = np.clip(render(scene, view.camera)[0] * 255 + 0.5, 0, 255).astype(np.uint8)
         Image.fromarray(image // 2 + 30).save(tmp_path / f"{view.name}.png")
         held_out.append(View(view.name, view.camera, tmp_path / f"{view.name}.png"))
-    views = Views(around(5), tuple(held_out), black(), "five views")
+    return Views(around(5), tuple(held_out), black(), "five views")
+
+
+def test_a_drop_is_measured_to_photographs_if_there_are_any(tmp_path):
+    """A scene with low PSNR to its photographs loses less by the same errors than the model of 30 dB predicts."""
+    scene = cloud(200)
+    views = capture_with_photographs(scene, tmp_path)
     chosen = Settings.from_preset("balanced", max_psnr_drop=0.3, **FEW_VIEWS)
     found = kissgs.compress(scene, settings=chosen, views=views, evaluate=True)
     mean = found.report.evaluation.mean
@@ -113,7 +133,27 @@ def test_a_drop_is_measured_to_photographs_if_there_are_any(tmp_path):
     ]
 
 
+def test_a_drop_of_ssim_is_measured_to_photographs_if_there_are_any(tmp_path):
+    scene = cloud(200)
+    views = capture_with_photographs(scene, tmp_path)
+    chosen = Settings.from_preset("balanced", max_ssim_drop=0.02, **FEW_VIEWS)
+    found = kissgs.compress(scene, settings=chosen, views=views, evaluate=True)
+    mean = found.report.evaluation.mean
+    lost = mean.reference.ssim - mean.candidate.ssim
+    assert lost <= 0.02
+    assert (pytest.approx(lost), len(found.to_zip())) in [
+        (trial.ssim_drop, trial.bytes) for trial in found.report.trials
+    ]
+
+
 def test_an_unreachable_drop_is_refused():
+    with pytest.raises(
+        UnsupportedError,
+        match=r"max_psnr_drop 9 dB and max_ssim_drop 1e-09 cannot be met: .* loses \d\.\d+ dB and 0\.\d+ of SSIM; ",
+    ):
+        kissgs.compress(
+            SCENE, settings=Settings.from_preset("balanced", max_psnr_drop=9, max_ssim_drop=1e-9, **FEW_VIEWS)
+        )
     with pytest.raises(UnsupportedError, match=r"max_psnr_drop 1e-09 dB cannot be met: .* loses \d\.\d+ dB; allow"):
         kissgs.compress(SCENE, settings=Settings.from_preset("balanced", max_psnr_drop=1e-9, **FEW_VIEWS))
 
@@ -161,16 +201,26 @@ def test_all_gaussians_stay_if_they_fit():
     assert "all of them fit into the target size" in found.report.compaction.note
 
 
-@pytest.mark.parametrize("goal", [{"max_psnr_drop": 0.4}, {"psnr": 35.0}])
+@pytest.mark.parametrize("goal", [{"max_psnr_drop": 0.4}, {"psnr": 35.0}, {"max_ssim_drop": 0.02}])
 @pytest.mark.quick(0)
 def test_fewer_gaussians_for_a_quality(goal):
     found = kissgs.compress(SCENE, settings=settings(**goal), evaluate=True)
     whole = kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **goal, **FEW_VIEWS))
     assert len(found.to_zip()) <= len(whole.to_zip())
     made = [trial for trial in found.report.trials if trial.bytes == len(found.to_zip())]
-    assert any(trial.drop <= 0.4 if "psnr" not in goal else trial.psnr >= 35.0 for trial in made)
-    evaluation = found.report.evaluation  # from other cameras
-    assert drop_of(evaluation) <= 0.8 if "psnr" not in goal else evaluation.mean.candidate_vs_reference.psnr >= 33.0
+    met = {
+        "max_psnr_drop": lambda trial: trial.drop <= 0.4,
+        "psnr": lambda trial: trial.psnr >= 35,
+        "max_ssim_drop": lambda trial: trial.ssim_drop <= 0.02,
+    }
+    nearly = {
+        "max_psnr_drop": lambda evaluation: drop_of(evaluation) <= 0.8,
+        "psnr": lambda evaluation: evaluation.mean.candidate.psnr >= 33,
+        "max_ssim_drop": lambda evaluation: evaluation.mean.candidate.ssim >= 0.96,
+    }
+    (name,) = goal
+    assert any(map(met[name], made))
+    assert nearly[name](found.report.evaluation)  # from other cameras
 
 
 @pytest.mark.quick(0)
@@ -236,7 +286,7 @@ def test_a_stopped_search_for_a_count_returns_the_best_count():
 @pytest.mark.parametrize(
     ("goal", "changes", "message"),
     [
-        ({}, {}, "auto_count needs a goal: give target_size, max_psnr_drop or psnr"),
+        ({}, {}, "auto_count needs a goal: give target_size, max_psnr_drop, max_ssim_drop or psnr"),
         ({"target_size": "1MB"}, {"count": 9}, "count and auto_count cannot both be met; give one"),
         ({"target_size": "1MB", "max_psnr_drop": 1}, {}, "target_size and max_psnr_drop cannot both be met"),
         (

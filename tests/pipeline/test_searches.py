@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 import kissgs
 from kissgs import Settings, UnsupportedError
 from kissgs.core.root_finding import ATTEMPTS, MAX_EXTRAPOLATION, StopRule, find_root
-from kissgs.pipeline.rate_control import Goal
+from kissgs.pipeline.goal import Goal
 from kissgs.pipeline.trial import Trial
 
 SCENE = kissgs.sample_scene(1500, sh_degree=1, seed=5)
@@ -277,6 +277,17 @@ def test_goals_of_scenes_of_few_gaussians(count):
         ("paper", {"target_size": "3MB"}, "target_size needs rate_distortion"),
         ("balanced", {"psnr": 40, "target_size": "3MB"}, "psnr and target_size cannot both be met; give one"),
         ("balanced", {"psnr": 40, "rd_lambda": 1e-9}, "rd_lambda and psnr cannot both be met"),
+        ("balanced", {"psnr": 40, "max_ssim_drop": 0.1}, "psnr and max_ssim_drop cannot both be met; give one"),
+        ("balanced", {"target_size": 9000, "max_ssim_drop": 0.1}, "target_size and max_ssim_drop cannot both be met"),
+        ("balanced", {"rd_lambda": 1e-9, "max_ssim_drop": 0.1}, "rd_lambda and max_ssim_drop cannot both be met"),
+        (
+            "balanced",
+            {"psnr": 40, "max_psnr_drop": 1, "max_ssim_drop": 0.1},
+            "psnr and max_psnr_drop cannot both be met",
+        ),
+        ("fast", {"max_ssim_drop": 0.1}, "max_ssim_drop needs rate_distortion"),
+        ("balanced", {"max_ssim_drop": 0}, "setting max_ssim_drop: input should be greater than 0"),
+        ("balanced", {"max_ssim_drop": 1.1}, "setting max_ssim_drop: input should be less than or equal to 1"),
         ("balanced", {"psnr": 0}, "setting psnr: input should be greater than 0"),
         ("balanced", {"target_size": 0}, "setting target_size: input should be greater than or equal to 1"),
         ("balanced", {"target_size": "3 XB"}, "setting target_size: write 800kB, 2.5MB or 2,500,000, not '3 XB'"),
@@ -318,3 +329,38 @@ def test_infinity_and_nan_in_json():
 def test_an_infinite_drop_meets_no_goal():
     goal = Goal.of(Settings.from_preset("balanced", max_psnr_drop=1.0).encode)
     assert goal.margin(Trial(1, 1e-9, 10, drop=math.inf)) == -math.inf
+
+
+@pytest.mark.parametrize(
+    ("drop", "ssim_drop", "met"),
+    [(0.1, 0.003, True), (0.11, 0.003, False), (0.1, 0.0031, False), (-1.0, 0.003, True), (0.1, -1.0, True)],
+)
+def test_of_two_drops_both_must_hold(drop, ssim_drop, met):
+    goal = Goal.of(Settings.from_preset("balanced", max_psnr_drop=0.1, max_ssim_drop=0.003).encode)
+    assert (goal.margin(Trial(1, 1e-9, 10, drop=drop, ssim_drop=ssim_drop)) >= 0) == met
+
+
+@pytest.mark.parametrize("drops", [(math.nan, 0.001), (0.05, math.nan), (math.nan, math.nan)])
+def test_a_failed_rendering_meets_no_drop(drops):
+    goal = Goal.of(Settings.from_preset("balanced", max_psnr_drop=0.1, max_ssim_drop=0.003).encode)
+    assert not goal.margin(Trial(1, 1e-9, 10, drop=drops[0], ssim_drop=drops[1])) >= 0
+
+
+@pytest.mark.parametrize(("drop", "ssim_drop"), [(0.085, 0.001), (0.01, 0.0029)])
+def test_near_either_limit_is_near_enough(drop, ssim_drop):
+    """The margin of SSIM is scaled: 5 % of its drop are as near as 0.02 dB."""
+    goal = Goal.of(Settings.from_preset("balanced", max_psnr_drop=0.1, max_ssim_drop=0.003).encode)
+    assert 0 < goal.margin(Trial(1, 1e-9, 10, drop=drop, ssim_drop=ssim_drop)) < goal.near
+    assert goal.margin(Trial(1, 1e-9, 10, drop=0.07, ssim_drop=0.0028)) > goal.near
+
+
+def test_nothing_lost_is_an_unknown_distance():
+    goal = Goal.of(Settings.from_preset("balanced", max_ssim_drop=0.1).encode)
+    assert goal.margin(Trial(1, 1e-9, 10, ssim_drop=0.0)) == math.inf
+
+
+def test_a_trial_names_the_loss_of_ssim_where_it_is_a_goal():
+    trial = Trial(1, 1e-9, 812_000, psnr=41.2, drop=0.12, worst=35.1)
+    assert trial.summary() == "812 kB at 41.20 dB, drop 0.12 dB, worst view 35.1 dB"
+    text = Trial(1, 1e-9, 812_000, psnr=41.2, drop=0.12, ssim_drop=0.00291, worst=35.1).summary()
+    assert text == "812 kB at 41.20 dB, drop 0.12 dB, SSIM drop 0.0029, worst view 35.1 dB"

@@ -1,4 +1,7 @@
-"""PSNR and SSIM. Reference: the textbook formula for each window in float64, and values in closed form."""
+"""PSNR, SSIM and MS-SSIM.
+
+Reference: the textbook formulas in float64, for each window or by convolutions of SciPy, and values in closed form.
+"""
 
 import math
 import subprocess
@@ -10,10 +13,11 @@ from helpers.examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.signal import convolve2d
 
 from kissgs.core.errors import InvalidViewsError
 from kissgs.core.threads import Workers
-from kissgs.rendering.metrics import difference_and_ssim, psnr, ssim
+from kissgs.rendering.metrics import difference_and_ssim, ms_ssim, psnr, ssim
 
 C1, C2 = 0.01**2, 0.03**2
 
@@ -32,6 +36,28 @@ def naive_ssim(image, reference):
             numerator = (2 * mx * my + C1) * (2 * (xy - mx * my) + C2)
             values[i, j] = numerator / ((mx**2 + my**2 + C1) * (xx - mx**2 + yy - my**2 + C2))
     return values.mean()
+
+
+def naive_ms_ssim(image, reference):
+    """Return MS-SSIM by five convolutions for each scale and channel, of windows inside the image."""
+    profile = np.exp(-(np.arange(-5.0, 6.0) ** 2) / (2 * 1.5**2))
+    window = np.outer(profile, profile) / profile.sum() ** 2
+    weights = [0.0448, 0.2856, 0.3001, 0.2363, 0.1333]
+    while min(image.shape[:2]) < 11 * 2 ** (len(weights) - 1):
+        weights = weights[:-1]
+    total = sum(weights) if len(weights) < 5 else 1
+    channels = []
+    for x, y in zip(image.astype(np.float64).transpose(2, 0, 1), reference.transpose(2, 0, 1), strict=True):
+        score = 1
+        for n, weight in enumerate(weights):
+            mx, my, xx, yy, xy = (convolve2d(m, window, mode="valid") for m in (x, y, x * x, y * y, x * y))
+            luminance = (2 * mx * my + C1) / (mx**2 + my**2 + C1)
+            structure = (2 * (xy - mx * my) + C2) / (xx - mx**2 + yy - my**2 + C2)
+            mean = (luminance * structure if n == len(weights) - 1 else structure).mean()
+            score *= max(mean, 0) ** (weight / total)
+            x, y = (convolve2d(m, np.full((2, 2), 0.25), mode="valid")[::2, ::2] for m in (x, y))
+        channels.append(score)
+    return np.mean(channels)
 
 
 def smooth_image(rng, height, width):
@@ -60,6 +86,39 @@ def test_ssim_is_that_of_the_textbook(height, width):
 def test_ssim_of_a_line(height, width):
     image, reference = image_pair(height, width)
     assert ssim(image, reference) == pytest.approx(naive_ssim(image, reference), abs=1e-6)
+
+
+@pytest.mark.quick(3)
+@pytest.mark.parametrize(
+    ("height", "width"), [(177, 195), (11, 11), (22, 57), (12, 300), (21, 90), (87, 99), (175, 200), (400, 176)]
+)
+def test_ms_ssim_is_that_of_the_textbook(height, width):
+    """All numbers of scales, sizes at their limits and odd ones, and several tiles in either direction."""
+    image, reference = image_pair(height, width)
+    assert ms_ssim(image, reference) == pytest.approx(naive_ms_ssim(image, reference), abs=2e-6)
+
+
+def test_ms_ssim_of_images_below_the_window_is_ssim():
+    image, reference = image_pair(10, 300)
+    assert ms_ssim(image, reference) == ssim(image, reference) > 0
+
+
+@pytest.mark.parametrize("side", [8, 80])
+def test_ms_ssim_of_an_inverted_image_is_zero(side):
+    """A negative mean has no real root."""
+    image = (np.indices((side, side)).sum(axis=0) % 2 * np.ones((3, 1, 1))).transpose(1, 2, 0).astype(np.float32)
+    assert ssim(image, 1 - image) < 0
+    assert ms_ssim(image, 1 - image) == 0
+
+
+def test_ms_ssim_separates_scales():
+    """A difference of single pixels disappears at coarse scales; one of the same energy over 16 pixels does not."""
+    noise = 0.1 * np.random.default_rng(0).choice([-1, 1], (192, 192, 3)).astype(np.float32)
+    image = 0.2 + 0.6 * smooth_image(np.random.default_rng(1), 192, 192)
+    coarse = np.kron(noise[:12, :12], np.ones((16, 16, 1), dtype=np.float32))
+    assert psnr(image + noise, image) == pytest.approx(psnr(image + coarse, image), abs=1e-4)
+    assert ssim(image + noise, image) < ssim(image + coarse, image)
+    assert ms_ssim(image + noise, image) > ssim(image + noise, image)
 
 
 def test_ssim_of_bright_and_uniform_images_is_accurate():
@@ -110,19 +169,21 @@ def test_arrays_need_not_be_contiguous():
     assert ssim(image[::2, 5:30].astype(np.float64), reference[::2, 5:30]) == expected
 
 
-sizes = st.tuples(st.integers(1, 14), st.integers(1, 14), st.just(3))
+sizes = st.tuples(st.integers(1, 24), st.integers(1, 24), st.just(3))
 
 
 @examples(60)
 @given(data=st.data(), shape=sizes, limit=st.sampled_from([1.0, 100.0, 1e6, 2.0**127]))
 def test_properties_of_the_metrics(data, shape, limit):
-    """SSIM is exactly symmetric, in [-1, 1], and 1 for equal images, for any values that a renderer may produce."""
+    """Both are exactly symmetric, in [-1, 1], and 1 for equal images, for any values that a renderer may produce."""
     values = st.floats(-limit, limit, width=32, allow_nan=False)
     image, reference = (data.draw(arrays(np.float32, shape, elements=values)) for _ in range(2))
     score = ssim(image, reference)
     assert -1 - 1e-6 <= score <= 1 + 1e-6
     assert score == ssim(reference, image)
     assert ssim(image, image.copy()) == 1
+    assert 0 <= ms_ssim(image, reference) == ms_ssim(reference, image) <= 1 + 1e-6
+    assert ms_ssim(image, image.copy()) == 1
     assert psnr(image, reference) == psnr(reference, image)
 
 
@@ -131,6 +192,7 @@ def test_extreme_values_give_a_finite_value(extreme):
     image, reference = image_pair(25, 25)
     image[12, 12] = extreme
     assert -1 <= ssim(image, reference) <= 1
+    assert 0 <= ms_ssim(image, reference) <= 1
     assert not math.isnan(psnr(image, reference))
 
 
@@ -139,6 +201,7 @@ def test_nan_is_not_hidden(where):
     pair = image_pair(200, 200)
     pair[where][199, 0, 1] = math.nan
     assert math.isnan(ssim(*pair))
+    assert math.isnan(ms_ssim(*pair))
     assert math.isnan(psnr(*pair))
 
 
@@ -146,7 +209,7 @@ def test_nan_is_not_hidden(where):
     ("first", "second"),
     [((4, 4, 3), (4, 5, 3)), ((4, 4, 4), (4, 4, 4)), ((4, 4), (4, 4)), ((0, 4, 3), (0, 4, 3)), ((1, 4, 4, 3),) * 2],
 )
-@pytest.mark.parametrize("metric", [psnr, ssim])
+@pytest.mark.parametrize("metric", [psnr, ssim, ms_ssim])
 def test_images_of_different_or_invalid_shapes_are_refused(metric, first, second):
     with pytest.raises(InvalidViewsError, match=r"must have one shape, \(height, width, 3\), not \("):
         metric(np.zeros(first, dtype=np.float32), np.zeros(second, dtype=np.float32))
@@ -175,6 +238,7 @@ def test_the_inputs_are_not_changed():
     pair = image_pair(20, 20)
     before = [image.copy() for image in pair]
     ssim(*pair)
+    ms_ssim(*pair)
     psnr(*pair)
     assert all((after == image).all() for after, image in zip(pair, before, strict=True))
 
