@@ -49,8 +49,10 @@ class Sensitivity:
             the Gaussian's own axes, radians): the opacity; opacity and each scale; each scale; each rotation. The 48
             equivalent forms only permute them. The other entries hardly change any decision, and are left out.
         color_weight: ``(N,)`` weight of one colour channel, 0 to 1: mean of (alpha T)², divided by 3.
-        mean_sh_basis: ``(N, K)`` mean of the spherical harmonics without the constant one, over the directions from
+        mean_harmonics: ``(N, K)`` means of the spherical harmonics without the constant one, over the directions from
             which the Gaussian is seen, K as in its scene; 0 if it is not seen.
+        higher_harmonics: ``(N, H)`` the same of the degrees above that of the scene up to twice it, so that the means
+            of all products are known; with a capture only, whose directions are those of viewers. Else H is 0.
         prior: ``(N,)`` the part of ``color_weight`` that was not measured, see :meth:`with_prior`.
         coverage: ``(N,)`` from 0, no camera saw the Gaussian or only from far away, to 1, one saw it from nearby.
         captured: ``(N,)`` coverage by the cameras of a capture alone, which show where people look.
@@ -60,20 +62,23 @@ class Sensitivity:
     position_hessian: Float32[np.ndarray, "N 3"]
     shape_hessian: Float32[np.ndarray, "N 10"]
     color_weight: Float32[np.ndarray, " N"]
-    mean_sh_basis: Float32[np.ndarray, "N K"]
+    mean_harmonics: Float32[np.ndarray, "N K"]
+    higher_harmonics: Float32[np.ndarray, "N H"]
     prior: Float32[np.ndarray, " N"]
     coverage: Float32[np.ndarray, " N"]
     captured: Float32[np.ndarray, " N"]
     view_uncertainty: float = 0.0
 
     @classmethod
-    def none(cls, count: int, sh_degree: int) -> Sensitivity:
-        """Return the sensitivity of a scene that no camera has seen: zeros."""
+    def none(cls, count: int, sh_degree: int, *, captured: bool = False) -> Sensitivity:
+        """Return the sensitivity of a scene that no camera has seen: zeros; ``captured`` decides about H."""
+        higher = (2 * sh_degree + 1) ** 2 - (sh_degree + 1) ** 2 if captured else 0
         return cls(
             position_hessian=np.zeros((count, 3), np.float32),
             shape_hessian=np.zeros((count, 10), np.float32),
             color_weight=np.zeros(count, np.float32),
-            mean_sh_basis=np.zeros((count, SH_REST_COUNTS[sh_degree]), np.float32),
+            mean_harmonics=np.zeros((count, SH_REST_COUNTS[sh_degree]), np.float32),
+            higher_harmonics=np.zeros((count, higher), np.float32),
             prior=np.zeros(count, np.float32),
             coverage=np.zeros(count, np.float32),
             captured=np.zeros(count, np.float32),
@@ -86,12 +91,13 @@ class Sensitivity:
             InvalidSceneError: wrong shapes or dtypes for the scene, values that are not finite, negative weights, or
                 coverage or view uncertainty outside 0 to 1.
         """
-        wanted = Sensitivity.none(len(splats), splats.sh_degree)
+        wanted = Sensitivity.none(len(splats), splats.sh_degree, captured=self.higher_harmonics.size > 0)
         for name in (
             "position_hessian",
             "shape_hessian",
             "color_weight",
-            "mean_sh_basis",
+            "mean_harmonics",
+            "higher_harmonics",
             "prior",
             "coverage",
             "captured",
@@ -170,7 +176,8 @@ class Sensitivity:
             for values in (self.shape_hessian[rows], self.position_hessian[rows]):
                 np.clip(values * raised[:, None], -LARGEST, LARGEST, out=values)
             self.color_weight[rows], self.prior[rows] = shrunk, np.maximum(shrunk - measured, 0)
-            self.mean_sh_basis[rows] *= np.float32(1 - view_uncertainty)
+            for values in (self.mean_harmonics[rows], self.higher_harmonics[rows]):
+                values *= np.float32(1 - view_uncertainty)
         return replace(self, coverage=coverage, view_uncertainty=view_uncertainty)
 
     def _diagonals(

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 VIEW_UNCERTAINTY = {True: 0.1, False: 0.55}
 """Default of the setting ``view_uncertainty``: True with the cameras of a capture, False with virtual cameras only."""
 
-SENSITIVITY_VERSION = 4
+SENSITIVITY_VERSION = 5
 """Version of the measurement of sensitivity; a cache file of another version is measured again and replaced."""
 
 MAX_FINETUNED_ENCODES = 4

@@ -79,7 +79,7 @@ class Clustering:
         from kissgs.planning import kmeans_kernels as kernels
 
         data = self.data
-        self.members, self.edges = sorted_by_label(self.labels, len(self.centroids))
+        self.sort_members()
         pool.map(
             lambda part: kernels.means(
                 data.table,
@@ -93,8 +93,12 @@ class Clustering:
                 self.totals,
                 self.errors,
             ),
-            self._parts(),
+            self.parts(),
         )
+
+    def sort_members(self) -> None:
+        """Sort the vectors by label again, after labels have changed."""
+        self.members, self.edges = sorted_by_label(self.labels, len(self.centroids))
 
     def reassign(self, pool: Workers) -> None:
         """Assign every vector to the nearest of the centroids near its present one."""
@@ -113,7 +117,7 @@ class Clustering:
                 self.labels,
                 self.distances,
             ),
-            self._parts(),
+            self.parts(),
         )
 
     def refresh_near(self, pool: Workers) -> None:
@@ -121,7 +125,7 @@ class Clustering:
         from kissgs.planning import kmeans_kernels as kernels
 
         found = np.empty_like(self.near)
-        pool.map(lambda part: kernels.find_near(self.centroids, self.near, SEARCHED, *part, found), self._parts())
+        pool.map(lambda part: kernels.find_near(self.centroids, self.near, SEARCHED, *part, found), self.parts())
         self.near = found
 
     def relocate(self, pool: Workers) -> None:
@@ -157,14 +161,14 @@ class Clustering:
                 gains,
             )
 
-        pool.map(work, self._parts())
+        pool.map(work, self.parts())
         merged = np.argsort(costs, kind="stable")[:most].astype(np.int32)
         split = np.argsort(-gains, kind="stable")[:most].astype(np.int32)
         kernels.relocate(
             merged, split, partners, costs, gains, second, self.members, self.edges, self.labels, self.near
         )
 
-    def _parts(self) -> list[tuple[int, int]]:
+    def parts(self) -> list[tuple[int, int]]:
         """Return ranges of clusters with about equal numbers of vectors."""
         wanted = np.linspace(0, self.edges[-1], TASKS + 1)
         cuts = np.unique(np.concatenate([[0], np.searchsorted(self.edges, wanted[1:-1]), [len(self.edges) - 1]]))

@@ -22,15 +22,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from kissgs.core.array_types import Float32, Int, Int32
 from kissgs.core.threads import Workers
-from kissgs.planning.clustering import Vectors
+from kissgs.planning.clustering import Clustering, Vectors
 from kissgs.planning.kmeans_start import start
 from kissgs.planning.quantize import clip_outliers
 from kissgs.planning.rows import for_each_block
+
+if TYPE_CHECKING:
+    from kissgs.planning.sh_metric import ShMetric
+
+METRIC_ITERATIONS = 3
+"""Iterations under a metric, after those of the Euclidean distance."""
 
 OUTLIERS = 1e-3
 """Share of entries, at either end of a dimension, that may be clipped so that the step of the others stays small."""
@@ -82,6 +89,7 @@ def fit(
     pool: Workers,
     options: KMeansOptions,
     *,
+    metric: ShMetric | None = None,
     report: Callable[[float], None] = lambda fraction: None,
 ) -> Clusters:
     """Find at most ``size`` centroids of small weighted squared error.
@@ -93,6 +101,8 @@ def fit(
         size: K, largest number of centroids, at most 65,536.
         pool: threads.
         options: options of the clustering.
+        metric: forms of the errors of the table's rows, by which the clustering is then improved; the Euclidean
+            distance for None.
         report: receives the fraction done, 0 to 1.
 
     Returns:
@@ -130,14 +140,33 @@ def fit(
         state.reassign(pool)
         state.update(pool)
         report(0.4 + 0.6 * (iteration + 1) / options.iterations)
+    if metric is not None:
+        for _ in range(METRIC_ITERATIONS):
+            state.refresh_near(pool)
+            metric.reassign(state, pool)
+            metric.move_centroids(state, pool)
     step = 0.0
     if options.lattice:
-        error = np.average(state.distances, weights=weights) / table.shape[1]
-        step = _round_to_lattice(state.centroids, options.lattice * float(error) ** 0.5, options)
-        state.reassign(pool)
+        step = _round_to_lattice(state.centroids, options.lattice * _rms_error(state, pool), options)
+        if metric is None:
+            state.reassign(pool)
+        else:
+            metric.reassign(state, pool)
     used = np.bincount(state.labels, minlength=len(state.centroids)) > 0
     compact = np.cumsum(used, dtype=np.int32) - np.int32(1)
     return Clusters(state.centroids[used], compact[state.labels], step)
+
+
+def _rms_error(state: Clustering, pool: Workers) -> float:
+    """Return the weighted root mean square distance of the vectors to their centroids, per dimension."""
+    data = state.data
+
+    def squares(rows: slice) -> float:
+        lost = data.table[data.rows[rows]] - state.centroids[state.labels[rows]]
+        return float(np.square(lost).sum(axis=1, dtype=np.float64) @ data.weights[rows])
+
+    total = sum(for_each_block(len(data.rows), squares, pool))
+    return float(total / data.weights.sum(dtype=np.float64) / data.table.shape[1]) ** 0.5
 
 
 def _round_to_lattice(centroids: np.ndarray, step: float, options: KMeansOptions) -> float:

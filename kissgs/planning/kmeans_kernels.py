@@ -208,3 +208,70 @@ def assign_near(
                 norm += table[row, d] * table[row, d]
             labels[n] = near[k, best]
             distances[n] = max(lowest + norm, np.float32(0))
+
+
+@compiled(
+    "void(float32[:, ::1], int32[::1], int64[::1], float32[:, ::1], uint16[:, ::1], int64, int32[::1])",
+    fastmath={"contract", "nnan", "ninf", "nsz", "reassoc"},
+)
+def assign_by_form(
+    vectors: np.ndarray,
+    members: np.ndarray,
+    edges: np.ndarray,
+    centroids: np.ndarray,
+    near: np.ndarray,
+    first: int,
+    labels: np.ndarray,
+) -> None:
+    """Assign vectors of some clusters to that of their cluster's near centroids at which their own form is smallest.
+
+    The form of a difference x - c is that of c less twice the product of c with the form times x, and a constant.
+
+    Args:
+        vectors: ``(n, P + D)`` upper triangle of the form of each vector, row by row, and the form times the vector.
+        members: ``(n,)`` numbers of the vectors, sorted by cluster.
+        edges: ``(C + 1,)`` where the vectors of each cluster begin.
+        centroids: ``(K, D)``, three values of each coefficient in a row.
+        near: ``(K, k)`` near centroids of each; the first wins ties.
+        first: number of the first cluster.
+        labels: ``(N,)`` receives the centroids.
+    """
+    dimensions = centroids.shape[1]
+    coefficients = dimensions // 3
+    width = vectors.shape[1]
+    triangle = width - dimensions
+    count = near.shape[1]
+    columns = np.empty((width, count), dtype=np.float32)
+    scores = np.empty(count, dtype=np.float32)
+    for cluster in range(edges.shape[0] - 1):
+        if edges[cluster] == edges[cluster + 1]:
+            continue
+        for j in range(count):
+            c = near[first + cluster, j]
+            at = 0
+            for a in range(coefficients):
+                for b in range(a, coefficients):
+                    product = np.float32(0)
+                    for channel in range(3):
+                        product += centroids[c, 3 * a + channel] * centroids[c, 3 * b + channel]
+                    columns[at, j] = product if a == b else np.float32(2) * product
+                    at += 1
+            for d in range(dimensions):
+                columns[triangle + d, j] = np.float32(-2) * centroids[c, d]
+        for i in range(edges[cluster], edges[cluster + 1]):
+            scores[:] = np.float32(0)
+            for d in range(0, width - width % 3, 3):  # three at a time, as in assign_near
+                x0 = vectors[i, d]
+                x1 = vectors[i, d + 1]
+                x2 = vectors[i, d + 2]
+                for j in range(count):
+                    scores[j] += x0 * columns[d, j] + x1 * columns[d + 1, j] + x2 * columns[d + 2, j]
+            for d in range(width - width % 3, width):
+                x0 = vectors[i, d]
+                for j in range(count):
+                    scores[j] += x0 * columns[d, j]
+            best = 0
+            for j in range(1, count):
+                if scores[j] < scores[best]:
+                    best = j
+            labels[members[i]] = near[first + cluster, best]

@@ -25,6 +25,7 @@ from kissgs.planning.rdo_quantize import largest_changes
 from kissgs.planning.rotation_forms import choose_forms
 from kissgs.planning.rows import for_each_block, selected
 from kissgs.planning.sh_codebook import Codebook, fit_codebook, nearest_square, sensitivity_weights
+from kissgs.planning.sh_metric import ShMetric
 from kissgs.settings import EncodeSettings
 
 ColorRefit = Callable[[Splats, Int[np.ndarray, " M"]], Float32[np.ndarray, "M 3"]]
@@ -91,7 +92,8 @@ def plan_rate_distortion(
     size = sh_model.best_size(rd_lambda, len(order), settings.gaussians_per_codebook_entry, container.entry_bits)
     size = nearest_square(size) if container.tables is None else size
     weights = sensitivity_weights(sensitivity, order, splats)
-    codebook = fit_codebook(splats, order, weights, size, settings, container, pool, progress)
+    metric = ShMetric.of(sensitivity, splats.sh_degree)
+    codebook = fit_codebook(splats, order, weights, size, settings, container, pool, progress, metric=metric)
     del weights
     return_free_memory()
 
@@ -176,7 +178,7 @@ def _compensated_colors(
     def compensate(rows: slice) -> None:
         some = order[rows]
         lost = splats.shN.take(some, axis=0) - entries.take(labels[rows], axis=0)
-        basis = sensitivity.mean_sh_basis.take(some, axis=0)
+        basis = sensitivity.mean_harmonics.take(some, axis=0)
         change = np.einsum("nk,nkc->nc", basis, lost) / np.float32(SH_C0)
         base[rows] += np.clip(change, -MAX_COMPENSATION, MAX_COMPENSATION)
 

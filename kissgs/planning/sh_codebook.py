@@ -19,6 +19,7 @@ from kissgs.planning.axes_order import axes_order, principal_axes
 from kissgs.planning.container_model import ContainerModel
 from kissgs.planning.plas import plas
 from kissgs.planning.quantize import Quantized, half_steps, quantize
+from kissgs.planning.sh_metric import ShMetric
 from kissgs.planning.value_table import fit_table, nearest_levels, table_field
 from kissgs.settings import EncodeSettings
 
@@ -70,6 +71,8 @@ def fit_codebook(
     container: ContainerModel,
     pool: Workers,
     progress: Progress,
+    *,
+    metric: ShMetric | None = None,
 ) -> Codebook:
     """Build the codebook for the Gaussians ``chosen``.
 
@@ -85,6 +88,7 @@ def fit_codebook(
         container: what the container can hold.
         pool: threads.
         progress: receives "codebook" and "sort codebook" events.
+        metric: forms of the errors; by default every coefficient counts alike.
     """
     dimensions = splats.shN.shape[1] * 3
     if dimensions == 0 or len(chosen) == 0:
@@ -106,6 +110,7 @@ def fit_codebook(
             lattice=settings.sh_step if settings.shared_step_size else 0.0,
             from_zero=container.tables is not None,
         ),
+        metric=metric,
         report=lambda fraction: progress("codebook", fraction),
     )
     # The smallest square that holds the entries; unused places repeat some of them.

@@ -94,7 +94,7 @@ def measure_sensitivity(
 
     splats = for_kernels(splats)
     coverage = Coverage(splats)
-    found = Sensitivity.none(len(splats), splats.sh_degree)
+    found = Sensitivity.none(len(splats), splats.sh_degree, captured=cameras.captured > 0)
     if not view_uncertainty:
         found.captured[:] = 1  # no other cameras count
     with Workers(threads) as pool:
@@ -113,13 +113,10 @@ def measure_sensitivity(
     _bound(found.position_hessian, (0, 1, 2))
     _bound(found.shape_hessian, OPACITY + SCALES + ROTATION)
     np.nan_to_num(found.color_weight, copy=False, nan=LARGEST, posinf=LARGEST)
-    np.nan_to_num(found.mean_sh_basis, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
-    np.divide(
-        found.mean_sh_basis,
-        found.color_weight[:, None],
-        out=found.mean_sh_basis,
-        where=found.color_weight[:, None] > 0,
-    )
+    for harmonics in (found.mean_harmonics, found.higher_harmonics):
+        np.nan_to_num(harmonics, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+        colors = found.color_weight[:, None]
+        np.divide(harmonics, colors, out=harmonics, where=colors > 0)
     return_free_memory()
     progress("sensitivity", 1.0)
     return found.with_prior(splats, coverage.close_up, coverage.share, view_uncertainty)

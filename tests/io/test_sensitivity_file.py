@@ -75,7 +75,7 @@ def test_it_survives(tmp_path):
         kept.position_hessian,
         kept.shape_hessian,
         kept.color_weight,
-        kept.mean_sh_basis,
+        kept.mean_harmonics,
         kept.prior,
         kept.coverage,
     ):

@@ -170,14 +170,14 @@ def test_images_are_averaged_by_weight_and_sh_bases_by_visibility():
     total = sum(colors)
     seen = total > 0
     mean = sum(color[:, None] * values for color, values in zip(colors, basis, strict=True))[seen] / total[seen, None]
-    np.testing.assert_allclose(both.mean_sh_basis[seen], mean, rtol=1e-4, atol=1e-5)
-    assert (both.mean_sh_basis[~seen] == 0).all()
+    np.testing.assert_allclose(both.mean_harmonics[seen], mean, rtol=1e-4, atol=1e-5)
+    assert (both.mean_harmonics[~seen] == 0).all()
 
 
 def test_sensitivity_does_not_depend_on_threads():
     splats, view = blobs(3000, 2, seed=8, log_scale=-3), camera(200, 150)
     one_thread, three = (measure_sensitivity(splats, weighted(view), threads=threads) for threads in (1, 3))
-    for name in ("position_hessian", "shape_hessian", "color_weight", "mean_sh_basis"):
+    for name in ("position_hessian", "shape_hessian", "color_weight", "mean_harmonics"):
         np.testing.assert_array_equal(getattr(one_thread, name), getattr(three, name))
 
 
@@ -187,7 +187,7 @@ def test_sensitivity_does_not_depend_on_bands_of_tiles(monkeypatch, band):
     whole = measure_sensitivity(scene, views)
     monkeypatch.setattr(frame, "BAND", band)
     parts = measure_sensitivity(scene, views)
-    for name in ("shape_hessian", "position_hessian", "color_weight", "mean_sh_basis", "coverage"):
+    for name in ("shape_hessian", "position_hessian", "color_weight", "mean_harmonics", "coverage"):
         wanted = getattr(whole, name)
         np.testing.assert_allclose(getattr(parts, name), wanted, rtol=1e-5, atol=1e-6 * np.abs(wanted).max())
     np.testing.assert_array_equal(measure_sensitivity(scene, views, threads=1).shape_hessian, parts.shape_hessian)
@@ -234,7 +234,7 @@ def test_without_view_uncertainty_the_prior_has_no_effect():
     splats = panes(0.0, 2.0)
     found = measure_sensitivity(splats, weighted(camera(120, 120)))
     same = found.with_prior(splats, np.ones(len(splats)), np.full(len(splats), 0.25), 0.0)
-    for name in ("position_hessian", "shape_hessian", "color_weight", "mean_sh_basis", "prior"):
+    for name in ("position_hessian", "shape_hessian", "color_weight", "mean_harmonics", "prior"):
         np.testing.assert_array_equal(getattr(same, name), getattr(found, name))
     np.testing.assert_array_equal(same.coverage, np.float32(0.25))
     assert same.view_uncertainty == found.view_uncertainty == 0

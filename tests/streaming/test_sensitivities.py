@@ -35,7 +35,7 @@ def test_a_file_has_the_sensitivity_that_its_gaussians_have_in_the_scene():
     own, others = blobs(40, seed=1), blobs(30, seed=2)
     expected = measure_sensitivity(concatenate([own, others]), CAMERAS)
     found = measure_file(own, others, CAMERAS, 0, PLAIN, 1)
-    for name in ("position_hessian", "shape_hessian", "color_weight", "mean_sh_basis"):
+    for name in ("position_hessian", "shape_hessian", "color_weight", "mean_harmonics"):
         wanted = getattr(expected, name)[:40]
         np.testing.assert_allclose(getattr(found, name), wanted, rtol=1e-4, atol=1e-6 * np.abs(wanted).max())
     alone = measure_file(own, others.select(slice(0)), CAMERAS, 0, PLAIN, 1)

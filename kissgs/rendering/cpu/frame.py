@@ -167,8 +167,8 @@ def add_sensitivities(
         weight: weight of the squared error of a single value of the image.
         spread: standard deviation of each channel of the background.
         into: sums over images; ``shape_hessian`` receives moments, to be converted by
-            :func:`kissgs.rendering.cpu.sensitivity.moments_to_hessians` in the end, and ``mean_sh_basis`` sums of
-            (alpha T)² times the spherical harmonics, to be divided by ``color_weight``.
+            :func:`kissgs.rendering.cpu.sensitivity.moments_to_hessians` in the end; both fields of harmonics receive
+            sums of (alpha T)² times the spherical harmonics, to be divided by ``color_weight``.
         pool: threads; the result does not depend on their number.
 
     Returns:
@@ -226,7 +226,8 @@ def add_sensitivities(
                 into.position_hessian,
                 into.shape_hessian,
                 into.color_weight,
-                into.mean_sh_basis,
+                into.mean_harmonics,
+                into.higher_harmonics,
                 seen,
             )
 

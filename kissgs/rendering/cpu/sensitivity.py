@@ -17,6 +17,7 @@ from numba import njit
 
 from kissgs.core.numba_kernels import compiled
 from kissgs.rendering.cpu.blending import _FAST, _copy_records, _exp_minus, _footprint, _pixel_centres
+from kissgs.rendering.cpu.harmonics import write_harmonics
 from kissgs.rendering.cpu.projection import (
     Vector,
     _applied,
@@ -33,7 +34,6 @@ from kissgs.rendering.cpu.projection import (
     _unit_quat,
     _whitened,
 )
-from kissgs.rendering.cpu.shading import _harmonics
 
 MOMENTS = 10
 """Number of moments of each footprint in each tile."""
@@ -162,7 +162,7 @@ def _thickened(s: Vector) -> Vector:
     "void(float32[:, ::1], float32[:, ::1], float32[:, ::1],"
     " int32[::1], int32[::1], int32[::1], float32[:, ::1], int64, int64,"
     " float64[:, ::1], float64[::1], float64[:, ::1], int64, int64, float64[::1], float64,"
-    " float32[:, ::1], float32[:, ::1], float32[::1], float32[:, ::1], float32[::1])"
+    " float32[:, ::1], float32[:, ::1], float32[::1], float32[:, ::1], float32[:, ::1], float32[::1])"
 )
 def add_to_parameters(
     means: np.ndarray,
@@ -184,7 +184,8 @@ def add_to_parameters(
     position_hessian: np.ndarray,
     shape_moments: np.ndarray,
     color_weight: np.ndarray,
-    sh_basis_sum: np.ndarray,
+    harmonics_sum: np.ndarray,
+    higher_sum: np.ndarray,
     seen: np.ndarray,
 ) -> None:
     """Add the moments of some tiles of an image to those of the Gaussians of the footprints ``rows[first:last]``.
@@ -204,14 +205,17 @@ def add_to_parameters(
         shape_moments: ``(N, 10)`` sums over pixels of |w|² times 1; times g0², g1², g2²; times their squares; and times
             (g1 g2)², (g2 g0)², (g0 g1)².
         color_weight: ``(N,)`` sum of (alpha T)².
-        sh_basis_sum: ``(N, K)`` sum of (alpha T)² times the spherical harmonics without the constant one.
+        harmonics_sum: ``(N, K)`` sum of (alpha T)² times the spherical harmonics without the constant one.
+        higher_sum: ``(N, H)`` the same of higher degrees.
         seen: by row, sum of (alpha T)² of this image alone, without its weight; added.
     """
     dilation = constants[2]
     fx, fy = K[0, 0], K[1, 1]
     rotation, translation = _pose(viewmat)
     left, right, top, bottom = _frustum(K, width, height, constants[3])
-    basis = np.zeros(15, np.float64)
+    own, higher = harmonics_sum.shape[1], higher_sum.shape[1]
+    degree = int(np.sqrt(own + higher + 1.0) + 0.5) - 1
+    basis = np.zeros(own + higher, np.float64)
     for i in range(first, last):
         row = rows[i]
         n = visible[row]
@@ -271,13 +275,15 @@ def add_to_parameters(
         out[9] += _dot(by_0, g1)
 
         color_weight[n] += squared_weight
-        if sh_basis_sum.shape[1] > 0:
+        if own > 0:
             direction = (mean[0] - eye[0], mean[1] - eye[1], mean[2] - eye[2])
             inverse = 1.0 / np.sqrt(_dot(direction, direction))
             dx, dy, dz = direction[0] * inverse, direction[1] * inverse, direction[2] * inverse
-            _harmonics(dx, dy, dz, sh_basis_sum.shape[1], basis)
-            for c in range(sh_basis_sum.shape[1]):
-                sh_basis_sum[n, c] += squared_weight * basis[c]
+            write_harmonics(dx, dy, dz, degree, basis)
+            for c in range(own):
+                harmonics_sum[n, c] += squared_weight * basis[c]
+            for c in range(higher):
+                higher_sum[n, c] += squared_weight * basis[own + c]
 
 
 @compiled("void(float32[:, ::1], float32[::1], int64, int64, float32[:, ::1])")

@@ -1,0 +1,143 @@
+"""The metric of view-dependent colour: its forms, and clustering under them, against direct sums over directions."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.captured_scene import cameras
+
+import kissgs
+from kissgs.core.sensitivity import Sensitivity
+from kissgs.core.spherical_harmonics import sh_basis
+from kissgs.core.splats import SH_REST_COUNTS
+from kissgs.core.threads import Workers
+from kissgs.planning import kmeans
+from kissgs.planning.clustering import Clustering, Vectors, sorted_by_label
+from kissgs.planning.sh_metric import ELSEWHERE, ShMetric
+
+OPTIONS = kmeans.KMeansOptions(seed=0, iterations=3, neighbors=32, tolerance=0.0, lattice=0.0)
+
+
+def seen_directions(count, spread, seed=0, number=12):
+    """Return unit vectors ``(count, number, 3)`` around a random axis per Gaussian, and weights that sum to 1."""
+    rng = np.random.default_rng(seed)
+    found = rng.normal(size=(count, 1, 3)) + spread * rng.normal(size=(count, number, 3))
+    weights = rng.uniform(0.1, 1, (count, number))
+    return found / np.linalg.norm(found, axis=2, keepdims=True), weights / weights.sum(axis=1, keepdims=True)
+
+
+def metric_of(directions, weights, degree, captured=1.0):
+    """Return the metric of a capture that sees each Gaussian from these directions."""
+    count = len(directions)
+    basis = sh_basis(directions.reshape(-1, 3), 2 * degree)[:, 1:].reshape(count, weights.shape[1], -1)
+    means = np.einsum("nd,ndj->nj", weights, basis).astype(np.float32)
+    own = SH_REST_COUNTS[degree]
+    sensitivity = replace(
+        Sensitivity.none(count, degree, captured=True),
+        mean_harmonics=means[:, :own].copy(),
+        higher_harmonics=means[:, own:].copy(),
+        captured=np.full(count, captured, np.float32),
+    )
+    return ShMetric.of(sensitivity, degree)
+
+
+def direct_errors(differences, directions, weights, degree, captured=1.0):
+    """Return errors summed over directions: the variance of the colour error, and all coefficients alike."""
+    some = differences.reshape(len(differences), -1, 3)
+    basis = sh_basis(directions.reshape(-1, 3), degree)[:, 1:].reshape(*weights.shape, -1)
+    colors = basis @ some
+    mean = np.einsum("nd,ndc->nc", weights, colors)
+    variance = np.einsum("nd,ndc->n", weights, np.square(colors - mean[:, None]))
+    known = (1 - ELSEWHERE) * captured
+    # A form that is the identity for all directions alike: of the second moment, the uniform part stays at 1 - known.
+    uniform = np.square(some).sum(axis=(1, 2))
+    return known * 4 * np.pi * variance + (1 - known) * uniform
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+@pytest.mark.parametrize("captured", [0.0, 0.4, 1.0])
+def test_errors_are_those_of_the_colours_from_the_directions_of_view(degree, captured):
+    directions, weights = seen_directions(40, 0.4)
+    differences = np.random.default_rng(1).normal(size=(40, 3 * SH_REST_COUNTS[degree])).astype(np.float32)
+    metric = metric_of(directions, weights, degree, captured)
+    wanted = direct_errors(differences, directions, weights, degree, captured)
+    np.testing.assert_allclose(metric.errors(differences, np.arange(40)), wanted, rtol=2e-4)
+    assert np.linalg.eigvalsh(metric.forms(np.arange(40))).min() > 0.9 * (1 - captured * (1 - ELSEWHERE))
+
+
+def test_without_a_capture_there_is_no_metric():
+    assert ShMetric.of(Sensitivity.none(5, 3), 3) is None
+    assert ShMetric.of(Sensitivity.none(5, 0, captured=True), 0) is None
+
+
+def clustering(vectors, labels, centroids, weights):
+    data = Vectors(vectors, np.arange(len(vectors)), weights)
+    members, edges = sorted_by_label(labels, len(centroids))
+    near = np.array([[k, *(c for c in range(len(centroids)) if c != k)] for k in range(len(centroids))], np.uint16)
+    zeros = np.zeros(len(centroids))
+    distances = np.zeros(len(vectors), np.float32)
+    return Clustering(data, centroids, labels, distances, near, members, edges, zeros, zeros.copy())
+
+
+def test_vectors_go_to_the_centroid_of_the_smallest_error_and_centroids_to_the_best_place():
+    rng = np.random.default_rng(2)
+    count, clusters, degree = 300, 7, 2
+    directions, weights = seen_directions(count, 0.3, seed=3)
+    metric = metric_of(directions, weights, degree)
+    vectors = rng.normal(size=(count, 3 * SH_REST_COUNTS[degree])).astype(np.float32)
+    centroids = rng.normal(size=(clusters, vectors.shape[1])).astype(np.float32)
+    state = clustering(
+        vectors, rng.integers(0, clusters - 1, count).astype(np.int32), centroids, np.ones(count, np.float32)
+    )
+    with Workers(1) as pool:
+        metric.reassign(state, pool)
+        each = [direct_errors(vectors - centroid, directions, weights, degree) for centroid in centroids]
+        np.testing.assert_array_equal(state.labels, np.argmin(each, axis=0))
+        empty = np.flatnonzero(np.bincount(state.labels, minlength=clusters) == 0)
+        before = state.centroids.copy()
+        metric.move_centroids(state, pool)
+    np.testing.assert_array_equal(state.centroids[empty], before[empty])
+
+    def total(moved):
+        return direct_errors(vectors - moved[state.labels], directions, weights, degree).sum()
+
+    best = total(state.centroids)
+    for seed in range(5):
+        step = np.random.default_rng(seed).normal(size=centroids.shape).astype(np.float32)
+        assert total(state.centroids + 0.02 * step) > best
+        assert total(state.centroids - 0.02 * step) > best
+
+
+def test_clustering_under_the_metric_errs_less_where_cameras_are_and_does_not_depend_on_threads():
+    rng = np.random.default_rng(4)
+    count, degree = 3000, 3
+    directions, weights = seen_directions(count, 0.2, seed=5)
+    metric = metric_of(directions, weights, degree)
+    own = 3 * SH_REST_COUNTS[degree]
+    vectors = (rng.normal(size=(count, 4)) @ rng.normal(size=(4, own)) + 0.1 * rng.normal(size=(count, own))).astype(
+        "f4"
+    )
+    ones = np.ones(count, np.float32)
+    found = {}
+    for name, used, threads in (("plain", None, 1), ("metric", metric, 1), ("threads", metric, 3)):
+        with Workers(threads) as pool:
+            clusters = kmeans.fit(vectors, np.arange(count), ones, 64, pool, OPTIONS, metric=used)
+        found[name] = vectors - clusters.centroids[clusters.labels]
+    np.testing.assert_array_equal(found["metric"], found["threads"])
+    errors = {name: direct_errors(lost, directions, weights, degree).sum() for name, lost in found.items()}
+    assert errors["metric"] < 0.97 * errors["plain"]
+    assert np.square(found["metric"]).sum() > np.square(found["plain"]).sum()
+
+
+def test_a_capture_makes_the_codebook_better_from_where_it_looks(monkeypatch):
+    scene = kissgs.sample_scene(8000, sh_degree=3)
+    views = cameras(test=4, train=16, size=(120, 80))
+    found = []
+    for with_metric in (True, False):
+        if not with_metric:
+            monkeypatch.setattr(ShMetric, "of", lambda sensitivity, degree: None)
+        result = kissgs.compress(scene, settings=kissgs.Settings.from_preset("balanced"), views=views, threads=1)
+        evaluation = kissgs.evaluate(scene, kissgs.decompress(result.to_zip()), views)
+        found.append((result.report.container_bytes, evaluation.mean.candidate_vs_reference.psnr))
+    (size, psnr), (plain_size, plain_psnr) = found
+    assert psnr - 20 * np.log10(size / plain_size) > plain_psnr + 0.1  # 6 dB for twice the bytes
