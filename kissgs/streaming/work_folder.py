@@ -31,6 +31,12 @@ ENCODED_BYTES = 30
 """Upper estimate of the encoded bytes of a Gaussian with all its levels."""
 
 
+def work_folder(manifest: Path) -> Path:
+    """Return the work folder of a streamed scene, given its manifest."""
+    folder = manifest.parent if manifest.parent.name not in ("", "..") else manifest.parent.resolve()
+    return folder.parent / f"{folder.name}.partial"
+
+
 def check_destination(manifest: Path, source: Path, *, overwrite: bool) -> None:
     """Refuse to replace anything but a streamed scene, and that only if allowed.
 
@@ -182,6 +188,21 @@ def finish(work: Path, manifest: Path, source: Path, *, overwrite: bool) -> None
         shutil.rmtree(_discarded(work))
     except OSError as error:
         raise OutputError(f"cannot write {folder}: {reason_of(error)}") from error
+
+
+def remove(work: Path) -> None:
+    """Delete a claimed work folder whose work is of no use; what cannot be deleted stays.
+
+    The files by which :func:`claimed` recognises it are the last to go, so that after an interruption anywhere the same
+    command may begin anew.
+    """
+    with contextlib.suppress(OSError):
+        for path in work.iterdir():
+            if path.name not in (WORK, LOCK):
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+        (work / WORK).unlink(missing_ok=True)
+        (work / LOCK).unlink()
+        work.rmdir()
 
 
 def _discarded(work: Path) -> Path:
