@@ -277,4 +277,10 @@ def test_the_ending_chooses_the_container(service, scene, tmp_path):
         assert remote.compress(scene, tmp_path / "b.sog", settings=FAST)["options"]["format"] == "sog"
         with pytest.raises(kissgs.UnsupportedError, match=r"end it in \.zip"):
             remote.compress(scene, tmp_path / "c.sog", settings=FAST, container="sogxt")
+        for name in ("meta.json", "city.sogxt", "city/lod-meta.json"):
+            with pytest.raises(kissgs.UnsupportedError, match=f"{name} is not the name of a container"):
+                remote.compress(scene, tmp_path / name)
+            refused = kissgs_command("compress", scene, "-o", tmp_path / name, KISSGS_SERVER=service.url)
+            assert (refused.returncode, f"{name} is not the name" in refused.stderr) == (2, True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["Schloß 1.ply", "Schloß 1.sog", "a.sog", "b.sog", "out"]
     assert (tmp_path / "b.sog").read_bytes() == expected
