@@ -107,7 +107,8 @@ def _engine(url: str, wait: float, opened: list[Any] | None = None) -> sa.Engine
         engine = sa.create_engine(url, pool_pre_ping=not url.startswith("sqlite"), hide_parameters=True)
     except ModuleNotFoundError as error:
         raise SettingsError(
-            f"KISSGS_DATABASE_URL: the package {error.name} is missing; for PostgreSQL install kissgs[postgresql]"
+            f"KISSGS_DATABASE_URL: the package {error.name} is missing; "
+            "for PostgreSQL: pip install 'kissgs[postgresql]'"
         ) from error
     except (ArgumentError, NoSuchModuleError, ValueError) as error:
         raise SettingsError(f"KISSGS_DATABASE_URL: {error_text(error)}; set it to a SQLAlchemy URL") from error
