@@ -29,6 +29,7 @@ from kissgs.streaming.work_folder import (
     check_destination,
     check_space,
     claimed,
+    explaining_full_disks,
     finish,
     needed_bytes,
     read_json,
@@ -120,7 +121,7 @@ def compress_streamed(
     _check_settings(settings)
     if read_json(work / REPORT) is None:
         check_destination(manifest, source, overwrite=overwrite)
-    with claimed(work, {"container": container, **_identity(source, settings, reading)}):
+    with claimed(work, {"container": container, **_identity(source, settings, reading)}), explaining_full_disks(work):
         if (found := read_json(work / REPORT)) is None:
             layout = _partition(work, source, container, settings, reading, threads, progress)
             found = asdict(_make(work, layout, settings, runner, threads, progress))

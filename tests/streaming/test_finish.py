@@ -178,7 +178,7 @@ def test_names_and_inputs_that_would_be_replaced_are_refused(scene, tmp_path, mo
         compress_streamed(scene, tmp_path / "city" / "scene.json", settings=FAST)
     target = tmp_path / "city" / "lod-meta.json"
     for source in (target, tmp_path / "city" / "0_0" / "meta.json"):
-        with pytest.raises(OutputError, match="would be replaced, but"):
+        with pytest.raises(OutputError, match="would be replaced as a whole, but has the input in it"):
             compress_streamed(source, target, settings=FAST, overwrite=True)
     (tmp_path / "city" / "0_0" / "empty").mkdir()
     with pytest.raises(OutputError, match=r"holds other files \(0_0/empty\)"):
@@ -188,6 +188,6 @@ def test_names_and_inputs_that_would_be_replaced_are_refused(scene, tmp_path, mo
         compress_streamed(scene, tmp_path / "town" / "lod-meta.json", settings=FAST)
     (tmp_path / "here" / "below").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "here" / "below")
-    with pytest.raises(OutputError, match="would be replaced, but"):
+    with pytest.raises(OutputError, match="would be replaced as a whole, but has the current folder in it"):
         compress_streamed(scene, "../lod-meta.json", settings=FAST)
     assert len(kissgs.load(target)) > 1000
