@@ -89,6 +89,6 @@ RayOption = Annotated[
         metavar="[HOST:PORT]",
         help="Compress the scenes on the nodes of a Ray cluster: all machines must see scenes, outputs and --views at "
         "the same paths, on shared storage. Default address: RAY_ADDRESS, a cluster on this machine, or a new one that "
-        "uses its processors. Needs kissgs[ray]; docs/guide/many-machines.md.",
+        "uses its processors. Needs the extra ray; docs/guide/many-machines.md.",
     ),
 ]

@@ -11,7 +11,7 @@ import typer
 
 from kissgs.cli.arguments import PresetOption, SetOption
 from kissgs.cli.bench_arguments import JsonOption, ThreadsOption
-from kissgs.cli.bench_scenes import BenchInputs, BenchOutput, open_inputs, report
+from kissgs.cli.bench_scenes import BenchInputs, BenchOutput, announce, open_inputs, report
 from kissgs.cli.options import chosen
 from kissgs.core.errors import UnsupportedError
 
@@ -61,8 +61,14 @@ def _measure(inputs: BenchInputs, degree: int, gaussians: int, settings: Setting
     from kissgs.cli.console import progress_bar
 
     with progress_bar(False) as progress:
-        progress("measure", 0.0)
-        costs = measure_costs(inputs.scenes[0] if inputs.scenes else degree, settings, gaussians, inputs.threads)
+        costs = measure_costs(
+            inputs.scenes[0] if inputs.scenes else degree,
+            settings,
+            gaussians,
+            inputs.threads,
+            announce=announce,
+            progress=progress,
+        )
         progress("simulate", 0.0)
         scenes = [simulate_scene(costs, node, nodes, count) for count in GAUSSIANS for nodes in NODES]
         job = JobCosts(

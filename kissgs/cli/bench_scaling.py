@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from contextlib import closing
 from functools import partial
 from typing import TYPE_CHECKING
 
 from kissgs.cli.bench_codecs import ExternalCodecs, all_settings, command_words
-from kissgs.cli.bench_scenes import BenchInputs, BenchOutput, distinct_names
+from kissgs.cli.bench_scenes import BenchInputs, BenchOutput, announce, distinct_names
 from kissgs.cli.files import is_folder
 from kissgs.cli.interrupts import Interrupted
 from kissgs.core.errors import UnsupportedError
@@ -93,14 +92,10 @@ def _measure(
 
     with progress_bar(False) as progress:
         for source, name in sources:
-            found = measure_scaling(source, counts, plan, name=name, announce=_announce, progress=progress)
+            found = measure_scaling(source, counts, plan, name=name, announce=announce, progress=progress)
             with closing(found):
                 for row in found:
                     if isinstance(row, FailedMeasurement):
                         failed.append(row)
                     else:
                         rows.append(row)
-
-
-def _announce(text: str) -> None:
-    sys.stderr.write(f"kissgs: {text}\n")

@@ -73,6 +73,11 @@ def open_inputs(scenes: list[str], views: Views | None, threads: int, plot: Path
     return inputs
 
 
+def announce(text: str) -> None:
+    """Print a line about a measurement before it begins."""
+    sys.stderr.write(f"kissgs: {text}\n")
+
+
 def report(output: BenchOutput, as_json: bool, plot: Path | None = None) -> None:
     """Print the results, write the plot, and exit with code 2 if a part of the measurement failed."""
     try:  # results that took long are plotted even if they cannot be printed

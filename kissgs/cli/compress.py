@@ -26,7 +26,6 @@ from kissgs.cli.arguments import (
 )
 from kissgs.cli.files import for_each_input
 from kissgs.cli.options import budget_of, chosen, device_of, open_views, refuse_without_training
-from kissgs.io.container_names import named_manifest
 
 
 def compress(
@@ -118,10 +117,11 @@ def compress(
 ) -> None:
     """Compress each scene into a SOG-XT container, into SOG, or into a folder with levels of detail."""
     from kissgs.cli.compress_options import CompressOptions
-    from kissgs.io.container_names import ending_of, named_container
+    from kissgs.io.container_names import ending_of, named_container, named_manifest
     from kissgs.pipeline.read_options import ReadOptions
 
-    kind = named_container(container, output)
+    manifest = None if output is None else named_manifest(output)
+    kind = named_container(container, None if manifest else output)
     reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes)
     settings = chosen(
         preset,
@@ -153,7 +153,7 @@ def compress(
         quiet=quiet or as_json,
     )
     ending = "" if unpacked else ending_of(kind)
-    if output is not None and (manifest := named_manifest(output)) is not None:
+    if manifest is not None:
         from kissgs.cli.compress_streamed import compress_streamed, refuse_options
 
         refuse_options(manifest, options, container=container, unpacked=unpacked)

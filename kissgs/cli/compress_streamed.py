@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from kissgs.cli.console import progress_bar
 from kissgs.cli.files import show
-from kissgs.cli.interrupts import say_when_interrupted
+from kissgs.cli.interrupts import NOTHING_LEFT, say_when_interrupted
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.progress import Progress
 
@@ -58,6 +58,10 @@ def compress_streamed(options: CompressOptions, ray: str | None, scene: str, tar
     with _stages(options.quiet) as progress, contextlib.ExitStack() as ending:
         progress("kernels", 0.0)
         from kissgs.streaming.compress import compress_streamed as run
+        from kissgs.streaming.work_folder import work_folder
+
+        say_when_interrupted("the same command begins anew")  # a second signal may stop the removal of what was made
+        ending.callback(_say_if_gone, work_folder(target))
 
         runner = None
         if ray is not None:
@@ -85,7 +89,7 @@ def compress_streamed(options: CompressOptions, ray: str | None, scene: str, tar
 
 @contextlib.contextmanager
 def _stages(quiet: bool) -> Iterator[Progress]:
-    """Yield a receiver of progress that announces the scratch folder, and says what an interruption leaves."""
+    """Yield a receiver of progress that announces the scratch folder, and says when an interruption leaves it."""
     with progress_bar(quiet) as bar:
 
         def receive(stage: str, fraction: float, note: str = "") -> None:
@@ -96,3 +100,9 @@ def _stages(quiet: bool) -> Iterator[Progress]:
             bar(stage, fraction, note)
 
         yield receive
+
+
+def _say_if_gone(work: Path) -> None:
+    """Let the message of an interruption say that nothing is left, if that is so."""
+    if not work.exists():
+        say_when_interrupted(NOTHING_LEFT)

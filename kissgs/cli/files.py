@@ -113,11 +113,14 @@ def _entry(name: str, target: Path, writes: bool, report: dict[str, Any]) -> dic
 
 def _targets(inputs: list[str], output: Path | None, suffix: str) -> list[Path]:
     """Return the output path of each input: next to it, in the folder ``output``, or the file ``output``."""
+    from kissgs.io.container_names import named_manifest
+
     if "-" in inputs and (len(inputs) > 1 or output is None):
         raise OutputError("standard input has no name and must be the only input; give the output with -o")
     if output is not None and (str(output) == "-" or _ends_with(output, suffix)):
         if len(inputs) > 1:
-            raise OutputError(f"{len(inputs)} inputs cannot all become {output}; give a folder with -o")
+            remedy = "compress one scene at a time" if named_manifest(output) else "give a folder with -o"
+            raise OutputError(f"{len(inputs)} inputs cannot all become {output}; {remedy}")
         return [output]
     if output is not None and "-" in inputs:
         raise OutputError(f"-o {output} is a folder, but standard input has no name; give -o NAME{suffix}")
@@ -137,15 +140,18 @@ def _targets(inputs: list[str], output: Path | None, suffix: str) -> list[Path]:
 
 def _refuse_file_name(folder: Path, suffix: str) -> None:
     """Raise OutputError if the name of a folder to be made is that of a scene's file, which somebody expects there."""
-    from kissgs.io.container_names import ENDINGS, SCENE_ENDINGS
+    from kissgs.io.container_names import ENDINGS, FILE_ENDINGS, SCENE_ENDINGS
 
-    if folder.suffix.lower() not in (*ENDINGS, *SCENE_ENDINGS):
+    ending = folder.suffix.lower()
+    if ending not in (*ENDINGS, *FILE_ENDINGS):
         return
     if not suffix:
         raise OutputError(f"{folder!s:.100} is the name of a file, but --unpacked writes folders; name a folder")
+    remedy = f"end it in {suffix}, or name a folder"
+    if ending in (*ENDINGS, *SCENE_ENDINGS):
+        remedy = "use kissgs " + ("compress" if ending in ENDINGS else "convert")
     raise OutputError(
-        f"{folder!s:.100} has the ending of another format than {suffix}, which this command writes; use kissgs "
-        + ("compress" if folder.suffix.lower() in ENDINGS else "convert")
+        f"{folder!s:.100} has the ending of another format than {suffix}, which this command writes; {remedy}"
     )
 
 

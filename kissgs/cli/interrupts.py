@@ -36,7 +36,9 @@ def signal_behind(error: BaseException | None) -> int | None:
     return error.args[0] if isinstance(error, Interrupted) else None
 
 
-_left = ["no partial file is left"]
+NOTHING_LEFT = "no partial file is left"
+
+_left = [NOTHING_LEFT]
 
 
 def say_when_interrupted(left: str) -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import glob
+import os
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
 from kissgs.core.errors import UnsupportedError
+from kissgs.io.container_names import ENDINGS, FILE_ENDINGS
 
 if TYPE_CHECKING:
     from kissgs.cameras.views import Views
@@ -60,14 +63,18 @@ def chosen(
     return Settings.from_preset(preset, compact=values["compact"], finetune=values["finetune"], **values["encode"])
 
 
-FINETUNE = "--finetune"
+FINETUNE, RAY = "--finetune", "--ray"
 
-OPTIONAL_VALUES = {FINETUNE: r"[0-9]+|auto", "--ray": r"auto|[^\s/]+:[0-9]+|ray://\S+"}
+OPTIONAL_VALUES = {FINETUNE: r"[0-9]+|auto", RAY: r"auto|[^\s/]+:[0-9]+|ray://\S+"}
 """Options whose value may be left out, and what a value looks like."""
 
 
 def with_default_values(words: list[str]) -> list[str]:
-    """Insert ``auto`` after each ``--finetune`` and ``--ray`` without a value: typer has no optional values."""
+    """Insert ``auto`` after each ``--finetune`` and ``--ray`` without a value: typer has no optional values.
+
+    Raises:
+        UnsupportedError: what follows ``--ray`` is neither an address nor a scene.
+    """
     result = list[str]()
     for n, word in enumerate(words):
         if word == "--":
@@ -75,8 +82,20 @@ def with_default_values(words: list[str]) -> list[str]:
         result.append(word)
         following = words[n + 1] if n + 1 < len(words) else ""
         if word in OPTIONAL_VALUES and not re.fullmatch(OPTIONAL_VALUES[word], following):
+            if word == RAY and _is_host(following):
+                raise UnsupportedError(f"--ray takes HOST:PORT, such as head:6379, not {following:.100}")
             result.append("auto")
     return result
+
+
+def _is_host(word: str) -> bool:
+    """Whether a word that follows ``--ray`` is rather meant as a machine without a port, or as a URL, than as a scene.
+
+    It is if no file has the name, and it is not that of a file that may be missing.
+    """
+    if word.startswith("-") or not word or glob.has_magic(word) or os.path.lexists(word):
+        return False
+    return "://" in word or ("/" not in word and Path(word).suffix.lower() not in (*ENDINGS, *FILE_ENDINGS))
 
 
 def _finetune_values(steps: str | None) -> Values:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from kissgs.cli.arguments import ContainerOption
 from kissgs.cli.files import for_each_input, print_json, show
+
+if TYPE_CHECKING:
+    from kissgs.core.progress import Progress
 
 ServerOption = Annotated[
     str, typer.Option("--server", envvar="KISSGS_SERVER", metavar="URL", help="URL of the service.")
@@ -109,7 +113,7 @@ def compress(
                     container=kind,
                     evaluate=evaluate,
                     overwrite=force,
-                    progress=progress,
+                    progress=_announcing(progress, server, quiet),
                 )
             if not (quiet or as_json):
                 show(_summary(status, target))
@@ -154,7 +158,8 @@ def get(
     from kissgs.io.atomic import refuse_existing
     from kissgs.io.container_names import ending_of, named_container
 
-    with Remote(server, key=key) as remote, progress_bar(False) as progress:
+    with Remote(server, key=key) as remote, progress_bar(False) as bar:
+        progress = _announcing(bar, server, False)
         known = remote.status(job)
         kind = named_container(known["options"].get("format"), output)  # services of older versions state none
         target = output or Path(f"{known['name']}{ending_of(kind)}")
@@ -175,6 +180,22 @@ def cancel(
 
     with Remote(server, key=key) as remote:
         show(f"{job} {remote.cancel(job)['state']}")
+
+
+def _announcing(progress: Progress, server: str, quiet: bool) -> Progress:
+    """Return a receiver that prints a line when the service refuses a request for the first time."""
+    from kissgs.client.remote import WAIT
+
+    said = quiet
+
+    def receive(stage: str, fraction: float, note: str = "") -> None:
+        nonlocal said
+        if stage == WAIT and not said:
+            sys.stderr.write(f"kissgs: {server}: {note}\n")
+            said = True
+        progress(stage, fraction, "" if stage == WAIT else note)
+
+    return receive
 
 
 def _summary(status: dict[str, Any], target: Path) -> str:

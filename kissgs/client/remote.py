@@ -33,6 +33,9 @@ RETRY_SECONDS = 300.0
 FIRST_RETRY_SECONDS = 8.0
 """Time for which requests to a service that has never answered are repeated: its address may be wrong."""
 
+WAIT = "wait for server"
+"""Stage in which a request is repeated after a while."""
+
 _ERRORS: dict[str, type[KissgsError]] = {kind.code: kind for kind in (InvalidSceneError, UnsupportedError)}
 """Errors by problem type, for problems of the scene or the settings that the library itself would raise."""
 
@@ -96,8 +99,8 @@ class Remote:
             container: ``"sogxt"`` or ``"sog"``; by default SOG if ``destination`` ends in ``.sog``, else SOG-XT.
             evaluate: whether the service also compares rendered images.
             overwrite: whether to replace ``destination`` if it exists.
-            progress: receives "upload", "queue", the stages of the service, "download", and "wait for server". An
-                exception that it raises cancels the job.
+            progress: receives "upload", "queue", the stages of the service, "download", and "wait for server" with the
+                reason as a note. An exception that it raises cancels the job.
 
         Returns:
             The status of the job: sizes, times and so on, see the API of the service.
@@ -288,7 +291,8 @@ class Remote:
                 limit = RETRY_SECONDS if self._has_answered or not error.unreachable else FIRST_RETRY_SECONDS
                 if delay is None or time.monotonic() + delay > start + limit:
                     raise
-                _sleep(delay, progress)
+                time_limit = f"{limit:.0f} seconds" if limit < 60 else f"{limit / 60:.0f} minutes"
+                _sleep(delay, progress, f"not ready ({error}); trying again for {time_limit}")
 
 
 def _is_address(server: str) -> bool:
@@ -301,11 +305,11 @@ def _is_address(server: str) -> bool:
         return False
 
 
-def _sleep(seconds: float, progress: Progress) -> None:
+def _sleep(seconds: float, progress: Progress, why: str) -> None:
     """Sleep in short steps that call ``progress``, which may raise."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
-        progress("wait for server", 0.0)
+        progress(WAIT, 0.0, why)
         time.sleep(min(0.5, seconds))
 
 

@@ -95,7 +95,7 @@ def path_state(path: Path) -> tuple[bool, bool]:
     except (OSError, ValueError) as error:
         raise OutputError(f"cannot write {path!s:.100}: {reason_of(error)}") from error
     if not above:
-        raise OutputError(f"cannot write {path}: there is no folder {path.parent}")
+        raise OutputError(f"cannot write {path}: there is no folder {path.parent}; make it first")
     return present, folder
 
 

@@ -26,6 +26,22 @@ LEVELS_ENDING = ".sogxt"
 SCENE_ENDINGS = (".ply", ".spz", ".splat", ".ksplat", ".glb", ".gltf")
 """Endings of scenes that are no containers."""
 
+FILE_ENDINGS = (
+    *SCENE_ENDINGS,
+    ".json",
+    ".yaml",
+    ".yml",
+    ".webp",
+    ".png",
+    ".jpg",
+    ".html",
+    ".txt",
+    ".npz",
+    ".gz",
+    ".tar",
+)
+"""Endings of files that are no containers: a folder of such a name would not be what was meant."""
+
 
 def ending_of(container: ContainerName) -> str:
     """Return the ending of a container's files."""
@@ -36,14 +52,20 @@ def named_container(requested: str | None, destination: Path | None) -> Containe
     """Return the container to write: the requested one, else that of the destination's ending, else SOG-XT.
 
     Raises:
-        UnsupportedError: there is no such container, or the ending is that of another one or of another format.
+        UnsupportedError: there is no such container, or the destination has the name of another one, of another format
+            or of a streamed scene.
     """
     ending = "" if destination is None else destination.suffix.lower()
-    if ending in SCENE_ENDINGS:
-        raise UnsupportedError(
-            f"{destination!s:.100} is not the name of a container: end it in .zip or .sog (kissgs convert writes "
-            "other formats)"
-        )
+    if destination is not None and (ending in FILE_ENDINGS or named_manifest(destination) is not None):
+        remedy = "end it in .zip or .sog"
+        if ending in SCENE_ENDINGS:
+            remedy += " (kissgs convert writes other formats)"
+        elif ending in (".json", LEVELS_ENDING):
+            remedy += (
+                f"; levels of detail, which kissgs compress and kissgs.compress_streamed write, are FOLDER/{LOD_NAME}, "
+                f"FOLDER/{LEVELS_NAME} or NAME{LEVELS_ENDING}"
+            )
+        raise UnsupportedError(f"{destination!s:.100} is not the name of a container: {remedy}")
     by_ending = ENDINGS.get(ending)
     if requested is None:
         return by_ending or "sogxt"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -26,7 +25,17 @@ from kissgs.streaming.build import Blocks
 from kissgs.streaming.items import run_all, run_environment, run_file, run_levels
 from kissgs.streaming.layout import OUT, PARTITION, Layout, keep_layout, read_layout
 from kissgs.streaming.time_left import with_time_left
-from kissgs.streaming.work_folder import check_destination, check_space, claimed, finish, needed_bytes, read_json
+from kissgs.streaming.work_folder import (
+    check_destination,
+    check_space,
+    claimed,
+    explaining_full_disks,
+    finish,
+    needed_bytes,
+    read_json,
+    remove,
+    work_folder,
+)
 
 WORK_LAYOUT = 2
 """Version of the files in the work folder; another one's are not continued."""
@@ -108,12 +117,11 @@ def compress_streamed(
         )
     if manifest.parent.name in ("", ".."):
         manifest = manifest.parent.resolve() / manifest.name
-    container, folder = MANIFESTS[manifest.name], manifest.parent
-    work = folder.parent / f"{folder.name}.partial"
+    container, work = MANIFESTS[manifest.name], work_folder(manifest)
     _check_settings(settings)
     if read_json(work / REPORT) is None:
         check_destination(manifest, source, overwrite=overwrite)
-    with claimed(work, {"container": container, **_identity(source, settings, reading)}):
+    with claimed(work, {"container": container, **_identity(source, settings, reading)}), explaining_full_disks(work):
         if (found := read_json(work / REPORT)) is None:
             layout = _partition(work, source, container, settings, reading, threads, progress)
             found = asdict(_make(work, layout, settings, runner, threads, progress))
@@ -229,7 +237,7 @@ def _partition(
         if _identity(source, settings, reading) != before:
             raise InvalidSceneError(f"{source} was changed while it was read; run the same command again")
     except BaseException:
-        shutil.rmtree(work, ignore_errors=True)  # a partition that is not complete is of no use
+        remove(work)  # a partition that is not complete is of no use
         raise
     keep_layout(work, layout)
     return layout

@@ -7,7 +7,7 @@ from kissgs.settings import EncodeSettings
 COARSER_DB = 6.0
 """Decibels by which coarser levels are encoded less accurately, with rate-distortion planning."""
 
-COARSER_STEPS = 1.5
+COARSER_STEPS = 1.6
 """Steps of coarser levels of SH degree 0 in units of the finest level's, without rate-distortion planning."""
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
+import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +17,7 @@ from kissgs.io.container_names import MANIFESTS
 from kissgs.io.streamed import MAX_TREE_BYTES
 from kissgs.sog.encode import FILES
 from kissgs.streaming.build import CHUNK
-from kissgs.streaming.layout import OUT
+from kissgs.streaming.layout import OUT, PARTITION
 from kissgs.streaming.rows import row_bytes
 
 WORK, LOCK = "work.json", "lock"
@@ -29,6 +31,12 @@ REPLACED = "replaced"
 
 ENCODED_BYTES = 30
 """Upper estimate of the encoded bytes of a Gaussian with all its levels."""
+
+
+def work_folder(manifest: Path) -> Path:
+    """Return the work folder of a streamed scene, given its manifest."""
+    folder = manifest.parent if manifest.parent.name not in ("", "..") else manifest.parent.resolve()
+    return folder.parent / f"{folder.name}.partial"
 
 
 def check_destination(manifest: Path, source: Path, *, overwrite: bool) -> None:
@@ -49,10 +57,12 @@ def check_destination(manifest: Path, source: Path, *, overwrite: bool) -> None:
     if not present:
         return
     if not is_folder or folder.is_symlink() or folder.is_mount():
-        raise OutputError(f"{folder} cannot be replaced as a whole; {remedy}")
-    for inside in (Path.cwd(), source.resolve()):
+        what = "a link" if folder.is_symlink() else "a mount point" if is_folder else "a file"
+        raise OutputError(f"{folder} is {what} and cannot be replaced as a whole; {remedy}")
+    for inside, what in ((Path.cwd(), "the current folder"), (source.resolve(), "the input")):
         if inside.is_relative_to(folder.resolve()):
-            raise OutputError(f"{folder} would be replaced, but {inside} is in it; {remedy}")
+            where = f"is {what}" if inside == folder.resolve() else f"has {what} in it"
+            raise OutputError(f"{folder} would be replaced as a whole, but {where}; {remedy}")
     ours = _paths_of(folder)
     if strange := next((path for path in folder.iterdir() if path.relative_to(folder) not in ours), None):
         raise OutputError(f"{folder} holds other files ({strange.name}); {remedy}")
@@ -105,6 +115,18 @@ def claimed(work: Path, mine: dict[str, Any]) -> Iterator[None]:
             raise OutputError(f"another process works in {work}; wait for it, or choose another name")
         _take_over(work, mine)
         yield
+
+
+@contextlib.contextmanager
+def explaining_full_disks(work: Path) -> Iterator[None]:
+    """Let errors about a full disk say what the same command does once there is room."""
+    try:
+        yield
+    except OutputError as error:
+        if not any(os.strerror(number).lower() in str(error) for number in (errno.ENOSPC, errno.EDQUOT)):
+            raise
+        then = "goes on where it was" if (work / PARTITION).exists() else "begins anew"
+        raise OutputError(f"{error}; once there is room, the same command {then}") from error
 
 
 def _names(work: Path) -> set[str]:
@@ -182,6 +204,21 @@ def finish(work: Path, manifest: Path, source: Path, *, overwrite: bool) -> None
         shutil.rmtree(_discarded(work))
     except OSError as error:
         raise OutputError(f"cannot write {folder}: {reason_of(error)}") from error
+
+
+def remove(work: Path) -> None:
+    """Delete a claimed work folder whose work is of no use; what cannot be deleted stays.
+
+    The files by which :func:`claimed` recognises it are the last to go, so that after an interruption anywhere the same
+    command may begin anew.
+    """
+    with contextlib.suppress(OSError):
+        for path in work.iterdir():
+            if path.name not in (WORK, LOCK):
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+        (work / WORK).unlink(missing_ok=True)
+        (work / LOCK).unlink()
+        work.rmdir()
 
 
 def _discarded(work: Path) -> Path:

@@ -10,6 +10,6 @@ def main() -> None:
     try:
         from .commands import run
     except ModuleNotFoundError as error:
-        sys.stderr.write(f"kissgs-serve: the package {error.name} is missing; install kissgs[service]\n")
+        sys.stderr.write(f"kissgs-serve: the package {error.name} is missing: pip install 'kissgs[service]'\n")
         sys.exit(2)
     run()

@@ -127,7 +127,7 @@ def parse_options(text: str | bytes) -> JobOptions:
         raise ProblemError(
             "invalid-request",
             "these options need torch, which this server does not have; use preset fast without fine-tuning, or "
-            "compact with method merge, or ask the operator to install kissgs[train]",
+            "compact with method merge, or ask the operator to install the extra train",
         )
     return options
 

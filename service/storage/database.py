@@ -107,7 +107,8 @@ def _engine(url: str, wait: float, opened: list[Any] | None = None) -> sa.Engine
         engine = sa.create_engine(url, pool_pre_ping=not url.startswith("sqlite"), hide_parameters=True)
     except ModuleNotFoundError as error:
         raise SettingsError(
-            f"KISSGS_DATABASE_URL: the package {error.name} is missing; for PostgreSQL install kissgs[postgresql]"
+            f"KISSGS_DATABASE_URL: the package {error.name} is missing; "
+            "for PostgreSQL: pip install 'kissgs[postgresql]'"
         ) from error
     except (ArgumentError, NoSuchModuleError, ValueError) as error:
         raise SettingsError(f"KISSGS_DATABASE_URL: {error_text(error)}; set it to a SQLAlchemy URL") from error
@@ -119,11 +120,19 @@ def _engine(url: str, wait: float, opened: list[Any] | None = None) -> sa.Engine
 
 
 def _tune_postgresql(engine: sa.Engine) -> None:
-    """Let PostgreSQL end the transactions of a suspended service, which would make others wait for its locks."""
+    """Refuse encodings that lack characters; end the transactions of a suspended service, which others wait for."""
 
-    @sa.event.listens_for(engine, "connect")
+    @sa.event.listens_for(engine, "connect", insert=True)  # before SQLAlchemy reads texts, which it cannot in SQL_ASCII
     def tune(connection: Any, record: object) -> None:  # noqa: ANN401
         with connection.cursor() as cursor:
+            cursor.execute("SHOW server_encoding")
+            (found,) = cursor.fetchone()
+            encoding = found if isinstance(found, str) else found.decode("ascii")  # bytes in SQL_ASCII
+            if encoding != "UTF8":
+                raise SettingsError(
+                    f"KISSGS_DATABASE_URL: the database has the encoding {encoding}, but jobs need UTF8; create "
+                    "another with CREATE DATABASE … ENCODING 'UTF8' TEMPLATE template0"
+                )
             cursor.execute(f"SET idle_in_transaction_session_timeout = {int(1000 * IDLE_TRANSACTION_SECONDS)}")
         connection.commit()
 

@@ -79,7 +79,9 @@ class ObjectStore:
             import obstore
             import obstore.exceptions
         except ModuleNotFoundError as error:
-            raise SettingsError(f"KISSGS_STORAGE: the package {error.name} is missing; install kissgs[s3]") from error
+            raise SettingsError(
+                f"KISSGS_STORAGE: the package {error.name} is missing: pip install 'kissgs[s3]'"
+            ) from error
         self._api, self._errors = obstore, (obstore.exceptions.BaseError, OSError, ValueError)
         self._store, self._hasty = self._connect(RETRY_SECONDS), self._connect(HASTY_SECONDS)
 

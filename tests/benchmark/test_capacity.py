@@ -89,7 +89,16 @@ def test_jobs_beyond_the_processors_wait_and_more_nodes_end_it(monkeypatch):
 
 
 def test_costs_are_measured():
-    costs = measure_costs(1, Settings.from_preset("fast"), 3000)
+    said, events = list[str](), []
+    costs = measure_costs(
+        1,
+        Settings.from_preset("fast"),
+        3000,
+        announce=said.append,
+        progress=lambda *event: events.append((*said, event)),
+    )
+    assert [event[-1][::2] for event in events] == [("measure", "sample scene"), ("measure", "3,000 Gaussians")]
+    assert all(len(event) == 2 for event in events)  # announced before any work
     assert costs.gaussians == 3000
     assert costs.source_bytes == pytest.approx(4 * (17 + 9), rel=0.01)
     assert costs.camera_seconds == 0.0

@@ -173,13 +173,25 @@ def test_a_folder_as_output_means_into_it_for_one_file_as_for_many(scene: Path, 
 
 def test_no_folder_gets_the_name_of_a_file(scene: Path, tmp_path: Path) -> None:
     """Regression: compress -o a.spz made a folder a.spz, and wrote a SOG-XT container into it."""
-    for name in ("a.spz", "a.PLY", "a.glb"):
+    for name in ("a.spz", "a.PLY", "a.glb", "a.webp", "a.Yaml"):
         assert f"{name} is not the name of a container" in failure("compress", scene, "-o", name, cwd=tmp_path)
+    for name in ("lod_meta.json", "new/meta.json", "LOD-META.JSON"):
+        refused = f"{name} is not the name of a container: end it in .zip or .sog; levels of detail, which "
+        for options in ((), ("--unpacked",), ("--container", "sog")):
+            assert refused in failure("compress", scene, "-o", name, *options, cwd=tmp_path)
+        with pytest.raises(kissgs.UnsupportedError, match=f"^{refused}.* are FOLDER/lod-meta"):
+            kissgs.compress(scene, name)
+    for name in ("city/lod-meta.json", "city/levels.json", "city.sogxt"):
+        with pytest.raises(
+            kissgs.UnsupportedError, match=r"end it in \.zip or \.sog; .*kissgs\.compress_streamed write"
+        ):
+            kissgs.compress(scene, tmp_path / name)
     with pytest.raises(kissgs.UnsupportedError, match=r"end it in \.zip or \.sog"):
         kissgs.compress(scene, tmp_path / "a.spz")
     for name, command in (("a.spz", "convert"), ("a.sog", "compress")):
         sentence = f"{name} has the ending of another format than .ply, which this command writes; use kissgs {command}"
         assert sentence in failure("decompress", scene, "-o", name, cwd=tmp_path)
+    assert "end it in .ply, or name a folder" in failure("decompress", scene, "-o", "meta.json", cwd=tmp_path)
     assert "a.sog is the name of a file, but --unpacked" in failure(
         "compress", scene, "-o", "a.sog", "--unpacked", cwd=tmp_path
     )

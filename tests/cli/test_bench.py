@@ -133,6 +133,10 @@ def test_invalid_options_of_scaling_are_refused(options: str, message: str) -> N
 def test_clusters_are_simulated(tmp_path: Path) -> None:
     words = ("bench", "capacity", "-p", "fast", "--gaussians", 2000, "--degree", 1, "--cpus", 8, "--dollars", 0.3)
     done = run(*words, "--json", "--plot", tmp_path / "capacity.svg")
+    said = done.stderr.decode().splitlines()[0]
+    assert said.startswith(
+        "kissgs: measuring 2,000 Gaussians with levels of detail and without: about 1 min of processor "
+    )
     costs, *runs = json.loads(done.stdout)
     assert costs["node"] == {"cpus": 8, "network_bytes": 625e6, "dollars": 0.3}
     assert [run["jobs_per_day"] for run in runs[16:]] == [1e3, 1e4, 1e5, 1e6]
@@ -141,6 +145,18 @@ def test_clusters_are_simulated(tmp_path: Path) -> None:
     shown = run(*words).stdout.decode()
     assert "1,000,000,000" in shown
     assert max(map(len, shown.splitlines())) <= 120
+
+
+def test_the_time_of_a_simulation_is_stated_by_count_and_preset(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Oracle: 240 and 62 CPU seconds of a million Gaussians, docs/scaling.md."""
+    from kissgs.benchmark import streaming_costs
+
+    monkeypatch.setattr(streaming_costs, "isolated", lambda work, what: None)
+    for count, preset, minutes in ((1_048_576, "balanced", 5), (10_000_000, "balanced", 40), (10_000_000, "fast", 11)):
+        said: list[str] = []
+        settings = kissgs.Settings.from_preset(preset)
+        streaming_costs.measure_costs(3, settings, count, announce=said.append)
+        assert f"{count:,} Gaussians with levels of detail and without: about {minutes} min" in said[0]
 
 
 @pytest.mark.quick(0)

@@ -1,6 +1,7 @@
 """``kissgs compress -o FOLDER/lod-meta.json``, ``-o NAME.sogxt/``. Oracle: what the library writes, and the input."""
 
 import json
+import os
 import signal
 import subprocess
 import time
@@ -47,7 +48,8 @@ def test_options_that_do_not_fit_are_refused(scene, tmp_path, name):
         assert "levels of detail (l" in said
         assert f"are made without {words[0]}" in said
     assert "without goals" in failure("compress", scene, "-o", target, "--target-size", "1MB")
-    assert "2 inputs cannot all become" in failure("compress", scene, scene, "-o", target)
+    assert "become" in (said := failure("compress", scene, scene, "-o", target))
+    assert said.endswith("; compress one scene at a time")
     assert "levels of detail need a file" in failure("compress", "-", "-o", target, stdin=scene.read_bytes())
     assert list(tmp_path.iterdir()) == []
 
@@ -70,3 +72,32 @@ def test_interrupted_work_says_that_it_goes_on_and_does(tmp_path):
     subprocess.run(call, check=True, capture_output=True)
     assert len(kissgs.load(target)) > 100_000
     assert not work.exists()
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_the_message_of_an_interruption_says_whether_something_is_left(scene, tmp_path, again):
+    # A sitecustomize that interrupts the partition once it has written a file, and perhaps the removal of that, too.
+    (tmp_path / "sitecustomize.py").write_text(
+        "import os, pathlib, signal\n"
+        "from kissgs.streaming import build, work_folder\n"
+        f"work, again = pathlib.Path('city.partial'), {again}\n"
+        "def partition(*arguments):\n"
+        "    (work / 'chunk_0.f32').write_bytes(b'1234')\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "unlink = pathlib.Path.unlink\n"
+        "def interrupted(path, *arguments, **options):\n"
+        "    if again and path.name == 'chunk_0.f32':\n"
+        "        os.kill(os.getpid(), signal.SIGINT)\n"
+        "    unlink(path, *arguments, **options)\n"
+        "build.partition, pathlib.Path.unlink = partition, interrupted\n"
+    )
+    call = [str(KISSGS), "compress", str(scene), "-o", "city/lod-meta.json", "-p", "fast"]
+    paths = f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"
+    environment = {**os.environ, "PYTHONPATH": paths}
+    done = subprocess.run(call, check=False, cwd=tmp_path, env=environment, capture_output=True)
+    left = b"the same command begins anew" if again else b"no partial file is left"
+    assert done.returncode == 130
+    assert done.stderr.endswith(b"kissgs: interrupted; " + left + b"\n")
+    assert (tmp_path / "city.partial").exists() == again
+    subprocess.run(call, cwd=tmp_path, check=True, capture_output=True)
+    assert not (tmp_path / "city.partial").exists()

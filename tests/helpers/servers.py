@@ -55,14 +55,14 @@ def postgresql_server():
 
 @pytest.fixture(scope="session")
 def new_database(postgresql_server):
-    """``new_database()`` creates a database and returns its URL."""
+    """``new_database()`` creates a database and returns its URL; ``encoding`` is UTF8 by default."""
     numbers = itertools.count(1)
 
-    def create():
+    def create(encoding="UTF8"):
         name = f"jobs{next(numbers)}"
         engine = sa.create_engine(postgresql_server, isolation_level="AUTOCOMMIT")
         with engine.connect() as connection:
-            connection.exec_driver_sql(f"CREATE DATABASE {name}")
+            connection.exec_driver_sql(f"CREATE DATABASE {name} ENCODING '{encoding}' LOCALE 'C' TEMPLATE template0")
         engine.dispose()
         return postgresql_server.rpartition("/")[0] + f"/{name}"
 

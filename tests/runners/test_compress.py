@@ -238,3 +238,13 @@ def test_the_default_address_is_auto():
     assert with_default_values(["--ray", "a.ply"]) == ["--ray", "auto", "a.ply"]
     assert with_default_values(["--ray", "head:6379", "a.ply"]) == ["--ray", "head:6379", "a.ply"]
     assert with_default_values(["--ray", "[::1]:6379"]) == ["--ray", "[::1]:6379"]
+    for scene in ("*.ply", "missing.zip", "folder/scene", "-q", "city.sog"):
+        assert with_default_values(["--ray", scene]) == ["--ray", "auto", scene]
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1", "http://127.0.0.1:6379", "head", "head.example.com", "h:port"])
+def test_an_address_without_a_port_is_not_taken_for_a_scene(scenes, tmp_path, address):
+    said = failure("compress", "--ray", address, scenes / "a.ply", "-o", tmp_path)
+    assert said == f"kissgs: --ray takes HOST:PORT, such as head:6379, not {address}"
+    (tmp_path / "head").mkdir()  # a container or a streamed scene
+    assert with_default_values(["--ray", str(tmp_path / "head")])[1] == "auto"

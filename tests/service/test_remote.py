@@ -1,12 +1,14 @@
 """The client, in Python and on the command line, with a real service; oracle: local kissgs.compress."""
 
 import hashlib
+import http.server
 import json
 import os
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
@@ -208,6 +210,38 @@ def test_the_command(service, scene, tmp_path):
     assert json.loads(as_json.stdout)["state"] == "succeeded"
 
 
+@pytest.mark.quick(1)
+@pytest.mark.parametrize("words", [(), ("--quiet",), ("--json",)])
+def test_the_command_says_once_that_the_service_refuses_and_why(scene, words):
+    """Oracle: a server that refuses twice for a while, as a service without its storage does, and then for good."""
+    answers = [("storage", "the storage is down", 503)] * 2 + [("gone", "the end", 410)]
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_POST(self):
+            self.rfile.read(int(self.headers["Content-Length"]))
+            code, detail, status = answers.pop(0)
+            body = json.dumps({"code": code, "detail": detail}).encode()
+            self.send_response(status)
+            self.send_header("Retry-After", "1")
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, *arguments):
+            pass
+
+    with http.server.HTTPServer(("127.0.0.1", 0), Handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        url = f"http://127.0.0.1:{server.server_address[1]}"
+        done = kissgs_command("compress", scene, "--server", url, *words)
+        server.shutdown()
+        thread.join()
+    said = f"kissgs: {url}: not ready (the storage is down); trying again for 5 minutes\n"
+    assert done.stderr == ("" if words == ("--quiet",) else said) + "kissgs: the end\n"
+    assert (done.returncode, answers) == (2, [])
+
+
 @pytest.mark.quick(0)
 def test_the_command_with_a_goal(service, scene, tmp_path):
     words = ("--server", service.url, "--target-size", "14.5kB", "--set", "sensitivity_views=4", "-f", "-q")
@@ -277,4 +311,10 @@ def test_the_ending_chooses_the_container(service, scene, tmp_path):
         assert remote.compress(scene, tmp_path / "b.sog", settings=FAST)["options"]["format"] == "sog"
         with pytest.raises(kissgs.UnsupportedError, match=r"end it in \.zip"):
             remote.compress(scene, tmp_path / "c.sog", settings=FAST, container="sogxt")
+        for name in ("meta.json", "city.sogxt", "city/lod-meta.json"):
+            with pytest.raises(kissgs.UnsupportedError, match=f"{name} is not the name of a container"):
+                remote.compress(scene, tmp_path / name)
+            refused = kissgs_command("compress", scene, "-o", tmp_path / name, KISSGS_SERVER=service.url)
+            assert (refused.returncode, f"{name} is not the name" in refused.stderr) == (2, True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["Schloß 1.ply", "Schloß 1.sog", "a.sog", "b.sog", "out"]
     assert (tmp_path / "b.sog").read_bytes() == expected

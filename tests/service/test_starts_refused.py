@@ -12,6 +12,7 @@ from helpers.data_folders import command, database, finish_a_job, listing, opene
 
 from service.core.models import SCHEMA_VERSION
 from service.core.settings import SettingsError
+from service.storage.database import connect
 from service.storage.job_records import Store
 
 pytestmark = pytest.mark.usefixtures("no_variables")
@@ -174,6 +175,15 @@ def test_a_refused_command_prints_one_line(jobs_folder, change):
 
 
 @pytest.mark.quick(0)
+@pytest.mark.parametrize("encoding", ["SQL_ASCII", "LATIN1"])
+def test_a_database_of_postgresql_that_cannot_hold_every_name(new_database, tmp_path, encoding):
+    remedy = r"create another with CREATE DATABASE … ENCODING 'UTF8' TEMPLATE template0$"
+    with pytest.raises(SettingsError, match=f"^KISSGS_DATABASE_URL: .* the encoding {encoding}, but .* UTF8; {remedy}"):
+        connect(new_database(encoding))
+    engine, *_ = connect(new_database())
+    engine.dispose()
+
+
 def test_a_locked_database(jobs_folder):
     before = listing(jobs_folder)
     with contextlib.closing(sqlite3.connect(jobs_folder / "jobs.sqlite")) as other:

@@ -1,7 +1,9 @@
 """Streamed scenes. Oracle: the reader, the input's Gaussians, and work that is interrupted anywhere."""
 
+import errno
 import itertools
 import json
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -258,8 +260,12 @@ def test_the_folder_of_levels_of_sogxt_is_named_by_its_ending(scene, tmp_path):
 def test_the_current_folder_is_not_replaced(scene, tmp_path, monkeypatch, name):
     (tmp_path / "here" / "inner").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "here")
-    with pytest.raises(OutputError, match="in a new folder"):
+    name_it = rf"name {Path(name).name} in a new folder$"
+    with pytest.raises(OutputError, match=rf"replaced as a whole, but is the current folder; {name_it}"):
         compress_streamed(scene, Path(name), settings=FAST)
+    monkeypatch.chdir("inner")
+    with pytest.raises(OutputError, match=rf"replaced as a whole, but has the current folder in it; {name_it}"):
+        compress_streamed(scene, Path("..", name), settings=FAST)
     assert [path.name for path in tmp_path.iterdir()] == ["here"]
 
 
@@ -275,8 +281,44 @@ def test_two_processes_do_not_work_in_one_folder(scene, tmp_path):
     assert len(kissgs.load(target)) > 0
 
 
+@pytest.mark.parametrize("made", ["link", "mount point", "file"])
+def test_what_is_no_folder_of_its_own_is_not_replaced(scene, tmp_path, monkeypatch, made):
+    folder = tmp_path / "city"
+    if made == "link":
+        folder.symlink_to(tmp_path)
+    elif made == "file":
+        folder.write_text("mine")
+    else:
+        folder.mkdir()
+        monkeypatch.setattr(Path, "is_mount", lambda path: path == folder)
+    with pytest.raises(
+        OutputError, match=f"city is a {made} and cannot be replaced as a whole; name lod-meta.json in a"
+    ):
+        compress_streamed(scene, folder / "lod-meta.json", settings=FAST)
+
+
+@pytest.mark.parametrize(("stage", "then"), [("partition", "begins anew"), ("images", "goes on where it was")])
+@pytest.mark.parametrize("reason", [errno.ENOSPC, errno.EDQUOT])
+def test_a_disk_that_fills_up_does_not_end_the_work_for_good(scene, target, tmp_path, monkeypatch, stage, then, reason):
+    with monkeypatch.context() as patch:
+
+        def fill(now, fraction, note=""):
+            if now == stage:
+                patch.setattr(os, "fsync", full)
+
+        def full(descriptor):
+            raise OSError(reason, os.strerror(reason))
+
+        said = f"^cannot write .*: {os.strerror(reason).lower()}; once there is room, the same command {then}$"
+        with pytest.raises(OutputError, match=said):
+            compress_streamed(scene, target, settings=FAST, progress=fill)
+    assert target.parent.with_name(f"{target.parent.name}.partial").exists() == (stage == "images")
+    compress_streamed(scene, target, settings=FAST)
+    assert len(kissgs.load(target)) > 0
+
+
 def test_a_missing_folder_above_is_named(scene, tmp_path):
-    with pytest.raises(OutputError, match="there is no folder"):
+    with pytest.raises(OutputError, match=r"there is no folder .*/none; make it first"):
         compress_streamed(scene, tmp_path / "none" / "city" / "lod-meta.json", settings=FAST)
     assert list(tmp_path.iterdir()) == []
 

@@ -75,6 +75,48 @@ def test_it_may_be_killed_before_every_change_of_the_disk(scene, tmp_path, monke
     assert step >= 4
 
 
+FILE_OPERATIONS = ("lstat", "open", "rename", "replace", "rmdir", "scandir", "unlink")
+"""Functions of ``os`` by which files are removed, and those by which they might be."""
+
+
+def test_the_removal_of_a_partition_may_be_interrupted_before_every_operation(scene, tmp_path, monkeypatch):
+    target, work = tmp_path / "city" / "lod-meta.json", tmp_path / "city.partial"
+
+    def partitioned(step):
+        """Interrupt a partition that has written files, and the n-th operation of their removal, if there is one."""
+        with monkeypatch.context() as patch:
+            left = [step]
+
+            def counted(function):
+                def call(*arguments, **options):
+                    left[0] -= 1
+                    if left[0] == -1:
+                        raise Killed
+                    return function(*arguments, **options)
+
+                return call
+
+            def interrupt(stage, fraction, note=""):
+                if stage == "partition" and any(work.glob("chunk_*")):
+                    for name in FILE_OPERATIONS:
+                        patch.setattr(os, name, counted(getattr(os, name)))
+                    raise Killed
+
+            with pytest.raises(Killed):
+                compress_streamed(scene, target, settings=FAST, progress=interrupt)
+            return left[0] < 0
+
+    step = 0
+    while partitioned(step):
+        step += 1
+    assert step >= 8
+    assert list(tmp_path.iterdir()) == []
+    partitioned(step // 2)
+    assert work.exists()
+    compress_streamed(scene, target, settings=FAST)
+    assert [path.name for path in tmp_path.iterdir()] == ["city"]
+
+
 def test_files_that_appear_meanwhile_are_kept(scene, tmp_path):
     target = tmp_path / "city" / "lod-meta.json"
 
@@ -136,7 +178,7 @@ def test_names_and_inputs_that_would_be_replaced_are_refused(scene, tmp_path, mo
         compress_streamed(scene, tmp_path / "city" / "scene.json", settings=FAST)
     target = tmp_path / "city" / "lod-meta.json"
     for source in (target, tmp_path / "city" / "0_0" / "meta.json"):
-        with pytest.raises(OutputError, match="would be replaced, but"):
+        with pytest.raises(OutputError, match="would be replaced as a whole, but has the input in it"):
             compress_streamed(source, target, settings=FAST, overwrite=True)
     (tmp_path / "city" / "0_0" / "empty").mkdir()
     with pytest.raises(OutputError, match=r"holds other files \(0_0/empty\)"):
@@ -146,6 +188,6 @@ def test_names_and_inputs_that_would_be_replaced_are_refused(scene, tmp_path, mo
         compress_streamed(scene, tmp_path / "town" / "lod-meta.json", settings=FAST)
     (tmp_path / "here" / "below").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "here" / "below")
-    with pytest.raises(OutputError, match="would be replaced, but"):
+    with pytest.raises(OutputError, match="would be replaced as a whole, but has the current folder in it"):
         compress_streamed(scene, "../lod-meta.json", settings=FAST)
     assert len(kissgs.load(target)) > 1000
