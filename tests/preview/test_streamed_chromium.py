@@ -1,16 +1,20 @@
 """``kissgs view`` of a streamed scene in Chromium: what is loaded when, and what the page says about it."""
 
+import contextlib
 import json
 import re
 import threading
 import urllib.parse
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from helpers.preview_browser import colours, preview, psnr, software_browser  # noqa: F401  fixtures
 from helpers.streamed_scenes import small_sizes
 from helpers.viewers import scattered
 
 import kissgs
+from kissgs.core.splats import concatenate
 from kissgs.preview import server as server_module
 from kissgs.preview.server import PageServer
 from kissgs.preview.streamed_folder import streamed_folder
@@ -41,14 +45,22 @@ def server(city, monkeypatch):
         return find(handler)
 
     monkeypatch.setattr(server_module._Handler, "_find", held)
-    with PageServer(streamed_folder(city)) as server:
+    with serving(city) as server:
         server.gate = threading.Event()
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
         yield server
         server.gate.set()
-        server.shutdown()
-        thread.join()
+
+
+@contextlib.contextmanager
+def serving(folder):
+    with PageServer(streamed_folder(folder)) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        try:
+            yield server
+        finally:
+            server.shutdown()
+            thread.join()
 
 
 @pytest.fixture
@@ -149,7 +161,7 @@ def test_a_small_budget(server, opened):
     assert facts(tab)["At most"] == ("400", "on this device")
     assert not any(name.startswith("0_") for name in far)
     tab.page.locator("#viewport").focus()
-    for _ in range(95):  # to the far end of the scene
+    for _ in range(85):  # to the far end of the scene
         tab.page.keyboard.press("w")
     tab.page.wait_for_timeout(300)
     settle(tab)
@@ -175,3 +187,26 @@ def test_a_missing_file_and_a_damaged_list(server, opened):
     tab.error_message("list of this scene's files is damaged")
     tab.choose(("lod-meta.json", b"{}"))
     tab.error_message("does not open the list of a scene's files alone", "kissgs view lod-meta.json")
+
+
+def test_the_first_camera_is_within_the_sky(preview, tmp_path):  # noqa: F811
+    """A sky that merging leaves in nearly half of the coarsest level does not decide where the camera stands."""
+    near = scattered(1000, 0)
+    sky = scattered(140, 1)
+    far = 12 * sky.means / np.linalg.norm(sky.means, axis=1, keepdims=True)
+    sky = replace(sky, means=far, scales=sky.scales + 3.5, opacities=sky.opacities + 8, shN=near.shN[:140])
+    kissgs.save(concatenate([near, sky]), tmp_path / "scene.ply")
+    with pytest.MonkeyPatch.context() as patch:
+        small_sizes(patch, chunk=2000, leaf=600, coarsest=200)
+        settings = kissgs.Settings(preset="fast")
+        kissgs.compress_streamed(tmp_path / "scene.ply", tmp_path / "city" / "lod-meta.json", settings=settings)
+    coarsest = kissgs.load(tmp_path / "city", level=3)
+    assert np.mean(np.linalg.norm(coarsest.means, axis=1) > 8) > 0.3
+    with serving(tmp_path / "city") as server:
+        tab = preview()
+        tab.origin = server.url.partition("?")[0]
+        tab.page.goto(server.url)
+        settle(tab)
+        image = tab.still_image()
+    background = (image[:8] == (11, 10, 16)).all(axis=-1)
+    assert background.mean() < 0.2

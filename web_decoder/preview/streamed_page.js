@@ -2,7 +2,7 @@
 
 import { budgetOf } from "./device.js";
 import { byId } from "./dom.js";
-import { extentOfBoxes } from "./extent.js";
+import { extentOfBoxes, extentOfCoarsest } from "./extent.js";
 import { parseTree } from "./lod_tree.js";
 import { UserError, sentenceOf } from "./problem.js";
 import { StreamedFiles } from "./streamed_files.js";
@@ -10,6 +10,7 @@ import { streamedStatisticsView } from "./statistics.js";
 import { Streaming } from "./streaming.js";
 
 /** @typedef {import("./streamed_meshes.js").Content} Content */
+/** @typedef {import("./scene.js").Scene} Scene */
 
 /** Shortest time between two choices of levels while the camera moves, milliseconds, and in units of what one takes. */
 const [INTERVAL, REST] = [100, 5];
@@ -35,6 +36,8 @@ export async function openStreamed(address, load, view, failed) {
   /** Seconds and bytes until the first image. @type {{seconds: number, bytes: number} | null} */
   let first = null;
   let needed = 0;
+  /** Files of the coarsest level until the camera has been placed by them. @type {Map<number, Scene> | null} */
+  let coarsest = new Map();
   let timer = 0;
   let closed = false;
   /** @type {(error?: unknown) => void} */
@@ -48,7 +51,11 @@ export async function openStreamed(address, load, view, failed) {
   /** @type {Streaming<Content>} */
   const streaming = new Streaming(tree, {
     budget,
-    load: async (file, signal) => contentOf(await files.load(file, tree.files[file], signal), signal),
+    load: async (file, signal) => {
+      const scene = await files.load(file, tree.files[file], signal);
+      if (streaming.base.includes(file)) coarsest?.set(file, scene);
+      return contentOf(scene, signal);
+    },
     draw: (parts) => viewer.setParts(parts),
     changed: () => soon(0),
     failed: lose,
@@ -64,6 +71,10 @@ export async function openStreamed(address, load, view, failed) {
   function look() {
     timer = 0;
     const before = performance.now();
+    if (streaming.begun && coarsest) {
+      if (coarsest.size) view.place(extentOfCoarsest(tree.leaves, coarsest));
+      coarsest = null;
+    }
     streaming.look(viewer.sight);
     interval = Math.max(INTERVAL, REST * (performance.now() - before));
     if (streaming.begun) needed ||= files.received;
