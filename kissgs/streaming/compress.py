@@ -26,7 +26,15 @@ from kissgs.streaming.build import Blocks
 from kissgs.streaming.items import run_all, run_environment, run_file, run_levels
 from kissgs.streaming.layout import OUT, PARTITION, Layout, keep_layout, read_layout
 from kissgs.streaming.time_left import with_time_left
-from kissgs.streaming.work_folder import check_destination, check_space, claimed, finish, needed_bytes, read_json
+from kissgs.streaming.work_folder import (
+    check_destination,
+    check_space,
+    claimed,
+    finish,
+    megabytes,
+    needed_bytes,
+    read_json,
+)
 
 WORK_LAYOUT = 2
 """Version of the files in the work folder; another one's are not continued."""
@@ -239,7 +247,7 @@ def _announce(work: Path, count: int, sh_degree: int, progress: Progress) -> Non
     """Check that the disk has room for the work folder, and report its size."""
     needed = needed_bytes(count, sh_degree)
     check_space(work, needed)
-    progress("scratch", 1.0, f"{work} takes up to {needed / 1e6:,.0f} MB until the work is done")
+    progress("scratch", 1.0, f"{work} takes up to {megabytes(needed)} until the work is done")
 
 
 def _report(work: Path, layout: Layout, chunks: int) -> StreamedReport:

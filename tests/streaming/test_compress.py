@@ -142,7 +142,9 @@ def test_what_cannot_be_read_leaves_no_work_folder(scene, tmp_path):
 def test_a_full_disk_is_noticed_before_any_work(scene, tmp_path, monkeypatch):
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=100_000))
-    with pytest.raises(OutputError, match=r"city\.partial will take up to 1 MB, but its disk has 0 MB free; free some"):
+    with pytest.raises(
+        OutputError, match=r"city\.partial will take up to 918 kB, but its disk has 100 kB free; free some"
+    ):
         compress_streamed(scene, tmp_path / "city" / "lod-meta.json", settings=FAST)
     assert list(tmp_path.iterdir()) == []
 
