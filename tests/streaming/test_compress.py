@@ -294,3 +294,20 @@ def test_the_number_of_threads_does_not_matter(scene, tmp_path, name):
     for threads in (1, 3):
         compress_streamed(scene, tmp_path / str(threads) / name, settings=FAST, threads=threads)
     assert files_of(tmp_path / "1") == files_of(tmp_path / "3")
+
+
+@pytest.mark.parametrize("preset", ["fast", "balanced"])
+def test_items_report_within(scene, tmp_path, preset):
+    """Every chunk and file, of which there are four and more, reports more than its beginning, and never goes back."""
+    found = {}
+
+    def progress(stage, fraction, note=""):
+        found.setdefault(stage, []).append(fraction)
+
+    settings = Settings.from_preset(preset)
+    compress_streamed(scene, tmp_path / "city" / "lod-meta.json", settings=settings, progress=progress)
+    for stage, items in (("merge", 4), ("images", 5)):
+        own = found[stage]
+        assert own == sorted(own)
+        for item in range(items - 1):
+            assert any(item / items < fraction < (item + 1) / items for fraction in own)
