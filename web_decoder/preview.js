@@ -130,7 +130,7 @@ async function openAddressed(load) {
 async function openStreamedScene(name, address, load) {
   setTitle(name);
   showPanel();
-  announce(`${name}: ${count(await openStreamed(address, load, view, showProblem))} Gaussians.`);
+  announce(`${name}: ${count(await openStreamed(address, load, view))} Gaussians.`);
 }
 
 /** Show the panel of a scene that has no planes and cannot be compared, with its statistics. @param {...Node} statistics */

@@ -102,7 +102,7 @@ class ClusterCompression:
         if not self.options.quiet:
             from rich.text import Text
 
-            show(Text.from_ansi(outcome.result["table"]))
+            show(Text.from_ansi(outcome.result["table"].removesuffix("\n")))
         report: dict[str, Any] = outcome.result["report"]
         return report
 

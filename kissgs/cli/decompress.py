@@ -64,7 +64,9 @@ def decompress(
                 write_ply(sys.stdout.buffer, splats)
             return {}
         if not (quiet or as_json):
-            show(f"{target}  {len(splats):,} Gaussians, SH degree {splats.sh_degree}")
+            from kissgs.cli.tables import gaussians
+
+            show(f"{target}  {gaussians(len(splats))}, SH degree {splats.sh_degree}")
         return {"count": len(splats), "sh_degree": splats.sh_degree, "bytes": target.stat().st_size}
 
     for_each_input(containers, output, ".ply", as_json, work, unreadable=InvalidContainerError)

@@ -47,6 +47,11 @@ def size(count: float) -> str:
     return f"{count:.2f} GB"
 
 
+def gaussians(count: int) -> str:
+    """Format a number of Gaussians: "1 Gaussian", "60,000 Gaussians"."""
+    return f"{count:,} Gaussian{'' if count == 1 else 's'}"
+
+
 def report_table(report: Report, target: str) -> RenderableType:
     """Format the report of one compression."""
     head = Text.assemble(
@@ -57,7 +62,7 @@ def report_table(report: Report, target: str) -> RenderableType:
     )
     time = f"{sum(report.seconds.values()):.1f} s ({report.cpu_seconds:.1f} CPU s)"
     cost = f"{time}, peak memory {size(report.peak_memory)}"
-    body = f"{report.count:,} of {report.source_count:,} Gaussians, SH degree {report.sh_degree}; {cost}"
+    body = f"{report.count:,} of {gaussians(report.source_count)}, SH degree {report.sh_degree}; {cost}"
     changed = {
         "invisible": report.invisible,
         "pruned_by_rd": report.pruned_by_rd,
@@ -88,17 +93,19 @@ def compaction_table(report: CompactionReport, target: str) -> RenderableType:
 
 def streamed_table(report: StreamedReport, target: str) -> RenderableType:
     """Format the report of a streamed compression."""
+    stored = report.counts[0] + report.environment_count
+    chunks = f"{report.chunks} chunk{'s' * (report.chunks > 1)}"
     head = Text.assemble(
         (target, "bold"),
-        f"  {report.source_count:,} Gaussians in {report.chunks} chunk{'s' * (report.chunks > 1)}, ",
+        f"  {stored:,} of {gaussians(report.source_count)} in {chunks}, ",
         (size(report.total_bytes), "bold green"),
     )
     table = Table("level", *map(_right, ("Gaussians", "bytes", "per Gaussian")), box=None, pad_edge=False)
-    for level, (count, stored) in enumerate(zip(report.counts, report.level_bytes, strict=True)):
-        table.add_row(str(level), f"{count:,}", f"{stored:,}", f"{stored / max(count, 1):.2f}")
+    for level, (count, taken) in enumerate(zip(report.counts, report.level_bytes, strict=True)):
+        table.add_row(str(level), f"{count:,}", f"{taken:,}", f"{taken / max(count, 1):.2f}")
     if count := report.environment_count:
-        stored = report.environment_bytes
-        table.add_row("environment", f"{count:,}", f"{stored:,}", f"{stored / count:.2f}")
+        taken = report.environment_bytes
+        table.add_row("environment", f"{count:,}", f"{taken:,}", f"{taken / count:.2f}")
     return Group(head, table, *_changes(report.changed))
 
 
@@ -167,20 +174,21 @@ def surroundings_summary(surroundings: Evaluation) -> str:
     return f"{mean} from {surroundings.views_used}; {surroundings.extremes}"
 
 
-def parts_table(parts: Mapping[str, int], count: int) -> Table:
-    """Return a table of bytes per file or attribute: absolute, share of all, and bits per Gaussian."""
+def parts_table(parts: Mapping[str, int], count: int, whole: str = "total") -> Table:
+    """Return a table of bytes per file or attribute: absolute, share of the whole, and bits per Gaussian."""
     table = Table("part", _right("bytes"), _right("share"), _right("bits/Gaussian"), box=None, pad_edge=False)
     total = sum(parts.values())
     for name, value in parts.items():
         table.add_row(name, f"{value:,}", f"{value / max(total, 1):.1%}", f"{8 * value / max(count, 1):.2f}")
-    table.add_row("total", f"{total:,}", "", f"{8 * total / max(count, 1):.2f}", style="bold")
+    table.add_row(whole, f"{total:,}", "", f"{8 * total / max(count, 1):.2f}", style="bold")
     return table
 
 
 def info_table(info: Info) -> RenderableType:
     """Format the output of ``kissgs info``."""
-    head = Text.assemble((info.path, "bold"), f"  {_kind(info)}, {size(info.bytes)}")
-    body = f"{info.count:,} Gaussians, SH degree {info.sh_degree}, {info.bits_per_gaussian:.1f} bits per Gaussian"
+    streamed = info.kind in STREAMED_FORMATS
+    head = Text.assemble((info.path, "bold"), f"  {_kind(info)}, {size(info.bytes)}{' in all levels' * streamed}")
+    body = f"{gaussians(info.count)}, SH degree {info.sh_degree}, {info.bits_per_gaussian:.1f} bits per Gaussian"
     stored = info.kind in CONTAINER_FORMATS
     of = "value of {} level" if stored else "{} value"  # channels share a step, so few reach the highest
     ends = [_right(of.format(end)) for end in ("lowest", "highest")]
@@ -189,7 +197,8 @@ def info_table(info: Info) -> RenderableType:
         ranges.add_row(name, f"{low:.5g}", f"{high:.5g}")
     blocks: list[RenderableType] = [head, Text(body), ranges]
     if info.parts:
-        blocks.insert(2, parts_table(info.parts, info.count))
+        whole = f"total of level {info.details['level']}" if streamed else "total"
+        blocks.insert(2, parts_table(info.parts, info.count, whole))
     details = info.details
     if info.kind == "sogxt":
         origin = "unknown"
@@ -197,9 +206,11 @@ def info_table(info: Info) -> RenderableType:
             origin = f"kissgs {details['version']} from {details['source_count']:,} Gaussians"
         grid, codebook = details["grid_side"], details["codebook_side"]
         blocks.append(Text(f"grid {grid} x {grid}, codebook {codebook} x {codebook}; encoder: {origin}"))
-    if info.kind in STREAMED_FORMATS:
+    if streamed:
         levels = ", ".join(f"{count:,}" for count in details["levels"])
-        blocks.append(Text(f"Gaussians by level, finest first: {levels}; environment: {details['environment']:,}"))
+        around = details["environment"]
+        beside = f"; in the environment, which belongs to every level: {around:,}" if around else ""
+        blocks.append(Text(f"Gaussians by level, finest first: {levels}{beside}"))
     return Group(*blocks, *_changes(info.changed))
 
 
@@ -236,7 +247,7 @@ def _kind(info: Info) -> str:
 
 def _changes(changed: Mapping[str, int]) -> list[Text]:
     return [
-        Text(f"{count:,} Gaussian{'' if count == 1 else 's'} {CHANGES[name]}", style="yellow")
+        Text(f"{gaussians(count)} {CHANGES[name]}", style="yellow")
         for name, count in changed.items()
         if count and name in CHANGES
     ]

@@ -136,7 +136,14 @@ def _prepare(
                 "--max-gaussians does not apply to a streamed scene that the page loads in parts; "
                 "add &gaussians=N to the page's address, or name a --level"
             )
-        return streamed_folder(content)
+        folder = streamed_folder(content)
+        if folder.missing and not quiet:
+            others = len(folder.missing) - 1
+            lost = folder.missing[0] + (f" and {others} more file{'s' * (others > 1)}" if others else "")
+            sys.stderr.write(
+                f"kissgs: {scene} lacks {lost}, so a part will be missing; export or download the scene again\n"
+            )
+        return folder
     with progress_bar(quiet) as progress:
         return page_scene(content, reading, threads=threads, progress=progress)
 

@@ -229,6 +229,6 @@ def open_source(source: Path | bytes | Mapping[str, bytes], root: str | None = N
 
 def _check(name: str, present: bool, size: int, limit: int) -> None:
     if not present:
-        raise InvalidContainerError(f"the container has no file {name!r}")
+        raise InvalidContainerError(f"the container has no file {name!r}; export or download it again")
     if size > limit:
         raise InvalidContainerError(f"{name} has {size} bytes; the limit for this file is {limit}")

@@ -6,7 +6,9 @@ says how its files are opened and decoded.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import os
 import posixpath
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -111,6 +113,34 @@ class StreamedFormat(Generic[C]):
     containers: str | None
     opened: Callable[[Source, str], C]
 
+    @contextlib.contextmanager
+    def open(self, source: Path | bytes | Mapping[str, bytes]) -> Iterator[Source]:
+        """Open a streamed scene for reading; errors about its files name the scene.
+
+        Args:
+            source: the folder of the manifest, a zip of it, the bytes of one, or files in memory.
+
+        Raises:
+            InvalidContainerError: ``source`` cannot be read or is not a zip file.
+        """
+        with open_source(source, self.manifest) as files:
+            try:
+                yield files
+            except (InvalidContainerError, UnsupportedError) as error:
+                if not isinstance(source, Path):
+                    raise
+                raise type(error)(self._located(source, str(error))) from error
+
+    def _located(self, source: Path, message: str) -> str:
+        """Return a message about a file of a streamed scene with the path of the scene."""
+        if not source.is_dir():
+            return f"{source}: {message}"
+        if source.name and f"{source}{os.sep}" in message:
+            return message
+        if message.startswith(self.manifest):
+            return f"{source / self.manifest}{message.removeprefix(self.manifest)}"
+        return f"{source / self.manifest}: {message}"
+
     def decode(
         self,
         source: Path | bytes | Mapping[str, bytes],
@@ -137,7 +167,7 @@ class StreamedFormat(Generic[C]):
             InvalidContainerError: a part is missing, damaged or invalid.
             UnsupportedError: there is no such level, another version, or more Gaussians than ``max_gaussians``.
         """
-        with open_source(source, self.manifest) as files, Workers(threads) as pool:
+        with self.open(source) as files, Workers(threads) as pool:
             parts = list(self.parts(files, self.read_manifest(files), level))
             count = sum(part.count for part in parts)
             refuse_more_than(max_gaussians, count, f"level {level}")

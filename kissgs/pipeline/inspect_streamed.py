@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from kissgs.io.packed_files import Source, open_source
+from kissgs.io.packed_files import Source
 from kissgs.io.streamed import C, Part, StreamedFormat
 from kissgs.pipeline.container_facts import Facts, stored_size
 from kissgs.pipeline.inspect_sog import sog_images, sog_ranges
@@ -58,7 +58,7 @@ def _facts(
     size: Callable[[Source, Part[C]], tuple[str, int]],
     ranges: Callable[[Sequence[C]], Ranges],
 ) -> Facts:
-    with open_source(path, streamed.manifest) as files:
+    with streamed.open(path) as files:
         manifest = streamed.read_manifest(files)
         parts = list(streamed.parts(files, manifest, level))
         sizes = {streamed.manifest: stored_size(files, streamed.manifest), **dict(size(files, part) for part in parts)}

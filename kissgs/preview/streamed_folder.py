@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from kissgs.core.errors import KissgsError
-from kissgs.io.packed_files import Source, open_source
+from kissgs.io.packed_files import Source
 from kissgs.io.streamed import StreamedFormat
 from kissgs.pipeline.scene_formats import STREAMED_FORMATS, recognise, scene_root
 from kissgs.sog import streamed as streamed_sog
@@ -28,11 +28,13 @@ class StreamedFolder:
         name: name of the folder.
         manifest: name of the manifest in it.
         files: all files of the scene by their paths from the folder, the manifest included, and no others.
+        missing: files that the scene should have, but that are not in the folder or cannot be reached.
     """
 
     name: str
     manifest: str
     files: dict[str, Path]
+    missing: tuple[str, ...]
 
 
 def is_streamed(source: Path | bytes) -> bool:
@@ -58,14 +60,15 @@ def streamed_folder(source: Path) -> StreamedFolder:
         KissgsError: the manifest is damaged, or names files that are not below its folder.
     """
     folder, kind = scene_root(source), _format(source)
-    with open_source(folder, kind.manifest) as opened:
+    with kind.open(folder) as opened:
         tree = kind.read_manifest(opened)
         names = [kind.manifest]
         for name in (*tree.filenames, *([tree.environment] if tree.environment else [])):
             names += _container_files(opened, name)
     root = folder.resolve()
     inside = {name: path for name in names if (path := _file_inside(root, name)) is not None}
-    return StreamedFolder(os.fsencode(root.name).decode(errors="replace") or "scene", kind.manifest, inside)
+    missing = tuple(name for name in names if name not in inside)
+    return StreamedFolder(os.fsencode(root.name).decode(errors="replace") or "scene", kind.manifest, inside, missing)
 
 
 def _file_inside(root: Path, name: str) -> Path | None:
@@ -105,7 +108,7 @@ def fitting_level(source: Path | bytes, max_gaussians: int | None = None) -> tup
         KissgsError: the manifest or the environment is missing or damaged.
     """
     kind = _format(source)
-    with open_source(scene_root(source) if isinstance(source, Path) else source, kind.manifest) as files:
+    with kind.open(scene_root(source) if isinstance(source, Path) else source) as files:
         tree = kind.read_manifest(files)
         environment = 0 if tree.environment is None else kind.opened(files, tree.environment).count
     most = (PAGE_GAUSSIANS if max_gaussians is None else min(max_gaussians, PAGE_GAUSSIANS)) - environment

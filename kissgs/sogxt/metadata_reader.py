@@ -11,6 +11,7 @@ import yaml
 from pydantic import ValidationError
 
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
+from kissgs.io.container_names import LEVELS_NAME, LOD_NAME
 from kissgs.io.packed_files import Source
 from kissgs.sogxt.metadata import CHANNELS, TILE_COLUMNS, TILE_ROWS, Layout
 from kissgs.sogxt.names import CHECKSUM, FORMAT, JSON_NAME, YAML_NAME
@@ -42,7 +43,8 @@ def read_layout(source: Source) -> Layout:
     name = next((name for name in (YAML_NAME, JSON_NAME) if name in names), None)
     if name is None:
         raise InvalidContainerError(
-            f"this is no container: it has neither {YAML_NAME} nor {JSON_NAME}; name the folder or the zip that has one"
+            f"this is no container: it has neither {YAML_NAME} nor {JSON_NAME}, and no {LOD_NAME} or {LEVELS_NAME} of "
+            "a streamed scene; name the folder or the zip that has one"
         )
     read = _from_yaml if name == YAML_NAME else _from_json
     raw = read(source.read(name, MAX_METADATA_BYTES))

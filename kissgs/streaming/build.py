@@ -146,10 +146,10 @@ def has_levels(work: Path, chunk: int) -> bool:
     return leaves_file(work, chunk).exists()
 
 
-def make_levels(work: Path, layout: Layout, chunk: int, threads: int) -> None:
-    """Merge a chunk into its levels, one file of rows each."""
+def make_levels(work: Path, layout: Layout, chunk: int, threads: int, progress: Progress = silent) -> None:
+    """Merge a chunk into its levels, one file of rows each; ``progress`` receives "merge"."""
     rows = read_rows(chunk_file(work, chunk), layout.sh_degree, layout.counts[chunk])
-    made = chunk_levels(from_rows(rows), layout.levels, layout.leaf, threads)
+    made = chunk_levels(from_rows(rows), layout.levels, layout.leaf, threads, progress)
     for level, splats in enumerate(made.levels):
         write_rows(level_file(work, chunk, level), to_rows(splats))
     write_json(leaves_file(work, chunk), {"counts": made.counts, "bounds": made.bounds.tolist(), "errors": made.errors})
@@ -176,13 +176,23 @@ def has_cameras(work: Path) -> bool:
     return (work / CAMERAS).exists()
 
 
-def make_file(work: Path, layout: Layout, settings: EncodeSettings, level: int, file: int, threads: int) -> None:
-    """Encode the Gaussians of one level of some chunks."""
+def make_file(
+    work: Path,
+    layout: Layout,
+    settings: EncodeSettings,
+    level: int,
+    file: int,
+    threads: int,
+    progress: Progress = silent,
+) -> None:
+    """Encode the Gaussians of one level of some chunks; ``progress`` receives the stages of the encoder."""
     members = [chunk for chunk in layout.members(level, file) if layout.counts[chunk]]
     splats = _read_level(work, layout, level, members)
     counts = [count for chunk in members for count in read_leaves(work, chunk)["counts"][level]]
     groups = np.repeat(np.arange(len(counts)), counts).astype(np.uint16)
-    stored = _encode(work, layout, splats, groups, settings, level, members, layout.path(level, file), threads)
+    stored = _encode(
+        work, layout, splats, groups, settings, level, members, layout.path(level, file), threads, progress
+    )
     write_json(rows_file(work, level, file), {"counts": stored})
     if level != layout.context:
         for chunk in members:
@@ -194,11 +204,13 @@ def has_environment(work: Path) -> bool:
     return environment_marker(work).exists()
 
 
-def make_environment(work: Path, layout: Layout, settings: EncodeSettings, threads: int) -> None:
-    """Encode the Gaussians of the environment."""
+def make_environment(
+    work: Path, layout: Layout, settings: EncodeSettings, threads: int, progress: Progress = silent
+) -> None:
+    """Encode the Gaussians of the environment; ``progress`` receives the stages of the encoder."""
     splats = read_environment(work, layout)
     groups = np.zeros(len(splats), np.uint16)
-    stored = _encode(work, layout, splats, groups, settings, 0, None, layout.environment_path, threads)
+    stored = _encode(work, layout, splats, groups, settings, 0, None, layout.environment_path, threads, progress)
     write_json(environment_marker(work), {"counts": stored})
 
 
@@ -212,6 +224,7 @@ def _encode(
     members: Sequence[int] | None,
     path: str,
     threads: int,
+    progress: Progress,
 ) -> list[int]:
     """Write a container; return the number of rows of each group in it.
 
@@ -225,6 +238,7 @@ def _encode(
         members: chunks that they are from; None for the environment.
         path: name of the container in the folder of the result.
         threads: number of threads; 0 means one per processor.
+        progress: receives "sensitivity" and the stages of the encoder.
     """
     settings, count = file_settings(settings, level, layout.sh_degree), int(groups[-1]) + 1
     if not len(visible_gaussians(splats, settings)):  # merging may have made all of them invisible
@@ -235,7 +249,7 @@ def _encode(
         if members is not None:
             others.append(read_environment(work, layout))
         cameras = cameras_of(json.loads((work / CAMERAS).read_bytes()))
-        sensitivity = measure_file(splats, concatenate(others), cameras, level, settings, threads)
+        sensitivity = measure_file(splats, concatenate(others), cameras, level, settings, threads, progress)
         del others
     plan = plan_encoding(
         splats,
@@ -245,9 +259,10 @@ def _encode(
         groups=groups,
         keep_costs=False,
         threads=threads,
+        progress=progress,
     )
     del sensitivity, splats
-    encoded = write_files(layout.container, plan, settings, threads=threads)
+    encoded = write_files(layout.container, plan, settings, threads=threads, progress=progress)
     write_container(encoded.files, work / OUT / path, overwrite=True)
     return np.bincount(groups[encoded.order], minlength=count).tolist()
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from kissgs._version import __version__
 from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
-from kissgs.core.progress import Progress, silent
+from kissgs.core.progress import Progress, as_stage, silent
 from kissgs.core.splats import BLOCK
 from kissgs.io.atomic import atomic_file, reason_of
 from kissgs.io.container_names import LEVELS_ENDING, LOD_NAME, MANIFESTS, ContainerName, named_manifest
@@ -31,6 +31,7 @@ from kissgs.streaming.work_folder import (
     claimed,
     explaining_full_disks,
     finish,
+    megabytes,
     needed_bytes,
     read_json,
     remove,
@@ -145,12 +146,15 @@ def _make(
         def part(fraction: float) -> None:
             report(stage, done + fraction * (1 - done))
 
+        def within(at: int) -> Progress:
+            return as_stage(stage, lambda _, fraction, note="": part((at + fraction) / len(items)))
+
         if runner is not None:
             run_all(runner, function.__name__, items, layout, threads, part)
             return
         for at, item in enumerate(items):
             part(at / len(items))
-            function({**item, "threads": threads}, silent)
+            function({**item, "threads": threads}, within(at))
 
     chunks = [chunk for chunk in layout.filled if not build.has_levels(work, chunk)]
     run(run_levels, "merge", [{"work": path, "chunk": chunk} for chunk in chunks], len(layout.filled))
@@ -247,7 +251,7 @@ def _announce(work: Path, count: int, sh_degree: int, progress: Progress) -> Non
     """Check that the disk has room for the work folder, and report its size."""
     needed = needed_bytes(count, sh_degree)
     check_space(work, needed)
-    progress("scratch", 1.0, f"{work} takes up to {needed / 1e6:,.0f} MB until the work is done")
+    progress("scratch", 1.0, f"{work} takes up to {megabytes(needed)} until the work is done")
 
 
 def _report(work: Path, layout: Layout, chunks: int) -> StreamedReport:

@@ -37,7 +37,7 @@ def run_levels(arguments: dict[str, Any], progress: Progress) -> dict[str, Any]:
     chunk = arguments["chunk"]
     _make_once(
         lambda: build.has_levels(work, chunk),
-        lambda: build.make_levels(work, read_layout(work), chunk, arguments["threads"]),
+        lambda: build.make_levels(work, read_layout(work), chunk, arguments["threads"], progress),
     )
     return {}
 
@@ -48,7 +48,7 @@ def run_file(arguments: dict[str, Any], progress: Progress) -> dict[str, Any]:
     settings = EncodeSettings.model_validate(arguments["settings"])
     _make_once(
         lambda: build.has_file(work, level, file),
-        lambda: build.make_file(work, read_layout(work), settings, level, file, arguments["threads"]),
+        lambda: build.make_file(work, read_layout(work), settings, level, file, arguments["threads"], progress),
     )
     return {}
 
@@ -58,7 +58,7 @@ def run_environment(arguments: dict[str, Any], progress: Progress) -> dict[str, 
     work, settings = _shared(arguments), EncodeSettings.model_validate(arguments["settings"])
     _make_once(
         lambda: build.has_environment(work),
-        lambda: build.make_environment(work, read_layout(work), settings, arguments["threads"]),
+        lambda: build.make_environment(work, read_layout(work), settings, arguments["threads"], progress),
     )
     return {}
 

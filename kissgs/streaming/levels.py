@@ -9,10 +9,14 @@ import numpy as np
 from kissgs.compaction.covariance_kernels import covariances_of
 from kissgs.compaction.merging import merged_levels
 from kissgs.core.array_types import Float64
+from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats, concatenate
 from kissgs.core.threads import Workers
 from kissgs.streaming.level_errors import level_errors
 from kissgs.streaming.partition import leaf_groups
+
+MERGING = 0.7
+"""Share of merging in the time for the levels of a chunk; the rest measures their errors."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,7 +42,7 @@ def level_count(count: int, coarsest: int) -> int:
     return 1 + max(0, int(np.ceil(np.log2(max(count, 1) / coarsest))))
 
 
-def chunk_levels(chunk: Splats, levels: int, leaf: int, threads: int) -> ChunkLevels:
+def chunk_levels(chunk: Splats, levels: int, leaf: int, threads: int, progress: Progress = silent) -> ChunkLevels:
     """Split a chunk into leaves and merge each to half its Gaussians for every further level.
 
     Args:
@@ -46,13 +50,16 @@ def chunk_levels(chunk: Splats, levels: int, leaf: int, threads: int) -> ChunkLe
         levels: number of levels, the finest included.
         leaf: largest number of Gaussians in a leaf.
         threads: number of threads; 0 means one per processor. The result does not depend on it.
+        progress: receives the stage "merge".
     """
     order, edges = leaf_groups(chunk.means, leaf)
     with Workers(threads) as pool:
         leaves = pool.map(
-            lambda at: _leaf_levels(chunk.select(order[edges[at] : edges[at + 1]]), levels), range(len(edges) - 1)
+            lambda at: _leaf_levels(chunk.select(order[edges[at] : edges[at + 1]]), levels),
+            range(len(edges) - 1),
+            lambda fraction: progress("merge", MERGING * fraction),
         )
-        errors = pool.map(level_errors, leaves)
+        errors = pool.map(level_errors, leaves, lambda fraction: progress("merge", MERGING + (1 - MERGING) * fraction))
     return ChunkLevels(
         [concatenate([own[level] for own in leaves]) for level in range(levels)],
         [[len(own[level]) for own in leaves] for level in range(levels)],

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from kissgs.cameras.virtual.sensitivity_cameras import MAX_VIEWS, default_view_count, sensitivity_cameras
+from kissgs.core.progress import Progress, silent
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats, concatenate
 from kissgs.rendering.camera import Camera
@@ -65,7 +66,13 @@ def cameras_of(document: dict[str, Any]) -> WeightedCameras:
 
 
 def measure_file(
-    splats: Splats, others: Splats, cameras: WeightedCameras, level: int, settings: EncodeSettings, threads: int
+    splats: Splats,
+    others: Splats,
+    cameras: WeightedCameras,
+    level: int,
+    settings: EncodeSettings,
+    threads: int,
+    progress: Progress = silent,
 ) -> Sensitivity:
     """Measure the sensitivity of the Gaussians of a file, as part of the whole scene.
 
@@ -76,6 +83,7 @@ def measure_file(
         level: level of the file. A level of half the Gaussians is meant for images of half the size.
         settings: settings of the encoder.
         threads: number of threads; 0 means one per processor. The result does not depend on it.
+        progress: receives the stage "sensitivity".
     """
     size = max(MIN_SIZE, settings.sensitivity_view_size >> level)
     shown = [_shown(camera, splats) for camera in cameras.cameras]
@@ -89,6 +97,7 @@ def measure_file(
         WeightedCameras(seeing, [1.0] * len(seeing), cameras.background),
         view_uncertainty=uncertainty,
         threads=threads,
+        progress=progress,
     )
     own = _rows(found, slice(len(splats)))
     share = np.float32(len(seeing) / len(cameras.cameras))  # the mean is over the images of all cameras

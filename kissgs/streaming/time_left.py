@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import time
 
 from kissgs.core.progress import Progress
@@ -19,17 +20,23 @@ LEAST_SECONDS = 5.0
 
 
 def with_time_left(progress: Progress, rate_distortion: bool) -> Progress:
-    """Return a receiver that adds the time left to notes, by the pace since its first event."""
+    """Return a receiver that adds the time left to notes, by the pace since its first event.
+
+    Until more of the work is done, the clock counts it down; once that is at zero, nothing is added.
+    """
     shares = SHARES[rate_distortion]
     before = dict(zip(shares, itertools.accumulate(shares.values(), initial=0.0), strict=False))
-    first: list[tuple[float, float]] = []
+    first: tuple[float, float] | None = None
+    latest, end = 0.0, math.inf  # the work done, and the estimated time of its end
 
     def receive(stage: str, fraction: float, note: str = "") -> None:
+        nonlocal first, latest, end
         now, done = time.monotonic(), before[stage] + fraction * shares[stage]
-        if not first:
-            first.append((now, done))
-        elapsed, gained = now - first[0][0], done - first[0][1]
-        left = [f"{duration(elapsed * (1 - done) / gained)} left"] if gained > 0 and elapsed > LEAST_SECONDS else []
+        first = first or (now, done)
+        elapsed, gained = now - first[0], done - first[1]
+        if gained > 0 and elapsed > LEAST_SECONDS and (done > latest or end == math.inf):
+            latest, end = done, now + elapsed * (1 - done) / gained
+        left = [f"{duration(end - now)} left"] if now <= end < math.inf else []
         progress(stage, fraction, ", ".join([*filter(None, [note]), *left]))
 
     return receive

@@ -166,6 +166,11 @@ def needed_bytes(count: int, sh_degree: int) -> int:
     return (2 * count + min(count, CHUNK)) * row_bytes(sh_degree) + count * ENCODED_BYTES
 
 
+def megabytes(count: float) -> str:
+    """Format bytes: "10,622 MB", and below one megabyte "34 kB"."""
+    return f"{count / 1e6:,.0f} MB" if count >= 1e6 else f"{count / 1e3:,.0f} kB"
+
+
 def check_space(work: Path, needed: int) -> None:
     """Check that the disk has room for what the work folder still lacks.
 
@@ -176,7 +181,7 @@ def check_space(work: Path, needed: int) -> None:
     free = shutil.disk_usage(work).free
     if needed - present > free:
         raise OutputError(
-            f"{work} will take up to {needed / 1e6:,.0f} MB, but its disk has {free / 1e6:,.0f} MB free; "
+            f"{work} will take up to {megabytes(needed)}, but its disk has {megabytes(free)} free; "
             "free some, or write to another disk"
         )
 

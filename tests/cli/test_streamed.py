@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import time
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from helpers.command_line import KISSGS, failure, run
-from helpers.streamed_scenes import files_of
+from helpers.streamed_scenes import files_of, small_sizes
 
 import kissgs
 from kissgs import Settings
@@ -29,7 +30,8 @@ def test_the_command_writes_what_the_library_writes(scene, tmp_path, name):
     done = run("compress", scene, "-o", target, "-p", "fast")
     assert done.returncode == 0
     assert f"{folder}.partial takes up to ".encode() in done.stderr
-    assert b"2,000 Gaussians in 1 chunk, " in done.stdout
+    stored = len(kissgs.load(target))
+    assert f"  {stored:,} of 2,000 Gaussians in 1 chunk, ".encode() in done.stdout
     (tmp_path / "own").mkdir()
     kissgs.compress_streamed(scene, f"{tmp_path}/own/{name}", settings=Settings.from_preset("fast"))
     assert files_of(tmp_path / folder) == files_of(tmp_path / "own" / folder)
@@ -101,3 +103,29 @@ def test_the_message_of_an_interruption_says_whether_something_is_left(scene, tm
     assert (tmp_path / "city.partial").exists() == again
     subprocess.run(call, cwd=tmp_path, check=True, capture_output=True)
     assert not (tmp_path / "city.partial").exists()
+
+
+def test_numbers_say_what_they_count(tmp_path):
+    """``info`` describes one of two levels, and gives the bytes of both in its heading."""
+    with pytest.MonkeyPatch.context() as patch:
+        small_sizes(patch, chunk=400, leaf=200, coarsest=200)
+        kissgs.save(kissgs.sample_scene(300, sh_degree=0), tmp_path / "scene.ply")
+        kissgs.compress_streamed(
+            tmp_path / "scene.ply", tmp_path / "city/lod-meta.json", settings=Settings.from_preset("fast")
+        )
+    for level in (0, 1):
+        said = run("info", tmp_path / "city", "--level", str(level)).stdout.decode()
+        sizes = {path: path.stat().st_size for path in (tmp_path / "city").rglob("*.*")}
+        assert f"{sum(sizes.values()) / 1000:.1f} kB in all levels\n" in said
+        own = [size for path, size in sizes.items() if path.parent.name in (f"{level}_0", "city")]
+        assert re.search(rf"\ntotal of level {level} +{sum(own):,} ", said)
+
+
+def test_one_gaussian_takes_less_than_a_megabyte(tmp_path):
+    kissgs.save(kissgs.sample_scene(100, sh_degree=0).select(slice(9, 10)), tmp_path / "scene.ply")
+    done = run("compress", tmp_path / "scene.ply", "-o", tmp_path / "city.sogxt", "-p", "fast")
+    assert b"  1 of 1 Gaussian in 1 chunk, " in done.stdout
+    assert re.search(rb"city\.partial takes up to \d+ kB until", done.stderr.replace(b".sogxt", b""))
+    assert b"\n1 Gaussian, SH degree 0, " in run("info", tmp_path / "city.sogxt").stdout
+    said = run("decompress", tmp_path / "city.sogxt", "-o", tmp_path / "one.ply").stdout
+    assert b"  1 Gaussian, SH degree 0" in said

@@ -84,13 +84,14 @@ def test_a_streamed_scene(tmp_path, city):
             with urllib.request.urlopen(base + query) as answer:
                 content = answer.read()
             process.send_signal(signal.SIGINT)
-            process.communicate(timeout=30)
-        return query, content
+            warnings = process.communicate(timeout=30)[1].decode()
+        return query, content, warnings
 
-    query, manifest = served()
+    query, manifest, warnings = served()
+    assert warnings == ""
     assert query == "scene/streamed/lod-meta.json"
     assert manifest == (city / "lod-meta.json").read_bytes()
-    query, ply = served("--level", "1")
+    query, ply, _ = served("--level", "1")
     assert query == "scene/streamed.ply"
     assert ply.startswith(b"ply")
     assert b"element vertex %d\n" % len(kissgs.load(city, level=1)) in ply
@@ -98,6 +99,12 @@ def test_a_streamed_scene(tmp_path, city):
         done = run("view", city, "-o", tmp_path / "page.html", *options)
         assert f"holds streamed.zip, level {level} of 0 to 2, compressed" in " ".join(done.stdout.decode().split())
     assert "--max-gaussians does not apply" in failure("view", city, "--no-browser", "--max-gaussians", "9")
+    (city / "0_0" / "sh0.webp").unlink()
+    lacks = f"kissgs: {city} lacks 0_0/sh0.webp"
+    assert served()[2] == f"{lacks}, so a part will be missing; export or download the scene again\n"
+    (city / "0_0" / "quats.webp").unlink()
+    assert "lacks 0_0/quats.webp and 1 more file, so" in served()[2]
+    assert served("--quiet")[2] == ""
 
 
 @needs_viewer

@@ -1,6 +1,7 @@
 """Streamed scenes. Oracle: the containers decoded one by one."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from helpers.streamed_scenes import KINDS, SOGXT
 
 from kissgs.core.errors import InvalidContainerError, KissgsError, UnsupportedError
 from kissgs.core.splats import ATTRIBUTES
+from kissgs.pipeline.inspect import describe
+from kissgs.pipeline.read_options import ReadOptions
 
 LEVELS = [[made_scene(65, 2), made_scene(40, 1)], [made_scene(20, 1)], [made_scene(3, 0)]]
 ENVIRONMENT = made_scene(7, 1)
@@ -128,3 +131,29 @@ def test_zips_that_are_no_sogxt_containers_are_named():
     with pytest.raises(UnsupportedError, match=r"levels\.json is of format 'sog'; format sog-xt is read"):
         SOGXT.decode(edited(SOGXT, files, lambda meta: meta.update(format="sog")))
     assert len(SOGXT.decode(edited(SOGXT, files, lambda meta: meta.update(format="sog-xt")))) == 9
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_messages_about_files_name_the_scene(kind, files, tmp_path, packed):
+    """The path is the one that was given, and stands there once."""
+    first = json.loads(files[kind.manifest])["filenames"][0]
+    scene = tmp_path / "city"
+    whole = f"{scene}.zip" if packed else f"{scene}/{kind.manifest}"
+    begins = f"{whole}: {kind.manifest}" if packed else whole
+
+    def refusal(damaged, level=0):
+        scene.with_suffix(".zip").write_bytes(zip_of(damaged))
+        source = scene.with_suffix(".zip") if packed else write_folder(damaged, scene)
+        with pytest.raises(KissgsError) as error:
+            kind.decode(source, level=level)
+        with pytest.raises(type(error.value)) as described:
+            describe(source, ReadOptions(level=level))
+        shutil.rmtree(scene, ignore_errors=True)
+        assert str(described.value) == str(error.value)
+        return str(error.value)
+
+    lost = {name: data for name, data in files.items() if name != first}
+    assert refusal(lost) == f"{whole}: the container has no file {first!r}; export or download it again"
+    cut = {**files, kind.manifest: files[kind.manifest][:-9]}
+    assert refusal(cut) == f"{begins} is not readable JSON; export the scene again"
+    assert refusal(files, 3).startswith(f"{whole}: there is no level 3")

@@ -192,7 +192,11 @@ def test_the_command_line_reads_them(tmp_path):
     assert run("decompress", tmp_path / "a.zip", "-o", tmp_path / "c.ply", "--level", "1").returncode == 0
     assert len(kissgs.load(tmp_path / "c.ply")) == 7
     said = run("info", tmp_path / "a.sog", tmp_path / "a2.spz", tmp_path / "a.zip").stdout.decode()
-    for text in ("SOG container (version 2, by hand)", "SPZ scene (version 2)", "finest first: 30, 5; environment: 2"):
+    for text in (
+        "SOG container (version 2, by hand)",
+        "SPZ scene (version 2)",
+        "finest first: 30, 5; in the environment, which belongs to every level: 2",
+    ):
         assert text in said
 
 

@@ -1,19 +1,24 @@
 """``kissgs view`` of a streamed scene in Chromium: what is loaded when, and what the page says about it."""
 
+import contextlib
 import json
 import re
 import threading
 import urllib.parse
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from helpers.preview_browser import colours, preview, psnr, software_browser  # noqa: F401  fixtures
 from helpers.streamed_scenes import small_sizes
 from helpers.viewers import scattered
 
 import kissgs
+from kissgs.core.splats import concatenate
 from kissgs.preview import server as server_module
 from kissgs.preview.server import PageServer
 from kissgs.preview.streamed_folder import streamed_folder
+from kissgs.streaming import environment
 
 NAME = "city 100%41 \N{SNOWMAN}"
 
@@ -41,14 +46,22 @@ def server(city, monkeypatch):
         return find(handler)
 
     monkeypatch.setattr(server_module._Handler, "_find", held)
-    with PageServer(streamed_folder(city)) as server:
+    with serving(city) as server:
         server.gate = threading.Event()
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
         yield server
         server.gate.set()
-        server.shutdown()
-        thread.join()
+
+
+@contextlib.contextmanager
+def serving(folder):
+    with PageServer(streamed_folder(folder)) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        try:
+            yield server
+        finally:
+            server.shutdown()
+            thread.join()
 
 
 @pytest.fixture
@@ -149,7 +162,7 @@ def test_a_small_budget(server, opened):
     assert facts(tab)["At most"] == ("400", "on this device")
     assert not any(name.startswith("0_") for name in far)
     tab.page.locator("#viewport").focus()
-    for _ in range(95):  # to the far end of the scene
+    for _ in range(85):  # to the far end of the scene
         tab.page.keyboard.press("w")
     tab.page.wait_for_timeout(300)
     settle(tab)
@@ -169,9 +182,49 @@ def test_a_missing_file_and_a_damaged_list(server, opened):
     tab.expect_errors("404 .*0_1/scales.webp", "Failed to load resource.*404")
     server.contents[lost] = content
 
+    lost = [path for path in server.contents if path.endswith("3_0/sh0.webp")]
+    content = server.contents.pop(*lost)
+    server.gate.clear()
+    tab = opened()
+    tab.error_message("3_0/meta.json", "sh0.webp cannot be fetched", "part of the scene is missing")
+    server.gate.set()
+    settle(tab)
+    tab.page.locator("#problem").wait_for(state="hidden")  # all parts are drawn by now
+    tab.expect_errors("404 .*3_0/sh0.webp", "Failed to load resource.*404")
+    server.contents[lost[0]] = content
+
     (manifest,) = [path for path in server.contents if path.endswith("lod-meta.json")]
     server.contents[manifest] = b'{"lodLevels": 4}'
     tab = opened()
     tab.error_message("list of this scene's files is damaged")
     tab.choose(("lod-meta.json", b"{}"))
     tab.error_message("does not open the list of a scene's files alone", "kissgs view lod-meta.json")
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_the_first_camera_is_within_the_sky(preview, tmp_path, apart):  # noqa: F811
+    """A sky that is much of the coarsest level does not decide where the camera stands; nor does an environment."""
+    near = scattered(1000, 0)
+    sky = scattered(140, 1)
+    far = 12 * sky.means / np.linalg.norm(sky.means, axis=1, keepdims=True)
+    sky = replace(sky, means=far, scales=sky.scales + 3.5, opacities=sky.opacities + 8, shN=near.shN[:140])
+    kissgs.save(concatenate([near, sky]), tmp_path / "scene.ply")
+    with pytest.MonkeyPatch.context() as patch:
+        small_sizes(patch, chunk=2000, leaf=600, coarsest=200)
+        patch.setattr(environment, "FEWEST", 100 if apart else 1000)
+        settings = kissgs.Settings(preset="fast")
+        kissgs.compress_streamed(tmp_path / "scene.ply", tmp_path / "city" / "lod-meta.json", settings=settings)
+    coarsest = kissgs.load(tmp_path / "city", level=3)
+    assert np.mean(np.linalg.norm(coarsest.means, axis=1) > 8) > 0.3
+    assert (tmp_path / "city" / "environment").exists() == apart
+    with serving(tmp_path / "city") as server:
+        tab = preview()
+        tab.origin = server.url.partition("?")[0]
+        tab.page.goto(server.url)
+        settle(tab)
+        image = tab.still_image()
+    background = (image[:8] == (11, 10, 16)).all(axis=-1)
+    assert background.mean() < 0.2
+    total = f"{len(kissgs.load(tmp_path / 'city')):,}"
+    assert facts(tab)["Gaussians drawn"] == (total, f"of {total}")
+    assert tab.page.locator("#statistics tbody tr").filter(has_text="Environment").count() == apart

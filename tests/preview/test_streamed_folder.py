@@ -54,6 +54,7 @@ def test_the_files_of_the_manifest_and_no_others(made, city):
     assert served(city) == served(city / "lod-meta.json") == expected
     assert len(expected) > 15
     assert streamed_folder(city).name == NAME
+    assert streamed_folder(city).missing == ()
 
 
 def test_links_out_of_the_folder_are_left_out(city):
@@ -61,6 +62,7 @@ def test_links_out_of_the_folder_are_left_out(city):
     (city / "0_0" / "quats.webp").symlink_to(city.parent / "secret.webp")
     (city / "0_1" / "quats.webp").unlink()
     found = served(city)
+    assert streamed_folder(city).missing == ("0_0/quats.webp", "0_1/quats.webp")
     assert "0_0/quats.webp" not in found
     assert "0_1/quats.webp" not in found
     assert "0_0/sh0.webp" in found

@@ -77,6 +77,8 @@ def test_a_folder_is_written_shown_and_replaced_only_if_allowed(cluster, scenes,
     done = run(*words)
     assert (done.returncode, done.stderr) == (0, b"")
     assert b"Gaussians, SH degree 2" in done.stdout
+    assert done.stdout.endswith(b"\n")
+    assert not done.stdout.endswith(b"\n\n")  # no empty line, as without a cluster
     files = {path.name: path.read_bytes() for path in (tmp_path / "a.container").iterdir()}
     assert files == dict(kissgs.compress(scenes / "a.ply", settings=kissgs.Settings.from_preset("fast")).files)
     assert "exists already" in failure(*words)

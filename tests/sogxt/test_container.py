@@ -104,7 +104,7 @@ def test_missing_and_oversized_files_are_refused(kind, tmp_path):
     source = {"memory": FILES, "folder": tmp_path / "folder", "zip": tmp_path / "file.zip"}[kind]
     if kind != "memory":
         write_container(FILES, source)
-    assert refusal(source, "b.webp") == "the container has no file 'b.webp'"
+    assert refusal(source, "b.webp") == "the container has no file 'b.webp'; export or download it again"
     assert refusal(source, "a.webp", 1023) == "a.webp has 1024 bytes; the limit for this file is 1023"
     with open_source(source) as files:
         assert len(files.read("a.webp", 1024)) == 1024

@@ -132,9 +132,8 @@ def refusal(files):
 
 @pytest.mark.parametrize("name", PLANES)
 def test_a_missing_image(name):
-    assert (
-        refusal({k: v for k, v in FILES.items() if k != f"{name}.webp"}) == f"the container has no file '{name}.webp'"
-    )
+    found = refusal({k: v for k, v in FILES.items() if k != f"{name}.webp"})
+    assert found == f"the container has no file '{name}.webp'; export or download it again"
 
 
 @pytest.mark.parametrize("name", PLANES)

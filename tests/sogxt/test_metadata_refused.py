@@ -76,8 +76,8 @@ def test_images_other_than_webp_are_unsupported_by_name():
 
 def test_no_metadata_at_all():
     sentence = (
-        "this is no container: it has neither container_meta.yaml nor meta.json; "
-        "name the folder or the zip that has one"
+        "this is no container: it has neither container_meta.yaml nor meta.json, and no lod-meta.json or "
+        "levels.json of a streamed scene; name the folder or the zip that has one"
     )
     assert refusal({"active_mask.webp": FILES["active_mask.webp"]}) == sentence
     assert refusal({}) == sentence

@@ -144,7 +144,9 @@ def test_what_cannot_be_read_leaves_no_work_folder(scene, tmp_path):
 def test_a_full_disk_is_noticed_before_any_work(scene, tmp_path, monkeypatch):
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=100_000))
-    with pytest.raises(OutputError, match=r"city\.partial will take up to 1 MB, but its disk has 0 MB free; free some"):
+    with pytest.raises(
+        OutputError, match=r"city\.partial will take up to 918 kB, but its disk has 100 kB free; free some"
+    ):
         compress_streamed(scene, tmp_path / "city" / "lod-meta.json", settings=FAST)
     assert list(tmp_path.iterdir()) == []
 
@@ -334,3 +336,20 @@ def test_the_number_of_threads_does_not_matter(scene, tmp_path, name):
     for threads in (1, 3):
         compress_streamed(scene, tmp_path / str(threads) / name, settings=FAST, threads=threads)
     assert files_of(tmp_path / "1") == files_of(tmp_path / "3")
+
+
+@pytest.mark.parametrize("preset", ["fast", "balanced"])
+def test_items_report_within(scene, tmp_path, preset):
+    """Every chunk and file, of which there are four and more, reports more than its beginning, and never goes back."""
+    found = {}
+
+    def progress(stage, fraction, note=""):
+        found.setdefault(stage, []).append(fraction)
+
+    settings = Settings.from_preset(preset)
+    compress_streamed(scene, tmp_path / "city" / "lod-meta.json", settings=settings, progress=progress)
+    for stage, items in (("merge", 4), ("images", 5)):
+        own = found[stage]
+        assert own == sorted(own)
+        for item in range(items - 1):
+            assert any(item / items < fraction < (item + 1) / items for fraction in own)

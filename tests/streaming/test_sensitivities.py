@@ -102,3 +102,18 @@ def test_the_time_left_follows_the_pace(monkeypatch):
     assert notes[1].endswith(" left")
     assert notes[2] == "level 0, 0 s left"
     assert [duration(seconds) for seconds in (40, 100, 3000, 12600)] == ["40 s", "2 min", "50 min", "3.5 h"]
+
+
+def test_the_clock_counts_the_time_left_down(monkeypatch):
+    """Half of the work takes 60 s; until more of it is done, reports have the time that is left of the same again."""
+    clock, notes = [0.0], {}
+    monkeypatch.setattr("time.monotonic", lambda: clock[0])
+    receive = with_time_left(lambda stage, fraction, note="": notes.update({clock[0]: note}), rate_distortion=False)
+    half = (0.5 - 0.06) / 0.4  # of the second stage
+    events = [(0, 0.0), (60, half), (61, half), (80, half), (119, half), (121, half), (125, half + 0.1)]
+    for seconds, fraction in events:
+        clock[0] = float(seconds)
+        receive("partition" if seconds == 0 else "merge", fraction)
+    assert [notes[seconds] for seconds in (60, 61, 80, 119)] == ["60 s left", "59 s left", "40 s left", "1 s left"]
+    assert notes[121] == ""  # it takes longer than the pace before said
+    assert notes[125] == "2 min left"  # 125 s for 54 %

@@ -81,7 +81,10 @@ async function fly({ manifest, budget, cameras, environmentRows = 0, short = [] 
     failed: (file, error) => states.push({ problem: [file, error.message] }),
   });
   const keep = (camera) =>
-    states.push({ camera, begun: streaming.begun, complete: streaming.complete, drawn: [...drawn] });
+    states.push({
+      ...{ camera, begun: streaming.begun, complete: streaming.complete, drawn: [...drawn] },
+      ...{ lacking: streaming.lacking, surrounding: streaming.surrounding },
+    });
   for (const [number, { matrix, eye, focal, pixels }] of cameras.entries()) {
     const view = viewOf(matrix, eye, focal, pixels);
     streaming.look(view);

@@ -266,6 +266,7 @@ def test_an_environment_is_drawn_always_and_counts():
         last = dict(states[-1]["drawn"])
         assert set(last) == files
         assert last[3][0][0] == 0
+        assert [state["surrounding"] for state in states[:2] + states[-1:]] == [0, 0, 100]
 
 
 def test_a_file_with_too_few_rows():
@@ -276,3 +277,27 @@ def test_a_file_with_too_few_rows():
     assert problem[0] == 0
     assert "0_0/meta.json has 127 Gaussians, fewer than" in problem[1]
     assert dict(states[-1]["drawn"]).keys() == {1}
+
+
+def test_a_lost_file_is_lacking_only_while_a_view_needs_it():
+    """The camera sees two leaves, then two others."""
+    leaves = [leaf(number, [64, 16, 4]) for number in (0, 1, 50, 51)]
+    for number, each in enumerate(leaves):
+        for level in each["lods"].values():
+            level.update(offset=number % 2 * level["count"], file=level["file"] + number // 2 * 3)
+    document = {**manifest(leaves, 3), "filenames": [f"{file}.sog" for file in range(6)]}
+    cameras = [camera((x, 0.5, -1.2)) for x in (1, 51, 1)]
+
+    def flown(short):
+        job = {"manifest": json.dumps(document), "budget": 999, "cameras": cameras, "short": [short]}
+        return [state for state in ask(flight=job)["flown"] if "camera" in state]
+
+    states = flown(2)  # the coarsest of the first two leaves
+    assert [] in [state["lacking"] for state in states]
+    assert [2] in [state["lacking"] for state in states]
+    assert states[-1]["lacking"] == []
+    assert 0 in dict(states[-1]["drawn"])
+
+    states = flown(0)  # the finest of them
+    last = [[state for state in states if state["camera"] == number][-1]["lacking"] for number in range(3)]
+    assert last == [[0], [], [0]]

@@ -5,6 +5,13 @@ import { sigmoid } from "./scene.js";
 const SAMPLES = 20_000;
 const DISTANT = 0.85; // share of the opacity within the radius; the rest may be sky and outliers
 
+/**
+ * The nearest share of a scene that has been merged, and the radius in units of its own. Merging thins dense parts more
+ * than sparse ones, so that a sky may be more than half of the coarsest level. A ball of even density has a radius of
+ * 1.4 of these units, a disc one of 1.6.
+ */
+const [NEAR, REACH] = [0.4, 2.5];
+
 /** @typedef {{centre: number[], radius: number}} Extent */
 
 /**
@@ -12,9 +19,10 @@ const DISTANT = 0.85; // share of the opacity within the radius; the rest may be
  * @param {number} count
  * @param {(index: number) => ArrayLike<number>} mean position of a Gaussian
  * @param {(index: number) => number} weight
+ * @param {number} [reach] largest radius, in units of that which contains the nearest `NEAR` of the scene
  * @returns {Extent}
  */
-export function extentOf(count, mean, weight) {
+export function extentOf(count, mean, weight, reach = Infinity) {
   const step = Math.max(1, Math.floor(count / SAMPLES));
   const [points, weights] = [/** @type {number[][]} */ ([]), /** @type {number[]} */ ([])];
   for (let i = 0; i < count; i += step) {
@@ -29,7 +37,8 @@ export function extentOf(count, mean, weight) {
     ),
   );
   const distances = points.map((point) => Math.hypot(...point.map((value, axis) => value - centre[axis])));
-  return { centre, radius: quantile(distances, weights, DISTANT) || 1 };
+  const within = (/** @type {number} */ share) => quantile(distances, weights, share);
+  return { centre, radius: Math.min(within(DISTANT), reach * within(NEAR)) || 1 };
 }
 
 /** @param {import("./scene.js").Scene} scene */
@@ -39,6 +48,31 @@ export const extentOfScene = ({ count, means, opacities }) =>
     (i) => means.subarray(3 * i, 3 * i + 3),
     (i) => sigmoid(opacities[i]),
   );
+
+/**
+ * Return the extent of a streamed scene by the Gaussians of its coarsest level, each of which stands for several.
+ * @param {import("./lod_tree.js").LodTree["leaves"]} leaves
+ * @param {Map<number, import("./scene.js").Scene>} files that hold the level, as far as they were loaded
+ */
+export function extentOfCoarsest(leaves, files) {
+  const [points, weights] = [/** @type {Float32Array[]} */ ([]), /** @type {number[]} */ ([])];
+  for (const { levels } of leaves) {
+    const [{ file, offset, count }] = levels;
+    const scene = files.get(file);
+    if (!scene) continue;
+    const each = (levels.at(-1)?.count ?? count) / count;
+    for (let row = offset; row < offset + count; row++) {
+      points.push(scene.means.subarray(3 * row, 3 * row + 3));
+      weights.push(each * sigmoid(scene.opacities[row]));
+    }
+  }
+  return extentOf(
+    points.length,
+    (i) => points[i],
+    (i) => weights[i],
+    REACH,
+  );
+}
 
 /** Ends of the points that stand for a box, as shares of its sides: they spread as far as points all over it. */
 const SPREAD = [0.5 - Math.sqrt(1 / 12), 0.5 + Math.sqrt(1 / 12)];

@@ -6,8 +6,12 @@ import { byId, el } from "./dom.js";
 /** An error with a message for users, a sentence. */
 export class UserError extends Error {}
 
+/** The error whose message is shown. @type {unknown} */
+let shown = null;
+
 /** @param {unknown} error null to hide the message */
 export function showProblem(error) {
+  shown = error;
   const place = byId("problem");
   place.hidden = error === null;
   if (error === null) return place.replaceChildren();
@@ -17,6 +21,11 @@ export function showProblem(error) {
     "×",
   );
   place.replaceChildren(el("p", {}, sentenceOf(error)), close);
+}
+
+/** Hide the message of an error, unless another one is shown by now. @param {unknown} error */
+export function withdrawProblem(error) {
+  if (error === shown) showProblem(null);
 }
 
 /** Return the message for users. @param {unknown} error */

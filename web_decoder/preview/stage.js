@@ -129,6 +129,12 @@ export function stage(failed) {
       reveal(true);
       return viewer;
     },
+    /** Place a scene that is drawn in parts anew. @param {import("./extent.js").Extent} extent */
+    place(extent) {
+      if (!live) return;
+      live.viewer.refineExtent(extent, live.camera.moved);
+      if (!live.camera.moved) live.camera.home();
+    },
     /** @param {import("./file_types.js").FileType} type @param {Uint8Array} bytes */
     async compare(type, bytes) {
       const { viewer, comparison } = await ready;

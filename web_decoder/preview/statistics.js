@@ -63,32 +63,39 @@ export const fileStatisticsView = (gaussians, size) => [
  * @param {import("./lod_tree.js").LodTree} facts.tree
  * @param {number} facts.budget largest number of Gaussians that are drawn
  * @param {{leaves: number, gaussians: number}[]} facts.drawn by level
+ * @param {number} facts.surrounding number of Gaussians drawn of the environment
  * @param {boolean} facts.complete whether nothing is to be loaded for this view
  * @param {number} facts.received bytes
  * @param {number} facts.total bytes, estimated
  * @param {{seconds: number, bytes: number} | null} facts.first when the first image was drawn; null before
  */
-export function streamedStatisticsView({ tree, budget, drawn, complete, received, total, first }) {
-  const gaussians = drawn.reduce((sum, level) => sum + level.gaussians, 0);
+export function streamedStatisticsView({ tree, budget, drawn, surrounding, complete, received, total, first }) {
+  const gaussians = drawn.reduce((sum, level) => sum + level.gaussians, surrounding);
+  const all = tree.count + (tree.environment === null ? 0 : tree.rows[tree.environment]);
   return [
     el("h2", { id: "statistics-title" }, "Statistics"),
     list([
-      ["Gaussians drawn", count(gaussians), `of ${count(tree.count)}`],
+      ["Gaussians drawn", count(gaussians), `of ${count(all)}`],
       ["At most", count(budget), "on this device"],
       ["Loaded", bytes(received), `of about ${bytes(Math.max(received, total))}`],
       ["First image", first ? duration(first.seconds) : "…", first ? `after ${bytes(first.bytes)}` : undefined],
       ["Levels", count(tree.levels)],
       ["This view", complete ? "complete" : "loading"],
     ]),
-    levelTable(drawn, tree.leaves.length),
+    levelTable(drawn, tree.leaves.length, tree.environment === null ? null : surrounding),
   ];
 }
 
-/** @param {{leaves: number, gaussians: number}[]} drawn @param {number} leaves */
-function levelTable(drawn, leaves) {
+/**
+ * @param {{leaves: number, gaussians: number}[]} drawn
+ * @param {number} leaves
+ * @param {number | null} surrounding Gaussians drawn of the environment; null without one
+ */
+function levelTable(drawn, leaves, surrounding) {
   const rows = drawn.map(({ leaves: own, gaussians }, level) =>
     tableRow(level ? `Level ${level}` : "Level 0, finest", own / leaves, count(own), count(gaussians)),
   );
+  if (surrounding !== null) rows.push(tableRow("Environment", surrounding && 1, "", count(surrounding)));
   return barTable("What is drawn", ["Level", "Parts", "Gaussians"], rows);
 }
 

@@ -2,14 +2,15 @@
 
 import { budgetOf } from "./device.js";
 import { byId } from "./dom.js";
-import { extentOfBoxes } from "./extent.js";
+import { extentOfBoxes, extentOfCoarsest } from "./extent.js";
 import { parseTree } from "./lod_tree.js";
-import { UserError, sentenceOf } from "./problem.js";
+import { UserError, sentenceOf, showProblem, withdrawProblem } from "./problem.js";
 import { StreamedFiles } from "./streamed_files.js";
 import { streamedStatisticsView } from "./statistics.js";
 import { Streaming } from "./streaming.js";
 
 /** @typedef {import("./streamed_meshes.js").Content} Content */
+/** @typedef {import("./scene.js").Scene} Scene */
 
 /** Shortest time between two choices of levels while the camera moves, milliseconds, and in units of what one takes. */
 const [INTERVAL, REST] = [100, 5];
@@ -19,10 +20,9 @@ const [INTERVAL, REST] = [100, 5];
  * @param {string} address of the manifest
  * @param {import("./loading.js").Load} load
  * @param {ReturnType<typeof import("./stage.js").stage>} view
- * @param {(error: UserError) => void} failed called when a file cannot be loaded
- * @returns {Promise<number>} the number of Gaussians of the finest level
+ * @returns {Promise<number>} the number of Gaussians of the finest level and the environment
  */
-export async function openStreamed(address, load, view, failed) {
+export async function openStreamed(address, load, view) {
   const begun = performance.now();
   const files = new StreamedFiles(address, (received) => load.progress({ received, total: 0 }));
   const tree = parseTree(await files.manifest(load.signal));
@@ -35,6 +35,12 @@ export async function openStreamed(address, load, view, failed) {
   /** Seconds and bytes until the first image. @type {{seconds: number, bytes: number} | null} */
   let first = null;
   let needed = 0;
+  /** Why files cannot be loaded, and the one that the page has shown. @type {Map<number, UserError>} */
+  const losses = new Map();
+  /** @type {UserError | null} */
+  let announced = null;
+  /** Files of the coarsest level until the camera has been placed by them. @type {Map<number, Scene> | null} */
+  let coarsest = new Map();
   let timer = 0;
   let closed = false;
   /** @type {(error?: unknown) => void} */
@@ -43,12 +49,25 @@ export async function openStreamed(address, load, view, failed) {
   /** @param {number} file @param {unknown} error */
   function lose(file, error) {
     const what = streaming.base.includes(file) ? "part of the scene is missing" : "its part of the scene stays coarse";
-    failed(new UserError(`${tree.files[file]}: ${sentenceOf(error).replace(/[.]$/, "")}; ${what}.`));
+    losses.set(file, new UserError(`${tree.files[file]}: ${sentenceOf(error).replace(/[.]$/, "")}; ${what}.`));
+  }
+
+  /** Say what this view lacks, once; the user may close the message. */
+  function tell() {
+    const loss = losses.get(streaming.lacking[0]) ?? null;
+    if (loss === announced) return;
+    withdrawProblem(announced);
+    if (loss) showProblem(loss);
+    announced = loss;
   }
   /** @type {Streaming<Content>} */
   const streaming = new Streaming(tree, {
     budget,
-    load: async (file, signal) => contentOf(await files.load(file, tree.files[file], signal), signal),
+    load: async (file, signal) => {
+      const scene = await files.load(file, tree.files[file], signal);
+      if (streaming.base.includes(file)) coarsest?.set(file, scene);
+      return contentOf(scene, signal);
+    },
     draw: (parts) => viewer.setParts(parts),
     changed: () => soon(0),
     failed: lose,
@@ -64,12 +83,26 @@ export async function openStreamed(address, load, view, failed) {
   function look() {
     timer = 0;
     const before = performance.now();
+    if (streaming.begun && coarsest) {
+      if (coarsest.size) view.place(extentOfCoarsest(tree.leaves, coarsest));
+      coarsest = null;
+    }
     streaming.look(viewer.sight);
+    tell();
     interval = Math.max(INTERVAL, REST * (performance.now() - before));
     if (streaming.begun) needed ||= files.received;
     if (streaming.begun && !streaming.drawn.some(({ leaves }) => leaves)) ended(); // no file could be loaded
-    const { drawn, complete } = streaming;
-    const facts = { tree, budget, drawn, complete, received: files.received, total: files.total(tree), first };
+    const { drawn, surrounding, complete } = streaming;
+    const facts = {
+      tree,
+      budget,
+      drawn,
+      surrounding,
+      complete,
+      received: files.received,
+      total: files.total(tree),
+      first,
+    };
     byId("statistics").replaceChildren(...streamedStatisticsView(facts));
   }
 
@@ -97,5 +130,6 @@ export async function openStreamed(address, load, view, failed) {
     });
     look();
   });
-  return tree.count;
+  const { count, environment, rows } = tree;
+  return count + (environment === null ? 0 : rows[environment]);
 }

@@ -27,6 +27,8 @@ export class Streaming {
   #shown;
   /** Index of the level of each leaf that is loaded if it is not. @type {number[]} */
   #wanted;
+  /** Pixels of each leaf, 0 of those that the image does not show. @type {number[]} */
+  #visible = [];
   /** What is drawn of each file, as text to compare. @type {Map<number, string>} */
   #drawn = new Map();
   /** Whether something has arrived that is not drawn yet. */
@@ -100,6 +102,25 @@ export class Streaming {
     return found;
   }
 
+  /** Number of Gaussians of the environment that are drawn: all or none. */
+  get surrounding() {
+    const { environment, rows } = this.tree;
+    return environment !== null && this.#drawn.has(environment) ? rows[environment] : 0;
+  }
+
+  /** Files that cannot be loaded, and whose rows the latest view lacks. */
+  get lacking() {
+    const { environment } = this.tree;
+    const needed = environment === null ? [] : [environment];
+    this.levels.forEach((levels, leaf) => {
+      const [at, wanted] = [this.#shown[leaf], this.#wanted[leaf]];
+      if (!this.#visible[leaf] || at >= wanted) return;
+      if (at < 0) needed.push(levels[0].file);
+      needed.push(levels[wanted].file);
+    });
+    return [...new Set(needed)].filter(this.store.isLost);
+  }
+
   /**
    * Choose files and levels for a camera, and draw what has changed.
    * @param {View} view
@@ -108,7 +129,7 @@ export class Streaming {
     const { leaves, rows, environment } = this.tree;
     const areas = leaves.map((leaf) => areaOf(view, leaf));
     const outside = leaves.map((leaf) => isOutside(view, leaf));
-    const visible = areas.map((area, leaf) => (outside[leaf] ? 0 : area));
+    const visible = (this.#visible = areas.map((area, leaf) => (outside[leaf] ? 0 : area)));
     const budget = this.budget - (environment === null ? 0 : rows[environment]);
     this.#wanted = chooseLevels(this.levels, visible, budget, { current: this.#wanted });
     this.store.want(this.begun ? [...this.base, ...this.#files(visible)] : this.base);

@@ -116,6 +116,19 @@ export class Viewer {
   }
 
   /**
+   * Place what is drawn in parts anew.
+   * @param {Extent} extent
+   * @param {boolean} held whether the user has moved the camera, so that the origin must not change
+   */
+  refineExtent({ centre, radius }, held) {
+    const former = this.#extent.centre;
+    this.#extent = { centre: held ? former : centre, radius };
+    const [x, y, z] = former.map((value, axis) => value - this.#extent.centre[axis]);
+    for (const mesh of this.#meshes.values()) mesh.position.add(new THREE.Vector3(x, -y, -z));
+    this.invalidate();
+  }
+
+  /**
    * Show other parts of the scene, or none instead of what they were; Spark sorts the Gaussians of all parts together.
    * @param {Map<number, Part | null>} parts
    */
