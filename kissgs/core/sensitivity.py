@@ -23,6 +23,9 @@ SEEN_COVERAGE = 0.2
 LARGEST = 1e25
 """Largest absolute Hessian entry: squares of enormous Gaussians overflow, and sums of costs would be infinite."""
 
+HARMONICS_TOLERANCE = 1.001
+"""Factor by which the squares of mean harmonics may exceed their largest sum by rounding."""
+
 OPACITY, SCALES, ROTATION = (0,), (4, 5, 6), (7, 8, 9)
 """Indices of the diagonal entries in ``shape_hessian``."""
 
@@ -52,7 +55,8 @@ class Sensitivity:
         mean_harmonics: ``(N, K)`` means of the spherical harmonics without the constant one, over the directions from
             which the Gaussian is seen, K as in its scene; 0 if it is not seen.
         higher_harmonics: ``(N, H)`` the same of the degrees above that of the scene up to twice it, so that the means
-            of all products are known; with a capture only, whose directions are those of viewers. Else H is 0.
+            of all products are known: H is 33 at degree 3, 16 at 2, 5 at 1. Only with a capture among the cameras,
+            which shows where viewers are; else H is 0.
         prior: ``(N,)`` the part of ``color_weight`` that was not measured, see :meth:`with_prior`.
         coverage: ``(N,)`` from 0, no camera saw the Gaussian or only from far away, to 1, one saw it from nearby.
         captured: ``(N,)`` coverage by the cameras of a capture alone, which show where people look.
@@ -91,7 +95,7 @@ class Sensitivity:
             InvalidSceneError: wrong shapes or dtypes for the scene, values that are not finite, negative weights, or
                 coverage or view uncertainty outside 0 to 1.
         """
-        wanted = Sensitivity.none(len(splats), splats.sh_degree, captured=self.higher_harmonics.size > 0)
+        wanted = Sensitivity.none(len(splats), splats.sh_degree, captured=self.higher_harmonics.shape[-1] > 0)
         for name in (
             "position_hessian",
             "shape_hessian",
@@ -119,11 +123,28 @@ class Sensitivity:
                 raise InvalidSceneError(
                     f"the sensitivity is damaged: {name} must be from 0 to 1, and has {outside[0]:g}; measure it again"
                 )
+        if not self._harmonics_are_means(splats.sh_degree):
+            raise InvalidSceneError(
+                "the sensitivity is damaged: mean_harmonics or higher_harmonics are no means of spherical harmonics; "
+                "measure it again"
+            )
         if not 0 <= self.view_uncertainty <= 1:
             raise InvalidSceneError(
                 f"the sensitivity is damaged: view_uncertainty must be from 0 to 1, not {self.view_uncertainty}; "
                 "measure it again"
             )
+
+    def _harmonics_are_means(self, sh_degree: int) -> bool:
+        """Whether the squares of each degree n add up to (2 n + 1) / (4 pi) at most, as they do in each direction."""
+        first = 0
+        values = np.concatenate([self.mean_harmonics, self.higher_harmonics], axis=1)
+        for degree in range(1, (2 if self.higher_harmonics.shape[1] else 1) * sh_degree + 1):
+            last = first + 2 * degree + 1
+            squares = np.square(values[:, first:last], dtype=np.float64).sum(axis=1)
+            if squares.max(initial=0) > HARMONICS_TOLERANCE * (2 * degree + 1) / (4 * np.pi):
+                return False
+            first = last
+        return True
 
     def with_prior(
         self,

@@ -37,8 +37,8 @@ MAX_DISPLAYED_ERROR = 3.0
 """Largest squared error of a displayed colour, summed over RGB from 0 to 1."""
 
 METRIC_GROWTH = 1.5
-"""Factor on errors under a metric, which leaves out what base colours compensate: with it, the codebook's size was best
-for held-out photographs."""
+"""Factor on errors under a metric, of Gaussians that a capture has seen. The metric leaves out what base colours
+compensate; with the factor, the codebook's size was best for held-out photographs."""
 
 SH_MEAN_SQUARE = 0.0796
 """Mean square of a spherical harmonic over all directions, 1 / (4 pi)."""
@@ -107,7 +107,10 @@ def codebook_error_model(
     )
     lost, most = vectors[some] - clusters.centroids[clusters.labels], MAX_DISPLAYED_ERROR / SH_MEAN_SQUARE
     squared = np.minimum(np.square(lost, dtype=np.float64).sum(axis=1), most)
-    seen = squared if metric is None else np.minimum(METRIC_GROWTH * metric.errors(lost, some), most)
+    seen = squared
+    if metric is not None:
+        growth = 1 + (METRIC_GROWTH - 1) * sensitivity.captured[some]
+        seen = np.minimum(growth * metric.errors(lost, some), most)
     colors = sensitivity.color_weight[kept].astype(np.float64).sum() * SH_MEAN_SQUARE
     share = sensitivity.color_weight[some].astype(np.float64)
     weighted = float(seen @ share / max(share.sum(), 1e-300) * colors)

@@ -132,6 +132,7 @@ def fit(
         pool=pool,
     )
     report(0.4)
+    all_iterations = options.iterations + (0 if metric is None else METRIC_ITERATIONS)
     for iteration in range(options.iterations):
         if iteration:  # the start has just made the lists
             state.refresh_near(pool)
@@ -139,12 +140,13 @@ def fit(
         state.update(pool)
         state.reassign(pool)
         state.update(pool)
-        report(0.4 + 0.6 * (iteration + 1) / options.iterations)
+        report(0.4 + 0.6 * (iteration + 1) / all_iterations)
     if metric is not None:
-        for _ in range(METRIC_ITERATIONS):
+        for iteration in range(METRIC_ITERATIONS):
             state.refresh_near(pool)
             metric.reassign(state, pool)
             metric.move_centroids(state, pool)
+            report(0.4 + 0.6 * (options.iterations + iteration + 1) / all_iterations)
     step = 0.0
     if options.lattice:
         step = _round_to_lattice(state.centroids, options.lattice * _rms_error(state, pool), options)

@@ -1,20 +1,22 @@
-"""``ShMetric``: errors of view-dependent colour, measured where cameras see each Gaussian."""
+"""``ShMetric``: errors of view-dependent colour, measured in the directions from which cameras see each Gaussian."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 
-from kissgs.core.array_types import Float32, Float64, Int
+from kissgs.core.array_types import Float32, Float64, Int, Int32
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.spherical_harmonics import sh_basis
 from kissgs.core.threads import Workers
-from kissgs.planning.clustering import Clustering
+from kissgs.planning.clustering import BLOCK, Clustering
 
-ELSEWHERE = 0.3
-"""Weight of all directions alike beside those from which the capture sees a Gaussian; both add up to 1."""
+UNIFORM_WEIGHT = 0.3
+"""Weight of all directions alike, beside those from which cameras see a Gaussian; both add up to 1. It grows with the
+view uncertainty, since that shrinks the measured means, and is 1 for Gaussians that no capture has seen."""
 
 NEIGHBORS = 32
 """Number of codebook entries, the nearest to a Gaussian's present one, that are compared."""
@@ -30,7 +32,8 @@ class ShMetric:
     The colour error in direction d is that of shN times the harmonics at d. Its mean square over the directions from
     which a Gaussian is seen, less the square of its mean, which the base colour takes up, is a form of the covariance
     of the harmonics. Products of harmonics are sums of harmonics of up to twice the degree, so the means of these give
-    all covariances.
+    all covariances. What the base colour's change costs in all other directions is left out: counting it made the
+    images of the capture worse, and those from elsewhere too.
 
     Attributes:
         sensitivity: sensitivity of the scene, with the means of harmonics to twice the scene's degree. A Gaussian that
@@ -46,13 +49,13 @@ class ShMetric:
         """Return the metric of a sensitivity that knows directions of view; None for others."""
         return cls(sensitivity, degree) if sensitivity.higher_harmonics.shape[1] > 0 else None
 
-    def forms(self, rows: Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n K K"]:
+    def quadratic_forms(self, rows: Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n K K"]:
         """Return the forms of some Gaussians: positive definite, the identity where all directions count alike."""
         means, higher = (
             values.take(rows, axis=0) for values in (self.sensitivity.mean_harmonics, self.sensitivity.higher_harmonics)
         )
         number = means.shape[1]
-        known = np.float32(SPHERE * (1 - ELSEWHERE)) * self.sensitivity.captured.take(rows)[:, None, None]
+        known = np.float32(SPHERE * (1 - UNIFORM_WEIGHT)) * self.sensitivity.captured.take(rows)[:, None, None]
         form = (np.concatenate([means, higher], axis=1) @ _products(self.degree)).reshape(-1, number, number)
         form -= means[:, :, None] * means[:, None, :]
         form *= known
@@ -62,25 +65,36 @@ class ShMetric:
 
     def errors(self, vectors: Float32[np.ndarray, "n D"], rows: Int[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
         """Return the squared errors of shN under the forms of these Gaussians; ``vectors`` are the differences."""
-        some = vectors.reshape(len(vectors), -1, 3)
-        return np.einsum("nkc,nkc->n", some, self.forms(rows) @ some, dtype=np.float64)
+        found = np.empty(len(vectors))
+        for first in range(0, len(vectors), BLOCK):
+            block = slice(first, first + BLOCK)
+            some = vectors[block].reshape(-1, self.coefficients, 3)
+            found[block] = np.einsum("nkc,nkc->n", some, self.quadratic_forms(rows[block]) @ some, dtype=np.float64)
+        return found
+
+    @property
+    def coefficients(self) -> int:
+        """Number of coefficients of shN per colour channel."""
+        return (self.degree + 1) ** 2 - 1
 
     def move_centroids(self, state: Clustering, pool: Workers) -> None:
         """Move every centroid to where its vectors' error is smallest; one without vectors stays."""
-        data = state.data
+        data, number = state.data, self.coefficients
 
         def work(part: tuple[int, int]) -> None:
             first, last = part
-            filled = first + np.flatnonzero(np.diff(state.edges[first : last + 1]))
-            if len(filled) == 0:
-                return
-            members = state.members[state.edges[first] : state.edges[last]]
-            vectors = data.take(members).reshape(len(members), -1, 3)
-            forms = self.forms(data.rows[members]) * data.weights[members, None, None]
-            starts = state.edges[filled] - state.edges[first]
-            left = np.add.reduceat(forms, starts, axis=0, dtype=np.float64)
-            right = np.add.reduceat(forms @ vectors, starts, axis=0, dtype=np.float64)
-            state.centroids[filled] = np.linalg.solve(left, right).reshape(len(filled), -1)
+            counts = np.diff(state.edges[first : last + 1])
+            left, right = np.zeros((last - first, number, number)), np.zeros((last - first, number, 3))
+            for members, _ in _blocks(state, part):
+                vectors = data.take(members).reshape(-1, number, 3)
+                forms = self.quadratic_forms(data.rows[members]) * data.weights[members, None, None]
+                clusters, starts = np.unique(state.labels[members] - first, return_index=True)
+                left[clusters] += np.add.reduceat(forms, starts, axis=0, dtype=np.float64)
+                right[clusters] += np.add.reduceat(forms @ vectors, starts, axis=0, dtype=np.float64)
+            several, single = np.flatnonzero(counts > 1), np.flatnonzero(counts == 1)
+            moved = np.linalg.solve(left[several], right[several])
+            state.centroids[first + several] = moved.reshape(-1, 3 * number)
+            state.centroids[first + single] = data.take(state.members[state.edges[first + single]])
 
         pool.map(work, state.parts())
 
@@ -88,23 +102,32 @@ class ShMetric:
         """Assign every vector to the one of the centroids near its present one at which its error is smallest."""
         from kissgs.planning import kmeans_kernels as kernels
 
-        data = state.data
+        data, number = state.data, self.coefficients
         near = np.ascontiguousarray(state.near[:, :NEIGHBORS])
-        upper = np.triu_indices((self.degree + 1) ** 2 - 1)
+        upper = np.triu_indices(number)
 
         def work(part: tuple[int, int]) -> None:
-            first, last = part
-            members = state.members[state.edges[first] : state.edges[last]]
-            if len(members) == 0:
-                return
-            forms = self.forms(data.rows[members])
-            products = forms @ data.take(members).reshape(len(members), -1, 3)
-            rows = np.concatenate([forms[:, *upper], products.reshape(len(members), -1)], axis=1)
-            edges = state.edges[first : last + 1] - state.edges[first]
-            kernels.assign_by_form(rows, members, edges, state.centroids, near, first, state.labels)
+            for members, edges in _blocks(state, part):
+                forms = self.quadratic_forms(data.rows[members])
+                products = forms @ data.take(members).reshape(-1, number, 3)
+                rows = np.concatenate([forms[:, *upper], products.reshape(len(members), -1)], axis=1)
+                kernels.assign_by_form(rows, members, edges, state.centroids, near, part[0], state.labels)
 
         pool.map(work, state.parts())
         state.sort_members()
+
+
+def _blocks(
+    state: Clustering, part: tuple[int, int]
+) -> Iterator[tuple[Int32[np.ndarray, " n"], Int[np.ndarray, " edges"]]]:
+    """Yield the vectors of a range of clusters in blocks, sorted by cluster, and where each cluster's begin in a block.
+
+    A form takes a kilobyte, and a single cluster may have most of the vectors.
+    """
+    edges = state.edges[part[0] : part[1] + 1]
+    for first in range(int(edges[0]), int(edges[-1]), BLOCK):
+        last = min(first + BLOCK, int(edges[-1]))
+        yield state.members[first:last], np.clip(edges, first, last) - first
 
 
 @cache

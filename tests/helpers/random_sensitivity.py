@@ -23,7 +23,7 @@ def random_sensitivity(splats, seed=0, spread=2.0):
         position_hessian=(np.ones(3) * size[:, None]).astype(np.float32),
         shape_hessian=np.stack([packed_hessian(form) for form in forms]) if count else np.zeros((0, 10), np.float32),
         color_weight=size.astype(np.float32),
-        mean_harmonics=rng.normal(0, 0.2, (count, splats.shN.shape[1])).astype(np.float32),
+        mean_harmonics=rng.normal(0, 0.05, (count, splats.shN.shape[1])).astype(np.float32),
         higher_harmonics=np.zeros((count, 0), np.float32),
         prior=np.zeros(count, np.float32),
         coverage=np.ones(count, np.float32),

@@ -70,12 +70,14 @@ def test_other_arrays_are_not_written_over(tmp_path):
 
 def test_it_survives(tmp_path):
     rng = np.random.default_rng(0)
-    kept = Sensitivity.none(5, 2)
+    kept = Sensitivity.none(5, 2, captured=True)
     for values in (
         kept.position_hessian,
         kept.shape_hessian,
         kept.color_weight,
         kept.mean_harmonics,
+        kept.higher_harmonics,
+        kept.captured,
         kept.prior,
         kept.coverage,
     ):

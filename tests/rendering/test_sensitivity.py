@@ -172,6 +172,12 @@ def test_images_are_averaged_by_weight_and_sh_bases_by_visibility():
     mean = sum(color[:, None] * values for color, values in zip(colors, basis, strict=True))[seen] / total[seen, None]
     np.testing.assert_allclose(both.mean_harmonics[seen], mean, rtol=1e-4, atol=1e-5)
     assert (both.mean_harmonics[~seen] == 0).all()
+    captured = measure_sensitivity(splats, WeightedCameras(views, [1.0, 3.0], BACKGROUND, 0.0, captured=1))
+    np.testing.assert_array_equal(captured.mean_harmonics, both.mean_harmonics)
+    higher = [sh_basis(d / np.linalg.norm(d, axis=1, keepdims=True), 6)[:, 16:] for d in directions]
+    mean = sum(color[:, None] * values for color, values in zip(colors, higher, strict=True))[seen] / total[seen, None]
+    np.testing.assert_allclose(captured.higher_harmonics[seen], mean, rtol=1e-4, atol=1e-5)
+    assert both.higher_harmonics.shape == (15, 0)
 
 
 def test_sensitivity_does_not_depend_on_threads():
@@ -397,3 +403,16 @@ def test_sensitivity_cameras_of_a_capture_are_its_training_cameras_and_some_arou
     assert len(virtual.cameras) == 4
     with Workers(1):
         assert sensitivity_cameras(splats, capture, count=100, size=500).cameras[0].width == 120
+
+
+@pytest.mark.parametrize("name", ["mean_harmonics", "higher_harmonics"])
+def test_harmonics_that_are_no_means_are_refused(name):
+    splats = blobs(4, 2)
+    damaged = Sensitivity.none(4, 2, captured=True)
+    getattr(damaged, name)[1] = 1e15
+    with pytest.raises(kissgs.InvalidSceneError, match="no means of spherical harmonics"):
+        damaged.check(splats)
+
+
+def test_the_sensitivity_of_an_empty_scene_is_valid_with_a_capture():
+    Sensitivity.none(0, 3, captured=True).check(blobs(0, 3))

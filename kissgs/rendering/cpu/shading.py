@@ -10,7 +10,10 @@ from kissgs.core.numba_kernels import compiled
 
 @njit(nogil=True, error_model="numpy")
 def _harmonics(x: float, y: float, z: float, count: int, basis: np.ndarray) -> None:
-    """Write the real spherical harmonics 1 to ``count``, without the constant one, at a unit vector into ``basis``."""
+    """Write the real spherical harmonics 1 to ``count``, without the constant one, at a unit vector into ``basis``.
+
+    Unrolled, unlike :func:`kissgs.rendering.cpu.harmonics.write_harmonics`, because every footprint needs it.
+    """
     if count >= 3:
         basis[0] = -0.4886025119029199 * y
         basis[1] = 0.4886025119029199 * z
