@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from kissgs.runners import Runner
 from kissgs.settings import Settings
 from kissgs.streaming import build
 from kissgs.streaming.build import Blocks
-from kissgs.streaming.items import run_all, run_environment, run_file, run_levels
+from kissgs.streaming.items import Item, run_all, run_environment, run_file, run_levels
 from kissgs.streaming.layout import OUT, PARTITION, Layout, keep_layout, read_layout
 from kissgs.streaming.time_left import with_time_left
 from kissgs.streaming.work_folder import (
@@ -140,7 +139,7 @@ def _make(
     report = with_time_left(progress, encode.rate_distortion)
     path, stored = str(work.absolute()), encode.model_dump(mode="json")
 
-    def run(function: Callable[..., Any], stage: str, items: list[dict[str, Any]], total: int) -> None:
+    def run(stage: str, items: list[Item], total: int) -> None:
         done = 1 - len(items) / total
 
         def part(fraction: float) -> None:
@@ -150,23 +149,24 @@ def _make(
             return as_stage(stage, lambda _, fraction, note="": part((at + fraction) / len(items)))
 
         if runner is not None:
-            run_all(runner, function.__name__, items, layout, threads, part)
+            run_all(runner, items, layout, threads, part)
             return
-        for at, item in enumerate(items):
+        for at, (function, arguments) in enumerate(items):
             part(at / len(items))
-            function({**item, "threads": threads}, within(at))
+            function({**arguments, "threads": threads}, within(at))
 
     chunks = [chunk for chunk in layout.filled if not build.has_levels(work, chunk)]
-    run(run_levels, "merge", [{"work": path, "chunk": chunk} for chunk in chunks], len(layout.filled))
+    run("merge", [(run_levels, {"work": path, "chunk": chunk}) for chunk in chunks], len(layout.filled))
     if encode.rate_distortion and not build.has_cameras(work):
         report("cameras", 0.0)
         build.make_cameras(work, layout, encode, threads)
+    items: list[Item] = []
     if layout.environment and not build.has_environment(work):
-        run(run_environment, "images", [{"work": path, "settings": stored}], 1)
-    files = layout.files()
-    missing = [each for each in files if not build.has_file(work, *each)]
-    items = [{"work": path, "level": level, "file": file, "settings": stored} for level, file in missing]
-    run(run_file, "images", items, len(files))
+        items.append((run_environment, {"work": path, "settings": stored}))
+    for level, file in layout.files():
+        if not build.has_file(work, level, file):
+            items.append((run_file, {"work": path, "level": level, "file": file, "settings": stored}))
+    run("images", items, len(layout.files()) + bool(layout.environment))
     report("images", 1.0)
     build.make_manifest(work, layout)
     return _report(work, layout, len(layout.filled))
