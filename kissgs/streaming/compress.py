@@ -22,7 +22,7 @@ from kissgs.settings import Settings
 from kissgs.streaming import build
 from kissgs.streaming.build import Blocks
 from kissgs.streaming.items import Item, run_all, run_environment, run_file, run_levels
-from kissgs.streaming.layout import OUT, PARTITION, Layout, keep_layout, read_layout
+from kissgs.streaming.layout import OUT, PARTITION, Layout, keep_layout, read_layout, work_folder
 from kissgs.streaming.time_left import with_time_left
 from kissgs.streaming.work_folder import (
     check_destination,
@@ -34,7 +34,6 @@ from kissgs.streaming.work_folder import (
     needed_bytes,
     read_json,
     remove,
-    work_folder,
 )
 
 WORK_LAYOUT = 2
@@ -227,13 +226,15 @@ def _partition(
     """Partition the scene, unless that has been done."""
     if read_json(work / PARTITION) is not None:
         layout = read_layout(work)
-        _announce(work, layout.source_count, layout.sh_degree, progress)
+        _announce(work, needed_bytes(layout.source_count, layout.sh_degree), progress)
         return layout
     encode, before = settings.encode, _identity(source, settings, reading)
     try:
         (work / OUT).mkdir(exist_ok=True)
         blocks, count, sh_degree = _reader(source, reading, threads)
-        _announce(work, count, sh_degree, progress)
+        needed = needed_bytes(count, sh_degree)
+        check_space(work, needed)  # later, files are deleted as others are written, so that the folder hardly grows
+        _announce(work, needed, progress)
         stages = with_time_left(progress, encode.rate_distortion)
         layout = build.partition(work, blocks, count, container, encode, stages)
         if not any(layout.counts):
@@ -247,10 +248,8 @@ def _partition(
     return layout
 
 
-def _announce(work: Path, count: int, sh_degree: int, progress: Progress) -> None:
-    """Check that the disk has room for the work folder, and report its size."""
-    needed = needed_bytes(count, sh_degree)
-    check_space(work, needed)
+def _announce(work: Path, needed: int, progress: Progress) -> None:
+    """Report the size of the work folder."""
     progress("scratch", 1.0, f"{work} takes up to {megabytes(needed)} until the work is done")
 
 

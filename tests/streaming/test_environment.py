@@ -144,7 +144,7 @@ def test_interrupted_work_ends_with_the_same_bytes_and_is_replaced_as_a_whole(sc
 @pytest.mark.quick(1)
 @pytest.mark.parametrize("resumed", [True, False])
 def test_images_never_go_back_and_have_the_time_left(scene, tmp_path, monkeypatch, resumed):
-    """By a clock on which every event takes a second, each that is further than those before has the time left."""
+    """The clock goes on by a second at every event; those that are further than all before have the time left."""
     ticks, events = itertools.count(), []
     monkeypatch.setattr(time_left, "time", SimpleNamespace(monotonic=lambda: float(next(ticks))))
 
