@@ -56,12 +56,13 @@ def compress_streamed(options: CompressOptions, ray: str | None, scene: str, tar
     if scene == "-":
         raise UnsupportedError("levels of detail need a file: it is read more than once")
     with _stages(options.quiet) as progress, contextlib.ExitStack() as ending:
+        from kissgs.streaming.layout import continuation, work_folder
+
+        work = work_folder(target)
+        say_when_interrupted(continuation(work))  # a second signal may stop the removal of what was made
+        ending.callback(_say_what_is_left, work)
         progress("kernels", 0.0)
         from kissgs.streaming.compress import compress_streamed as run
-        from kissgs.streaming.work_folder import work_folder
-
-        say_when_interrupted("the same command begins anew")  # a second signal may stop the removal of what was made
-        ending.callback(_say_if_gone, work_folder(target))
 
         runner = None
         if ray is not None:
@@ -102,7 +103,8 @@ def _stages(quiet: bool) -> Iterator[Progress]:
         yield receive
 
 
-def _say_if_gone(work: Path) -> None:
-    """Let the message of an interruption say that nothing is left, if that is so."""
-    if not work.exists():
-        say_when_interrupted(NOTHING_LEFT)
+def _say_what_is_left(work: Path) -> None:
+    """Let the message of an interruption say whether something is left, and what the same command does with it."""
+    from kissgs.streaming.layout import continuation
+
+    say_when_interrupted(continuation(work) if work.exists() else NOTHING_LEFT)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -22,8 +21,8 @@ from kissgs.runners import Runner
 from kissgs.settings import Settings
 from kissgs.streaming import build
 from kissgs.streaming.build import Blocks
-from kissgs.streaming.items import run_all, run_environment, run_file, run_levels
-from kissgs.streaming.layout import OUT, PARTITION, Layout, keep_layout, read_layout
+from kissgs.streaming.items import Item, run_all, run_environment, run_file, run_levels
+from kissgs.streaming.layout import OUT, PARTITION, Layout, keep_layout, read_layout, work_folder
 from kissgs.streaming.time_left import with_time_left
 from kissgs.streaming.work_folder import (
     check_destination,
@@ -35,7 +34,6 @@ from kissgs.streaming.work_folder import (
     needed_bytes,
     read_json,
     remove,
-    work_folder,
 )
 
 WORK_LAYOUT = 2
@@ -140,7 +138,7 @@ def _make(
     report = with_time_left(progress, encode.rate_distortion)
     path, stored = str(work.absolute()), encode.model_dump(mode="json")
 
-    def run(function: Callable[..., Any], stage: str, items: list[dict[str, Any]], total: int) -> None:
+    def run(stage: str, items: list[Item], total: int) -> None:
         done = 1 - len(items) / total
 
         def part(fraction: float) -> None:
@@ -150,23 +148,24 @@ def _make(
             return as_stage(stage, lambda _, fraction, note="": part((at + fraction) / len(items)))
 
         if runner is not None:
-            run_all(runner, function.__name__, items, layout, threads, part)
+            run_all(runner, items, layout, threads, part)
             return
-        for at, item in enumerate(items):
+        for at, (function, arguments) in enumerate(items):
             part(at / len(items))
-            function({**item, "threads": threads}, within(at))
+            function({**arguments, "threads": threads}, within(at))
 
     chunks = [chunk for chunk in layout.filled if not build.has_levels(work, chunk)]
-    run(run_levels, "merge", [{"work": path, "chunk": chunk} for chunk in chunks], len(layout.filled))
+    run("merge", [(run_levels, {"work": path, "chunk": chunk}) for chunk in chunks], len(layout.filled))
     if encode.rate_distortion and not build.has_cameras(work):
         report("cameras", 0.0)
         build.make_cameras(work, layout, encode, threads)
+    items: list[Item] = []
     if layout.environment and not build.has_environment(work):
-        run(run_environment, "images", [{"work": path, "settings": stored}], 1)
-    files = layout.files()
-    missing = [each for each in files if not build.has_file(work, *each)]
-    items = [{"work": path, "level": level, "file": file, "settings": stored} for level, file in missing]
-    run(run_file, "images", items, len(files))
+        items.append((run_environment, {"work": path, "settings": stored}))
+    for level, file in layout.files():
+        if not build.has_file(work, level, file):
+            items.append((run_file, {"work": path, "level": level, "file": file, "settings": stored}))
+    run("images", items, len(layout.files()) + bool(layout.environment))
     report("images", 1.0)
     build.make_manifest(work, layout)
     return _report(work, layout, len(layout.filled))
@@ -227,13 +226,15 @@ def _partition(
     """Partition the scene, unless that has been done."""
     if read_json(work / PARTITION) is not None:
         layout = read_layout(work)
-        _announce(work, layout.source_count, layout.sh_degree, progress)
+        _announce(work, needed_bytes(layout.source_count, layout.sh_degree), progress)
         return layout
     encode, before = settings.encode, _identity(source, settings, reading)
     try:
         (work / OUT).mkdir(exist_ok=True)
         blocks, count, sh_degree = _reader(source, reading, threads)
-        _announce(work, count, sh_degree, progress)
+        needed = needed_bytes(count, sh_degree)
+        check_space(work, needed)  # later, files are deleted as others are written, so that the folder hardly grows
+        _announce(work, needed, progress)
         stages = with_time_left(progress, encode.rate_distortion)
         layout = build.partition(work, blocks, count, container, encode, stages)
         if not any(layout.counts):
@@ -247,10 +248,8 @@ def _partition(
     return layout
 
 
-def _announce(work: Path, count: int, sh_degree: int, progress: Progress) -> None:
-    """Check that the disk has room for the work folder, and report its size."""
-    needed = needed_bytes(count, sh_degree)
-    check_space(work, needed)
+def _announce(work: Path, needed: int, progress: Progress) -> None:
+    """Report the size of the work folder."""
     progress("scratch", 1.0, f"{work} takes up to {megabytes(needed)} until the work is done")
 
 

@@ -27,6 +27,9 @@ PROCESS_BYTES = 500_000_000
 MEMORY_RATIO = 5
 """Memory of an item for each byte of the Gaussians of its file as float32."""
 
+Item = tuple[Callable[[dict[str, Any], Progress], dict[str, Any]], dict[str, Any]]
+"""A function of this module, and its arguments without "threads"."""
+
 POLL_SECONDS = 0.5
 """Seconds between reports of progress, which may also stop the work."""
 
@@ -80,8 +83,7 @@ def _make_once(done: Callable[[], bool], make: Callable[[], None]) -> None:
 
 def run_all(
     runner: Runner,
-    function: str,
-    items: Sequence[dict[str, Any]],
+    items: Sequence[Item],
     layout: Layout,
     threads: int,
     report: Callable[[float], None],
@@ -90,8 +92,7 @@ def run_all(
 
     Args:
         runner: engine of the items.
-        function: name of a function of this module.
-        items: arguments of each, without "threads".
+        items: a function of this module and its arguments, without "threads", of each.
         layout: sizes of the scene.
         threads: processors of each item; 0 means one.
         report: receives the fraction of the items that is done.
@@ -104,8 +105,8 @@ def run_all(
     if refusal := runner.refusal(requested):
         raise UnsupportedError(f"{refusal}; choose another number with --threads")
     handles = [
-        runner.submit(WorkItem(f"{__name__}:{function}", {**item, "threads": max(1, threads)}, requested))
-        for item in items
+        runner.submit(WorkItem(f"{__name__}:{function.__name__}", {**arguments, "threads": max(1, threads)}, requested))
+        for function, arguments in items
     ]
     waiting = {handle.outcome for handle in handles}
     try:

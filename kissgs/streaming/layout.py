@@ -88,6 +88,17 @@ class Layout:
         ]
 
 
+def work_folder(manifest: Path) -> Path:
+    """Return the work folder of a streamed scene, given its manifest."""
+    folder = manifest.parent if manifest.parent.name not in ("", "..") else manifest.parent.resolve()
+    return folder.parent / f"{folder.name}.partial"
+
+
+def continuation(work: Path) -> str:
+    """Return what the same command does after the work has ended early: all that follows the partition is kept."""
+    return f"the same command {'goes on where it was' if (work / PARTITION).exists() else 'begins anew'}"
+
+
 def read_layout(work: Path) -> Layout:
     """Return the layout of a scene that is partitioned."""
     found = json.loads((work / PARTITION).read_bytes())

@@ -17,7 +17,7 @@ from kissgs.io.container_names import MANIFESTS
 from kissgs.io.streamed import MAX_TREE_BYTES
 from kissgs.sog.encode import FILES
 from kissgs.streaming.build import CHUNK
-from kissgs.streaming.layout import OUT, PARTITION
+from kissgs.streaming.layout import OUT, continuation
 from kissgs.streaming.rows import row_bytes
 
 WORK, LOCK = "work.json", "lock"
@@ -31,12 +31,6 @@ REPLACED = "replaced"
 
 ENCODED_BYTES = 30
 """Upper estimate of the encoded bytes of a Gaussian with all its levels."""
-
-
-def work_folder(manifest: Path) -> Path:
-    """Return the work folder of a streamed scene, given its manifest."""
-    folder = manifest.parent if manifest.parent.name not in ("", "..") else manifest.parent.resolve()
-    return folder.parent / f"{folder.name}.partial"
 
 
 def check_destination(manifest: Path, source: Path, *, overwrite: bool) -> None:
@@ -125,8 +119,7 @@ def explaining_full_disks(work: Path) -> Iterator[None]:
     except OutputError as error:
         if not any(os.strerror(number).lower() in str(error) for number in (errno.ENOSPC, errno.EDQUOT)):
             raise
-        then = "goes on where it was" if (work / PARTITION).exists() else "begins anew"
-        raise OutputError(f"{error}; once there is room, the same command {then}") from error
+        raise OutputError(f"{error}; once there is room, {continuation(work)}") from error
 
 
 def _names(work: Path) -> set[str]:
@@ -172,7 +165,7 @@ def megabytes(count: float) -> str:
 
 
 def check_space(work: Path, needed: int) -> None:
-    """Check that the disk has room for what the work folder still lacks.
+    """Check, before the partition, that the disk has room for the work folder; what is in it counts as free.
 
     Raises:
         OutputError: the disk is too full.

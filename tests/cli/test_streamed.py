@@ -105,6 +105,44 @@ def test_the_message_of_an_interruption_says_whether_something_is_left(scene, tm
     assert not (tmp_path / "city.partial").exists()
 
 
+@pytest.mark.parametrize("early", ["kissgs.streaming.build", "kissgs.streaming.compress"])
+def test_a_resumed_run_that_is_interrupted_early_says_that_it_goes_on(scene, tmp_path, early):
+    """The signal arrives before any new work: while the modules are imported, or when the layout is read."""
+
+    class Stop(Exception):
+        pass
+
+    def stop(stage, fraction, note=""):
+        if stage == "merge":
+            raise Stop
+
+    with pytest.raises(Stop):
+        kissgs.compress_streamed(
+            scene, tmp_path / "city/lod-meta.json", settings=Settings.from_preset("fast"), progress=stop
+        )
+    if early == "kissgs.streaming.build":
+        hook = (
+            "import os, signal, sys\n"
+            "class Finder:\n"
+            "    def find_spec(self, name, *rest):\n"
+            f"        if name == '{early}': os.kill(os.getpid(), signal.SIGINT)\n"
+            "sys.meta_path.insert(0, Finder())\n"
+        )
+    else:
+        hook = (
+            "import os, signal\n"
+            f"import {early} as module\n"
+            "module.read_layout = lambda work: os.kill(os.getpid(), signal.SIGINT)\n"
+        )
+    (tmp_path / "sitecustomize.py").write_text(hook)
+    call = [str(KISSGS), "compress", str(scene), "-o", "city/lod-meta.json", "-p", "fast"]
+    environment = {**os.environ, "PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"}
+    done = subprocess.run(call, check=False, cwd=tmp_path, env=environment, capture_output=True)
+    assert done.returncode == 130
+    assert done.stderr.endswith(b"kissgs: interrupted; the same command goes on where it was\n")
+    assert (tmp_path / "city.partial" / "partition.json").exists()
+
+
 def test_numbers_say_what_they_count(tmp_path):
     """``info`` describes one of two levels, and gives the bytes of both in its heading."""
     with pytest.MonkeyPatch.context() as patch:

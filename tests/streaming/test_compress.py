@@ -151,6 +151,22 @@ def test_a_full_disk_is_noticed_before_any_work(scene, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("stage", ["merge", "images"])
+def test_resumed_work_needs_no_room_for_what_is_done(scene, tmp_path, monkeypatch, stage):
+    """Files that are written from then on take the place of others."""
+
+    def stop(now, fraction, note=""):
+        if now == stage and fraction > 0.5:
+            raise Stop
+
+    with pytest.raises(Stop):
+        compress_streamed(scene, tmp_path / "city" / "lod-meta.json", settings=FAST, progress=stop)
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=100_000))
+    compress_streamed(scene, tmp_path / "city" / "lod-meta.json", settings=FAST)
+    assert len(kissgs.load(tmp_path / "city" / "lod-meta.json")) > 0
+
+
 def test_invisible_gaussians_are_left_out_and_counted(tmp_path):
     made = kissgs.sample_scene(COUNT, sh_degree=0, seed=3)
     opacities, means = made.opacities.copy(), made.means.copy()

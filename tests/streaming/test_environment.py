@@ -1,6 +1,8 @@
 """Environments. Oracle: scenes that are made with surroundings, and the reader."""
 
+import itertools
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from helpers.streamed_scenes import FAST, TARGETS, files_of, small_sizes
 import kissgs
 from kissgs import Settings
 from kissgs.evaluation.attributes import sigmoid
-from kissgs.streaming import environment
+from kissgs.streaming import environment, time_left
 from kissgs.streaming.compress import compress_streamed
 from kissgs.streaming.environment import FEWEST, MOST, Environment
 
@@ -137,6 +139,35 @@ def test_interrupted_work_ends_with_the_same_bytes_and_is_replaced_as_a_whole(sc
     assert files_of(target.parent) == files_of((tmp_path / "whole" / name).parent)
     compress_streamed(scene, target, settings=Settings.from_preset("fast", sh0_step=0.1), overwrite=True)
     assert not list(target.parent.parent.glob("*.partial"))
+
+
+@pytest.mark.quick(1)
+@pytest.mark.parametrize("resumed", [True, False])
+def test_images_never_go_back_and_have_the_time_left(scene, tmp_path, monkeypatch, resumed):
+    """The clock goes on by a second at every event; those that are further than all before have the time left."""
+    ticks, events = itertools.count(), []
+    monkeypatch.setattr(time_left, "time", SimpleNamespace(monotonic=lambda: float(next(ticks))))
+
+    def stop(stage, fraction, note=""):
+        if stage == "images" and fraction > 0.5:
+            raise Stop
+
+    def keep(stage, fraction, note=""):
+        if stage == "images":
+            events.append((fraction, note))
+
+    target = tmp_path / "city" / "lod-meta.json"
+    if resumed:
+        with pytest.raises(Stop):
+            compress_streamed(scene, target, settings=FAST, progress=stop)
+    assert compress_streamed(scene, target, settings=FAST, progress=keep).environment_count > 0
+    fractions = [fraction for fraction, _ in events]
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1.0
+    assert (fractions[0] > 0.3) == resumed
+    notes = [note for (before, _), (now, note) in itertools.pairwise(events) if now > before]
+    assert len(notes) > 5
+    assert all(note.endswith(" left") for note in notes[5 * resumed :])  # the pace is not known at first
 
 
 def test_an_environment_that_nobody_sees_is_left_out(tmp_path):
