@@ -92,13 +92,19 @@ def measure_costs(
         minutes = gaussians * CPU_SECONDS[settings.encode.rate_distortion] / 60
         announce(
             f"measuring {gaussians:,} Gaussians with levels of detail and without: about {math.ceil(minutes)} min of "
-            "processor time; fewer Gaussians and the preset fast take less"
+            f"processor time{_faster(isinstance(source, int), settings)}"
         )
         if not isinstance(source, Path):
             progress("measure", 0.0, "sample scene")
             isolated(partial(_write_sample, path, gaussians, source), f"the scene of {gaussians:,} Gaussians")
         progress("measure", 0.1, f"{gaussians:,} Gaussians")
         return isolated(partial(_measure, path, Path(folder), settings, threads), str(path))
+
+
+def _faster(sample: bool, settings: Settings) -> str:
+    """Return the end of a sentence: what takes less time, if anything does."""
+    ways = ["fewer Gaussians"] * sample + ["the preset fast"] * settings.encode.rate_distortion
+    return f"; {' and '.join(ways)} {'takes' if ways == ['the preset fast'] else 'take'} less" if ways else ""
 
 
 def _write_sample(path: Path, gaussians: int, sh_degree: int) -> None:

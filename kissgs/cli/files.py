@@ -36,7 +36,7 @@ def for_each_input(
 ) -> None:
     """Call ``work`` for every input. If one of several fails, the others are still processed; the exit code is then 2.
 
-    A folder that is made for the outputs is removed again if it is empty at the end, because all inputs failed.
+    A folder that is made for the outputs stays if all inputs fail: another command may be about to write into it.
 
     Args:
         names: inputs as given: paths, patterns or "-".
@@ -56,7 +56,7 @@ def for_each_input(
     pairs = list(zip(inputs, targets, strict=True))
     with contextlib.ExitStack() as ending:
         if writes and output is not None and output not in targets:
-            ending.enter_context(_folder(output))
+            _make_folder(output)
         if during is not None:
             ending.enter_context(during(pairs))
         if len(pairs) > 1:
@@ -140,14 +140,14 @@ def _targets(inputs: list[str], output: Path | None, suffix: str) -> list[Path]:
 
 def _refuse_file_name(folder: Path, suffix: str) -> None:
     """Raise OutputError if the name of a folder to be made is that of a scene's file, which somebody expects there."""
-    from kissgs.io.container_names import ENDINGS, FILE_ENDINGS, SCENE_ENDINGS
+    from kissgs.io.container_names import ENDINGS, SCENE_ENDINGS, names_file
 
     ending = folder.suffix.lower()
-    if ending not in (*ENDINGS, *FILE_ENDINGS):
+    if ending not in ENDINGS and not names_file(folder):
         return
     if not suffix:
         raise OutputError(f"{folder!s:.100} is the name of a file, but --unpacked writes folders; name a folder")
-    remedy = f"end it in {suffix}, or name a folder"
+    remedy = f"end it in {suffix}, or name a folder; one with such a name must exist"
     if ending in (*ENDINGS, *SCENE_ENDINGS):
         remedy = "use kissgs " + ("compress" if ending in ENDINGS else "convert")
     raise OutputError(
@@ -190,22 +190,14 @@ def is_folder(path: Path) -> bool:
     return os.path.isdir(path)  # noqa: PTH112  Path.is_dir raises where a name is too long
 
 
-@contextlib.contextmanager
-def _folder(folder: Path) -> Iterator[None]:
-    """Make a folder and its parents, if they do not exist; at the end, those of them that are empty are removed."""
+def _make_folder(folder: Path) -> None:
+    """Make a folder and its parents, if they do not exist."""
     from kissgs.io.atomic import reason_of
 
-    made = [path for path in (folder, *folder.parents) if not is_folder(path)]
     try:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except (OSError, ValueError) as error:
-            raise OutputError(f"cannot make the folder {folder!s:.100}: {reason_of(error)}") from error
-        yield
-    finally:
-        for path in made:
-            with contextlib.suppress(OSError, ValueError):
-                path.rmdir()
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        raise OutputError(f"cannot make the folder {folder!s:.100}: {reason_of(error)}") from error
 
 
 def expand(names: list[str]) -> list[str]:

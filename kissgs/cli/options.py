@@ -72,8 +72,11 @@ OPTIONAL_VALUES = {FINETUNE: r"[0-9]+|auto", RAY: r"auto|[^\s/]+:[0-9]+|ray://\S
 def with_default_values(words: list[str]) -> list[str]:
     """Insert ``auto`` after each ``--finetune`` and ``--ray`` without a value: typer has no optional values.
 
+    Args:
+        words: arguments of ``kissgs``, the name of the command first.
+
     Raises:
-        UnsupportedError: what follows ``--ray`` is neither an address nor a scene.
+        UnsupportedError: what follows ``--ray`` of ``kissgs compress`` is neither an address nor a scene.
     """
     result = list[str]()
     for n, word in enumerate(words):
@@ -82,7 +85,7 @@ def with_default_values(words: list[str]) -> list[str]:
         result.append(word)
         following = words[n + 1] if n + 1 < len(words) else ""
         if word in OPTIONAL_VALUES and not re.fullmatch(OPTIONAL_VALUES[word], following):
-            if word == RAY and _is_host(following):
+            if words[0] == "compress" and word == RAY and _is_host(following):
                 raise UnsupportedError(f"--ray takes HOST:PORT, such as head:6379, not {following:.100}")
             result.append("auto")
     return result
@@ -184,12 +187,14 @@ def refuse_without_training(settings: Settings, *, checkpoint: bool, device: str
         checkpoint: whether ``--checkpoint`` was given.
         device: value of ``--device``.
     """
-    prunes = settings.compact.enabled and settings.compact.method == "prune"
-    if prunes or settings.finetune.enabled or not (checkpoint or device != "cpu"):
+    trains = settings.finetune.enabled or (settings.compact.enabled and settings.compact.trains)
+    if trains or not (checkpoint or device != "cpu"):
         return
-    remedy = "leave them out, the method merge does not train"
+    remedy = "leave them out, these settings take no training steps"
     if not settings.compact.enabled:
         remedy = "add --compact or --finetune"
+    elif settings.compact.method == "merge":
+        remedy = "leave them out, the method merge does not train"
     raise UnsupportedError(f"--checkpoint and --device only apply to training: {remedy}")
 
 

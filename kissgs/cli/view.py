@@ -137,15 +137,30 @@ def _prepare(
                 "add &gaussians=N to the page's address, or name a --level"
             )
         folder = streamed_folder(content)
-        if folder.missing and not quiet:
-            others = len(folder.missing) - 1
-            lost = folder.missing[0] + (f" and {others} more file{'s' * (others > 1)}" if others else "")
-            sys.stderr.write(
-                f"kissgs: {scene} lacks {lost}, so a part will be missing; export or download the scene again\n"
-            )
+        if not quiet:
+            _warn(scene, folder)
         return folder
     with progress_bar(quiet) as progress:
         return page_scene(content, reading, threads=threads, progress=progress)
+
+
+def _warn(scene: str, folder: StreamedFolder) -> None:
+    """Say which files the page cannot get: those that are missing, and those that are there."""
+    if folder.missing:
+        sys.stderr.write(
+            f"kissgs: {scene} lacks {_listed(folder.missing)}, so a part will be missing; export or download the scene "
+            "again\n"
+        )
+    if folder.unusable:
+        sys.stderr.write(
+            f"kissgs: the page gets only files inside {scene}, not links out of it, so a part will be missing; copy "
+            f"what they lead to: {_listed(folder.unusable)}\n"
+        )
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    others = len(names) - 1
+    return names[0] + (f" and {others} more file{'s' * (others > 1)}" if others else "")
 
 
 def _has_display() -> bool:

@@ -292,7 +292,8 @@ class Remote:
                 if delay is None or time.monotonic() + delay > start + limit:
                     raise
                 time_limit = f"{limit:.0f} seconds" if limit < 60 else f"{limit / 60:.0f} minutes"
-                _sleep(delay, progress, f"not ready ({error}); trying again for {time_limit}")
+                reason = str(error).replace(str(self._http.base_url), "it")  # the command prints the address before it
+                _sleep(delay, progress, f"not ready ({reason}); trying again for {time_limit}")
 
 
 def _is_address(server: str) -> bool:

@@ -28,13 +28,15 @@ class StreamedFolder:
         name: name of the folder.
         manifest: name of the manifest in it.
         files: all files of the scene by their paths from the folder, the manifest included, and no others.
-        missing: files that the scene should have, but that are not in the folder or cannot be reached.
+        missing: files that the scene should have, but that are not in the folder.
+        unusable: files that are there, but that are no files, or links that lead out of the folder or nowhere.
     """
 
     name: str
     manifest: str
     files: dict[str, Path]
     missing: tuple[str, ...]
+    unusable: tuple[str, ...]
 
 
 def is_streamed(source: Path | bytes) -> bool:
@@ -67,8 +69,15 @@ def streamed_folder(source: Path) -> StreamedFolder:
             names += _container_files(opened, name)
     root = folder.resolve()
     inside = {name: path for name in names if (path := _file_inside(root, name)) is not None}
-    missing = tuple(name for name in names if name not in inside)
-    return StreamedFolder(os.fsencode(root.name).decode(errors="replace") or "scene", kind.manifest, inside, missing)
+    others = [name for name in names if name not in inside]
+    unusable = tuple(name for name in others if os.path.lexists(root / name))
+    return StreamedFolder(
+        name=os.fsencode(root.name).decode(errors="replace") or "scene",
+        manifest=kind.manifest,
+        files=inside,
+        missing=tuple(name for name in others if name not in unusable),
+        unusable=unusable,
+    )
 
 
 def _file_inside(root: Path, name: str) -> Path | None:

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 from helpers.command_line import KISSGS, failure, run
 
 import kissgs
+from kissgs.cli.files import for_each_input
 
 
 @pytest.fixture(scope="module")
@@ -173,6 +177,12 @@ def test_a_folder_as_output_means_into_it_for_one_file_as_for_many(scene: Path, 
 
 def test_no_folder_gets_the_name_of_a_file(scene: Path, tmp_path: Path) -> None:
     """Regression: compress -o a.spz made a folder a.spz, and wrote a SOG-XT container into it."""
+    for name in ("out.jpeg", "foo.md", "run.v2/"):
+        sentence = (
+            f"{name.rstrip('/')} is not the name of a container: end it in .zip or .sog, or make the folder first"
+        )
+        assert sentence in failure("compress", scene, "-o", name, cwd=tmp_path)
+    assert "must exist" in failure("decompress", scene, "-o", "out.jpeg", cwd=tmp_path)
     for name in ("a.spz", "a.PLY", "a.glb", "a.webp", "a.Yaml"):
         assert f"{name} is not the name of a container" in failure("compress", scene, "-o", name, cwd=tmp_path)
     for name in ("lod_meta.json", "new/meta.json", "LOD-META.JSON"):
@@ -197,25 +207,54 @@ def test_no_folder_gets_the_name_of_a_file(scene: Path, tmp_path: Path) -> None:
     )
     assert "would become one file" in failure("compress", scene, scene, "-o", "new", cwd=tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == []
+    (tmp_path / "run.v2").mkdir()
+    for name in ("run.v2", "run.1/"):
+        assert run("compress", scene, "-o", tmp_path / name, "-p", "fast", "-q").returncode == 0
+        assert (tmp_path / name / "scene.zip").is_file()
     (tmp_path / "c.sog").mkdir()
     assert run("compress", scene, "-o", tmp_path / "c.sog", "-p", "fast", "-q", "--unpacked").returncode == 0
 
 
 @pytest.mark.parametrize("option", ["--unpacked", "--quiet"])
-def test_a_disk_that_fills_up_leaves_no_new_folder(
+def test_a_disk_that_fills_up_leaves_no_file(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str
 ) -> None:
-    """A folder that was there stays."""
-    (tmp_path / "mine").mkdir()
 
     def full(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "fsync", full)
-    for folder in ("new/inner", "mine"):
-        words = ["compress", scene, "-p", "fast", "-o", tmp_path / folder, option]
-        assert "no space left on device" in failure(*words)
-    assert sorted(tmp_path.rglob("*")) == [tmp_path / "mine"]
+    words = ["compress", scene, "-p", "fast", "-o", tmp_path / "new", option]
+    assert "no space left on device" in failure(*words)
+    assert sorted(tmp_path.rglob("*")) == [tmp_path / "new"]
+
+
+def test_a_command_that_fails_leaves_the_folder_of_another(tmp_path: Path) -> None:
+    """Regression: its end removed the folder, which the other had found there and had not written into yet."""
+    begun, end = threading.Event(), threading.Event()
+    for name in ("a.ply", "b.ply"):
+        (tmp_path / name).touch()
+
+    def fail(name: str, target: Path) -> dict[str, Any]:
+        begun.set()
+        end.wait(60)
+        raise kissgs.InvalidSceneError(f"{name} is no scene")
+
+    def failing() -> None:
+        with contextlib.suppress(kissgs.InvalidSceneError):
+            for_each_input([str(tmp_path / "a.ply")], tmp_path / "new/out", ".zip", False, fail)
+
+    def write(name: str, target: Path) -> dict[str, Any]:
+        end.set()
+        other.join()
+        target.write_bytes(b"result")
+        return {}
+
+    other = threading.Thread(target=failing)
+    other.start()
+    assert begun.wait(60)
+    for_each_input([str(tmp_path / "b.ply")], tmp_path / "new/out", ".zip", False, write)
+    assert (tmp_path / "new" / "out" / "b.zip").read_bytes() == b"result"
 
 
 def test_names_are_printed_as_they_are(scene: Path, tmp_path: Path) -> None:

@@ -159,6 +159,22 @@ def test_the_time_of_a_simulation_is_stated_by_count_and_preset(monkeypatch: pyt
         assert f"{count:,} Gaussians with levels of detail and without: about {minutes} min" in said[0]
 
 
+def test_what_makes_a_simulation_faster_is_named_where_it_applies(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regression: it named the preset fast where it was chosen, and a number of Gaussians that no file has."""
+    from kissgs.benchmark import streaming_costs
+
+    monkeypatch.setattr(streaming_costs, "isolated", lambda work, what: None)
+    for source, preset, end in (
+        (3, "balanced", " min of processor time; fewer Gaussians and the preset fast take less"),
+        (3, "fast", " min of processor time; fewer Gaussians take less"),
+        (scene, "balanced", " min of processor time; the preset fast takes less"),
+        (scene, "fast", " min of processor time"),
+    ):
+        said: list[str] = []
+        streaming_costs.measure_costs(source, kissgs.Settings.from_preset(preset), 1000, announce=said.append)
+        assert said[0].endswith(end)
+
+
 @pytest.mark.quick(0)
 def test_images_are_compared_and_the_rasteriser_is_measured(scene: Path) -> None:
     rows = json.loads(run("bench", "codecs", scene, "-p", "fast", "--evaluate", "--json").stdout)

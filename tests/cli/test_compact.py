@@ -159,6 +159,7 @@ def test_ctrl_c_leaves_a_checkpoint_to_resume_from(tmp_path: Path, tmp_path_fact
     assert same(kissgs.load(target), kissgs.clean(whole.splats)[0])
 
 
+FAST = ["-n", "9", "-o", "b.ply", "-p", "fast"]
 MERGE = ["-n", "9", "-o", "b.ply", "--method", "merge"]
 
 
@@ -184,6 +185,8 @@ MERGE = ["-n", "9", "-o", "b.ply", "--method", "merge"]
             "--checkpoint and --device only apply to training: leave them out, the method merge",
         ),
         ([*MERGE, "--device", "cuda"], "--checkpoint and --device only apply to training: leave them out"),
+        ([*FAST, "--device", "cuda"], "only apply to training: leave them out, these settings take no training steps"),
+        ([*FAST, "--checkpoint"], "only apply to training: leave them out, these settings take no training steps"),
     ],
 )
 def test_impossible_requests_are_refused(folder: Path, tmp_path: Path, words: list[str], sentence: str) -> None:

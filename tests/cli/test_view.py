@@ -105,6 +105,16 @@ def test_a_streamed_scene(tmp_path, city):
     (city / "0_0" / "quats.webp").unlink()
     assert "lacks 0_0/quats.webp and 1 more file, so" in served()[2]
     assert served("--quiet")[2] == ""
+    for name in ("sh0.webp", "quats.webp"):
+        (tmp_path / name).touch()
+        (city / "0_0" / name).symlink_to(tmp_path / name)
+    warning = served()[2]
+    assert warning.startswith(f"kissgs: the page gets only files inside {city}, not links out of it, so a part will be")
+    assert warning.endswith("copy what they lead to: 0_0/quats.webp and 1 more file\n")
+    (city / "0_0" / "sh0.webp").unlink()
+    first, second = served()[2].splitlines()
+    assert first.startswith(lacks)
+    assert second.endswith("copy what they lead to: 0_0/quats.webp")
 
 
 @needs_viewer

@@ -236,12 +236,14 @@ def test_a_cluster_of_this_machine_is_started_where_there_is_none(scenes, tmp_pa
 
 
 def test_the_default_address_is_auto():
-    assert with_default_values(["a.ply", "--ray"]) == ["a.ply", "--ray", "auto"]
-    assert with_default_values(["--ray", "a.ply"]) == ["--ray", "auto", "a.ply"]
-    assert with_default_values(["--ray", "head:6379", "a.ply"]) == ["--ray", "head:6379", "a.ply"]
-    assert with_default_values(["--ray", "[::1]:6379"]) == ["--ray", "[::1]:6379"]
-    for scene in ("*.ply", "missing.zip", "folder/scene", "-q", "city.sog"):
-        assert with_default_values(["--ray", scene]) == ["--ray", "auto", scene]
+    for words, meant in (
+        (["a.ply", "--ray"], ["a.ply", "--ray", "auto"]),
+        (["--ray", "a.ply"], ["--ray", "auto", "a.ply"]),
+        (["--ray", "head:6379", "a.ply"], ["--ray", "head:6379", "a.ply"]),
+        (["--ray", "[::1]:6379"], ["--ray", "[::1]:6379"]),
+        *((["--ray", scene], ["--ray", "auto", scene]) for scene in ("*.ply", "missing.zip", "dir/x", "-q", "a.sog")),
+    ):
+        assert with_default_values(["compress", *words]) == ["compress", *meant]
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1", "http://127.0.0.1:6379", "head", "head.example.com", "h:port"])
@@ -249,4 +251,11 @@ def test_an_address_without_a_port_is_not_taken_for_a_scene(scenes, tmp_path, ad
     said = failure("compress", "--ray", address, scenes / "a.ply", "-o", tmp_path)
     assert said == f"kissgs: --ray takes HOST:PORT, such as head:6379, not {address}"
     (tmp_path / "head").mkdir()  # a container or a streamed scene
-    assert with_default_values(["--ray", str(tmp_path / "head")])[1] == "auto"
+    assert with_default_values(["compress", "--ray", str(tmp_path / "head")])[2] == "auto"
+
+
+def test_an_address_is_not_asked_for_where_there_is_no_cluster(scenes):
+    """Regression: convert, which has no --ray, said what --ray takes."""
+    said = run("convert", scenes / "a.ply", "--ray", "head").stderr
+    assert b"No such option: --ray" in said
+    assert b"HOST:PORT" not in said

@@ -105,6 +105,23 @@ def test_an_unreachable_service(scene, tmp_path, monkeypatch):
             client.compress(scene, tmp_path / "x.zip")
 
 
+def test_the_note_about_a_service_that_is_down_leaves_its_address_to_the_command(scene, tmp_path):
+    """Regression: the command printed the address before the note, which had it once more."""
+
+    def stop(stage, fraction, note=""):
+        raise kissgs.Cancelled(note)
+
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        url = f"http://127.0.0.1:{unused.getsockname()[1]}"
+        with (
+            kissgs.Remote(url) as client,
+            pytest.raises(kissgs.Cancelled, match=r"^not ready \(cannot reach it: .*refused.*\)") as raised,
+        ):
+            client.compress(scene, tmp_path / "x.zip", progress=stop)
+    assert url not in str(raised.value)
+
+
 def test_cancelled_raised_by_progress_cancels_the_job(start, tmp_path):
     service = start()
     scene = tmp_path / "scene.ply"

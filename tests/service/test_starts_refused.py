@@ -184,6 +184,7 @@ def test_a_database_of_postgresql_that_cannot_hold_every_name(new_database, tmp_
     engine.dispose()
 
 
+@pytest.mark.quick(0)
 def test_a_locked_database(jobs_folder):
     before = listing(jobs_folder)
     with contextlib.closing(sqlite3.connect(jobs_folder / "jobs.sqlite")) as other:
