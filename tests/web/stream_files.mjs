@@ -65,6 +65,7 @@ async function fly({ manifest, budget, cameras, environmentRows = 0, short = [] 
   const drawn = new Map();
   const states = [];
   const pending = [];
+  const prepared = [];
   const streaming = new Streaming(tree, {
     budget,
     load: (file, signal) =>
@@ -72,6 +73,10 @@ async function fly({ manifest, budget, cameras, environmentRows = 0, short = [] 
         pending.push({ file, resolve });
         signal.addEventListener("abort", () => reject(signal.reason));
       }),
+    prepare: async (file, loaded) => {
+      prepared.push(file);
+      return loaded;
+    },
     draw: (parts) => {
       for (const [file, part] of parts)
         if (part) drawn.set(file, part.ranges);
@@ -83,7 +88,7 @@ async function fly({ manifest, budget, cameras, environmentRows = 0, short = [] 
   const keep = (camera) =>
     states.push({
       ...{ camera, begun: streaming.begun, complete: streaming.complete, drawn: [...drawn] },
-      ...{ lacking: streaming.lacking, surrounding: streaming.surrounding },
+      ...{ lacking: streaming.lacking, surrounding: streaming.surrounding, prepared: [...prepared] },
     });
   for (const [number, { matrix, eye, focal, pixels }] of cameras.entries()) {
     const view = viewOf(matrix, eye, focal, pixels);

@@ -23,7 +23,8 @@ async function open(url, budget) {
   let changed = () => {};
   const streaming = new Streaming(tree, {
     budget,
-    load: async (file, signal) => contentOf(await files.load(file, tree.files[file], signal), signal),
+    load: (file, signal) => files.load(file, tree.files[file], signal),
+    prepare: (file, scene, signal) => contentOf(scene, signal),
     draw: (parts) => {
       for (const [file, part] of parts)
         if (part) drawn.set(tree.files[file], part.ranges);

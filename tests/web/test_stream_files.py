@@ -277,6 +277,7 @@ def test_a_file_with_too_few_rows():
     assert problem[0] == 0
     assert "0_0/meta.json has 127 Gaussians, fewer than" in problem[1]
     assert dict(states[-1]["drawn"]).keys() == {1}
+    assert states[-1]["prepared"] == [2, 1]  # the page keeps only these for its first camera
 
 
 def test_a_lost_file_is_lacking_only_while_a_view_needs_it():

@@ -12,17 +12,31 @@ const DISTANT = 0.85; // share of the opacity within the radius; the rest may be
  */
 const [NEAR, REACH] = [0.4, 2.5];
 
+/** Length of the mean direction from which far Gaussians do not surround a scene. Half a sphere has 0.5. */
+const ONE_SIDED = 0.7;
+
 /** @typedef {{centre: number[], radius: number}} Extent */
 
 /**
- * Return the opacity-weighted median of a scene, and the radius that contains most of it, without outliers.
+ * Return the opacity-weighted median of a scene, and the radius that contains most of it, without outliers; 1 for a
+ * scene without any size.
  * @param {number} count
  * @param {(index: number) => ArrayLike<number>} mean position of a Gaussian
  * @param {(index: number) => number} weight
- * @param {number} [reach] largest radius, in units of that which contains the nearest `NEAR` of the scene
  * @returns {Extent}
  */
-export function extentOf(count, mean, weight, reach = Infinity) {
+export function extentOf(count, mean, weight) {
+  const { centre, radius } = measure(count, mean, weight, false);
+  return { centre, radius: radius || 1 };
+}
+
+/**
+ * @param {number} count
+ * @param {(index: number) => ArrayLike<number>} mean
+ * @param {(index: number) => number} weight
+ * @param {boolean} merged whether what surrounds the scene may have too large a share, and must not set the radius
+ */
+function measure(count, mean, weight, merged) {
   const step = Math.max(1, Math.floor(count / SAMPLES));
   const [points, weights] = [/** @type {number[][]} */ ([]), /** @type {number[]} */ ([])];
   for (let i = 0; i < count; i += step) {
@@ -36,9 +50,30 @@ export function extentOf(count, mean, weight, reach = Infinity) {
       0.5,
     ),
   );
-  const distances = points.map((point) => Math.hypot(...point.map((value, axis) => value - centre[axis])));
-  const within = (/** @type {number} */ share) => quantile(distances, weights, share);
-  return { centre, radius: Math.min(within(DISTANT), reach * within(NEAR)) || 1 };
+  const offsets = points.map((point) => point.map((value, axis) => value - centre[axis]));
+  const distances = offsets.map((offset) => Math.hypot(...offset));
+  const radius = quantile(distances, weights, DISTANT);
+  const limit = merged ? REACH * quantile(distances, weights, NEAR) : 0; // 0 also where so many share one position
+  const limited = limit > 0 && limit < radius && surrounds(offsets, distances, weights, limit);
+  return { centre, radius: limited ? limit : radius };
+}
+
+/**
+ * Whether what is farther than a radius lies around the scene, not on one side of it.
+ * @param {number[][]} offsets from the centre
+ * @param {number[]} distances lengths of the offsets
+ * @param {number[]} weights
+ * @param {number} radius
+ */
+function surrounds(offsets, distances, weights, radius) {
+  const sums = [0, 0, 0];
+  let total = 0;
+  offsets.forEach((offset, i) => {
+    if (distances[i] <= radius) return;
+    total += weights[i];
+    offset.forEach((value, axis) => (sums[axis] += (weights[i] * value) / distances[i]));
+  });
+  return Math.hypot(...sums) < ONE_SIDED * total;
 }
 
 /** @param {import("./scene.js").Scene} scene */
@@ -50,9 +85,11 @@ export const extentOfScene = ({ count, means, opacities }) =>
   );
 
 /**
- * Return the extent of a streamed scene by the Gaussians of its coarsest level, each of which stands for several.
+ * Return the extent of a streamed scene by the Gaussians of its coarsest level, each of which stands for several; null
+ * if none were loaded, or if they have no size.
  * @param {import("./lod_tree.js").LodTree["leaves"]} leaves
  * @param {Map<number, import("./scene.js").Scene>} files that hold the level, as far as they were loaded
+ * @returns {Extent | null}
  */
 export function extentOfCoarsest(leaves, files) {
   const [points, weights] = [/** @type {Float32Array[]} */ ([]), /** @type {number[]} */ ([])];
@@ -66,12 +103,13 @@ export function extentOfCoarsest(leaves, files) {
       weights.push(each * sigmoid(scene.opacities[row]));
     }
   }
-  return extentOf(
+  const extent = measure(
     points.length,
     (i) => points[i],
     (i) => weights[i],
-    REACH,
+    true,
   );
+  return extent.radius > 0 ? extent : null;
 }
 
 /** Ends of the points that stand for a box, as shares of its sides: they spread as far as points all over it. */

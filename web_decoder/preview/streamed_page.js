@@ -60,12 +60,12 @@ export async function openStreamed(address, load, view) {
     if (loss) showProblem(loss);
     announced = loss;
   }
-  /** @type {Streaming<Content>} */
+  /** @type {Streaming<Scene, Content>} */
   const streaming = new Streaming(tree, {
     budget,
-    load: async (file, signal) => {
-      const scene = await files.load(file, tree.files[file], signal);
-      if (streaming.base.includes(file)) coarsest?.set(file, scene);
+    load: (file, signal) => files.load(file, tree.files[file], signal),
+    prepare: (file, scene, signal) => {
+      if (file !== tree.environment && streaming.base.includes(file)) coarsest?.set(file, scene);
       return contentOf(scene, signal);
     },
     draw: (parts) => viewer.setParts(parts),
@@ -84,7 +84,8 @@ export async function openStreamed(address, load, view) {
     timer = 0;
     const before = performance.now();
     if (streaming.begun && coarsest) {
-      if (coarsest.size) view.place(extentOfCoarsest(tree.leaves, coarsest));
+      const extent = extentOfCoarsest(tree.leaves, coarsest);
+      if (extent) view.place(extent);
       coarsest = null;
     }
     streaming.look(viewer.sight);

@@ -20,7 +20,8 @@ const FILES_AT_ONCE = 2;
 const HELD_PER_DRAWN = 4;
 
 /**
- * @template {{count: number}} T content of a file, with the number of its rows
+ * @template {{count: number}} S a loaded file, with the number of its rows
+ * @template T what is drawn of it
  */
 export class Streaming {
   /** Index of the level of each leaf that is drawn, -1 for none. @type {number[]} */
@@ -38,13 +39,15 @@ export class Streaming {
    * @param {LodTree} tree
    * @param {object} options
    * @param {number} options.budget largest number of Gaussians to draw
-   * @param {(file: number, signal: AbortSignal) => Promise<T>} options.load
+   * @param {(file: number, signal: AbortSignal) => Promise<S>} options.load
+   * @param {(file: number, loaded: S, signal: AbortSignal) => Promise<T>} options.prepare called for files that have the
+   *   rows that the tree names
    * @param {(parts: Map<number, {content: T, ranges: Ranges} | null>) => void} options.draw draws other rows of some
    *   files than before, or none; all at once, so that no leaf is drawn in two levels, or in none
    * @param {() => void} options.changed called when a file has arrived or will not: time to `look` again
    * @param {(file: number, error: unknown) => void} options.failed
    */
-  constructor(tree, { budget, load, draw, changed, failed }) {
+  constructor(tree, { budget, load, prepare, draw, changed, failed }) {
     this.tree = tree;
     this.budget = budget;
     this.draw = draw;
@@ -61,7 +64,7 @@ export class Streaming {
     );
     this.store = new FileStore({
       ...{ sizes: rows, room: this.room, most: FILES_AT_ONCE, failed },
-      load: (file, signal) => load(file, signal).then((content) => this.#checked(file, content)),
+      load: async (file, signal) => prepare(file, this.#checked(file, await load(file, signal)), signal),
       changed: () => {
         this.#stale = true;
         changed();
@@ -69,15 +72,15 @@ export class Streaming {
     });
   }
 
-  /** @param {number} file @param {T} content */
-  #checked(file, content) {
+  /** @param {number} file @param {S} loaded */
+  #checked(file, loaded) {
     const { rows, files, environment } = this.tree;
-    if (file === environment) rows[file] = content.count; // the manifest does not tell it
-    if (content.count < rows[file])
+    if (file === environment) rows[file] = loaded.count; // the manifest does not tell it
+    if (loaded.count < rows[file])
       throw new UserError(
-        `${files[file]} has ${content.count} Gaussians, fewer than the list of this scene's files names`,
+        `${files[file]} has ${loaded.count} Gaussians, fewer than the list of this scene's files names`,
       );
-    return content;
+    return loaded;
   }
 
   /** Whether all coarsest levels have arrived, or cannot. */
