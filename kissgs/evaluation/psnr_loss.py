@@ -27,7 +27,7 @@ that few views show: there the ratio is in the hundreds, in views that are merel
 MAX_SSIM_RATIO = 5.0
 """Largest ratio of the worst views' loss of SSIM to that of the goal.
 
-Unlike errors, no loss to renderings is negative, so that the mean already limits the worst twentieth to 20 times itself.
+No loss to renderings is negative, so that the mean of all views already limits the worst twentieth to 20 times itself.
 """
 
 
