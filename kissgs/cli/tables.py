@@ -113,8 +113,7 @@ def _compaction(report: CompactionReport) -> list[RenderableType]:
     """Format the steps of a compaction."""
     lines: list[RenderableType] = [Text(report.note, style="yellow")] if report.note else []
     if report.trials:
-        tried = (f"{count:,} Gaussians lose {drop:.2f} dB" for count, drop in report.trials)
-        lines.append(Text(f"search: {'; '.join(tried)}"))
+        lines.append(Text(f"search: {'; '.join(trial.summary() for trial in report.trials)}"))
     if not report.steps:
         return lines
     trained = {"photos": "trained on photographs", "renderings": "trained on renderings of the scene"}

@@ -13,7 +13,7 @@ import numpy as np
 from kissgs.cameras.views import Views
 from kissgs.compaction.evaluate import step_log
 from kissgs.compaction.popspa import Popspa
-from kissgs.compaction.result import Compacted, CompactionReport
+from kissgs.compaction.result import Compacted, CompactionReport, CountTrial
 from kissgs.compaction.step_log import StepLog
 from kissgs.core.errors import StopSearch, UnsupportedError
 from kissgs.core.progress import Progress, as_stage, silent
@@ -271,7 +271,8 @@ class _DropSearch:
                 raise
         best = self.best or unchanged(splats, f"and every smaller count that was tried loses more than {allowed:g} dB")
         note = "; ".join(filter(None, [best.report.note, self.compactor.note]))
-        return replace(best, report=replace(best.report, trials=tuple(self.trials.items()), note=note))
+        trials = tuple(CountTrial(count, drop) for count, drop in self.trials.items())
+        return replace(best, report=replace(best.report, trials=trials, note=note))
 
     def _drop(self, log2_share: float, allowed: float) -> float:
         """Compact to this share of the Gaussians and return the drop of PSNR, decibels."""

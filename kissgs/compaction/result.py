@@ -36,6 +36,30 @@ class CompactionStep:
     bytes: int | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class CountTrial:
+    """One number of Gaussians that a search tried, before any encoding.
+
+    Attributes:
+        count: number of Gaussians.
+        drop: loss of PSNR as goals count it, decibels (:func:`kissgs.evaluation.psnr_loss.drop_of`).
+        ssim_drop: loss of SSIM as goals count it (:func:`kissgs.evaluation.psnr_loss.ssim_drop_of`); None where that is
+            no goal.
+        ssim_decides: whether the limit of SSIM leaves the least room.
+    """
+
+    count: int
+    drop: float
+    ssim_drop: float | None = None
+    ssim_decides: bool = False
+
+    def summary(self) -> str:
+        """Return the loss that decides in one phrase: "50,000 Gaussians lose 0.12 dB"."""
+        decides = self.ssim_decides and self.ssim_drop is not None
+        loss = f"{self.ssim_drop:.3g} of SSIM" if decides else f"{self.drop:.2f} dB"
+        return f"{self.count:,} Gaussians lose {loss}"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CompactionReport:
     """Effort and results of a compaction.
@@ -46,7 +70,7 @@ class CompactionReport:
         target_source: training targets: "photos", or "renderings" of the input; "nothing" without training.
         source: description of the training views; empty if no view was used.
         steps: all steps in order, the input first; empty if the scene is unchanged.
-        trials: counts that a search tried, and the drop of PSNR of each, decibels; empty if the count was given.
+        trials: counts that a search tried, with the loss of each; empty if the count was given.
         cleaned: invalid values of the input that cleaning removed or replaced.
         cpu_seconds: CPU time of all threads.
         peak_memory: largest resident memory of the process so far, bytes.
@@ -58,7 +82,7 @@ class CompactionReport:
     target_source: str
     source: str
     steps: tuple[CompactionStep, ...]
-    trials: tuple[tuple[int, float], ...] = ()
+    trials: tuple[CountTrial, ...] = ()
     cleaned: Cleaned = NOTHING_CLEANED
     cpu_seconds: float = 0.0
     peak_memory: int = 0

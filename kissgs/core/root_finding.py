@@ -36,7 +36,7 @@ def find_root(
     margin: Callable[[float], float],
     start: float,
     slope: float,
-    tolerance: float,
+    tolerance: float | Callable[[float], float],
     bounds: tuple[float, float],
     grain: float = 0.0,
     stop: StopRule = StopRule(),
@@ -53,7 +53,7 @@ def find_root(
             may be slightly non-monotone and non-smooth, as results of rounding are.
         start: first point.
         slope: approximate slope of ``margin``; its sign must be right.
-        tolerance: a margin from 0 to this ends the search.
+        tolerance: a margin from 0 to this ends the search; a function of an evaluated point if it differs between them.
         bounds: smallest and largest point.
         grain: points are whole multiples of this; 0 for any number.
         stop: limits of the search.
@@ -64,16 +64,19 @@ def find_root(
     """
     known = dict(before or {})
     attempts = stop.attempts + len(known)
+    tolerance_at = tolerance if callable(tolerance) else lambda x: tolerance
     x = _rounded(start, grain)
     while len(known) < attempts and x not in known:
         known[x] = margin(x)
         inside, outside = _bracket(known, slope)
-        if 0 <= known[x] <= tolerance or (inside is not None and outside is not None and stop.settled(inside, outside)):
+        if 0 <= known[x] <= tolerance_at(x) or (
+            inside is not None and outside is not None and stop.settled(inside, outside)
+        ):
             break
         if (inside is None or outside is None) and _no_progress(known, slope):
             x = bounds[(inside is None) == (slope > 0)]
         else:
-            x = min(max(_rounded(_next(known, slope, tolerance / 2), grain), bounds[0]), bounds[1])
+            x = min(max(_rounded(_next(known, slope, tolerance_at(x) / 2), grain), bounds[0]), bounds[1])
     bound = bounds[slope > 0]
     if len(known) > 1 and bound not in known and all(found < 0 for found in known.values()):
         known[bound] = margin(bound)

@@ -21,9 +21,14 @@ WORST_SHARE = 0.05
 """Share of the views, the worst ones, that a goal limits separately."""
 
 MAX_ERROR_RATIO = 20.0
-"""Largest ratio of the worst views' squared error, or loss of SSIM, to that of the goal. The mean alone would accept
-the loss of a part that few views show: there the ratio of squared errors is in the hundreds, in views that are merely
-difficult below ten."""
+"""Largest ratio of the worst views' squared error to that of the goal. The mean alone would accept the loss of a part
+that few views show: there the ratio is in the hundreds, in views that are merely difficult below ten."""
+
+MAX_SSIM_RATIO = 5.0
+"""Largest ratio of the worst views' loss of SSIM to that of the goal.
+
+No loss to renderings is negative, so that the mean of all views already limits the worst twentieth to 20 times itself.
+"""
 
 
 def psnr_of(evaluation: Evaluation) -> float:
@@ -67,13 +72,13 @@ def ssim_drop_of(evaluation: Evaluation) -> float:
     """Return the drop of SSIM from reference to candidate as goals define it; NaN if a rendering failed.
 
     With photographs it is the drop of the mean SSIM to them, without photographs 1 - SSIM to the renderings of the
-    reference. The worst views limit it: it is at least their mean drop divided by :data:`MAX_ERROR_RATIO`.
+    reference. The worst views limit it: it is at least their mean drop divided by :data:`MAX_SSIM_RATIO`.
     """
     drops = [
         (1.0 if view.reference is None else view.reference.ssim) - view.candidate.ssim
         for view in (compared.comparison for compared in evaluation.views)
     ]
-    mean, worst = sum(drops) / len(drops), _mean_of_worst(drops) / MAX_ERROR_RATIO
+    mean, worst = sum(drops) / len(drops), _mean_of_worst(drops) / MAX_SSIM_RATIO
     return mean if math.isnan(mean) or worst <= 0 else max(mean, worst)
 
 

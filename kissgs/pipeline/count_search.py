@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+from kissgs.compaction.result import CountTrial
 from kissgs.core.errors import StopSearch, UnsupportedError
 from kissgs.core.root_finding import minimize_unimodal
 from kissgs.core.splats import Splats
@@ -62,7 +63,7 @@ class CountSearch:
     encoding: Encoding
     compactor: Compactor
     trials: list[Trial] = field(default_factory=list)
-    _drops: dict[int, float] = field(default_factory=dict)
+    _tried: list[CountTrial] = field(default_factory=list)
     _candidates: dict[int, CountCandidate] = field(default_factory=dict)
     _full_search: RateControl | None = None
     _stopped: bool = False
@@ -96,7 +97,7 @@ class CountSearch:
         best.search.stopped |= self._stopped
         compacted = best.compacted or unchanged(splats, self._reason_to_keep_all())
         notes = filter(None, [compacted.report.note, self.compactor.note])
-        report = replace(compacted.report, trials=tuple(self._drops.items()), note="; ".join(notes))
+        report = replace(compacted.report, trials=tuple(self._tried), note="; ".join(notes))
         return replace(compacted, report=report), best.search, tuple(self.trials)
 
     @property
@@ -116,7 +117,7 @@ class CountSearch:
         return self.trials[0].bytes <= target_size or self._full_search.overhead >= target_size
 
     def _reason_to_keep_all(self) -> str:
-        if self._drops:
+        if self._tried:
             return "and none of the smaller counts tried serves the goal better"
         if self._stopped:
             return "and the search was stopped before a smaller count was tried"
@@ -139,10 +140,11 @@ class CountSearch:
         self.encoding.progress.note = f"{count:,} Gaussians"
         compacted = self.compactor(count)
         evaluation = self.compactor.evaluate(compacted)
-        self._drops[count] = drop_of(evaluation)
-        infeasible = (
-            not self.goal.by_size and self.goal.margin(self.goal.measured(Trial(count, None, 0), evaluation)) < 0
-        )
+        trial = self.goal.measured(Trial(count, None, 0), evaluation)
+        limit = self.goal.decisive(trial)
+        ssim_decides = limit.setting == "max_ssim_drop"
+        self._tried.append(CountTrial(count, drop_of(evaluation), trial.ssim_drop, ssim_decides))
+        infeasible = not self.goal.by_size and limit.room(trial) < 0
         candidate = (
             CountCandidate(math.inf, None, compacted) if infeasible else self._encode(compacted.splats, compacted)
         )

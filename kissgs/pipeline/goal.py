@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from decimal import ROUND_CEILING, Context
 from typing import TYPE_CHECKING
 
 from kissgs.evaluation.results import MAX_VIEW_PSNR
@@ -14,8 +15,50 @@ from kissgs.settings import EncodeSettings
 if TYPE_CHECKING:
     from kissgs.evaluation.results import Evaluation
 
-NEAR_SSIM_DROP = -math.log2(0.95)
-"""Margin of a drop of SSIM that is small enough: 5 % of the drop, for which a container takes some 3 % of bytes."""
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """A limit that one setting names.
+
+    Attributes:
+        setting: name of the setting.
+        value: value of the setting: bytes, decibels, or a difference of SSIM.
+        slope: typical change of :meth:`room` per doubling of lambda.
+        near: room that is small enough to stop the search.
+    """
+
+    setting: str
+    value: float
+    slope: float
+    near: float
+
+    def figure(self, trial: Trial) -> float | None:
+        """Return what is limited of a trial, in the unit of ``value``; None if it is unknown."""
+        match self.setting:
+            case "target_size":
+                return trial.bytes
+            case "psnr":
+                return trial.psnr
+            case "max_psnr_drop":
+                return trial.drop
+            case _:
+                return trial.ssim_drop
+
+    def room(self, trial: Trial) -> float:
+        """Return by how much a trial exceeds the limit: at least 0 where it is met.
+
+        The unit is log2 of a ratio for sizes and drops, and decibels for a PSNR. Infinite where nothing is lost at all:
+        then the distance to the limit is unknown. -∞ where the figure is unknown or not a number.
+        """
+        found = self.figure(trial)
+        if found is None or math.isnan(found):
+            return -math.inf
+        if self.setting == "psnr":
+            return found - self.value
+        if found <= 0:  # a container may even be closer to the photographs than the scene
+            return math.inf
+        # a drop is infinite where the photographs equal the renderings of the scene
+        return math.log2(self.value / found) if found < math.inf else -math.inf
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,98 +66,85 @@ class Goal:
     """A goal for a container: a size, a PSNR, or a drop of PSNR, of SSIM or of both.
 
     Attributes:
-        settings: settings that name a goal.
-        slope: typical change of :meth:`margin` per doubling of lambda.
-        near: margin that is small enough to stop the search.
+        limits: what the container must meet.
     """
 
-    settings: EncodeSettings
-    slope: float
-    near: float
+    limits: tuple[Limit, ...]
 
     @classmethod
     def of(cls, settings: EncodeSettings) -> Goal:
         """Return the goal of these settings.
 
-        Near is 3 % of a size, 0.1 dB of a PSNR, 0.02 dB of a drop of PSNR and 5 % of a drop of SSIM.
+        Near is 3 % of a size, 0.1 dB of a PSNR, 0.02 dB of a drop of PSNR and 5 % of a drop of SSIM, for which a
+        container takes some 3 % of bytes.
         """
+        limits = []
         if settings.target_size is not None:
-            return cls(settings, 0.2, -math.log2(0.97))
+            limits.append(Limit("target_size", settings.target_size, 0.2, -math.log2(0.97)))
         if settings.psnr is not None:
-            return cls(settings, -1.5, 0.1)
-        if settings.max_psnr_drop is None:
-            return cls(settings, -0.6, NEAR_SSIM_DROP)
-        return cls(settings, -0.5, -math.log2(max(1 - 0.02 / settings.max_psnr_drop, 0.5)))
+            limits.append(Limit("psnr", settings.psnr, -1.5, 0.1))
+        if settings.max_psnr_drop is not None:
+            near = -math.log2(max(1 - 0.02 / settings.max_psnr_drop, 0.5))
+            limits.append(Limit("max_psnr_drop", settings.max_psnr_drop, -0.5, near))
+        if settings.max_ssim_drop is not None:
+            limits.append(Limit("max_ssim_drop", settings.max_ssim_drop, -0.6, -math.log2(0.95)))
+        return cls(tuple(limits))
 
     @property
     def by_size(self) -> bool:
         """Whether the goal is a size, so that no rendering is needed to evaluate it."""
-        return self.settings.target_size is not None
+        return self.limits[0].setting == "target_size"
 
     def measured(self, trial: Trial, evaluation: Evaluation) -> Trial:
         """Return a copy of a trial with the figures of its evaluation, those of SSIM only if they decide."""
-        return trial.with_evaluation(evaluation, ssim=self.settings.max_ssim_drop is not None)
+        return trial.with_evaluation(evaluation, ssim=self.limits[-1].setting == "max_ssim_drop")
+
+    def decisive(self, trial: Trial) -> Limit:
+        """Return the limit to which a trial has the least room."""
+        return min(self.limits, key=lambda limit: limit.room(trial))
 
     def margin(self, trial: Trial) -> float:
-        """Return by how much a trial exceeds the goal: at least 0 where it is met.
-
-        The unit is log2 of a ratio for sizes and drops, and decibels for a PSNR. Infinite where nothing is lost at all:
-        then the distance to the goal is unknown. Of two drops the smaller margin counts, where that of SSIM is scaled
-        such that both have the same ``near``.
-        """
-        settings = self.settings
-        if settings.target_size is not None:
-            return math.log2(settings.target_size / trial.bytes)
-        if settings.psnr is not None:
-            return (trial.psnr or 0.0) - settings.psnr
-        margins = []
-        if settings.max_psnr_drop is not None:
-            margins.append(_room(settings.max_psnr_drop, trial.drop))
-        if settings.max_ssim_drop is not None:
-            margins.append(_room(settings.max_ssim_drop, trial.ssim_drop) * self.near / NEAR_SSIM_DROP)
-        return min(margins)
+        """Return the room of a trial to the limit that decides (:meth:`Limit.room`): at least 0 where all are met."""
+        return self.decisive(trial).room(trial)
 
     def failure_message(self, trials: Sequence[Trial], *, suggest_compaction: bool) -> str:
         """Return why no trial meets the goal; ``suggest_compaction``: whether fewer Gaussians might, untried so far."""
         lambdas = [trial.rd_lambda for trial in trials if trial.rd_lambda]
         extreme = (max if self.by_size else min)(lambdas, default=None)
         trials = [trial for trial in trials if trial.rd_lambda in (None, extreme)]  # those at the extreme lambda
-        if self.settings.target_size is not None:
-            smallest, target = min(trial.bytes for trial in trials), int(self.settings.target_size)
+        if self.by_size:
+            smallest, target = min(trial.bytes for trial in trials), int(self.limits[0].value)
             return (
                 f"target_size {target:,} byte{'' if target == 1 else 's'} cannot be met: the smallest container found "
                 f"has {smallest:,}; ask for at least that"
                 + (", or for fewer Gaussians: --compact auto" * suggest_compaction)
             )
-        if self.settings.psnr is not None:
-            highest = math.floor(100 * max(trial.psnr or 0.0 for trial in trials)) / 100
+        finest = max(trials, key=self.margin)
+        missed = {limit: limit.figure(finest) for limit in self.limits if limit.room(finest) < 0}
+        units = {"psnr": " dB", "max_psnr_drop": " dB", "max_ssim_drop": ""}
+        wanted = " and ".join(f"{limit.setting} {limit.value:g}{units[limit.setting]}" for limit in missed)
+        found = [math.nan if figure is None else figure for figure in missed.values()]
+        if any(map(math.isnan, found)):
             return (
-                f"psnr {self.settings.psnr:g} dB cannot be met: the finest container found has {highest:.2f} dB; "
-                "ask for at most that"
-                + (f"; each view counts for at most {MAX_VIEW_PSNR:g} dB" if self.settings.psnr > MAX_VIEW_PSNR else "")
+                f"{wanted} cannot be met: a rendering of the finest container found failed, so its quality is unknown"
             )
-        limits, found = [], []
-        if self.settings.max_psnr_drop is not None:
-            limits.append(f"max_psnr_drop {self.settings.max_psnr_drop:g} dB")
-            found.append(f"{_smallest(trial.drop for trial in trials):.3g} dB")
-        if self.settings.max_ssim_drop is not None:
-            limits.append(f"max_ssim_drop {self.settings.max_ssim_drop:g}")
-            found.append(f"{_smallest(trial.ssim_drop for trial in trials):.3g} of SSIM")
-        return (
-            f"{' and '.join(limits)} cannot be met: the finest container found loses {' and '.join(found)}; allow at "
-            "least that"
+        if math.inf in found:
+            return (
+                f"{wanted} cannot be met: the scene's renderings equal the photographs, so any loss of PSNR is infinite"
+            )
+        if self.limits[0].setting == "psnr":
+            highest, limit = math.floor(100 * found[0]) / 100, self.limits[0].value
+            return f"{wanted} cannot be met: the finest container found has {highest:.2f} dB; ask for at most that" + (
+                f"; each view counts for at most {MAX_VIEW_PSNR:g} dB" if limit > MAX_VIEW_PSNR else ""
+            )
+        losses = " and ".join(
+            f"{_rounded_up(drop)}{' dB' if limit.setting == 'max_psnr_drop' else ' of SSIM'}"
+            for limit, drop in zip(missed, found, strict=True)
         )
+        return f"{wanted} cannot be met: the finest container found loses {losses}; allow at least that"
 
 
-def _room(limit: float, drop: float | None) -> float:
-    """Return log2 of the ratio of a limit to a drop; -∞ where the drop is unknown."""
-    if drop is None or not drop < math.inf:  # infinite where the photographs equal the renderings of the scene
-        return -math.inf
-    if drop <= 0:  # a container may even be closer to the photographs than the scene
-        return math.inf
-    return math.log2(limit / drop)
-
-
-def _smallest(drops: Iterable[float | None]) -> float:
-    """Return the smallest drop, rounded up."""
-    return 1.005 * min(math.inf if drop is None else drop for drop in drops)
+def _rounded_up(value: float) -> str:
+    """Return three significant digits of a number that is at least ``value``."""
+    digits = Context(prec=3, rounding=ROUND_CEILING).create_decimal_from_float(value)
+    return f"{float(digits):.3g}"

@@ -15,7 +15,7 @@ from kissgs.core.root_finding import StopRule, find_root
 from kissgs.core.splats import Splats
 from kissgs.evaluation.psnr_loss import SEARCH_SEED
 from kissgs.finetuning.result import FinetuneReport
-from kissgs.pipeline.goal import Goal
+from kissgs.pipeline.goal import Goal, Limit
 from kissgs.pipeline.read_options import ReadOptions
 from kissgs.pipeline.scene_files import read_scene
 from kissgs.pipeline.trial import Trial
@@ -164,7 +164,7 @@ class RateControl:
     def _short(self) -> bool:
         """Whether all samples are well below the target size, or all miss the quality goal."""
         margins = [sample.margin for sample in self._samples.values()]
-        return min(margins) > self.goal.near if self.goal.by_size else max(margins) < 0
+        return min(margins) > self.goal.limits[0].near if self.goal.by_size else max(margins) < 0
 
     def run(self, encoder: Encoder, rd_lambda: float | None = None, attempts: int | None = None) -> None:
         """Make up to ``attempts`` containers, by default ``max_encodes``, the first at ``rd_lambda``."""
@@ -201,16 +201,21 @@ class RateControl:
             return ""
         if self._is_codebook_limited(best.settings):
             return ""
-        if math.log2(target / self._bytes) <= self.goal.near:
+        if math.log2(target / self._bytes) <= self.goal.limits[0].near:
             return ""
         return f"target_size {int(target):,} bytes is above the finest container of this scene: {self._bytes:,} bytes"
 
     def _run(self, encoder: Encoder, rd_lambda: float | None, attempts: int) -> None:
         first = encoder(self.settings if rd_lambda is None else self._settings_at(rd_lambda))
-        first_margin = self._evaluate(first)
+        first_sample = self._sample(first)
         if first.encoded.rd_lambda is None:
             return
-        if rd_lambda is None and attempts > 1 and first_margin >= 0 and self._is_far_below(self.trials[-1].bytes):
+        if (
+            rd_lambda is None
+            and attempts > 1
+            and first_sample.margin >= 0
+            and self._is_far_below(self.trials[-1].bytes)
+        ):
             if self._finest_fits(encoder):
                 return
             attempts -= 1
@@ -219,7 +224,7 @@ class RateControl:
         def margin_at(x: float) -> float:
             settings = self._settings_at(2.0**x)
             if x == start:
-                sample = _Sample(first.encoded.codebook_side, first_margin)
+                sample = first_sample
             elif self._finest is not None and settings == self._finest[0]:
                 sample = self._finest[1]
             else:
@@ -230,8 +235,8 @@ class RateControl:
         find_root(
             margin_at,
             start,
-            self.goal.slope,
-            self.goal.near,
+            first_sample.limit.slope,
+            lambda x: self._samples[x].limit.near,
             LOG2_LAMBDA_RANGE,
             stop=StopRule(attempts, self._is_jump),
             before={x: sample.margin for x, sample in self._samples.items()},
@@ -275,8 +280,8 @@ class RateControl:
         if not self.goal.by_size:
             return False
         one, other, gap = self._samples[inside], self._samples[outside], abs(inside - outside)
-        smooth = gap * abs(self.goal.slope)
-        jumps = gap < 1 and (smooth < self.goal.near or one.margin - other.margin > 2 * smooth)
+        smooth = gap * abs(one.limit.slope)
+        jumps = gap < 1 and (smooth < one.limit.near or one.margin - other.margin > 2 * smooth)
         if jumps and one.side != other.side and self._finetuning is None:
             self._jump = 2.0 ** min(inside, outside), min(one.side, other.side)
             return True
@@ -287,10 +292,7 @@ class RateControl:
         return EncodeSettings(**{**(settings or self.settings).model_dump(), **no_goal, "rd_lambda": rd_lambda})
 
     def _sample(self, container: Container) -> _Sample:
-        return _Sample(container.encoded.codebook_side, self._evaluate(container))
-
-    def _evaluate(self, container: Container) -> float:
-        """Record a container as a trial, and as the best if it is; return its margin to the goal."""
+        """Record a container as a trial, and as the best if it is."""
         encoded = container.encoded
         size, sizes = stored_sizes(encoded.files, packed=self.packed)
         trial = Trial(self.count, encoded.rd_lambda, size)
@@ -299,13 +301,14 @@ class RateControl:
         self.trials.append(trial)
         self.overhead = size - sum(stored for name, stored in sizes.items() if name.endswith(".webp"))
         self.progress.note = f"try {len(self.trials) + 1}, last: {trial.summary()}"
-        margin = self.goal.margin(trial)
+        limit = self.goal.decisive(trial)
+        margin = limit.room(trial)
         self._finetuning = container.finetuning or self._finetuning
         if margin >= 0 and self._is_better(container, size):
             self.best, self._bytes = container, size
         if margin < 0 and not self.goal.by_size and size >= self.byte_limit:
             raise _CannotImprove
-        return margin
+        return _Sample(encoded.codebook_side, limit, margin)
 
     def _is_better(self, container: Container, size: int) -> bool:
         """Whether a container that meets the goal is better than the best so far."""
@@ -336,9 +339,10 @@ class RateControl:
 
 @dataclass(frozen=True, slots=True)
 class _Sample:
-    """One container: the side of its codebook's image in pixels, and its margin to the goal."""
+    """One container: the side of its codebook's image in pixels, the limit that decides, and its margin to that."""
 
     side: int
+    limit: Limit
     margin: float
 
 

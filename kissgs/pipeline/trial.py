@@ -54,7 +54,7 @@ class Trial:
         """Return size and quality in one phrase: "812 kB at 41.20 dB, drop 0.12 dB, worst view 35.1 dB"."""
         psnr = "" if self.psnr is None else f" at {self.psnr:.2f} dB"
         drop = "" if self.drop is None else f", drop {self.drop:.2f} dB"
-        ssim = "" if self.ssim_drop is None else f", SSIM drop {self.ssim_drop:.4f}"
+        ssim = "" if self.ssim_drop is None else f", SSIM drop {self.ssim_drop:.3g}"
         worst = "" if self.worst is None else f", worst view {self.worst:.1f} dB"
         return f"{self.bytes / 1000:,.0f} kB{psnr}{drop}{ssim}{worst}"
 

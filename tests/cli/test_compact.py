@@ -85,7 +85,7 @@ def test_merging_takes_neither_views_nor_training(folder: Path, tmp_path: Path) 
             tmp_path / "d.ply",
         ).stdout
     )
-    assert max(drop for count, drop in searched["trials"] if count == searched["count"]) <= 0.3
+    assert max(trial["drop"] for trial in searched["trials"] if trial["count"] == searched["count"]) <= 0.3
 
 
 @pytest.mark.parametrize(("text", "share"), [("0.2", 0.2), ("20%", 0.2), (" 2.5 % ", 0.025), ("1e-3", 0.001)])

@@ -4,6 +4,7 @@ import json
 import math
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from PIL import Image
 import kissgs
 from kissgs import Settings, UnsupportedError
 from kissgs.cameras.views import View, Views, black
+from kissgs.compaction.result import CountTrial
 from kissgs.core.progress import SearchNote
 from kissgs.core.root_finding import MIN_STEP, minimize_unimodal
 from kissgs.evaluation.psnr_loss import drop_of
@@ -108,7 +110,7 @@ def test_a_drop_of_ssim_is_met(limits):
     assert kept.bytes == min(trial.bytes for trial in met)
     near = kept.ssim_drop > 0.95 * 0.01 or kept.drop > allowed_psnr - 0.02
     assert near or len(found.report.trials) == chosen.encode.max_encodes
-    assert f"SSIM drop {kept.ssim_drop:.4f}" in kept.summary()
+    assert f"SSIM drop {kept.ssim_drop:.3g}" in kept.summary()
 
 
 def capture_with_photographs(scene, tmp_path):
@@ -149,7 +151,7 @@ def test_a_drop_of_ssim_is_measured_to_photographs_if_there_are_any(tmp_path):
 def test_an_unreachable_drop_is_refused():
     with pytest.raises(
         UnsupportedError,
-        match=r"max_psnr_drop 9 dB and max_ssim_drop 1e-09 cannot be met: .* loses \d\.\d+ dB and 0\.\d+ of SSIM; ",
+        match=r"^max_ssim_drop 1e-09 cannot be met: the finest container found loses 0\.\d+ of SSIM; allow",
     ):
         kissgs.compress(
             SCENE, settings=Settings.from_preset("balanced", max_psnr_drop=9, max_ssim_drop=1e-9, **FEW_VIEWS)
@@ -180,7 +182,7 @@ def test_fewer_gaussians_for_a_size(share):
     wanted = int(share * plain)
     found = kissgs.compress(SCENE, settings=settings(target_size=wanted), evaluate=True)
     assert 0.97 * wanted <= len(found.to_zip()) <= wanted
-    counts = [count for count, _ in found.report.compaction.trials]
+    counts = [trial.count for trial in found.report.compaction.trials]
     assert 1 <= len(counts) <= 3
     assert {trial.count for trial in found.report.trials} == {*counts, 600}
     assert found.report.compaction.count in [*counts, 600]
@@ -220,7 +222,17 @@ def test_fewer_gaussians_for_a_quality(goal):
     }
     (name,) = goal
     assert any(map(met[name], made))
+    tried = found.report.compaction.trials
+    assert tried
+    assert {(trial.ssim_decides, trial.ssim_drop is not None) for trial in tried} == {(name == "max_ssim_drop",) * 2}
     assert nearly[name](found.report.evaluation)  # from other cameras
+
+
+def test_a_count_is_reported_by_the_loss_that_decides():
+    psnr = CountTrial(50_000, 0.123, 0.00291, ssim_decides=False)
+    assert psnr.summary() == "50,000 Gaussians lose 0.12 dB"
+    assert replace(psnr, ssim_decides=True).summary() == "50,000 Gaussians lose 0.00291 of SSIM"
+    assert CountTrial(50_000, 0.123).summary() == "50,000 Gaussians lose 0.12 dB"
 
 
 @pytest.mark.quick(0)
