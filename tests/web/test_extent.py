@@ -71,7 +71,7 @@ def test_no_size(count):
 
 
 def test_files_that_no_leaf_names():
-    """Where the coarsest file is lost, an environment or files of finer levels say nothing."""
+    """A scene whose coarsest file is lost has no extent by an environment or by files of finer levels."""
     assert measure(ball(100, 50), lost=[0])[1] is None
 
 
