@@ -140,14 +140,14 @@ def _targets(inputs: list[str], output: Path | None, suffix: str) -> list[Path]:
 
 def _refuse_file_name(folder: Path, suffix: str) -> None:
     """Raise OutputError if the name of a folder to be made is that of a scene's file, which somebody expects there."""
-    from kissgs.io.container_names import ENDINGS, SCENE_ENDINGS, names_file
+    from kissgs.io.container_names import ENDINGS, FILE_ENDINGS, SCENE_ENDINGS
 
     ending = folder.suffix.lower()
-    if ending not in ENDINGS and not names_file(folder):
+    if ending not in (*ENDINGS, *FILE_ENDINGS):
         return
     if not suffix:
         raise OutputError(f"{folder!s:.100} is the name of a file, but --unpacked writes folders; name a folder")
-    remedy = f"end it in {suffix}, or name a folder; one with such a name must exist"
+    remedy = f"end it in {suffix}, or name a folder"
     if ending in (*ENDINGS, *SCENE_ENDINGS):
         remedy = "use kissgs " + ("compress" if ending in ENDINGS else "convert")
     raise OutputError(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import re
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -50,18 +48,6 @@ def ending_of(container: ContainerName) -> str:
     return next(ending for ending, name in ENDINGS.items() if name == container)
 
 
-def names_file(path: Path) -> bool:
-    """Whether a path has the ending of a file that is no container: a known one, or any short one with a letter.
-
-    Other endings, such as that of ``run.1``, and those of existing folders are no endings of files.
-    """
-    ending = path.suffix.lower()
-    if ending in FILE_ENDINGS:
-        return True
-    short = re.fullmatch(r"\.(?=.*[a-z])[a-z0-9]{1,5}", ending) is not None and ending not in (*ENDINGS, LEVELS_ENDING)
-    return short and not os.path.isdir(path)  # noqa: PTH112  Path.is_dir raises where a name is too long
-
-
 def named_container(requested: str | None, destination: Path | None) -> ContainerName:
     """Return the container to write: the requested one, else that of the destination's ending, else SOG-XT.
 
@@ -70,10 +56,8 @@ def named_container(requested: str | None, destination: Path | None) -> Containe
             or of a streamed scene.
     """
     ending = "" if destination is None else destination.suffix.lower()
-    if destination is not None and (names_file(destination) or named_manifest(destination) is not None):
+    if destination is not None and (ending in FILE_ENDINGS or named_manifest(destination) is not None):
         remedy = "end it in .zip or .sog"
-        if ending not in (*FILE_ENDINGS, LEVELS_ENDING):
-            remedy += ", or make the folder first if it is to be one"
         if ending in SCENE_ENDINGS:
             remedy += " (kissgs convert writes other formats)"
         elif ending in (".json", LEVELS_ENDING):
