@@ -142,25 +142,33 @@ def fit(
         state.update(pool)
         report(0.4 + 0.6 * (iteration + 1) / all_iterations)
     if metric is not None:
-        for iteration in range(METRIC_ITERATIONS):
+        for iteration in range(options.iterations, all_iterations):
             state.refresh_near(pool)
             metric.reassign(state, pool)
             metric.move_centroids(state, pool)
-            report(0.4 + 0.6 * (options.iterations + iteration + 1) / all_iterations)
-    step = 0.0
-    if options.lattice:
-        step = _round_to_lattice(state.centroids, options.lattice * _rms_error(state, pool), options)
-        if metric is None:
-            state.reassign(pool)
-        else:
-            metric.reassign(state, pool)
+            report(0.4 + 0.6 * (iteration + 1) / all_iterations)
+    step = _place_on_lattice(state, metric, options, pool) if options.lattice else 0.0
     used = np.bincount(state.labels, minlength=len(state.centroids)) > 0
     compact = np.cumsum(used, dtype=np.int32) - np.int32(1)
     return Clusters(state.centroids[used], compact[state.labels], step)
 
 
-def _rms_error(state: Clustering, pool: Workers) -> float:
-    """Return the weighted root mean square distance of the vectors to their centroids, per dimension."""
+def _place_on_lattice(state: Clustering, metric: ShMetric | None, options: KMeansOptions, pool: Workers) -> float:
+    """Round the centroids to the lattice, assign the vectors anew, and return the step."""
+    if metric is None:
+        error = float(np.average(state.distances, weights=state.data.weights) / state.data.table.shape[1])
+    else:
+        error = _mean_square_error(state, pool)
+    step = _round_to_lattice(state.centroids, options.lattice * error**0.5, options)
+    if metric is None:
+        state.reassign(pool)
+    else:
+        metric.reassign(state, pool)
+    return step
+
+
+def _mean_square_error(state: Clustering, pool: Workers) -> float:
+    """Return the weighted mean square distance of the vectors to their centroids, per dimension."""
     data = state.data
 
     def squares(rows: slice) -> float:
@@ -168,7 +176,7 @@ def _rms_error(state: Clustering, pool: Workers) -> float:
         return float(np.square(lost).sum(axis=1, dtype=np.float64) @ data.weights[rows])
 
     total = sum(for_each_block(len(data.rows), squares, pool))
-    return float(total / data.weights.sum(dtype=np.float64) / data.table.shape[1]) ** 0.5
+    return float(total / data.weights.sum(dtype=np.float64) / data.table.shape[1])
 
 
 def _round_to_lattice(centroids: np.ndarray, step: float, options: KMeansOptions) -> float:

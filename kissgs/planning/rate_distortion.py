@@ -90,11 +90,7 @@ def plan_rate_distortion(
     )
     shapes = shapes.take(grid.mask)
     size = sh_model.best_size(rd_lambda, len(order), settings.gaussians_per_codebook_entry, container.entry_bits)
-    size = nearest_square(size) if container.tables is None else size
-    weights = sensitivity_weights(sensitivity, order, splats)
-    metric = ShMetric.of(sensitivity, splats.sh_degree)
-    codebook = fit_codebook(splats, order, weights, size, settings, container, pool, progress, metric=metric)
-    del weights
+    codebook = _codebook(splats, order, sensitivity, size, settings, container, pool, progress)
     return_free_memory()
 
     progress("rounding", 0.0)
@@ -145,6 +141,23 @@ def _ranks(order: Int[np.ndarray, " M"], kept: Int[np.ndarray, " M"], count: int
     place = np.empty(count, np.int32)
     place[kept] = np.arange(len(kept), dtype=np.int32)
     return place.take(order)
+
+
+def _codebook(
+    splats: Splats,
+    order: Int[np.ndarray, " M"],
+    sensitivity: Sensitivity,
+    size: int,
+    settings: EncodeSettings,
+    container: ContainerModel,
+    pool: Workers,
+    progress: Progress,
+) -> Codebook:
+    """Return the SH codebook of about ``size`` entries, fitted to what cameras see of each colour."""
+    weights = sensitivity_weights(sensitivity, order, splats)
+    metric = ShMetric.of(sensitivity, splats.sh_degree)
+    most = nearest_square(size) if container.tables is None else size
+    return fit_codebook(splats, order, weights, most, settings, container, pool, progress, metric=metric)
 
 
 def _base_colors(

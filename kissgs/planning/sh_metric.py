@@ -10,7 +10,6 @@ import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Int, Int32
 from kissgs.core.sensitivity import Sensitivity
-from kissgs.core.spherical_harmonics import sh_basis
 from kissgs.core.threads import Workers
 from kissgs.planning.clustering import BLOCK, Clustering
 
@@ -32,8 +31,8 @@ class ShMetric:
     The colour error in direction d is that of shN times the harmonics at d. Its mean square over the directions from
     which a Gaussian is seen, less the square of its mean, which the base colour takes up, is a form of the covariance
     of the harmonics. Products of harmonics are sums of harmonics of up to twice the degree, so the means of these give
-    all covariances. What the base colour's change costs in all other directions is left out: counting it made the
-    images of the capture worse, and those from elsewhere too.
+    all covariances. What the base colour's change costs in all other directions is left out: counting it made
+    images worse, those of the capture and those from elsewhere.
 
     Attributes:
         sensitivity: sensitivity of the scene, with the means of harmonics to twice the scene's degree. A Gaussian that
@@ -137,11 +136,15 @@ def _products(degree: int) -> Float32[np.ndarray, "J P"]:
     Column a · K + b has the coefficients of the product of harmonics a + 1 and b + 1, without the constant one: that is
     1 / SPHERE for a = b, and 0 else.
     """
-    number, points = (degree + 1) ** 2 - 1, 4 * (2 * degree + 1) ** 2
+    from kissgs.core.harmonics_kernel import write_harmonics
+
+    number, count = (degree + 1) ** 2 - 1, (2 * degree + 1) ** 2 - 1
+    points = 4 * count
     height = 1 - (2 * np.arange(points) + 1) / points
     turn, radius = np.pi * (3 - 5**0.5) * np.arange(points), np.sqrt(1 - height**2)
-    spiral = np.stack([radius * np.cos(turn), radius * np.sin(turn), height], axis=1)
-    values = sh_basis(spiral, 2 * degree)
-    some = values[:, 1 : number + 1]
-    pairs = (some[:, :, None] * some[:, None, :]).reshape(points, -1)
-    return np.linalg.lstsq(values, pairs, rcond=None)[0][1:].astype(np.float32)
+    values = np.empty((points, count))
+    for row, (x, y, z) in zip(values, np.stack([radius * np.cos(turn), radius * np.sin(turn), height], 1), strict=True):
+        write_harmonics(x, y, z, 2 * degree, row)
+    pairs = (values[:, :number, None] * values[:, None, :number]).reshape(points, -1)
+    with_constant = np.concatenate([np.ones((points, 1)), values], axis=1)
+    return np.linalg.lstsq(with_constant, pairs, rcond=None)[0][1:].astype(np.float32)

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.captured_scene import cameras
+from helpers.reference_harmonics import real_harmonics
 
 import kissgs
 from kissgs.core.sensitivity import Sensitivity
-from kissgs.core.spherical_harmonics import sh_basis
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.core.threads import Workers
 from kissgs.planning import kmeans
@@ -31,7 +31,7 @@ def seen_directions(count, spread, seed=0, number=12):
 def metric_of(directions, weights, degree, captured=1.0):
     """Return the metric of a capture that sees each Gaussian from these directions."""
     count = len(directions)
-    basis = sh_basis(directions.reshape(-1, 3), 2 * degree)[:, 1:].reshape(count, weights.shape[1], -1)
+    basis = real_harmonics(directions.reshape(-1, 3), 2 * degree)[:, 1:].reshape(count, weights.shape[1], -1)
     means = np.einsum("nd,ndj->nj", weights, basis).astype(np.float32)
     own = SH_REST_COUNTS[degree]
     sensitivity = replace(
@@ -46,7 +46,7 @@ def metric_of(directions, weights, degree, captured=1.0):
 def direct_errors(differences, directions, weights, degree, captured=1.0):
     """Return errors summed over directions: the variance of the colour error, and all coefficients alike."""
     some = differences.reshape(len(differences), -1, 3)
-    basis = sh_basis(directions.reshape(-1, 3), degree)[:, 1:].reshape(*weights.shape, -1)
+    basis = real_harmonics(directions.reshape(-1, 3), degree)[:, 1:].reshape(*weights.shape, -1)
     colors = basis @ some
     mean = np.einsum("nd,ndc->nc", weights, colors)
     variance = np.einsum("nd,ndc->n", weights, np.square(colors - mean[:, None]))

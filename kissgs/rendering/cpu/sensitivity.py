@@ -15,9 +15,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from kissgs.core.harmonics_kernel import write_harmonics
 from kissgs.core.numba_kernels import compiled
 from kissgs.rendering.cpu.blending import _FAST, _copy_records, _exp_minus, _footprint, _pixel_centres
-from kissgs.rendering.cpu.harmonics import write_harmonics
 from kissgs.rendering.cpu.projection import (
     Vector,
     _applied,
@@ -34,6 +34,7 @@ from kissgs.rendering.cpu.projection import (
     _unit_quat,
     _whitened,
 )
+from kissgs.rendering.cpu.shading import _harmonics
 
 MOMENTS = 10
 """Number of moments of each footprint in each tile."""
@@ -279,7 +280,10 @@ def add_to_parameters(
             direction = (mean[0] - eye[0], mean[1] - eye[1], mean[2] - eye[2])
             inverse = 1.0 / np.sqrt(_dot(direction, direction))
             dx, dy, dz = direction[0] * inverse, direction[1] * inverse, direction[2] * inverse
-            write_harmonics(dx, dy, dz, degree, basis)
+            if higher > 0:
+                write_harmonics(dx, dy, dz, degree, basis)
+            else:
+                _harmonics(dx, dy, dz, own, basis)
             for c in range(own):
                 harmonics_sum[n, c] += squared_weight * basis[c]
             for c in range(higher):

@@ -12,7 +12,7 @@ from kissgs.core.numba_kernels import compiled
 def _harmonics(x: float, y: float, z: float, count: int, basis: np.ndarray) -> None:
     """Write the real spherical harmonics 1 to ``count``, without the constant one, at a unit vector into ``basis``.
 
-    Unrolled, unlike :func:`kissgs.rendering.cpu.harmonics.write_harmonics`, because every footprint needs it.
+    Unrolled, unlike :func:`kissgs.core.harmonics_kernel.write_harmonics`, because every footprint needs it.
     """
     if count >= 3:
         basis[0] = -0.4886025119029199 * y
