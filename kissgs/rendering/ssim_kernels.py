@@ -20,6 +20,7 @@ s, d; a row of the second is M, ∂p, ∂q.
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
 from kissgs.core.numba_kernels import compiled
 
@@ -75,21 +76,27 @@ def _moments(ring: np.ndarray, count: int, out: np.ndarray) -> None:
         out[j + 1728] = _blur_squares(ring, j + 576, 1152)
 
 
+@njit(inline="always")
+def _means_and_variances(moments: np.ndarray, j: int) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+    """Blur the moments of column j horizontally; return the means of s and d, and their variances."""
+    zero = np.float32(0)
+    S = _blur(moments, j, 3)
+    D = _blur(moments, j + 576, 3)
+    p = _blur(moments, j + 1152, 3) - S * S
+    q = _blur(moments, j + 1728, 3) - D * D
+    return S, D, (zero if p < zero else p), (zero if q < zero else q)  # variances may be negative by rounding
+
+
 @compiled("void(float32[::1], float32[::1], float32[::1])", fastmath=_FAST)
 def _maps(moments: np.ndarray, values: np.ndarray, ring: np.ndarray) -> None:
     """Blur the moments horizontally; write SSIM into ``values`` and its derivatives M, ∂p and ∂q into ``ring``."""
     c1 = np.float32(2 * 0.01**2)
     c2 = np.float32(2 * 0.03**2)
-    zero, one, two = np.float32(0), np.float32(1), np.float32(2)
+    one, two = np.float32(1), np.float32(2)
     for j in range(len(values)):
-        S = _blur(moments, j, 3)
-        D = _blur(moments, j + 576, 3)
+        S, D, p, q = _means_and_variances(moments, j)
         SS = S * S
         DD = D * D
-        p = _blur(moments, j + 1152, 3) - SS
-        q = _blur(moments, j + 1728, 3) - DD
-        p = zero if p < zero else p  # a variance may be negative by rounding
-        q = zero if q < zero else q
         luminance = (SS - DD + c1) / (SS + DD + c1)
         structure = (p - q + c2) / (p + q + c2)
         by_luminance = one / (SS + DD + c1)
@@ -114,16 +121,10 @@ def _similarities(moments: np.ndarray, values: np.ndarray, structures: np.ndarra
     """Blur the moments horizontally; write SSIM into ``values`` and its second factor into ``structures``."""
     c1 = np.float32(2 * 0.01**2)
     c2 = np.float32(2 * 0.03**2)
-    zero = np.float32(0)
     for j in range(len(values)):
-        S = _blur(moments, j, 3)
-        D = _blur(moments, j + 576, 3)
+        S, D, p, q = _means_and_variances(moments, j)
         SS = S * S
         DD = D * D
-        p = _blur(moments, j + 1152, 3) - SS
-        q = _blur(moments, j + 1728, 3) - DD
-        p = zero if p < zero else p  # a variance may be negative by rounding
-        q = zero if q < zero else q
         structure = (p - q + c2) / (p + q + c2)
         values[j] = (SS - DD + c1) / (SS + DD + c1) * structure
         structures[j] = structure
