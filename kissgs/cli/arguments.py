@@ -82,6 +82,25 @@ RenderDeviceOption = Annotated[str, typer.Option(help="Device of the rasteriser:
 RenderThreadsOption = Annotated[
     int, typer.Option(min=0, help="Number of threads; 0 for one per processor. The images do not depend on it.")
 ]
+PsnrOption = Annotated[
+    float | None,
+    typer.Option(metavar="DB", help="Find the smallest container with at least this PSNR to the scene's renderings."),
+]
+TargetSizeOption = Annotated[
+    str | None,
+    typer.Option(metavar="SIZE", help="Find the best container of at most this size, such as 800kB or 2.5MB."),
+]
+MaxPsnrDropOption = Annotated[
+    float | None,
+    typer.Option(metavar="DB", help="Find the smallest container that loses at most this PSNR, such as 0.1."),
+]
+MaxSsimDropOption = Annotated[
+    float | None,
+    typer.Option(
+        metavar="SSIM",
+        help="Find the smallest container that loses at most this SSIM, such as 0.003; also with --max-psnr-drop.",
+    ),
+]
 RayOption = Annotated[
     str | None,
     typer.Option(

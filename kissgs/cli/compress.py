@@ -15,13 +15,17 @@ from kissgs.cli.arguments import (
     JsonOption,
     LevelOption,
     MaxGaussiansOption,
+    MaxPsnrDropOption,
+    MaxSsimDropOption,
     PresetOption,
+    PsnrOption,
     QuietOption,
     RawAxesOption,
     RayOption,
     ScenesArgument,
     SeedOption,
     SetOption,
+    TargetSizeOption,
     ThreadsOption,
 )
 from kissgs.cli.files import for_each_input
@@ -42,30 +46,10 @@ def compress(
     container: ContainerOption = None,
     preset: PresetOption = "balanced",
     changes: SetOption = None,
-    psnr: Annotated[
-        float | None,
-        typer.Option(
-            metavar="DB", help="Find the smallest container with at least this PSNR to the scene's renderings."
-        ),
-    ] = None,
-    target_size: Annotated[
-        str | None,
-        typer.Option(metavar="SIZE", help="Find the best container of at most this size, such as 800kB or 2.5MB."),
-    ] = None,
-    max_psnr_drop: Annotated[
-        float | None,
-        typer.Option(
-            metavar="DB",
-            help="Find the smallest container that loses at most this PSNR, such as 0.1. Best with --views.",
-        ),
-    ] = None,
-    max_ssim_drop: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SSIM",
-            help="Find the smallest container that loses at most this SSIM, such as 0.003; also with --max-psnr-drop.",
-        ),
-    ] = None,
+    psnr: PsnrOption = None,
+    target_size: TargetSizeOption = None,
+    max_psnr_drop: MaxPsnrDropOption = None,
+    max_ssim_drop: MaxSsimDropOption = None,
     compact: Annotated[
         str | None,
         typer.Option(

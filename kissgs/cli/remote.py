@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kissgs.cli.arguments import ContainerOption
+from kissgs.cli.arguments import (
+    ContainerOption,
+    MaxPsnrDropOption,
+    MaxSsimDropOption,
+    PsnrOption,
+    TargetSizeOption,
+)
 from kissgs.cli.files import for_each_input, print_json, show
 
 if TYPE_CHECKING:
@@ -44,27 +50,10 @@ def compress(
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Change a setting of the preset; repeatable."),
     ] = None,
-    psnr: Annotated[
-        float | None,
-        typer.Option(
-            metavar="DB", help="Find the smallest container with at least this PSNR to the scene's renderings."
-        ),
-    ] = None,
-    target_size: Annotated[
-        str | None,
-        typer.Option(metavar="SIZE", help="Find the best container of at most this size, such as 800kB or 2.5MB."),
-    ] = None,
-    max_psnr_drop: Annotated[
-        float | None,
-        typer.Option(metavar="DB", help="Find the smallest container that loses at most this PSNR, such as 0.1."),
-    ] = None,
-    max_ssim_drop: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SSIM",
-            help="Find the smallest container that loses at most this SSIM, such as 0.003; also with --max-psnr-drop.",
-        ),
-    ] = None,
+    psnr: PsnrOption = None,
+    target_size: TargetSizeOption = None,
+    max_psnr_drop: MaxPsnrDropOption = None,
+    max_ssim_drop: MaxSsimDropOption = None,
     compact: Annotated[
         str | None,
         typer.Option(
