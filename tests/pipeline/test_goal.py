@@ -1,0 +1,154 @@
+"""Oracle: the definition of each limit; a model of a scene whose losses grow with lambda."""
+
+import math
+import re
+
+import pytest
+
+from kissgs import Settings
+from kissgs.core.root_finding import find_root
+from kissgs.pipeline.goal import Goal
+from kissgs.pipeline.rate_control import LOG2_LAMBDA_RANGE
+from kissgs.pipeline.trial import Trial
+
+
+def goal_of(**limits):
+    return Goal.of(Settings.from_preset("balanced", **limits).encode)
+
+
+def test_infinity_and_nan_in_json():
+    trial = Trial(1, 1e-9, 10, psnr=math.inf, drop=-math.inf, worst=math.nan).as_dict()
+    assert (trial["psnr"], trial["drop"], trial["worst"], trial["bytes"]) == (None, None, "NaN", 10)
+
+
+def test_an_infinite_drop_meets_no_goal():
+    goal = goal_of(max_psnr_drop=1.0)
+    assert goal.margin(Trial(1, 1e-9, 10, drop=math.inf)) == -math.inf
+
+
+@pytest.mark.parametrize(
+    ("drop", "ssim_drop", "met"),
+    [(0.1, 0.003, True), (0.11, 0.003, False), (0.1, 0.0031, False), (-1.0, 0.003, True), (0.1, -1.0, True)],
+)
+def test_of_two_drops_both_must_hold(drop, ssim_drop, met):
+    goal = goal_of(max_psnr_drop=0.1, max_ssim_drop=0.003)
+    assert (goal.margin(Trial(1, 1e-9, 10, drop=drop, ssim_drop=ssim_drop)) >= 0) == met
+
+
+@pytest.mark.parametrize("drops", [(math.nan, 0.001), (0.05, math.nan), (math.nan, math.nan)])
+def test_a_failed_rendering_meets_no_drop(drops):
+    goal = goal_of(max_psnr_drop=0.1, max_ssim_drop=0.003)
+    assert not goal.margin(Trial(1, 1e-9, 10, drop=drops[0], ssim_drop=drops[1])) >= 0
+
+
+@pytest.mark.parametrize(
+    ("drop", "ssim_drop", "near"),
+    [(0.085, 0.001, True), (0.07, 0.001, False), (0.01, 0.0029, True), (0.01, 0.0027, False), (0.07, 0.0027, False)],
+)
+def test_near_the_limit_that_decides_is_near_enough(drop, ssim_drop, near):
+    """Near is 0.02 dB of a drop of PSNR, and 5 % of a drop of SSIM."""
+    goal = goal_of(max_psnr_drop=0.1, max_ssim_drop=0.003)
+    trial = Trial(1, 1e-9, 10, drop=drop, ssim_drop=ssim_drop)
+    assert goal.margin(trial) == pytest.approx(math.log2(min(0.1 / drop, 0.003 / ssim_drop)))
+    assert (0 <= goal.margin(trial) <= goal.decisive(trial).near) == near
+
+
+def model_trial(x, growth, ssim_growth):
+    """Return a trial at lambda 2^x whose drops grow exponentially with x."""
+    drop, ssim_drop = 0.45 * 2 ** (growth * (x + 34)), 0.0074 * 2 ** (ssim_growth * (x + 34))
+    return Trial(1, 2.0**x, 10, drop=drop, ssim_drop=ssim_drop)
+
+
+def searched(goal, growth, ssim_growth, start):
+    """Search in a model of a scene. Return log2(lambda) of all trials, and of the best."""
+
+    def decisive(x):
+        return goal.decisive(model_trial(x, growth, ssim_growth))
+
+    tried = []
+
+    def margin(x):
+        tried.append(x)
+        return goal.margin(model_trial(x, growth, ssim_growth))
+
+    found = find_root(margin, start, decisive(start).slope, lambda x: decisive(x).near, LOG2_LAMBDA_RANGE)
+    return tried, found
+
+
+@pytest.mark.parametrize("growth", [0.6, 0.9])
+@pytest.mark.parametrize("ssim_growth", [0.6, 0.9])
+@pytest.mark.parametrize("start", [-34.0, -39.0])
+def test_two_limits_take_few_more_encodings_than_the_tighter_one(growth, ssim_growth, start):
+    for psnr in (0.01, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0, 3.0, 20.0):
+        limits = {"max_psnr_drop": psnr, "max_ssim_drop": 0.003}
+        points, found = searched(goal_of(**limits), growth, ssim_growth, start)
+        decisive = goal_of(**limits).decisive(model_trial(found, growth, ssim_growth))
+        single, _ = searched(Goal((decisive,)), growth, ssim_growth, start)
+        assert len(points) <= len(single) + 2
+        assert 0 <= decisive.room(model_trial(found, growth, ssim_growth)) <= decisive.near
+
+
+@pytest.mark.parametrize(
+    ("limits", "found", "message"),
+    [
+        (
+            {"max_psnr_drop": 1.0, "max_ssim_drop": 1e-7},
+            {"drop": 0.0331, "ssim_drop": 0.00053901},
+            "max_ssim_drop 1e-07 cannot be met: the finest container found loses 0.00054 of SSIM; allow at least that",
+        ),
+        (
+            {"max_psnr_drop": 0.01, "max_ssim_drop": 1e-7},
+            {"drop": 0.033101, "ssim_drop": 0.000539001},
+            "max_psnr_drop 0.01 dB and max_ssim_drop 1e-07 cannot be met: the finest container found loses 0.0332 dB "
+            "and 0.00054 of SSIM; allow at least that",
+        ),
+        (
+            {"max_psnr_drop": 0.01, "max_ssim_drop": 0.001},
+            {"drop": -0.0201, "ssim_drop": 0.002001},
+            "max_ssim_drop 0.001 cannot be met: the finest container found loses 0.00201 of SSIM; allow at least that",
+        ),
+        (
+            {"max_psnr_drop": 0.01},
+            {"drop": math.inf},
+            "max_psnr_drop 0.01 dB cannot be met: the scene's renderings equal the photographs, so any loss of PSNR is "
+            "infinite",
+        ),
+        *[
+            (
+                {name: value},
+                {figure: math.nan},
+                f"{name} {value:g}{unit} cannot be met: a rendering of the finest container found failed, so its "
+                "quality is unknown",
+            )
+            for name, value, figure, unit in [
+                ("max_psnr_drop", 0.01, "drop", " dB"),
+                ("max_ssim_drop", 0.01, "ssim_drop", ""),
+                ("psnr", 40.0, "psnr", " dB"),
+            ]
+        ],
+    ],
+)
+def test_the_message_names_the_limits_that_are_missed(limits, found, message):
+    """Losses are rounded up, so that the one that is named can be met."""
+    assert goal_of(**limits).failure_message([Trial(1, 1e-9, 10, **found)], suggest_compaction=False) == message
+
+
+def test_the_loss_that_is_named_can_be_met():
+    trial = Trial(1, 1e-9, 10, drop=0.03, ssim_drop=0.0029999999)
+    message = goal_of(max_psnr_drop=0.001, max_ssim_drop=0.001).failure_message([trial], suggest_compaction=False)
+    psnr, ssim = re.search("loses (.*) dB and (.*) of SSIM", message).groups()
+    assert (psnr, ssim) == ("0.03", "0.003")
+    assert goal_of(max_psnr_drop=float(psnr), max_ssim_drop=float(ssim)).margin(trial) >= 0
+
+
+def test_nothing_lost_is_an_unknown_distance():
+    goal = Goal.of(Settings.from_preset("balanced", max_ssim_drop=0.1).encode)
+    assert goal.margin(Trial(1, 1e-9, 10, ssim_drop=0.0)) == math.inf
+
+
+def test_a_trial_names_the_loss_of_ssim_where_it_is_a_goal():
+    trial = Trial(1, 1e-9, 812_000, psnr=41.2, drop=0.12, worst=35.1)
+    assert trial.summary() == "812 kB at 41.20 dB, drop 0.12 dB, worst view 35.1 dB"
+    text = Trial(1, 1e-9, 812_000, psnr=41.2, drop=0.12, ssim_drop=0.00291, worst=35.1).summary()
+    assert text == "812 kB at 41.20 dB, drop 0.12 dB, SSIM drop 0.00291, worst view 35.1 dB"
+    assert "SSIM drop 2.35e-05" in Trial(1, 1e-9, 812_000, ssim_drop=0.000023456).summary()
