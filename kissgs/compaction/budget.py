@@ -15,6 +15,7 @@ from kissgs.compaction.evaluate import step_log
 from kissgs.compaction.popspa import Popspa
 from kissgs.compaction.result import Compacted, CompactionReport, CountTrial
 from kissgs.compaction.step_log import StepLog
+from kissgs.compaction.training_path import TrainingPath
 from kissgs.core.errors import StopSearch, UnsupportedError
 from kissgs.core.progress import Progress, as_stage, silent
 from kissgs.core.root_finding import find_root
@@ -197,17 +198,15 @@ class Compactor:
                 self.splats, count, self.threads, self.progress, evaluate=evaluate, supervision=self.supervision
             )
         if self._targets is None and self.settings.trains:
-            from kissgs.training.targets import training_targets
+            self._targets = self._task().load_targets()
+        return self._task()(count, evaluate=evaluate, checkpoint=checkpoint)
 
-            self._targets = training_targets(
-                self.splats,
-                self.supervision.train,
-                self.supervision.background,
-                threads=self.threads,
-                device=self.device,
-                progress=self.progress,
-            )
-        task = Popspa(
+    def path(self, *, keep_states: bool) -> TrainingPath:
+        """Return a training through falling numbers of Gaussians, for the method "prune"."""
+        return TrainingPath(self._task(), keep_states)
+
+    def _task(self) -> Popspa:
+        return Popspa(
             self.splats,
             self.settings,
             self.supervision,
@@ -216,9 +215,8 @@ class Compactor:
             device=self.device,
             progress=self.progress,
         )
-        return task(count, evaluate=evaluate, checkpoint=checkpoint)
 
-    def evaluate(self, compacted: Compacted) -> Evaluation:
+    def evaluate(self, splats: Splats) -> Evaluation:
         """Compare a result with the scene in views that no training used; reports the stage "evaluate"."""
         progress = as_stage("evaluate", self.progress)
         if self.eval_views is None:
@@ -226,7 +224,7 @@ class Compactor:
             self.eval_views, self._reference_images = drawn, {}
         return compare_images(
             self.splats,
-            compacted.splats,
+            splats,
             self.eval_views,
             threads=self.threads,
             reference_images=self._reference_images,
@@ -281,7 +279,7 @@ class _DropSearch:
         if count in self.trials:
             return self.trials[count]
         compacted = self.compactor(count)
-        drop = self.trials[count] = drop_of(self.compactor.evaluate(compacted))
+        drop = self.trials[count] = drop_of(self.compactor.evaluate(compacted.splats))
         if drop <= allowed and (self.best is None or count < len(self.best.splats)):
             self.best = compacted
         return drop

@@ -7,16 +7,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from kissgs.cameras.virtual.scene_bounds import scene_bounds
 from kissgs.compaction.checkpoint_state import State, Status, work_key
 from kissgs.compaction.evaluate import step_log
 from kissgs.compaction.result import Compacted, CompactionReport
-from kissgs.compaction.schedule import Phase, first_pruning_count, lr_schedule, stage_progress, training_phases
-from kissgs.compaction.scoring import prune_by_score
+from kissgs.compaction.scene_training import SceneTraining
+from kissgs.compaction.schedule import Phase, first_pruning_count, stage_progress, training_phases
 from kissgs.compaction.step_log import StepLog
-from kissgs.core.array_types import Float32, Int
 from kissgs.core.errors import OutputError
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
@@ -26,18 +22,8 @@ from kissgs.training.checkpoint import Checkpoint
 from kissgs.training.supervision import SupervisionViews
 
 if TYPE_CHECKING:
-    from kissgs.compaction.regularizers import ShapeRegularizer
     from kissgs.compaction.sparsify import AdmmSparsifier
-    from kissgs.training.model import GaussianModel
     from kissgs.training.targets import TrainingTargets
-
-MIN_RELATIVE_EXTENT = 1e-4
-"""Extent of the cameras, in radii of the scene, up to which they count as being at one position: a rotating camera,
-whose extent is 0 except for rounding."""
-
-MIN_SCORE = {True: 0.05, False: 0.3}
-"""Lowest score, in units of the score that an unobstructed camera nearby would find: True with a capture, whose cameras
-show what matters, False for virtual views."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,6 +80,19 @@ class Popspa:
         """The original scene: the reference, or else the scene itself."""
         return self.reference or self.splats
 
+    def load_targets(self) -> TrainingTargets:
+        """Return the target images, loaded or rendered unless :attr:`targets` are given."""
+        from kissgs.training.targets import training_targets
+
+        return self.targets or training_targets(
+            self.original,
+            self.supervision.train,
+            self.supervision.background,
+            threads=self.threads,
+            device=self.device,
+            progress=self.progress,
+        )
+
 
 @dataclass(slots=True, eq=False)
 class _Run:
@@ -104,8 +103,7 @@ class _Run:
         count: number of Gaussians to keep.
         checkpoint: where the state is saved.
         log: steps for the report.
-        index: index in the scene of each Gaussian that is left, ascending.
-        model: the trainable scene; set when training begins.
+        training: the scene as pruned and trained so far.
         checkpoint_note: note for the user if a checkpoint could not be saved.
     """
 
@@ -113,12 +111,12 @@ class _Run:
     count: int
     checkpoint: Checkpoint
     log: StepLog
-    index: Int[np.ndarray, " M"] = field(init=False)
-    model: GaussianModel = field(init=False)
+    training: SceneTraining = field(init=False)
     checkpoint_note: str = field(init=False, default="")
 
     def __post_init__(self) -> None:
-        self.index = np.arange(len(self.task.splats))
+        task = self.task
+        self.training = SceneTraining(task.splats, task.settings, task.supervision, task.threads, task.device)
 
     def run(self) -> Compacted:
         """Do all steps, or those that remain after the checkpoint."""
@@ -126,110 +124,59 @@ class _Run:
         load_kernels(task.progress)
         phases = training_phases(task.settings, len(task.splats), self.count)
         if not phases:
-            return self._result(self._first_pruning(self.count), "nothing")
-        targets = task.targets or self._load_targets()
+            self._first_pruning(self.count)
+            return self._result("nothing")
+        targets = task.load_targets()
         first, done, state = self._start(targets)
         for number in range(first, len(phases)):
             self._train(phases, number, done, state, targets)
             done, state = 0, {}
         self._save(len(phases), 0, {})
-        return self._result(self.model.splats(), targets.target_source)
-
-    def _load_targets(self) -> TrainingTargets:
-        from kissgs.training.targets import training_targets
-
-        task = self.task
-        return training_targets(
-            task.original,
-            task.supervision.train,
-            task.supervision.background,
-            threads=task.threads,
-            device=task.device,
-            progress=task.progress,
-        )
+        return self._result(targets.target_source)
 
     def _start(self, targets: TrainingTargets) -> tuple[int, int, State]:
         """Do the first pruning, or load the checkpoint; return the current phase, its steps done, and the state."""
-        from kissgs.training.model import GaussianModel
-
         task = self.task
         state = self.checkpoint.load()
         if state is not None:
             status = Status.from_state(state)
-            self.index = state["index"]
-            self.model = GaussianModel.restored(state, task.device, self._position_extents(targets))
+            self.training.restore(state, state["index"], targets)
             self.log.restore(status.steps, status.seconds)
             return status.phase, status.done, state
-        scene = self._first_pruning(first_pruning_count(task.settings, len(task.splats), self.count))
-        self.model = GaussianModel(scene, task.device, self._position_extents(targets))
+        self._first_pruning(first_pruning_count(task.settings, len(task.splats), self.count))
+        self.training.begin(targets)
         self._save(0, 0, {})  # a file that cannot be written must be reported before the training
         return 0, 0, {}
 
-    def _first_pruning(self, count: int) -> Splats:
+    def _first_pruning(self, count: int) -> None:
         """Prune the input to ``count`` Gaussians."""
         self.log.record("input", self.task.splats)
-        scene = self.task.splats.select(self._prune(self.task.splats, count, self.task.progress))
-        self.log.record("prune", scene)
-        return scene
-
-    def _prune(self, scene: Splats, count: int, progress: Progress) -> Int[np.ndarray, " M"]:
-        """Return the indices in ``scene`` of the ``count`` Gaussians to keep, and update :attr:`index`."""
-        task = self.task
-        kept = prune_by_score(
-            scene,
-            task.supervision.score,
-            task.supervision.background,
-            count,
-            min_keep_per_scoring=task.settings.min_keep_per_scoring,
-            min_score=MIN_SCORE[task.supervision.captured],
-            threads=task.threads,
-            progress=progress,
-        )
-        self.index = self.index[kept]
-        return kept
+        self.training.prune(count, self.task.progress)
+        self.log.record("prune", self.training.splats())
 
     def _train(self, phases: Sequence[Phase], number: int, done: int, state: State, targets: TrainingTargets) -> None:
         """Train phase ``number`` from step ``done`` on, then prune; ``state`` is that of the checkpoint, or empty."""
-        from kissgs.training.loop import TrainingPlan, train
-
-        phase, settings = phases[number], self.task.settings
-        shape, sparsifier = self._shape_regularizer(targets), self._sparsifier(phase, state)
+        phase, training = phases[number], self.training
+        sparsifier = self._sparsifier(phase, state)
 
         def save_if_due(step: int) -> None:
             if self.checkpoint.due:
                 self._save(number, step, {} if sparsifier is None else sparsifier.state())
 
-        plan = TrainingPlan(
-            stage=phase.name,
-            steps=phase.steps,
-            rates=lr_schedule(settings, phase, targets.target_source),
-            ssim_weight=settings.ssim_weight,
-            seed=(settings.seed, number),
-            regularizers=tuple(term for term in (shape, sparsifier) if term is not None),
-        )
         progress = stage_progress(self.task.progress, phases, number)
-        train(
-            self.model,
+        training.train(
+            phase,
             targets,
-            plan,
+            (self.task.settings.seed, number),
+            regularizers=() if sparsifier is None else (sparsifier,),
             first=done,
             after=save_if_due,
-            threads=self.task.threads,
             progress=progress,
         )
-        scene = self.model.splats()
-        self.log.record(phase.name, scene)
-        if len(scene) > phase.count:
-            self.model.keep(self._prune(scene, phase.count, progress))
-            self.log.record("prune", self.model.splats())
-
-    def _shape_regularizer(self, targets: TrainingTargets) -> ShapeRegularizer | None:
-        from kissgs.compaction.regularizers import ShapeRegularizer
-
-        settings = self.task.settings
-        if not (settings.erank_weight or settings.min_scale_weight):
-            return None
-        return ShapeRegularizer(settings.erank_weight, settings.min_scale_weight, self._camera_extent(targets))
+        self.log.record(phase.name, training.splats())
+        if len(training) > phase.count:
+            training.prune(phase.count, progress)
+            self.log.record("prune", training.splats())
 
     def _sparsifier(self, phase: Phase, state: State) -> AdmmSparsifier | None:
         from kissgs.compaction.sparsify import AdmmSparsifier
@@ -237,20 +184,11 @@ class _Run:
         settings = self.task.settings
         if phase.name != "sparsify" or not settings.admm_rho:
             return None
-        opacities = self.model.parameters["opacities"]
+        opacities = self.training.trained.parameters["opacities"]
         sparsifier = AdmmSparsifier(opacities, phase.count, settings.admm_rho, settings.admm_interval)
         if "z" in state:  # a checkpoint from before the first step of a phase has none
             sparsifier.restore(state)
         return sparsifier
-
-    def _camera_extent(self, targets: TrainingTargets) -> float:
-        """Return the extent of the cameras, world units; the scene's radius if they are nearly at one position."""
-        radius = scene_bounds(self.task.splats).radius
-        return targets.extent if targets.extent > MIN_RELATIVE_EXTENT * radius else radius
-
-    def _position_extents(self, targets: TrainingTargets) -> Float32[np.ndarray, " M"]:
-        """Return the unit of the position learning rate of each Gaussian left, from its position in the input."""
-        return targets.local_extents(self.task.splats.means[self.index], self._camera_extent(targets))
 
     def _save(self, number: int, done: int, sparsifier_state: State) -> None:
         """Save the state in phase ``number`` after ``done`` of its steps.
@@ -259,7 +197,8 @@ class _Run:
             OutputError: the first checkpoint cannot be written. Later, the work continues without one.
         """
         status = Status(number, done, self.log.seconds, self.log.steps)
-        state = {**self.model.state(), **sparsifier_state, "index": self.index, **status.as_state()}
+        training = self.training
+        state = {**training.trained.state(), **sparsifier_state, "index": training.index, **status.as_state()}
         try:
             self.checkpoint.save(state)
         except OutputError as error:
@@ -267,8 +206,8 @@ class _Run:
                 raise
             self.checkpoint_note = f"the work went on without a checkpoint: {error}"
 
-    def _result(self, scene: Splats, target_source: str) -> Compacted:
-        supervision = self.task.supervision
+    def _result(self, target_source: str) -> Compacted:
+        supervision, scene = self.task.supervision, self.training.splats()
         report = CompactionReport(
             source_count=len(self.task.splats),
             count=len(scene),
@@ -277,4 +216,4 @@ class _Run:
             steps=tuple(self.log.steps),
             note="; ".join(filter(None, [supervision.note, self.checkpoint_note])),
         )
-        return Compacted(scene, self.index, report)
+        return Compacted(scene, self.training.index, report)

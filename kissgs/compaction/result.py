@@ -55,9 +55,12 @@ class CountTrial:
 
     def summary(self) -> str:
         """Return the loss that decides in one phrase: "50,000 Gaussians lose 0.12 dB"."""
+        return f"{self.count:,} Gaussians lose {self.loss()}"
+
+    def loss(self) -> str:
+        """Return the loss that decides: "0.12 dB" or "0.003 of SSIM"."""
         decides = self.ssim_decides and self.ssim_drop is not None
-        loss = f"{self.ssim_drop:.3g} of SSIM" if decides else f"{self.drop:.2f} dB"
-        return f"{self.count:,} Gaussians lose {loss}"
+        return f"{self.ssim_drop:.3g} of SSIM" if decides else f"{self.drop:.2f} dB"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,0 +1,139 @@
+"""``TrainingPath``: one training through falling numbers of Gaussians, which can be completed at any of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from kissgs.compaction.popspa import Popspa
+from kissgs.compaction.result import Compacted, CompactionReport
+from kissgs.compaction.scene_training import SceneTraining
+from kissgs.compaction.schedule import Phase
+from kissgs.core.array_types import Int
+from kissgs.core.splats import Splats
+from kissgs.rendering.rasterizer import load_kernels
+
+if TYPE_CHECKING:
+    from kissgs.training.targets import TrainingTargets
+
+REFINEMENT = 1_000_000
+"""Number of the refinement in seeds: no path has as many points."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PathPoint:
+    """The scene at one number of Gaussians.
+
+    Attributes:
+        number: number of the point on its path, 0 for the whole scene.
+        splats: the scene there, clean.
+        index: ``(M,)`` index in the whole scene of each of its Gaussians, ascending.
+        trained: whether it was trained.
+        state: state of the training, from which it continues; None if it is not trained, or forgotten.
+    """
+
+    number: int
+    splats: Splats
+    index: Int[np.ndarray, " M"]
+    trained: bool = False
+    state: Mapping[str, np.ndarray] | None = None
+
+    def __len__(self) -> int:
+        return len(self.splats)
+
+
+@dataclass(slots=True, eq=False)
+class TrainingPath:
+    """Prunes and trains a scene in turn, and keeps the scene at every number of Gaussians.
+
+    Learning rates stay high along the path. :meth:`compacted` lets them fall from any of its points, which a compaction
+    to that number alone would do at its end. So several numbers of Gaussians share one training.
+
+    Attributes:
+        task: scene, settings and views.
+        keep_states: whether every point, not just the last one, can be refined: that takes three times the memory.
+        points: the points so far, the whole scene first.
+    """
+
+    task: Popspa
+    keep_states: bool = True
+    points: list[PathPoint] = field(init=False)
+    _loaded: TrainingTargets | None = field(init=False, default=None)
+
+    def __post_init__(self) -> None:
+        self.points = [PathPoint(0, self.task.splats, np.arange(len(self.task.splats)))]
+
+    def prune(self, count: int) -> PathPoint:
+        """Prune to ``count`` Gaussians, and return the new point; reports the stages "kernels" and "score".
+
+        If a progress receiver raises here or in :meth:`train`, the path stays as it was.
+        """
+        load_kernels(self.task.progress)
+        training = self._at(self.points[-1])
+        training.prune(count, self.task.progress)
+        return self._add(training, len(self.points))
+
+    def train(self) -> PathPoint:
+        """Train the last point for ``sparsify_steps / prune_rounds`` steps, and return it; reports "sparsify"."""
+        task, point = self.task, self.points[-1]
+        steps = task.settings.sparsify_steps // task.settings.prune_rounds
+        if steps == 0:
+            return point
+        training = self._at(point)
+        if not point.trained:
+            training.begin(self._targets())
+        self._train(training, Phase("sparsify", steps, len(point)), point.number)
+        self.points.pop()
+        return self._add(training, point.number)
+
+    def compacted(self, point: PathPoint, *, refine: bool) -> Compacted:
+        """Return a point as a compacted scene.
+
+        Args:
+            point: a point of this path.
+            refine: complete its training with falling learning rates; reports the stage "refine".
+        """
+        task, splats = self.task, point.splats
+        if refine and task.settings.refine_steps:
+            training = self._at(point)
+            if not point.trained:
+                training.begin(self._targets())
+            self._train(training, Phase("refine", task.settings.refine_steps, len(point)), REFINEMENT + point.number)
+            splats = training.splats()
+        report = CompactionReport(
+            source_count=len(task.splats),
+            count=len(splats),
+            target_source=self._targets().target_source if point.trained or refine else "nothing",
+            source=task.supervision.source,
+            steps=(),
+            note=task.supervision.note,
+        )
+        return Compacted(splats, point.index, report)
+
+    def _train(self, training: SceneTraining, phase: Phase, number: int) -> None:
+        task = self.task
+        training.train(phase, self._targets(), (task.settings.seed, number), progress=task.progress)
+
+    def _targets(self) -> TrainingTargets:
+        if self._loaded is None:
+            self._loaded = self.task.load_targets()
+        return self._loaded
+
+    def _at(self, point: PathPoint) -> SceneTraining:
+        task = self.task
+        training = SceneTraining(task.splats, task.settings, task.supervision, task.threads, task.device)
+        training.index = point.index
+        if point.state is not None:
+            training.restore(point.state, point.index, self._targets())
+        return training
+
+    def _add(self, training: SceneTraining, number: int) -> PathPoint:
+        """Add the state of a training as the last point."""
+        state = training.state() if training.begun else None
+        if self.points and not self.keep_states:
+            self.points[-1] = replace(self.points[-1], state=None)
+        self.points.append(PathPoint(number, training.splats(), training.index, training.begun, state))
+        return self.points[-1]

@@ -1,0 +1,117 @@
+"""Training path. Oracle: its parts called one by one, and the same work without interruption."""
+
+import numpy as np
+import pytest
+from helpers.training_scenes import around, cloud, same
+
+import kissgs
+from kissgs import CompactSettings
+from kissgs.cameras.views import black
+from kissgs.compaction.popspa import Popspa
+from kissgs.compaction.scoring import prune_by_score
+from kissgs.compaction.training_path import TrainingPath
+from kissgs.core.progress import silent
+from kissgs.training.supervision import SupervisionViews
+
+SCENE = cloud(60)
+SHORT = {"sparsify_steps": 12, "refine_steps": 6, "prune_rounds": 3, "min_keep_per_scoring": 0.0}
+
+
+def path(threads=1, progress=silent, **changes):
+    views = SupervisionViews(around(5), around(5), around(3), black(), "five views")
+    settings = CompactSettings(**{**SHORT, **changes})
+    return TrainingPath(Popspa(SCENE, settings, views, threads=threads, progress=progress))
+
+
+def test_points_have_falling_numbers_and_know_their_gaussians():
+    walked = path()
+    walked.prune(40)
+    walked.train()
+    walked.prune(20)
+    walked.train()
+    assert [point.number for point in walked.points] == [0, 1, 2]
+    assert [len(point) for point in walked.points] == [60, 40, 20]
+    assert [point.trained for point in walked.points] == [False, True, True]
+    whole, one, two = walked.points
+    assert same(whole.splats, SCENE)
+    assert set(two.index) < set(one.index) < set(whole.index)
+    expected = prune_by_score(SCENE, around(5), black(), 40, min_score=0.3)
+    assert np.array_equal(one.index, expected)
+    assert not same(one.splats, SCENE.select(one.index))  # it was trained
+    moved = np.linalg.norm(two.splats.means - SCENE.means[two.index], axis=1)
+    assert moved.max() < 0.2
+
+
+def test_an_untrained_point_is_the_pruned_scene():
+    walked = path()
+    point = walked.prune(30)
+    assert same(point.splats, SCENE.select(point.index))
+    compacted = walked.compacted(point, refine=False)
+    assert same(compacted.splats, point.splats)
+    assert compacted.report.target_source == "nothing"
+    refined = walked.compacted(point, refine=True)
+    assert not same(refined.splats, point.splats)
+    assert refined.report.target_source == "renderings"
+    assert (compacted.report.source_count, compacted.report.count) == (60, 30)
+
+
+def test_refinement_leaves_the_path_as_it_is():
+    with_refinement, without = path(), path()
+    for walked in (with_refinement, without):
+        walked.prune(40)
+        walked.train()
+        if walked is with_refinement:
+            refined = walked.compacted(walked.points[-1], refine=True)
+            assert not same(refined.splats, walked.points[-1].splats)
+            assert same(refined.splats, walked.compacted(walked.points[-1], refine=True).splats)
+        walked.prune(20)
+        walked.train()
+    assert same(with_refinement.points[-1].splats, without.points[-1].splats)
+    assert same(without.compacted(without.points[-1], refine=False).splats, without.points[-1].splats)
+
+
+@pytest.mark.parametrize("stage", ["score", "sparsify"])
+def test_an_interruption_leaves_the_path_as_it_was(stage):
+    armed = []
+
+    def progress(now, fraction, note=""):
+        if armed and now == stage and fraction > 0.3:
+            armed.clear()
+            raise kissgs.Cancelled
+
+    def walk(walked, repeated):
+        for count in (40, 20):
+            for step in (lambda n=count: walked.prune(n), walked.train):
+                if repeated and (step == walked.train) == (stage == "sparsify"):
+                    armed.append(True)
+                    points = list(walked.points)
+                    with pytest.raises(kissgs.Cancelled):
+                        step()
+                    assert walked.points == points
+                step()
+        return walked.points[-1]
+
+    one, other = walk(path(progress=progress), repeated=True), walk(path(), repeated=False)
+    assert same(one.splats, other.splats)
+
+
+def test_states_can_be_forgotten():
+    kept, forgotten = path(), path()
+    forgotten.keep_states = False
+    for walked in (kept, forgotten):
+        for count in (40, 20):
+            walked.prune(count)
+            walked.train()
+    assert same(kept.points[-1].splats, forgotten.points[-1].splats)
+    assert [point.state is None for point in kept.points] == [True, False, False]
+    assert [point.state is None for point in forgotten.points] == [True, True, False]
+
+
+def test_the_path_does_not_depend_on_threads():
+    points = []
+    for threads in (1, 3):
+        walked = path(threads)
+        walked.prune(40)
+        walked.train()
+        points.append(walked.compacted(walked.points[-1], refine=True))
+    assert same(points[0].splats, points[1].splats)
