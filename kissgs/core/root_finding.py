@@ -1,4 +1,4 @@
-"""Root finding and minimisation in few evaluations, for expensive functions without derivatives."""
+"""Root finding in few evaluations, for expensive functions without derivatives."""
 
 from __future__ import annotations
 
@@ -8,9 +8,6 @@ from dataclasses import dataclass
 
 ATTEMPTS = 10
 """Default number of evaluations."""
-
-MIN_STEP = 0.2
-"""Smallest step of :func:`minimize_unimodal`."""
 
 MAX_EXTRAPOLATION = 4.0
 """Largest distance of an evaluation from known points, except for one at a bound."""
@@ -82,49 +79,6 @@ def find_root(
         known[bound] = margin(bound)
     met = [x for x, found in known.items() if found >= 0 and x not in (before or {})]
     return min(met, key=lambda x: known[x]) if met else None
-
-
-def minimize_unimodal(
-    cost: Callable[[float], float],
-    known: dict[float, float],
-    start: float,
-    step: float,
-    bounds: tuple[float, float],
-    feasible_side: float,
-    attempts: int,
-) -> None:
-    """Search for the minimum of a unimodal function: steps downhill, halved around the best point.
-
-    Args:
-        cost: function to minimise; infinite at infeasible points.
-        known: known points and costs; every evaluation is added.
-        start: first point.
-        step: first step; the first one goes down from ``start``.
-        bounds: smallest and largest point.
-        feasible_side: where to look from an infeasible point: above it (1) or below it (-1).
-        attempts: largest number of evaluations.
-    """
-    x: float | None = min(max(start, bounds[0]), bounds[1])
-    for _ in range(attempts):
-        if x is None:
-            break
-        known[x] = cost(x)
-        x, step = _next_point(known, step, bounds, feasible_side)
-
-
-def _next_point(
-    known: dict[float, float], step: float, bounds: tuple[float, float], feasible_side: float
-) -> tuple[float | None, float]:
-    """Return the next point beside the best known one, and the step; None if all points nearby are known."""
-    best = min(known, key=lambda x: (known[x], -feasible_side * x))
-    directions = (feasible_side,) if math.isinf(known[best]) else (-1.0, 1.0)
-    while step >= MIN_STEP:
-        for direction in directions:
-            x = min(max(best + direction * step, bounds[0]), bounds[1])
-            if min(abs(x - other) for other in known) > step / 2:
-                return x, step
-        step /= 2
-    return None, step
 
 
 def _rounded(x: float, grain: float) -> float:

@@ -1,61 +1,93 @@
-"""Search for the number of Gaussians that serves a goal best: fewer with fine levels, or more with coarse ones."""
+"""Search for the number of Gaussians and the lambda that serve a goal best."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from kissgs.compaction.result import CountTrial
-from kissgs.core.errors import StopSearch, UnsupportedError
-from kissgs.core.root_finding import minimize_unimodal
+from kissgs.core.errors import StopSearch
+from kissgs.core.progress import SearchNote, ignore_stop_search
 from kissgs.core.splats import Splats
 from kissgs.evaluation.psnr_loss import drop_of
-from kissgs.pipeline.goal import Goal
-from kissgs.pipeline.rate_control import RateControl
+from kissgs.pipeline.encoding import FinetuneFactors
+from kissgs.pipeline.goal import HALF_ERROR_DB, Goal
+from kissgs.pipeline.path_points import OVERHEAD_BYTES, POINTS_PER_HALVING, count_at, last_number, number_for_size
+from kissgs.pipeline.rate_control import Container, Encoder, RateControl
+from kissgs.pipeline.trained_search import Position, search_positions
+from kissgs.pipeline.training_choice import has_photographs
 from kissgs.pipeline.trial import Trial
 from kissgs.sogxt.container import stored_sizes
 
 if TYPE_CHECKING:
     from kissgs.compaction.budget import Compactor
     from kissgs.compaction.result import Compacted
+    from kissgs.compaction.training_path import PathPoint, TrainingPath
+    from kissgs.finetuning.tune import Tuner
     from kissgs.pipeline.encoding import Encoding
 
-BYTES_GROWTH = 1.4
-"""Bytes per Gaussian expected after compaction, relative to the uncompacted scene; only for the first guess."""
+PRUNABLE_DROP = 1.0
+"""Drop of PSNR, decibels, up to which pruning goes on without training."""
 
-QUALITY_START_LOG2 = -2.0
-"""log2 of the share of the Gaussians that is tried first where the goal is no size."""
+PRUNABLE_POINTS = 3
+"""Number of the last point that is pruned without training where there are photographs: half of the Gaussians."""
 
-FIRST_STEP_LOG2 = {True: 0.5, False: 1.0}
-"""First change of log2(count): True where the goal is a size."""
+FIRST_NUMBER = 5
+"""Number of the point that is tried first with photographs where the goal is no size: a third of the Gaussians."""
+
+TRAINED_OFFSET_DB = 3.0
+"""Added to ``quality_offset_db`` for a scene trained on photographs. At equal bytes, fewer Gaussians with finer levels
+then lose less than more Gaussians with coarser ones (fox: 15 % of the Gaussians at 5 dB, 25 % at 0)."""
+
+COMPLETING = FinetuneFactors(steps=1.2, lr=2.5, codebook_lr=2.0)
+"""Fine-tuning that completes the training of the path too.
+
+A refinement of the scene before its encoding would take more steps for the same quality.
+"""
 
 
 @dataclass(frozen=True, slots=True)
-class CountCandidate:
-    """The result for one number of Gaussians.
+class Candidate:
+    """A number of Gaussians with containers that meet the goal.
 
     Attributes:
-        cost: to be minimised: minus the PSNR of the evaluation where the goal is a size, else the container's bytes;
-            infinite if this count cannot meet the goal.
-        search: the search that made the containers of this count; None if none was made.
-        compacted: the compacted scene; None for the scene with all its Gaussians.
+        cost: of the best container, to be minimised: minus PSNR where the goal is a size, else bytes.
+        search: the search that made the containers.
+        compacted: the scene that they hold.
     """
 
     cost: float
-    search: RateControl | None = None
-    compacted: Compacted | None = None
+    search: RateControl
+    compacted: Compacted
+
+
+@dataclass(frozen=True, slots=True)
+class TrainedScene:
+    """A scene of the path, and what makes containers of it.
+
+    Attributes:
+        compacted: the scene.
+        search: the search for its lambda.
+        encoder: encodes it, with fine-tuning if that is wanted.
+    """
+
+    compacted: Compacted
+    search: RateControl
+    encoder: Encoder
 
 
 @dataclass(slots=True, eq=False)
 class CountSearch:
-    """Compact the scene to several counts, and search for the best container of each.
+    """Prune and train a scene along a path, and make containers at the points that promise most.
 
-    The uncompacted scene is encoded first; its size gives the first guess of a count. The compacted scene is evaluated
-    before it is encoded, so that a count that already misses the goal costs no encoding.
+    Training on photographs starts where pruning alone begins to show. Renderings of the scene itself teach little: with
+    them, training starts only for a size that pruning alone cannot reach. With fine-tuning, a point of the path is
+    encoded as it is, and the training is completed through the decoder.
 
     Attributes:
-        encoding: encoding of the scene with all its Gaussians; fine-tuning follows after this search.
+        encoding: encoding of the whole scene.
         compactor: compactor of the same scene.
         trials: all containers that were made, in order.
     """
@@ -63,112 +95,221 @@ class CountSearch:
     encoding: Encoding
     compactor: Compactor
     trials: list[Trial] = field(default_factory=list)
-    _tried: list[CountTrial] = field(default_factory=list)
-    _candidates: dict[int, CountCandidate] = field(default_factory=dict)
-    _full_search: RateControl | None = None
-    _stopped: bool = False
+    _path: TrainingPath = field(init=False)
+    _pruned: list[Trial] = field(init=False, default_factory=list)
+    _tried: list[CountTrial] = field(init=False, default_factory=list)
+    _best: Candidate | None = field(init=False, default=None)
+    _tuner: Tuner | None = field(init=False, default=None)
+    _whole: RateControl | None = field(init=False, default=None)
+    _trained: dict[int, TrainedScene] = field(init=False, default_factory=dict)
+    _stopped: bool = field(init=False, default=False)
 
-    def run(self) -> tuple[Compacted, RateControl, tuple[Trial, ...]]:
-        """Return the compacted scene that serves the goal best, the search that made its container, and all trials.
+    def __post_init__(self) -> None:
+        self._path = self.compactor.path(keep_states=not self._tunes)
+
+    def run(self) -> tuple[Compacted, RateControl | None, tuple[Trial, ...]]:
+        """Return the scene that serves the goal best, the search that made its container, and all trials.
+
+        If no smaller number of Gaussians serves the goal, the search is that for all of them, None if there was none.
 
         Raises:
-            UnsupportedError: no count meets the goal.
+            StopSearch: the search was stopped before any container met the goal.
         """
         from kissgs.compaction.budget import unchanged
 
-        splats, log2_all = self.compactor.splats, math.log2(len(self.compactor.splats))
         try:
-            uncompacted = self._candidates[len(splats)] = self._encode(splats, None)
-            self._full_search = uncompacted.search
-            if not (self._stopped or self._keeps_all(uncompacted)):
-                by_size = self.goal.by_size
-                start = log2_all + (min(self._first_guess(), 0.0) if by_size else QUALITY_START_LOG2)
-                feasible_side = -1.0 if by_size else 1.0  # fewer Gaussians take fewer bytes, more have a higher PSNR
-                attempts = self.encoding.settings.compact.max_compactions
-                known, step = {log2_all: uncompacted.cost}, FIRST_STEP_LOG2[by_size]
-                minimize_unimodal(self._cost, known, start, step, (0.0, log2_all), feasible_side, attempts)
+            self._search()
         except StopSearch:
-            if all(math.isinf(candidate.cost) for candidate in self._candidates.values()):
-                raise
             self._stopped = True
-        best = self._candidates[min(self._candidates, key=lambda count: (self._candidates[count].cost, count))]
-        if best.search is None or best.search.best is None:
-            raise UnsupportedError(self.goal.failure_message(self.trials, suggest_compaction=False))
-        best.search.stopped |= self._stopped
-        compacted = best.compacted or unchanged(splats, self._reason_to_keep_all())
+            if self._best is None:
+                progress = SearchNote(ignore_stop_search(self.encoding.progress))
+                self.encoding = replace(self.encoding, progress=progress)
+                self._encode(self._path.compacted(self._latest_point(), refine=False))
+            if self._best is None:
+                raise
+        best, compacted = self._best, unchanged(self.compactor.splats, self._reason_to_keep_all())
+        if best is not None:
+            best.search.stopped |= self._stopped
+            compacted = compacted if best.compacted.splats is self.compactor.splats else best.compacted
         notes = filter(None, [compacted.report.note, self.compactor.note])
         report = replace(compacted.report, trials=tuple(self._tried), note="; ".join(notes))
-        return replace(compacted, report=report), best.search, tuple(self.trials)
+        return replace(compacted, report=report), self._whole if best is None else best.search, tuple(self.trials)
 
     @property
     def goal(self) -> Goal:
         """The goal that the settings name."""
         return Goal.of(self.encoding.settings.encode)
 
-    def _keeps_all(self, uncompacted: CountCandidate) -> bool:
-        """Whether no smaller count needs to be tried.
+    @property
+    def _tunes(self) -> bool:
+        return bool(self.encoding.settings.finetune.enabled)
 
-        Without a target size: if even all Gaussians miss the goal. With one: if all of them fit at the preset's own
-        quality, or if the files that are no images already exceed the target.
-        """
-        target_size = self.encoding.settings.encode.target_size
-        if target_size is None or self._full_search is None:
-            return math.isinf(uncompacted.cost)
-        return self.trials[0].bytes <= target_size or self._full_search.overhead >= target_size
+    @property
+    def _photographs(self) -> bool:
+        """Whether to train on photographs; never for a PSNR to the scene's own renderings, which then falls."""
+        trains = self.compactor.settings.trains and self.goal.limits[0].setting != "psnr"
+        return trains and has_photographs(self.encoding.views)
 
-    def _reason_to_keep_all(self) -> str:
-        if self._tried:
-            return "and none of the smaller counts tried serves the goal better"
-        if self._stopped:
-            return "and the search was stopped before a smaller count was tried"
-        return "and all of them fit into the target size"
+    @property
+    def _target_size(self) -> int:
+        return self.encoding.settings.encode.target_size or 0
 
-    def _first_guess(self) -> float:
-        """Return log2 of the share of the Gaussians that may fit into the target size at the preset's own quality."""
-        target_size = self.encoding.settings.encode.target_size or 1
-        overhead = 0 if self._full_search is None else self._full_search.overhead
-        available, used = target_size - overhead, self.trials[0].bytes - overhead
-        return math.log2(max(available, 1) / (BYTES_GROWTH * used))
+    @property
+    def _number_for_size(self) -> int:
+        return number_for_size(self.compactor.splats, self._target_size)
 
-    def _cost(self, x: float) -> float:
-        splats = self.compactor.splats
-        count = min(max(1, round(2**x)), len(splats) - 1)
-        if self._stopped:
-            return math.inf
-        if count in self._candidates:
-            return self._candidates[count].cost
-        self.encoding.progress.note = f"{count:,} Gaussians"
-        compacted = self.compactor(count)
-        evaluation = self.compactor.evaluate(compacted)
-        trial = self.goal.measured(Trial(count, None, 0), evaluation)
-        limit = self.goal.decisive(trial)
-        ssim_decides = limit.setting == "max_ssim_drop"
-        self._tried.append(CountTrial(count, drop_of(evaluation), trial.ssim_drop, ssim_decides))
-        infeasible = not self.goal.by_size and limit.room(trial) < 0
-        candidate = (
-            CountCandidate(math.inf, None, compacted) if infeasible else self._encode(compacted.splats, compacted)
+    def _search(self) -> None:
+        if not self._photographs:
+            self._search_without_photographs()
+        elif not self.goal.by_size or (self._target_size > OVERHEAD_BYTES and self._number_for_size > 0):
+            self._prune()
+            self._search_along_path()
+
+    def _search_without_photographs(self) -> None:
+        """Encode all Gaussians, then those that leave half of the error to the encoder, or as many as fit the size."""
+        search = self._whole = self._encode(self._path.compacted(self._path.points[0], refine=False))
+        if search.stopped or (self.goal.by_size and search.trials[0].bytes <= self._target_size):
+            return
+        if not self.goal.by_size:
+            if search.best is not None:
+                self._prune()
+                self._encode_last_pruned(lambda trial: self.goal.margin(trial) >= self.goal.decisive(trial).half)
+        elif self._target_size > search.overhead:
+            self._prune()
+            if search.best is None or self._number_for_size > len(self._pruned):
+                self._search_along_path() if self._tunes else self._encode_by_size()
+            else:
+                error = search.evaluate(search.best.encoded).mean.candidate_vs_reference.psnr
+                self._encode_last_pruned(lambda trial: (trial.psnr or 0.0) >= error + HALF_ERROR_DB)
+
+    def _prune(self) -> None:
+        """Prune without training as far as that serves the goal, and record what each point loses."""
+        while len(self._path.points[-1]) > 1:
+            point = self._path.prune(count_at(len(self._path.points), len(self.compactor.splats)))
+            trial = self._measure(point.splats)
+            self._pruned.append(trial)
+            useful = self._photographs or self.goal.by_size or self.goal.margin(trial) >= self.goal.decisive(trial).half
+            enough = self._photographs and point.number == PRUNABLE_POINTS
+            if enough or not useful or not (trial.drop or 0.0) <= PRUNABLE_DROP:  # a drop may be NaN
+                break
+
+    def _encode_last_pruned(self, serves: Callable[[Trial], bool]) -> None:
+        """Search for the lambda at the last point that ``serves`` the goal."""
+        numbers = [number for number, trial in enumerate(self._pruned, 1) if serves(trial)]
+        if numbers:
+            self._encode(self._path.compacted(self._path.points[numbers[-1]], refine=False))
+
+    def _encode_by_size(self) -> None:
+        """Search for the lambda at the point that the size suggests, or at a later one if its containers are larger."""
+        for attempt in range(self.compactor.settings.max_compactions):
+            compacted = self._path.compacted(self._trained_point(self._number_for_size + 2 * attempt), refine=True)
+            self._measure(compacted.splats)
+            if self._encode(compacted).best is not None:
+                return
+
+    def _search_along_path(self) -> None:
+        """Make containers of points of the path; see :func:`search_positions`."""
+        search_positions(
+            self.goal,
+            self._encode_position,
+            self._number_for_size if self.goal.by_size else FIRST_NUMBER,
+            (1, last_number(len(self.compactor.splats))),
+            POINTS_PER_HALVING,
+            self.compactor.settings.max_compactions,
         )
-        self._candidates[count] = candidate
-        return candidate.cost
 
-    def _encode(self, splats: Splats, compacted: Compacted | None) -> CountCandidate:
-        cache = self.encoding.cache if compacted is None else None
-        search = replace(self.encoding, splats=splats, cache=cache).search(byte_limit=self._best_bytes())
-        self._stopped = search.stopped
-        self.trials += search.trials
-        if search.best is None:
-            return CountCandidate(math.inf, search, compacted)
-        encoded = search.best.encoded
-        if not search.goal.by_size:
-            return CountCandidate(stored_sizes(encoded.files, packed=self.encoding.packed)[0], search, compacted)
+    def _encode_position(self, position: Position) -> RateControl:
+        """Make the container of a position of the path; return the search of that number of Gaussians."""
+        number, progress = position.number, self.encoding.progress
+        last = f"; last: {self.trials[-1].summary()}" if self.trials else ""
+        progress.note = f"{count_at(number, len(self.compactor.splats)):,} Gaussians{last}"
+        if number not in self._trained:
+            self._trained[number] = self._train(number)
+        trained = self._trained[number]
+        before = len(trained.search.trials)
         try:
-            psnr = search.evaluate(encoded).mean.candidate.psnr
-        except StopSearch:  # raised only once, when the evaluation began
-            self._stopped, psnr = True, search.evaluate(encoded).mean.candidate.psnr
-        return CountCandidate(-min(psnr, 1e3), search, compacted)
+            trained.search.make(trained.encoder, None if position.log2_lambda is None else 2.0**position.log2_lambda)
+        finally:
+            self.trials += trained.search.trials[before:]
+        self._stopped |= trained.search.stopped
+        self._keep(trained.search, trained.compacted)
+        return trained.search
+
+    def _train(self, number: int) -> TrainedScene:
+        """Train up to a point of the path, and prepare its encoding."""
+        compacted = self._path.compacted(self._trained_point(number), refine=not self._tunes)
+        encoding = self._encoding_of(compacted)
+        if self._tunes:  # training replaces the refit of colours
+            encoding = encoding.with_encode_settings(color_refit_iterations=0)
+            self._tuner = self._tuner or encoding.tuner(COMPLETING)
+        offset = TRAINED_OFFSET_DB if self._photographs else 0.0
+        search = encoding.rate_control(offset_db=offset, byte_limit=self._best_bytes())
+        return TrainedScene(compacted, search, encoding.encoder(self._tuner))
+
+    def _trained_point(self, number: int) -> PathPoint:
+        """Prune and train up to a point of the path."""
+        path = self._path
+        while len(path.points) <= number:
+            if not path.points[-1].trained:
+                path.train()
+            path.prune(count_at(len(path.points), len(self.compactor.splats)))
+            path.train()
+        return path.points[number]
+
+    def _encode(self, compacted: Compacted) -> RateControl:
+        """Search for the lambda of a scene without fine-tuning."""
+        search = self._encoding_of(compacted).search(byte_limit=self._best_bytes())
+        self._stopped |= search.stopped
+        self.trials += search.trials
+        self._keep(search, compacted)
+        return search
+
+    def _encoding_of(self, compacted: Compacted) -> Encoding:
+        cache = self.encoding.cache if compacted.splats is self.encoding.splats else None
+        return replace(self.encoding, splats=compacted.splats, cache=cache)
+
+    def _keep(self, search: RateControl, compacted: Compacted) -> None:
+        """Keep the best container of a search if it is better than that of all others."""
+        if search.best is None:
+            return
+        cost = float(stored_sizes(search.best.encoded.files, packed=self.encoding.packed)[0])
+        if self.goal.by_size:
+            cost = -self._psnr(search, search.best)
+        if self._best is None or cost < self._best.cost:
+            self._best = Candidate(cost, search, compacted)
+
+    def _psnr(self, search: RateControl, container: Container) -> float:
+        """Return the PSNR of a container, at most 1000 dB; minus infinity if a rendering failed."""
+        try:
+            psnr = search.evaluate(container.encoded).mean.candidate.psnr
+        except StopSearch:  # the container exists, so it is evaluated before the search ends
+            search.stopped = self._stopped = True
+            psnr = search.evaluate(container.encoded).mean.candidate.psnr
+        return -math.inf if math.isnan(psnr) else min(psnr, 1e3)
 
     def _best_bytes(self) -> float:
         """Return the bytes of the best container so far; infinite where bytes are not the cost."""
-        if self.goal.by_size:
-            return math.inf
-        return min((candidate.cost for candidate in self._candidates.values()), default=math.inf)
+        return math.inf if self._best is None or self.goal.by_size else self._best.cost
+
+    def _measure(self, splats: Splats) -> Trial:
+        """Return the figures of a scene that is not encoded, and record them for the report."""
+        evaluation = self.compactor.evaluate(splats)
+        trial = self.goal.measured(Trial(len(splats), None, 0), evaluation)
+        ssim_decides = self.goal.decisive(trial).setting == "max_ssim_drop"
+        self._tried.append(CountTrial(len(splats), drop_of(evaluation), trial.ssim_drop, ssim_decides))
+        return trial
+
+    def _latest_point(self) -> PathPoint:
+        """Return the last point if it is trained, else the last one that loses less than the goal allows."""
+        points = self._path.points
+        if points[-1].trained or self.goal.by_size:
+            return points[-1]
+        met = [number for number, trial in enumerate(self._pruned, 1) if self.goal.margin(trial) >= 0]
+        return points[max(met, default=0)]
+
+    def _reason_to_keep_all(self) -> str:
+        if self._tried:
+            return "and no smaller number of Gaussians that was tried serves the goal better"
+        if self._stopped:
+            return "and the search was stopped before a smaller number was tried"
+        return "and all of them fit into the target size"

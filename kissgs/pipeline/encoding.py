@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -47,10 +47,28 @@ SENSITIVITY_VERSION = 5
 MAX_FINETUNED_ENCODES = 4
 """Largest number of containers that a search for a goal fine-tunes; each takes a training."""
 
+MAX_OFFSET_DB = 30.0
+"""Largest value of the setting ``quality_offset_db``."""
+
 REFIT_SIZE = 320
 """Largest longer side of the images that colours are refitted to, pixels."""
 
 Planner = Callable[[EncodeSettings, Progress], EncodingPlan]
+
+
+@dataclass(frozen=True, slots=True)
+class FinetuneFactors:
+    """Factors on settings of fine-tuning.
+
+    Attributes:
+        steps: factor on the number of steps.
+        lr: factor on the learning rate of all attributes but the SH codebook.
+        codebook_lr: factor on that of the SH codebook.
+    """
+
+    steps: float
+    lr: float
+    codebook_lr: float
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
@@ -91,11 +109,14 @@ class Encoding:
     progress: SearchNote
     disposable: bool = False
 
-    def run(self, search: RateControl | None = None) -> tuple[Container, tuple[Trial, ...]]:
+    def run(
+        self, search: RateControl | None = None, trained: Sequence[Trial] = ()
+    ) -> tuple[Container, tuple[Trial, ...]]:
         """Encode the scene; return the container, and the trials of the search if the settings name a goal.
 
         Args:
             search: search for that goal if it was made before; its trials are not returned again.
+            trained: trials of other numbers of Gaussians, for the error.
 
         Raises:
             InvalidViewsError: a photograph cannot be read.
@@ -106,20 +127,21 @@ class Encoding:
         if not encode.has_goal and not self.settings.finetune.enabled:
             return self._encode_once(encode), ()
         if not encode.has_goal:
-            return self._encoder(self._planner(), self._tuner(), self.checkpoint)(encode), ()
+            return self._encoder(self._planner(), self.tuner(), self.checkpoint)(encode), ()
         planner = None
         if search is None:
             planner = self._planner()
             search = self.search(planner)
-        if self.settings.finetune.enabled and len(self.splats) > 0 and not search.stopped:
+        tunes = self.settings.finetune.enabled and len(self.splats) > 0
+        if tunes and not (search.stopped or search.finetuned):
             rd_lambda = search.trials[-1].rd_lambda if search.best is None else search.best.encoded.rd_lambda
             try:
-                encoder = self._encoder(planner or self._planner(), self._tuner(), None)
+                encoder = self._encoder(planner or self._planner(), self.tuner(), None)
                 search.run(encoder, rd_lambda, min(MAX_FINETUNED_ENCODES, encode.max_encodes))
             except StopSearch:  # raised while sensitivity was measured or targets were rendered
                 if search.best is None:
                     raise
-        container = search.result(suggest_compaction=not self.settings.compact.auto_count)
+        container = search.result(trained=trained, suggest_compaction=not self.settings.compact.auto_count)
         return container, tuple(search.trials[returned:])
 
     def _encode_once(self, settings: EncodeSettings) -> Container:
@@ -147,9 +169,23 @@ class Encoding:
 
     def search(self, planner: Planner | None = None, byte_limit: float = math.inf) -> RateControl:
         """Search for the goal of the settings without fine-tuning; see :class:`RateControl` for ``byte_limit``."""
-        search = RateControl(
+        search = self.rate_control(byte_limit=byte_limit)
+        search.search_all(self._encoder(planner or self._planner(), None, None))
+        return search
+
+    def rate_control(self, *, offset_db: float = 0.0, byte_limit: float = math.inf) -> RateControl:
+        """Return a search that has no container yet.
+
+        Args:
+            offset_db: added to ``quality_offset_db`` of the settings, for the first container.
+            byte_limit: see :class:`RateControl`.
+        """
+        settings = self.settings.encode
+        return RateControl(
             self.original,
-            self.settings.encode,
+            settings.model_copy(
+                update={"quality_offset_db": min(settings.quality_offset_db + offset_db, MAX_OFFSET_DB)}
+            ),
             self.views,
             self.threads,
             self.progress,
@@ -157,8 +193,15 @@ class Encoding:
             packed=self.packed,
             byte_limit=byte_limit,
         )
-        search.search_all(self._encoder(planner or self._planner(), None, None))
-        return search
+
+    def with_encode_settings(self, **changes: float) -> Encoding:
+        """Return a copy with other settings of the encoder."""
+        encode = self.settings.encode.model_copy(update=changes)
+        return replace(self, settings=self.settings.model_copy(update={"encode": encode}))
+
+    def encoder(self, tuner: Tuner | None) -> Encoder:
+        """Return a function that plans, fine-tunes if there is a tuner, and writes the files."""
+        return self._encoder(self._planner(), tuner, None)
 
     def _encoder(self, planner: Planner, tuner: Tuner | None, checkpoint: Path | None) -> Encoder:
         """Return a function that plans, fine-tunes if there is a tuner, and writes the files."""
@@ -186,14 +229,20 @@ class Encoding:
         threshold = max(settings.prune_threshold_bits, self.settings.finetune.prune_threshold_bits)
         return settings.model_copy(update={"prune_threshold_bits": threshold})
 
-    def _tuner(self) -> Tuner | None:
-        if not self.settings.finetune.enabled or len(self.splats) == 0:
+    def tuner(self, factors: FinetuneFactors | None = None) -> Tuner | None:
+        """Return what fine-tunes the container, if the settings ask for it; ``factors`` change its settings."""
+        settings = self.settings.finetune
+        if not settings.enabled or len(self.splats) == 0:
             return None
         from kissgs.finetuning.tune import Tuner
 
+        if factors is not None:
+            changes = {"steps": max(1, round(factors.steps * settings.steps)), "lr": factors.lr * settings.lr}
+            changes["codebook_lr"] = factors.codebook_lr * settings.codebook_lr
+            settings = settings.model_copy(update=changes)
         return Tuner.of(
             self.original,
-            self.settings.finetune,
+            settings,
             self.views,
             device=self.device,
             threads=self.threads,
@@ -254,7 +303,7 @@ class Encoding:
                 sensitivity=sensitivity,
                 recolor=recolor,
                 container=MODELS[self.container],
-                keep_costs=self.settings.finetune.enabled,
+                keep_costs=bool(self.settings.finetune.enabled),
                 threads=self.threads,
                 progress=without_kernels,
             )

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from kissgs.evaluation.results import Evaluation
 
 
+HALF_ERROR_DB = 10 * math.log10(2)
+"""Increase of PSNR, decibels, by half of the squared error."""
+
+
 @dataclass(frozen=True, slots=True)
 class Limit:
     """A limit that one setting names.
@@ -25,12 +29,17 @@ class Limit:
         value: value of the setting: bytes, decibels, or a difference of SSIM.
         slope: typical change of :meth:`room` per doubling of lambda.
         near: room that is small enough to stop the search.
+        half: room of a scene that has half of the error allowed; 0 for a size.
+        per_halving: typical change of :meth:`figure` by half as many Gaussians, for a size of its log2; NaN for a PSNR,
+            for which no number is searched with training.
     """
 
     setting: str
     value: float
     slope: float
     near: float
+    half: float
+    per_halving: float
 
     def figure(self, trial: Trial) -> float | None:
         """Return what is limited of a trial, in the unit of ``value``; None if it is unknown."""
@@ -60,6 +69,19 @@ class Limit:
         # a drop is infinite where the photographs equal the renderings of the scene
         return math.log2(self.value / found) if found < math.inf else -math.inf
 
+    def halvings(self, trial: Trial) -> float:
+        """Return how often the number of Gaussians could typically be halved to come near the limit; below 0 for more.
+
+        NaN for a PSNR, and where the figure is unknown or not a number.
+        """
+        found = self.figure(trial)
+        if found is None:
+            return math.nan
+        aim = self.value * 2 ** (-self.near / 2)
+        if self.setting == "target_size":
+            return math.log2(aim / found) / self.per_halving
+        return (aim - found) / self.per_halving
+
 
 @dataclass(frozen=True, slots=True)
 class Goal:
@@ -80,14 +102,18 @@ class Goal:
         """
         limits = []
         if settings.target_size is not None:
-            limits.append(Limit("target_size", settings.target_size, 0.2, -math.log2(0.97)))
+            size = settings.target_size
+            limits.append(Limit("target_size", size, slope=0.2, near=-math.log2(0.97), half=0.0, per_halving=-1.0))
         if settings.psnr is not None:
-            limits.append(Limit("psnr", settings.psnr, -1.5, 0.1))
+            psnr = settings.psnr
+            limits.append(Limit("psnr", psnr, slope=-1.5, near=0.1, half=HALF_ERROR_DB, per_halving=math.nan))
         if settings.max_psnr_drop is not None:
-            near = -math.log2(max(1 - 0.02 / settings.max_psnr_drop, 0.5))
-            limits.append(Limit("max_psnr_drop", settings.max_psnr_drop, -0.5, near))
+            drop = settings.max_psnr_drop
+            near = -math.log2(max(1 - 0.02 / drop, 0.5))
+            limits.append(Limit("max_psnr_drop", drop, slope=-0.5, near=near, half=1.0, per_halving=0.3))
         if settings.max_ssim_drop is not None:
-            limits.append(Limit("max_ssim_drop", settings.max_ssim_drop, -0.6, -math.log2(0.95)))
+            drop, near = settings.max_ssim_drop, -math.log2(0.95)
+            limits.append(Limit("max_ssim_drop", drop, slope=-0.6, near=near, half=1.0, per_halving=0.006))
         return cls(tuple(limits))
 
     @property
@@ -107,11 +133,19 @@ class Goal:
         """Return the room of a trial to the limit that decides (:meth:`Limit.room`): at least 0 where all are met."""
         return self.decisive(trial).room(trial)
 
-    def failure_message(self, trials: Sequence[Trial], *, suggest_compaction: bool) -> str:
-        """Return why no trial meets the goal; ``suggest_compaction``: whether fewer Gaussians might, untried so far."""
+    def failure_message(
+        self, trials: Sequence[Trial], trained: Sequence[Trial] = (), *, suggest_compaction: bool
+    ) -> str:
+        """Return why no trial meets the goal.
+
+        Args:
+            trials: trials of one search for lambda, of which those at the last lambda count.
+            trained: other trials.
+            suggest_compaction: whether fewer Gaussians might meet it, untried so far.
+        """
         lambdas = [trial.rd_lambda for trial in trials if trial.rd_lambda]
         extreme = (max if self.by_size else min)(lambdas, default=None)
-        trials = [trial for trial in trials if trial.rd_lambda in (None, extreme)]  # those at the extreme lambda
+        trials = [*(trial for trial in trials if trial.rd_lambda in (None, extreme)), *trained]
         if self.by_size:
             smallest, target = min(trial.bytes for trial in trials), int(self.limits[0].value)
             return (

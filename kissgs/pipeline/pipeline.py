@@ -22,6 +22,7 @@ from kissgs.pipeline.containers import FILES
 from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.report import Report
 from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, save_ply
+from kissgs.pipeline.training_choice import decided, note_on_training
 from kissgs.rendering.rasterizer import Device
 from kissgs.settings import EncodeSettings, Settings
 from kissgs.settings.encode import GOALS
@@ -190,7 +191,10 @@ def compress(
     """
     from kissgs.pipeline.encoding import Encoding
 
-    settings = settings or Settings()
+    requested = settings or Settings()
+    settings = decided(requested, views)
+    if sensitivity is not None and requested.compact.auto_count is None:  # it is of all Gaussians
+        settings = settings.model_copy(update={"compact": settings.compact.model_copy(update={"auto_count": False})})
     target = Path(destination) if destination is not None else None
     kind = named_container(container, target)
     if target is not None:
@@ -222,7 +226,7 @@ def compress(
         encoding = replace(encoding, splats=compacted.splats)
     if not settings.encode.has_goal:
         encoding = replace(encoding, progress=SearchNote(after_search))
-    result, more = encoding.run(search)
+    result, more = encoding.run(search, trials)
     encoded = result.encoded
     container_bytes, file_bytes = stored_sizes(encoded.files, packed=encoding.packed)
     evaluation = _evaluate(encoding.original, encoded.files, views, threads, after_search) if evaluate else None
@@ -244,7 +248,7 @@ def compress(
         finetuning=result.finetuning,
         invisible=encoded.invisible,
         pruned_by_rd=encoded.pruned_by_rd,
-        note="; ".join(filter(None, [encoded.note, result.note])),
+        note="; ".join(filter(None, [encoded.note, result.note, note_on_training(requested, views)])),
         clipped_colors=encoded.clipped_colors,
         form_error=encoded.form_error,
         max_quantization_error=encoded.errors,
@@ -275,8 +279,9 @@ def _check_finetuning(
 
 def _settings_as_used(requested: Settings, used: EncodeSettings) -> dict[str, Any]:
     """Return the requested settings with the changes by a search for a goal and by fine-tuning."""
-    goals = {name: getattr(requested.encode, name) for name in (*GOALS, "rd_lambda")}
-    return requested.model_copy(update={"encode": used.model_copy(update=goals)}).model_dump(mode="json")
+    kept = (*GOALS, "rd_lambda", "quality_offset_db", "color_refit_iterations")  # the same request gives the same bytes
+    changes = {name: getattr(requested.encode, name) for name in kept}
+    return requested.model_copy(update={"encode": used.model_copy(update=changes)}).model_dump(mode="json")
 
 
 class _Common(TypedDict):

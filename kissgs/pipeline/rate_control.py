@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -161,10 +161,26 @@ class RateControl:
             self.run(encoder, rd_lambda, remaining)
 
     @property
+    def finetuned(self) -> bool:
+        """Whether a container was fine-tuned."""
+        return self._finetuning is not None
+
+    @property
     def _short(self) -> bool:
         """Whether all samples are well below the target size, or all miss the quality goal."""
         margins = [sample.margin for sample in self._samples.values()]
         return min(margins) > self.goal.limits[0].near if self.goal.by_size else max(margins) < 0
+
+    def make(self, encoder: Encoder, rd_lambda: float | None) -> None:
+        """Make one container, at ``rd_lambda`` or as the settings say."""
+        container = encoder(self.settings if rd_lambda is None else self._settings_at(rd_lambda))
+        try:
+            self._sample(container)
+        except _CannotImprove:
+            self.cannot_improve = True
+        except StopSearch:  # the container exists, so it is evaluated before the search ends
+            self.stopped = True
+            self._sample(container)
 
     def run(self, encoder: Encoder, rd_lambda: float | None = None, attempts: int | None = None) -> None:
         """Make up to ``attempts`` containers, by default ``max_encodes``, the first at ``rd_lambda``."""
@@ -179,8 +195,10 @@ class RateControl:
         finally:
             self.progress.note = ""
 
-    def result(self, *, suggest_compaction: bool = True) -> Container:
+    def result(self, *, trained: Sequence[Trial] = (), suggest_compaction: bool = True) -> Container:
         """Return the best container; its reports say if fine-tuning was in vain, or if the target size is out of reach.
+
+        ``trained`` are the trials of other numbers of Gaussians.
 
         Raises:
             UnsupportedError: no container meets the goal. With ``suggest_compaction``, the message may advise fewer
@@ -188,7 +206,7 @@ class RateControl:
         """
         if self.best is None:
             suggest = suggest_compaction and self.count > 1 and self.overhead < (self.settings.target_size or 0)
-            raise UnsupportedError(self.goal.failure_message(self.trials, suggest_compaction=suggest))
+            raise UnsupportedError(self.goal.failure_message(self.trials, trained, suggest_compaction=suggest))
         best = replace(self.best, note=self._surplus_note(self.best))
         if self._finetuning is None or best.finetuning is not None:
             return best

@@ -52,11 +52,18 @@ class Trial:
 
     def summary(self) -> str:
         """Return size and quality in one phrase: "812 kB at 41.20 dB, drop 0.12 dB, worst view 35.1 dB"."""
-        psnr = "" if self.psnr is None else f" at {self.psnr:.2f} dB"
-        drop = "" if self.drop is None else f", drop {self.drop:.2f} dB"
-        ssim = "" if self.ssim_drop is None else f", SSIM drop {self.ssim_drop:.3g}"
-        worst = "" if self.worst is None else f", worst view {self.worst:.1f} dB"
-        return f"{self.bytes / 1000:,.0f} kB{psnr}{drop}{ssim}{worst}"
+        quality = self.quality()
+        return f"{self.bytes / 1000:,.0f} kB{quality and f' at {quality}'}"
+
+    def quality(self) -> str:
+        """Return the figures of quality in one phrase, empty where the goal is a size."""
+        parts = [
+            None if self.psnr is None else f"{self.psnr:.2f} dB",
+            None if self.drop is None else f"drop {self.drop:.2f} dB",
+            None if self.ssim_drop is None else f"SSIM drop {self.ssim_drop:.3g}",
+            None if self.worst is None else f"worst view {self.worst:.1f} dB",
+        ]
+        return ", ".join(filter(None, parts))
 
     def as_dict(self) -> dict[str, Any]:
         """Return all fields for JSON: infinity as null, NaN (a failed rendering) as the string ``"NaN"``."""

@@ -22,10 +22,12 @@ class CompactSettings(TrainingViewSettings):
         "PSNR, decibels. Takes several compactions. Without photographs, the loss is estimated at random cameras, "
         "other ones than those of 'evaluate', as if the original scene had 30 dB to photographs.",
     )
-    auto_count: bool = Field(
-        False,
+    auto_count: bool | None = Field(
+        None,
         description="Choose the number of Gaussians that meets the goal of encode best. Needs target_size, psnr, "
-        "max_psnr_drop or max_ssim_drop of encode.",
+        "max_psnr_drop or max_ssim_drop of encode. auto: with photographs and a goal other than psnr, where torch is "
+        "installed, unless count, ratio or max_psnr_drop is given. initial_prune_fraction and admm_rho do not apply "
+        "then.",
     )
     method: Literal["prune", "merge"] = Field(
         "prune",
@@ -33,7 +35,10 @@ class CompactSettings(TrainingViewSettings):
         "by one Gaussian with their mean, covariance, colour and opacity; no images, no cameras, no training.",
     )
     max_compactions: int = Field(
-        3, ge=1, le=20, description="With auto_count: largest number of compactions that are tried."
+        3,
+        ge=1,
+        le=20,
+        description="With auto_count: largest number of containers that are made of trained scenes.",
     )
     min_keep_per_scoring: float = Field(
         0.8,
@@ -140,7 +145,7 @@ class CompactSettings(TrainingViewSettings):
 
     @property
     def _given(self) -> list[str]:
-        return [name for name in BUDGETS if getattr(self, name) not in (None, False)]
+        return [name for name in BUDGETS if getattr(self, name)]
 
 
 BUDGETS = ("count", "ratio", "max_psnr_drop", "auto_count")

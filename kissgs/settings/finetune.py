@@ -10,8 +10,17 @@ from kissgs.settings.training import TrainingViewSettings
 class FinetuneSettings(TrainingViewSettings):
     """Settings of fine-tuning: training of the levels, so that the decoded scene renders closer to the targets."""
 
-    enabled: bool = Field(False, description="Fine-tune, against photographs if there are any, else renderings.")
-    steps: int = Field(1000, ge=1, le=1_000_000, description="Number of training steps.")
+    enabled: bool | None = Field(
+        None,
+        description="Fine-tune, against photographs if there are any, else renderings. auto: with photographs and a "
+        "goal other than psnr, where torch is installed.",
+    )
+    steps: int = Field(
+        1000,
+        ge=1,
+        le=1_000_000,
+        description="Number of training steps; a fifth more where auto_count of compact leaves training to complete.",
+    )
     batch: int = Field(1, ge=1, le=64, description="Images per training step.")
     prune_threshold_bits: float = Field(
         100.0,

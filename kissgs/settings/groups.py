@@ -35,8 +35,30 @@ class Settings(BaseModel):
         """Whether several scenes or containers are made to find one that meets a goal."""
         return self.encode.has_goal or self.compact.max_psnr_drop is not None
 
+    def decided(self, *, photographs: bool, torch: bool) -> Self:
+        """Return settings with what they leave open decided: whether training serves the goal.
+
+        A size or a loss is served best by fewer Gaussians that are trained on photographs, and by fine-tuning. Pruning
+        or training without photographs loses more in views that nobody knows than it saves, and a PSNR to the scene's
+        own renderings falls by training on photographs.
+
+        Args:
+            photographs: whether there are photographs to train on, and others to evaluate the result.
+            torch: whether torch is installed, which training needs.
+        """
+        trains = self.encode.has_goal and self.encode.psnr is None and photographs and torch
+        compact, finetune = self.compact, self.finetune
+        if compact.auto_count is None:
+            wanted = trains and compact.trains and not compact.enabled
+            compact = compact.model_copy(update={"auto_count": wanted})
+        if finetune.enabled is None:
+            finetune = finetune.model_copy(update={"enabled": trains})
+        return self.model_copy(update={"compact": compact, "finetune": finetune})
+
     @model_validator(mode="after")
     def _a_goal_to_go_by(self) -> Self:
+        if self.compact.auto_count and self.compact.method == "merge":
+            raise ValueError("auto_count prunes; give count or ratio with method merge")
         if self.compact.auto_count and not self.encode.has_goal:
             raise ValueError(
                 "auto_count needs a goal: give target_size, max_psnr_drop, max_ssim_drop or psnr, or the number of "

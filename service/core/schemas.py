@@ -48,7 +48,7 @@ class JobOptions(kissgs.Settings):
         """Preset and further stages (compaction, fine-tuning, search): with the scene, they determine the duration."""
         stages = {
             COMPACTED: self.compact.enabled,
-            FINETUNED: self.finetune.enabled,
+            FINETUNED: bool(self.finetune.enabled),
             SEARCHED: self.searches,
         }
         return "".join([self.preset, *(suffix for suffix, wanted in stages.items() if wanted)])
@@ -61,12 +61,12 @@ class JobOptions(kissgs.Settings):
     @property
     def trains(self) -> bool:
         """Whether compaction or fine-tuning trains, which needs torch."""
-        return self.retrains or self.finetune.enabled
+        return self.retrains or bool(self.finetune.enabled)
 
     @property
     def resumable(self) -> bool:
         """Whether training can resume from a checkpoint. Searches, which train several times, cannot resume."""
-        tunes_once = self.finetune.enabled and not self.encode.has_goal
+        tunes_once = bool(self.finetune.enabled) and not self.encode.has_goal
         compacts_once = self.compact.max_psnr_drop is None and not self.compact.auto_count
         return compacts_once and (self.retrains or tunes_once)
 

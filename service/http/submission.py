@@ -96,7 +96,8 @@ async def submit(
                 submission = await _receive_form(context, request, spool, parsed, name, key)
             else:
                 received = await _receive_raw(context, request, spool)
-                submission = Submission(received, parsed or JobOptions(), scene_name(name), key)
+                chosen = parsed or JobOptions().decided(photographs=False, torch=can_train())
+                submission = Submission(received, chosen, scene_name(name), key)
             try:
                 job, new = await run_sync(_queue, context, submission, owner)
             finally:
@@ -117,7 +118,7 @@ def parse_options(text: str | bytes) -> JobOptions:
         ProblemError: they are invalid; the problem lists every invalid field. Or they cannot be met on this server.
     """
     try:
-        options = JobOptions.model_validate_json(text)
+        options = JobOptions.model_validate_json(text).decided(photographs=False, torch=can_train())
     except ValidationError as error:
         named, found = field_errors(error.errors())
         raise ProblemError(
@@ -239,7 +240,7 @@ def _queue(context: ServiceContainer, submission: Submission, owner: str) -> tup
                 received.info.count,
                 received.info.sh_degree,
                 compact=options.retrains,
-                finetune=options.finetune.enabled,
+                finetune=bool(options.finetune.enabled),
             )
             if options.resumable
             else 0

@@ -132,7 +132,7 @@ class JobRunner:
 
 def _trains(task: dict[str, Any]) -> bool:
     settings = kissgs.Settings.model_validate(task.get("settings", {}))
-    return settings.compact.enabled or settings.finetune.enabled
+    return settings.compact.enabled or bool(settings.finetune.enabled)
 
 
 class JobProcess:

@@ -9,7 +9,7 @@ import { presetList } from "./presets.js";
 
 /**
  * @typedef {{preset: string, evaluate: boolean, format?: string, encode?: import("./goal.js").Goals,
- *   compact?: {ratio?: number | null, auto_count?: boolean}, finetune?: {enabled?: boolean}}} Options
+ *   compact?: {ratio?: number | null, auto_count?: boolean | null}, finetune?: {enabled?: boolean | null}}} Options
  * @typedef {{file: File, options: Options}} Submission
  */
 

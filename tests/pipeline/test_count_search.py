@@ -9,8 +9,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.training_scenes import around, cloud
-from hypothesis import given
-from hypothesis import strategies as st
 from PIL import Image
 
 import kissgs
@@ -18,9 +16,9 @@ from kissgs import Settings, UnsupportedError
 from kissgs.cameras.views import View, Views, black
 from kissgs.compaction.result import CountTrial
 from kissgs.core.progress import SearchNote
-from kissgs.core.root_finding import MIN_STEP, minimize_unimodal
 from kissgs.evaluation.psnr_loss import drop_of
 from kissgs.rendering.rasterizer import render
+from kissgs.rendering.sensitivity import WeightedCameras
 
 SCENE = kissgs.sample_scene(600, sh_degree=0, seed=5)
 FEW_VIEWS = {"sensitivity_views": 16, "sensitivity_view_size": 96}
@@ -36,42 +34,6 @@ PRUNE = {
 
 def settings(attempts=3, preset="balanced", **goal):
     return Settings.from_preset(preset, compact={**PRUNE, "max_compactions": attempts}, **FEW_VIEWS, **goal)
-
-
-@given(st.floats(2, 14), st.floats(0, 16), st.sampled_from([0.5, 1.0]), st.floats(0.3, 3), st.floats(0.3, 3))
-def test_the_minimum_is_found(minimum, start, step, left, right):
-    evaluated = []
-
-    def cost(x):
-        evaluated.append(x)
-        return (left if x < minimum else right) * abs(x - minimum)
-
-    known = {}
-    minimize_unimodal(cost, known, start, step, (0.0, 16.0), 1.0, 99)
-    assert abs(min(known, key=known.get) - minimum) <= 2 * MIN_STEP * max(left, right) / min(left, right)
-    assert sorted(known) == sorted(evaluated)
-    assert min(evaluated) >= 0
-    assert max(evaluated) <= 16
-
-
-@given(st.floats(1, 9), st.integers(1, 12), st.sampled_from([1.0, -1.0]))
-def test_infeasible_points_are_left(threshold, attempts, way_out):
-    """The cost grows with the distance from a threshold on one side, and is infinite on the other."""
-    known = {}
-
-    def cost(x):
-        return math.inf if way_out * (threshold - x) > 0 else abs(x - threshold)
-
-    minimize_unimodal(cost, known, 0.0 if way_out > 0 else 10.0, 1.0, (0.0, 10.0), way_out, attempts)
-    assert len(known) <= attempts
-    if attempts == 12:
-        assert min(known.values()) <= 1
-
-
-def test_the_number_of_attempts_is_limited():
-    known = {}
-    minimize_unimodal(lambda x: x, known, 5.0, 1.0, (0.0, 10.0), 1.0, 3)
-    assert list(known) == [5.0, 4.0, 3.0]
 
 
 def test_the_note_of_a_search_precedes_that_of_its_work():
@@ -162,41 +124,168 @@ def test_max_encodes_limits_the_trials():
     assert len(kissgs.compress(SCENE, settings=chosen).report.trials) <= 2
 
 
+def photographs(scene, tmp_path, train=12, held_out=3):
+    """Return a capture whose photographs are renderings of ``scene``, darker by a third: training can learn that."""
+
+    def view(name, around_view):
+        image = np.clip(render(scene, around_view.camera)[0] * 255 + 0.5, 0, 255).astype(np.uint8)
+        Image.fromarray(image * 2 // 3).save(tmp_path / f"{name}.png")
+        return View(name, around_view.camera, tmp_path / f"{name}.png")
+
+    views = [view(f"photo{n}", each) for n, each in enumerate(around(train + held_out))]
+    return Views(tuple(views[held_out:]), tuple(views[:held_out]), black(), "a capture")
+
+
+QUICK = {
+    "max_compactions": 4,
+    "sparsify_steps": 40,
+    "refine_steps": 20,
+    "prune_rounds": 2,
+    "min_keep_per_scoring": 0.0,
+    "view_size": 40,
+}
+
+
+def with_photographs(finetune=None, **goal):
+    tuning = {"steps": 20, "view_size": 40, **(finetune or {})}
+    return Settings.from_preset("balanced", compact=QUICK, finetune=tuning, **FEW_VIEWS, **goal)
+
+
+@pytest.mark.parametrize("goal", [{"max_ssim_drop": 0.02}, {"max_psnr_drop": 0.5}, {"target_size": 6200}])
+@pytest.mark.quick(2)
+def test_a_goal_is_served_by_training_where_there_are_photographs(tmp_path, goal):
+    scene = cloud(300)
+    views = photographs(scene, tmp_path)
+    found = kissgs.compress(scene, settings=with_photographs(**goal), views=views, evaluate=True)
+    assert found.report.settings["compact"]["auto_count"] is True
+    assert found.report.settings["finetune"]["enabled"] is True
+    assert found.report.finetuning.steps == 24
+    assert found.report.finetuning.target_source == "photos"
+    assert found.report.compaction.count < 300
+    (kept,) = {trial for trial in found.report.trials if trial.bytes == len(found.to_zip())}
+    mean = found.report.evaluation.mean
+    if "max_psnr_drop" in goal:
+        assert mean.reference.psnr - mean.candidate.psnr <= 0.5
+        assert kept.drop <= 0.5
+    elif "max_ssim_drop" in goal:
+        assert kept.ssim_drop <= 0.02
+    else:
+        assert len(found.to_zip()) <= 6200
+    plain = {"compact": {"ratio": 1}, "finetune": {"enabled": False}}
+    without = kissgs.compress(
+        scene, settings=Settings.from_preset("balanced", **plain, **FEW_VIEWS, **goal), views=views, evaluate=True
+    )
+    if "target_size" in goal:
+        assert mean.candidate.psnr > without.report.evaluation.mean.candidate.psnr
+    else:
+        assert len(found.to_zip()) < len(without.to_zip())
+
+
+def test_the_same_request_gives_the_same_bytes(tmp_path):
+    """Any number of threads, and also the request that the report shows."""
+    scene = cloud(150)
+    views = photographs(scene, tmp_path)
+    chosen = with_photographs(max_psnr_drop=1, max_ssim_drop=0.05)
+    found = kissgs.compress(scene, settings=chosen, views=views, threads=1)
+    assert found.report.settings["encode"]["quality_offset_db"] == 0
+    again = Settings.model_validate(found.report.settings)
+    assert kissgs.compress(scene, settings=again, views=views, threads=2).files == found.files
+    kept = [trial for trial in found.report.trials if trial.bytes == len(found.to_zip())]
+    assert any(trial.drop <= 1 and trial.ssim_drop <= 0.05 for trial in kept)
+
+
+def test_photographs_that_train_do_not_evaluate_a_goal(tmp_path):
+    """Without others that were held out, nothing is trained for a goal; nor with a sensitivity of all Gaussians."""
+    scene = cloud(60)
+    views = photographs(scene, tmp_path)
+    for test in ((), around(2)):
+        capture = replace(views, test=test)
+        found = kissgs.compress(scene, settings=with_photographs(max_psnr_drop=0.5), views=capture)
+        assert (found.report.compaction, found.report.finetuning) == (None, None)
+    sensitivity = kissgs.measure_sensitivity(
+        scene, WeightedCameras([view.camera for view in views.train], [1.0] * len(views.train), views.background)
+    )
+    found = kissgs.compress(scene, settings=with_photographs(max_psnr_drop=0.5), views=views, sensitivity=sensitivity)
+    assert found.report.compaction is None
+    assert found.report.finetuning is not None
+
+
+def test_the_order_leads_to_the_input(tmp_path):
+    """A Gaussian of the container lies near that of the input from which it was trained."""
+    scene = cloud(300)
+    found = kissgs.compress(scene, settings=with_photographs(max_psnr_drop=1), views=photographs(scene, tmp_path))
+    distance = np.linalg.norm(kissgs.decompress(found.files).means - scene.means[found.order], axis=1)
+    assert np.median(distance) < 0.1 * np.linalg.norm(scene.means - np.roll(scene.means, 1, axis=0), axis=1).mean()
+
+
+@pytest.mark.parametrize(
+    ("given", "compacts", "tunes"),
+    [
+        ({}, True, True),
+        ({"compact": {"ratio": 1.0}}, False, True),
+        ({"compact": {"auto_count": False}}, False, True),
+        ({"compact": {"sparsify_steps": 0, "refine_steps": 0}}, False, True),
+        ({"finetune": {"enabled": False}}, True, False),
+    ],
+)
+def test_what_settings_leave_open(given, compacts, tunes):
+    goal = Settings.from_preset("balanced", max_psnr_drop=0.1, **given)
+    chosen = goal.decided(photographs=True, torch=True)
+    assert (chosen.compact.auto_count, chosen.finetune.enabled) == (compacts, tunes)
+    for photographs_, torch in [(True, False), (False, True)]:
+        chosen = goal.decided(photographs=photographs_, torch=torch)
+        assert (chosen.compact.auto_count, chosen.finetune.enabled) == (False, False)
+    for other in (Settings(), Settings.from_preset("balanced", psnr=40)):
+        chosen = other.decided(photographs=True, torch=True)
+        assert (chosen.compact.auto_count, chosen.finetune.enabled) == (False, False)
+    assert goal.decided(photographs=True, torch=True).decided(photographs=False, torch=False) == goal.decided(
+        photographs=True, torch=True
+    )
+
+
+def test_without_torch_the_report_says_what_is_missing(tmp_path, monkeypatch):
+    monkeypatch.setattr("kissgs.pipeline.training_choice.find_spec", lambda name: None)
+    scene = cloud(100)
+    views = photographs(scene, tmp_path)
+    found = kissgs.compress(scene, settings=with_photographs(max_psnr_drop=0.5), views=views)
+    assert found.report.compaction is None
+    assert found.report.finetuning is None
+    assert "torch is missing: pip install 'kissgs[train]'" in found.report.note
+    kept = kissgs.compress(scene, settings=with_photographs({"enabled": False}, target_size="1MB"))
+    assert "torch" not in kept.report.note
+
+
 @pytest.mark.parametrize("share", [0.45, 0.8])
 @pytest.mark.quick(0)
 def test_fewer_gaussians_for_a_size(share):
     """Either all Gaussians do not fit, or fewer have a higher PSNR at that size in the evaluation views."""
     plain = len(kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **FEW_VIEWS)).to_zip())
     wanted = int(share * plain)
+    whole = Settings.from_preset("balanced", target_size=wanted, **FEW_VIEWS)
     found = kissgs.compress(SCENE, settings=settings(target_size=wanted), evaluate=True)
-    assert 0.97 * wanted <= len(found.to_zip()) <= wanted
+    assert 0.9 * wanted <= len(found.to_zip()) <= wanted
     counts = [trial.count for trial in found.report.compaction.trials]
-    assert 1 <= len(counts) <= 3
-    assert {trial.count for trial in found.report.trials} == {*counts, 600}
+    assert {trial.count for trial in found.report.trials} <= {*counts, 600}
     assert found.report.compaction.count in [*counts, 600]
     if share == 0.45:  # all Gaussians do not fit
         with pytest.raises(UnsupportedError, match="or for fewer Gaussians: --compact auto"):
-            kissgs.compress(SCENE, settings=Settings.from_preset("balanced", target_size=wanted, **FEW_VIEWS))
+            kissgs.compress(SCENE, settings=whole)
         return
-    whole = kissgs.compress(
-        SCENE, settings=Settings.from_preset("balanced", target_size=wanted, **FEW_VIEWS), evaluate=True
-    )
-    assert found.report.evaluation.mean.candidate.psnr >= whole.report.evaluation.mean.candidate.psnr - 1e-6
+    all_of_them = kissgs.compress(SCENE, settings=whole, evaluate=True).report.evaluation
+    assert found.report.evaluation.mean.candidate.psnr >= all_of_them.mean.candidate.psnr - 1e-6
 
 
 def test_all_gaussians_stay_if_they_fit():
     found = kissgs.compress(SCENE, settings=settings(target_size="1MB"))
-    assert found.report.compaction.trials == ()
     assert found.report.compacted == 0
     assert "all of them fit into the target size" in found.report.compaction.note
 
 
 @pytest.mark.parametrize("goal", [{"max_psnr_drop": 0.4}, {"psnr": 35.0}, {"max_ssim_drop": 0.02}])
 @pytest.mark.quick(0)
-def test_fewer_gaussians_for_a_quality(goal):
+def test_pruning_for_a_quality(goal):
+    """Without photographs nothing is trained, and pruning leaves the encoder half of the error."""
     found = kissgs.compress(SCENE, settings=settings(**goal), evaluate=True)
-    whole = kissgs.compress(SCENE, settings=Settings.from_preset("balanced", **goal, **FEW_VIEWS))
-    assert len(found.to_zip()) <= len(whole.to_zip())
     made = [trial for trial in found.report.trials if trial.bytes == len(found.to_zip())]
     met = {
         "max_psnr_drop": lambda trial: trial.drop <= 0.4,
@@ -210,10 +299,11 @@ def test_fewer_gaussians_for_a_quality(goal):
     }
     (name,) = goal
     assert any(map(met[name], made))
+    assert nearly[name](found.report.evaluation)  # from other cameras
     tried = found.report.compaction.trials
     assert tried
     assert {(trial.ssim_decides, trial.ssim_drop is not None) for trial in tried} == {(name == "max_ssim_drop",) * 2}
-    assert nearly[name](found.report.evaluation)  # from other cameras
+    assert [trial.count for trial in tried] == [round(600 * 0.8**n) for n in range(1, len(tried) + 1)]
 
 
 def test_a_count_is_reported_by_the_loss_that_decides():
@@ -268,25 +358,56 @@ def test_a_stopped_search_returns_its_best(count):
             kissgs.compress(SCENE, settings=chosen, progress=stop)
 
 
-def test_a_stopped_search_for_a_count_returns_the_best_count():
-    counts = 0
+@pytest.mark.parametrize("goal", [{"max_psnr_drop": 9}, {"target_size": 7000}])
+def test_a_search_that_is_stopped_while_its_first_container_is_evaluated_keeps_it(tmp_path, goal):
+    stopped, tuned = [], []
 
-    def stop(stage, fraction, note=""):
-        nonlocal counts
-        counts += stage == "score" and fraction == 0
-        if counts >= 4:
-            counts = -99
+    def stop(now, fraction, note=""):
+        tuned.extend([now] * (now == "finetune" and fraction == 1))
+        if now == "evaluate" and tuned and not stopped:
+            stopped.append(now)
             raise kissgs.StopSearch
 
-    found = kissgs.compress(SCENE, settings=settings(9, target_size="12kB"), progress=stop)
-    assert len(found.to_zip()) <= 12_000
-    assert len(found.report.compaction.trials) < 9
+    scene = cloud(300)
+    views = photographs(scene, tmp_path)
+    found = kissgs.compress(scene, settings=with_photographs(**goal), views=views, progress=stop)
+    assert stopped
+    assert found.report.finetuning is not None
+    assert found.report.trials[-1].bytes == len(found.to_zip())
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 8])
+def test_few_gaussians_with_photographs(tmp_path, count):
+    scene = cloud(8).select(range(count))
+    found = kissgs.compress(scene, settings=with_photographs(max_psnr_drop=1), views=photographs(scene, tmp_path, 4, 1))
+    assert 1 <= len(kissgs.decompress(found.files)) <= count
+
+
+@pytest.mark.parametrize("stage", ["score", "sparsify", "finetune"])
+def test_a_stopped_search_for_a_count_encodes_what_it_has(tmp_path, stage):
+    stopped = []
+
+    def stop(now, fraction, note=""):
+        if now == stage and fraction > 0 and not stopped:
+            stopped.append(now)
+            raise kissgs.StopSearch
+
+    scene = cloud(300)
+    views = photographs(scene, tmp_path)
+    found = kissgs.compress(scene, settings=with_photographs(max_psnr_drop=9), views=views, progress=stop)
+    assert stopped
+    assert found.report.finetuning is None
+    assert found.report.trials[-1].drop <= 9
+    stopped.clear()
+    with pytest.raises(kissgs.StopSearch):
+        kissgs.compress(scene, settings=with_photographs(target_size=4100), views=views, progress=stop)
 
 
 @pytest.mark.parametrize(
     ("goal", "changes", "message"),
     [
         ({}, {}, "auto_count needs a goal: give target_size, max_psnr_drop, max_ssim_drop or psnr"),
+        ({"target_size": "1MB"}, {"method": "merge"}, "auto_count prunes; give count or ratio with method merge"),
         ({"target_size": "1MB"}, {"count": 9}, "count and auto_count cannot both be met; give one"),
         ({"target_size": "1MB", "max_psnr_drop": 1}, {}, "target_size and max_psnr_drop cannot both be met"),
         (

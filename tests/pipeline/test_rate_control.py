@@ -64,7 +64,7 @@ def test_stopping_while_a_count_is_evaluated_keeps_it():
     )
     assert len(found.to_zip()) <= 8000
     assert found.report.compaction.trials == ()
-    assert "stopped before a smaller count was tried" in found.report.compaction.note
+    assert "stopped before a smaller number was tried" in found.report.compaction.note
 
 
 @pytest.mark.parametrize("auto_count", [False, True])

@@ -1,0 +1,104 @@
+"""Search for the number of Gaussians and the lambda of a trained scene: few containers, each with a training."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from kissgs.pipeline.goal import Goal
+from kissgs.pipeline.rate_control import LOG2_LAMBDA_RANGE, RateControl
+
+DOUBLINGS_PER_HALVING = 3.0
+"""Doublings of lambda that typically change size and quality as much as half as many Gaussians."""
+
+MAX_HALVINGS = 1.3
+"""Largest step of the search."""
+
+NEAR_HALVINGS = 0.1
+"""Step below which a container that meets the goal ends the search: another one would save some 5 % of its bytes."""
+
+CAUTION_HALVINGS = 0.1
+"""Added on the safe side of the last attempt if none before met the goal."""
+
+MIN_STEP = 0.03
+"""Smallest step, in halvings, whose effect is measured: that of a smaller one is lost in the noise of training."""
+
+MAX_SLOPE_RATIO = 3.0
+"""Inverse of the smallest ratio of the measured effect of a halving to the typical one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Position:
+    """A number of Gaussians and a lambda.
+
+    Attributes:
+        number: number of the point on the path of falling numbers of Gaussians.
+        log2_lambda: log2 of lambda; None for that of the settings.
+    """
+
+    number: int
+    log2_lambda: float | None
+
+
+def search_positions(
+    goal: Goal,
+    encode: Callable[[Position], RateControl],
+    first: int,
+    bounds: tuple[int, int],
+    points_per_halving: float,
+    attempts: int,
+) -> None:
+    """Make containers at positions that come closer to the goal.
+
+    Fewer Gaussians and a larger lambda both lower size and quality. Each step is taken by the number of Gaussians as
+    far as whole points go, and the rest by lambda, so that lambda stays near the value that serves such scenes best.
+
+    Args:
+        goal: the goal; no PSNR.
+        encode: makes the container of a position and returns the search that has it as its last trial.
+        first: number of the first point.
+        bounds: smallest and largest number of a point.
+        points_per_halving: points of the path by which the number of Gaussians is halved.
+        attempts: largest number of containers.
+    """
+    position = Position(min(max(first, bounds[0]), bounds[1]), None)
+    left_at, figures = dict[float, float](), set[tuple[int, float]]()
+    for remaining in reversed(range(attempts)):
+        search = encode(position)
+        trial = search.trials[-1]
+        left, met = min(limit.halvings(trial) for limit in goal.limits), goal.margin(trial) >= 0
+        if remaining == 0 or search.stopped or trial.rd_lambda is None or not math.isfinite(left):
+            return
+        if (met and abs(left) <= NEAR_HALVINGS) or (trial.bytes, left) in figures:  # near, or without any effect
+            return
+        figures.add((trial.bytes, left))
+        log2_lambda = math.log2(trial.rd_lambda)
+        halvings = position.number / points_per_halving + log2_lambda / DOUBLINGS_PER_HALVING
+        left_at[halvings] = left
+        step = _next_place(left_at, halvings) - halvings
+        if remaining == 1 and all((left > 0) == goal.by_size for left in left_at.values()):  # none meets the goal
+            step += CAUTION_HALVINGS if goal.by_size else -CAUTION_HALVINGS
+        number = min(max(position.number + round(step * points_per_halving), bounds[0]), bounds[1])
+        log2_lambda += DOUBLINGS_PER_HALVING * (step - (number - position.number) / points_per_halving)
+        position = Position(number, min(max(log2_lambda, LOG2_LAMBDA_RANGE[0]), LOG2_LAMBDA_RANGE[1]))
+
+
+def _next_place(left_at: dict[float, float], last: float) -> float:
+    """Return the place, in halvings by the number of Gaussians and by lambda, where the goal should just be met.
+
+    A step of the typical effect or of the one between the last two places, kept between places on both sides.
+
+    Args:
+        left_at: by place, the halvings that are left until the goal, below 0 beyond it.
+        last: the latest place.
+    """
+    effect, others = 1.0, [place for place in left_at if abs(place - last) > MIN_STEP]
+    if others:
+        measured = (left_at[others[-1]] - left_at[last]) / (last - others[-1])
+        effect = max(measured, 1 / MAX_SLOPE_RATIO)
+    place = last + min(max(left_at[last] / effect, -MAX_HALVINGS), MAX_HALVINGS)
+    below = max((x for x, left in left_at.items() if left >= 0), default=-math.inf)
+    above = min((x for x, left in left_at.items() if left < 0), default=math.inf)
+    margin = 0.1 * (above - below)
+    return min(max(place, below + margin), above - margin) if 0 < margin < math.inf else place

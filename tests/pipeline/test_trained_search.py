@@ -1,0 +1,107 @@
+"""Oracle: models of size and quality as functions of the number of Gaussians and of lambda, whose optimum is known."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kissgs.pipeline.goal import Goal
+from kissgs.pipeline.trained_search import search_positions
+from kissgs.pipeline.trial import Trial
+from kissgs.settings import EncodeSettings
+
+PER_HALVING = 3.0
+START = -33.0
+
+
+def search(goal, figures, first=6, bounds=(1, 40), attempts=3):
+    """Return the trials of a search whose containers have ``figures(number, log2_lambda)``."""
+    trials, positions = [], []
+
+    def encode(position):
+        x = START if position.log2_lambda is None else position.log2_lambda
+        positions.append((position.number, x))
+        trials.append(Trial(count=1, rd_lambda=2.0**x, **figures(position.number, x)))
+        return SimpleNamespace(trials=trials, stopped=False)
+
+    search_positions(Goal.of(EncodeSettings(**goal)), encode, first, bounds, PER_HALVING, attempts)
+    return trials, positions
+
+
+def model(number, x, per_halving=0.3, per_doubling=0.1, at_start=0.1, power=1.0):
+    """Return a drop that grows with fewer Gaussians and a larger lambda, and a size that falls."""
+    halvings = number / PER_HALVING - 2
+    drop = at_start + per_halving * abs(halvings) ** power * math.copysign(1, halvings) + per_doubling * (x - START)
+    return {"bytes": round(200_000 * 2 ** (-halvings - 0.25 * (x - START))), "drop": drop}
+
+
+@given(st.floats(-0.6, 0.7), st.floats(0.1, 0.6), st.floats(0.04, 0.2), st.floats(0.8, 1.3))
+def test_a_drop_is_met_in_few_containers(at_start, per_halving, per_doubling, power):
+    def figures(number, x):
+        return model(number, x, per_halving, per_doubling, at_start, power)
+
+    trials, _ = search({"max_psnr_drop": 0.2}, figures, attempts=4)
+    met = [trial.drop for trial in trials if trial.drop <= 0.2]
+    assert met
+    assert min(abs(trial.drop - 0.2) for trial in trials) < 0.12
+
+
+@given(st.integers(20_000, 900_000), st.floats(0.7, 1.4), st.floats(0.15, 0.4))
+def test_a_size_is_met_in_few_containers(target, per_gaussian, per_doubling):
+    def figures(number, x):
+        size = 800_000 * per_gaussian * 2 ** (-number / PER_HALVING - per_doubling * (x - START))
+        return {"bytes": round(size)}
+
+    first = max(1, round(PER_HALVING * math.log2(800_000 / target)))
+    trials, _ = search({"target_size": target}, figures, first, attempts=4)
+    assert any(0.85 * target <= trial.bytes <= target for trial in trials)
+
+
+def test_a_near_container_ends_the_search():
+    trials, positions = search({"max_psnr_drop": 0.2}, lambda number, x: model(number, x, at_start=0.19))
+    assert len(trials) == 1
+    assert positions == [(6, START)]
+
+
+def test_whole_points_are_taken_by_the_number_and_the_rest_by_lambda():
+    _, positions = search({"max_psnr_drop": 0.2}, lambda number, x: model(number, x, at_start=-0.15))
+    (_, _), (number, x), *_ = positions
+    assert number > 6
+    assert abs(x - START) <= 0.5 * 3 / PER_HALVING + 1e-9  # half a point at most
+
+
+def test_the_limit_with_the_fewest_halvings_left_decides():
+    """Both losses are below 0 at first; only SSIM then comes near its limit."""
+
+    def figures(number, x):
+        halvings = number / PER_HALVING - 2
+        return {"bytes": 9 - number, "drop": -0.5 + 0.01 * halvings, "ssim_drop": -0.001 + 0.006 * halvings}
+
+    trials, positions = search({"max_psnr_drop": 0.2, "max_ssim_drop": 0.003}, figures)
+    assert trials[-1].ssim_drop <= 0.003
+    assert [number for number, _ in positions] == [6, 8]
+
+
+def test_lambda_stays_in_its_range():
+    _, positions = search({"max_psnr_drop": 0.2}, lambda number, x: model(0, START, at_start=-9 - x), attempts=40)
+    assert max(x for _, x in positions) <= -6
+
+
+def test_positions_without_effect_end_the_search():
+    trials, _ = search({"max_psnr_drop": 0.2}, lambda number, x: {"bytes": 9, "drop": -3.0}, attempts=9)
+    assert len(trials) == 2
+
+
+def test_bounds_are_kept_and_lambda_goes_beyond_them():
+    trials, positions = search({"max_psnr_drop": 0.2}, lambda number, x: model(number, x, at_start=1.0), bounds=(5, 7))
+    assert {number for number, _ in positions} == {6, 5}
+    assert positions[-1][1] < START - 1
+    assert trials[-1].drop < trials[0].drop
+
+
+@pytest.mark.parametrize("figures", [{"bytes": 9, "drop": math.nan}, {"bytes": 9, "drop": math.inf}])
+def test_unknown_figures_end_the_search(figures):
+    trials, _ = search({"max_psnr_drop": 0.2}, lambda number, x: figures)
+    assert len(trials) == 1
