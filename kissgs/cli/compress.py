@@ -55,7 +55,8 @@ def compress(
         typer.Option(
             metavar="BUDGET",
             help="First reduce the number of Gaussians, see 'kissgs compact': to a count (200k), a share (20%) or a "
-            "PSNR drop (0.2dB); auto searches the count that is best for --target-size, --max-psnr-drop or --psnr.",
+            "PSNR drop (0.2dB); 100% keeps all; auto searches the number that serves a goal best, which is the default "
+            "with photographs.",
         ),
     ] = None,
     finetune: Annotated[
@@ -63,7 +64,8 @@ def compress(
         typer.Option(
             metavar="[STEPS]",
             help="Fine-tune the quantised values on the photographs of --views, or on renderings of the scene: fewer "
-            "bytes at equal PSNR, a minute or two more. Default number of steps: that of the preset.",
+            "bytes at equal PSNR, a minute or two more. Default number of steps: that of the preset; 0: never. "
+            "Default with a goal and photographs.",
         ),
     ] = None,
     seed: SeedOption = None,
@@ -103,6 +105,7 @@ def compress(
     from kissgs.cli.compress_options import CompressOptions
     from kissgs.io.container_names import ending_of, named_container, named_manifest
     from kissgs.pipeline.read_options import ReadOptions
+    from kissgs.pipeline.training_choice import decided
 
     manifest = None if output is None else named_manifest(output)
     kind = named_container(container, None if manifest else output)
@@ -118,9 +121,9 @@ def compress(
         max_psnr_drop=max_psnr_drop,
         max_ssim_drop=max_ssim_drop,
     )
-    refuse_without_training(settings, checkpoint=checkpoint, device=device)
     renders = evaluate or settings.encode.rate_distortion or settings.compact.enabled or settings.finetune.enabled
     capture, training_device = open_views(views), device_of(device)
+    refuse_without_training(decided(settings, capture), checkpoint=checkpoint, device=device)
     if views is not None and not renders and not quiet:
         sys.stderr.write(f"kissgs: --views has no effect: the preset {preset} renders no images; add --evaluate\n")
     options = CompressOptions(

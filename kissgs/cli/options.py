@@ -35,7 +35,7 @@ def chosen(
         changes: changes of settings of ``group``, or of another group as ``GROUP.NAME=VALUE``.
         group: "encode", "compact" or "finetune".
         budget: settings of the group "compact".
-        finetune: a number of steps, or "auto" for that of the preset; None for no fine-tuning.
+        finetune: a number of steps, 0 for no fine-tuning, or "auto" for that of the preset; None if not given.
         options: settings of ``group``; None if not given.
 
     Raises:
@@ -106,7 +106,9 @@ def _finetune_values(steps: str | None) -> Values:
         return {}
     if steps != "auto" and not steps.isdecimal():
         raise UnsupportedError(f"{FINETUNE} {steps}: give a number of steps, or none for that of the preset")
-    return {"enabled": True} if steps == "auto" else {"enabled": True, "steps": steps}
+    if steps == "auto":
+        return {"enabled": True}
+    return {"enabled": True, "steps": steps} if int(steps) else {"enabled": False}
 
 
 def count_of(text: str) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from rich.console import Group, RenderableType
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from kissgs.finetuning.result import FinetuneReport
     from kissgs.pipeline.inspect import Info
     from kissgs.pipeline.report import Report
-    from kissgs.pipeline.trial import Trial
     from kissgs.streaming.compress import StreamedReport
 
 CHANGES = {
@@ -69,10 +68,10 @@ def report_table(report: Report, target: str) -> RenderableType:
         "clipped_colors": report.clipped_colors,
         **report.cleaned.as_dict(),
     }
-    search = [Text(f"search: {_trials(report.trials)}")] if report.trials else []
+    search = [_search_table(report)] if report.trials else []
     evaluation = [] if report.evaluation is None else [_evaluation(report.evaluation)]
     changes = _changes(changed)
-    compaction = [] if report.compaction is None else _compaction(report.compaction)
+    compaction = [] if report.compaction is None else _compaction(report.compaction, search=not report.trials)
     finetuning = [] if report.finetuning is None else _finetuning(report.finetuning)
     note = [Text(report.note, style="yellow")] if report.note else []
     details = [*compaction, *search, *finetuning, *note, *evaluation]
@@ -109,10 +108,10 @@ def streamed_table(report: StreamedReport, target: str) -> RenderableType:
     return Group(head, table, *_changes(report.changed))
 
 
-def _compaction(report: CompactionReport) -> list[RenderableType]:
-    """Format the steps of a compaction."""
+def _compaction(report: CompactionReport, *, search: bool = True) -> list[RenderableType]:
+    """Format the steps of a compaction, and unless ``search`` is false the counts that were tried."""
     lines: list[RenderableType] = [Text(report.note, style="yellow")] if report.note else []
-    if report.trials:
+    if report.trials and search:
         lines.append(Text(f"search: {'; '.join(trial.summary() for trial in report.trials)}"))
     if not report.steps:
         return lines
@@ -143,14 +142,16 @@ def _finetuning(report: FinetuneReport) -> list[Text]:
     return [Text(line), *([Text(report.note, style="yellow")] if report.note else [])]
 
 
-def _trials(trials: Sequence[Trial]) -> str:
-    """Format the trials of a search in order; the count is named where it changes."""
-    parts, count = list[str](), next(iter(trials)).count
-    for trial in trials:
-        prefix = "" if trial.count == count else f"{trial.count:,} Gaussians: "
-        parts.append(f"{prefix}{trial.summary()}")
-        count = trial.count
-    return "; ".join(parts)
+def _search_table(report: Report) -> Table:
+    """Format what a search tried: scenes with fewer Gaussians before encoding, and containers, the kept one marked."""
+    table = Table("tried", *map(_right, ("Gaussians", "bytes")), "quality", box=None, pad_edge=False)
+    for count in () if report.compaction is None else report.compaction.trials:
+        table.add_row("scene", f"{count.count:,}", "", f"loses {count.loss()}")
+    kept = [n for n, trial in enumerate(report.trials) if trial.bytes == report.container_bytes]
+    for n, trial in enumerate(report.trials):
+        name = "container, kept" if n in kept[-1:] else "container"
+        table.add_row(name, f"{trial.count:,}", f"{trial.bytes:,}", trial.quality())
+    return table
 
 
 def _evaluation(evaluation: Evaluation) -> Text:

@@ -95,7 +95,10 @@ def test_ctrl_c_leaves_a_checkpoint_to_resume_from(tmp_path: Path, tmp_path_fact
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["--finetune", "0"], "setting steps: input should be greater than or equal to 1, not '0'"),
+        (
+            ["--set", "finetune.steps=0"],
+            "setting steps: input should be greater than or equal to 1, not '0'",
+        ),
         (["--finetune=many"], "--finetune many: give a number of steps, or none for that of the preset"),
         (["--finetune", "--set", "finetune.speed=9"], "there is no setting 'speed' of finetune; there are "),
         (["--device", "cuda"], "add --compact or --finetune"),
