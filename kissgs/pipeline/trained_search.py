@@ -18,8 +18,8 @@ MAX_HALVINGS = 1.3
 NEAR_HALVINGS = 0.1
 """Step below which a container that meets the goal ends the search: another one would save some 5 % of its bytes."""
 
-CAUTION_HALVINGS = 0.1
-"""Added on the safe side of the last attempt if none before met the goal."""
+CAUTION_HALVINGS, SIZE_CAUTION_HALVINGS = 0.1, 0.02
+"""Added on the safe side of the last attempt if none before met the goal; the second for a size, which varies less."""
 
 MIN_STEP = 0.03
 """Smallest step, in halvings, whose effect is measured: that of a smaller one is lost in the noise of training."""
@@ -78,7 +78,7 @@ def search_positions(
         left_at[halvings] = left
         step = _next_place(left_at, halvings) - halvings
         if remaining == 1 and all((left > 0) == goal.by_size for left in left_at.values()):  # none meets the goal
-            step += CAUTION_HALVINGS if goal.by_size else -CAUTION_HALVINGS
+            step += SIZE_CAUTION_HALVINGS if goal.by_size else -CAUTION_HALVINGS
         number = min(max(position.number + round(step * points_per_halving), bounds[0]), bounds[1])
         log2_lambda += DOUBLINGS_PER_HALVING * (step - (number - position.number) / points_per_halving)
         position = Position(number, min(max(log2_lambda, LOG2_LAMBDA_RANGE[0]), LOG2_LAMBDA_RANGE[1]))
