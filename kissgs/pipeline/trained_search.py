@@ -77,10 +77,14 @@ def search_positions(
         halvings = position.number / points_per_halving + log2_lambda / DOUBLINGS_PER_HALVING
         left_at[halvings] = left
         step = _next_place(left_at, halvings) - halvings
-        if remaining == 1 and all((left > 0) == goal.by_size for left in left_at.values()):  # none meets the goal
+        missed = all((left > 0) == goal.by_size for left in left_at.values())
+        if remaining == 1 and missed:
             step += SIZE_CAUTION_HALVINGS if goal.by_size else -CAUTION_HALVINGS
         number = min(max(position.number + round(step * points_per_halving), bounds[0]), bounds[1])
-        log2_lambda += DOUBLINGS_PER_HALVING * (step - (number - position.number) / points_per_halving)
+        rest = step - (number - position.number) / points_per_halving
+        if remaining == 1 and missed:  # lambda must not take back what the number gives
+            rest = max(rest, 0.0) if goal.by_size else min(rest, 0.0)
+        log2_lambda += DOUBLINGS_PER_HALVING * rest
         position = Position(number, min(max(log2_lambda, LOG2_LAMBDA_RANGE[0]), LOG2_LAMBDA_RANGE[1]))
 
 
