@@ -52,7 +52,7 @@ def settings_page() -> str:
         lines = [f"| setting | {' | '.join(Preset)} | meaning |", "|---" * (len(Preset) + 2) + "|"]
         for name, field in model.model_fields.items():
             values = [PRESETS[preset][group].get(name, field.default) for preset in Preset]
-            unset = "" if group == "compact" and name in BUDGETS else "auto"
+            unset = "" if group == "compact" and name in BUDGETS and name != "auto_count" else "auto"
             cells = " | ".join(unset if value is None else str(value) for value in values)
             lines.append(f"| `{name}` | {cells} | {field.description} |")
         page += f"\n## {group}\n\n{about}\n\n" + "\n".join(lines) + "\n"

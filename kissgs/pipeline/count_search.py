@@ -48,6 +48,12 @@ A refinement of the scene before its encoding would take more steps for the same
 """
 
 
+BEYOND_PHOTOGRAPHS = (
+    "trained for what the photographs show: beyond them it changes more (--evaluate measures how much; --compact 100% "
+    "--finetune 0 keeps it)"
+)
+
+
 @dataclass(frozen=True, slots=True)
 class Candidate:
     """A number of Gaussians with containers that meet the goal.
@@ -131,7 +137,8 @@ class CountSearch:
         if best is not None:
             best.search.stopped |= self._stopped
             compacted = compacted if best.compacted.splats is self.compactor.splats else best.compacted
-        notes = filter(None, [compacted.report.note, self.compactor.note])
+        trained = best is not None and compacted is best.compacted and self._photographs
+        notes = filter(None, [compacted.report.note, self.compactor.note, BEYOND_PHOTOGRAPHS if trained else ""])
         report = replace(compacted.report, trials=tuple(self._tried), note="; ".join(notes))
         return replace(compacted, report=report), self._whole if best is None else best.search, tuple(self.trials)
 

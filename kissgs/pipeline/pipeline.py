@@ -163,12 +163,13 @@ def compress(
         destination: ``.zip``, ``.sog`` or folder to write; by default nothing is written.
         settings: by default those of the preset ``balanced``. If their group ``compact`` has a budget, the scene is
             compacted first, see :func:`kissgs.compact`; if their group ``finetune`` is ``enabled``, the levels are then
-            fine-tuned on the photographs of ``views``, or on renderings of the scene.
+            fine-tuned on the photographs of ``views``, or on renderings of the scene. Where ``views`` have photographs,
+            some of them held out, a goal other than ``psnr`` does both by itself, see :meth:`kissgs.Settings.decided`.
         reading: options for a ``source`` that is a file.
         container: ``"sogxt"``, or ``"sog"`` for the files of SOG 2, which other viewers open; by default SOG if
             ``destination`` ends in ``.sog``, else SOG-XT.
-        sensitivity: sensitivity of a clean ``source`` (:func:`kissgs.measure_sensitivity`); by default it is measured
-            if the settings need it.
+        sensitivity: sensitivity of a clean ``source`` (:func:`kissgs.measure_sensitivity`), all of whose Gaussians then
+            stay; by default it is measured if the settings need it.
         cache: ``.npz`` file for the measured sensitivity. It is read if scene and cameras are unchanged since it was
             written, and replaced otherwise.
         evaluate: decode the result and compare its renderings with those of the cleaned scene, and with the photographs
@@ -192,9 +193,7 @@ def compress(
     from kissgs.pipeline.encoding import Encoding
 
     requested = settings or Settings()
-    settings = decided(requested, views)
-    if sensitivity is not None and requested.compact.auto_count is None:  # it is of all Gaussians
-        settings = settings.model_copy(update={"compact": settings.compact.model_copy(update={"auto_count": False})})
+    settings = decided(requested, views, keep_all=sensitivity is not None)
     target = Path(destination) if destination is not None else None
     kind = named_container(container, target)
     if target is not None:

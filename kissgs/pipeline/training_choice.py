@@ -16,8 +16,16 @@ NOT_TRAINED = (
 )
 
 
-def decided(settings: Settings, views: Views | None) -> Settings:
-    """Return the settings with what they leave open decided, see :meth:`kissgs.Settings.decided`."""
+def decided(settings: Settings, views: Views | None, *, keep_all: bool = False) -> Settings:
+    """Return the settings with what they leave open decided, see :meth:`kissgs.Settings.decided`.
+
+    Args:
+        settings: settings as requested.
+        views: capture of the scene; None for no capture.
+        keep_all: whether all Gaussians stay unless the settings request otherwise.
+    """
+    if keep_all and settings.compact.auto_count is None:
+        settings = settings.model_copy(update={"compact": settings.compact.model_copy(update={"auto_count": False})})
     return settings.decided(photographs=has_photographs(views), torch=find_spec("torch") is not None)
 
 

@@ -18,7 +18,6 @@ from kissgs.compaction.result import CountTrial
 from kissgs.core.progress import SearchNote
 from kissgs.evaluation.psnr_loss import drop_of
 from kissgs.rendering.rasterizer import render
-from kissgs.rendering.sensitivity import WeightedCameras
 
 SCENE = kissgs.sample_scene(600, sh_degree=0, seed=5)
 FEW_VIEWS = {"sensitivity_views": 16, "sensitivity_view_size": 96}
@@ -124,137 +123,6 @@ def test_max_encodes_limits_the_trials():
     assert len(kissgs.compress(SCENE, settings=chosen).report.trials) <= 2
 
 
-def photographs(scene, tmp_path, train=12, held_out=3):
-    """Return a capture whose photographs are renderings of ``scene``, darker by a third: training can learn that."""
-
-    def view(name, around_view):
-        image = np.clip(render(scene, around_view.camera)[0] * 255 + 0.5, 0, 255).astype(np.uint8)
-        Image.fromarray(image * 2 // 3).save(tmp_path / f"{name}.png")
-        return View(name, around_view.camera, tmp_path / f"{name}.png")
-
-    views = [view(f"photo{n}", each) for n, each in enumerate(around(train + held_out))]
-    return Views(tuple(views[held_out:]), tuple(views[:held_out]), black(), "a capture")
-
-
-QUICK = {
-    "max_compactions": 4,
-    "sparsify_steps": 40,
-    "refine_steps": 20,
-    "prune_rounds": 2,
-    "min_keep_per_scoring": 0.0,
-    "view_size": 40,
-}
-
-
-def with_photographs(finetune=None, **goal):
-    tuning = {"steps": 20, "view_size": 40, **(finetune or {})}
-    return Settings.from_preset("balanced", compact=QUICK, finetune=tuning, **FEW_VIEWS, **goal)
-
-
-@pytest.mark.parametrize("goal", [{"max_ssim_drop": 0.02}, {"max_psnr_drop": 0.5}, {"target_size": 6200}])
-@pytest.mark.quick(2)
-def test_a_goal_is_served_by_training_where_there_are_photographs(tmp_path, goal):
-    scene = cloud(300)
-    views = photographs(scene, tmp_path)
-    found = kissgs.compress(scene, settings=with_photographs(**goal), views=views, evaluate=True)
-    assert found.report.settings["compact"]["auto_count"] is True
-    assert found.report.settings["finetune"]["enabled"] is True
-    assert found.report.finetuning.steps == 24
-    assert found.report.finetuning.target_source == "photos"
-    assert found.report.compaction.count < 300
-    (kept,) = {trial for trial in found.report.trials if trial.bytes == len(found.to_zip())}
-    mean = found.report.evaluation.mean
-    if "max_psnr_drop" in goal:
-        assert mean.reference.psnr - mean.candidate.psnr <= 0.5
-        assert kept.drop <= 0.5
-    elif "max_ssim_drop" in goal:
-        assert kept.ssim_drop <= 0.02
-    else:
-        assert len(found.to_zip()) <= 6200
-    plain = {"compact": {"ratio": 1}, "finetune": {"enabled": False}}
-    without = kissgs.compress(
-        scene, settings=Settings.from_preset("balanced", **plain, **FEW_VIEWS, **goal), views=views, evaluate=True
-    )
-    if "target_size" in goal:
-        assert mean.candidate.psnr > without.report.evaluation.mean.candidate.psnr
-    else:
-        assert len(found.to_zip()) < len(without.to_zip())
-
-
-def test_the_same_request_gives_the_same_bytes(tmp_path):
-    """Any number of threads, and also the request that the report shows."""
-    scene = cloud(150)
-    views = photographs(scene, tmp_path)
-    chosen = with_photographs(max_psnr_drop=1, max_ssim_drop=0.05)
-    found = kissgs.compress(scene, settings=chosen, views=views, threads=1)
-    assert found.report.settings["encode"]["quality_offset_db"] == 0
-    again = Settings.model_validate(found.report.settings)
-    assert kissgs.compress(scene, settings=again, views=views, threads=2).files == found.files
-    kept = [trial for trial in found.report.trials if trial.bytes == len(found.to_zip())]
-    assert any(trial.drop <= 1 and trial.ssim_drop <= 0.05 for trial in kept)
-
-
-def test_photographs_that_train_do_not_evaluate_a_goal(tmp_path):
-    """Without others that were held out, nothing is trained for a goal; nor with a sensitivity of all Gaussians."""
-    scene = cloud(60)
-    views = photographs(scene, tmp_path)
-    for test in ((), around(2)):
-        capture = replace(views, test=test)
-        found = kissgs.compress(scene, settings=with_photographs(max_psnr_drop=0.5), views=capture)
-        assert (found.report.compaction, found.report.finetuning) == (None, None)
-    sensitivity = kissgs.measure_sensitivity(
-        scene, WeightedCameras([view.camera for view in views.train], [1.0] * len(views.train), views.background)
-    )
-    found = kissgs.compress(scene, settings=with_photographs(max_psnr_drop=0.5), views=views, sensitivity=sensitivity)
-    assert found.report.compaction is None
-    assert found.report.finetuning is not None
-
-
-def test_the_order_leads_to_the_input(tmp_path):
-    """A Gaussian of the container lies near that of the input from which it was trained."""
-    scene = cloud(300)
-    found = kissgs.compress(scene, settings=with_photographs(max_psnr_drop=1), views=photographs(scene, tmp_path))
-    distance = np.linalg.norm(kissgs.decompress(found.files).means - scene.means[found.order], axis=1)
-    assert np.median(distance) < 0.1 * np.linalg.norm(scene.means - np.roll(scene.means, 1, axis=0), axis=1).mean()
-
-
-@pytest.mark.parametrize(
-    ("given", "compacts", "tunes"),
-    [
-        ({}, True, True),
-        ({"compact": {"ratio": 1.0}}, False, True),
-        ({"compact": {"auto_count": False}}, False, True),
-        ({"compact": {"sparsify_steps": 0, "refine_steps": 0}}, False, True),
-        ({"finetune": {"enabled": False}}, True, False),
-    ],
-)
-def test_what_settings_leave_open(given, compacts, tunes):
-    goal = Settings.from_preset("balanced", max_psnr_drop=0.1, **given)
-    chosen = goal.decided(photographs=True, torch=True)
-    assert (chosen.compact.auto_count, chosen.finetune.enabled) == (compacts, tunes)
-    for photographs_, torch in [(True, False), (False, True)]:
-        chosen = goal.decided(photographs=photographs_, torch=torch)
-        assert (chosen.compact.auto_count, chosen.finetune.enabled) == (False, False)
-    for other in (Settings(), Settings.from_preset("balanced", psnr=40)):
-        chosen = other.decided(photographs=True, torch=True)
-        assert (chosen.compact.auto_count, chosen.finetune.enabled) == (False, False)
-    assert goal.decided(photographs=True, torch=True).decided(photographs=False, torch=False) == goal.decided(
-        photographs=True, torch=True
-    )
-
-
-def test_without_torch_the_report_says_what_is_missing(tmp_path, monkeypatch):
-    monkeypatch.setattr("kissgs.pipeline.training_choice.find_spec", lambda name: None)
-    scene = cloud(100)
-    views = photographs(scene, tmp_path)
-    found = kissgs.compress(scene, settings=with_photographs(max_psnr_drop=0.5), views=views)
-    assert found.report.compaction is None
-    assert found.report.finetuning is None
-    assert "torch is missing: pip install 'kissgs[train]'" in found.report.note
-    kept = kissgs.compress(scene, settings=with_photographs({"enabled": False}, target_size="1MB"))
-    assert "torch" not in kept.report.note
-
-
 @pytest.mark.parametrize("share", [0.45, 0.8])
 @pytest.mark.quick(0)
 def test_fewer_gaussians_for_a_size(share):
@@ -356,51 +224,6 @@ def test_a_stopped_search_returns_its_best(count):
     else:
         with pytest.raises(kissgs.StopSearch):
             kissgs.compress(SCENE, settings=chosen, progress=stop)
-
-
-@pytest.mark.parametrize("goal", [{"max_psnr_drop": 9}, {"target_size": 7000}])
-def test_a_search_that_is_stopped_while_its_first_container_is_evaluated_keeps_it(tmp_path, goal):
-    stopped, tuned = [], []
-
-    def stop(now, fraction, note=""):
-        tuned.extend([now] * (now == "finetune" and fraction == 1))
-        if now == "evaluate" and tuned and not stopped:
-            stopped.append(now)
-            raise kissgs.StopSearch
-
-    scene = cloud(300)
-    views = photographs(scene, tmp_path)
-    found = kissgs.compress(scene, settings=with_photographs(**goal), views=views, progress=stop)
-    assert stopped
-    assert found.report.finetuning is not None
-    assert found.report.trials[-1].bytes == len(found.to_zip())
-
-
-@pytest.mark.parametrize("count", [1, 2, 7, 8])
-def test_few_gaussians_with_photographs(tmp_path, count):
-    scene = cloud(8).select(range(count))
-    found = kissgs.compress(scene, settings=with_photographs(max_psnr_drop=1), views=photographs(scene, tmp_path, 4, 1))
-    assert 1 <= len(kissgs.decompress(found.files)) <= count
-
-
-@pytest.mark.parametrize("stage", ["score", "sparsify", "finetune"])
-def test_a_stopped_search_for_a_count_encodes_what_it_has(tmp_path, stage):
-    stopped = []
-
-    def stop(now, fraction, note=""):
-        if now == stage and fraction > 0 and not stopped:
-            stopped.append(now)
-            raise kissgs.StopSearch
-
-    scene = cloud(300)
-    views = photographs(scene, tmp_path)
-    found = kissgs.compress(scene, settings=with_photographs(max_psnr_drop=9), views=views, progress=stop)
-    assert stopped
-    assert found.report.finetuning is None
-    assert found.report.trials[-1].drop <= 9
-    stopped.clear()
-    with pytest.raises(kissgs.StopSearch):
-        kissgs.compress(scene, settings=with_photographs(target_size=4100), views=views, progress=stop)
 
 
 @pytest.mark.parametrize(
