@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from kissgs.core.deadline import Pace
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.free_memory import keep_free_memory
 from kissgs.core.progress import Progress, silent
@@ -151,7 +152,7 @@ def _training_steps(model: GaussianModel, camera: Camera, threads: int) -> list[
 
     grey = np.full((camera.height, camera.width, 3), 0.5, np.float16)
     targets = TrainingTargets((camera,), (grey,), np.zeros(3, np.float32), "renderings")
-    plan = TrainingPlan("measure", REPEATS + 1, lambda done: NO_RATES, ssim_weight=0.2, seed=(0,))
+    plan = TrainingPlan("measure", Pace(REPEATS + 1), lambda done: NO_RATES, ssim_weight=0.2, seed=(0,))
     ends: list[float] = []
     train(model, targets, plan, after=lambda done: ends.append(time.process_time()), threads=threads)
     return (1e3 * np.diff(ends)).tolist()

@@ -101,6 +101,15 @@ MaxSsimDropOption = Annotated[
         help="Find the smallest container that loses at most this SSIM, such as 0.003; also with --max-psnr-drop.",
     ),
 ]
+TimeOption = Annotated[
+    str | None,
+    typer.Option(
+        "--time",
+        metavar="TIME",
+        help="Time for each scene, such as 30s, 2min or 1h: the best that is found in it. With a goal, which comes "
+        "first, it bounds the search. --evaluate takes longer.",
+    ),
+]
 RayOption = Annotated[
     str | None,
     typer.Option(

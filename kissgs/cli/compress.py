@@ -27,6 +27,7 @@ from kissgs.cli.arguments import (
     SetOption,
     TargetSizeOption,
     ThreadsOption,
+    TimeOption,
 )
 from kissgs.cli.files import for_each_input
 from kissgs.cli.options import budget_of, chosen, device_of, open_views, refuse_without_training
@@ -50,6 +51,7 @@ def compress(
     target_size: TargetSizeOption = None,
     max_psnr_drop: MaxPsnrDropOption = None,
     max_ssim_drop: MaxSsimDropOption = None,
+    time: TimeOption = None,
     compact: Annotated[
         str | None,
         typer.Option(
@@ -116,6 +118,7 @@ def compress(
         budget=None if compact is None else budget_of(compact),
         finetune=finetune,
         seed=seed,
+        time=time,
         psnr=psnr,
         target_size=target_size,
         max_psnr_drop=max_psnr_drop,

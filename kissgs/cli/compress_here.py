@@ -31,7 +31,8 @@ def compress_here(options: CompressOptions, capture: Views | None, scene: str, t
         KissgsError: as :func:`kissgs.compress`, or standard output cannot be written.
     """
     piped = str(target) == "-"
-    with progress_bar(options.quiet) as bar, stoppable(bar, options.settings.searches) as progress:
+    searches = options.settings.searches or options.settings.aims
+    with progress_bar(options.quiet) as bar, stoppable(bar, searches) as progress:
         if options.evaluate:  # reported here, because evaluation reports only one stage
             from kissgs.rendering.rasterizer import load_kernels
 

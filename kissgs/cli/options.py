@@ -26,6 +26,7 @@ def chosen(
     group: str = "encode",
     budget: Values | None = None,
     finetune: str | None = None,
+    time: str | None = None,
     **options: float | str | None,
 ) -> Settings:
     """Return the settings of a preset with ``NAME=VALUE`` changes, which ``options`` override.
@@ -36,6 +37,7 @@ def chosen(
         group: "encode", "compact" or "finetune".
         budget: settings of the group "compact".
         finetune: a number of steps, 0 for no fine-tuning, or "auto" for that of the preset; None if not given.
+        time: time limit with a unit; None for no limit.
         options: settings of ``group``; None if not given.
 
     Raises:
@@ -60,7 +62,8 @@ def chosen(
     if group == "encode" and options.get("seed") is not None:
         for other in ("compact", "finetune"):
             values[other].setdefault("seed", options["seed"])
-    return Settings.from_preset(preset, compact=values["compact"], finetune=values["finetune"], **values["encode"])
+    groups = {"compact": values["compact"], "finetune": values["finetune"]}
+    return Settings.from_preset(preset, time_limit=time, **groups, **values["encode"])
 
 
 FINETUNE, RAY = "--finetune", "--ray"

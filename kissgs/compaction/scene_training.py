@@ -12,6 +12,7 @@ from kissgs.cameras.virtual.scene_bounds import scene_bounds
 from kissgs.compaction.schedule import Phase, lr_schedule
 from kissgs.compaction.scoring import prune_by_score
 from kissgs.core.array_types import Float32, Int
+from kissgs.core.deadline import Deadline, Pace
 from kissgs.core.progress import Progress
 from kissgs.core.splats import Splats
 from kissgs.rendering.rasterizer import Device
@@ -119,14 +120,18 @@ class SceneTraining:
         regularizers: tuple[Regularizer, ...] = (),
         first: int = 0,
         after: Callable[[int], None] = lambda done: None,
+        deadline: Deadline | None = None,
         progress: Progress,
     ) -> None:
-        """Train for one phase; arguments are those of :func:`kissgs.training.loop.train`."""
+        """Train for one phase, with fewer steps where ``deadline`` comes first.
+
+        The other arguments are those of :func:`kissgs.training.loop.train`.
+        """
         from kissgs.training.loop import TrainingPlan, train
 
         plan = TrainingPlan(
             stage=phase.name,
-            steps=phase.steps,
+            pace=Pace(phase.steps, deadline),
             rates=lr_schedule(self.settings, phase, targets.target_source),
             ssim_weight=self.settings.ssim_weight,
             seed=seed,

@@ -13,11 +13,15 @@ from kissgs.compaction.result import Compacted, CompactionReport
 from kissgs.compaction.scene_training import SceneTraining
 from kissgs.compaction.schedule import Phase
 from kissgs.core.array_types import Int
+from kissgs.core.deadline import Deadline
 from kissgs.core.splats import Splats
 from kissgs.rendering.rasterizer import load_kernels
 
 if TYPE_CHECKING:
     from kissgs.training.targets import TrainingTargets
+
+MOST_STEPS = 4
+"""Most steps before a deadline, in units of the usual number: more improve a scene by less than 1 %."""
 
 REFINEMENT = 1_000_000
 """Number of the refinement in seeds: no path has as many points."""
@@ -76,32 +80,37 @@ class TrainingPath:
         training.prune(count, self.task.progress)
         return self._add(training, len(self.points))
 
-    def train(self) -> PathPoint:
-        """Train the last point for ``sparsify_steps / prune_rounds`` steps, and return it; reports "sparsify"."""
+    def train(self, deadline: Deadline | None = None) -> PathPoint:
+        """Train the last point for ``sparsify_steps / prune_rounds`` steps, and return it; reports "sparsify".
+
+        With a deadline, as many steps are made as fit in, up to :data:`MOST_STEPS` times as many.
+        """
         task, point = self.task, self.points[-1]
-        steps = task.settings.sparsify_steps // task.settings.prune_rounds
+        steps = task.settings.sparsify_steps // task.settings.prune_rounds * (1 if deadline is None else MOST_STEPS)
         if steps == 0:
             return point
         training = self._at(point)
         if not point.trained:
             training.begin(self._targets())
-        self._train(training, Phase("sparsify", steps, len(point)), point.number)
+        self._train(training, Phase("sparsify", steps, len(point)), point.number, deadline)
         self.points.pop()
         return self._add(training, point.number)
 
-    def compacted(self, point: PathPoint, *, refine: bool) -> Compacted:
+    def compacted(self, point: PathPoint, *, refine: bool, deadline: Deadline | None = None) -> Compacted:
         """Return a point as a compacted scene.
 
         Args:
             point: a point of this path.
             refine: complete its training with falling learning rates; reports the stage "refine".
+            deadline: time until which that shall be done, with as many steps as fit in.
         """
         task, splats = self.task, point.splats
         if refine and task.settings.refine_steps:
             training = self._at(point)
             if not point.trained:
                 training.begin(self._targets())
-            self._train(training, Phase("refine", task.settings.refine_steps, len(point)), REFINEMENT + point.number)
+            phase = Phase("refine", task.settings.refine_steps, len(point))
+            self._train(training, phase, REFINEMENT + point.number, deadline)
             splats = training.splats()
         report = CompactionReport(
             source_count=len(task.splats),
@@ -113,9 +122,10 @@ class TrainingPath:
         )
         return Compacted(splats, point.index, report)
 
-    def _train(self, training: SceneTraining, phase: Phase, number: int) -> None:
+    def _train(self, training: SceneTraining, phase: Phase, number: int, deadline: Deadline | None = None) -> None:
         task = self.task
-        training.train(phase, self._targets(), (task.settings.seed, number), progress=task.progress)
+        seed = (task.settings.seed, number)
+        training.train(phase, self._targets(), seed, deadline=deadline, progress=task.progress)
 
     def _targets(self) -> TrainingTargets:
         if self._loaded is None:

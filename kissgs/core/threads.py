@@ -21,7 +21,7 @@ class Workers:
 
     def __init__(self, threads: int) -> None:
         """Create the pool; ``threads`` below 1 means all processors that this process may use."""
-        self.threads = threads if threads >= 1 else _processors()
+        self.threads = threads if threads >= 1 else processors()
         self._pool = ThreadPoolExecutor(self.threads)
 
     def map(
@@ -46,7 +46,7 @@ class Workers:
         self._pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _processors() -> int:
+def processors() -> int:
     """Return the number of processors that this process may use, or of all where the system does not report it."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from kissgs.core.array_types import Float32, Float64, Int
+from kissgs.core.deadline import Pace
 from kissgs.finetuning import kernels
 from kissgs.finetuning.planes import Plane
 from kissgs.finetuning.quantized_scene import QuantizedScene
@@ -91,22 +92,22 @@ class TotalVariationLoss:
     and over channels. The paper does not state the unit; here it is levels.
     """
 
-    def __init__(self, scene: QuantizedScene, weight: float, steps: int) -> None:
+    def __init__(self, scene: QuantizedScene, weight: float, pace: Pace) -> None:
         """Prepare the loss.
 
         Args:
             scene: the scene that is trained.
             weight: factor of the paper's weights.
-            steps: number of training steps.
+            pace: number of training steps.
         """
-        self._scene, self._weight, self._steps = scene, weight, steps
+        self._scene, self._weight, self._pace = scene, weight, pace
         device = scene.latents["means"].device
         self._one, self._other = (torch.from_numpy(side).to(device) for side in _neighbours(scene.grid))
 
     def penalty(self, step: int, parameters: Parameters) -> Tensor | None:
         """Return the weighted total variation of the current levels; ``parameters`` are not used."""
         begin, end = TV_RAMP
-        weight = self._weight * min(max((step / self._steps - begin) / (end - begin), 0.0), 1.0)
+        weight = self._weight * min(max((step / self._pace.steps - begin) / (end - begin), 0.0), 1.0)
         if weight == 0 or len(self._one) == 0:
             return None
         total = torch.zeros((), dtype=torch.float64, device=self._one.device)

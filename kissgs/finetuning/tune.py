@@ -14,6 +14,7 @@ import torch
 
 from kissgs._version import __version__
 from kissgs.cameras.views import Views
+from kissgs.core.deadline import Deadline, Pace
 from kissgs.core.errors import OutputError
 from kissgs.core.limits import MAX_GAUSSIANS
 from kissgs.core.progress import Progress, as_stage, silent
@@ -54,6 +55,12 @@ ATTRACTION_START = 0.5
 TABLE_LR = 1.0
 """Learning rate of tables in units of that of the levels: an error of a value is one of everything that uses it."""
 
+EVALUATIONS = 2
+"""Evaluations after the training: here, and in a search for a goal."""
+
+MOST_STEPS = 4
+"""Most steps before a deadline, in units of the setting ``steps``: more improve a container by less than 1 %."""
+
 NOT_KEPT = "fine-tuning did not help; the container is as it was without it"
 
 Write = Callable[[EncodingPlan, int, Progress], Encoded]
@@ -64,7 +71,7 @@ Decode = Callable[..., Splats]
 """Decoder of a container: takes its files, ``max_gaussians`` and ``threads``."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Tuner:
     """Fine-tunes encoding plans of one scene.
 
@@ -78,6 +85,8 @@ class Tuner:
         progress: receives the stage "finetune", and then those of writing.
         container: what the container can hold.
         decode: decoder of the container.
+        deadline: time until which a container shall be finished and evaluated: training makes as many steps as fit in,
+            up to :data:`MOST_STEPS` times the setting ``steps``. None for exactly that setting.
     """
 
     original: Splats
@@ -89,6 +98,7 @@ class Tuner:
     progress: Progress
     container: ContainerModel = EVEN_LEVELS
     decode: Decode = decode_sogxt
+    deadline: Deadline | None = None
 
     @classmethod
     def of(
@@ -102,6 +112,7 @@ class Tuner:
         progress: Progress = silent,
         container: ContainerModel = EVEN_LEVELS,
         decode: Decode = decode_sogxt,
+        deadline: Deadline | None = None,
     ) -> Tuner:
         """Prepare the targets: photographs of ``views``, or renderings of the original from virtual cameras.
 
@@ -113,7 +124,7 @@ class Tuner:
         targets = training_targets(
             original, supervision.train, supervision.background, threads=threads, device=device, progress=progress
         )
-        return cls(original, settings, supervision, targets, device, threads, progress, container, decode)
+        return cls(original, settings, supervision, targets, device, threads, progress, container, decode, deadline)
 
     def __call__(
         self, plan: EncodingPlan, start: EncodingPlan, scene: Splats, write: Write, checkpoint: Path | None = None
@@ -135,17 +146,23 @@ class Tuner:
         started = time.perf_counter()
         as_finetune = as_stage("finetune", self.progress)
         before = write(plan, 0, as_finetune)
+        written = time.perf_counter()
         first = self._evaluate(before, as_finetune)
+        evaluated = time.perf_counter()
         rd_lambda = plan.rd_lambda or implied_lambda(
             self._coding_error(before, scene, as_finetune), int(plan.grid.mask.sum())
         )
-        tuned, checkpoint_note = self._train(start, scene.sh_degree, start.rd_lambda or rd_lambda, checkpoint)
-        after = write(tuned, self.settings.steps, self.progress)
+        pace = Pace(self.settings.steps)
+        if self.deadline is not None:  # what comes after the training takes as long as what came before it
+            ending = (written - started) + EVALUATIONS * (evaluated - written)
+            pace = Pace(MOST_STEPS * self.settings.steps, self.deadline.earlier(ending))
+        tuned, checkpoint_note = self._train(start, scene.sh_degree, start.rd_lambda or rd_lambda, pace, checkpoint)
+        after = write(tuned, pace.steps, self.progress)
         second = self._evaluate(after, self._report_images_done)
         cost, new_cost = (result.error + 8 * result.bytes * rd_lambda for result in (first, second))
         kept = new_cost < cost
         report = FinetuneReport(
-            steps=self.settings.steps,
+            steps=pace.steps,
             target_source=self.targets.target_source,
             source=self.supervision.source,
             psnr_before=first.psnr,
@@ -186,7 +203,7 @@ class Tuner:
         )
 
     def _train(
-        self, plan: EncodingPlan, sh_degree: int, rd_lambda: float, path: Path | None
+        self, plan: EncodingPlan, sh_degree: int, rd_lambda: float, pace: Pace, path: Path | None
     ) -> tuple[EncodingPlan, str]:
         """Return the fine-tuned plan, and a note if the checkpoint could not be saved."""
         settings, scene = self.settings, QuantizedScene(plan, sh_degree, self.device, self.container)
@@ -203,7 +220,7 @@ class Tuner:
 
         def after(step: int) -> None:
             nonlocal checkpoint_note
-            if checkpoint.due or (path is not None and step == settings.steps):
+            if checkpoint.due or (path is not None and step == pace.steps):
                 try:
                     checkpoint.save({**scene.state(), **rate_loss.state(), "done": np.asarray(step)})
                 except OutputError as error:
@@ -211,11 +228,11 @@ class Tuner:
 
         training = TrainingPlan(
             stage="finetune",
-            steps=settings.steps,
+            pace=pace,
             rates=_lr_schedule(settings, self.targets),
             ssim_weight=settings.ssim_weight,
             seed=(settings.seed,),
-            regularizers=(rate_loss, TotalVariationLoss(scene, settings.tv_weight, settings.steps)),
+            regularizers=(rate_loss, TotalVariationLoss(scene, settings.tv_weight, pace)),
             batch=settings.batch,
         )
         train(scene, self.targets, training, first=done, after=after, threads=self.threads, progress=self.progress)

@@ -16,6 +16,7 @@ from kissgs.pipeline.encoding import FinetuneFactors
 from kissgs.pipeline.goal import HALF_ERROR_DB, Goal
 from kissgs.pipeline.path_points import OVERHEAD_BYTES, POINTS_PER_HALVING, count_at, last_number, number_for_size
 from kissgs.pipeline.rate_control import Container, Encoder, RateControl
+from kissgs.pipeline.search_time import SearchTime
 from kissgs.pipeline.trained_search import Position, search_positions
 from kissgs.pipeline.training_choice import has_photographs
 from kissgs.pipeline.trial import Trial
@@ -36,6 +37,9 @@ PRUNABLE_POINTS = 3
 
 FIRST_NUMBER = 5
 """Number of the point that is tried first with photographs where the goal is no size: a third of the Gaussians."""
+
+ONLY_NUMBER = 2
+"""The same for a container that must meet the goal because there is no time for another one."""
 
 TRAINED_OFFSET_DB = 3.0
 """Added to ``quality_offset_db`` for a scene trained on photographs. At equal bytes, fewer Gaussians with finer levels
@@ -95,11 +99,15 @@ class CountSearch:
     Attributes:
         encoding: encoding of the whole scene.
         compactor: compactor of the same scene.
+        time: the time of the search; None for no limit. It limits training on photographs only.
+        aims: whether the goal is no more than an aim: if no container meets it in time, the closest one is kept.
         trials: all containers that were made, in order.
     """
 
     encoding: Encoding
     compactor: Compactor
+    time: SearchTime | None = None
+    aims: bool = False
     trials: list[Trial] = field(default_factory=list)
     _path: TrainingPath = field(init=False)
     _pruned: list[Trial] = field(init=False, default_factory=list)
@@ -109,9 +117,13 @@ class CountSearch:
     _whole: RateControl | None = field(init=False, default=None)
     _trained: dict[int, TrainedScene] = field(init=False, default_factory=dict)
     _stopped: bool = field(init=False, default=False)
+    _containers: int = field(init=False)
 
     def __post_init__(self) -> None:
         self._path = self.compactor.path(keep_states=not self._tunes)
+        self._containers = self.compactor.settings.max_compactions
+        if self.time is not None:
+            self._containers = self.time.containers(self._containers)
 
     def run(self) -> tuple[Compacted, RateControl | None, tuple[Trial, ...]]:
         """Return the scene that serves the goal best, the search that made its container, and all trials.
@@ -165,11 +177,25 @@ class CountSearch:
     def _number_for_size(self) -> int:
         return number_for_size(self.compactor.splats, self._target_size)
 
+    @property
+    def _first_number(self) -> int:
+        """Number of the point that is tried first with photographs."""
+        if self.goal.by_size:
+            return self._number_for_size
+        if self._containers > 1 or self.time is None:
+            return FIRST_NUMBER
+        if not self.aims:
+            return ONLY_NUMBER
+        return FIRST_NUMBER - self.time.short
+
     def _search(self) -> None:
         if not self._photographs:
             self._search_without_photographs()
         elif not self.goal.by_size or (self._target_size > OVERHEAD_BYTES and self._number_for_size > 0):
-            self._prune()
+            if self.time is None:
+                self._prune()
+            else:  # what each point loses is not worth the time to measure it
+                self._prune_to(min(self._first_number - 1, PRUNABLE_POINTS))
             self._search_along_path()
 
     def _search_without_photographs(self) -> None:
@@ -192,13 +218,20 @@ class CountSearch:
     def _prune(self) -> None:
         """Prune without training as far as that serves the goal, and record what each point loses."""
         while len(self._path.points[-1]) > 1:
-            point = self._path.prune(count_at(len(self._path.points), len(self.compactor.splats)))
+            point = self._prune_to(len(self._path.points))
             trial = self._measure(point.splats)
             self._pruned.append(trial)
             useful = self._photographs or self.goal.by_size or self.goal.margin(trial) >= self.goal.decisive(trial).half
             enough = self._photographs and point.number == PRUNABLE_POINTS
             if enough or not useful or not (trial.drop or 0.0) <= PRUNABLE_DROP:  # a drop may be NaN
                 break
+
+    def _prune_to(self, number: int) -> PathPoint:
+        """Prune without training up to a point of the path."""
+        path = self._path
+        while len(path.points) <= number:
+            path.prune(count_at(len(path.points), len(self.compactor.splats)))
+        return path.points[-1]
 
     def _encode_last_pruned(self, serves: Callable[[Trial], bool]) -> None:
         """Search for the lambda at the last point that ``serves`` the goal."""
@@ -219,11 +252,15 @@ class CountSearch:
         search_positions(
             self.goal,
             self._encode_position,
-            self._number_for_size if self.goal.by_size else FIRST_NUMBER,
+            self._first_number,
             (1, last_number(len(self.compactor.splats))),
             POINTS_PER_HALVING,
-            self.compactor.settings.max_compactions,
+            self._containers,
         )
+        if self.aims and self._best is None:
+            closest = max(self._trained.values(), key=lambda scene: self.goal.margin(scene.search.trials[-1]))
+            closest.search.best = closest.search.closest
+            self._keep(closest.search, closest.compacted)
 
     def _encode_position(self, position: Position) -> RateControl:
         """Make the container of a position of the path; return the search of that number of Gaussians."""
@@ -233,18 +270,24 @@ class CountSearch:
         if number not in self._trained:
             self._trained[number] = self._train(number)
         trained = self._trained[number]
+        if self.time is not None and self._tuner is not None:
+            self._tuner.deadline = self.time.for_container(self._containers - len(self.trials))
         before = len(trained.search.trials)
         try:
             trained.search.make(trained.encoder, None if position.log2_lambda is None else 2.0**position.log2_lambda)
         finally:
             self.trials += trained.search.trials[before:]
+        trained.search.stopped |= self.time is not None and self.time.over
         self._stopped |= trained.search.stopped
         self._keep(trained.search, trained.compacted)
         return trained.search
 
     def _train(self, number: int) -> TrainedScene:
         """Train up to a point of the path, and prepare its encoding."""
-        compacted = self._path.compacted(self._trained_point(number), refine=not self._tunes)
+        point, deadline = self._trained_point(number), None
+        if self.time is not None:
+            deadline = self.time.for_container(self._containers - len(self.trials)).earlier(self.time.encode_seconds)
+        compacted = self._path.compacted(point, refine=not self._tunes, deadline=deadline)
         encoding = self._encoding_of(compacted)
         if self._tunes:  # training replaces the refit of colours
             encoding = encoding.with_encode_settings(color_refit_iterations=0)
@@ -258,10 +301,18 @@ class CountSearch:
         path = self._path
         while len(path.points) <= number:
             if not path.points[-1].trained:
-                path.train()
+                self._train_point(number)
             path.prune(count_at(len(path.points), len(self.compactor.splats)))
-            path.train()
+            self._train_point(number)
         return path.points[number]
+
+    def _train_point(self, number: int) -> None:
+        """Train the last point of the path, on the way to point ``number``."""
+        deadline = None
+        if self.time is not None:
+            points = number + 2 - len(self._path.points)
+            deadline = self.time.for_point(points, self._containers - len(self.trials))
+        self._path.train(deadline)
 
     def _encode(self, compacted: Compacted) -> RateControl:
         """Search for the lambda of a scene without fine-tuning."""

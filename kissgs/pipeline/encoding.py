@@ -15,6 +15,7 @@ import numpy as np
 from kissgs._version import __version__
 from kissgs.cameras.views import Views
 from kissgs.core.array_types import Float32, Int
+from kissgs.core.deadline import Deadline
 from kissgs.core.errors import StopSearch, UnsupportedError
 from kissgs.core.free_memory import return_free_memory
 from kissgs.core.progress import Progress, SearchNote, as_stage
@@ -90,6 +91,7 @@ class Encoding:
         packed: whether the files become a zip, whose size then counts; False for a folder.
         threads: number of threads; 0 means one per processor.
         progress: receives the events of all stages; its note says how far a search has come.
+        deadline: time until which the container shall be finished; None for no limit.
         disposable: whether nobody needs the scene after the encoding. If so, and it is planned only once, it is
             replaced by an empty one before the images are compressed, so that its memory is free.
     """
@@ -107,6 +109,7 @@ class Encoding:
     packed: bool
     threads: int
     progress: SearchNote
+    deadline: Deadline | None = None
     disposable: bool = False
 
     def run(
@@ -192,6 +195,7 @@ class Encoding:
             count=len(self.splats),
             packed=self.packed,
             byte_limit=byte_limit,
+            deadline=self.deadline,
         )
 
     def with_encode_settings(self, **changes: float) -> Encoding:
@@ -249,6 +253,7 @@ class Encoding:
             progress=self.progress,
             container=MODELS[self.container],
             decode=DECODERS[self.container],
+            deadline=self.deadline,
         )
 
     def _planner(self) -> Planner:

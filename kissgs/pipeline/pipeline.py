@@ -11,6 +11,7 @@ import numpy as np
 
 from kissgs.compaction.result import Compacted
 from kissgs.core.array_types import Int
+from kissgs.core.deadline import Deadline
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.limits import MAX_GAUSSIANS
 from kissgs.core.progress import Progress, SearchNote, as_stage, ignore_stop_search, silent
@@ -22,6 +23,7 @@ from kissgs.pipeline.containers import FILES
 from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.report import Report
 from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, save_ply
+from kissgs.pipeline.time_plan import time_plan
 from kissgs.pipeline.training_choice import decided, note_on_training
 from kissgs.rendering.rasterizer import Device
 from kissgs.settings import EncodeSettings, Settings
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
     from kissgs.evaluation.results import Evaluation
     from kissgs.pipeline.encoding import Encoding
     from kissgs.pipeline.rate_control import RateControl
+    from kissgs.pipeline.search_time import SearchTime
     from kissgs.pipeline.trial import Trial
 
 
@@ -199,9 +202,12 @@ def compress(
     if target is not None:
         check_destination(target, overwrite=overwrite, names=FILES)
     finetune_checkpoint = _check_finetuning(settings, views, checkpoint, device)
+    deadline = None if settings.time_limit is None else Deadline.after(settings.time_limit)
     clock = StageTimer(progress)
     original, cleaned, source_bytes = open_scene(source, reading, threads, clock)
     source_count, sh_degree = len(original) + cleaned.removed, original.sh_degree
+    plan = time_plan(requested, settings, len(original), deadline, captured=views is not None, threads=threads)
+    settings = plan.settings
     encoding = Encoding(
         splats=original,
         original=original,
@@ -216,10 +222,11 @@ def compress(
         packed=target is None or is_packed(target),
         threads=threads,
         progress=SearchNote(clock),
+        deadline=deadline,
         disposable=not (evaluate or isinstance(source, Splats)),
     )
     del original
-    compacted, search, trials = _compact_first(encoding, checkpoint)
+    compacted, search, trials = _compact_first(encoding, checkpoint, plan.time, aims=requested.aims)
     after_search = ignore_stop_search(clock) if settings.searches else clock
     if compacted is not None:
         encoding = replace(encoding, splats=compacted.splats)
@@ -247,7 +254,7 @@ def compress(
         finetuning=result.finetuning,
         invisible=encoded.invisible,
         pruned_by_rd=encoded.pruned_by_rd,
-        note="; ".join(filter(None, [encoded.note, result.note, note_on_training(requested, views)])),
+        note="; ".join(filter(None, [encoded.note, result.note, note_on_training(requested, views), plan.note])),
         clipped_colors=encoded.clipped_colors,
         form_error=encoded.form_error,
         max_quantization_error=encoded.errors,
@@ -256,7 +263,7 @@ def compress(
         seconds=clock.seconds,
         cpu_seconds=clock.cpu_seconds,
         peak_memory=peak_memory(),
-        settings=_settings_as_used(settings, result.settings),
+        settings=_settings_as_used(settings, result.settings, requested),
         evaluation=evaluation,
     )
     order = encoded.order if compacted is None else compacted.index[encoded.order]
@@ -276,11 +283,12 @@ def _check_finetuning(
     return None if checkpoint is None or settings.encode.has_goal else finetune_checkpoint_path(Path(checkpoint))
 
 
-def _settings_as_used(requested: Settings, used: EncodeSettings) -> dict[str, Any]:
-    """Return the requested settings with the changes by a search for a goal and by fine-tuning."""
-    kept = (*GOALS, "rd_lambda", "quality_offset_db", "color_refit_iterations")  # the same request gives the same bytes
-    changes = {name: getattr(requested.encode, name) for name in kept}
-    return requested.model_copy(update={"encode": used.model_copy(update=changes)}).model_dump(mode="json")
+def _settings_as_used(decided: Settings, used: EncodeSettings, requested: Settings) -> dict[str, Any]:
+    """Return the settings with the changes by a search for a goal and by fine-tuning, and the goals as requested."""
+    kept = ("rd_lambda", "quality_offset_db", "color_refit_iterations")  # the same request gives the same bytes
+    changes = {name: getattr(decided.encode, name) for name in kept}
+    changes |= {name: getattr(requested.encode, name) for name in GOALS}
+    return decided.model_copy(update={"encode": used.model_copy(update=changes)}).model_dump(mode="json")
 
 
 class _Common(TypedDict):
@@ -290,7 +298,7 @@ class _Common(TypedDict):
 
 
 def _compact_first(
-    encoding: Encoding, checkpoint: AnyPath | None
+    encoding: Encoding, checkpoint: AnyPath | None, time: SearchTime | None, *, aims: bool
 ) -> tuple[Compacted | None, RateControl | None, tuple[Trial, ...]]:
     """Compact the scene if requested; return the result, the search made with ``auto_count``, and its trials."""
     splats, settings, path = encoding.splats, encoding.settings.compact, Path(checkpoint) if checkpoint else None
@@ -308,7 +316,7 @@ def _compact_first(
         raise UnsupportedError(NO_CHECKPOINT.format("goal"))
     if len(splats) < 2:
         return unchanged(splats, "too few to remove any"), None, ()
-    return CountSearch(encoding, Compactor.of(splats, settings, encoding.views, **common)).run()
+    return CountSearch(encoding, Compactor.of(splats, settings, encoding.views, **common), time, aims).run()
 
 
 def _evaluate(

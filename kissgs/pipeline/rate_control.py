@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from kissgs.cameras.views import Views
+from kissgs.core.deadline import Deadline
 from kissgs.core.errors import StopSearch, UnsupportedError
 from kissgs.core.limits import MAX_GAUSSIANS
 from kissgs.core.progress import SearchNote
@@ -82,6 +84,7 @@ class RateControl:
         settings: settings of the containers: those given, with another codebook size where the goal needs it.
         trials: all containers made so far.
         best: best container so far; None if none meets the goal.
+        closest: of the containers that miss the goal, the one with the least distance to it; None if there is none.
         stopped: whether the search was stopped from outside (:class:`kissgs.StopSearch`).
         cannot_improve: whether ``byte_limit`` was reached.
         overhead: bytes of the latest container that are no images.
@@ -98,6 +101,7 @@ class RateControl:
         count: int | None = None,
         packed: bool = True,
         byte_limit: float = math.inf,
+        deadline: Deadline | None = None,
     ) -> None:
         """Prepare the search; nothing is encoded yet.
 
@@ -110,6 +114,7 @@ class RateControl:
             count: number of Gaussians of the scene that is encoded, if it is not ``original``.
             packed: whether the files become a zip, whose size then counts; False for a folder.
             byte_limit: for a goal that is no size: the search ends if a container of this size or more misses the goal.
+            deadline: once a container meets the goal, no other one is begun that would not be finished by then.
         """
         self.original, self.settings, self.goal = original, settings, Goal.of(settings)
         self.views, self.threads, self.progress = views, threads, progress
@@ -117,6 +122,7 @@ class RateControl:
         self.packed, self.byte_limit = packed, byte_limit
         self.trials: list[Trial] = []
         self.best: Container | None = None
+        self.closest: Container | None = None
         self.stopped = self.cannot_improve = False
         self.overhead = 0
         self._bytes = 0
@@ -126,6 +132,8 @@ class RateControl:
         self._psnr: float | None = None
         self._finetuning: FinetuneReport | None = None
         self._rendered: dict[str, Rendering] | None = None
+        self._distance = -math.inf
+        self._deadline, self._begun, self._longest = deadline, time.perf_counter(), 0.0
 
     def search_all(self, encoder: Encoder) -> None:
         """Search with up to ``max_encodes`` containers; change the codebook size if lambda alone cannot meet the goal.
@@ -224,7 +232,7 @@ class RateControl:
         return f"target_size {int(target):,} bytes is above the finest container of this scene: {self._bytes:,} bytes"
 
     def _run(self, encoder: Encoder, rd_lambda: float | None, attempts: int) -> None:
-        first = encoder(self.settings if rd_lambda is None else self._settings_at(rd_lambda))
+        first = self._encode(encoder, self.settings if rd_lambda is None else self._settings_at(rd_lambda))
         first_sample = self._sample(first)
         if first.encoded.rd_lambda is None:
             return
@@ -246,7 +254,7 @@ class RateControl:
             elif self._finest is not None and settings == self._finest[0]:
                 sample = self._finest[1]
             else:
-                sample = self._sample(encoder(settings))
+                sample = self._sample(self._encode(encoder, settings))
             self._samples[x] = sample
             return sample.margin
 
@@ -259,6 +267,17 @@ class RateControl:
             stop=StopRule(attempts, self._is_jump),
             before={x: sample.margin for x, sample in self._samples.items()},
         )
+
+    def _encode(self, encoder: Encoder, settings: EncodeSettings) -> Container:
+        """Make a container.
+
+        Raises:
+            StopSearch: one that meets the goal exists, and another would not be finished before the deadline.
+        """
+        self._begun = time.perf_counter()
+        if self._deadline is not None and self.best is not None and self._deadline.seconds < self._longest:
+            raise StopSearch
+        return encoder(settings)
 
     def _is_far_below(self, size: int) -> bool:
         """Whether the finest container may fit into the target size, given the bytes of the first container."""
@@ -273,7 +292,7 @@ class RateControl:
         limited = self._is_codebook_limited(self.settings)
         unlimited = self.settings.model_copy(update={"gaussians_per_codebook_entry": 1.0} if limited else {})
         settings = self._settings_at(2.0 ** LOG2_LAMBDA_RANGE[0], unlimited)
-        sample = self._sample(encoder(settings))
+        sample = self._sample(self._encode(encoder, settings))
         if sample.margin < 0:
             self._finest = settings, sample
         return sample.margin >= 0
@@ -321,6 +340,9 @@ class RateControl:
         self.progress.note = f"try {len(self.trials) + 1}, last: {trial.summary()}"
         limit = self.goal.decisive(trial)
         margin = limit.room(trial)
+        if self._distance < margin < 0:
+            self.closest, self._distance = container, margin
+        self._longest = max(self._longest, time.perf_counter() - self._begun)
         self._finetuning = container.finetuning or self._finetuning
         if margin >= 0 and self._is_better(container, size):
             self.best, self._bytes = container, size

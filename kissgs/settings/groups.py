@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from kissgs.core.errors import UnsupportedError
 from kissgs.settings.compact import CompactSettings
+from kissgs.settings.duration import Duration
 from kissgs.settings.encode import EncodeSettings
 from kissgs.settings.finetune import FinetuneSettings
 from kissgs.settings.presets import PRESETS, Preset
@@ -20,12 +21,25 @@ GROUPS: dict[str, type[BaseModel]] = {
 }
 
 
+AIMED_DROP = 0.1
+"""Loss of PSNR, decibels, that a search aims at where only its time is limited: few people see it."""
+
+
 class Settings(BaseModel):
     """All settings of a compression: one group per stage."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     preset: Preset = Field(Preset.BALANCED, description="Preset that settings which are not given come from.")
+    time_limit: Duration | None = Field(
+        None,
+        gt=0,
+        le=1e6,
+        description="Seconds that a compression may take, or 30s, 2min, 1h. A goal comes first: then time bounds the "
+        "search. Without a goal: with photographs and torch, the smallest container found that loses at most 0.1 dB, "
+        "or as little as time allows; else the preset, or fast if that takes too long. The same bytes are made again "
+        "only where the machine is equally fast.",
+    )
     compact: CompactSettings = CompactSettings()
     encode: EncodeSettings = EncodeSettings()
     finetune: FinetuneSettings = FinetuneSettings()
@@ -35,30 +49,45 @@ class Settings(BaseModel):
         """Whether several scenes or containers are made to find one that meets a goal."""
         return self.encode.has_goal or self.compact.max_psnr_drop is not None
 
+    @property
+    def aims(self) -> bool:
+        """Whether only the time is limited, so that training may choose the quality."""
+        encode = self.encode
+        return self.time_limit is not None and encode.rate_distortion and not encode.has_goal and not encode.rd_lambda
+
     def decided(self, *, photographs: bool, torch: bool) -> Self:
         """Return settings with what they leave open decided: whether training serves the goal.
 
-        A size or a loss is served best by fewer Gaussians that are trained on photographs, and by fine-tuning. Pruning
-        or training without photographs loses more in views that nobody knows than it saves, and a PSNR to the scene's
-        own renderings falls by training on photographs.
+        A size, a loss or the smallest container in a limited time is served best by fewer Gaussians that are trained on
+        photographs, and by fine-tuning. Pruning or training without photographs loses more in views that nobody knows
+        than it saves, and a PSNR to the scene's own renderings falls by training on photographs.
 
         Args:
             photographs: whether there are photographs to train on, and others to evaluate the result.
             torch: whether torch is installed, which training needs.
         """
-        trains = self.encode.has_goal and self.encode.psnr is None and photographs and torch
+        trains = (self.encode.has_goal or self.aims) and self.encode.psnr is None and photographs and torch
         compact, finetune = self.compact, self.finetune
         if compact.auto_count is None:
             wanted = trains and compact.trains and not compact.enabled
             compact = compact.model_copy(update={"auto_count": wanted})
         if finetune.enabled is None:
             finetune = finetune.model_copy(update={"enabled": trains})
-        return self.model_copy(update={"compact": compact, "finetune": finetune})
+        encode = self.encode
+        if self.aims and compact.auto_count:
+            encode = encode.model_copy(update={"max_psnr_drop": AIMED_DROP})
+        return self.model_copy(update={"compact": compact, "encode": encode, "finetune": finetune})
 
     @model_validator(mode="after")
     def _a_goal_to_go_by(self) -> Self:
         if self.compact.auto_count and self.compact.method == "merge":
             raise ValueError("auto_count prunes; give count or ratio with method merge")
+        compact = self.compact
+        if self.time_limit is not None and (compact.count or compact.max_psnr_drop or (compact.ratio or 1.0) < 1):
+            raise ValueError(
+                "time_limit does not apply to compaction by a given budget: leave out count, ratio and max_psnr_drop "
+                "of compact, or the time limit"
+            )
         if self.compact.auto_count and not self.encode.has_goal:
             raise ValueError(
                 "auto_count needs a goal: give target_size, max_psnr_drop, max_ssim_drop or psnr, or the number of "
@@ -81,6 +110,7 @@ class Settings(BaseModel):
         *,
         compact: Mapping[str, Any] | CompactSettings | None = None,
         finetune: Mapping[str, Any] | FinetuneSettings | None = None,
+        time_limit: float | str | None = None,
         **encode: Any,  # noqa: ANN401
     ) -> Settings:
         """Return the settings of a preset, with those that are given replaced.
@@ -89,6 +119,7 @@ class Settings(BaseModel):
             preset: name of the preset.
             compact: settings of compaction to replace.
             finetune: settings of fine-tuning to replace.
+            time_limit: seconds that a compression may take, or 30s, 2min, 1h; None for no limit.
             encode: settings of the encoder to replace.
 
         Raises:
@@ -100,6 +131,7 @@ class Settings(BaseModel):
             return cls.model_validate(
                 {
                     "preset": preset,
+                    "time_limit": time_limit,
                     "compact": compact if isinstance(compact, CompactSettings) else dict(compact or {}),
                     "encode": encode,
                     "finetune": finetune if isinstance(finetune, FinetuneSettings) else dict(finetune or {}),

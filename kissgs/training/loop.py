@@ -11,6 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
+from kissgs.core.deadline import Pace
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.free_memory import keep_free_memory
 from kissgs.core.progress import Progress, silent
@@ -69,7 +70,7 @@ class TrainingPlan:
 
     Attributes:
         stage: name of the stage in progress events.
-        steps: number of steps.
+        pace: number of steps.
         rates: learning rates.
         ssim_weight: weight of 1 - SSIM in the loss, 0 to 1; the mean absolute difference has the rest.
         seed: seed of the order of the images, one number or several.
@@ -78,7 +79,7 @@ class TrainingPlan:
     """
 
     stage: str
-    steps: int
+    pace: Pace
     rates: LrSchedule
     ssim_weight: float
     seed: Sequence[int]
@@ -105,7 +106,7 @@ def train(
         scene: the scene to train; changed in place.
         targets: cameras and target images.
         plan: settings of the training.
-        first: number of steps already done.
+        first: number of steps already done; without a deadline of the plan.
         after: called after each step with the number of steps done.
         threads: number of threads; 0 means one per processor.
         progress: receives the plan's stage, with count, loss and PSNR to the targets as its note. If it raises, the
@@ -113,8 +114,10 @@ def train(
     """
     order, running = targets.order(plan.seed, first * plan.batch), RunningMeans()
     with torch_threads(threads), keep_free_memory():
-        for step in range(first, plan.steps):
-            progress(plan.stage, step / plan.steps, running.text(len(scene)))
+        step, pace = first, plan.pace
+        pace.update(step)
+        while step < pace.steps:
+            progress(plan.stage, step / pace.steps, running.text(len(scene)))
             parameters = scene.gaussians()
             losses, errors = [], []
             for n in islice(order, plan.batch):
@@ -129,10 +132,12 @@ def train(
                 penalty = regularizer.penalty(step, parameters)
                 loss = loss if penalty is None else loss + penalty
             loss.backward()  # type: ignore[no-untyped-call]
-            scene.step(plan.rates(step / plan.steps))
+            scene.step(plan.rates(step / pace.steps))
             for regularizer in plan.regularizers:
                 regularizer.update(step, scene)
-            after(step + 1)
+            step += 1
+            after(step)
+            pace.update(step)
     progress(plan.stage, 1.0, running.text(len(scene)))
 
 

@@ -9,6 +9,7 @@ import torch
 from helpers.training_scenes import cloud
 from helpers.tuning_scenes import chosen, shuffled
 
+from kissgs.core.deadline import Pace
 from kissgs.finetuning.losses import ENTROPY_FIELDS, PAPER_TV_WEIGHTS, RateLoss, TotalVariationLoss
 from kissgs.finetuning.quantized_scene import QuantizedScene
 from kissgs.sog.container_model import SOG
@@ -102,8 +103,8 @@ def test_histograms_are_updated_every_25_steps_and_restored():
 
 def test_losses_of_weight_zero_are_skipped():
     assert RateLoss(quantized(), 0.0).penalty(0, {}) is None
-    assert TotalVariationLoss(quantized(), 0.0, 10).penalty(9, {}) is None
-    assert TotalVariationLoss(quantized(), 1.0, 100).penalty(35, {}) is None
+    assert TotalVariationLoss(quantized(), 0.0, Pace(10)).penalty(9, {}) is None
+    assert TotalVariationLoss(quantized(), 1.0, Pace(100)).penalty(35, {}) is None
 
 
 @pytest.mark.parametrize(("count", "preset"), [(400, "fast"), (70, "paper"), (1, "fast")])
@@ -127,13 +128,13 @@ def test_total_variation_equals_that_of_the_images(count, preset):
                             steps.append(np.abs(image[y, x] - image[v, u]))
             total += weight * np.mean(steps) if steps else 0.0
     for step, share in ((475, 0.5), (600, 1.0), (1000, 1.0)):
-        found = TotalVariationLoss(scene, 3.0, 1000).penalty(step, {})
+        found = TotalVariationLoss(scene, 3.0, Pace(1000)).penalty(step, {})
         assert value(found) == pytest.approx(3 * share * total, rel=1e-6)
 
 
 def test_total_variation_decreases_in_training():
     scene = quantized(preset="fast")
-    loss, rates = TotalVariationLoss(scene, 100.0, 1), {**dict.fromkeys(scene.latents, 0.05), "attraction": 0.0}
+    loss, rates = TotalVariationLoss(scene, 100.0, Pace(1)), {**dict.fromkeys(scene.latents, 0.05), "attraction": 0.0}
     before = value(loss.penalty(1, {}))
     for _ in range(40):
         loss.penalty(1, {}).backward()

@@ -6,6 +6,7 @@ import torch
 from helpers.training_scenes import around, cloud, same, targets_of
 
 import kissgs
+from kissgs.core.deadline import Pace
 from kissgs.rendering.losses import plain_photometric_loss
 from kissgs.rendering.rasterizer import render
 from kissgs.training.loop import TrainingPlan, exponential_lr, train
@@ -16,7 +17,14 @@ RATES = {"means": 2e-3, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0":
 
 def plan(steps=30, **changes):
     return TrainingPlan(
-        **{"stage": "learn", "steps": steps, "rates": lambda done: RATES, "ssim_weight": 0.2, "seed": (0,), **changes}
+        **{
+            "stage": "learn",
+            "pace": Pace(steps),
+            "rates": lambda done: RATES,
+            "ssim_weight": 0.2,
+            "seed": (0,),
+            **changes,
+        }
     )
 
 

@@ -1,0 +1,65 @@
+"""Expected time of an encoding on this machine, from its speed as ``kissgs warmup`` has measured it."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+
+from kissgs.core.threads import processors
+from kissgs.io.atomic import atomic_file
+from kissgs.settings import Preset
+
+ENCODE_SECONDS = {
+    Preset.FAST: (0.6, 6e-6),
+    Preset.BALANCED: (5.0, 36e-6),
+    Preset.SMALL: (5.0, 40e-6),
+    Preset.PAPER: (1.0, 140e-6),
+}
+"""Seconds of an encoding by preset, a fixed part and one per Gaussian, measured on two processors."""
+
+REFERENCE_PROCESSORS, MOST_PROCESSORS = 2, 8
+"""Processors of that machine, and the number beyond which an encoding is taken to become no faster."""
+
+
+def encode_seconds(preset: Preset, count: int, threads: int = 0) -> float:
+    """Return the expected wall time of an encoding of ``count`` Gaussians without training, seconds.
+
+    ``threads`` is the number of threads; 0 means one per processor.
+    """
+    fixed, each = ENCODE_SECONDS[preset]
+    used = min(threads or processors(), processors(), MOST_PROCESSORS)
+    return (fixed + each * count) / (_speed_per_processor() * used)
+
+
+def save_speed(seconds: float, preset: Preset, count: int) -> float:
+    """Save the speed of this machine, which encoded ``count`` Gaussians in ``seconds`` with all its processors.
+
+    Returns:
+        Its speed in units of that of the machine of :data:`ENCODE_SECONDS`.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    fixed, each = ENCODE_SECONDS[preset]
+    speed = (fixed + each * count) / seconds
+    path = _speed_file()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_file(path, overwrite=True) as file:
+        file.write(json.dumps({"speed_per_processor": speed / min(processors(), MOST_PROCESSORS)}).encode())
+    return speed
+
+
+def _speed_per_processor() -> float:
+    """Return the speed that was saved, of the reference machine if none was or the file is damaged."""
+    try:
+        speed = float(json.loads(_speed_file().read_bytes())["speed_per_processor"])
+    except (OSError, ValueError, TypeError, KeyError):
+        return 1 / REFERENCE_PROCESSORS
+    return speed if math.isfinite(speed) and speed > 0 else 1 / REFERENCE_PROCESSORS
+
+
+def _speed_file() -> Path:
+    """Return the file of the speed, in the user's folder for caches."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "kissgs" / "speed.json"

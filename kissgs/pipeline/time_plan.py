@@ -1,0 +1,63 @@
+"""What a limited time is used for: training, the preset, or the fastest preset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from kissgs.core.deadline import Deadline
+from kissgs.pipeline.machine_speed import encode_seconds
+from kissgs.pipeline.search_time import SearchTime
+from kissgs.settings import Preset, Settings
+
+TRAINING_TIME = 3.2
+"""Time from which training on photographs pays, in units of an encoding without training."""
+
+CAPTURE_TIME = 1.5
+"""Time of an encoding with a capture, whose images colours are refitted to, in units of one without."""
+
+
+@dataclass(frozen=True, slots=True)
+class TimePlan:
+    """How a limited time is used.
+
+    Attributes:
+        settings: settings that fit into the time.
+        time: the time, for a search that trains; None for no limit.
+        note: what the user may not expect; empty if there is nothing to say.
+    """
+
+    settings: Settings
+    time: SearchTime | None = None
+    note: str = ""
+
+
+def time_plan(
+    requested: Settings, settings: Settings, count: int, deadline: Deadline | None, *, captured: bool, threads: int
+) -> TimePlan:
+    """Choose what to do in the time that is left for a scene.
+
+    Training that was not requested is left out where there is too little time for it, and the preset where even a
+    plain encoding takes too long, unless a goal or a setting of the encoder is given.
+
+    Args:
+        requested: settings as requested.
+        settings: the same with what they leave open decided, as if there were time for everything.
+        count: number of Gaussians.
+        deadline: time until which the container shall be ready; None for no limit.
+        captured: whether there is a capture.
+        threads: number of threads; 0 means one per processor.
+    """
+    if deadline is None:
+        return TimePlan(settings)
+    plain, left = encode_seconds(settings.preset, count, threads), deadline.seconds
+    time = SearchTime(deadline, plain)
+    if left >= TRAINING_TIME * plain:
+        return TimePlan(settings, time)
+    settings = requested.decided(photographs=False, torch=False)
+    usual = Settings.from_preset(settings.preset, seed=settings.encode.seed).encode
+    takes = plain * (CAPTURE_TIME if captured and settings.encode.rate_distortion else 1.0)
+    if left >= takes or settings.preset == Preset.FAST or settings.encode != usual or settings.finetune.enabled:
+        return TimePlan(settings, time)
+    fast = Settings.from_preset(Preset.FAST, compact=settings.compact, seed=settings.encode.seed)
+    fast = fast.model_copy(update={"time_limit": settings.time_limit, "finetune": settings.finetune})
+    return TimePlan(fast, time, f"encoded with the preset fast: {settings.preset} would take about {takes:.0f} s")
