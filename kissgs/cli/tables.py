@@ -135,9 +135,11 @@ def _compaction(report: CompactionReport, *, search: bool = True) -> list[Render
 def _finetuning(report: FinetuneReport) -> list[Text]:
     """Format the result of fine-tuning in one line, and its note."""
     targets = "photographs" if report.target_source == "photos" else "renderings of the scene"
+    first_size = "" if report.bytes_before is None else f"{size(report.bytes_before)} -> "
+    first_psnr = "" if report.psnr_before is None else f"{format_metric(report.psnr_before, 2)} -> "
     line = (
-        f"fine-tuned on {targets}: {size(report.bytes_before)} -> {size(report.bytes_after)}, held-out PSNR "
-        f"{format_metric(report.psnr_before, 2)} -> {format_metric(report.psnr_after, 2)} dB, {report.seconds:.0f} s"
+        f"fine-tuned on {targets}: {first_size}{size(report.bytes_after)}, held-out PSNR "
+        f"{first_psnr}{format_metric(report.psnr_after, 2)} dB, {report.seconds:.0f} s"
     )
     return [Text(line), *([Text(report.note, style="yellow")] if report.note else [])]
 

@@ -91,7 +91,7 @@ class TrainingPath:
             return point
         training = self._at(point)
         if not point.trained:
-            training.begin(self._targets())
+            training.begin(self.targets)
         self._train(training, Phase("sparsify", steps, len(point)), point.number, deadline)
         self.points.pop()
         return self._add(training, point.number)
@@ -108,14 +108,14 @@ class TrainingPath:
         if refine and task.settings.refine_steps:
             training = self._at(point)
             if not point.trained:
-                training.begin(self._targets())
+                training.begin(self.targets)
             phase = Phase("refine", task.settings.refine_steps, len(point))
             self._train(training, phase, REFINEMENT + point.number, deadline)
             splats = training.splats()
         report = CompactionReport(
             source_count=len(task.splats),
             count=len(splats),
-            target_source=self._targets().target_source if point.trained or refine else "nothing",
+            target_source=self.targets.target_source if point.trained or refine else "nothing",
             source=task.supervision.source,
             steps=(),
             note=task.supervision.note,
@@ -125,9 +125,11 @@ class TrainingPath:
     def _train(self, training: SceneTraining, phase: Phase, number: int, deadline: Deadline | None = None) -> None:
         task = self.task
         seed = (task.settings.seed, number)
-        training.train(phase, self._targets(), seed, deadline=deadline, progress=task.progress)
+        training.train(phase, self.targets, seed, deadline=deadline, progress=task.progress)
 
-    def _targets(self) -> TrainingTargets:
+    @property
+    def targets(self) -> TrainingTargets:
+        """Target images of the training, which are loaded or rendered when they are first needed."""
         if self._loaded is None:
             self._loaded = self.task.load_targets()
         return self._loaded
@@ -137,7 +139,7 @@ class TrainingPath:
         training = SceneTraining(task.splats, task.settings, task.supervision, task.threads, task.device)
         training.index = point.index
         if point.state is not None:
-            training.restore(point.state, point.index, self._targets())
+            training.restore(point.state, point.index, self.targets)
         return training
 
     def _add(self, training: SceneTraining, number: int) -> PathPoint:

@@ -14,11 +14,12 @@ class FinetuneReport:
         steps: number of training steps.
         target_source: training targets: "photos", or "renderings" of the original scene.
         source: description of the training views.
-        psnr_before: PSNR of the container before fine-tuning, decibels: mean over the evaluation views, to photographs
+        psnr_before: PSNR of the container without fine-tuning, decibels: mean over the evaluation views, to photographs
             or, without them, to renderings of the original scene. Evaluation views are held-out views, or training
-            views if there are none.
+            views if there are none. None if no such container was made, because training the scene went on through
+            fine-tuning.
         psnr_after: PSNR after fine-tuning, decibels.
-        bytes_before: size of the container before fine-tuning, as a zip.
+        bytes_before: size of the container without fine-tuning, as a zip; None as before.
         bytes_after: size after fine-tuning, as a zip.
         kept: whether the fine-tuned container was kept: it has less squared error plus lambda times bits.
         seconds: wall time, evaluation included, preparation of the targets excluded.
@@ -28,9 +29,9 @@ class FinetuneReport:
     steps: int
     target_source: str
     source: str
-    psnr_before: float
+    psnr_before: float | None
     psnr_after: float
-    bytes_before: int
+    bytes_before: int | None
     bytes_after: int
     kept: bool
     seconds: float

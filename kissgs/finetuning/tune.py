@@ -55,9 +55,6 @@ ATTRACTION_START = 0.5
 TABLE_LR = 1.0
 """Learning rate of tables in units of that of the levels: an error of a value is one of everything that uses it."""
 
-EVALUATIONS = 2
-"""Evaluations after the training: here, and in a search for a goal."""
-
 MOST_STEPS = 4
 """Most steps before a deadline, in units of the setting ``steps``: more improve a container by less than 1 %."""
 
@@ -85,8 +82,9 @@ class Tuner:
         progress: receives the stage "finetune", and then those of writing.
         container: what the container can hold.
         decode: decoder of the container.
-        deadline: time until which a container shall be finished and evaluated: training makes as many steps as fit in,
-            up to :data:`MOST_STEPS` times the setting ``steps``. None for exactly that setting.
+        deadline: time until which a container shall be finished: training makes as many steps as fit in, up to
+            :data:`MOST_STEPS` times the setting ``steps``. None for exactly that setting.
+        ending_seconds: expected time of what comes after the training, seconds; measured by the first container.
     """
 
     original: Splats
@@ -99,6 +97,7 @@ class Tuner:
     container: ContainerModel = EVEN_LEVELS
     decode: Decode = decode_sogxt
     deadline: Deadline | None = None
+    ending_seconds: float = 0.0
 
     @classmethod
     def of(
@@ -113,26 +112,38 @@ class Tuner:
         container: ContainerModel = EVEN_LEVELS,
         decode: Decode = decode_sogxt,
         deadline: Deadline | None = None,
+        prepared: tuple[SupervisionViews, TrainingTargets] | None = None,
     ) -> Tuner:
         """Prepare the targets: photographs of ``views``, or renderings of the original from virtual cameras.
+
+        ``prepared`` are views and targets that exist already for these settings.
 
         Raises:
             InvalidViewsError: a photograph cannot be read.
             UnsupportedError: an image would take too much memory.
         """
-        supervision = supervision_views(original, views, settings, scoring_stride=0, threads=threads, progress=progress)
-        targets = training_targets(
-            original, supervision.train, supervision.background, threads=threads, device=device, progress=progress
-        )
-        return cls(original, settings, supervision, targets, device, threads, progress, container, decode, deadline)
+        if prepared is None:
+            views_by_role = supervision_views(
+                original, views, settings, scoring_stride=0, threads=threads, progress=progress
+            )
+            train, background = views_by_role.train, views_by_role.background
+            targets = training_targets(original, train, background, threads=threads, device=device, progress=progress)
+            prepared = views_by_role, targets
+        return cls(original, settings, *prepared, device, threads, progress, container, decode, deadline)
 
     def __call__(
-        self, plan: EncodingPlan, start: EncodingPlan, scene: Splats, write: Write, checkpoint: Path | None = None
+        self,
+        plan: EncodingPlan | None,
+        start: EncodingPlan,
+        scene: Splats,
+        write: Write,
+        checkpoint: Path | None = None,
     ) -> tuple[Encoded, FinetuneReport]:
         """Fine-tune, and return the better container with a report: the tuned one, or that of ``plan``.
 
         Args:
-            plan: plan of the container without fine-tuning, with at least one Gaussian.
+            plan: plan of the container without fine-tuning, with at least one Gaussian; None where the training is part
+                of that of the scene, so that no such container is made.
             start: plan from which training starts: ``plan``, or one with fewer Gaussians, at least one.
             scene: the scene of both plans.
             write: writes the files of a plan.
@@ -145,35 +156,37 @@ class Tuner:
         """
         started = time.perf_counter()
         as_finetune = as_stage("finetune", self.progress)
-        before = write(plan, 0, as_finetune)
-        written = time.perf_counter()
-        first = self._evaluate(before, as_finetune)
-        evaluated = time.perf_counter()
-        rd_lambda = plan.rd_lambda or implied_lambda(
-            self._coding_error(before, scene, as_finetune), int(plan.grid.mask.sum())
-        )
+        before, first, rd_lambda = None, None, start.rd_lambda
+        if plan is not None:
+            before = write(plan, 0, as_finetune)
+            first = self._evaluate(before, as_finetune)
+            self.ending_seconds = time.perf_counter() - started
+            rd_lambda = plan.rd_lambda
+        if rd_lambda is None:
+            container = before or write(start, 0, as_finetune)
+            rd_lambda = implied_lambda(self._coding_error(container, scene, as_finetune), int(start.grid.mask.sum()))
         pace = Pace(self.settings.steps)
-        if self.deadline is not None:  # what comes after the training takes as long as what came before it
-            ending = (written - started) + EVALUATIONS * (evaluated - written)
-            pace = Pace(MOST_STEPS * self.settings.steps, self.deadline.earlier(ending))
+        if self.deadline is not None:
+            pace = Pace(MOST_STEPS * self.settings.steps, self.deadline.earlier(self.ending_seconds))
         tuned, checkpoint_note = self._train(start, scene.sh_degree, start.rd_lambda or rd_lambda, pace, checkpoint)
+        trained = time.perf_counter()
         after = write(tuned, pace.steps, self.progress)
         second = self._evaluate(after, self._report_images_done)
-        cost, new_cost = (result.error + 8 * result.bytes * rd_lambda for result in (first, second))
-        kept = new_cost < cost
+        self.ending_seconds = time.perf_counter() - trained
+        kept = first is None or second.cost(rd_lambda) < first.cost(rd_lambda)
         report = FinetuneReport(
             steps=pace.steps,
             target_source=self.targets.target_source,
             source=self.supervision.source,
-            psnr_before=first.psnr,
+            psnr_before=None if first is None else first.psnr,
             psnr_after=second.psnr,
-            bytes_before=first.bytes,
+            bytes_before=None if first is None else first.bytes,
             bytes_after=second.bytes,
             kept=kept,
             seconds=time.perf_counter() - started,
             note="; ".join(filter(None, [self.supervision.note, "" if kept else NOT_KEPT, checkpoint_note])),
         )
-        return (after if kept else before), report
+        return (after if kept or before is None else before), report
 
     def _report_images_done(self, stage: str, fraction: float, note: str = "") -> None:
         self.progress("images", 1.0)
@@ -313,6 +326,10 @@ class _Result:
     bytes: int
     psnr: float
     error: float
+
+    def cost(self, rd_lambda: float) -> float:
+        """Return the error plus lambda times bits."""
+        return self.error + 8 * self.bytes * rd_lambda
 
 
 def _squared_error(psnr: float) -> float:

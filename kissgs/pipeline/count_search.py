@@ -120,10 +120,14 @@ class CountSearch:
     _containers: int = field(init=False)
 
     def __post_init__(self) -> None:
-        self._path = self.compactor.path(keep_states=not self._tunes)
         self._containers = self.compactor.settings.max_compactions
         if self.time is not None:
             self._containers = self.time.containers(self._containers)
+            if self.time.short:  # half of the views score nearly as well
+                supervision = self.compactor.supervision
+                score = supervision.score[::2]
+                self.compactor = replace(self.compactor, supervision=replace(supervision, score=score))
+        self._path = self.compactor.path(keep_states=not self._tunes)
 
     def run(self) -> tuple[Compacted, RateControl | None, tuple[Trial, ...]]:
         """Return the scene that serves the goal best, the search that made its container, and all trials.
@@ -291,7 +295,10 @@ class CountSearch:
         encoding = self._encoding_of(compacted)
         if self._tunes:  # training replaces the refit of colours
             encoding = encoding.with_encode_settings(color_refit_iterations=0)
-            self._tuner = self._tuner or encoding.tuner(COMPLETING)
+            prepared = self.compactor.supervision, self._path.targets
+            self._tuner = self._tuner or encoding.tuner(COMPLETING, prepared if self._photographs else None)
+            if self._tuner is not None and self.time is not None and not self.trials:
+                self._tuner.ending_seconds = self.time.ending_seconds
         offset = TRAINED_OFFSET_DB if self._photographs else 0.0
         search = encoding.rate_control(offset_db=offset, byte_limit=self._best_bytes())
         return TrainedScene(compacted, search, encoding.encoder(self._tuner))

@@ -38,6 +38,8 @@ from kissgs.settings import EncodeSettings, Settings
 if TYPE_CHECKING:
     from kissgs.finetuning.tune import Tuner
     from kissgs.rendering.sensitivity import WeightedCameras
+    from kissgs.training.supervision import SupervisionViews
+    from kissgs.training.targets import TrainingTargets
 
 VIEW_UNCERTAINTY = {True: 0.1, False: 0.55}
 """Default of the setting ``view_uncertainty``: True with the cameras of a capture, False with virtual cameras only."""
@@ -204,11 +206,16 @@ class Encoding:
         return replace(self, settings=self.settings.model_copy(update={"encode": encode}))
 
     def encoder(self, tuner: Tuner | None) -> Encoder:
-        """Return a function that plans, fine-tunes if there is a tuner, and writes the files."""
-        return self._encoder(self._planner(), tuner, None)
+        """Return a function that plans, fine-tunes as a part of training if there is a tuner, and writes the files."""
+        return self._encoder(self._planner(), tuner, None, completes=True)
 
-    def _encoder(self, planner: Planner, tuner: Tuner | None, checkpoint: Path | None) -> Encoder:
-        """Return a function that plans, fine-tunes if there is a tuner, and writes the files."""
+    def _encoder(
+        self, planner: Planner, tuner: Tuner | None, checkpoint: Path | None, *, completes: bool = False
+    ) -> Encoder:
+        """Return a function that plans, fine-tunes if there is a tuner, and writes the files.
+
+        If fine-tuning ``completes`` the training of the scene, no container is made without it.
+        """
 
         def encoder(settings: EncodeSettings) -> Container:
             pruned = self._pruned_for_finetune(settings)
@@ -217,11 +224,13 @@ class Encoding:
                 compacted = len(self.original) - len(self.splats)
                 return self._write(plan, pruned if finetune_steps else settings, compacted, finetune_steps, progress)
 
-            plan = planner(settings, self.progress)
+            plan = planner(pruned if completes and tuner is not None else settings, self.progress)
             if tuner is None or not plan.grid.mask.any():
                 return Container(files(plan, 0, self.progress), settings)
-            start = plan if pruned == settings else planner(pruned, as_stage("finetune", self.progress))
-            encoded, report = tuner(plan, start, self.splats, files, checkpoint)
+            start = plan
+            if not completes and pruned != settings:
+                start = planner(pruned, as_stage("finetune", self.progress))
+            encoded, report = tuner(None if completes else plan, start, self.splats, files, checkpoint)
             return Container(encoded, pruned if report.kept else settings, report)
 
         return encoder
@@ -233,8 +242,17 @@ class Encoding:
         threshold = max(settings.prune_threshold_bits, self.settings.finetune.prune_threshold_bits)
         return settings.model_copy(update={"prune_threshold_bits": threshold})
 
-    def tuner(self, factors: FinetuneFactors | None = None) -> Tuner | None:
-        """Return what fine-tunes the container, if the settings ask for it; ``factors`` change its settings."""
+    def tuner(
+        self,
+        factors: FinetuneFactors | None = None,
+        prepared: tuple[SupervisionViews, TrainingTargets] | None = None,
+    ) -> Tuner | None:
+        """Return what fine-tunes the container, if the settings ask for it.
+
+        Args:
+            factors: change its settings.
+            prepared: views and targets of compaction, which are used if those of fine-tuning are the same.
+        """
         settings = self.settings.finetune
         if not settings.enabled or len(self.splats) == 0:
             return None
@@ -254,6 +272,7 @@ class Encoding:
             container=MODELS[self.container],
             decode=DECODERS[self.container],
             deadline=self.deadline,
+            prepared=prepared if _same_views(self.settings) else None,
         )
 
     def _planner(self) -> Planner:
@@ -314,6 +333,12 @@ class Encoding:
             )
 
         return planner
+
+
+def _same_views(settings: Settings) -> bool:
+    """Return whether compaction and fine-tuning train on the same images."""
+    names = ("synthetic_view_share", "views", "view_size")
+    return all(getattr(settings.compact, name) == getattr(settings.finetune, name) for name in names)
 
 
 def check_finetuning(settings: Settings, views: Views | None, device: Device) -> None:

@@ -358,7 +358,7 @@ class RateControl:
         if self._psnr is None and self.best is not None:  # the first is fine-tuned at the lambda of the best
             self._psnr = finetuning.psnr_before
         psnr = finetuning.psnr_after if finetuning.kept else finetuning.psnr_before
-        if self._psnr is not None and psnr < self._psnr:
+        if self._psnr is not None and (psnr is None or psnr < self._psnr):
             return False
         self._psnr = psnr
         return True

@@ -13,6 +13,9 @@ TWO_CONTAINERS, THREE_CONTAINERS = 10.0, 30.0
 """Time from which a second and a third container are worth their time, in units of an encoding without training."""
 
 
+ENDING_SHARE = 0.45
+"""Time to write a fine-tuned container and to evaluate it, in units of an encoding without training."""
+
 FULL_TRAINING = 5.0
 """Time below which fewer Gaussians lose more by too short a training than they save, in the same unit."""
 
@@ -41,6 +44,11 @@ class SearchTime:
     def short(self) -> bool:
         """Whether there is too little time to train as few Gaussians as serve a goal best."""
         return self.deadline.seconds < FULL_TRAINING * self.encode_seconds
+
+    @property
+    def ending_seconds(self) -> float:
+        """Expected seconds to write a fine-tuned container and to evaluate it."""
+        return ENDING_SHARE * self.encode_seconds
 
     def containers(self, most: int) -> int:
         """Return how many containers to make in the time that is left, from 1 to ``most``."""

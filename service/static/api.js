@@ -11,7 +11,7 @@
  *     evaluate: boolean,
  *     compact: {count: number | null, ratio: number | null, max_psnr_drop: number | null, auto_count: boolean | null,
  *     sparsify_steps: number, refine_steps: number}, finetune: {enabled: boolean | null}},
- *   finetuning?: {kept: boolean, psnr_before: number | null, psnr_after: number | null, bytes_before: number,
+ *   finetuning?: {kept: boolean, psnr_before: number | null, psnr_after: number | null, bytes_before: number | null,
  *     bytes_after: number},
  *   upload_bytes: number, gaussians: number, sh_degree: number, kept?: number, compacted?: number, invisible?: number, cleaned?: Record<string, number>,
  *   evaluation?: {psnr?: number | null, ssim: number, ms_ssim?: number, worst?: {psnr: number | string | null, position: number[]}}, sizes?: Sizes, timings: Timings, starts: number,

@@ -81,7 +81,7 @@ function point(position) {
 
 /** @param {NonNullable<Status["finetuning"]>} finetuning */
 function gain({ kept, psnr_before: before, psnr_after: after, bytes_before: first, bytes_after: last }) {
-  if (!kept || before === null || after === null) return kept ? "kept" : "no improvement";
+  if (!kept || before === null || after === null || first === null) return kept ? "kept" : "no improvement";
   const [psnr, share] = [after - before, (100 * last) / first - 100];
   return `${psnr < 0 ? "−" : "+"}${Math.abs(psnr).toFixed(2)} dB, ${share < 0 ? "−" : "+"}${Math.abs(share).toFixed(1)} %`;
 }
