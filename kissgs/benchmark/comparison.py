@@ -107,6 +107,12 @@ def measurements(scene: Path, plan: BenchmarkPlan) -> list[tuple[str, Callable[[
     ]
 
 
+def in_time(seconds: float) -> str:
+    """Return the name of a measurement with a time limit: "in 30 s", "in 2 min"."""
+    minutes = seconds >= 60 and seconds % 60 == 0
+    return f"in {seconds / 60:g} min" if minutes else f"in {seconds:g} s"
+
+
 def _measure_preset(
     scene: Path, settings: Settings, quality_offset_db: float | None, container: ContainerName, plan: BenchmarkPlan
 ) -> Measurement:
@@ -129,7 +135,7 @@ def _measure_preset(
     first = results[0]
     return Measurement(
         scene=scene.name,
-        codec=str(settings.preset),
+        codec=str(settings.preset) if settings.time_limit is None else in_time(settings.time_limit),
         container=container,
         quality_offset_db=quality_offset_db,
         gaussians=first.report.source_count,

@@ -60,25 +60,28 @@ def comparison_plot(rows: Sequence[Measurement], path: Path) -> None:
         _bars(panels["bytes"], [(row.name, _kilobytes(row)) for row in whole], "kilobytes, by file")
         stages = [(row.name, row.median_run.stage_seconds) for row in whole if not row.is_external]
         _bars(panels["stages"], stages, "seconds, by stage")
-        labels = {"speed": _speed(panels["speed"], whole), "original": _quality(panels["original"], rows, "original")}
+        labels = {
+            "speed": _speed(panels["speed"], whole),
+            "original": quality_panel(panels["original"], rows, "original"),
+        }
         if photographed:
-            labels["photographs"] = _quality(panels["photographs"], rows, "photographs")
+            labels["photographs"] = quality_panel(panels["photographs"], rows, "photographs")
         figure.draw_without_rendering()  # the positions of points are known only after the layout
         for name, panel_labels in labels.items():
-            _place_labels(figure, panels[name], panel_labels)
+            place_labels(figure, panels[name], panel_labels)
 
 
 def _speed(axes: Axes, rows: Sequence[Measurement]) -> list[Annotation]:
     """Draw size over encoding time of presets and external codecs; better ones are further down and left."""
     positions = [(row.median_run.encode_cpu_seconds, row.bytes / max(row.gaussians, 1)) for row in rows]
-    labels = _points(axes, rows, positions)
+    labels = labelled_points(axes, rows, positions)
     axes.set(xscale="log", xlabel="encoding, CPU seconds", ylabel="bytes per Gaussian")
     axes.set_ylim(0, 1.15 * max(size for _, size in positions))
-    _set_log_axis(axes, [seconds for seconds, _ in positions])
+    set_log_axis(axes, [seconds for seconds, _ in positions])
     return labels
 
 
-def _quality(axes: Axes, rows: Sequence[Measurement], target: PsnrTarget) -> list[Annotation]:
+def quality_panel(axes: Axes, rows: Sequence[Measurement], target: PsnrTarget) -> list[Annotation]:
     """Draw quality over size, as curves, points and their Pareto front; better ones are further up and left."""
     positions = [(row.bytes / 1000, row.psnr(target)) for row in rows]
     known = [(row, (x, y)) for row, (x, y) in zip(rows, positions, strict=True) if y is not None and math.isfinite(y)]
@@ -92,7 +95,7 @@ def _quality(axes: Axes, rows: Sequence[Measurement], target: PsnrTarget) -> lis
         label = f"{curve_name(preset, container)}, by quality_offset_db"
         axes.plot(*zip(*curve, strict=True), line, color=BLACK, marker=".", linewidth=1.2, label=label)
     whole = [(row, position) for row, position in known if row.quality_offset_db is None]
-    labels = _points(axes, [row for row, _ in whole], [position for _, position in whole])
+    labels = labelled_points(axes, [row for row, _ in whole], [position for _, position in whole])
     if target == "photographs":
         references = [row.evaluation.mean.reference for row, _ in known if row.evaluation is not None]
         uncompressed = next((mean.psnr for mean in references if mean is not None), math.nan)
@@ -100,13 +103,15 @@ def _quality(axes: Axes, rows: Sequence[Measurement], target: PsnrTarget) -> lis
             axes.axhline(uncompressed, color=GREY, linewidth=1, linestyle="--", label="uncompressed scene")
     images = "renderings of the scene" if target == "original" else "photographs"
     axes.set(xscale="log", xlabel="kilobytes", ylabel=f"PSNR to {images}, dB")
-    _set_log_axis(axes, [size for _, (size, _) in known])
+    set_log_axis(axes, [size for _, (size, _) in known])
     if axes.get_legend_handles_labels()[0]:
         axes.legend(loc="lower right", fontsize="small")
     return labels
 
 
-def _points(axes: Axes, rows: Sequence[Measurement], positions: Sequence[tuple[float, float]]) -> list[Annotation]:
+def labelled_points(
+    axes: Axes, rows: Sequence[Measurement], positions: Sequence[tuple[float, float]]
+) -> list[Annotation]:
     """Draw presets as filled circles and external codecs as open squares; return their labels."""
     labels = []
     for row, position in zip(rows, positions, strict=True):
@@ -117,7 +122,7 @@ def _points(axes: Axes, rows: Sequence[Measurement], positions: Sequence[tuple[f
     return labels
 
 
-def _set_log_axis(axes: Axes, values: Sequence[float]) -> None:
+def set_log_axis(axes: Axes, values: Sequence[float]) -> None:
     """Set the limits of a logarithmic x axis around the values, with ticks in decimal notation at 1, 2, 5, 10, …"""
     low, high = min(values, default=1.0) * 0.8, max(values, default=1.0) * 1.35
     ticks = [digit * 10.0**power for power in range(-4, 10) for digit in (1, 2, 5)]
@@ -128,7 +133,7 @@ def _set_log_axis(axes: Axes, values: Sequence[float]) -> None:
     axes.grid(alpha=0.3)
 
 
-def _place_labels(figure: Figure, axes: Axes, labels: Sequence[Annotation]) -> None:
+def place_labels(figure: Figure, axes: Axes, labels: Sequence[Annotation]) -> None:
     """Move each label to where it overlaps least with points, lines, other labels and the legend."""
     radius = figure.dpi / 72 * 5
     points = axes.transData.transform([label.xy for label in labels])

@@ -85,6 +85,43 @@ def codecs(
 
 
 @app.command()
+def frontier(
+    scenes: FilesArgument,
+    times: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--time", metavar="TIME", help="Time limit to measure; repeatable. Default: 5s, 30s, 2min and 10min."
+        ),
+    ] = None,
+    presets: PresetsOption = None,
+    changes: SetAllOption = None,
+    external_codecs: ExternalCodecsOption = None,
+    splat_transform: SplatTransformOption = "splat-transform",
+    sog_iterations: SogIterationsOption = None,
+    plot: PlotOption = None,
+    views: ViewsOption = None,
+    scale: ScaleOption = None,
+    images: ImagesOption = None,
+    resolution: ResolutionOption = None,
+    threads: ThreadsOption = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure bytes and quality of what is found in limited times, beside presets and external codecs."""
+    capture = open_views(views, scale=scale, images=images, resolution=resolution)
+    inputs = open_inputs(scenes, capture, threads, plot)
+    from kissgs.cli import bench_codecs, bench_frontier
+
+    output = bench_frontier.frontier(
+        inputs,
+        times=times or [],
+        presets=presets,
+        changes=changes,
+        external=bench_codecs.ExternalCodecs(external_codecs or [], splat_transform, sog_iterations),
+    )
+    report(output, as_json, plot)
+
+
+@app.command()
 def scaling(
     counts: Annotated[
         list[int],

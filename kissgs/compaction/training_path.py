@@ -20,8 +20,8 @@ from kissgs.rendering.rasterizer import load_kernels
 if TYPE_CHECKING:
     from kissgs.training.targets import TrainingTargets
 
-MOST_STEPS = 4
-"""Most steps before a deadline, in units of the usual number: more improve a scene by less than 1 %."""
+MOST_STEPS = 2
+"""Most steps before a deadline, in units of the usual number: more do not improve other views."""
 
 REFINEMENT = 1_000_000
 """Number of the refinement in seeds: no path has as many points."""

@@ -55,8 +55,8 @@ ATTRACTION_START = 0.5
 TABLE_LR = 1.0
 """Learning rate of tables in units of that of the levels: an error of a value is one of everything that uses it."""
 
-MOST_STEPS = 4
-"""Most steps before a deadline, in units of the setting ``steps``: more improve a container by less than 1 %."""
+MOST_STEPS = 2
+"""Most steps before a deadline, in units of the setting ``steps``: more do not improve other views."""
 
 NOT_KEPT = "fine-tuning did not help; the container is as it was without it"
 

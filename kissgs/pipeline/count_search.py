@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
@@ -12,21 +11,20 @@ from kissgs.core.errors import StopSearch
 from kissgs.core.progress import SearchNote, ignore_stop_search
 from kissgs.core.splats import Splats
 from kissgs.evaluation.psnr_loss import drop_of
-from kissgs.pipeline.encoding import FinetuneFactors
+from kissgs.pipeline.candidates import Candidates
 from kissgs.pipeline.goal import HALF_ERROR_DB, Goal
 from kissgs.pipeline.path_points import OVERHEAD_BYTES, POINTS_PER_HALVING, count_at, last_number, number_for_size
-from kissgs.pipeline.rate_control import Container, Encoder, RateControl
+from kissgs.pipeline.rate_control import RateControl
 from kissgs.pipeline.search_time import SearchTime
+from kissgs.pipeline.trained_scenes import TrainedScenes
 from kissgs.pipeline.trained_search import Position, search_positions
 from kissgs.pipeline.training_choice import has_photographs
 from kissgs.pipeline.trial import Trial
-from kissgs.sogxt.container import stored_sizes
 
 if TYPE_CHECKING:
     from kissgs.compaction.budget import Compactor
     from kissgs.compaction.result import Compacted
     from kissgs.compaction.training_path import PathPoint, TrainingPath
-    from kissgs.finetuning.tune import Tuner
     from kissgs.pipeline.encoding import Encoding
 
 PRUNABLE_DROP = 1.0
@@ -38,54 +36,17 @@ PRUNABLE_POINTS = 3
 FIRST_NUMBER = 5
 """Number of the point that is tried first with photographs where the goal is no size: a third of the Gaussians."""
 
-ONLY_NUMBER = 2
-"""The same for a container that must meet the goal because there is no time for another one."""
+ONLY_NUMBERS = {(True, True): 4, (True, False): 5, (False, True): 2, (False, False): 4}
+"""Number of that point where there is time for a single container.
 
-TRAINED_OFFSET_DB = 3.0
-"""Added to ``quality_offset_db`` for a scene trained on photographs. At equal bytes, fewer Gaussians with finer levels
-then lose less than more Gaussians with coarser ones (fox: 15 % of the Gaussians at 5 dB, 25 % at 0)."""
-
-COMPLETING = FinetuneFactors(steps=1.2, lr=2.5, codebook_lr=2.0)
-"""Fine-tuning that completes the training of the path too.
-
-A refinement of the scene before its encoding would take more steps for the same quality.
+The key says whether the goal is no more than an aim, and whether the time is short. With fewer Gaussians, training that
+is too short loses more than they save.
 """
-
 
 BEYOND_PHOTOGRAPHS = (
     "trained for what the photographs show: beyond them it changes more (--evaluate measures how much; --compact 100% "
     "--finetune 0 keeps it)"
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Candidate:
-    """A number of Gaussians with containers that meet the goal.
-
-    Attributes:
-        cost: of the best container, to be minimised: minus PSNR where the goal is a size, else bytes.
-        search: the search that made the containers.
-        compacted: the scene that they hold.
-    """
-
-    cost: float
-    search: RateControl
-    compacted: Compacted
-
-
-@dataclass(frozen=True, slots=True)
-class TrainedScene:
-    """A scene of the path, and what makes containers of it.
-
-    Attributes:
-        compacted: the scene.
-        search: the search for its lambda.
-        encoder: encodes it, with fine-tuning if that is wanted.
-    """
-
-    compacted: Compacted
-    search: RateControl
-    encoder: Encoder
 
 
 @dataclass(slots=True, eq=False)
@@ -112,15 +73,16 @@ class CountSearch:
     _path: TrainingPath = field(init=False)
     _pruned: list[Trial] = field(init=False, default_factory=list)
     _tried: list[CountTrial] = field(init=False, default_factory=list)
-    _best: Candidate | None = field(init=False, default=None)
-    _tuner: Tuner | None = field(init=False, default=None)
+    _candidates: Candidates = field(init=False)
+    _scenes: TrainedScenes = field(init=False)
     _whole: RateControl | None = field(init=False, default=None)
-    _trained: dict[int, TrainedScene] = field(init=False, default_factory=dict)
     _stopped: bool = field(init=False, default=False)
     _containers: int = field(init=False)
 
     def __post_init__(self) -> None:
         self._containers = self.compactor.settings.max_compactions
+        if not self._photographs:
+            self.time = None
         if self.time is not None:
             self._containers = self.time.containers(self._containers)
             if self.time.short:  # half of the views score nearly as well
@@ -128,6 +90,10 @@ class CountSearch:
                 score = supervision.score[::2]
                 self.compactor = replace(self.compactor, supervision=replace(supervision, score=score))
         self._path = self.compactor.path(keep_states=not self._tunes)
+        self._candidates = Candidates(self.goal, self.encoding.packed)
+        self._scenes = TrainedScenes(
+            self.encoding, self.compactor, self._path, self._photographs, self.time, self._containers
+        )
 
     def run(self) -> tuple[Compacted, RateControl | None, tuple[Trial, ...]]:
         """Return the scene that serves the goal best, the search that made its container, and all trials.
@@ -143,13 +109,15 @@ class CountSearch:
             self._search()
         except StopSearch:
             self._stopped = True
-            if self._best is None:
+            if self._candidates.best is None:
                 progress = SearchNote(ignore_stop_search(self.encoding.progress))
                 self.encoding = replace(self.encoding, progress=progress)
                 self._encode(self._path.compacted(self._latest_point(), refine=False))
-            if self._best is None:
+            if self._candidates.best is None and not self.aims:
                 raise
-        best, compacted = self._best, unchanged(self.compactor.splats, self._reason_to_keep_all())
+        if self._candidates.best is None and self.aims:
+            self._candidates.keep_closest()
+        best, compacted = self._candidates.best, unchanged(self.compactor.splats, self._reason_to_keep_all())
         if best is not None:
             best.search.stopped |= self._stopped
             compacted = compacted if best.compacted.splats is self.compactor.splats else best.compacted
@@ -188,9 +156,7 @@ class CountSearch:
             return self._number_for_size
         if self._containers > 1 or self.time is None:
             return FIRST_NUMBER
-        if not self.aims:
-            return ONLY_NUMBER
-        return FIRST_NUMBER - self.time.short
+        return ONLY_NUMBERS[self.aims, self.time.short]
 
     def _search(self) -> None:
         if not self._photographs:
@@ -246,7 +212,7 @@ class CountSearch:
     def _encode_by_size(self) -> None:
         """Search for the lambda at the point that the size suggests, or at a later one if its containers are larger."""
         for attempt in range(self.compactor.settings.max_compactions):
-            compacted = self._path.compacted(self._trained_point(self._number_for_size + 2 * attempt), refine=True)
+            compacted = self._path.compacted(self._scenes.point(self._number_for_size + 2 * attempt), refine=True)
             self._measure(compacted.splats)
             if self._encode(compacted).best is not None:
                 return
@@ -261,100 +227,37 @@ class CountSearch:
             POINTS_PER_HALVING,
             self._containers,
         )
-        if self.aims and self._best is None:
-            closest = max(self._trained.values(), key=lambda scene: self.goal.margin(scene.search.trials[-1]))
-            closest.search.best = closest.search.closest
-            self._keep(closest.search, closest.compacted)
+        if self.goal.by_size and self._candidates.best is None:  # lambda alone makes this scene small enough
+            self._encode(self._path.compacted(self._path.points[-1], refine=False))
 
     def _encode_position(self, position: Position) -> RateControl:
         """Make the container of a position of the path; return the search of that number of Gaussians."""
         number, progress = position.number, self.encoding.progress
         last = f"; last: {self.trials[-1].summary()}" if self.trials else ""
         progress.note = f"{count_at(number, len(self.compactor.splats)):,} Gaussians{last}"
-        if number not in self._trained:
-            self._trained[number] = self._train(number)
-        trained = self._trained[number]
-        if self.time is not None and self._tuner is not None:
-            self._tuner.deadline = self.time.for_container(self._containers - len(self.trials))
+        self._scenes.containers = max(self._containers - len(self.trials), 1)
+        trained = self._scenes.scene(number, self._candidates.best_bytes)
         before = len(trained.search.trials)
         try:
             trained.search.make(trained.encoder, None if position.log2_lambda is None else 2.0**position.log2_lambda)
         finally:
             self.trials += trained.search.trials[before:]
         trained.search.stopped |= self.time is not None and self.time.over
+        self._candidates.keep(trained.search, trained.compacted)
         self._stopped |= trained.search.stopped
-        self._keep(trained.search, trained.compacted)
         return trained.search
-
-    def _train(self, number: int) -> TrainedScene:
-        """Train up to a point of the path, and prepare its encoding."""
-        point, deadline = self._trained_point(number), None
-        if self.time is not None:
-            deadline = self.time.for_container(self._containers - len(self.trials)).earlier(self.time.encode_seconds)
-        compacted = self._path.compacted(point, refine=not self._tunes, deadline=deadline)
-        encoding = self._encoding_of(compacted)
-        if self._tunes:  # training replaces the refit of colours
-            encoding = encoding.with_encode_settings(color_refit_iterations=0)
-            prepared = self.compactor.supervision, self._path.targets
-            self._tuner = self._tuner or encoding.tuner(COMPLETING, prepared if self._photographs else None)
-            if self._tuner is not None and self.time is not None and not self.trials:
-                self._tuner.ending_seconds = self.time.ending_seconds
-        offset = TRAINED_OFFSET_DB if self._photographs else 0.0
-        search = encoding.rate_control(offset_db=offset, byte_limit=self._best_bytes())
-        return TrainedScene(compacted, search, encoding.encoder(self._tuner))
-
-    def _trained_point(self, number: int) -> PathPoint:
-        """Prune and train up to a point of the path."""
-        path = self._path
-        while len(path.points) <= number:
-            if not path.points[-1].trained:
-                self._train_point(number)
-            path.prune(count_at(len(path.points), len(self.compactor.splats)))
-            self._train_point(number)
-        return path.points[number]
-
-    def _train_point(self, number: int) -> None:
-        """Train the last point of the path, on the way to point ``number``."""
-        deadline = None
-        if self.time is not None:
-            points = number + 2 - len(self._path.points)
-            deadline = self.time.for_point(points, self._containers - len(self.trials))
-        self._path.train(deadline)
 
     def _encode(self, compacted: Compacted) -> RateControl:
         """Search for the lambda of a scene without fine-tuning."""
-        search = self._encoding_of(compacted).search(byte_limit=self._best_bytes())
-        self._stopped |= search.stopped
+        search = self._encoding_of(compacted).search(byte_limit=self._candidates.best_bytes)
         self.trials += search.trials
-        self._keep(search, compacted)
+        self._candidates.keep(search, compacted)
+        self._stopped |= search.stopped
         return search
 
     def _encoding_of(self, compacted: Compacted) -> Encoding:
         cache = self.encoding.cache if compacted.splats is self.encoding.splats else None
         return replace(self.encoding, splats=compacted.splats, cache=cache)
-
-    def _keep(self, search: RateControl, compacted: Compacted) -> None:
-        """Keep the best container of a search if it is better than that of all others."""
-        if search.best is None:
-            return
-        cost = float(stored_sizes(search.best.encoded.files, packed=self.encoding.packed)[0])
-        if self.goal.by_size:
-            cost = -self._psnr(search, search.best)
-        if self._best is None or cost < self._best.cost:
-            self._best = Candidate(cost, search, compacted)
-
-    def _psnr(self, search: RateControl, container: Container) -> float:
-        """Return the PSNR of a container, at most 1000 dB; minus infinity if a rendering failed."""
-        try:
-            psnr = search.evaluate(container.encoded).mean.candidate.psnr
-        except StopSearch:  # the container exists, so it is evaluated before the search ends
-            search.stopped = self._stopped = True
-            psnr = search.evaluate(container.encoded).mean.candidate.psnr
-        return -math.inf if math.isnan(psnr) else min(psnr, 1e3)
-
-    def _best_bytes(self) -> float:
-        """Return the bytes of the best container so far; infinite where bytes are not the cost."""
-        return math.inf if self._best is None or self.goal.by_size else self._best.cost
 
     def _measure(self, splats: Splats) -> Trial:
         """Return the figures of a scene that is not encoded, and record them for the report."""

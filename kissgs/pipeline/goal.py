@@ -85,13 +85,15 @@ class Limit:
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """A goal for a container: a size, a PSNR, or a drop of PSNR, of SSIM or of both.
+    """A goal for a container: a size, or the quality that the smallest container must have.
 
     Attributes:
-        limits: what the container must meet.
+        limits: what the container must meet: its size, or a PSNR, a drop of PSNR, one of SSIM, or several of these.
+        most_bytes: for a quality: bytes that the smallest container with it may have at most; None for any number.
     """
 
     limits: tuple[Limit, ...]
+    most_bytes: int | None = None
 
     @classmethod
     def of(cls, settings: EncodeSettings) -> Goal:
@@ -100,10 +102,7 @@ class Goal:
         Near is 3 % of a size, 0.1 dB of a PSNR, 0.02 dB of a drop of PSNR and 5 % of a drop of SSIM, for which a
         container takes some 3 % of bytes.
         """
-        limits = []
-        if settings.target_size is not None:
-            size = settings.target_size
-            limits.append(Limit("target_size", size, slope=0.2, near=-math.log2(0.97), half=0.0, per_halving=-1.0))
+        limits, size = list[Limit](), settings.target_size
         if settings.psnr is not None:
             psnr = settings.psnr
             limits.append(Limit("psnr", psnr, slope=-1.5, near=0.1, half=HALF_ERROR_DB, per_halving=math.nan))
@@ -114,7 +113,10 @@ class Goal:
         if settings.max_ssim_drop is not None:
             drop, near = settings.max_ssim_drop, -math.log2(0.95)
             limits.append(Limit("max_ssim_drop", drop, slope=-0.6, near=near, half=1.0, per_halving=0.006))
-        return cls(tuple(limits))
+        if not limits and size is not None:
+            limits.append(Limit("target_size", size, slope=0.2, near=-math.log2(0.97), half=0.0, per_halving=-1.0))
+            size = None
+        return cls(tuple(limits), size)
 
     @property
     def by_size(self) -> bool:
@@ -155,6 +157,9 @@ class Goal:
             )
         finest = max(trials, key=self.margin)
         missed = {limit: limit.figure(finest) for limit in self.limits if limit.room(finest) < 0}
+        first = next(iter(missed))
+        if first.setting == "psnr":  # one thing at a time
+            missed = {first: missed[first]}
         units = {"psnr": " dB", "max_psnr_drop": " dB", "max_ssim_drop": ""}
         wanted = " and ".join(f"{limit.setting} {limit.value:g}{units[limit.setting]}" for limit in missed)
         found = [math.nan if figure is None else figure for figure in missed.values()]
@@ -166,8 +171,8 @@ class Goal:
             return (
                 f"{wanted} cannot be met: the scene's renderings equal the photographs, so any loss of PSNR is infinite"
             )
-        if self.limits[0].setting == "psnr":
-            highest, limit = math.floor(100 * found[0]) / 100, self.limits[0].value
+        if first.setting == "psnr":
+            highest, limit = math.floor(100 * found[0]) / 100, first.value
             return f"{wanted} cannot be met: the finest container found has {highest:.2f} dB; ask for at most that" + (
                 f"; each view counts for at most {MAX_VIEW_PSNR:g} dB" if limit > MAX_VIEW_PSNR else ""
             )

@@ -7,8 +7,9 @@ import math
 import os
 from pathlib import Path
 
+from kissgs.core.errors import OutputError
 from kissgs.core.threads import processors
-from kissgs.io.atomic import atomic_file
+from kissgs.io.atomic import atomic_file, reason_of
 from kissgs.settings import Preset
 
 ENCODE_SECONDS = {
@@ -33,29 +34,30 @@ def encode_seconds(preset: Preset, count: int, threads: int = 0) -> float:
     return (fixed + each * count) / (_speed_per_processor() * used)
 
 
-def save_speed(seconds: float, preset: Preset, count: int) -> float:
+def save_speed(seconds: float, preset: Preset, count: int) -> None:
     """Save the speed of this machine, which encoded ``count`` Gaussians in ``seconds`` with all its processors.
-
-    Returns:
-        Its speed in units of that of the machine of :data:`ENCODE_SECONDS`.
 
     Raises:
         OutputError: the file cannot be written.
     """
     fixed, each = ENCODE_SECONDS[preset]
     speed = (fixed + each * count) / seconds
-    path = _speed_file()
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path = _speed_file()
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {reason_of(error)}") from error
+    except RuntimeError as error:  # this user has no home
+        raise OutputError("there is no folder for caches; name one by XDG_CACHE_HOME") from error
     with atomic_file(path, overwrite=True) as file:
         file.write(json.dumps({"speed_per_processor": speed / min(processors(), MOST_PROCESSORS)}).encode())
-    return speed
 
 
 def _speed_per_processor() -> float:
     """Return the speed that was saved, of the reference machine if none was or the file is damaged."""
     try:
         speed = float(json.loads(_speed_file().read_bytes())["speed_per_processor"])
-    except (OSError, ValueError, TypeError, KeyError):
+    except (OSError, RuntimeError, ValueError, TypeError, KeyError):
         return 1 / REFERENCE_PROCESSORS
     return speed if math.isfinite(speed) and speed > 0 else 1 / REFERENCE_PROCESSORS
 

@@ -215,6 +215,12 @@ class RateControl:
         if self.best is None:
             suggest = suggest_compaction and self.count > 1 and self.overhead < (self.settings.target_size or 0)
             raise UnsupportedError(self.goal.failure_message(self.trials, trained, suggest_compaction=suggest))
+        if self.goal.most_bytes is not None and self._bytes > self.goal.most_bytes:
+            names = " and ".join(limit.setting for limit in self.goal.limits)
+            raise UnsupportedError(
+                f"target_size and {names} cannot both be met: the smallest container found with that quality has "
+                f"{self._bytes:,} bytes; allow at least that"
+            )
         best = replace(self.best, note=self._surplus_note(self.best))
         if self._finetuning is None or best.finetuning is not None:
             return best
@@ -222,7 +228,7 @@ class RateControl:
 
     def _surplus_note(self, best: Container) -> str:
         """Say that the finest container of the scene is below the target size; empty if that is not the case."""
-        target = self.settings.target_size
+        target = self.settings.target_size if self.goal.by_size else None
         if target is None or best.encoded.rd_lambda != 2.0 ** LOG2_LAMBDA_RANGE[0]:
             return ""
         if self._is_codebook_limited(best.settings):
@@ -281,7 +287,7 @@ class RateControl:
 
     def _is_far_below(self, size: int) -> bool:
         """Whether the finest container may fit into the target size, given the bytes of the first container."""
-        target = self.settings.target_size
+        target = self.settings.target_size if self.goal.by_size else None
         if target is None:
             return False
         growth = (target - self.overhead) / max(size - self.overhead, 1)
@@ -340,7 +346,7 @@ class RateControl:
         self.progress.note = f"try {len(self.trials) + 1}, last: {trial.summary()}"
         limit = self.goal.decisive(trial)
         margin = limit.room(trial)
-        if self._distance < margin < 0:
+        if margin < 0 and (self.closest is None or margin > self._distance):
             self.closest, self._distance = container, margin
         self._longest = max(self._longest, time.perf_counter() - self._begun)
         self._finetuning = container.finetuning or self._finetuning

@@ -1,4 +1,4 @@
-"""What a limited time is used for: training, the preset, or the fastest preset."""
+"""Choice of what a limited time is used for: training, the preset, or the fastest preset."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def time_plan(
         return TimePlan(settings)
     plain, left = encode_seconds(settings.preset, count, threads), deadline.seconds
     time = SearchTime(deadline, plain)
-    if left >= TRAINING_TIME * plain:
+    if left >= TRAINING_TIME * plain and count > 1:
         return TimePlan(settings, time)
     settings = requested.decided(photographs=False, torch=False)
     usual = Settings.from_preset(settings.preset, seed=settings.encode.seed).encode

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from kissgs.pipeline.goal import Goal
 from kissgs.pipeline.rate_control import LOG2_LAMBDA_RANGE, RateControl
 
-DOUBLINGS_PER_HALVING = 3.0
+DOUBLINGS_PER_HALVING = 4.0
 """Doublings of lambda that typically change size and quality as much as half as many Gaussians."""
 
 MAX_HALVINGS = 1.3

@@ -61,7 +61,8 @@ class EncodeSettings(BaseModel):
         None,
         ge=1,
         description="With rate_distortion: search for the best container of at most this size, bytes, such as 800kB "
-        "or 2.5MB; the result is usually within 3 % below it. Takes a few encodings.",
+        "or 2.5MB; the result is usually within 3 % below it. Takes a few encodings. With psnr, max_psnr_drop or "
+        "max_ssim_drop, the smallest container of that quality, which then must have at most this size.",
     )
     max_psnr_drop: float | None = Field(
         None,
@@ -77,8 +78,7 @@ class EncodeSettings(BaseModel):
         le=1,
         description="With rate_distortion: search for the smallest container whose renderings of the held-out views "
         "lose at most this SSIM to the photographs; without photographs, SSIM to renderings of the scene is at least 1 "
-        "minus this, at random cameras other than those of 'evaluate'. With max_psnr_drop, both must hold. Takes a few "
-        "encodings.",
+        "minus this, at random cameras other than those of 'evaluate'. Takes a few encodings.",
     )
     max_encodes: int = Field(
         10,
@@ -268,7 +268,7 @@ class EncodeSettings(BaseModel):
     @model_validator(mode="after")
     def _one_goal(self) -> Self:
         goals = [name for name in ("rd_lambda", *GOALS) if getattr(self, name) is not None]
-        if len(goals) > 1 and goals != ["max_psnr_drop", "max_ssim_drop"]:
+        if len(goals) > 1 and goals[0] == "rd_lambda":
             raise ValueError(f"{goals[0]} and {goals[1]} cannot both be met; give one")
         if goals and not self.rate_distortion:
             raise ValueError(

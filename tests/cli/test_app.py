@@ -103,8 +103,10 @@ def test_goals_and_cached_sensitivity(scene: Path, tmp_path: Path) -> None:
         "compress", copy, "-f", "-q", "--psnr", "150", *few_views
     )
     assert "psnr needs rate_distortion" in failure("compress", copy, "-f", "-p", "fast", "--psnr", "40")
-    both = "--psnr", "40", "--max-ssim-drop", "0.1"
-    assert "psnr and max_ssim_drop cannot both be met" in failure("compress", copy, "-f", *both)
+    both = "--psnr", "30", "--target-size", "100B"
+    assert "target_size and psnr cannot both be met: the smallest container found" in failure(
+        "compress", copy, "-f", "-q", *both, *few_views
+    )
     piped = failure("compress", "-", "-o", tmp_path / "b.zip", "--cache", stdin=scene.read_bytes())
     assert "standard input has no folder" in piped
 

@@ -4,43 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.photographed import FEW_VIEWS, photographs, with_photographs
 from helpers.training_scenes import around, cloud
-from PIL import Image
 
 import kissgs
 from kissgs import Settings
-from kissgs.cameras.views import View, Views, black
-from kissgs.rendering.rasterizer import render
 from kissgs.rendering.sensitivity import WeightedCameras
-
-FEW_VIEWS = {"sensitivity_views": 16, "sensitivity_view_size": 96}
-
-
-def photographs(scene, tmp_path, train=12, held_out=3):
-    """Return a capture whose photographs are renderings of ``scene``, darker by a third: training can learn that."""
-
-    def view(name, around_view):
-        image = np.clip(render(scene, around_view.camera)[0] * 255 + 0.5, 0, 255).astype(np.uint8)
-        Image.fromarray(image * 2 // 3).save(tmp_path / f"{name}.png")
-        return View(name, around_view.camera, tmp_path / f"{name}.png")
-
-    views = [view(f"photo{n}", each) for n, each in enumerate(around(train + held_out))]
-    return Views(tuple(views[held_out:]), tuple(views[:held_out]), black(), "a capture")
-
-
-QUICK = {
-    "max_compactions": 4,
-    "sparsify_steps": 40,
-    "refine_steps": 20,
-    "prune_rounds": 2,
-    "min_keep_per_scoring": 0.0,
-    "view_size": 40,
-}
-
-
-def with_photographs(finetune=None, **goal):
-    tuning = {"steps": 20, "view_size": 40, **(finetune or {})}
-    return Settings.from_preset("balanced", compact=QUICK, finetune=tuning, **FEW_VIEWS, **goal)
 
 
 @pytest.mark.parametrize("goal", [{"max_ssim_drop": 0.02}, {"max_psnr_drop": 0.5}, {"target_size": 6200}])

@@ -1,0 +1,190 @@
+"""Limited time. Oracle: the limit itself, and what the container shows of the work that was done."""
+
+import json
+
+import pytest
+from helpers.photographed import FEW_VIEWS, photographs, with_photographs
+from helpers.training_scenes import cloud
+
+import kissgs
+from kissgs import Settings, UnsupportedError
+from kissgs.core.deadline import Deadline
+from kissgs.pipeline import machine_speed
+from kissgs.pipeline.machine_speed import encode_seconds, save_speed
+from kissgs.pipeline.search_time import SearchTime
+from kissgs.pipeline.time_plan import time_plan
+from kissgs.settings import Preset
+
+LONG = 1e5
+
+
+@pytest.fixture(autouse=True)
+def no_saved_speed(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+def plan_of(seconds, count=100_000, *, photographs=True, **changes):
+    requested = Settings.from_preset(changes.pop("preset", "balanced"), time_limit=seconds, **changes)
+    decided = requested.decided(photographs=photographs, torch=True)
+    return time_plan(requested, decided, count, Deadline.after(seconds), captured=photographs, threads=2)
+
+
+def trains(plan):
+    return bool(plan.settings.compact.auto_count), bool(plan.settings.finetune.enabled)
+
+
+def test_training_is_chosen_where_there_is_time_and_a_capture():
+    plain = encode_seconds(Preset.BALANCED, 100_000, 2)
+    assert trains(plan_of(10 * plain)) == (True, True)
+    assert plan_of(10 * plain).settings.encode.max_psnr_drop == 0.1
+    assert trains(plan_of(2 * plain)) == (False, False)
+    assert plan_of(2 * plain).settings.encode.has_goal is False
+    assert trains(plan_of(10 * plain, photographs=False)) == (False, False)
+    assert trains(plan_of(10 * plain, count=10_000_000)) == (False, False)
+    assert trains(plan_of(10 * plain, count=1)) == (False, False)
+
+
+def test_a_preset_that_takes_too_long_becomes_the_fastest():
+    plain = encode_seconds(Preset.BALANCED, 100_000, 2)
+    short = plan_of(0.5 * plain)
+    assert short.settings.preset == Preset.FAST
+    assert "encoded with the preset fast: balanced would take about" in short.note
+    assert plan_of(2 * plain).settings.preset == Preset.BALANCED
+    assert plan_of(0.5 * plain, target_size=9000).settings.encode.target_size == 9000  # a goal comes first
+    assert plan_of(0.5 * plain, sh_step=2).settings.encode.sh_step == 2  # and so does what was requested
+    assert plan_of(0.01, preset="fast").note == ""
+
+
+def test_a_goal_keeps_its_value():
+    assert plan_of(LONG, max_psnr_drop=0.3).settings.encode.max_psnr_drop == 0.3
+    assert plan_of(LONG, rd_lambda=1e-9).settings.encode.has_goal is False
+    assert trains(plan_of(LONG, psnr=40)) == (False, False)
+
+
+def test_more_time_makes_more_containers():
+    made = [SearchTime(Deadline.after(10 * units), 10).containers(3) for units in (3, 12, 40)]
+    assert made == [1, 2, 3]
+    assert SearchTime(Deadline.after(400), 10).containers(2) == 2
+
+
+def test_the_shares_of_a_search_fill_its_time():
+    time = SearchTime(Deadline.after(1000), 10)
+    spent = 0.0
+    for points in (3, 2, 1):
+        spent += SearchTime(Deadline.after(1000 - spent), 10).for_point(points, 2).seconds
+    spent += SearchTime(Deadline.after(1000 - spent), 10).for_container(2).seconds
+    spent += SearchTime(Deadline.after(1000 - spent), 10).for_container(1).seconds
+    assert spent == pytest.approx(1000, abs=1)
+    assert time.for_point(3, 2).seconds < time.for_container(2).seconds
+
+
+def test_the_saved_speed_counts(tmp_path):
+    usual = encode_seconds(Preset.BALANCED, 50_000)
+    save_speed(usual / 4, Preset.BALANCED, 50_000)
+    assert encode_seconds(Preset.BALANCED, 50_000) == pytest.approx(usual / 4)
+    assert encode_seconds(Preset.FAST, 1_000_000, 1) >= encode_seconds(Preset.FAST, 1_000_000, 2)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"speed_per_processor": "x"}', '{"speed_per_processor": NaN}', "\xff"]
+)
+def test_a_damaged_speed_file_is_ignored(text):
+    usual = encode_seconds(Preset.BALANCED, 50_000)
+    path = machine_speed._speed_file()
+    path.parent.mkdir(parents=True)
+    path.write_text(text, encoding="latin-1")
+    assert encode_seconds(Preset.BALANCED, 50_000) == usual
+
+
+def test_a_speed_that_cannot_be_saved_is_one_sentence(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    with pytest.raises(kissgs.OutputError, match=r"cannot write .*speed\.json"):
+        save_speed(1.0, Preset.BALANCED, 9)
+
+
+@pytest.mark.quick(0)
+def test_time_alone_trains_and_keeps_the_closest_container(tmp_path, monkeypatch):
+    """The photographs are the scene's own renderings, so that nothing can be lost without missing the aim."""
+    scene = cloud(200)
+    views = photographs(scene, tmp_path, brightness=1.0)
+    requested = with_photographs().model_copy(update={"time_limit": LONG})
+    found = kissgs.compress(scene, settings=requested, views=views)
+    assert found.report.compaction.count < 200
+    assert found.report.finetuning.steps == 2 * 24  # twice the usual number, and no more
+    assert len(found.report.trials) > 1
+    assert found.report.settings["encode"]["max_psnr_drop"] is None
+    assert found.report.settings["time_limit"] == LONG
+    assert min(trial.drop for trial in found.report.trials) > 0.1
+    (kept,) = {trial.drop for trial in found.report.trials if trial.bytes == len(found.to_zip())}
+    assert kept == min(trial.drop for trial in found.report.trials)
+
+
+@pytest.mark.quick(0)
+def test_little_time_makes_one_container_with_few_steps(tmp_path, monkeypatch):
+    scene = cloud(200)
+    views = photographs(scene, tmp_path)
+    monkeypatch.setattr("kissgs.pipeline.time_plan.encode_seconds", lambda *found: 1.0)
+    settings = with_photographs({"steps": 10_000}).model_copy(update={"time_limit": 6.0})
+    found = kissgs.compress(scene, settings=settings, views=views)
+    assert len(found.report.trials) == 1
+    assert 0 < found.report.finetuning.steps < 20_000
+    assert json.loads(found.files["meta.json"])["kissgs"]["finetune_steps"] == found.report.finetuning.steps
+
+
+@pytest.mark.quick(1)
+def test_a_goal_comes_before_the_time():
+    scene = cloud(400)
+    plain = kissgs.compress(scene, settings=Settings.from_preset("balanced", **FEW_VIEWS))
+    wanted = round(0.8 * len(plain.to_zip()))
+    settings = Settings.from_preset("balanced", time_limit=1e-3, target_size=wanted, **FEW_VIEWS)
+    found = kissgs.compress(scene, settings=settings)
+    assert len(found.to_zip()) <= wanted
+    assert found.report.trials[-1].bytes == len(found.to_zip())  # the search ended with the first that fits
+
+
+@pytest.mark.quick(0)
+def test_too_little_time_for_the_preset_is_reported():
+    found = kissgs.compress(cloud(50), settings=Settings(time_limit=0.01))
+    assert found.report.settings["preset"] == "fast"
+    assert "encoded with the preset fast" in found.report.note
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [("30s", 30), ("2min", 120), ("1.5 h", 5400), ("90", 90), (45, 45), ("2 MIN", 120), (".5m", 30)],
+)
+def test_times_have_units(text, seconds):
+    assert Settings(time_limit=text).time_limit == seconds
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"time_limit": "2 days"}, "setting time_limit: write 30s, 2min, 1h or a number of seconds, not '2 days'"),
+        ({"time_limit": "-3s"}, "write 30s, 2min"),
+        ({"time_limit": 0}, "setting time_limit: input should be greater than 0"),
+        (
+            {"time_limit": "1min", "compact": {"ratio": 0.2}},
+            "time_limit does not apply to compaction by a given budget",
+        ),
+        ({"time_limit": "nan"}, "write 30s, 2min"),
+    ],
+)
+def test_impossible_times_are_refused(settings, message):
+    with pytest.raises(UnsupportedError) as failed:
+        Settings.from_preset("balanced", **settings)
+    assert message in str(failed.value)
+
+
+@pytest.mark.quick(0)
+def test_size_and_quality_must_both_hold():
+    scene = kissgs.sample_scene(1500, sh_degree=1, seed=5)
+    views = {"sensitivity_views": 4, "sensitivity_view_size": 48}
+    alone = kissgs.compress(scene, settings=Settings.from_preset("balanced", psnr=36, **views))
+    both = Settings.from_preset("balanced", psnr=36, target_size=len(alone.to_zip()), **views)
+    assert kissgs.compress(scene, settings=both).files == alone.files
+    with pytest.raises(
+        UnsupportedError, match=f"target_size and psnr cannot both be met.*{len(alone.to_zip()):,} bytes"
+    ):
+        kissgs.compress(scene, settings=Settings.from_preset("balanced", psnr=36, target_size=900, **views))
