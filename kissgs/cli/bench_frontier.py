@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from kissgs.benchmark.results import Measurement
     from kissgs.core.progress import Progress
+    from kissgs.evaluation.results import Evaluation
 
 TIMES = ("5s", "30s", "2min", "10min")
 """Default time limits."""
@@ -76,6 +77,13 @@ def frontier_table(rows: list[Measurement]) -> RenderableType:
     return Group(*blocks)
 
 
+def _worst(evaluation: Evaluation) -> float:
+    """Return the largest change of PSNR to a photograph, decibels; without photographs, the lowest PSNR of a view."""
+    views = [view.comparison for view in evaluation.views]
+    changes = [view.candidate.psnr - view.reference.psnr for view in views if view.reference is not None]
+    return min(changes) if changes else evaluation.worst.comparison.candidate_vs_reference.psnr
+
+
 def _table(rows: list[Measurement]) -> Table:
     from kissgs.benchmark.bd_rate import pareto_front
     from kissgs.benchmark.results import PsnrTarget
@@ -85,7 +93,7 @@ def _table(rows: list[Measurement]) -> Table:
     against = "photographs" if photographed else "the original"
     names = ("wall s", "CPU s", "bytes", f"PSNR to {against}", *(("change, dB",) * photographed), "SSIM", "MS-SSIM")
     heads = [Column(name, justify="right") for name in names]
-    table = Table("", *heads, Column("worst view", justify="right"), "front", box=None, pad_edge=False)
+    table = Table("", *heads, Column("worst view, dB", justify="right"), "front", box=None, pad_edge=False)
     psnrs = [row.psnr(target) for row in rows]
     known = [n for n, psnr in enumerate(psnrs) if psnr is not None]
     front = {known[n] for n in pareto_front([(float(rows[n].bytes), psnrs[n] or 0.0) for n in known])}
@@ -94,8 +102,6 @@ def _table(rows: list[Measurement]) -> Table:
         mean, run = row.evaluation.mean, row.median_run
         images = mean.candidate if photographed else mean.candidate_vs_reference
         change = [] if mean.reference is None else [format_metric(images.psnr - mean.reference.psnr, 2, signed=True)]
-        worst = row.evaluation.worst.comparison
-        worst_psnr = worst.candidate.psnr if photographed else worst.candidate_vs_reference.psnr
         table.add_row(
             row.name,
             f"{run.encode_seconds:.1f}",
@@ -105,7 +111,7 @@ def _table(rows: list[Measurement]) -> Table:
             *change,
             format_metric(images.ssim, 4),
             format_metric(images.ms_ssim, 4),
-            format_metric(worst_psnr, 2),
+            format_metric(_worst(row.evaluation), 2, signed=photographed),
             "*" * (n in front),
         )
     return table

@@ -9,14 +9,14 @@ from kissgs.core.deadline import Deadline
 CONTAINER_SHARE = 4.0
 """Time to fine-tune a container, in units of that to train one point of the path."""
 
-TWO_CONTAINERS, THREE_CONTAINERS = 10.0, 30.0
+TWO_CONTAINERS, THREE_CONTAINERS = 8.5, 25.0
 """Time from which a second and a third container are worth their time, in units of an encoding without training."""
 
 
-ENDING_SHARE = 0.45
+ENDING_SHARE = 0.38
 """Time to write a fine-tuned container and to evaluate it, in units of an encoding without training."""
 
-FULL_TRAINING = 5.0
+FULL_TRAINING = 4.2
 """Time below which fewer Gaussians lose more by too short a training than they save, in the same unit."""
 
 LEAST_FOR_CONTAINER = 2.0

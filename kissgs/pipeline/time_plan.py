@@ -9,7 +9,7 @@ from kissgs.pipeline.machine_speed import encode_seconds
 from kissgs.pipeline.search_time import SearchTime
 from kissgs.settings import Preset, Settings
 
-TRAINING_TIME = 3.2
+TRAINING_TIME = 2.6
 """Time from which training on photographs pays, in units of an encoding without training."""
 
 CAPTURE_TIME = 1.5
