@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
@@ -206,7 +207,15 @@ def compress(
     clock = StageTimer(progress)
     original, cleaned, source_bytes = open_scene(source, reading, threads, clock)
     source_count, sh_degree = len(original) + cleaned.removed, original.sh_degree
-    plan = time_plan(requested, settings, len(original), deadline, captured=views is not None, threads=threads)
+    plan = time_plan(
+        requested,
+        settings,
+        len(original),
+        deadline,
+        captured=views is not None,
+        torch=find_spec("torch") is not None,
+        threads=threads,
+    )
     settings = plan.settings
     encoding = Encoding(
         splats=original,

@@ -12,6 +12,9 @@ from kissgs.settings import Preset, Settings
 TRAINING_TIME = 2.6
 """Time from which training on photographs pays, in units of an encoding without training."""
 
+TUNING_TIME = 5.0
+"""Time from which fine-tuning on renderings of the scene pays, in the same unit."""
+
 CAPTURE_TIME = 1.5
 """Time of an encoding with a capture, whose images colours are refitted to, in units of one without."""
 
@@ -32,12 +35,20 @@ class TimePlan:
 
 
 def time_plan(
-    requested: Settings, settings: Settings, count: int, deadline: Deadline | None, *, captured: bool, threads: int
+    requested: Settings,
+    settings: Settings,
+    count: int,
+    deadline: Deadline | None,
+    *,
+    captured: bool,
+    torch: bool,
+    threads: int,
 ) -> TimePlan:
     """Choose what to do in the time that is left for a scene.
 
     Training that was not requested is left out where there is too little time for it, and the preset where even a
-    plain encoding takes too long, unless a goal or a setting of the encoder is given.
+    plain encoding takes too long, unless a goal or a setting of the encoder is given. Without a goal and photographs,
+    time that is left goes to fine-tuning on renderings of the scene.
 
     Args:
         requested: settings as requested.
@@ -45,6 +56,7 @@ def time_plan(
         count: number of Gaussians.
         deadline: time until which the container shall be ready; None for no limit.
         captured: whether there is a capture.
+        torch: whether torch is installed, which training needs.
         threads: number of threads; 0 means one per processor.
     """
     if deadline is None:
@@ -52,6 +64,9 @@ def time_plan(
     plain, left = encode_seconds(settings.preset, count, threads), deadline.seconds
     time = SearchTime(deadline, plain)
     if left >= TRAINING_TIME * plain and count > 1:
+        tunes = requested.aims and not settings.encode.has_goal and requested.finetune.enabled is None
+        if tunes and torch and left >= TUNING_TIME * plain:
+            settings = settings.model_copy(update={"finetune": settings.finetune.model_copy(update={"enabled": True})})
         return TimePlan(settings, time)
     settings = requested.decided(photographs=False, torch=False)
     usual = Settings.from_preset(settings.preset, seed=settings.encode.seed).encode

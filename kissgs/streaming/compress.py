@@ -173,9 +173,11 @@ def _make(
 
 def _check_settings(settings: Settings) -> None:
     """Refuse settings that do not fit, before any work."""
-    if settings.compact.enabled or settings.finetune.enabled or settings.encode.has_goal:
+    limited = settings.encode.has_goal or settings.time_limit is not None
+    if settings.compact.enabled or settings.finetune.enabled or limited:
         raise UnsupportedError(
-            "levels of detail are made without goals, compaction and fine-tuning; leave these out, or write a .sog"
+            "levels of detail are made without goals, time limits, compaction and fine-tuning; leave these out, or "
+            "write a .sog"
         )
     if settings.encode.order != "hilbert":
         raise UnsupportedError(f"levels of detail need order=hilbert, not {settings.encode.order}")

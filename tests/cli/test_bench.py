@@ -51,6 +51,17 @@ def test_a_curve_is_plotted_and_images_are_compared(scene: Path, tmp_path: Path)
     assert (tmp_path / "p.svg").read_bytes().startswith(b"<?xml")
 
 
+def test_time_limits_are_measured_beside_presets(scene: Path, tmp_path: Path) -> None:
+    words = "bench", "frontier", scene, "-p", "fast", "--time", "0.01s", "--time", "0.02s"
+    rows = json.loads(run(*words, "--json").stdout)
+    assert [row["codec"] for row in rows] == ["fast", "in 0.01 s", "in 0.02 s"]
+    assert len({row["bytes"] for row in rows}) == 1  # there is time for the preset fast only
+    done = run(*words, "--plot", tmp_path / "p.svg")
+    assert done.returncode == 0, done.stderr
+    assert [line.split()[-1] == "*" for line in done.stdout.decode().splitlines() if "fast" in line] == [True]
+    assert (tmp_path / "p.svg").read_bytes().startswith(b"<?xml")
+
+
 def test_other_sizes_are_measured_and_plotted(scene: Path, tmp_path: Path) -> None:
     options = ["-p", "fast", "--gaussians", 200, "--gaussians", 900, "--json", "--plot", tmp_path / "p.png"]
     done = run("bench", "scaling", scene, *options)

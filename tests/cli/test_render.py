@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import runpy
 import signal
 import subprocess
@@ -236,10 +237,12 @@ def test_the_clock_of_the_progress_bar_runs_through_all_stages(
     assert "0:01:15" in capsys.readouterr().err
 
 
-def test_warmup_loads_the_kernels_of_encoder_and_rasteriser() -> None:
+def test_warmup_loads_the_kernels_of_encoder_and_rasteriser(tmp_path: Path) -> None:
     lines = (
         "import sys; from kissgs.cli.app import warmup; warmup(); "
         "print(*(name in sys.modules for name in ('kissgs.planning.kernels', 'kissgs.rendering.cpu.frame')))"
     )
-    done = subprocess.run([sys.executable, "-c", lines], capture_output=True, timeout=300, check=True)
+    places = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", lines], capture_output=True, timeout=300, check=True, env=places)
     assert done.stdout.split() == [b"True", b"True"]
+    assert 0.01 < json.loads((tmp_path / "kissgs/speed.json").read_text())["speed_per_processor"] < 100

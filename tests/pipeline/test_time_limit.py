@@ -1,7 +1,5 @@
 """Limited time. Oracle: the limit itself, and what the container shows of the work that was done."""
 
-import json
-
 import pytest
 from helpers.photographed import FEW_VIEWS, photographs, with_photographs
 from helpers.training_scenes import cloud
@@ -26,7 +24,8 @@ def no_saved_speed(monkeypatch, tmp_path):
 def plan_of(seconds, count=100_000, *, photographs=True, **changes):
     requested = Settings.from_preset(changes.pop("preset", "balanced"), time_limit=seconds, **changes)
     decided = requested.decided(photographs=photographs, torch=True)
-    return time_plan(requested, decided, count, Deadline.after(seconds), captured=photographs, threads=2)
+    facts = {"captured": photographs, "torch": True, "threads": 2}
+    return time_plan(requested, decided, count, Deadline.after(seconds), **facts)
 
 
 def trains(plan):
@@ -39,7 +38,10 @@ def test_training_is_chosen_where_there_is_time_and_a_capture():
     assert plan_of(10 * plain).settings.encode.max_psnr_drop == 0.1
     assert trains(plan_of(2 * plain)) == (False, False)
     assert plan_of(2 * plain).settings.encode.has_goal is False
-    assert trains(plan_of(10 * plain, photographs=False)) == (False, False)
+    assert trains(plan_of(10 * plain, photographs=False)) == (False, True)  # levels alone, on renderings
+    assert trains(plan_of(10 * plain, photographs=False, finetune={"enabled": False})) == (False, False)
+    assert trains(plan_of(10 * plain, photographs=False, psnr=40)) == (False, False)
+    assert trains(plan_of(3 * plain, photographs=False)) == (False, False)
     assert trains(plan_of(10 * plain, count=10_000_000)) == (False, False)
     assert trains(plan_of(10 * plain, count=1)) == (False, False)
 
@@ -129,7 +131,7 @@ def test_little_time_makes_one_container_with_few_steps(tmp_path, monkeypatch):
     found = kissgs.compress(scene, settings=settings, views=views)
     assert len(found.report.trials) == 1
     assert 0 < found.report.finetuning.steps < 20_000
-    assert json.loads(found.files["meta.json"])["kissgs"]["finetune_steps"] == found.report.finetuning.steps
+    assert f"finetune_steps: {found.report.finetuning.steps}" in found.files["container_meta.yaml"].decode()
 
 
 @pytest.mark.quick(1)
