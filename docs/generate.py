@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import ByteSize
 
-from kissgs.settings import PRESETS, CompactSettings, EncodeSettings, FinetuneSettings, Preset
+from kissgs.settings import PRESETS, CompactSettings, EncodeSettings, FinetuneSettings, Preset, Settings
 from kissgs.settings.compact import BUDGETS
 from kissgs.sogxt.metadata import ContainerMeta
 from service.core.problems import PROBLEM_TYPES
@@ -47,7 +47,8 @@ GROUPS = {
 
 def settings_page() -> str:
     """Return the page of all settings of the library: value in each preset, and meaning."""
-    page = INTRODUCTION
+    limit = Settings.model_fields["time_limit"].description
+    page = f"{INTRODUCTION}\n`time_limit`, beside the groups (`kissgs compress --time`): {limit}\n"
     for group, (model, about) in GROUPS.items():
         lines = [f"| setting | {' | '.join(Preset)} | meaning |", "|---" * (len(Preset) + 2) + "|"]
         for name, field in model.model_fields.items():

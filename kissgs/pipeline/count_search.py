@@ -17,7 +17,7 @@ from kissgs.pipeline.path_points import OVERHEAD_BYTES, POINTS_PER_HALVING, coun
 from kissgs.pipeline.rate_control import RateControl
 from kissgs.pipeline.search_time import SearchTime
 from kissgs.pipeline.trained_scenes import TrainedScenes
-from kissgs.pipeline.trained_search import Position, search_positions
+from kissgs.pipeline.trained_search import NEAR_HALVINGS, NEAR_IN_TIME, Position, search_positions
 from kissgs.pipeline.training_choice import has_photographs
 from kissgs.pipeline.trial import Trial
 
@@ -33,8 +33,8 @@ PRUNABLE_DROP = 1.0
 PRUNABLE_POINTS = 3
 """Number of the last point that is pruned without training where there are photographs: half of the Gaussians."""
 
-FIRST_NUMBER = 5
-"""Number of the point that is tried first with photographs where the goal is no size: a third of the Gaussians."""
+FIRST_NUMBER = 6
+"""Number of the point that is tried first with photographs where the goal is no size: a quarter of the Gaussians."""
 
 ONLY_NUMBERS = {(True, True): 4, (True, False): 5, (False, True): 2, (False, False): 4}
 """Number of that point where there is time for a single container.
@@ -226,6 +226,7 @@ class CountSearch:
             (1, last_number(len(self.compactor.splats))),
             POINTS_PER_HALVING,
             self._containers,
+            NEAR_HALVINGS if self.time is None else NEAR_IN_TIME,
         )
         if self.goal.by_size and self._candidates.best is None:  # lambda alone makes this scene small enough
             self._encode(self._path.compacted(self._path.points[-1], refine=False))

@@ -15,8 +15,9 @@ DOUBLINGS_PER_HALVING = 4.0
 MAX_HALVINGS = 1.3
 """Largest step of the search."""
 
-NEAR_HALVINGS = 0.1
-"""Step below which a container that meets the goal ends the search: another one would save some 5 % of its bytes."""
+NEAR_HALVINGS, NEAR_IN_TIME = 0.1, 0.03
+"""Step below which a container that meets the goal ends the search: another one would save some 5 % of its bytes, or
+2 %, which is worth a time that the user has given."""
 
 CAUTION_HALVINGS, SIZE_CAUTION_HALVINGS = 0.1, 0.02
 """Added on the safe side of the last attempt if none before met the goal; the second for a size, which varies less."""
@@ -48,6 +49,7 @@ def search_positions(
     bounds: tuple[int, int],
     points_per_halving: float,
     attempts: int,
+    near: float = NEAR_HALVINGS,
 ) -> None:
     """Make containers at positions that come closer to the goal.
 
@@ -61,6 +63,7 @@ def search_positions(
         bounds: smallest and largest number of a point.
         points_per_halving: points of the path by which the number of Gaussians is halved.
         attempts: largest number of containers.
+        near: step, in halvings, below which a container that meets the goal ends the search.
     """
     position = Position(min(max(first, bounds[0]), bounds[1]), None)
     left_at, figures = dict[float, float](), set[tuple[int, float]]()
@@ -70,7 +73,7 @@ def search_positions(
         left, met = min(limit.halvings(trial) for limit in goal.limits), goal.margin(trial) >= 0
         if remaining == 0 or search.stopped or trial.rd_lambda is None or not math.isfinite(left):
             return
-        if (met and abs(left) <= NEAR_HALVINGS) or (trial.bytes, left) in figures:  # near, or without any effect
+        if (met and abs(left) <= near) or (trial.bytes, left) in figures:  # near, or without any effect
             return
         figures.add((trial.bytes, left))
         log2_lambda = math.log2(trial.rd_lambda)
