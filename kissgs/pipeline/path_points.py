@@ -12,7 +12,7 @@ KEEP = 0.8
 POINTS_PER_HALVING = math.log(0.5) / math.log(KEEP)
 """Points of the path by which the number of Gaussians is halved."""
 
-BYTES_PER_GAUSSIAN, BYTES_OF_SH = 8.0, 4.0
+BYTES_PER_GAUSSIAN, BYTES_OF_SH = 8.6, 4.0
 """Bytes of a container per Gaussian that are expected at first, and those of view-dependent colour in addition."""
 
 OVERHEAD_BYTES = 4000
