@@ -65,8 +65,12 @@ class TrainedScenes:
     photographs: bool
     time: SearchTime | None
     containers: int
+    _brief: bool = field(init=False)
     _tuner: Tuner | None = field(init=False, default=None)
     _scenes: dict[int, TrainedScene] = field(init=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._brief = self.time is not None and self.containers == 1
 
     def scene(self, number: int, byte_limit: float) -> TrainedScene:
         """Return the scene at a point of the path, trained and ready for the next container.
@@ -106,8 +110,7 @@ class TrainedScenes:
         if tunes:  # training replaces the refit of colours
             encoding = encoding.with_encode_settings(color_refit_iterations=0)
             self._tuner = self._tuner or self._first_tuner(encoding)
-        brief = self.time is not None and self.time.containers(2) == 1
-        offset = (BRIEF_OFFSET_DB if brief else TRAINED_OFFSET_DB) if self.photographs else 0.0
+        offset = (BRIEF_OFFSET_DB if self._brief else TRAINED_OFFSET_DB) if self.photographs else 0.0
         search = encoding.rate_control(offset_db=offset, byte_limit=byte_limit)
         return TrainedScene(compacted, search, encoding.encoder(self._tuner))
 
