@@ -98,7 +98,7 @@ MaxSsimDropOption = Annotated[
     float | None,
     typer.Option(
         metavar="SSIM",
-        help="Find the smallest container that loses at most this SSIM, such as 0.003; also with --max-psnr-drop.",
+        help="Find the smallest container that loses at most this SSIM, such as 0.003.",
     ),
 ]
 TimeOption = Annotated[

@@ -172,7 +172,7 @@ class ClusterCompression:
     def _memory(self, scene: Path, size: int) -> int:
         """Return an estimate of the memory that a scene needs, bytes."""
         settings = self.options.settings
-        goal_trains = (settings.encode.has_goal or settings.aims) and self.options.views is not None
+        goal_trains = settings.aims or (settings.encode.has_goal and self.options.views is not None)
         trains = settings.compact.enabled or settings.finetune.enabled or goal_trains
         plain = size if scene.suffix.lower() == ".ply" else PACKED_RATIO * size
         return PROCESS_BYTES + (TRAINING_RATIO if trains else MEMORY_RATIO) * plain

@@ -9,6 +9,7 @@ from kissgs.cli.console import progress_bar
 from kissgs.cli.files import show, sibling, source, write_stdout
 from kissgs.cli.signals import stoppable
 from kissgs.pipeline.pipeline import compress
+from kissgs.pipeline.training_choice import decided
 from kissgs.training.checkpoint import delete_checkpoints
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ def compress_here(options: CompressOptions, capture: Views | None, scene: str, t
         KissgsError: as :func:`kissgs.compress`, or standard output cannot be written.
     """
     piped = str(target) == "-"
-    searches = options.settings.searches or options.settings.aims
+    searches = decided(options.settings, capture).searches
     with progress_bar(options.quiet) as bar, stoppable(bar, searches) as progress:
         if options.evaluate:  # reported here, because evaluation reports only one stage
             from kissgs.rendering.rasterizer import load_kernels

@@ -192,7 +192,7 @@ def refuse_without_training(settings: Settings, *, checkpoint: bool, device: str
         checkpoint: whether ``--checkpoint`` was given.
         device: value of ``--device``.
     """
-    trains = settings.finetune.enabled or (settings.compact.enabled and settings.compact.trains)
+    trains = settings.finetune.enabled or (settings.compact.enabled and settings.compact.trains) or settings.aims
     if trains or not (checkpoint or device != "cpu"):
         return
     remedy = "leave them out, these settings take no training steps"

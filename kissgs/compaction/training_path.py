@@ -20,9 +20,6 @@ from kissgs.rendering.rasterizer import load_kernels
 if TYPE_CHECKING:
     from kissgs.training.targets import TrainingTargets
 
-MOST_STEPS = 2
-"""Most steps before a deadline, in units of the usual number: more do not improve other views."""
-
 REFINEMENT = 1_000_000
 """Number of the refinement in seeds: no path has as many points."""
 
@@ -83,10 +80,11 @@ class TrainingPath:
     def train(self, deadline: Deadline | None = None) -> PathPoint:
         """Train the last point for ``sparsify_steps / prune_rounds`` steps, and return it; reports "sparsify".
 
-        With a deadline, as many steps are made as fit in, up to :data:`MOST_STEPS` times as many.
+        With a deadline, as many steps are made as fit in, up to :data:`kissgs.training.loop.MOST_STEPS` times as
+        many.
         """
         task, point = self.task, self.points[-1]
-        steps = task.settings.sparsify_steps // task.settings.prune_rounds * (1 if deadline is None else MOST_STEPS)
+        steps = _with_deadline(task.settings.sparsify_steps // task.settings.prune_rounds, deadline)
         if steps == 0:
             return point
         training = self._at(point)
@@ -109,7 +107,7 @@ class TrainingPath:
             training = self._at(point)
             if not point.trained:
                 training.begin(self.targets)
-            phase = Phase("refine", task.settings.refine_steps, len(point))
+            phase = Phase("refine", _with_deadline(task.settings.refine_steps, deadline), len(point))
             self._train(training, phase, REFINEMENT + point.number, deadline)
             splats = training.splats()
         report = CompactionReport(
@@ -149,3 +147,10 @@ class TrainingPath:
             self.points[-1] = replace(self.points[-1], state=None)
         self.points.append(PathPoint(number, training.splats(), training.index, training.begun, state))
         return self.points[-1]
+
+
+def _with_deadline(steps: int, deadline: Deadline | None) -> int:
+    """Return the largest number of steps before a deadline; without one, ``steps``."""
+    from kissgs.training.loop import MOST_STEPS
+
+    return steps if deadline is None else MOST_STEPS * steps

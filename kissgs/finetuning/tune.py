@@ -36,7 +36,7 @@ from kissgs.settings import FinetuneSettings
 from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.decode import decode as decode_sogxt
 from kissgs.training.checkpoint import Checkpoint
-from kissgs.training.loop import LrSchedule, TrainingPlan, exponential_lr, image_loss, torch_threads, train
+from kissgs.training.loop import MOST_STEPS, LrSchedule, TrainingPlan, exponential_lr, image_loss, torch_threads, train
 from kissgs.training.supervision import SupervisionViews, supervision_views
 from kissgs.training.targets import TrainingTargets, training_targets
 
@@ -55,10 +55,9 @@ ATTRACTION_START = 0.5
 TABLE_LR = 1.0
 """Learning rate of tables in units of that of the levels: an error of a value is one of everything that uses it."""
 
-MOST_STEPS = 2
-"""Most steps before a deadline, in units of the setting ``steps``: more do not improve other views."""
-
 NOT_KEPT = "fine-tuning did not help; the container is as it was without it"
+
+NO_TIME = "there was no time for fine-tuning; the container is as it was without it"
 
 Write = Callable[[EncodingPlan, int, Progress], Encoded]
 """Writes a plan that was fine-tuned in a number of steps; the third argument receives progress."""
@@ -168,6 +167,9 @@ class Tuner:
         pace = Pace(self.settings.steps)
         if self.deadline is not None:
             pace = Pace(MOST_STEPS * self.settings.steps, self.deadline.earlier(self.ending_seconds))
+            pace.update(0)
+        if before is not None and first is not None and pace.steps == 0:
+            return before, self._untuned(first, started)
         tuned, checkpoint_note = self._train(start, scene.sh_degree, start.rd_lambda or rd_lambda, pace, checkpoint)
         trained = time.perf_counter()
         after = write(tuned, pace.steps, self.progress)
@@ -187,6 +189,21 @@ class Tuner:
             note="; ".join(filter(None, [self.supervision.note, "" if kept else NOT_KEPT, checkpoint_note])),
         )
         return (after if kept or before is None else before), report
+
+    def _untuned(self, result: _Result, started: float) -> FinetuneReport:
+        """Return the report where no training step fits into the time."""
+        return FinetuneReport(
+            steps=0,
+            target_source=self.targets.target_source,
+            source=self.supervision.source,
+            psnr_before=result.psnr,
+            psnr_after=result.psnr,
+            bytes_before=result.bytes,
+            bytes_after=result.bytes,
+            kept=False,
+            seconds=time.perf_counter() - started,
+            note="; ".join(filter(None, [self.supervision.note, NO_TIME])),
+        )
 
     def _report_images_done(self, stage: str, fraction: float, note: str = "") -> None:
         self.progress("images", 1.0)

@@ -50,6 +50,11 @@ class Candidates:
         """Bytes of the best container so far; infinite where bytes are not the cost."""
         return math.inf if self.best is None or self.goal.by_size else self.best.cost
 
+    @property
+    def any_missed(self) -> bool:
+        """Whether there is a container that misses the goal."""
+        return any(search.closest is not None for search, _ in self._missed)
+
     def keep(self, search: RateControl, compacted: Compacted) -> None:
         """Keep the best container of a search if it is better than that of all others."""
         if search.best is None:

@@ -78,17 +78,19 @@ class CountSearch:
     _whole: RateControl | None = field(init=False, default=None)
     _stopped: bool = field(init=False, default=False)
     _containers: int = field(init=False)
+    _first: int = field(init=False)
 
     def __post_init__(self) -> None:
-        self._containers = self.compactor.settings.max_compactions
+        self._containers, short = self.compactor.settings.max_compactions, False
         if not self._photographs:
             self.time = None
         if self.time is not None:
-            self._containers = self.time.containers(self._containers)
-            if self.time.short:  # half of the views score nearly as well
-                supervision = self.compactor.supervision
-                score = supervision.score[::2]
-                self.compactor = replace(self.compactor, supervision=replace(supervision, score=score))
+            self._containers, short = self.time.containers(self._containers), self.time.short
+        if short:  # half of the views score nearly as well
+            supervision = self.compactor.supervision
+            score = supervision.score[::2]
+            self.compactor = replace(self.compactor, supervision=replace(supervision, score=score))
+        self._first = self._first_number(short)
         self._path = self.compactor.path(keep_states=not self._tunes)
         self._candidates = Candidates(self.goal, self.encoding.packed)
         self._scenes = TrainedScenes(
@@ -109,7 +111,7 @@ class CountSearch:
             self._search()
         except StopSearch:
             self._stopped = True
-            if self._candidates.best is None:
+            if self._candidates.best is None and not (self.aims and self._candidates.any_missed):
                 progress = SearchNote(ignore_stop_search(self.encoding.progress))
                 self.encoding = replace(self.encoding, progress=progress)
                 self._encode(self._path.compacted(self._latest_point(), refine=False))
@@ -149,14 +151,11 @@ class CountSearch:
     def _number_for_size(self) -> int:
         return number_for_size(self.compactor.splats, self._target_size)
 
-    @property
-    def _first_number(self) -> int:
-        """Number of the point that is tried first with photographs."""
+    def _first_number(self, short: bool) -> int:
+        """Return the number of the point to try first with photographs; ``short`` says if there is little time."""
         if self.goal.by_size:
             return self._number_for_size
-        if self._containers > 1 or self.time is None:
-            return FIRST_NUMBER
-        return ONLY_NUMBERS[self.aims, self.time.short]
+        return FIRST_NUMBER if self._containers > 1 or self.time is None else ONLY_NUMBERS[self.aims, short]
 
     def _search(self) -> None:
         if not self._photographs:
@@ -165,7 +164,7 @@ class CountSearch:
             if self.time is None:
                 self._prune()
             else:  # what each point loses is not worth the time to measure it
-                self._prune_to(min(self._first_number - 1, PRUNABLE_POINTS))
+                self._prune_to(min(self._first - 1, PRUNABLE_POINTS))
             self._search_along_path()
 
     def _search_without_photographs(self) -> None:
@@ -222,7 +221,7 @@ class CountSearch:
         search_positions(
             self.goal,
             self._encode_position,
-            self._first_number,
+            self._first,
             (1, last_number(len(self.compactor.splats))),
             POINTS_PER_HALVING,
             self._containers,
@@ -277,7 +276,7 @@ class CountSearch:
         return points[max(met, default=0)]
 
     def _reason_to_keep_all(self) -> str:
-        if self._tried:
+        if self._tried or self.trials:
             return "and no smaller number of Gaussians that was tried serves the goal better"
         if self._stopped:
             return "and the search was stopped before a smaller number was tried"

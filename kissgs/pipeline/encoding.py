@@ -138,7 +138,8 @@ class Encoding:
             planner = self._planner()
             search = self.search(planner)
         tunes = self.settings.finetune.enabled and len(self.splats) > 0
-        if tunes and not (search.stopped or search.finetuned):
+        late = self.deadline is not None and self.deadline.seconds <= 0
+        if tunes and not (search.stopped or search.finetuned or late):
             rd_lambda = search.trials[-1].rd_lambda if search.best is None else search.best.encoded.rd_lambda
             try:
                 encoder = self._encoder(planner or self._planner(), self.tuner(), None)
@@ -337,7 +338,7 @@ class Encoding:
 
 def _same_views(settings: Settings) -> bool:
     """Return whether compaction and fine-tuning train on the same images."""
-    names = ("synthetic_view_share", "views", "view_size")
+    names = ("synthetic_view_share", "views", "view_size", "seed")
     return all(getattr(settings.compact, name) == getattr(settings.finetune, name) for name in names)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 from pathlib import Path
 
@@ -13,12 +12,19 @@ from kissgs.io.atomic import atomic_file, reason_of
 from kissgs.settings import Preset
 
 ENCODE_SECONDS = {
-    Preset.FAST: (0.5, 6e-6),
-    Preset.BALANCED: (6.5, 36e-6),
-    Preset.SMALL: (6.5, 40e-6),
-    Preset.PAPER: (1.0, 140e-6),
+    Preset.FAST: (0.5, 0.0, 6e-6),
+    Preset.BALANCED: (1.5, 5.0, 36e-6),
+    Preset.SMALL: (1.5, 5.0, 40e-6),
+    Preset.PAPER: (1.0, 0.0, 140e-6),
 }
-"""Seconds of an encoding by preset, a fixed part and one per Gaussian, measured on two processors."""
+"""Seconds of an encoding by preset, measured on two processors: a fixed part; one that all scenes of more than
+:data:`FULL_RENDERINGS` Gaussians have, for renderings; one per Gaussian."""
+
+FULL_RENDERINGS = 20_000
+"""Number of Gaussians from which renderings take about the same time; with fewer, they take in proportion less."""
+
+SPEEDS = (1e-3, 1e3)
+"""Slowest and fastest speed of a processor that is believed, in units of :func:`save_speed`."""
 
 REFERENCE_PROCESSORS, MOST_PROCESSORS = 2, 8
 """Processors of that machine, and the number beyond which an encoding is taken to become no faster."""
@@ -29,9 +35,13 @@ def encode_seconds(preset: Preset, count: int, threads: int = 0) -> float:
 
     ``threads`` is the number of threads; 0 means one per processor.
     """
-    fixed, each = ENCODE_SECONDS[preset]
     used = min(threads or processors(), processors(), MOST_PROCESSORS)
-    return (fixed + each * count) / (_speed_per_processor() * used)
+    return _reference_seconds(preset, count) / (_speed_per_processor() * used)
+
+
+def _reference_seconds(preset: Preset, count: int) -> float:
+    fixed, renderings, each = ENCODE_SECONDS[preset]
+    return fixed + renderings * min(count / FULL_RENDERINGS, 1.0) + each * count
 
 
 def save_speed(seconds: float, preset: Preset, count: int) -> None:
@@ -40,8 +50,7 @@ def save_speed(seconds: float, preset: Preset, count: int) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    fixed, each = ENCODE_SECONDS[preset]
-    speed = (fixed + each * count) / seconds
+    speed = _reference_seconds(preset, count) / seconds
     try:
         path = _speed_file()
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -57,9 +66,9 @@ def _speed_per_processor() -> float:
     """Return the speed that was saved, of the reference machine if none was or the file is damaged."""
     try:
         speed = float(json.loads(_speed_file().read_bytes())["speed_per_processor"])
-    except (OSError, RuntimeError, ValueError, TypeError, KeyError):
+    except (OSError, RuntimeError, ValueError, TypeError, KeyError, OverflowError):
         return 1 / REFERENCE_PROCESSORS
-    return speed if math.isfinite(speed) and speed > 0 else 1 / REFERENCE_PROCESSORS
+    return speed if SPEEDS[0] <= speed <= SPEEDS[1] else 1 / REFERENCE_PROCESSORS
 
 
 def _speed_file() -> Path:

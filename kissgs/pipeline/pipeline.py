@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
@@ -24,8 +23,7 @@ from kissgs.pipeline.containers import FILES
 from kissgs.pipeline.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from kissgs.pipeline.report import Report
 from kissgs.pipeline.scene_files import AnyPath, check_ply, open_scene, read_scene, save_ply
-from kissgs.pipeline.time_plan import time_plan
-from kissgs.pipeline.training_choice import decided, note_on_training
+from kissgs.pipeline.training_choice import decided, work_plan
 from kissgs.rendering.rasterizer import Device
 from kissgs.settings import EncodeSettings, Settings
 from kissgs.settings.encode import GOALS
@@ -202,20 +200,15 @@ def compress(
     kind = named_container(container, target)
     if target is not None:
         check_destination(target, overwrite=overwrite, names=FILES)
+    if checkpoint is not None and settings.time_limit is not None:
+        raise UnsupportedError("no checkpoint is kept with a time limit; leave out one of them")
     finetune_checkpoint = _check_finetuning(settings, views, checkpoint, device)
     deadline = None if settings.time_limit is None else Deadline.after(settings.time_limit)
     clock = StageTimer(progress)
     original, cleaned, source_bytes = open_scene(source, reading, threads, clock)
     source_count, sh_degree = len(original) + cleaned.removed, original.sh_degree
-    plan = time_plan(
-        requested,
-        settings,
-        len(original),
-        deadline,
-        captured=views is not None,
-        torch=find_spec("torch") is not None,
-        threads=threads,
-    )
+    keep_all = sensitivity is not None
+    plan = work_plan(requested, views, len(original), deadline, keep_all=keep_all, threads=threads)
     settings = plan.settings
     encoding = Encoding(
         splats=original,
@@ -263,7 +256,7 @@ def compress(
         finetuning=result.finetuning,
         invisible=encoded.invisible,
         pruned_by_rd=encoded.pruned_by_rd,
-        note="; ".join(filter(None, [encoded.note, result.note, note_on_training(requested, views), plan.note])),
+        note="; ".join(filter(None, [encoded.note, result.note, plan.note])),
         clipped_colors=encoded.clipped_colors,
         form_error=encoded.form_error,
         max_quantization_error=encoded.errors,
@@ -297,7 +290,12 @@ def _settings_as_used(decided: Settings, used: EncodeSettings, requested: Settin
     kept = ("rd_lambda", "quality_offset_db", "color_refit_iterations")  # the same request gives the same bytes
     changes = {name: getattr(decided.encode, name) for name in kept}
     changes |= {name: getattr(requested.encode, name) for name in GOALS}
-    return decided.model_copy(update={"encode": used.model_copy(update=changes)}).model_dump(mode="json")
+    groups: dict[str, Any] = {"encode": used.model_copy(update=changes)}
+    if requested.aims:  # what the time decides
+        auto_count, tuned = requested.compact.auto_count, requested.finetune.enabled
+        groups["compact"] = decided.compact.model_copy(update={"auto_count": auto_count})
+        groups["finetune"] = decided.finetune.model_copy(update={"enabled": tuned})
+    return decided.model_copy(update=groups).model_dump(mode="json")
 
 
 class _Common(TypedDict):

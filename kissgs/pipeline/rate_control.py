@@ -216,10 +216,11 @@ class RateControl:
             suggest = suggest_compaction and self.count > 1 and self.overhead < (self.settings.target_size or 0)
             raise UnsupportedError(self.goal.failure_message(self.trials, trained, suggest_compaction=suggest))
         if self.goal.most_bytes is not None and self._bytes > self.goal.most_bytes:
-            names = " and ".join(limit.setting for limit in self.goal.limits)
+            names = " and ".join(["target_size", *(limit.setting for limit in self.goal.limits)])
+            verb = "were not met before the search was stopped" if self.stopped else "cannot be met together"
             raise UnsupportedError(
-                f"target_size and {names} cannot both be met: the smallest container found with that quality has "
-                f"{self._bytes:,} bytes; allow at least that"
+                f"{names} {verb}: the smallest container found with that quality has {self._bytes:,} bytes; allow at "
+                "least that"
             )
         best = replace(self.best, note=self._surplus_note(self.best))
         if self._finetuning is None or best.finetuning is not None:
@@ -281,7 +282,8 @@ class RateControl:
             StopSearch: one that meets the goal exists, and another would not be finished before the deadline.
         """
         self._begun = time.perf_counter()
-        if self._deadline is not None and self.best is not None and self._deadline.seconds < self._longest:
+        met = self.best is not None and self._bytes <= (self.goal.most_bytes or math.inf)
+        if self._deadline is not None and met and self._deadline.seconds < self._longest:
             raise StopSearch
         return encoder(settings)
 

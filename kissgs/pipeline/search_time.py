@@ -10,7 +10,7 @@ CONTAINER_SHARE = 4.0
 """Time to fine-tune a container, in units of that to train one point of the path."""
 
 TWO_CONTAINERS, THREE_CONTAINERS = 8.5, 25.0
-"""Time from which a second and a third container are worth their time, in units of an encoding without training."""
+"""Times from which a second and a third container are worth their time, in units of an encoding without training."""
 
 
 ENDING_SHARE = 0.38

@@ -47,7 +47,7 @@ def time_plan(
     """Choose what to do in the time that is left for a scene.
 
     Training that was not requested is left out where there is too little time for it, and the preset where even a
-    plain encoding takes too long, unless a goal or a setting of the encoder is given. Without a goal and photographs,
+    plain encoding takes too long, unless a goal or a setting of the encoder is given. Without a goal and a capture,
     time that is left goes to fine-tuning on renderings of the scene.
 
     Args:
@@ -64,15 +64,16 @@ def time_plan(
     plain, left = encode_seconds(settings.preset, count, threads), deadline.seconds
     time = SearchTime(deadline, plain)
     if left >= TRAINING_TIME * plain and count > 1:
-        tunes = requested.aims and not settings.encode.has_goal and requested.finetune.enabled is None
+        tunes = requested.aims and not captured and settings.finetune.enabled is None
         if tunes and torch and left >= TUNING_TIME * plain:
             settings = settings.model_copy(update={"finetune": settings.finetune.model_copy(update={"enabled": True})})
         return TimePlan(settings, time)
+    trained = settings.compact.auto_count and not requested.compact.auto_count
     settings = requested.decided(photographs=False, torch=False)
+    note = "there was too little time for training" if trained and count > 1 else ""
     usual = Settings.from_preset(settings.preset, seed=settings.encode.seed).encode
     takes = plain * (CAPTURE_TIME if captured and settings.encode.rate_distortion else 1.0)
     if left >= takes or settings.preset == Preset.FAST or settings.encode != usual or settings.finetune.enabled:
-        return TimePlan(settings, time)
-    fast = Settings.from_preset(Preset.FAST, compact=settings.compact, seed=settings.encode.seed)
-    fast = fast.model_copy(update={"time_limit": settings.time_limit, "finetune": settings.finetune})
+        return TimePlan(settings, time, note)
+    fast = Settings.from_preset(Preset.FAST, time_limit=settings.time_limit, seed=settings.encode.seed)
     return TimePlan(fast, time, f"encoded with the preset fast: {settings.preset} would take about {takes:.0f} s")

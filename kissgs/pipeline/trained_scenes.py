@@ -119,4 +119,6 @@ class TrainedScenes:
         tuner = encoding.tuner(COMPLETING, prepared)
         if tuner is not None and self.time is not None:
             tuner.ending_seconds = self.time.ending_seconds
+        elif tuner is not None:
+            tuner.deadline = None  # several containers cannot share the one of the whole work
         return tuner

@@ -60,7 +60,8 @@ class Settings(BaseModel):
 
         A size, a loss or the smallest container in a limited time is served best by fewer Gaussians that are trained on
         photographs, and by fine-tuning. Pruning or training without photographs loses more in views that nobody knows
-        than it saves, and a PSNR to the scene's own renderings falls by training on photographs.
+        than it saves, and a PSNR to the scene's own renderings falls by training on photographs. With a time limit
+        alone, ``finetune.enabled`` stays open without photographs: it depends on the time.
 
         Args:
             photographs: whether there are photographs to train on, and others to evaluate the result.
@@ -68,10 +69,10 @@ class Settings(BaseModel):
         """
         trains = (self.encode.has_goal or self.aims) and self.encode.psnr is None and photographs and torch
         compact, finetune = self.compact, self.finetune
-        if compact.auto_count is None:
-            wanted = trains and compact.trains and not compact.enabled
+        if compact.auto_count is None or self.aims:
+            wanted = trains and compact.trains and (compact.auto_count or not compact.enabled)
             compact = compact.model_copy(update={"auto_count": wanted})
-        if finetune.enabled is None:
+        if finetune.enabled is None and (trains or not self.aims):
             finetune = finetune.model_copy(update={"enabled": trains})
         encode = self.encode
         if self.aims and compact.auto_count:
@@ -88,10 +89,10 @@ class Settings(BaseModel):
                 "time_limit does not apply to compaction by a given budget: leave out count, ratio and max_psnr_drop "
                 "of compact, or the time limit"
             )
-        if self.compact.auto_count and not self.encode.has_goal:
+        if self.compact.auto_count and not (self.encode.has_goal or self.aims):
             raise ValueError(
-                "auto_count needs a goal: give target_size, max_psnr_drop, max_ssim_drop or psnr, or the number of "
-                "Gaussians to keep"
+                "auto_count needs a goal: give target_size, max_psnr_drop, max_ssim_drop, psnr or a time limit, or the "
+                "number of Gaussians to keep"
             )
         return self
 

@@ -16,6 +16,7 @@ from .problems import Problem
 COMPACTED = "+compact"
 FINETUNED = "+finetune"
 SEARCHED = "+search"
+TIMED = "+time"
 """Suffixes of the preset's name in :attr:`JobOptions.kind`."""
 
 
@@ -45,11 +46,12 @@ class JobOptions(kissgs.Settings):
 
     @property
     def kind(self) -> str:
-        """Preset and further stages (compaction, fine-tuning, search): with the scene, they determine the duration."""
+        """Preset, further stages and whether time is limited: with the scene, they determine the duration."""
         stages = {
             COMPACTED: self.compact.enabled,
             FINETUNED: bool(self.finetune.enabled),
             SEARCHED: self.searches,
+            TIMED: self.time_limit is not None,
         }
         return "".join([self.preset, *(suffix for suffix, wanted in stages.items() if wanted)])
 
@@ -67,7 +69,7 @@ class JobOptions(kissgs.Settings):
     def resumable(self) -> bool:
         """Whether training can resume from a checkpoint. Searches, which train several times, cannot resume."""
         tunes_once = bool(self.finetune.enabled) and not self.encode.has_goal
-        compacts_once = self.compact.max_psnr_drop is None and not self.compact.auto_count
+        compacts_once = self.compact.max_psnr_drop is None and not self.compact.auto_count and self.time_limit is None
         return compacts_once and (self.retrains or tunes_once)
 
 

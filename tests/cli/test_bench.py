@@ -51,7 +51,8 @@ def test_a_curve_is_plotted_and_images_are_compared(scene: Path, tmp_path: Path)
     assert (tmp_path / "p.svg").read_bytes().startswith(b"<?xml")
 
 
-def test_time_limits_are_measured_beside_presets(scene: Path, tmp_path: Path) -> None:
+def test_time_limits_are_measured_beside_presets(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     words = "bench", "frontier", scene, "-p", "fast", "--time", "0.01s", "--time", "0.02s"
     rows = json.loads(run(*words, "--json").stdout)
     assert [row["codec"] for row in rows] == ["fast", "in 0.01 s", "in 0.02 s"]

@@ -1,5 +1,7 @@
 """Limited time. Oracle: the limit itself, and what the container shows of the work that was done."""
 
+from dataclasses import replace
+
 import pytest
 from helpers.photographed import FEW_VIEWS, photographs, with_photographs
 from helpers.training_scenes import cloud
@@ -126,12 +128,90 @@ def test_time_alone_trains_and_keeps_the_closest_container(tmp_path, monkeypatch
 def test_little_time_makes_one_container_with_few_steps(tmp_path, monkeypatch):
     scene = cloud(200)
     views = photographs(scene, tmp_path)
-    monkeypatch.setattr("kissgs.pipeline.time_plan.encode_seconds", lambda *found: 1.0)
-    settings = with_photographs({"steps": 10_000}).model_copy(update={"time_limit": 6.0})
+    monkeypatch.setattr("kissgs.pipeline.time_plan.encode_seconds", lambda *found: 1.5)
+    settings = with_photographs({"steps": 10_000}).model_copy(update={"time_limit": 9.0})
     found = kissgs.compress(scene, settings=settings, views=views)
     assert len(found.report.trials) == 1
     assert 0 < found.report.finetuning.steps < 20_000
     assert f"finetune_steps: {found.report.finetuning.steps}" in found.files["container_meta.yaml"].decode()
+
+
+class StopIn:
+    """Receiver that ends the search in the second fine-tuning."""
+
+    def __init__(self):
+        self.tuned, self.last, self.stopped_at = 0, "", None
+
+    def __call__(self, stage, fraction, note=""):
+        self.tuned += stage == "finetune" != self.last
+        self.last = stage
+        if self.tuned == 2 and self.stopped_at is None:
+            self.stopped_at = self.tuned
+            raise kissgs.StopSearch
+
+
+def test_a_stopped_search_for_an_aim_keeps_the_closest_container(tmp_path):
+    scene, receiver = cloud(150), StopIn()
+    views = photographs(scene, tmp_path, brightness=1.0)
+    requested = with_photographs().model_copy(update={"time_limit": LONG})
+    found = kissgs.compress(scene, settings=requested, views=views, progress=receiver)
+    assert receiver.stopped_at == 2
+    assert [trial.bytes for trial in found.report.trials] == [len(found.to_zip())]
+
+
+def test_the_reported_settings_are_valid(tmp_path):
+    scene = cloud(100)
+    views = photographs(scene, tmp_path)
+    requested = with_photographs().model_copy(update={"time_limit": LONG})
+    found = kissgs.compress(scene, settings=requested, views=views)
+    again = Settings.model_validate(found.report.settings)
+    assert again.compact.auto_count is None
+    assert again.time_limit == LONG
+
+
+def test_a_short_search_prunes_no_further_than_it_trains(tmp_path, monkeypatch):
+    """The clock says that there is much time at first, and little later."""
+    scene, answers = cloud(200), iter([True])
+    views = photographs(scene, tmp_path)
+    monkeypatch.setattr("kissgs.pipeline.time_plan.encode_seconds", lambda *found: 1e-3)
+    monkeypatch.setattr(SearchTime, "containers", lambda self, most: 1)
+    monkeypatch.setattr(SearchTime, "short", property(lambda self: next(answers, False)))
+    requested = with_photographs(max_psnr_drop=0.5).model_copy(update={"time_limit": LONG})
+    found = kissgs.compress(scene, settings=requested, views=views)
+    assert found.report.trials[0].count == round(200 * 0.8**2)
+    assert found.report.compaction.target_source == "photos"
+
+
+def test_a_checkpoint_and_a_time_limit_are_refused_together(tmp_path):
+    with pytest.raises(UnsupportedError, match="no checkpoint is kept with a time limit"):
+        kissgs.compress(cloud(9), settings=Settings(time_limit=5), checkpoint=tmp_path / "state")
+
+
+def test_the_note_says_what_torch_would_have_bought(tmp_path, monkeypatch):
+    scene = cloud(60)
+    views = photographs(scene, tmp_path)
+    monkeypatch.setattr("kissgs.pipeline.training_choice.has_torch", lambda: False)
+    for capture in (views, None):
+        plenty, little = (Settings.from_preset("balanced", time_limit=t, **FEW_VIEWS) for t in (LONG, 1e-3))
+        assert "torch is missing" in kissgs.compress(scene, settings=plenty, views=capture).report.note
+        assert "torch is missing" not in kissgs.compress(scene, settings=little, views=capture).report.note
+
+
+def test_captures_without_held_out_photographs_are_not_trained_on(tmp_path):
+    scene = cloud(60)
+    views = replace(photographs(scene, tmp_path), test=())
+    found = kissgs.compress(scene, settings=with_photographs().model_copy(update={"time_limit": LONG}), views=views)
+    assert found.report.finetuning is None
+    assert found.report.compaction is None
+
+
+@pytest.mark.quick(0)
+def test_a_size_and_a_quality_come_before_the_time():
+    scene = kissgs.sample_scene(1500, sh_degree=1, seed=5)
+    views = {"sensitivity_views": 4, "sensitivity_view_size": 48}
+    alone = kissgs.compress(scene, settings=Settings.from_preset("balanced", psnr=36, **views))
+    both = Settings.from_preset("balanced", psnr=36, target_size=len(alone.to_zip()), time_limit=1e-3, **views)
+    assert len(kissgs.compress(scene, settings=both).to_zip()) <= len(alone.to_zip())
 
 
 @pytest.mark.quick(1)
@@ -187,6 +267,6 @@ def test_size_and_quality_must_both_hold():
     both = Settings.from_preset("balanced", psnr=36, target_size=len(alone.to_zip()), **views)
     assert kissgs.compress(scene, settings=both).files == alone.files
     with pytest.raises(
-        UnsupportedError, match=f"target_size and psnr cannot both be met.*{len(alone.to_zip()):,} bytes"
+        UnsupportedError, match=f"target_size and psnr cannot be met together.*{len(alone.to_zip()):,} bytes"
     ):
         kissgs.compress(scene, settings=Settings.from_preset("balanced", psnr=36, target_size=900, **views))
