@@ -15,7 +15,7 @@ from kissgs.pipeline.candidates import Candidates
 from kissgs.pipeline.goal import HALF_ERROR_DB, Goal
 from kissgs.pipeline.path_points import OVERHEAD_BYTES, POINTS_PER_HALVING, count_at, last_number, number_for_size
 from kissgs.pipeline.rate_control import RateControl
-from kissgs.pipeline.search_time import SearchTime
+from kissgs.pipeline.search_time import SearchPlan, SearchTime
 from kissgs.pipeline.trained_scenes import TrainedScenes
 from kissgs.pipeline.trained_search import NEAR_HALVINGS, NEAR_IN_TIME, Position, search_positions
 from kissgs.pipeline.training_choice import has_photographs
@@ -32,16 +32,6 @@ PRUNABLE_DROP = 1.0
 
 PRUNABLE_POINTS = 3
 """Number of the last point that is pruned without training where there are photographs: half of the Gaussians."""
-
-FIRST_NUMBER = 6
-"""Number of the point that is tried first with photographs where the goal is no size: a quarter of the Gaussians."""
-
-ONLY_NUMBERS = {(True, True): 4, (True, False): 5, (False, True): 2, (False, False): 4}
-"""Number of that point where there is time for a single container.
-
-The key says whether the goal is no more than an aim, and whether the time is short. With fewer Gaussians, training that
-is too short loses more than they save.
-"""
 
 BEYOND_PHOTOGRAPHS = (
     "trained for what the photographs show: beyond them it changes more (--evaluate measures how much; --compact 100% "
@@ -77,24 +67,28 @@ class CountSearch:
     _scenes: TrainedScenes = field(init=False)
     _whole: RateControl | None = field(init=False, default=None)
     _stopped: bool = field(init=False, default=False)
-    _containers: int = field(init=False)
-    _first: int = field(init=False)
+    _plan: SearchPlan = field(init=False)
 
     def __post_init__(self) -> None:
-        self._containers, short = self.compactor.settings.max_compactions, False
+        most = self.compactor.settings.max_compactions
         if not self._photographs:
             self.time = None
-        if self.time is not None:
-            self._containers, short = self.time.containers(self._containers), self.time.short
-        if short:  # half of the views score nearly as well
+        plan = SearchPlan(most) if self.time is None else self.time.plan(aims=self.aims)
+        self._plan = replace(plan, containers=min(plan.containers, most))
+        if plan.brief:  # half of the views score nearly as well
             supervision = self.compactor.supervision
             score = supervision.score[::2]
             self.compactor = replace(self.compactor, supervision=replace(supervision, score=score))
-        self._first = self._first_number(short)
         self._path = self.compactor.path(keep_states=not self._tunes)
         self._candidates = Candidates(self.goal, self.encoding.packed)
         self._scenes = TrainedScenes(
-            self.encoding, self.compactor, self._path, self._photographs, self.time, self._containers
+            encoding=self.encoding,
+            compactor=self.compactor,
+            path=self._path,
+            photographs=self._photographs,
+            offset_db=self._plan.offset_db if self._photographs else 0.0,
+            time=self.time,
+            containers=self._plan.containers,
         )
 
     def run(self) -> tuple[Compacted, RateControl | None, tuple[Trial, ...]]:
@@ -151,11 +145,10 @@ class CountSearch:
     def _number_for_size(self) -> int:
         return number_for_size(self.compactor.splats, self._target_size)
 
-    def _first_number(self, short: bool) -> int:
-        """Return the number of the point to try first with photographs; ``short`` says if there is little time."""
-        if self.goal.by_size:
-            return self._number_for_size
-        return FIRST_NUMBER if self._containers > 1 or self.time is None else ONLY_NUMBERS[self.aims, short]
+    @property
+    def _first_number(self) -> int:
+        """Number of the point that is tried first with photographs."""
+        return self._number_for_size if self.goal.by_size else self._plan.number
 
     def _search(self) -> None:
         if not self._photographs:
@@ -164,7 +157,7 @@ class CountSearch:
             if self.time is None:
                 self._prune()
             else:  # what each point loses is not worth the time to measure it
-                self._prune_to(min(self._first - 1, PRUNABLE_POINTS))
+                self._prune_to(min(self._first_number - 1, PRUNABLE_POINTS))
             self._search_along_path()
 
     def _search_without_photographs(self) -> None:
@@ -221,10 +214,10 @@ class CountSearch:
         search_positions(
             self.goal,
             self._encode_position,
-            self._first,
+            self._first_number,
             (1, last_number(len(self.compactor.splats))),
             POINTS_PER_HALVING,
-            self._containers,
+            self._plan.containers,
             NEAR_HALVINGS if self.time is None else NEAR_IN_TIME,
         )
         if self.goal.by_size and self._candidates.best is None:  # lambda alone makes this scene small enough
@@ -235,7 +228,7 @@ class CountSearch:
         number, progress = position.number, self.encoding.progress
         last = f"; last: {self.trials[-1].summary()}" if self.trials else ""
         progress.note = f"{count_at(number, len(self.compactor.splats)):,} Gaussians{last}"
-        self._scenes.containers = max(self._containers - len(self.trials), 1)
+        self._scenes.containers = max(self._plan.containers - len(self.trials), 1)
         trained = self._scenes.scene(number, self._candidates.best_bytes)
         before = len(trained.search.trials)
         try:

@@ -17,13 +17,6 @@ if TYPE_CHECKING:
     from kissgs.finetuning.tune import Tuner
     from kissgs.pipeline.encoding import Encoding
 
-TRAINED_OFFSET_DB, BRIEF_OFFSET_DB = 5.0, 3.0
-"""Added to ``quality_offset_db`` for a scene trained on photographs; the second where there is time for one container.
-
-At equal bytes, fewer Gaussians with finer levels lose less than more Gaussians with coarser ones, if they are trained
-long enough (fox: 26 % of the Gaussians at 5 dB take 266 kB and lose 0.08 dB, 33 % at 0 dB 271 kB and 0.11 dB).
-"""
-
 COMPLETING = FinetuneFactors(steps=1.2, lr=2.5, codebook_lr=2.0)
 """Fine-tuning that completes the training of the path too.
 
@@ -55,6 +48,7 @@ class TrainedScenes:
         compactor: compactor of the same scene.
         path: training path of the compactor.
         photographs: whether photographs are the targets.
+        offset_db: added to ``quality_offset_db`` for the first container of a scene, decibels.
         time: the time that training shares with encoding; None for no limit.
         containers: number of containers that are still to be made in that time, this one included.
     """
@@ -63,14 +57,11 @@ class TrainedScenes:
     compactor: Compactor
     path: TrainingPath
     photographs: bool
+    offset_db: float
     time: SearchTime | None
     containers: int
-    _brief: bool = field(init=False)
     _tuner: Tuner | None = field(init=False, default=None)
     _scenes: dict[int, TrainedScene] = field(init=False, default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self._brief = self.time is not None and self.containers == 1
 
     def scene(self, number: int, byte_limit: float) -> TrainedScene:
         """Return the scene at a point of the path, trained and ready for the next container.
@@ -110,8 +101,7 @@ class TrainedScenes:
         if tunes:  # training replaces the refit of colours
             encoding = encoding.with_encode_settings(color_refit_iterations=0)
             self._tuner = self._tuner or self._first_tuner(encoding)
-        offset = (BRIEF_OFFSET_DB if self._brief else TRAINED_OFFSET_DB) if self.photographs else 0.0
-        search = encoding.rate_control(offset_db=offset, byte_limit=byte_limit)
+        search = encoding.rate_control(offset_db=self.offset_db, byte_limit=byte_limit)
         return TrainedScene(compacted, search, encoding.encoder(self._tuner))
 
     def _first_tuner(self, encoding: Encoding) -> Tuner | None:

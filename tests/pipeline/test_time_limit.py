@@ -11,7 +11,7 @@ from kissgs import Settings, UnsupportedError
 from kissgs.core.deadline import Deadline
 from kissgs.pipeline import machine_speed
 from kissgs.pipeline.machine_speed import encode_seconds, save_speed
-from kissgs.pipeline.search_time import SearchTime
+from kissgs.pipeline.search_time import MEETING, SearchTime
 from kissgs.pipeline.time_plan import time_plan
 from kissgs.settings import Preset
 
@@ -66,9 +66,12 @@ def test_a_goal_keeps_its_value():
 
 
 def test_more_time_makes_more_containers():
-    made = [SearchTime(Deadline.after(10 * units), 10).containers(3) for units in (3, 12, 40)]
-    assert made == [1, 2, 3]
-    assert SearchTime(Deadline.after(400), 10).containers(2) == 2
+    for aims in (True, False):
+        plans = [SearchTime(Deadline.after(10 * units), 10).plan(aims=aims) for units in (3, 6, 12, 30, 90)]
+        assert [plan.containers for plan in plans] == sorted(plan.containers for plan in plans)
+        assert [plan.number for plan in plans] == sorted(plan.number for plan in plans)
+        assert (plans[0].containers, plans[-1].containers) == (1, 3)
+        assert [plan.brief for plan in plans] == [True, False, False, False, False]
 
 
 def test_the_shares_of_a_search_fill_its_time():
@@ -170,12 +173,10 @@ def test_the_reported_settings_are_valid(tmp_path):
 
 
 def test_a_short_search_prunes_no_further_than_it_trains(tmp_path, monkeypatch):
-    """The clock says that there is much time at first, and little later."""
-    scene, answers = cloud(200), iter([True])
+    scene = cloud(200)
     views = photographs(scene, tmp_path)
     monkeypatch.setattr("kissgs.pipeline.time_plan.encode_seconds", lambda *found: 1e-3)
-    monkeypatch.setattr(SearchTime, "containers", lambda self, most: 1)
-    monkeypatch.setattr(SearchTime, "short", property(lambda self: next(answers, False)))
+    monkeypatch.setattr(SearchTime, "plan", lambda self, aims: MEETING[0][1])
     requested = with_photographs(max_psnr_drop=0.5).model_copy(update={"time_limit": LONG})
     found = kissgs.compress(scene, settings=requested, views=views)
     assert found.report.trials[0].count == round(200 * 0.8**2)
