@@ -9,7 +9,7 @@ from kissgs.pipeline.machine_speed import encode_seconds
 from kissgs.pipeline.search_time import SearchTime
 from kissgs.settings import Preset, Settings
 
-TRAINING_TIME = 2.6
+TRAINING_TIME = 3.5
 """Time from which training on photographs pays, in units of an encoding without training."""
 
 TUNING_TIME = 5.0
