@@ -269,7 +269,7 @@ class CountSearch:
         return points[max(met, default=0)]
 
     def _reason_to_keep_all(self) -> str:
-        if self._tried or self.trials:
+        if self._tried or any(trial.count < len(self.compactor.splats) for trial in self.trials):
             return "and no smaller number of Gaussians that was tried serves the goal better"
         if self._stopped:
             return "and the search was stopped before a smaller number was tried"

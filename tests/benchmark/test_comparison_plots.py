@@ -29,7 +29,7 @@ def test_a_plot_has_the_same_bytes_each_time(tmp_path, kind, draw, rows):
 @pytest.mark.parametrize("photo", [False, True])
 def test_labels_cover_neither_each_other_nor_points(tmp_path, monkeypatch, photo):
     """The points of 'small' and 'balanced' nearly coincide."""
-    place_labels, boxes_by_panel = comparison_plots._place_labels, []
+    place_labels, boxes_by_panel = comparison_plots.place_labels, []
 
     def recording(figure, axes, labels):
         place_labels(figure, axes, labels)
@@ -37,7 +37,7 @@ def test_labels_cover_neither_each_other_nor_points(tmp_path, monkeypatch, photo
         points = axes.transData.transform([label.xy for label in labels])
         assert not any(box.contains(*point) for box in boxes_by_panel[-1] for point in points)
 
-    monkeypatch.setattr(comparison_plots, "_place_labels", recording)
+    monkeypatch.setattr(comparison_plots, "place_labels", recording)
     comparison_plot(many(photo=photo), tmp_path / "p.png")
     assert [len(boxes) for boxes in boxes_by_panel] == [5] * (3 if photo else 2)
     for boxes in boxes_by_panel:

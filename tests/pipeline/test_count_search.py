@@ -229,7 +229,7 @@ def test_a_stopped_search_returns_its_best(count):
 @pytest.mark.parametrize(
     ("goal", "changes", "message"),
     [
-        ({}, {}, "auto_count needs a goal: give target_size, max_psnr_drop, max_ssim_drop or psnr"),
+        ({}, {}, "auto_count needs a goal: give target_size, max_psnr_drop, max_ssim_drop, psnr or a time limit"),
         ({"target_size": "1MB"}, {"method": "merge"}, "auto_count prunes; give count or ratio with method merge"),
         ({"target_size": "1MB"}, {"count": 9}, "count and auto_count cannot both be met; give one"),
         (
