@@ -105,7 +105,7 @@ def quality_panel(axes: Axes, rows: Sequence[Measurement], target: PsnrTarget) -
     axes.set(xscale="log", xlabel="kilobytes", ylabel=f"PSNR to {images}, dB")
     set_log_axis(axes, [size for _, (size, _) in known])
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(loc="lower right", fontsize="small")
+        axes.legend(loc="best", fontsize="small")
     return labels
 
 

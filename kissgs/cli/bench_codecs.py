@@ -14,6 +14,7 @@ from kissgs.core.errors import UnsupportedError
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from kissgs.benchmark.comparison import BenchmarkPlan
     from kissgs.benchmark.results import Measurement
     from kissgs.core.progress import Progress
     from kissgs.settings import Settings
@@ -56,7 +57,7 @@ def codecs(
 ) -> BenchOutput:
     """Measure presets, points of their quality curves and external codecs."""
     external.check()
-    from kissgs.benchmark.comparison import BenchmarkPlan, compare
+    from kissgs.benchmark.comparison import BenchmarkPlan
     from kissgs.benchmark.comparison_plots import comparison_plot
     from kissgs.benchmark.results import at_equal_psnr
     from kissgs.cli.bench_tables import bench_tables
@@ -79,13 +80,7 @@ def codecs(
         views=inputs.views,
         threads=inputs.threads,
     )
-    external_failures = list[str]()
-
-    def measure(scene: Path, progress: Progress) -> list[Measurement]:
-        return compare(scene, plan, on_failure=external_failures.append, progress=progress)
-
-    found, failures = each_scene(inputs.scenes, measure)
-    rows = [replace(row, scene=name) for name, row in found]
+    rows, failures = measured(inputs, plan)
     equals = at_equal_psnr(rows)
     entries = [row.as_dict() for row in rows]
     for row, entry in zip(rows, entries, strict=True):
@@ -96,8 +91,21 @@ def codecs(
         rows=entries,
         table=bench_tables(rows, equals),
         draw=partial(comparison_plot, rows),
-        failures=external_failures + failures,
+        failures=failures,
     )
+
+
+def measured(inputs: BenchInputs, plan: BenchmarkPlan) -> tuple[list[Measurement], list[str]]:
+    """Measure each scene as planned; return all measurements, and the messages of what failed."""
+    from kissgs.benchmark.comparison import compare
+
+    external_failures = list[str]()
+
+    def measure(scene: Path, progress: Progress) -> list[Measurement]:
+        return compare(scene, plan, on_failure=external_failures.append, progress=progress)
+
+    found, failures = each_scene(inputs.scenes, measure)
+    return [replace(row, scene=name) for name, row in found], external_failures + failures
 
 
 def all_settings(presets: list[str] | None, changes: list[str] | None) -> list[Settings]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -10,18 +9,15 @@ from rich.console import Group
 from rich.table import Column, Table
 from rich.text import Text
 
-from kissgs.cli.bench_codecs import ExternalCodecs, command_words
-from kissgs.cli.bench_scenes import BenchInputs, BenchOutput, each_scene
+from kissgs.cli.bench_codecs import ExternalCodecs, command_words, measured
+from kissgs.cli.bench_scenes import BenchInputs, BenchOutput
 from kissgs.cli.options import chosen
 from kissgs.evaluation.metric_text import format_metric
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from rich.console import RenderableType
 
     from kissgs.benchmark.results import Measurement
-    from kissgs.core.progress import Progress
     from kissgs.evaluation.results import Evaluation
 
 TIMES = ("5s", "30s", "2min", "10min")
@@ -38,7 +34,7 @@ def frontier(
 ) -> BenchOutput:
     """Measure presets, time limits and external codecs, and mark the Pareto front of bytes and quality."""
     external.check()
-    from kissgs.benchmark.comparison import BenchmarkPlan, compare
+    from kissgs.benchmark.comparison import BenchmarkPlan
     from kissgs.benchmark.frontier_plot import frontier_plot
     from kissgs.cli.bench_codecs import all_settings
 
@@ -53,18 +49,12 @@ def frontier(
         views=inputs.views,
         threads=inputs.threads,
     )
-    external_failures = list[str]()
-
-    def measure(scene: Path, progress: Progress) -> list[Measurement]:
-        return compare(scene, plan, on_failure=external_failures.append, progress=progress)
-
-    found, failures = each_scene(inputs.scenes, measure)
-    rows = [replace(row, scene=name) for name, row in found]
+    rows, failures = measured(inputs, plan)
     return BenchOutput(
         rows=[row.as_dict() for row in rows],
         table=frontier_table(rows),
         draw=partial(frontier_plot, rows),
-        failures=external_failures + failures,
+        failures=failures,
     )
 
 

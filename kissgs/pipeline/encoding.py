@@ -223,7 +223,8 @@ class Encoding:
 
             def files(plan: EncodingPlan, finetune_steps: int, progress: Progress) -> Encoded:
                 compacted = len(self.original) - len(self.splats)
-                return self._write(plan, pruned if finetune_steps else settings, compacted, finetune_steps, progress)
+                used = pruned if finetune_steps or (completes and tuner is not None) else settings
+                return self._write(plan, used, compacted, finetune_steps, progress)
 
             plan = planner(pruned if completes and tuner is not None else settings, self.progress)
             if tuner is None or not plan.grid.mask.any():

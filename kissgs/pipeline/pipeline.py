@@ -200,8 +200,6 @@ def compress(
     kind = named_container(container, target)
     if target is not None:
         check_destination(target, overwrite=overwrite, names=FILES)
-    if checkpoint is not None and settings.time_limit is not None:
-        raise UnsupportedError("no checkpoint is kept with a time limit; leave out one of them")
     finetune_checkpoint = _check_finetuning(settings, views, checkpoint, device)
     deadline = None if settings.time_limit is None else Deadline.after(settings.time_limit)
     clock = StageTimer(progress)
@@ -279,6 +277,8 @@ def _check_finetuning(
     """Check that fine-tuning is possible if the settings ask for it; return its checkpoint file if it has one."""
     from kissgs.pipeline.encoding import check_finetuning
 
+    if checkpoint is not None and settings.time_limit is not None:
+        raise UnsupportedError("no checkpoint is kept with a time limit; leave out one of them")
     if not settings.finetune.enabled:
         return None
     check_finetuning(settings, views, device)
