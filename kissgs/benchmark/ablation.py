@@ -118,10 +118,11 @@ RATE_DISTORTION_VARIANTS = (
     Variant(changes={"color_refit_iterations": 0}, needs_capture=True),
     Variant(changes={"view_uncertainty": 0.0}),
     Variant(changes={"sensitivity_views": 12}),
+    Variant(changes={"order": "hilbert"}),
     Variant(changes={"order": "plas"}),
     Variant(changes={"rotation_form": "pras"}),
     Variant(changes={"sh_kmeans_iterations": 1, "sh_neighbors": 32}),
-    Variant(changes={"codebook_max_effort": False}),
+    Variant(changes={"webp_high_effort": False}),
     Variant(changes={"webp_quality": 50, "webp_method": 2}),
 )
 """Changes of presets with rate-distortion planning, each of which leaves out one of their choices."""

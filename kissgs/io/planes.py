@@ -11,8 +11,14 @@ from kissgs.core.threads import Workers
 from kissgs.io.webp import encode_plane
 from kissgs.settings import EncodeSettings
 
-HIGHEST_EFFORT = (100, 6)
-"""Quality and method of libwebp for the smallest files."""
+HIGHEST_EFFORT, HIGH_EFFORT = (100, 6), (100, 5)
+"""Quality and method of libwebp for the codebook, and for other images that gain from more effort."""
+
+NEARLY_RANDOM = ("mask", "means", "labels")
+"""Parts of the names of images that no effort makes smaller."""
+
+SMALL = 100_000
+"""Pixels up to which images get a high effort; it takes 10 CPU seconds per megapixel."""
 
 USUAL_EFFORT = (75, 4)
 """Quality and method up to which large images take less effort."""
@@ -32,9 +38,12 @@ def compress_images(
     """Compress all images of a container in parallel, the slowest first: the one called ``codebook``."""
 
     def work(name: str) -> bytes:
-        slow = settings.codebook_max_effort and name == codebook
-        asked = settings.webp_quality, settings.webp_method
-        quality, method = HIGHEST_EFFORT if slow else effort_of(images[name].shape, *asked)
+        height, width, _ = shape = images[name].shape
+        quality, method = effort_of(shape, settings.webp_quality, settings.webp_method)
+        if settings.webp_high_effort and name == codebook:
+            quality, method = HIGHEST_EFFORT
+        elif settings.webp_high_effort and height * width <= SMALL and not any(part in name for part in NEARLY_RANDOM):
+            quality, method = max((quality, method), HIGH_EFFORT)
         return encode_plane(images[name], quality=quality, method=method)
 
     names = sorted(images, key=lambda name: (name != codebook, -images[name].size))

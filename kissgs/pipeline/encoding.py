@@ -21,6 +21,7 @@ from kissgs.core.free_memory import return_free_memory
 from kissgs.core.progress import Progress, SearchNote, as_stage
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import ATTRIBUTES, Cleaned, Splats, empty_splats
+from kissgs.core.threads import blas_workers
 from kissgs.io.container_names import ContainerName
 from kissgs.io.sensitivity_file import read_sensitivity, write_sensitivity
 from kissgs.pipeline.containers import DECODERS, MODELS, write_files
@@ -28,6 +29,7 @@ from kissgs.pipeline.rate_control import Container, Encoder, RateControl
 from kissgs.pipeline.trial import Trial
 from kissgs.planning.encoded import Encoded
 from kissgs.planning.encoding_plan import EncodingPlan
+from kissgs.planning.order_refinement import refine_order
 from kissgs.planning.planner import load_kernels as load_encoder
 from kissgs.planning.planner import plan_encoding
 from kissgs.planning.rate_distortion import ColorRefit
@@ -223,6 +225,9 @@ class Encoding:
 
             def files(plan: EncodingPlan, finetune_steps: int, progress: Progress) -> Encoded:
                 compacted = len(self.original) - len(self.splats)
+                if finetune_steps and settings.order == "refined":  # for its levels of now
+                    with blas_workers(self.threads) as pool:
+                        plan = refine_order(plan, None, pool)
                 used = pruned if finetune_steps or (completes and tuner is not None) else settings
                 return self._write(plan, used, compacted, finetune_steps, progress)
 

@@ -80,7 +80,7 @@ def layout_grid(
         nothing = np.zeros(side * side, dtype=np.int32)
         return Grid(side, nothing, nothing.astype(bool), nothing)
     levels = quantize_means(selected(means, kept), bits=bits, pool=pool).levels
-    if settings.order == "hilbert":
+    if settings.order != "plas":
         order = hilbert_order(levels, _with_groups(classes, groups, kept), pool)
         order = np.concatenate([order, np.repeat(order[-1:], side * side - len(order))])
         mask = np.arange(side * side) < len(kept)

@@ -12,6 +12,7 @@ from kissgs.core.splats import Splats
 from kissgs.core.threads import blas_workers
 from kissgs.planning.container_model import EVEN_LEVELS, ContainerModel
 from kissgs.planning.encoding_plan import EncodingPlan
+from kissgs.planning.order_refinement import refine_order
 from kissgs.planning.rate_distortion import ColorRefit, plan_rate_distortion
 from kissgs.planning.uniform import plan_uniform
 from kissgs.settings import EncodeSettings
@@ -47,16 +48,16 @@ def plan_encoding(
         container: what the container can hold.
         keep_costs: whether the plan of rate-distortion planning has its costs, which fine-tuning needs.
         groups: group of each Gaussian, below 16,384: those of a group follow one another in the container, the groups
-            in ascending order. Needs the Hilbert order. None for one group.
+            in ascending order. Not with PLAS. None for one group.
         threads: number of threads; 0 means one per processor.
         progress: receives "kernels", "rate_distortion", "order", "forms", "codebook", "sort codebook" and "rounding".
 
     Raises:
         InvalidSceneError: ``sensitivity`` does not fit the scene.
-        UnsupportedError: the scene is too large for one container; groups with another order.
+        UnsupportedError: the scene is too large for one container; groups with PLAS.
     """
-    if groups is not None and settings.order != "hilbert":
-        raise UnsupportedError("a container with groups of Gaussians needs order=hilbert")
+    if groups is not None and settings.order == "plas":
+        raise UnsupportedError("a container with groups of Gaussians needs order=hilbert or order=refined")
     if groups is not None and int(groups.max(initial=0)) >= MAX_GROUPS:
         raise UnsupportedError(f"a container holds up to {MAX_GROUPS:,} groups of Gaussians; make them larger")
     if sensitivity is not None:
@@ -65,7 +66,7 @@ def plan_encoding(
     kept = visible_gaussians(splats, settings)
     with blas_workers(threads) as pool:
         if sensitivity is not None and (sensitivity.color_weight[kept] > 0).any():
-            return plan_rate_distortion(
+            plan = plan_rate_distortion(
                 splats,
                 kept,
                 sensitivity,
@@ -77,7 +78,12 @@ def plan_encoding(
                 keep_costs=keep_costs,
                 groups=groups,
             )
-        return plan_uniform(splats, kept, settings, container, pool, progress, groups)
+        else:
+            plan = plan_uniform(splats, kept, settings, container, pool, progress, groups)
+        if settings.order == "refined":
+            progress("rounding", 0.9)
+            plan = refine_order(plan, groups, pool)
+        return plan
 
 
 def visible_gaussians(splats: Splats, settings: EncodeSettings) -> Int32[np.ndarray, " K"]:
@@ -90,6 +96,6 @@ def visible_gaussians(splats: Splats, settings: EncodeSettings) -> Int32[np.ndar
 def load_kernels(progress: Progress = silent) -> None:
     """Compile the encoder's kernels, or load them from numba's cache."""
     progress("kernels", 0.0)
-    from kissgs.planning import form_kernels, kernels, kmeans_kernels, order_kernels, relocation_kernels  # noqa: F401
+    from kissgs.planning import form_kernels, kernels, kmeans_kernels, order_kernels, relocation_kernels, tour_kernels  # noqa: F401
 
     progress("kernels", 1.0)

@@ -138,7 +138,7 @@ def largest_errors(
 
     Args:
         fields: levels of the Gaussians, in order.
-        values: opacity logit, log-scales and unit quaternion, in the stored form of each Gaussian.
+        values: opacity logit, log-scales and quaternion, in the stored form of each Gaussian.
         means: positions.
         colors: ``sh0``.
         pool: threads; None for the calling one.

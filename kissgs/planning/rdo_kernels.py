@@ -23,14 +23,19 @@ def _form_hessian(packed: np.ndarray, order: np.ndarray, floor: np.ndarray, hess
 
 @njit(nogil=True, error_model="numpy")
 def _jacobian(w: float, x: float, y: float, z: float, jacobian: np.ndarray) -> None:
-    """Write the derivatives of (opacity, scales, rotation vector 2 Im(conj(q) dq)) by the eight stored values."""
+    """Write the derivatives of (opacity, scales, rotation vector) by the eight stored values.
+
+    A change dq of a quaternion q turns by the vector 2 Im(conj(q) dq) / |q|².
+    """
     jacobian[:, :] = 0.0
+    scale = 2 / (w * w + x * x + y * y + z * z)
+    w, x, y, z = scale * w, scale * x, scale * y, scale * z
     for i in range(4):
         jacobian[i, i] = 1.0
-    jacobian[4, 4], jacobian[4, 5], jacobian[4, 6] = -2 * x, -2 * y, -2 * z
-    jacobian[5, 4], jacobian[5, 5], jacobian[5, 6] = 2 * w, -2 * z, 2 * y
-    jacobian[6, 4], jacobian[6, 5], jacobian[6, 6] = 2 * z, 2 * w, -2 * x
-    jacobian[7, 4], jacobian[7, 5], jacobian[7, 6] = -2 * y, 2 * x, 2 * w
+    jacobian[4, 4], jacobian[4, 5], jacobian[4, 6] = -x, -y, -z
+    jacobian[5, 4], jacobian[5, 5], jacobian[5, 6] = w, -z, y
+    jacobian[6, 4], jacobian[6, 5], jacobian[6, 6] = z, w, -x
+    jacobian[7, 4], jacobian[7, 5], jacobian[7, 6] = -y, x, w
 
 
 @compiled(
@@ -59,7 +64,7 @@ def choose_levels(
     compensate one of a scale.
 
     Args:
-        values: ``(N, 8)``, quaternions of length 1.
+        values: ``(N, 8)``, quaternions of any length above 0.
         shapes: ``(N, 10)`` shape Hessians of :class:`kissgs.Sensitivity`.
         forms: ``(N,)`` rotation form of each Gaussian, 0 to 23 (plus 24 for -q).
         orders: ``(24, 3)`` original axis of each axis of the form.

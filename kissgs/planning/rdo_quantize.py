@@ -126,7 +126,7 @@ def rdo_quantize_shapes(
     """Choose the levels of opacities, scales and quaternions jointly by squared error plus lambda · bits.
 
     Args:
-        values: opacity logit, log-scales and unit quaternion, in the stored form of each Gaussian.
+        values: opacity logit, log-scales and quaternion, in the stored form of each Gaussian.
         parts: the rounded values: opacities, scales, quaternions.
         shapes: shape Hessians of :class:`kissgs.Sensitivity`.
         forms: form of each Gaussian, see :mod:`kissgs.planning.rotation_forms`.

@@ -5,7 +5,7 @@ The axes of an ellipsoid can be ordered in 6 and directed in 4 right-handed ways
 the paper's name (section on permutation-rotation sorting) for choosing among them.
 
 * :func:`canonical_forms`, of kissgs: the form nearest to the identity. All quaternions then lie within 63° of it, w is
-  nearly constant and x, y, z use 40 % of their range.
+  at least 0.85 and x, y, z use 40 % of their range.
 * :func:`pras_forms`, of the paper: the form most similar to its neighbours on the grid.
 """
 
@@ -51,17 +51,19 @@ class StoredShapes:
         splats: the scene.
         index: ``(M,)`` the Gaussians.
         forms: ``(M,)`` form of each.
+        w_is_one: whether quaternions are scaled such that w is 1, which must not be 0; else they have length 1.
     """
 
     splats: Splats
     index: Int[np.ndarray, " M"]
     forms: UInt8[np.ndarray, " M"]
+    w_is_one: bool = False
 
     def __len__(self) -> int:
         return len(self.index)
 
     def __getitem__(self, rows: slice) -> Float64[np.ndarray, "n 8"]:
-        """Return opacity logit, log-scales and unit quaternion of some rows."""
+        """Return opacity logit, log-scales and quaternion of some rows."""
         quats, scales = self._turned(rows)
         values = np.empty((len(quats), 8))
         values[:, 0] = self.splats.opacities.take(self.index[rows])
@@ -70,7 +72,7 @@ class StoredShapes:
 
     def take(self, chosen: Int[np.ndarray, " K"] | Bool[np.ndarray, " M"]) -> StoredShapes:
         """Return the rows ``chosen``."""
-        return StoredShapes(self.splats, self.index[chosen], self.forms[chosen])
+        return StoredShapes(self.splats, self.index[chosen], self.forms[chosen], self.w_is_one)
 
     @property
     def opacities(self) -> Computed:
@@ -84,12 +86,15 @@ class StoredShapes:
 
     @property
     def quats(self) -> Computed:
-        """Unit quaternions, four columns, float64."""
+        """Quaternions, four columns, float64."""
         return Computed(len(self), lambda rows: self._turned(rows)[0])
 
     def _turned(self, rows: slice) -> tuple[Float64[np.ndarray, "n 4"], Float32[np.ndarray, "n 3"]]:
         index = self.index[rows]
-        return apply_forms(unit_quats(self.splats, index), self.splats.scales.take(index, axis=0), self.forms[rows])
+        quats, scales = apply_forms(
+            unit_quats(self.splats, index), self.splats.scales.take(index, axis=0), self.forms[rows]
+        )
+        return (quats / quats[:, :1] if self.w_is_one else quats), scales
 
 
 def choose_forms(
@@ -99,8 +104,13 @@ def choose_forms(
     settings: EncodeSettings,
     pool: Workers,
     report: Callable[[float], None],
+    *,
+    free_length: bool,
 ) -> tuple[StoredShapes, float]:
     """Choose the form of rotation and log-scales of the Gaussian in each of ``cells``, as the settings say.
+
+    Where quaternions have a ``free_length``, because decoders normalise them, those of canonical forms have w = 1: x, y
+    and z hold the whole rotation, and w takes no bits.
 
     Returns:
         The Gaussians in these forms, and the largest relative change of a covariance, by rounding only.
@@ -115,7 +125,7 @@ def choose_forms(
     else:
         quats, scales = unit_quats(splats, cells), splats.scales.take(cells, axis=0)
         forms = pras_forms(quats, scales, side, pool, decay=settings.plas_radius_decay, report=report)
-    shapes = StoredShapes(splats, cells, forms)
+    shapes = StoredShapes(splats, cells, forms, free_length and settings.rotation_form == "canonical")
 
     def error(rows: slice) -> float:
         quats, scales = unit_quats(splats, cells[rows]), splats.scales.take(cells[rows], axis=0)

@@ -18,10 +18,11 @@ class Preset(StrEnum):
 ENCODE: dict[Preset, dict[str, Any]] = {
     Preset.FAST: {
         "rate_distortion": False,
+        "order": "hilbert",
         "sh_kmeans_iterations": 1,
         "sh_neighbors": 32,
         "codebook_order": "axes",
-        "codebook_max_effort": False,
+        "webp_high_effort": False,
         "webp_quality": 50,
         "webp_method": 2,
     },
@@ -49,7 +50,7 @@ ENCODE: dict[Preset, dict[str, Any]] = {
         "prune_invisible": False,
         "webp_quality": 75,
         "webp_method": 4,
-        "codebook_max_effort": False,
+        "webp_high_effort": False,
     },
 }
 

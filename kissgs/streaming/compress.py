@@ -179,8 +179,8 @@ def _check_settings(settings: Settings) -> None:
             "levels of detail are made without goals, time limits, compaction and fine-tuning; leave these out, or "
             "write a .sog"
         )
-    if settings.encode.order != "hilbert":
-        raise UnsupportedError(f"levels of detail need order=hilbert, not {settings.encode.order}")
+    if settings.encode.order == "plas":
+        raise UnsupportedError("levels of detail need order=hilbert or order=refined, not plas")
 
 
 def _reader(source: Path, reading: ReadOptions, threads: int) -> tuple[Blocks, int, int]:

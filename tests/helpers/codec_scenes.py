@@ -92,6 +92,15 @@ def equivalents(quats, scales):
     return np.stack(new_quats), np.stack(new_scales)
 
 
+def stored_forms(quats, scales):
+    """Return all forms that a container may hold: the equivalent ones with a length of 1, and those with w = 1."""
+    forms, permuted = equivalents(quats, scales)
+    w = forms[:, :, :1]
+    return np.concatenate([forms, np.where(w > 0.5, forms / np.where(w > 0.5, w, 1), forms)]), np.tile(
+        permuted, (2, 1, 1)
+    )
+
+
 def signed_log(x):
     """Return sign(x) ln(1 + |x|) in float64."""
     wide = np.asarray(x, np.float64)
@@ -119,7 +128,7 @@ def assert_round_trip(splats, result):
     assert_within(signed_log(found.means), signed_log(wanted.means), half["means"])
     assert_within(found.opacities, wanted.opacities, half["opacities"][0])
     assert_within(found.sh0, wanted.sh0, half["f_dc"])
-    quats, scales = equivalents(wanted.quats, wanted.scales)
+    quats, scales = stored_forms(wanted.quats, wanted.scales)
     fits = (np.abs(quats - found.quats) <= np.array(half["quaternions"]) + rounding(quats)).all(axis=2)
     fits &= (np.abs(scales - found.scales) <= np.array(half["scales"]) + rounding(scales)).all(axis=2)
     assert fits.any(axis=0).all()

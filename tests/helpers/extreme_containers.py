@@ -11,7 +11,7 @@ import torch
 
 import kissgs
 from helpers import reference_decoder
-from helpers.codec_scenes import equivalents, rounding, signed_log
+from helpers.codec_scenes import rounding, signed_log, stored_forms
 from helpers.extremes import EXTREMES
 from kissgs import Settings, Splats
 from kissgs.core.splats import ATTRIBUTES
@@ -105,7 +105,7 @@ def _share(splats, result, preset):
         error = np.abs(np.asarray(value, np.float64) - target)
         return error / (np.asarray(step) * (1 + 1e-6) + rounding(target))
 
-    quats, scales = equivalents(wanted.quats, wanted.scales)
+    quats, scales = stored_forms(wanted.quats, wanted.scales)
     turned, stretched = share(found.quats, quats, half["quaternions"]), share(found.scales, scales, half["scales"])
     parts = [
         share(signed_log(found.means), signed_log(wanted.means), half["means"]),

@@ -182,7 +182,19 @@ def test_large_images_take_less_effort_unless_more_than_the_usual_is_asked_for(s
 def test_large_images_are_compressed_with_that_effort():
     images = {"book.webp": random_image(1000, 1000, 3) // 64, "other.webp": random_image(1000, 1000, 1) // 64}
     with blas_workers(2) as pool:
-        settings = EncodeSettings(webp_quality=75, webp_method=4, codebook_max_effort=False)
+        settings = EncodeSettings(webp_quality=75, webp_method=4, webp_high_effort=False)
         found = compress_images(images, settings, pool, lambda fraction: None, codebook="book.webp")
     assert found["book.webp"] == encode_plane(images["book.webp"], quality=50, method=2)
     assert found["other.webp"] == encode_plane(images["other.webp"], quality=25, method=4)
+
+
+@pytest.mark.parametrize(("side", "effort"), [(80, (100, 5)), (320, (75, 4))])
+def test_more_effort_goes_to_small_images_that_gain_from_it(side, effort):
+    names = ("book.webp", "scales.webp", "means_bytes_0.webp", "f_rest_labels.webp")
+    images = {name: random_image(side, side, 3) // 16 for name in names}
+    with blas_workers(2) as pool:
+        found = compress_images(images, EncodeSettings(), pool, lambda fraction: None, codebook="book.webp")
+    efforts = {"book.webp": (100, 6), "scales.webp": effort}
+    for name, image in images.items():
+        quality, method = efforts.get(name, (75, 4))
+        assert found[name] == encode_plane(image, quality=quality, method=method), name

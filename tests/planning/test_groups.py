@@ -23,12 +23,13 @@ def order_of(settings, sensitivity, groups):
     return write_files(plan, settings)
 
 
+@pytest.mark.parametrize("order", ["hilbert", "refined"])
 @pytest.mark.parametrize("classes", [None, 1, 3])
-def test_groups_follow_one_another(classes):
+def test_groups_follow_one_another(classes, order):
     """Without sensitivity, and with one or several classes of steps inside each group."""
-    settings, sensitivity = Settings.from_preset("fast").encode, None
+    settings, sensitivity = Settings.from_preset("fast", order=order).encode, None
     if classes is not None:
-        settings = Settings.from_preset("balanced", step_classes=classes, prune_threshold_bits=0).encode
+        settings = Settings.from_preset("balanced", order=order, step_classes=classes, prune_threshold_bits=0).encode
         sensitivity = random_sensitivity(SCENE)
     encoded = order_of(settings, sensitivity, GROUPS)
     assert (np.diff(GROUPS[encoded.order].astype(int)) >= 0).all()

@@ -115,7 +115,7 @@ def test_colours_are_asked_for_once_the_rest_is_known():
         asked.append((decoded, order))
         return np.full((len(order), 3), 0.25, np.float32)
 
-    settings = Settings.from_preset("balanced").encode
+    settings = Settings.from_preset("balanced", order="hilbert").encode
     result = encode(splats, settings, sensitivity=random_sensitivity(splats), recolor=recolor)
     ((decoded, order),) = asked
     found = decompress(result.files)

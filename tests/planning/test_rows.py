@@ -79,7 +79,10 @@ def test_the_stored_form_is_the_largest_w_of_the_24_rotations(count):
     splats = random_scene(count, 0, seed=count)
     cells = np.random.default_rng(count).permutation(count).astype(np.int32)
     with Workers(2) as pool:
-        shapes, error = choose_forms(splats, cells, 8, Settings().encode, pool, lambda fraction: None)
+        shapes, error = choose_forms(
+            splats, cells, 8, Settings().encode, pool, lambda fraction: None, free_length=False
+        )
+        free, _ = choose_forms(splats, cells, 8, Settings().encode, pool, lambda fraction: None, free_length=True)
     quats = splats.quats[cells].astype(float)
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     w = quats @ (ROTATIONS * (1, -1, -1, -1)).T
@@ -90,6 +93,9 @@ def test_the_stored_form_is_the_largest_w_of_the_24_rotations(count):
     np.testing.assert_array_equal(stored[:, 1:4], np.take_along_axis(splats.scales[cells], order, axis=1))
     np.testing.assert_array_equal(stored[:, 0], splats.opacities[cells])
     assert error < 1e-12
+    assert (free[:][:, 4] == 1).all(), "where the length is free, w takes no bits"
+    np.testing.assert_allclose(free[:][:, 5:], stored[:, 5:] / stored[:, 4:5], atol=1e-12)
+    np.testing.assert_array_equal(free[:][:, :4], stored[:, :4])
 
 
 def test_parts_of_the_stored_form_agree():

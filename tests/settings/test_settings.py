@@ -88,7 +88,7 @@ def test_an_unknown_setting_is_refused_with_the_list_of_settings():
         ("means_bits", 17, "setting means_bits: input should be less than or equal to 16, not 17"),
         ("means_bits", 7, "setting means_bits: input should be greater than or equal to 8, not 7"),
         ("opacity_step", 0, "setting opacity_step: input should be greater than or equal to 0.0001, not 0"),
-        ("order", "random", "setting order: input should be 'hilbert' or 'plas', not 'random'"),
+        ("order", "random", "setting order: input should be 'hilbert', 'refined' or 'plas', not 'random'"),
         ("seed", "x", "setting seed: input should be a valid integer, unable to parse string as an integer, not 'x'"),
     ],
 )

@@ -1,0 +1,142 @@
+"""Order along the Hilbert curve, refined such that WebP predicts positions and base colours better.
+
+WebP codes the difference of a pixel from the one on its left. Along a curve through space, that works for the high
+bytes of positions and for base colours; low bytes, opacities, scales, rotations and labels do not resemble those of
+neighbours. So the Gaussians of each class are reordered, by the local search of the travelling-salesman problem (2-opt
+and Or-opt), such that these differences take fewer bits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from kissgs.core.array_types import Int, Int32, UInt8, UInt16
+from kissgs.core.threads import Workers
+from kissgs.planning.encoding_plan import EncodingPlan
+from kissgs.planning.layout import hilbert_order
+from kissgs.planning.rows import sorted_order
+
+BLOCK = 1 << 13
+"""Number of Gaussians that are reordered together. Reversals take longer the larger it is."""
+
+ROUNDS, PASSES = 2, 2
+"""Number of times that bits are counted and near Gaussians found, each time in blocks that begin elsewhere, and the
+largest number of passes of the local search in each."""
+
+NEAR, REACH = 8, 16
+"""Number of Gaussians that each one may be joined to, and places on the curves among which they are found."""
+
+TURNS = ((0, 1, 2, 0), (1, 2, 0, 21845), (2, 0, 1, 43690))
+"""Axes and shift of the Hilbert curves on which near Gaussians are found: where one has a gap, another has none."""
+
+SMOOTHING = ((-2, 1 / 9), (-1, 2 / 9), (0, 3 / 9), (1, 2 / 9), (2, 1 / 9))
+"""Shifts and weights of the average of the counts of similar differences."""
+
+UNIT = 256
+"""Fractions of a bit that the local search counts in, so that no rounding of a machine changes the order."""
+
+
+def refine_order(plan: EncodingPlan, groups: UInt16[np.ndarray, " N"] | None, pool: Workers) -> EncodingPlan:
+    """Reorder a plan along the Hilbert curve within each class, and within each of ``groups``."""
+    count = len(plan.classes)
+    if count == 0:
+        return plan
+    runs = plan.classes if groups is None else groups[plan.grid.cells[:count]].astype(np.int32) * 256 + plan.classes
+    order = refined_order(plan.fields["means"].levels[:count], plan.fields["f_dc"].levels[:count], runs, pool)
+    cells = np.concatenate([order, np.arange(count, len(plan.grid.cells), dtype=np.int32)])
+    fields = {name: field.take(cells) for name, field in plan.fields.items() if name != "f_rest_centroids"}
+    return replace(
+        plan,
+        grid=replace(plan.grid, cells=plan.grid.cells[cells]),
+        fields={name: fields.get(name, field) for name, field in plan.fields.items()},
+        codebook=replace(plan.codebook, labels=plan.codebook.labels[order]),
+        classes=plan.classes[order],
+        costs=None if plan.costs is None else plan.costs.take(order),
+    )
+
+
+def refined_order(
+    means: UInt16[np.ndarray, "M 3"],
+    colors: UInt8[np.ndarray, "M 3"],
+    runs: Int[np.ndarray, " M"],
+    pool: Workers,
+) -> Int32[np.ndarray, " M"]:
+    """Return the index of the Gaussian for every place.
+
+    Gaussians at the same position keep their order, because renderers blend them in it. The first and the last Gaussian
+    of a run stay.
+
+    Args:
+        means: levels of positions, along a curve through space.
+        colors: levels of base colours.
+        runs: equal for Gaussians that follow one another anyway; only these change places.
+        pool: threads. The result does not depend on their number.
+    """
+    pixels, order = _pixels(means, colors), np.arange(len(means), dtype=np.int32)
+    ends = np.concatenate([np.flatnonzero(np.diff(runs)) + 1, [len(runs)]]).tolist()
+
+    def refine(places: slice) -> None:
+        chosen = order[places]
+        order[places] = chosen[_block_order(means[chosen], pixels[chosen])]
+
+    for turn in range(ROUNDS):
+        pool.map(refine, _blocks(ends, BLOCK if turn % 2 == 0 else BLOCK // 2))
+    return _with_equal_positions_in_order(order, means)
+
+
+def _pixels(means: UInt16[np.ndarray, "M 3"], colors: UInt8[np.ndarray, "M 3"]) -> UInt8[np.ndarray, "M 6"]:
+    """Return what WebP predicts from the left: high bytes of positions; green, and red and blue without it."""
+    red, green, blue = colors.T
+    return np.ascontiguousarray(np.column_stack([(means >> 8).astype(np.uint8), green, red - green, blue - green]))
+
+
+def _blocks(ends: list[int], first_size: int) -> list[slice]:
+    """Return blocks of runs with these ends: in each run, one of at most ``first_size`` places, then larger ones."""
+    blocks = []
+    for start, end in pairwise([0, *ends]):
+        edges = [start, *range(start + first_size, end, BLOCK), end]
+        blocks += [slice(a, b) for a, b in pairwise(edges)]
+    return blocks
+
+
+def _block_order(means: UInt16[np.ndarray, "B 3"], pixels: UInt8[np.ndarray, "B 6"]) -> Int32[np.ndarray, " B"]:
+    """Return the refined order of some Gaussians, of which the first and the last stay."""
+    from kissgs.planning import tour_kernels
+
+    order = np.arange(len(means), dtype=np.int32)
+    if len(means) <= 3:
+        return order
+    bits = _difference_bits(pixels)
+    curves = np.stack([hilbert_order(means[:, axes] + np.uint16(shift)) for *axes, shift in TURNS])
+    near = np.empty((len(means), NEAR), np.int32)
+    tour_kernels.near_pixels(pixels, bits, curves, REACH, near)
+    tour_kernels.improve(pixels, bits, near, PASSES, order)
+    return order
+
+
+def _difference_bits(pixels: UInt8[np.ndarray, "B C"]) -> Int32[np.ndarray, "C 256"]:
+    """Return the bits of each difference of a channel from the pixel before, modulo 256, by how often it occurs.
+
+    The counts of differences that are alike are averaged. A difference and its negative take the same bits.
+    """
+    counts = np.stack([np.bincount(channel, minlength=256) for channel in np.diff(pixels, axis=0).T]).astype(np.float64)
+    counts += counts[:, -np.arange(256)]
+    counts = (counts + sum(weight * np.roll(counts, shift, axis=1) for shift, weight in SMOOTHING)) / 2 + 1
+    return np.rint(UNIT * np.log2(counts.sum(axis=1, keepdims=True) / counts)).astype(np.int32)
+
+
+def _with_equal_positions_in_order(
+    order: Int32[np.ndarray, " M"], means: UInt16[np.ndarray, "M 3"]
+) -> Int32[np.ndarray, " M"]:
+    """Return an order in which Gaussians of equal position have ascending indices."""
+    keys = means[order].astype(np.uint64) @ (np.uint64(1) << np.array([0, 16, 32], np.uint64))
+    places = sorted_order(keys, 48)
+    group = np.cumsum(np.diff(keys, prepend=keys[:1]) > 0)
+    shared = np.bincount(group, minlength=1)[group] > 1
+    places, group = places[shared], group[shared]
+    order = order.copy()
+    order[places] = order[places][np.lexsort((order[places], group))]
+    return order
