@@ -87,6 +87,23 @@ def usual_seconds(kind: str, evaluate: bool, gaussians: int) -> float:
     return START_SECONDS + cpu / BUSY_CORES
 
 
+LONGEST_FINETUNING = 2.0
+"""Largest factor on the time of a job that fine-tunes with a time limit: up to twice the usual number of steps."""
+
+
+def limited_seconds(kind: str, evaluate: bool, gaussians: int, unlimited: float, limit: float) -> float:
+    """Estimate the wall time of a job with a time limit, which does not include the start and the evaluation.
+
+    Nor does it limit a search for the number of Gaussians. ``kind`` is that of the same job without the limit, and
+    ``unlimited`` its time, in seconds.
+    """
+    if COMPACTED.removeprefix("+") in kind.split("+"):
+        return unlimited
+    longest = LONGEST_FINETUNING if kind.endswith(FINETUNED) else 1.0
+    evaluation = evaluate * EVALUATION * gaussians / 1e6 / BUSY_CORES
+    return min(longest * unlimited, START_SECONDS + limit + evaluation)
+
+
 def can_train() -> bool:
     """Return whether torch is installed, which fine-tuning needs, and compaction that trains."""
     return find_spec("torch") is not None

@@ -31,6 +31,7 @@ class JobOptions(kissgs.Settings):
                 {"preset": "small", "encode": {"seed": 7}},
                 {"compact": {"ratio": 0.2}},
                 {"finetune": {"enabled": True}},
+                {"encode": {"target_size": 3_000_000}, "time_limit": 120},
                 {"format": "sog"},
             ]
         },
@@ -164,6 +165,9 @@ class JobStatus(ApiModel):
     )
     finetuning: dict[str, Any] | None = Field(
         None, description="PSNR and bytes before and after fine-tuning, and whether its result was kept."
+    )
+    note: str | None = Field(
+        None, description="What may surprise about the result, such as another preset because time was limited."
     )
     sizes: Sizes | None = None
     timings: Timings

@@ -49,6 +49,7 @@ def compress(task: Task, progress: kissgs.Progress) -> dict[str, Any]:
         "count": report["count"],
         "compacted": result.report.compacted,
         "finetuning": report["finetuning"],
+        "note": report["note"],
         "invisible": report["invisible"],
         "cleaned": report["cleaned"],
         "seconds": report["seconds"],

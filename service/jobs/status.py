@@ -6,8 +6,8 @@ import statistics
 
 from ..core.clock import as_datetime
 from ..core.models import ACTIVE, Job, State
-from ..core.presets import usual_seconds
-from ..core.schemas import Estimate, JobOptions, JobStatus, Links, Progress, Sizes, Timings
+from ..core.presets import can_train, limited_seconds, usual_seconds
+from ..core.schemas import FINETUNED, TIMED, Estimate, JobOptions, JobStatus, Links, Progress, Sizes, Timings
 from ..storage.job_records import Store
 
 
@@ -55,12 +55,14 @@ class QueueEstimator:
 
     def _work(self, job: Job) -> float:
         """Estimate the remaining seconds of a job itself, from recent jobs with equal preset and evaluation."""
-        kind = job.preset, job.evaluate
+        kind = _kind_without_limit(job), job.evaluate
         if kind not in self._rates:
             rates = self._store.rates(*kind)
             self._rates[kind] = statistics.median(rates) if rates else None
         rate = self._rates[kind]
         total = usual_seconds(*kind, job.gaussians) if rate is None else rate * job.gaussians
+        if (limit := job.options.get("time_limit")) is not None:
+            total = limited_seconds(*kind, job.gaussians, total, limit)
         spent = self.now - job.started_at if job.state == State.RUNNING and job.started_at is not None else 0.0
         return max(total - spent, 0.1 * total, 0.5)  # a running job is never taken for done
 
@@ -83,6 +85,7 @@ def job_status(job: Job, queue: QueueEstimator) -> JobStatus:
         kept=result.get("count"),
         compacted=result.get("compacted"),
         finetuning=result.get("finetuning"),
+        note=result.get("note") or None,
         invisible=result.get("invisible"),
         cleaned=result.get("cleaned"),
         evaluation=result.get("evaluation"),
@@ -93,6 +96,14 @@ def job_status(job: Job, queue: QueueEstimator) -> JobStatus:
         links=_links(job),
         expires_at=as_datetime(job.expires_at) if job.expires_at is not None else None,
     )
+
+
+def _kind_without_limit(job: Job) -> str:
+    """Return the kind of the same job without a time limit, with fine-tuning where that is left to the time."""
+    if not job.preset.endswith(TIMED):
+        return job.preset
+    open_to_tuning = job.options["finetune"]["enabled"] is None and can_train()
+    return job.preset.removesuffix(TIMED) + (FINETUNED if open_to_tuning else "")
 
 
 def _estimate(job: Job, queue: QueueEstimator) -> Estimate:

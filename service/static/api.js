@@ -3,21 +3,26 @@
 /**
  * @typedef {{stage: string, fraction: number, note?: string}} Progress
  * @typedef {{title: string, detail: string, code: string, status: number, retryable: boolean}} ProblemDocument
+ * @typedef {{target_size?: number | null, max_psnr_drop?: number | null, max_ssim_drop?: number | null,
+ *   psnr?: number | null}} Goals
+ * @typedef {{ratio?: number | null, count?: number | null, max_psnr_drop?: number | null,
+ *   auto_count?: boolean | null}} Budget
+ * @typedef {{preset: string, format?: string, evaluate: boolean, time_limit?: number | null,
+ *   encode: {rate_distortion: boolean} & Goals,
+ *   compact: {method: string, sparsify_steps: number, refine_steps: number} & Budget,
+ *   finetune: {enabled: boolean | null}}} JobOptions
  * @typedef {{container: number, files: Record<string, number>, ratio: number,
  *   bytes_per_gaussian: number}} Sizes
  * @typedef {{created_at: string, queue_seconds?: number, run_seconds?: number}} Timings
  * @typedef {{id: string, name: string, state: string, position?: number, progress?: Progress,
- *   estimate?: {seconds_left: number}, options: {preset: string, format?: string, encode: {rate_distortion: boolean} & import("./goal.js").Goals,
- *     evaluate: boolean,
- *     compact: {count: number | null, ratio: number | null, max_psnr_drop: number | null, auto_count: boolean | null,
- *     sparsify_steps: number, refine_steps: number}, finetune: {enabled: boolean | null}},
+ *   estimate?: {seconds_left: number}, options: JobOptions,
  *   finetuning?: {kept: boolean, psnr_before: number | null, psnr_after: number | null, bytes_before: number | null,
  *     bytes_after: number},
  *   upload_bytes: number, gaussians: number, sh_degree: number, kept?: number, compacted?: number, invisible?: number, cleaned?: Record<string, number>,
  *   evaluation?: {psnr?: number | null, ssim: number, ms_ssim?: number, worst?: {psnr: number | string | null, position: number[]}}, sizes?: Sizes, timings: Timings, starts: number,
- *   problem?: ProblemDocument, links: Record<string, string>, expires_at?: string}} Status
+ *   note?: string, problem?: ProblemDocument, links: Record<string, string>, expires_at?: string}} Status
  * @typedef {{jobs: Status[], next: string | null}} JobPage
- * @typedef {{max_upload_bytes: number, max_header_bytes: number, max_gaussians: number,
+ * @typedef {{max_upload_bytes: number, max_header_bytes: number, max_gaussians: number, job_seconds: number,
  *   keys_required: boolean, training: boolean}} Limits
  * @typedef {{name: string, title: string, description: string, bytes_per_gaussian: number, psnr_change: number,
  *   cpu_seconds_per_million: number, settings: {encode: {rate_distortion: boolean}}}} Preset

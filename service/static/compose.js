@@ -4,12 +4,14 @@ import { announce, byId, el } from "./dom.js";
 import { bytes, count } from "./format.js";
 import { formatField } from "./container_formats.js";
 import { goalField } from "./goal.js";
+import { keepField } from "./keep.js";
 import { UnsuitableFile, inspect } from "./ply.js";
 import { presetList } from "./presets.js";
+import { timeField } from "./time_limit.js";
 
 /**
- * @typedef {{preset: string, evaluate: boolean, format?: string, encode?: import("./goal.js").Goals,
- *   compact?: {ratio?: number | null, auto_count?: boolean | null}, finetune?: {enabled?: boolean | null}}} Options
+ * @typedef {{preset: string, evaluate: boolean, format: string, time_limit?: number, encode?: import("./api.js").Goals,
+ *   compact?: import("./api.js").Budget, finetune?: {enabled: boolean}}} Options options that differ from the preset
  * @typedef {{file: File, options: Options}} Submission
  */
 
@@ -20,24 +22,13 @@ import { presetList } from "./presets.js";
  * @param {(submission: Submission) => void} submit
  */
 export function composer(limits, presets, submit) {
-  const [form, input] = [byId("compose"), byId("file")];
-  const list = presetList(presets);
-  const [goal, format] = [goalField(presets, list.chosen), formatField()];
+  const [form, input, fields] = [byId("compose"), byId("file"), optionFields(limits, presets)];
   /** @type {File | null} */
   let chosen = null;
   let inspections = 0; // only the result of the latest is shown
 
   byId("file-limits").textContent =
     `Up to ${bytes(limits.max_upload_bytes)} and ${count(limits.max_gaussians)} Gaussians.`;
-
-  byId("keep-note").textContent = limits.training
-    ? "The remaining Gaussians are trained to preserve the images: a smaller file after a few minutes of training."
-    : "This server has no torch: choose Fast, which prunes without training, at a greater loss of quality.";
-
-  byId("finetune").disabled = !limits.training;
-  byId("finetune-note").textContent = limits.training
-    ? "Trains the quantised scene with renderings: better quality at equal size, after one or two minutes."
-    : "This server has no torch, which training needs.";
 
   /** @param {File} file */
   async function choose(file) {
@@ -48,13 +39,13 @@ export function composer(limits, presets, submit) {
       if (inspection !== inspections) return;
       chosen = file;
       show(file, facts);
-      list.estimate(facts.gaussians);
+      fields.estimate(facts.gaussians);
     } catch (error) {
       if (inspection !== inspections) return;
       if (!(error instanceof UnsuitableFile)) throw error;
       chosen = null;
       clear();
-      list.estimate(null);
+      fields.estimate(null);
       showError(error.message);
     }
   }
@@ -65,10 +56,7 @@ export function composer(limits, presets, submit) {
   });
   form.addEventListener("submit", (/** @type {SubmitEvent} */ event) => {
     event.preventDefault();
-    const [preset, evaluate, encode] = [list.chosen(), byId("evaluate").checked, goal.chosen()];
-    const [compact, finetune] = [budget(byId("keep").value), byId("finetune").checked && { enabled: true }];
-    const optional = { ...(encode && { encode }), ...(compact && { compact }), ...(finetune && { finetune }) };
-    if (chosen) return submit({ file: chosen, options: { preset, evaluate, format: format.chosen(), ...optional } });
+    if (chosen) return submit({ file: chosen, options: fields.chosen() });
     showError("Choose a scene first.");
     input.focus();
   });
@@ -79,26 +67,63 @@ export function composer(limits, presets, submit) {
     /** @param {boolean} visible */
     show: (visible) => (form.hidden = !visible),
     focus: () => byId("compose-title").focus({ preventScroll: true }),
-    /** Set the options of an earlier job. @param {Options} options */
-    prefer(options) {
-      list.choose(options.preset);
-      goal.prefer(options.encode ?? {});
-      format.prefer(options.format);
-      byId("evaluate").checked = options.evaluate;
-      byId("finetune").checked = limits.training && (options.finetune?.enabled ?? false);
-      const [keep, ratio] = [/** @type {HTMLSelectElement} */ (byId("keep")), options.compact?.ratio ?? null];
-      if (ratio !== null && ![...keep.options].some(({ value }) => Number(value) === ratio))
-        keep.add(new Option(`Keep ${Math.round(100 * ratio)} %`, String(ratio)));
-      const known = options.compact?.auto_count
-        ? "auto"
-        : [...keep.options].find(({ value }) => Number(value) === ratio)?.value;
-      keep.value = known ?? "";
-    },
+    prefer: fields.prefer,
   };
 }
 
-/** @param {string} kept share of Gaussians, "auto", or empty for all */
-const budget = (kept) => (kept === "auto" ? { auto_count: true } : kept ? { ratio: Number(kept) } : null);
+/**
+ * Connect the controls of the options.
+ * @param {import("./api.js").Limits} limits
+ * @param {import("./api.js").Presets} presets
+ */
+function optionFields(limits, presets) {
+  const [list, goal, format] = [presetList(presets), goalField(), formatField()];
+  const [time, keep] = [timeField(limits), keepField(limits.training)];
+  const [finetune, evaluate] = [byId("finetune"), byId("evaluate")];
+
+  finetune.disabled = !limits.training;
+  byId("finetune-note").textContent = limits.training
+    ? "Trains the quantised scene with renderings: better quality at equal size, after one or two minutes."
+    : "This server has no torch, which training needs.";
+
+  /** Enable the choices that can be combined, and explain them. */
+  function refresh() {
+    goal.refresh(list.plans());
+    const [preset, plans, aims] = [list.chosen(), list.plans(), goal.chosen() !== null];
+    keep.refresh(aims, time.chosen() !== null);
+    time.refresh({ preset, plans, goal: aims, tunes: finetune.checked, kept: keep.chosen() });
+  }
+
+  byId("compose").addEventListener("change", refresh);
+  refresh();
+  return {
+    estimate: list.estimate,
+    /** @returns {Options} */
+    chosen() {
+      const [encode, compact, limit] = [goal.chosen(), keep.chosen(), time.chosen()];
+      return {
+        preset: list.chosen(),
+        evaluate: evaluate.checked,
+        format: format.chosen(),
+        ...(limit && { time_limit: limit }),
+        ...(encode && { encode }),
+        ...(compact && { compact }),
+        ...(finetune.checked && { finetune: { enabled: true } }),
+      };
+    },
+    /** Set the options of an earlier job. @param {import("./api.js").JobOptions} earlier */
+    prefer(earlier) {
+      list.choose(earlier.preset);
+      goal.prefer(earlier.encode);
+      time.prefer(earlier.time_limit);
+      keep.prefer(earlier.compact);
+      format.prefer(earlier.format);
+      evaluate.checked = earlier.evaluate;
+      finetune.checked = limits.training && (earlier.finetune.enabled ?? false);
+      refresh();
+    },
+  };
+}
 
 /** @param {string} text */
 function showError(text) {

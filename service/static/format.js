@@ -20,6 +20,9 @@ const sizes = SIZES.map((unit) =>
     : formatter({ style: "unit", unit, minimumSignificantDigits: 3, maximumSignificantDigits: 3 }),
 );
 
+/** @param {string} text */
+export const capitalised = (text) => text.charAt(0).toUpperCase() + text.slice(1);
+
 /** @param {number} value */
 export const count = (value) => whole.format(value);
 

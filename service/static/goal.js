@@ -1,8 +1,10 @@
-/** The goal of a compression: none, a maximum size, or a maximum PSNR loss. */
+/** The goal of a compression: none, a maximum size, a maximum PSNR loss, or the goals of an earlier job. */
 
 import { byId } from "./dom.js";
+import { goalLabels, goalsOf } from "./labels.js";
+import { capitalised } from "./format.js";
 
-/** @typedef {{target_size?: number | null, max_psnr_drop?: number | null}} Goals */
+/** @typedef {import("./api.js").Goals} Goals */
 
 /** @type {Record<string, {unit: string, factor: number, usual: number, step: number, most: number, note: string}>} */
 const GOALS = {
@@ -24,26 +26,23 @@ const GOALS = {
   },
 };
 
-/**
- * Connect the controls of the goal.
- * @param {import("./api.js").Presets} presets
- * @param {() => string} preset returns the name of the chosen preset
- */
-export function goalField(presets, preset) {
+/** Connect the controls of the goal. */
+export function goalField() {
   const [goal, amount] = [/** @type {HTMLSelectElement} */ (byId("goal")), byId("amount")];
-  const hasGoals = () =>
-    presets.presets.find(({ name }) => name === preset())?.settings.encode.rate_distortion ?? false;
+  const earlier = new Option("As in the earlier job"); // only in the list if the other controls cannot express its goals
   const selected = () => GOALS[goal.value];
 
-  function refresh() {
-    goal.disabled = !hasGoals();
+  /** @param {boolean} supported whether the preset supports goals */
+  function refresh(supported) {
+    goal.disabled = !supported;
     if (goal.disabled) goal.value = "";
-    const chosen = selected();
-    byId("goal-amount").hidden = amount.disabled = !chosen;
-    byId("goal-note").textContent = chosen?.note ?? (goal.disabled ? "This preset does not support goals." : "");
-    const [auto, keep] = [byId("keep-auto"), /** @type {HTMLSelectElement} */ (byId("keep"))];
-    auto.disabled = !chosen;
-    if (auto.disabled && keep.value === "auto") keep.value = "";
+    byId("goal-amount").hidden = amount.disabled = !selected();
+    byId("goal-note").textContent = supported ? note() : "This preset does not support goals.";
+  }
+
+  function note() {
+    if (selected() || !goal.value) return selected()?.note ?? "";
+    return `${capitalised(goalLabels(JSON.parse(goal.value)).join(", "))}: the smallest container that meets this.`;
   }
 
   /** @param {number} value in the displayed unit */
@@ -53,25 +52,31 @@ export function goalField(presets, preset) {
     byId("unit").textContent = unit;
   }
 
-  goal.addEventListener("change", () => {
-    if (selected()) fill(selected().usual);
-    refresh();
-  });
-  byId("preset-list").addEventListener("change", refresh);
-  refresh();
+  goal.addEventListener("change", () => selected() && fill(selected().usual));
   return {
+    refresh,
     /** @returns {Goals | null} */
     chosen() {
-      if (!selected()) return null;
+      if (!selected()) return goal.value ? JSON.parse(goal.value) : null;
       const value = Number((Number(amount.value) * selected().factor).toPrecision(12));
       return { [goal.value]: goal.value === "target_size" ? Math.floor(value) : value };
     },
-    /** @param {Goals} goals */
-    prefer(goals) {
-      const name = Object.keys(GOALS).find((key) => (goals[/** @type {keyof Goals} */ (key)] ?? null) !== null) ?? "";
-      goal.value = name;
-      if (name) fill(Number(goals[/** @type {keyof Goals} */ (name)]) / GOALS[name].factor);
-      refresh();
+    /**
+     * Set the goals of an earlier job.
+     * @param {Goals} encode
+     */
+    prefer(encode) {
+      const goals = goalsOf(encode);
+      earlier.remove();
+      const [name = "", ...others] = Object.keys(goals);
+      if (name && (others.length > 0 || !GOALS[name])) {
+        earlier.value = JSON.stringify(goals);
+        goal.add(earlier);
+        goal.value = earlier.value;
+      } else {
+        goal.value = name;
+        if (name) fill(goals[name] / GOALS[name].factor);
+      }
     },
   };
 }

@@ -1,6 +1,6 @@
-/** Labels for the service's names of states, stages, files and corrections; unknown names are shown unchanged. */
+/** Labels for the service's names of states, goals, files and corrections; unknown names are shown unchanged. */
 
-import { count } from "./format.js";
+import { bytes, count, duration } from "./format.js";
 import { formatOf } from "./container_formats.js";
 
 /** @typedef {import("./api.js").Status} Status */
@@ -15,33 +15,21 @@ const STATES = {
   expired: "expired",
 };
 
-/** Labels of the stages, in the order of a job. @type {Record<string, string>} */
-const STAGES = {
-  read: "Reading the scene",
-  kernels: "Preparing",
-  cameras: "Placing cameras",
-  score: "Scoring Gaussians",
-  targets: "Rendering training targets",
-  sparsify: "Training with sparsification",
-  refine: "Refining the remaining Gaussians",
-  sensitivity: "Measuring sensitivity",
-  rate_distortion: "Rate–distortion planning",
-  order: "Ordering Gaussians",
-  forms: "Choosing rotation forms",
-  codebook: "Building the codebook",
-  "sort codebook": "Sorting the codebook",
-  rounding: "RDO quantisation",
-  refit: "Refitting base colours",
-  finetune: "Fine-tuning",
-  images: "Compressing images",
-  write: "Writing the container",
-  evaluate: "Measuring quality",
+/** Labels of goals of the encoder. @type {Record<string, (value: number) => string>} */
+const GOALS = {
+  target_size: (size) => `at most ${bytes(size)}`,
+  max_psnr_drop: (drop) => `at most ${drop} dB PSNR loss`,
+  max_ssim_drop: (drop) => `at most ${drop} SSIM loss`,
+  psnr: (psnr) => `at least ${psnr} dB PSNR`,
 };
 
-const ALWAYS = ["read", "kernels", "order", "forms", "images"];
-const RATE_DISTORTION = ["cameras", "sensitivity", "rate_distortion", "rounding"];
-const COMPACTED = ["cameras", "score"];
-const WITH_SH_REST = ["codebook", "sort codebook"];
+/** Labels of budgets of Gaussians, other than the share of all of them. @type {Record<string, (value: any) => string>} */
+const BUDGETS = {
+  ratio: (/** @type {number} */ ratio) => `keep ${Number((100 * ratio).toPrecision(3))} %`,
+  count: (/** @type {number} */ number) => `keep ${count(number)}`,
+  max_psnr_drop: (/** @type {number} */ drop) => `keep as few as lose at most ${drop} dB PSNR`,
+  auto_count: () => "keep as many as the goal needs",
+};
 
 /** @type {[RegExp, string][]} */
 const PLANES = [
@@ -73,38 +61,50 @@ const CLEANED = {
 /** @param {string} state */
 export const stateLabel = (state) => STATES[state] ?? state;
 
-/** Describe what a job was given. @param {Status} status */
-export const jobLabel = (status) =>
-  `${count(status.gaussians)} Gaussians · ${status.options.preset} preset · ${formatOf(status).title}`;
+/**
+ * Return the goals among settings of the encoder.
+ * @param {import("./api.js").Goals} encode
+ * @returns {Record<string, number>}
+ */
+export const goalsOf = (encode) => given(encode, Object.keys(GOALS));
 
-/** @param {string} stage */
-export const stageLabel = (stage) => STAGES[stage] ?? stage;
+/** @param {import("./api.js").Goals} encode */
+export const goalLabels = (encode) => Object.entries(goalsOf(encode)).map(([name, value]) => GOALS[name](value));
 
 /**
- * Return the expected stages of a job.
- * @param {Status} status
+ * Return the budget among settings of compaction; null if all Gaussians are kept.
+ * @param {import("./api.js").Budget} compact
+ * @returns {Record<string, any> | null}
  */
-export function plannedStages(status) {
-  const planned = new Set(ALWAYS);
-  if (status.options.encode.rate_distortion) RATE_DISTORTION.forEach((stage) => planned.add(stage));
-  const {
-    count: wanted,
-    ratio,
-    max_psnr_drop: drop,
-    auto_count,
-    sparsify_steps,
-    refine_steps,
-  } = status.options.compact;
-  if (wanted !== null || ratio !== null || drop !== null || auto_count) {
-    COMPACTED.forEach((stage) => planned.add(stage));
-    if (sparsify_steps + refine_steps > 0) planned.add("targets");
-    if (sparsify_steps > 0) planned.add("sparsify");
-    if (refine_steps > 0) planned.add("refine");
-  }
-  if (status.options.finetune.enabled) ["cameras", "targets", "finetune"].forEach((stage) => planned.add(stage));
-  if (status.sh_degree > 0) WITH_SH_REST.forEach((stage) => planned.add(stage));
-  if (status.options.evaluate) planned.add("evaluate");
-  return Object.keys(STAGES).filter((stage) => planned.has(stage));
+export function budgetOf(compact) {
+  const [entry] = Object.entries(given(compact, Object.keys(BUDGETS)));
+  return entry && !(entry[0] === "ratio" && entry[1] >= 1) ? Object.fromEntries([entry]) : null;
+}
+
+/** @param {import("./api.js").Budget} compact */
+export function budgetLabel(compact) {
+  const [entry] = Object.entries(budgetOf(compact) ?? {});
+  return entry ? BUDGETS[entry[0]](entry[1]) : "";
+}
+
+/**
+ * @param {Record<string, any>} settings
+ * @param {string[]} names
+ */
+const given = (settings, names) =>
+  Object.fromEntries(names.map((name) => [name, settings[name]]).filter(([, value]) => value));
+
+/** Describe what a job was given. @param {Status} status */
+export function jobLabel({ gaussians, options }) {
+  const { preset, encode, compact, finetune, time_limit: limit } = options;
+  const wishes = [
+    ...goalLabels(encode),
+    budgetLabel(compact),
+    finetune.enabled ? "fine-tuning" : "",
+    limit ? `at most ${duration(limit)}` : "",
+  ];
+  const facts = [`${count(gaussians)} Gaussians`, `${preset} preset`, formatOf({ options }).title];
+  return [...facts, ...wishes.filter(Boolean)].join(" · ");
 }
 
 /**

@@ -30,9 +30,12 @@ export function presetList(presets) {
       `is the PSNR change of renderings against photographs. Measured on ${presets.measured_on}.`;
   }
   estimate(null);
+  const chosen = () => radios().find((radio) => radio.checked)?.value ?? presets.default;
   return {
     estimate,
-    chosen: () => radios().find((radio) => radio.checked)?.value ?? presets.default,
+    chosen,
+    /** Whether the chosen preset has rate–distortion planning. */
+    plans: () => sorted.find(({ name }) => name === chosen())?.settings.encode.rate_distortion ?? false,
     /** @param {string} name */
     choose: (name) => radios().forEach((radio) => (radio.checked = radio.value === name)),
   };

@@ -2,6 +2,7 @@
 
 import { Problem } from "./api.js";
 import { byId, el } from "./dom.js";
+import { capitalised } from "./format.js";
 
 /**
  * Create a box with a problem, which screen readers announce at once.
@@ -16,8 +17,7 @@ export function problemBox({ title, detail }) {
  * @param {string} text
  */
 export function sentence(text) {
-  const capitalised = text.charAt(0).toUpperCase() + text.slice(1);
-  return /[.!?…]$/.test(capitalised) ? capitalised : `${capitalised}.`;
+  return capitalised(/[.!?…]$/.test(text) ? text : `${text}.`);
 }
 
 /**

@@ -2,10 +2,10 @@
 
 import { call } from "./api.js";
 import { el, facts, time } from "./dom.js";
-import { ago, bytes, count, duration, moment, share, short } from "./format.js";
+import { ago, bytes, capitalised, count, duration, moment, share, short } from "./format.js";
 import { formatLabel, formatOf } from "./container_formats.js";
-import { explain, problemBox } from "./problems.js";
-import { cleaningNotes, planes } from "./labels.js";
+import { explain, problemBox, sentence } from "./problems.js";
+import { cleaningNotes, goalLabels, planes } from "./labels.js";
 
 /**
  * @typedef {import("./api.js").Status} Status
@@ -25,6 +25,7 @@ export function resultView(status, keyed) {
     ratio(status),
     downloads(status, keyed),
     figures(status),
+    status.note ? el("p", { class: "small muted" }, sentence(status.note)) : null,
     planeTable(sizes),
     notes.length ? notesList(notes) : null,
   ].filter((child) => child !== null);
@@ -47,16 +48,20 @@ function ratio(status) {
 
 /** @param {Status & {sizes: Sizes}} status */
 function figures(status) {
-  const { sizes, timings, evaluation, finetuning } = status;
+  const { sizes, timings, evaluation, finetuning, options } = status;
   const [waited, kept] = [timings.queue_seconds ?? 0, status.kept ?? status.gaussians];
+  const limit = options.time_limit ? `limit ${duration(options.time_limit)}` : "";
+  const spent = [limit, waited >= 1 ? `after ${duration(waited)} in the queue` : ""].filter(Boolean);
+  const [goal, ...goals] = goalLabels(options.encode);
   /** @type {[string, string, string?][]} */
   const pairs = [
     ["Per Gaussian", `${short(sizes.bytes_per_gaussian)} bytes`],
     ["Gaussians", count(kept), kept === status.gaussians ? "all of them" : `of ${count(status.gaussians)}`],
-    ["Time", duration(timings.run_seconds ?? 0), waited >= 1 ? `after ${duration(waited)} in the queue` : undefined],
-    ["Preset", status.options.preset],
+    ["Time", duration(timings.run_seconds ?? 0), spent.join(", ")],
+    ["Preset", options.preset],
     ["Format", formatLabel(formatOf(status))],
   ];
+  if (goal) pairs.push(["Goal", capitalised(goal), goals.length ? `and ${goals.join(", ")}` : undefined]);
   if (finetuning) pairs.push(["Fine-tuning", gain(finetuning), "on held-out views"]);
   if (evaluation) {
     const { psnr, ssim, ms_ssim, worst } = evaluation; // no PSNR if the images are identical

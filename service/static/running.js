@@ -2,16 +2,18 @@
 
 import { announce, el, setTitle } from "./dom.js";
 import { clock, percent, roughly } from "./format.js";
-import { jobLabel, plannedStages, stageLabel } from "./labels.js";
+import { jobLabel } from "./labels.js";
+import { plannedStages, stageLabel } from "./stages.js";
 
 /** @typedef {import("./api.js").Status} Status */
 
 /**
  * Create the view of a job that has not ended.
  * @param {Status} first
+ * @param {boolean} training whether the server can train
  * @param {() => void} cancel
  */
-export function runningView(first, cancel) {
+export function runningView(first, training, cancel) {
   const kicker = el("p", { class: "kicker" });
   const [headline, amount] = [el("span", { class: "stage" }), el("span", { class: "stage" })];
   const bar = el("progress", { max: 1, "aria-label": "Progress of this stage" });
@@ -19,7 +21,7 @@ export function runningView(first, cancel) {
   const note = el("p", { class: "note small muted", hidden: true }); // not announced: it changes often
   const notice = el("p", { class: "small muted", hidden: true }, "The connection was lost; reconnecting…");
   const button = el("button", { class: "quiet", type: "button", onclick: press }, "Cancel job");
-  const steps = stepList(first);
+  const steps = stepList(plannedStages(first, training));
   const children = [
     kicker,
     el("h1", { id: "job-title", tabindex: "-1" }, first.name),
@@ -118,10 +120,9 @@ export function runningView(first, cancel) {
 
 /**
  * Create the list of past, present and future stages.
- * @param {Status} status
+ * @param {string[]} planned
  */
-function stepList(status) {
-  const planned = plannedStages(status);
+function stepList(planned) {
   const element = el("ol", { class: "steps", "aria-label": "Stages" });
   /** @type {string[]} */
   let passed = [];

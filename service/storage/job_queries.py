@@ -50,7 +50,7 @@ class JobQueries:
 
     def active(self) -> list[Job]:
         """Return all queued and running jobs, with only the columns that estimates need."""
-        columns = load_only(Job.state, Job.preset, Job.evaluate, Job.gaussians, Job.started_at)
+        columns = load_only(Job.state, Job.preset, Job.evaluate, Job.gaussians, Job.options, Job.started_at)
         with self._reading() as session:
             return list(session.scalars(sa.select(Job).where(Job.state.in_(ACTIVE)).options(columns)))
 

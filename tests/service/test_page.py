@@ -109,7 +109,7 @@ def test_keyboard_operation(visit, service):
     page.locator("#file").focus()
     page.keyboard.press("Tab")
     page.keyboard.press("ArrowUp")  # from balanced to fast
-    for _ in range(3):
+    for _ in range(4):
         page.keyboard.press("Tab")
     page.keyboard.press("Enter")
     page.get_by_text("smaller").first.wait_for()
@@ -121,7 +121,7 @@ def test_goals(visit, service):
     choose(page)
     page.get_by_text("300 Gaussians").wait_for()
     goal, keep = page.get_by_label("Goal"), page.get_by_label("Gaussians", exact=True)
-    auto = keep.locator("option[value=auto]")
+    auto = keep.get_by_role("option", name="As many")
     page.get_by_label("Fast").check()
     assert goal.is_disabled()  # this preset has no rate-distortion planning
     page.get_by_label("Balanced").check()
@@ -129,7 +129,7 @@ def test_goals(visit, service):
     goal.select_option("Maximum size")
     assert (page.locator("#amount").input_value(), page.locator("#unit").inner_text()) == ("3", "MB")
     assert auto.is_enabled()
-    keep.select_option("auto")
+    keep.select_option("As many as the goal needs")
     goal.select_option("Maximum PSNR loss")
     assert (page.locator("#amount").input_value(), page.locator("#unit").inner_text()) == ("0.1", "dB")
     goal.select_option("Preset default")
@@ -141,6 +141,114 @@ def test_goals(visit, service):
     job = newest(service)
     assert job["options"]["encode"]["target_size"] == 8000
     assert 0.9 * 8000 <= job["sizes"]["container"] <= 8000
+
+
+def facts_of(page):
+    return dict(text.split("\n", 1) for text in page.locator("#job .facts > div").all_inner_texts())
+
+
+def test_a_time_limit(visit, service):
+    page = visit()
+    choose(page)
+    page.get_by_text("300 Gaussians").wait_for()
+    limit, keep = page.get_by_label("Time limit"), page.get_by_label("Gaussians", exact=True)
+    note = page.locator("#time-note")
+    assert limit.locator("option").all_inner_texts() == ["None", "30 s", "1 min", "2 min", "5 min", "10 min", "30 min"]
+    keep.select_option("Keep half")
+    assert limit.is_disabled()
+    assert note.inner_text() == "Possible only if all Gaussians are kept, or as many as the goal needs."
+    keep.select_option("Keep all")
+    limit.select_option("30 s")
+    assert keep.get_by_role("option", name="half").is_disabled()
+    assert "left is used for fine-tuning. If the preset takes longer, Fast is used" in note.inner_text()
+    page.get_by_label("Goal").select_option("Maximum size")
+    assert "not before the goal is met" in note.inner_text()
+    page.locator("#amount").fill("0.008")
+    keep.select_option("As many as the goal needs")
+    assert note.inner_text() == "It does not limit the search for the number of Gaussians."
+    keep.select_option("Keep all")
+    page.get_by_role("button", name="Compress").click()
+    page.get_by_text("smaller").first.wait_for()
+    job = newest(service)
+    assert (job["options"]["time_limit"], job["options"]["encode"]["target_size"]) == (30, 8000)
+    found = facts_of(page)
+    assert found["Goal"] == "At most 8.00 kB"
+    assert "limit 30 s" in found["Time"]
+
+
+def test_time_limits_are_shorter_than_jobs_may_take(visit, start):
+    page = visit(start(KISSGS_JOB_SECONDS=100))
+    page.locator("#drop").wait_for()
+    assert page.get_by_label("Time limit").locator("option").all_inner_texts() == ["None", "30 s", "1 min"]
+
+
+def test_a_result_that_time_has_changed_says_so(visit, service):
+    job = service.ended(service.submit(options=json.dumps({"time_limit": 0.01})))
+    assert "encoded with the preset fast" in job["note"]
+    page = visit()
+    page.goto(f"{service.url}/#{job['id']}")
+    page.get_by_text("Encoded with the preset fast: balanced would take about").wait_for()
+
+
+REPEATED = {
+    "several goals": {
+        "encode": {"target_size": "9kB", "max_psnr_drop": 0.5, "max_ssim_drop": 0.01},
+        "compact": {"auto_count": True},
+        "time_limit": "90s",
+        "format": "sog",
+        "evaluate": True,
+    },
+    "psnr": {"encode": {"psnr": 38}, "finetune": {"enabled": True}},
+    "loss and time": {"encode": {"max_psnr_drop": 0.25}, "time_limit": "1min"},
+    "share": {"preset": "fast", "compact": {"ratio": 0.125}},
+    "count": {"preset": "small", "compact": {"count": 120}},
+    "loss by pruning": {"compact": {"max_psnr_drop": 0.3}},
+    "time": {"time_limit": 45},
+}
+
+
+@pytest.fixture
+def repeat(visit, service):
+    """``repeat(options)`` cancels a job with options and prefers them on the page; returns the job and the page."""
+
+    def begin(options):
+        job = service.submit(options=json.dumps(options))
+        service.http.post(job["links"]["cancel"])
+        page = visit()
+        page.goto(f"{service.url}/#{job['id']}")
+        page.get_by_role("button", name="Try again").click()
+        return job, page
+
+    return begin
+
+
+@pytest.mark.parametrize("name", REPEATED)
+@pytest.mark.quick(2)
+def test_a_repeated_job_has_the_same_options(repeat, service, name):
+    job, page = repeat(REPEATED[name])
+    choose(page)
+    page.get_by_text("300 Gaussians").wait_for()
+    page.get_by_role("button", name="Compress").click()
+    page.locator("#job-title").wait_for()
+    again = newest(service)
+    service.http.post(f"/v1/jobs/{again['id']}/cancel")
+    assert (again["id"] != job["id"], again["options"]) == (True, job["options"])
+
+
+def test_goals_that_the_form_lacks_are_described_and_can_be_replaced(repeat):
+    _, page = repeat(REPEATED["several goals"])
+    goal, limit = page.locator("#goal"), page.locator("#time")
+    label = "As in the earlier job"
+    assert goal.evaluate("field => field.selectedOptions[0].text") == label
+    described = (
+        "At most 9.00 kB, at most 0.5 dB PSNR loss, at most 0.01 SSIM loss: the smallest container that meets this."
+    )
+    assert page.locator("#goal-note").inner_text() == described
+    assert limit.evaluate("field => field.selectedOptions[0].text") == "1 min 30 s"
+    goal.select_option("Maximum PSNR loss")
+    assert page.locator("#amount").input_value() == "0.1"
+    goal.select_option(label)
+    assert page.locator("#amount").is_hidden()
 
 
 @pytest.mark.parametrize(

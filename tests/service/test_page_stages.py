@@ -1,0 +1,89 @@
+"""The page's words about a job in advance, in Node. Oracles: stages that the library reports; words for options."""
+
+import json
+
+import pytest
+from helpers.service import SMALL
+from helpers.web_tools import run_node
+
+import kissgs
+from service.http.submission import parse_options
+
+LONG = 1e5
+FEW = {"sensitivity_views": 4, "sensitivity_view_size": 48}
+VIEWS = {"views": 24, "view_size": 48}
+TRAINED = {"sparsify_steps": 4, "refine_steps": 4, "prune_rounds": 2, **VIEWS}
+TUNED = {"enabled": True, "steps": 4, **VIEWS}
+
+JOBS = {
+    "fast": {"preset": "fast"},
+    "evaluated": {"preset": "fast", "evaluate": True},
+    "pruned": {"preset": "fast", "compact": {"ratio": 0.5, **VIEWS}},
+    "tuned fast": {"preset": "fast", "finetune": TUNED},
+    "balanced": {"encode": FEW},
+    "a share": {"encode": FEW, "compact": {"ratio": 0.5, **TRAINED}},
+    "more than all": {"encode": FEW, "compact": {"count": 300, **TRAINED}},
+    "a loss by pruning": {"encode": FEW, "compact": {"max_psnr_drop": 3, **TRAINED}},
+    "a size, tuned": {"encode": {"target_size": 6000, **FEW}, "finetune": TUNED},
+    "merged": {"encode": FEW, "compact": {"ratio": 0.5, "method": "merge"}},
+    "tuned": {"encode": FEW, "finetune": TUNED},
+    "a size": {"encode": {"target_size": 6000, **FEW}},
+    "time alone": {"time_limit": LONG, "encode": FEW, "finetune": {**TUNED, "enabled": None}},
+    "a loss": {"encode": {"max_psnr_drop": 0.5, **FEW}},
+    "as many as a loss needs": {"encode": {"max_psnr_drop": 3, **FEW}, "compact": {"auto_count": True, **TRAINED}},
+    "time and a size": {"time_limit": LONG, "encode": {"target_size": 6000, **FEW}},
+    "time and tuning": {"time_limit": LONG, "encode": FEW, "finetune": TUNED},
+}
+
+
+def in_node(options, *, gaussians=300, sh_degree=1, training=True):
+    """Return what the page says of a job with options as the service stores them."""
+    job = {"options": options.model_dump(mode="json"), "gaussians": gaussians, "sh_degree": sh_degree}
+    (answer,) = json.loads(run_node("plan_stages.mjs", json.dumps([{"job": job, "training": training}])))
+    return answer
+
+
+@pytest.mark.parametrize("name", JOBS)
+@pytest.mark.quick(5)
+def test_expected_stages(name, tmp_path):
+    options, scene, reported = parse_options(json.dumps(JOBS[name])), tmp_path / "scene.ply", []
+    scene.write_bytes(SMALL)
+    settings = kissgs.Settings.model_validate(options.model_dump(exclude={"format", "evaluate"}))
+    kissgs.compress(
+        scene,
+        settings=settings,
+        evaluate=options.evaluate,
+        progress=lambda stage, fraction, note="": reported.append(stage),
+    )
+    assert in_node(options)["stages"] == list(dict.fromkeys(reported))
+
+
+def test_time_alone_trains_only_where_the_server_can():
+    options = parse_options('{"time_limit": "2min"}')
+    assert "finetune" in in_node(options)["stages"]
+    assert "finetune" not in in_node(options, training=False)["stages"]
+    assert "codebook" not in in_node(options, sh_degree=0)["stages"]
+
+
+@pytest.mark.parametrize(
+    ("options", "label"),
+    [
+        ({"preset": "fast"}, ""),
+        (
+            {"encode": {"target_size": "3MB", "max_psnr_drop": 0.1, "max_ssim_drop": 0.003}, "time_limit": "2min"},
+            " · at most 3.00 MB · at most 0.1 dB PSNR loss · at most 0.003 SSIM loss · at most 2 min",
+        ),
+        ({"encode": {"psnr": 42}, "time_limit": 90}, " · at least 42 dB PSNR · at most 1 min 30 s"),
+        ({"compact": {"ratio": 0.125}, "finetune": {"enabled": True}}, " · keep 12.5 % · fine-tuning"),
+        ({"compact": {"ratio": 1}}, ""),
+        ({"compact": {"count": 5000}}, " · keep 5,000"),
+        ({"compact": {"max_psnr_drop": 0.2}}, " · keep as few as lose at most 0.2 dB PSNR"),
+        (
+            {"encode": {"psnr": 42}, "compact": {"auto_count": True}},
+            " · at least 42 dB PSNR · keep as many as the goal needs",
+        ),
+    ],
+)
+def test_jobs_are_described_completely(options, label):
+    chosen = parse_options(json.dumps(options))
+    assert in_node(chosen)["label"] == f"300 Gaussians · {chosen.preset} preset · SOG-XT{label}"
