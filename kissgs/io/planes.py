@@ -12,7 +12,7 @@ from kissgs.io.webp import encode_plane
 from kissgs.settings import EncodeSettings
 
 HIGHEST_EFFORT, HIGH_EFFORT = (100, 6), (100, 5)
-"""Quality and method of libwebp for the codebook, and for other images that gain from more effort."""
+"""Quality and method of libwebp for the codebook, and at least for other images that gain from more effort."""
 
 NEARLY_RANDOM = ("mask", "means", "labels")
 """Parts of the names of images that no effort makes smaller."""
@@ -43,7 +43,7 @@ def compress_images(
         if settings.webp_high_effort and name == codebook:
             quality, method = HIGHEST_EFFORT
         elif settings.webp_high_effort and height * width <= SMALL and not any(part in name for part in NEARLY_RANDOM):
-            quality, method = max((quality, method), HIGH_EFFORT)
+            quality, method = max(quality, HIGH_EFFORT[0]), max(method, HIGH_EFFORT[1])
         return encode_plane(images[name], quality=quality, method=method)
 
     names = sorted(images, key=lambda name: (name != codebook, -images[name].size))

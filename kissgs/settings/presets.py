@@ -33,6 +33,7 @@ ENCODE: dict[Preset, dict[str, Any]] = {
         "sh_kmeans_iterations": 8,
         "sh_neighbors": 128,
         "plas_radius_decay": 0.9,
+        "webp_method": 6,
     },
     Preset.PAPER: {
         "rate_distortion": False,
