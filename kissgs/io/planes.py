@@ -14,7 +14,7 @@ from kissgs.settings import EncodeSettings
 HIGHEST_EFFORT, HIGH_EFFORT = (100, 6), (100, 5)
 """Quality and method of libwebp for the codebook, and at least for other images that gain from more effort."""
 
-NEARLY_RANDOM = ("mask", "means", "labels")
+NO_GAIN = ("mask", "means", "labels")
 """Parts of the names of images that no effort makes smaller."""
 
 SMALL = 100_000
@@ -42,7 +42,7 @@ def compress_images(
         quality, method = effort_of(shape, settings.webp_quality, settings.webp_method)
         if settings.webp_high_effort and name == codebook:
             quality, method = HIGHEST_EFFORT
-        elif settings.webp_high_effort and height * width <= SMALL and not any(part in name for part in NEARLY_RANDOM):
+        elif settings.webp_high_effort and height * width <= SMALL and not any(part in name for part in NO_GAIN):
             quality, method = max(quality, HIGH_EFFORT[0]), max(method, HIGH_EFFORT[1])
         return encode_plane(images[name], quality=quality, method=method)
 

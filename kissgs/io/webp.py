@@ -75,7 +75,7 @@ def probe_webp(data: bytes, name: str) -> tuple[int, int]:
     Raises:
         InvalidContainerError: not a WebP file, or lossy, animated or cut off.
     """
-    if len(data) < 30 or data[:4] != b"RIFF" or data[8:12] != b"WEBP":
+    if len(data) < 20 or data[:4] != b"RIFF" or data[8:12] != b"WEBP":
         raise InvalidContainerError(f"{name} is not a WebP image")
     if struct.unpack_from("<I", data, 4)[0] + 8 > len(data):
         raise InvalidContainerError(f"{name} is cut off: its header announces more bytes than there are")

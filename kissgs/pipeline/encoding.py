@@ -227,7 +227,7 @@ class Encoding:
                 compacted = len(self.original) - len(self.splats)
                 if finetune_steps and settings.order == "refined":  # for its levels of now
                     with blas_workers(self.threads) as pool:
-                        plan = refine_order(plan, None, pool)
+                        plan = refine_order(plan, None, pool, progress)
                 used = pruned if finetune_steps or (completes and tuner is not None) else settings
                 return self._write(plan, used, compacted, finetune_steps, progress)
 

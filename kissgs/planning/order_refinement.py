@@ -8,19 +8,22 @@ and Or-opt), such that these differences take fewer bits.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
 
 from kissgs.core.array_types import Int, Int32, UInt8, UInt16
+from kissgs.core.progress import Progress
 from kissgs.core.threads import Workers
 from kissgs.planning.encoding_plan import EncodingPlan
 from kissgs.planning.layout import hilbert_order
 from kissgs.planning.rows import sorted_order
 
-BLOCK = 1 << 13
-"""Number of Gaussians that are reordered together. Reversals take longer the larger it is."""
+BLOCK, SMALLEST = 1 << 13, 64
+"""Largest and smallest number of Gaussians that are reordered together. Reversals take longer the larger it is."""
 
 ROUNDS, PASSES = 2, 2
 """Number of times that bits are counted and near Gaussians found, each time in blocks that begin elsewhere, and the
@@ -39,13 +42,20 @@ UNIT = 256
 """Fractions of a bit that the local search counts in, so that no rounding of a machine changes the order."""
 
 
-def refine_order(plan: EncodingPlan, groups: UInt16[np.ndarray, " N"] | None, pool: Workers) -> EncodingPlan:
-    """Reorder a plan along the Hilbert curve within each class, and within each of ``groups``."""
+def refine_order(
+    plan: EncodingPlan, groups: UInt16[np.ndarray, " N"] | None, pool: Workers, progress: Progress
+) -> EncodingPlan:
+    """Reorder a plan along the Hilbert curve within each class, and within each of ``groups``; reports "reorder".
+
+    Padding, at the end, repeats the last Gaussian, which stays.
+    """
     count = len(plan.classes)
     if count == 0:
         return plan
     runs = plan.classes if groups is None else groups[plan.grid.cells[:count]].astype(np.int32) * 256 + plan.classes
-    order = refined_order(plan.fields["means"].levels[:count], plan.fields["f_dc"].levels[:count], runs, pool)
+    order = refined_order(
+        plan.fields["means"].levels[:count], plan.fields["f_dc"].levels[:count], runs, pool, _stage(progress)
+    )
     cells = np.concatenate([order, np.arange(count, len(plan.grid.cells), dtype=np.int32)])
     fields = {name: field.take(cells) for name, field in plan.fields.items() if name != "f_rest_centroids"}
     return replace(
@@ -63,6 +73,7 @@ def refined_order(
     colors: UInt8[np.ndarray, "M 3"],
     runs: Int[np.ndarray, " M"],
     pool: Workers,
+    report: Callable[[float], None] = lambda fraction: None,
 ) -> Int32[np.ndarray, " M"]:
     """Return the index of the Gaussian for every place.
 
@@ -74,6 +85,7 @@ def refined_order(
         colors: levels of base colours.
         runs: equal for Gaussians that follow one another anyway; only these change places.
         pool: threads. The result does not depend on their number.
+        report: receives the fraction done, 0 to 1.
     """
     pixels, order = _pixels(means, colors), np.arange(len(means), dtype=np.int32)
     ends = np.concatenate([np.flatnonzero(np.diff(runs)) + 1, [len(runs)]]).tolist()
@@ -83,8 +95,18 @@ def refined_order(
         order[places] = chosen[_block_order(means[chosen], pixels[chosen])]
 
     for turn in range(ROUNDS):
-        pool.map(refine, _blocks(ends, BLOCK if turn % 2 == 0 else BLOCK // 2))
+        blocks = _blocks(ends, BLOCK if turn % 2 == 0 else BLOCK // 2)
+        pool.map(refine, blocks, partial(_report_round, report, turn))
     return _with_equal_positions_in_order(order, means)
+
+
+def _stage(progress: Progress) -> Callable[[float], None]:
+    progress("reorder", 0.0)
+    return lambda fraction: progress("reorder", fraction)
+
+
+def _report_round(report: Callable[[float], None], number: int, fraction: float) -> None:
+    report((number + fraction) / ROUNDS)
 
 
 def _pixels(means: UInt16[np.ndarray, "M 3"], colors: UInt8[np.ndarray, "M 3"]) -> UInt8[np.ndarray, "M 6"]:
@@ -94,11 +116,14 @@ def _pixels(means: UInt16[np.ndarray, "M 3"], colors: UInt8[np.ndarray, "M 3"]) 
 
 
 def _blocks(ends: list[int], first_size: int) -> list[slice]:
-    """Return blocks of runs with these ends: in each run, one of at most ``first_size`` places, then larger ones."""
+    """Return blocks of runs with these ends: in each run, one of at most ``first_size`` places, then larger ones.
+
+    What is left of a run may be too small to count differences in, and is no block.
+    """
     blocks = []
     for start, end in pairwise([0, *ends]):
         edges = [start, *range(start + first_size, end, BLOCK), end]
-        blocks += [slice(a, b) for a, b in pairwise(edges)]
+        blocks += [slice(a, b) for a, b in pairwise(edges) if b - a >= SMALLEST]
     return blocks
 
 
@@ -107,8 +132,6 @@ def _block_order(means: UInt16[np.ndarray, "B 3"], pixels: UInt8[np.ndarray, "B 
     from kissgs.planning import tour_kernels
 
     order = np.arange(len(means), dtype=np.int32)
-    if len(means) <= 3:
-        return order
     bits = _difference_bits(pixels)
     curves = np.stack([hilbert_order(means[:, axes] + np.uint16(shift)) for *axes, shift in TURNS])
     near = np.empty((len(means), NEAR), np.int32)
@@ -132,7 +155,8 @@ def _with_equal_positions_in_order(
     order: Int32[np.ndarray, " M"], means: UInt16[np.ndarray, "M 3"]
 ) -> Int32[np.ndarray, " M"]:
     """Return an order in which Gaussians of equal position have ascending indices."""
-    keys = means[order].astype(np.uint64) @ (np.uint64(1) << np.array([0, 16, 32], np.uint64))
+    x, y, z = means[order].T
+    keys = x | y.astype(np.uint64) << np.uint64(16) | z.astype(np.uint64) << np.uint64(32)
     places = sorted_order(keys, 48)
     group = np.cumsum(np.diff(keys, prepend=keys[:1]) > 0)
     shared = np.bincount(group, minlength=1)[group] > 1

@@ -50,7 +50,8 @@ def plan_encoding(
         groups: group of each Gaussian, below 16,384: those of a group follow one another in the container, the groups
             in ascending order. Not with PLAS. None for one group.
         threads: number of threads; 0 means one per processor.
-        progress: receives "kernels", "rate_distortion", "order", "forms", "codebook", "sort codebook" and "rounding".
+        progress: receives "kernels", "rate_distortion", "order", "forms", "codebook", "sort codebook", "rounding" and
+            "reorder".
 
     Raises:
         InvalidSceneError: ``sensitivity`` does not fit the scene.
@@ -81,8 +82,7 @@ def plan_encoding(
         else:
             plan = plan_uniform(splats, kept, settings, container, pool, progress, groups)
         if settings.order == "refined":
-            progress("rounding", 0.9)
-            plan = refine_order(plan, groups, pool)
+            plan = refine_order(plan, groups, pool, progress)
         return plan
 
 

@@ -4,8 +4,8 @@ The axes of an ellipsoid can be ordered in 6 and directed in 4 right-handed ways
 6 × 4 × 2 = 48. The 24 quaternions below are the rotations of the cube, which are closed under multiplication. PRAS is
 the paper's name (section on permutation-rotation sorting) for choosing among them.
 
-* :func:`canonical_forms`, of kissgs: the form nearest to the identity. All quaternions then lie within 63° of it, w is
-  at least 0.85 and x, y, z use 40 % of their range.
+* :func:`canonical_forms`, of kissgs: the form nearest to the identity. All rotations are then within 63° of it: at
+  length 1, w is at least 0.85 and x, y, z use 40 % of their range.
 * :func:`pras_forms`, of the paper: the form most similar to its neighbours on the grid.
 """
 

@@ -244,8 +244,9 @@ class EncodeSettings(BaseModel):
     )
     webp_high_effort: bool = Field(
         True,
-        description="Use more of libwebp's effort for images that gain from it: the codebook, and up to 100,000 "
-        "Gaussians also opacities, scales, rotations and base colours. Saves 1 to 4 % of the bytes in some seconds.",
+        description="Use more of libwebp's effort for images that gain from it: the codebook, and in images of up to "
+        "100,000 pixels also opacities, scales, rotations and base colours. Saves 1 to 4 % of the bytes in some "
+        "seconds. webp_quality and webp_method then hold for the other images.",
     )
     seed: int = Field(
         0,

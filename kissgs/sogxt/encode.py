@@ -48,8 +48,8 @@ def encode(
         cleaned: see :func:`write_files`.
         compacted: see :func:`write_files`.
         threads: number of threads; 0 means one per processor. The bytes do not depend on it.
-        progress: receives "kernels", "rate_distortion", "order", "forms", "codebook", "sort codebook", "rounding" and
-            "images".
+        progress: receives "kernels", "rate_distortion", "order", "forms", "codebook", "sort codebook", "rounding",
+            "reorder" and "images".
 
     Raises:
         InvalidSceneError: ``sensitivity`` does not fit the scene.

@@ -24,6 +24,7 @@ const STAGES = {
   codebook: "Building the codebook",
   "sort codebook": "Sorting the codebook",
   rounding: "RDO quantisation",
+  reorder: "Refining the order",
   refit: "Refitting base colours",
   finetune: "Fine-tuning",
   images: "Compressing images",
@@ -48,7 +49,7 @@ export function plannedStages({ options, gaussians, sh_degree }, training) {
       "read",
       ...compactionStages(compact, gaussians),
       ...when(compact.auto_count, "cameras"),
-      ...encodingStages(encode.rate_distortion, sh_degree > 0, tunes && !goals.length),
+      ...encodingStages(encode, sh_degree > 0, tunes && !goals.length),
       ...when(compact.auto_count, "evaluate", "score"),
       ...when(
         goals.some((name) => name !== "target_size"),
@@ -80,11 +81,11 @@ function compactionStages(compact, gaussians) {
 }
 
 /**
- * @param {boolean} plans whether there is rate–distortion planning
+ * @param {JobOptions["encode"]} encode
  * @param {boolean} sh whether there are SH coefficients above degree 0
  * @param {boolean} tunes whether fine-tuning follows
  */
-function encodingStages(plans, sh, tunes) {
+function encodingStages({ rate_distortion: plans, order }, sh, tunes) {
   const targets = when(tunes, "cameras", "targets");
   return [
     ...(plans ? ["kernels", "cameras", "sensitivity", ...targets, "rate_distortion"] : [...targets, "kernels"]),
@@ -92,6 +93,7 @@ function encodingStages(plans, sh, tunes) {
     "forms",
     ...when(sh, "codebook", "sort codebook"),
     ...when(plans, "rounding"),
+    ...when(order === "refined", "reorder"),
     ...when(tunes, "finetune"),
     "images",
   ];

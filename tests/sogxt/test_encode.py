@@ -267,6 +267,6 @@ def test_progress_names_every_stage_and_ends_at_one():
     events = []
     encode(random_scene(300, 3), Settings().encode, progress=lambda stage, fraction: events.append((stage, fraction)))
     stages = list(dict.fromkeys(stage for stage, _ in events))
-    assert stages == ["kernels", "order", "forms", "codebook", "sort codebook", "rounding", "images"]
+    assert stages == ["kernels", "order", "forms", "codebook", "sort codebook", "reorder", "images"]
     assert all(0 <= fraction <= 1 for _, fraction in events)
     assert events[-1] == ("images", 1.0)
