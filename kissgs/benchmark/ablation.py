@@ -122,7 +122,7 @@ RATE_DISTORTION_VARIANTS = (
     Variant(changes={"order": "plas"}),
     Variant(changes={"rotation_form": "pras"}),
     Variant(changes={"sh_kmeans_iterations": 1, "sh_neighbors": 32}),
-    Variant(changes={"webp_high_effort": False}),
+    Variant(changes={"codebook_max_effort": False}),
     Variant(changes={"webp_quality": 50, "webp_method": 2}),
 )
 """Changes of presets with rate-distortion planning, each of which leaves out one of their choices."""

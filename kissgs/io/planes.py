@@ -12,13 +12,10 @@ from kissgs.io.webp import encode_plane
 from kissgs.settings import EncodeSettings
 
 HIGHEST_EFFORT, HIGH_EFFORT = (100, 6), (100, 5)
-"""Quality and method of libwebp for the codebook, and at least for other images that gain from more effort."""
+"""Quality and method of libwebp for the codebook, and at least for small images that gain from more effort."""
 
 NO_GAIN = ("mask", "means", "labels")
 """Parts of the names of images that no effort makes smaller."""
-
-SMALL = 100_000
-"""Pixels up to which images get a high effort; it takes 10 CPU seconds per megapixel."""
 
 USUAL_EFFORT = (75, 4)
 """Quality and method up to which large images take less effort."""
@@ -40,9 +37,10 @@ def compress_images(
     def work(name: str) -> bytes:
         height, width, _ = shape = images[name].shape
         quality, method = effort_of(shape, settings.webp_quality, settings.webp_method)
-        if settings.webp_high_effort and name == codebook:
+        gains = not any(part in name for part in NO_GAIN)
+        if settings.codebook_max_effort and name == codebook:
             quality, method = HIGHEST_EFFORT
-        elif settings.webp_high_effort and height * width <= SMALL and not any(part in name for part in NO_GAIN):
+        elif gains and height * width <= settings.high_effort_pixels:
             quality, method = max(quality, HIGH_EFFORT[0]), max(method, HIGH_EFFORT[1])
         return encode_plane(images[name], quality=quality, method=method)
 

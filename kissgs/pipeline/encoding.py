@@ -225,7 +225,7 @@ class Encoding:
 
             def files(plan: EncodingPlan, finetune_steps: int, progress: Progress) -> Encoded:
                 compacted = len(self.original) - len(self.splats)
-                if finetune_steps and settings.order == "refined":  # for its levels of now
+                if finetune_steps and settings.order == "refined":  # training has changed the levels
                     with blas_workers(self.threads) as pool:
                         plan = refine_order(plan, None, pool, progress)
                 used = pruned if finetune_steps or (completes and tuner is not None) else settings

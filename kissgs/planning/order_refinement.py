@@ -23,7 +23,8 @@ from kissgs.planning.layout import hilbert_order
 from kissgs.planning.rows import sorted_order
 
 BLOCK, SMALLEST = 1 << 13, 64
-"""Largest and smallest number of Gaussians that are reordered together. Reversals take longer the larger it is."""
+"""Largest and smallest number of Gaussians that are reordered together: reversals in larger blocks take longer, and
+smaller ones have too few differences to count."""
 
 ROUNDS, PASSES = 2, 2
 """Number of times that bits are counted and near Gaussians found, each time in blocks that begin elsewhere, and the
@@ -32,7 +33,7 @@ largest number of passes of the local search in each."""
 NEAR, REACH = 8, 16
 """Number of Gaussians that each one may be joined to, and places on the curves among which they are found."""
 
-TURNS = ((0, 1, 2, 0), (1, 2, 0, 21845), (2, 0, 1, 43690))
+CURVES = ((0, 1, 2, 0), (1, 2, 0, 21845), (2, 0, 1, 43690))
 """Axes and shift of the Hilbert curves on which near Gaussians are found: where one has a gap, another has none."""
 
 SMOOTHING = ((-2, 1 / 9), (-1, 2 / 9), (0, 3 / 9), (1, 2 / 9), (2, 1 / 9))
@@ -53,9 +54,9 @@ def refine_order(
     if count == 0:
         return plan
     runs = plan.classes if groups is None else groups[plan.grid.cells[:count]].astype(np.int32) * 256 + plan.classes
-    order = refined_order(
-        plan.fields["means"].levels[:count], plan.fields["f_dc"].levels[:count], runs, pool, _stage(progress)
-    )
+    progress("reorder", 0.0)
+    means, colors = (plan.fields[name].levels[:count] for name in ("means", "f_dc"))
+    order = refined_order(means, colors, runs, pool, lambda fraction: progress("reorder", fraction))
     cells = np.concatenate([order, np.arange(count, len(plan.grid.cells), dtype=np.int32)])
     fields = {name: field.take(cells) for name, field in plan.fields.items() if name != "f_rest_centroids"}
     return replace(
@@ -94,19 +95,15 @@ def refined_order(
         chosen = order[places]
         order[places] = chosen[_block_order(means[chosen], pixels[chosen])]
 
-    for turn in range(ROUNDS):
-        blocks = _blocks(ends, BLOCK if turn % 2 == 0 else BLOCK // 2)
-        pool.map(refine, blocks, partial(_report_round, report, turn))
+    for done in range(ROUNDS):
+        blocks = _blocks(ends, BLOCK if done % 2 == 0 else BLOCK // 2)
+        pool.map(refine, blocks, partial(_report_round, report, done))
     return _with_equal_positions_in_order(order, means)
 
 
-def _stage(progress: Progress) -> Callable[[float], None]:
-    progress("reorder", 0.0)
-    return lambda fraction: progress("reorder", fraction)
-
-
-def _report_round(report: Callable[[float], None], number: int, fraction: float) -> None:
-    report((number + fraction) / ROUNDS)
+def _report_round(report: Callable[[float], None], done: int, fraction: float) -> None:
+    """Report a fraction of a round, after so many rounds."""
+    report((done + fraction) / ROUNDS)
 
 
 def _pixels(means: UInt16[np.ndarray, "M 3"], colors: UInt8[np.ndarray, "M 3"]) -> UInt8[np.ndarray, "M 6"]:
@@ -133,7 +130,7 @@ def _block_order(means: UInt16[np.ndarray, "B 3"], pixels: UInt8[np.ndarray, "B 
 
     order = np.arange(len(means), dtype=np.int32)
     bits = _difference_bits(pixels)
-    curves = np.stack([hilbert_order(means[:, axes] + np.uint16(shift)) for *axes, shift in TURNS])
+    curves = np.stack([hilbert_order(means[:, axes] + np.uint16(shift)) for *axes, shift in CURVES])
     near = np.empty((len(means), NEAR), np.int32)
     tour_kernels.near_pixels(pixels, bits, curves, REACH, near)
     tour_kernels.improve(pixels, bits, near, PASSES, order)

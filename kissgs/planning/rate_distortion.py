@@ -86,13 +86,7 @@ def plan_rate_distortion(
 
     progress("forms", 0.0)
     shapes, form_error = choose_forms(
-        splats,
-        grid.cells,
-        grid.side,
-        settings,
-        pool,
-        lambda fraction: progress("forms", fraction),
-        free_length=container.tables is None,
+        splats, grid.cells, grid.side, settings, pool, lambda fraction: progress("forms", fraction), container
     )
     shapes = shapes.take(grid.mask)
     size = sh_model.best_size(rd_lambda, len(order), settings.gaussians_per_codebook_entry, container.entry_bits)

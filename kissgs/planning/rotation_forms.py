@@ -19,6 +19,7 @@ import numpy as np
 from kissgs.core.array_types import Bool, Float32, Float64, Int, UInt8
 from kissgs.core.splats import Splats
 from kissgs.core.threads import Workers
+from kissgs.planning.container_model import ContainerModel
 from kissgs.planning.plas import box_blur
 from kissgs.planning.rows import Computed, for_each_block, selected
 from kissgs.settings import EncodeSettings
@@ -104,12 +105,11 @@ def choose_forms(
     settings: EncodeSettings,
     pool: Workers,
     report: Callable[[float], None],
-    *,
-    free_length: bool,
+    container: ContainerModel,
 ) -> tuple[StoredShapes, float]:
     """Choose the form of rotation and log-scales of the Gaussian in each of ``cells``, as the settings say.
 
-    Where quaternions have a ``free_length``, because decoders normalise them, those of canonical forms have w = 1: x, y
+    Where the container stores whole quaternions, which decoders normalise, those of canonical forms have w = 1: x, y
     and z hold the whole rotation, and w takes no bits.
 
     Returns:
@@ -125,7 +125,8 @@ def choose_forms(
     else:
         quats, scales = unit_quats(splats, cells), splats.scales.take(cells, axis=0)
         forms = pras_forms(quats, scales, side, pool, decay=settings.plas_radius_decay, report=report)
-    shapes = StoredShapes(splats, cells, forms, free_length and settings.rotation_form == "canonical")
+    w_is_one = container.tables is None and settings.rotation_form == "canonical"
+    shapes = StoredShapes(splats, cells, forms, w_is_one)
 
     def error(rows: slice) -> float:
         quats, scales = unit_quats(splats, cells[rows]), splats.scales.take(cells[rows], axis=0)

@@ -9,7 +9,7 @@ from kissgs.core.numba_kernels import compiled
 
 
 @njit(nogil=True, error_model="numpy")
-def _bits(pixels: np.ndarray, bits: np.ndarray, a: int, b: int) -> int:
+def _bits_between(pixels: np.ndarray, bits: np.ndarray, a: int, b: int) -> int:
     """Return the bits of pixel ``a`` beside pixel ``b``."""
     total = 0
     for channel in range(pixels.shape[1]):
@@ -40,7 +40,7 @@ def near_pixels(pixels: np.ndarray, bits: np.ndarray, curves: np.ndarray, reach:
                 if j == i:
                     continue
                 other = curves[curve, j]
-                cost = _bits(pixels, bits, n, other)
+                cost = _bits_between(pixels, bits, n, other)
                 if cost >= best[n, most - 1]:
                     continue
                 known = False
@@ -74,17 +74,17 @@ def _reversal(
     if not 0 <= i + side < count:
         return False
     beside = order[i + side]
-    now = _bits(pixels, bits, a, beside)
+    now = _bits_between(pixels, bits, a, beside)
     best, found = 0, -1
     for place in range(near.shape[1]):
         b = near[a, place]
-        j, joined = places[b], _bits(pixels, bits, a, b)
+        j, joined = places[b], _bits_between(pixels, bits, a, b)
         if joined >= now:
             break
         if not 0 <= j + side < count:
             continue
         other = order[j + side]
-        gain = now + _bits(pixels, bits, b, other) - joined - _bits(pixels, bits, beside, other)
+        gain = now + _bits_between(pixels, bits, b, other) - joined - _bits_between(pixels, bits, beside, other)
         if gain > best:
             best, found = gain, j
     if found < 0:
@@ -103,13 +103,17 @@ def _move(
     if i < 1 or i + length >= count:
         return False
     before, last, after = order[i - 1], order[i + length - 1], order[i + length]
-    saved = _bits(pixels, bits, before, a) + _bits(pixels, bits, last, after) - _bits(pixels, bits, before, after)
+    saved = (
+        _bits_between(pixels, bits, before, a)
+        + _bits_between(pixels, bits, last, after)
+        - _bits_between(pixels, bits, before, after)
+    )
     best, found, found_side, joined_first = 0, -1, 0, False
     for first in (True, False):
         joined, loose = (a, last) if first else (last, a)
         for place in range(near.shape[1]):
             b = near[joined, place]
-            cost, j = _bits(pixels, bits, joined, b), places[b]
+            cost, j = _bits_between(pixels, bits, joined, b), places[b]
             if cost >= saved:
                 break
             if i <= j < i + length:
@@ -119,7 +123,7 @@ def _move(
                 if not 0 <= k < count or i <= k < i + length:
                     continue
                 other = order[k]
-                gain = saved - cost - _bits(pixels, bits, loose, other) + _bits(pixels, bits, b, other)
+                gain = saved - cost - _bits_between(pixels, bits, loose, other) + _bits_between(pixels, bits, b, other)
                 if gain > best:
                     best, found, found_side, joined_first = gain, j, side, first
     if found < 0:

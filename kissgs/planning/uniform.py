@@ -59,13 +59,7 @@ def plan_uniform(
     sh0 = clip_outliers(source.sh0, step=settings.sh0_step, share=OUTLIERS) if clips else source.sh0
     progress("forms", 0.0)
     shapes, form_error = choose_forms(
-        source,
-        cells,
-        grid.side,
-        settings,
-        pool,
-        lambda fraction: progress("forms", fraction),
-        free_length=container.tables is None,
+        source, cells, grid.side, settings, pool, lambda fraction: progress("forms", fraction), container
     )
     chosen = cells[grid.mask]
     weights = np.ones(len(chosen), np.float32)

@@ -22,7 +22,8 @@ ENCODE: dict[Preset, dict[str, Any]] = {
         "sh_kmeans_iterations": 1,
         "sh_neighbors": 32,
         "codebook_order": "axes",
-        "webp_high_effort": False,
+        "codebook_max_effort": False,
+        "high_effort_pixels": 0,
         "webp_quality": 50,
         "webp_method": 2,
     },
@@ -34,6 +35,7 @@ ENCODE: dict[Preset, dict[str, Any]] = {
         "sh_neighbors": 128,
         "plas_radius_decay": 0.9,
         "webp_method": 6,
+        "high_effort_pixels": 100_000,
     },
     Preset.PAPER: {
         "rate_distortion": False,
@@ -51,7 +53,8 @@ ENCODE: dict[Preset, dict[str, Any]] = {
         "prune_invisible": False,
         "webp_quality": 75,
         "webp_method": 4,
-        "webp_high_effort": False,
+        "codebook_max_effort": False,
+        "high_effort_pixels": 0,
     },
 }
 

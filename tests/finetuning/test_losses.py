@@ -136,7 +136,7 @@ def test_total_variation_decreases_in_training():
     scene = quantized(preset="fast")
     loss, rates = TotalVariationLoss(scene, 100.0, Pace(1)), {**dict.fromkeys(scene.latents, 0.05), "attraction": 0.0}
     before = value(loss.penalty(1, {}))
-    for _ in range(40):
+    for _ in range(60):
         loss.penalty(1, {}).backward()
         scene.step(rates)
-    assert value(loss.penalty(1, {})) < 0.85 * before
+    assert value(loss.penalty(1, {})) < 0.8 * before

@@ -47,14 +47,23 @@ def tuned(scene, *, checkpoint=None, progress=None, preset="fast", encode=COARSE
     return work(plan, plan, scene, written(scene, settings), checkpoint)
 
 
-@pytest.mark.parametrize("degree", [0, 2])
-@pytest.mark.quick(1)
-def test_fine_tuning_raises_the_psnr_to_the_original_scene(degree):
-    scene = cloud(150, degree)
-    encoded, report = tuned(scene, steps=150)
+def test_fine_tuning_raises_the_psnr_to_the_original_scene():
+    """In the mean of four scenes: with twelve small training images each, single gains are 0.7 to 2.0 dB."""
+    gains = []
+    for seed in range(4):
+        encoded, report = tuned(cloud(150, 2, seed), steps=150)
+        gains.append(report.psnr_after - report.psnr_before)
+        assert report.kept
+        assert report.target_source == "renderings"
+        assert report.bytes_after == len(zip_bytes(encoded.files))
+        assert len(decompress(encoded.files)) == 150
+    assert np.mean(gains) > 0.8
+
+
+def test_a_scene_without_sh_is_fine_tuned():
+    encoded, report = tuned(cloud(150, 0), steps=150)
     assert report.kept
-    assert report.psnr_after > report.psnr_before + 0.2
-    assert report.target_source == "renderings"
+    assert report.psnr_after > report.psnr_before
     assert report.bytes_after == len(zip_bytes(encoded.files))
     assert len(decompress(encoded.files)) == 150
 
@@ -193,6 +202,20 @@ def test_the_fine_tuned_container_meets_a_target_size():
     assert found.report.container_bytes <= size
     assert found.report.finetuning is not None
     assert len(found.report.trials) >= 2
+
+
+@pytest.mark.quick(0)
+def test_the_order_is_refined_for_the_trained_levels_too(monkeypatch):
+    """The order that is reported is that of the container; each refinement is a stage of its own."""
+    scene, stages = cloud(500, 1), []
+    settings = Settings.from_preset("fast", order="refined", finetune={**SHORT, **GENTLE})
+    monkeypatch.setattr("kissgs.finetuning.tune._Result.cost", lambda result, rd_lambda: result.bytes)
+    found = kissgs.compress(scene, settings=settings, progress=lambda stage, *rest: stages.append(stage))
+    assert found.report.finetuning.kept
+    assert "reorder" in stages[stages.index("finetune") :]
+    decoded = decompress(found.files)
+    np.testing.assert_allclose(decoded.means, scene.means[found.order], atol=0.05)
+    assert len(np.unique(found.order)) == len(decoded)
 
 
 @pytest.mark.quick(0)

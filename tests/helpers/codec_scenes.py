@@ -95,10 +95,8 @@ def equivalents(quats, scales):
 def stored_forms(quats, scales):
     """Return all forms that a container may hold: the equivalent ones with a length of 1, and those with w = 1."""
     forms, permuted = equivalents(quats, scales)
-    w = forms[:, :, :1]
-    return np.concatenate([forms, np.where(w > 0.5, forms / np.where(w > 0.5, w, 1), forms)]), np.tile(
-        permuted, (2, 1, 1)
-    )
+    w = np.where(forms[:, :, :1] > 0.5, forms[:, :, :1], 1)  # canonical forms have 0.85 at least
+    return np.concatenate([forms, forms / w]), np.concatenate([permuted, permuted])
 
 
 def signed_log(x):

@@ -95,6 +95,14 @@ def test_all_images_of_a_container_keep_their_names_and_order():
     assert fractions == pytest.approx([1 / 3, 2 / 3, 1])
 
 
+def test_the_smallest_files_are_read():
+    """libwebp's highest effort stores a constant image in less than 30 bytes."""
+    image = np.zeros((8, 8, 4), np.uint8)
+    data = encode_plane(image, quality=100, method=6)
+    assert len(data) < 30
+    assert (decoded(data, image) == image).all()
+
+
 IMAGE = random_image(24, 16, 3)
 LOSSLESS = webp(IMAGE, lossless=True)
 
@@ -182,19 +190,22 @@ def test_large_images_take_less_effort_unless_more_than_the_usual_is_asked_for(s
 def test_large_images_are_compressed_with_that_effort():
     images = {"book.webp": random_image(1000, 1000, 3) // 64, "other.webp": random_image(1000, 1000, 1) // 64}
     with blas_workers(2) as pool:
-        settings = EncodeSettings(webp_quality=75, webp_method=4, webp_high_effort=False)
+        settings = EncodeSettings(webp_quality=75, webp_method=4, codebook_max_effort=False)
         found = compress_images(images, settings, pool, lambda fraction: None, codebook="book.webp")
     assert found["book.webp"] == encode_plane(images["book.webp"], quality=50, method=2)
     assert found["other.webp"] == encode_plane(images["other.webp"], quality=25, method=4)
 
 
-@pytest.mark.parametrize(("side", "effort"), [(80, (100, 5)), (320, (75, 4))])
-def test_more_effort_goes_to_small_images_that_gain_from_it(side, effort):
+@pytest.mark.parametrize(
+    ("limit", "asked", "effort"), [(6400, (75, 4), (100, 5)), (6399, (75, 4), (75, 4)), (6400, (50, 6), (100, 6))]
+)
+def test_more_effort_goes_to_small_images_that_gain_from_it(limit, asked, effort):
     names = ("book.webp", "scales.webp", "means_bytes_0.webp", "f_rest_labels.webp")
-    images = {name: random_image(side, side, 3) // 16 for name in names}
+    images = {name: random_image(80, 80, 3) // 16 for name in names}
+    settings = EncodeSettings(high_effort_pixels=limit, webp_quality=asked[0], webp_method=asked[1])
     with blas_workers(2) as pool:
-        found = compress_images(images, EncodeSettings(), pool, lambda fraction: None, codebook="book.webp")
+        found = compress_images(images, settings, pool, lambda fraction: None, codebook="book.webp")
     efforts = {"book.webp": (100, 6), "scales.webp": effort}
     for name, image in images.items():
-        quality, method = efforts.get(name, (75, 4))
+        quality, method = efforts.get(name, asked)
         assert found[name] == encode_plane(image, quality=quality, method=method), name

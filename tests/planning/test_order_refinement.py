@@ -75,7 +75,7 @@ def levels_along_a_curve(count, rng):
     return means, (means >> 8).astype(np.uint8) + rng.integers(0, 40, (count, 3)).astype(np.uint8)
 
 
-@pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 20_000])
+@pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 63, 64, 65, 500, 20_000])
 def test_gaussians_stay_in_their_run_and_differences_become_smaller(count):
     rng = np.random.default_rng(count)
     means, colors = levels_along_a_curve(count, rng)
@@ -128,11 +128,12 @@ def test_the_scene_is_the_same_in_fewer_bytes(with_sensitivity):
     assert sizes[1] < 0.99 * sizes[0]
 
 
-@pytest.mark.parametrize("count", [0, 1, 7, 8, 9])
+@pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 700])
 def test_the_plan_stays_consistent(count):
-    """Every Gaussian decodes near itself: levels, labels, classes and costs moved together."""
+    """Every Gaussian decodes near itself; labels are compared above."""
     splats = kissgs.clean(random_scene(count, 2, seed=count))[0]
     result = encode(splats, Settings.from_preset("balanced").encode)
     found = kissgs.decompress(result.files)
     np.testing.assert_allclose(found.means, splats.means[result.order], atol=0.05)
-    np.testing.assert_allclose(found.shN, splats.shN[result.order], atol=0.3)
+    np.testing.assert_allclose(found.opacities, splats.opacities[result.order], atol=0.2)
+    np.testing.assert_allclose(found.sh0, splats.sh0[result.order], atol=0.1)

@@ -5,12 +5,14 @@ import pytest
 from helpers.codec_scenes import random_scene
 
 from kissgs.core.threads import Workers
+from kissgs.planning.container_model import EVEN_LEVELS
 from kissgs.planning.gaussian_costs import Costs
 from kissgs.planning.quantize import means_bits, quantize, quantize_means
 from kissgs.planning.rdo_quantize import level_bits
 from kissgs.planning.rotation_forms import PERMUTATIONS, ROTATIONS, StoredShapes, choose_forms
 from kissgs.planning.rows import BLOCK, for_each_block, row_range, selected, sorted_order
 from kissgs.settings import Settings
+from kissgs.sog.container_model import SOG
 
 BORDERS = (1, 7, 8, 9, BLOCK - 1, BLOCK, BLOCK + 1, 3 * BLOCK)
 
@@ -79,10 +81,8 @@ def test_the_stored_form_is_the_largest_w_of_the_24_rotations(count):
     splats = random_scene(count, 0, seed=count)
     cells = np.random.default_rng(count).permutation(count).astype(np.int32)
     with Workers(2) as pool:
-        shapes, error = choose_forms(
-            splats, cells, 8, Settings().encode, pool, lambda fraction: None, free_length=False
-        )
-        free, _ = choose_forms(splats, cells, 8, Settings().encode, pool, lambda fraction: None, free_length=True)
+        shapes, error = choose_forms(splats, cells, 8, Settings().encode, pool, lambda fraction: None, SOG)
+        free, _ = choose_forms(splats, cells, 8, Settings().encode, pool, lambda fraction: None, EVEN_LEVELS)
     quats = splats.quats[cells].astype(float)
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     w = quats @ (ROTATIONS * (1, -1, -1, -1)).T
@@ -93,7 +93,7 @@ def test_the_stored_form_is_the_largest_w_of_the_24_rotations(count):
     np.testing.assert_array_equal(stored[:, 1:4], np.take_along_axis(splats.scales[cells], order, axis=1))
     np.testing.assert_array_equal(stored[:, 0], splats.opacities[cells])
     assert error < 1e-12
-    assert (free[:][:, 4] == 1).all(), "where the length is free, w takes no bits"
+    assert (free[:][:, 4] == 1).all(), "decoders normalise, so w takes no bits"
     np.testing.assert_allclose(free[:][:, 5:], stored[:, 5:] / stored[:, 4:5], atol=1e-12)
     np.testing.assert_array_equal(free[:][:, :4], stored[:, :4])
 
