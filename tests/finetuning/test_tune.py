@@ -48,7 +48,7 @@ def tuned(scene, *, checkpoint=None, progress=None, preset="fast", encode=COARSE
 
 
 def test_fine_tuning_raises_the_psnr_to_the_original_scene():
-    """In the mean of four scenes: with twelve small training images each, single gains are 0.7 to 2.0 dB."""
+    """Mean of four scenes: with twelve small training images each, single gains are 0.7 to 2.0 dB."""
     gains = []
     for seed in range(4):
         encoded, report = tuned(cloud(150, 2, seed), steps=150)
