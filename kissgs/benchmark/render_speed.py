@@ -152,7 +152,7 @@ def _training_steps(model: GaussianModel, camera: Camera, threads: int) -> list[
 
     grey = np.full((camera.height, camera.width, 3), 0.5, np.float16)
     targets = TrainingTargets((camera,), (grey,), np.zeros(3, np.float32), "renderings")
-    plan = TrainingPlan("measure", Pace(REPEATS + 1), lambda done: NO_RATES, ssim_weight=0.2, seed=(0,))
+    plan = TrainingPlan("measure", Pace(REPEATS + 1), lambda done: NO_RATES, ssim_weight=0.2, mse_weight=0.0, seed=(0,))
     ends: list[float] = []
     train(model, targets, plan, after=lambda done: ends.append(time.process_time()), threads=threads)
     return (1e3 * np.diff(ends)).tolist()

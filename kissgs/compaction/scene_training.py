@@ -133,9 +133,11 @@ class SceneTraining:
             stage=phase.name,
             pace=Pace(phase.steps, deadline),
             rates=lr_schedule(self.settings, phase, targets.target_source),
-            ssim_weight=self.settings.ssim_weight,
+            ssim_weight=self.settings.loss_ssim_weight,
+            mse_weight=self.settings.mse_weight,
             seed=seed,
             regularizers=(*self._shape_regularizers(targets), *regularizers),
+            dropout=self.settings.dropout if targets.target_source == "photos" else 0.0,
         )
         train(self.trained, targets, plan, first=first, after=after, threads=self.threads, progress=progress)
 

@@ -14,6 +14,8 @@ from torch.autograd.function import once_differentiable
 from kissgs.core.array_types import Float32, Float64, Int
 from kissgs.core.deadline import Pace
 from kissgs.finetuning import kernels
+from kissgs.finetuning.codebook_rate import CodebookRate
+from kissgs.finetuning.even_plane import EvenPlane
 from kissgs.finetuning.planes import Plane
 from kissgs.finetuning.quantized_scene import QuantizedScene
 from kissgs.finetuning.table_plane import TablePlane
@@ -27,6 +29,7 @@ ENTROPY_FIELDS = ("opacities", "scales", "quaternions", "f_dc")
 """Fields whose bits are estimated from the histograms of their levels; positions have too many levels for that.
 
 Entries of the SH codebook are added where they are a list, sorted by frequency: neighbours then predict nothing.
+In a square they predict each other (:class:`kissgs.finetuning.codebook_rate.CodebookRate`).
 """
 
 RECOUNT_STEPS = 25
@@ -38,18 +41,21 @@ class RateLoss:
 
     The bits are those of an ideal entropy code with one histogram per sensitivity class and channel. WebP's entropy
     image comes near to it, and RDO quantisation uses it too (:mod:`kissgs.planning.rdo_quantize`). Between two levels,
-    bits are interpolated linearly, so that the gradient moves latents to the cheaper neighbouring level.
+    bits are interpolated linearly, so that the gradient moves latents to the cheaper neighbouring level. Those of a
+    square SH codebook come from differences of neighbouring entries.
     """
 
     def __init__(self, scene: QuantizedScene, weight: float) -> None:
         """Prepare the loss of ``scene``; ``weight`` is the weight of one bit."""
         self._scene, self._weight = scene, weight
-        self._rates = {}
+        self._rates: dict[str, _LevelRate | CodebookRate] = {}
         for name in ENTROPY_FIELDS:
             plane = scene.planes[name]
             self._rates[name] = _LevelRate(plane, scene.classes, np.arange(plane.base_multiples.shape[1]))
         codebook = scene.planes["f_rest_centroids"]
-        if isinstance(codebook, TablePlane):
+        if isinstance(codebook, EvenPlane):
+            self._rates["f_rest_centroids"] = CodebookRate(codebook)
+        elif isinstance(codebook, TablePlane):
             used = (codebook.min_latent < codebook.max_latent).any(dim=0).cpu().numpy()
             # An image has one code per colour, for all coefficients; those that are not stored get one of their own.
             colors = np.where(used, np.arange(len(used)) // COEFFICIENTS, 3)

@@ -260,10 +260,12 @@ class Tuner:
             stage="finetune",
             pace=pace,
             rates=_lr_schedule(settings, self.targets),
-            ssim_weight=settings.ssim_weight,
+            ssim_weight=settings.loss_ssim_weight,
+            mse_weight=settings.mse_weight,
             seed=(settings.seed,),
             regularizers=(rate_loss, TotalVariationLoss(scene, settings.tv_weight, pace)),
             batch=settings.batch,
+            dropout=settings.dropout if self.targets.target_source == "photos" else 0.0,
         )
         train(scene, self.targets, training, first=done, after=after, threads=self.threads, progress=self.progress)
         return scene.plan(), checkpoint_note
@@ -271,19 +273,25 @@ class Tuner:
     def _loss_per_error(self, scene: QuantizedScene) -> float:
         """Estimate the derivative of the loss with respect to the mean squared image error.
 
-        The loss is taken as proportional to the root of the error, as for errors on top of those to photographs.
+        All of the loss but the error itself is taken as proportional to the root of the error, as for errors on top of
+        those to photographs.
         """
-        losses, errors = [], []
+        settings, losses, errors = self.settings, [], []
         with torch.no_grad(), torch_threads(1):  # the sums depend on the number of threads
             parameters = scene.gaussians()
-            for n in islice(self.targets.order((self.settings.seed,)), min(LOSS_VIEWS, len(self.targets))):
+            for n in islice(self.targets.order((settings.seed,)), min(LOSS_VIEWS, len(self.targets))):
                 self.progress("finetune", 0.0)
                 loss, error = image_loss(
-                    parameters, self.targets, n, ssim_weight=self.settings.ssim_weight, threads=self.threads
+                    parameters,
+                    self.targets,
+                    n,
+                    ssim_weight=settings.loss_ssim_weight,
+                    mse_weight=0.0,
+                    threads=self.threads,
                 )
                 losses.append(float(loss))
                 errors.append(error)
-        return float(np.mean(losses)) / (2 * max(float(np.mean(errors)), 1e-10))
+        return float(np.mean(losses)) / (2 * max(float(np.mean(errors)), 1e-10)) + settings.mse_weight
 
     def _measure_costs(self, scene: QuantizedScene) -> Costs:
         """Measure the costs of errors in the training views, for a plan without costs."""

@@ -1,4 +1,4 @@
-"""The loss of 3DGS training: mean absolute difference and SSIM between a rendering and its target image."""
+"""The loss of training: mean absolute and squared difference and SSIM between a rendering and its target image."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from kissgs.core.array_types import Float
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
 from kissgs.core.threads import Workers
-from kissgs.rendering.metrics import difference_and_ssim
+from kissgs.rendering.metrics import differences_and_ssim
 
 try:
     import torch
@@ -23,18 +23,21 @@ def photometric_loss(
     target: Float[torch.Tensor, "..."],
     *,
     ssim_weight: float = 0.2,
+    mse_weight: float = 0.0,
     threads: int = 0,
 ) -> Float[torch.Tensor, ""]:
-    """Return (1 - w) · mean |image - target| + w · (1 - SSIM), with the SSIM of :func:`kissgs.rendering.metrics.ssim`.
+    """Return (1 - w) · mean |d| + w · (1 - SSIM) + m · mean d², for the difference d = image - target.
 
-    Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", ACM Transactions on Graphics 42
-    (2023), equation 7. On the CPU in float32 the gradient is computed together with the value; elsewhere by autograd.
+    SSIM is that of :func:`kissgs.rendering.metrics.ssim`. With m = 0 it is the loss of Kerbl et al., "3D Gaussian
+    Splatting for Real-Time Radiance Field Rendering", ACM Transactions on Graphics 42 (2023), equation 7. On the CPU in
+    float32 the gradient is computed together with the value; elsewhere by autograd.
 
     Args:
         image: ``(H, W, 3)`` or ``(C, H, W, 3)``, any values: renderings are not clamped. Values beyond ±1e9 are
             clamped; NaN gives NaN.
         target: of the same shape, dtype and device; gets no gradient.
         ssim_weight: w, from 0 to 1.
+        mse_weight: m, 0 or more.
         threads: number of CPU threads; 0 means one per processor. The result does not depend on it.
 
     Raises:
@@ -49,20 +52,20 @@ def photometric_loss(
     if target.requires_grad:
         raise ValueError("the loss has no gradient by its target; detach it")
     if image.device.type != "cpu" or image.dtype != torch.float32 or target.dtype != torch.float32:
-        return plain_photometric_loss(image, target, ssim_weight)
+        return plain_photometric_loss(image, target, ssim_weight, mse_weight)
     if image.requires_grad and torch.is_grad_enabled():
-        return _Photometric.apply(image, target, ssim_weight, threads)  # type: ignore[no-untyped-call]
-    return _photometric(image, target, ssim_weight, threads, None)
+        return _Photometric.apply(image, target, (ssim_weight, mse_weight), threads)  # type: ignore[no-untyped-call]
+    return _photometric(image, target, (ssim_weight, mse_weight), threads, None)
 
 
 class _Photometric(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: FunctionCtx, image: torch.Tensor, target: torch.Tensor, ssim_weight: float, threads: int
+        ctx: FunctionCtx, image: torch.Tensor, target: torch.Tensor, weights: tuple[float, float], threads: int
     ) -> torch.Tensor:
         gradient = torch.empty_like(image, memory_format=torch.contiguous_format)
         ctx.save_for_backward(gradient)
-        return _photometric(image, target, ssim_weight, threads, gradient)
+        return _photometric(image, target, weights, threads, gradient)
 
     @staticmethod
     @once_differentiable
@@ -73,15 +76,19 @@ class _Photometric(torch.autograd.Function):
 
 
 def _photometric(
-    image: torch.Tensor, target: torch.Tensor, ssim_weight: float, threads: int, gradient: torch.Tensor | None
+    image: torch.Tensor,
+    target: torch.Tensor,
+    weights: tuple[float, float],
+    threads: int,
+    gradient: torch.Tensor | None,
 ) -> torch.Tensor:
-    """Return the loss; write its gradient by the image into ``gradient`` if given."""
-    count = image.numel()
-    weights = (1 - ssim_weight) / count, -ssim_weight / count
+    """Return the loss with ``weights`` of SSIM and of the squares; write its gradient into ``gradient`` if given."""
+    count, (ssim_weight, mse_weight) = image.numel(), weights
+    factors = (1 - ssim_weight) / count, mse_weight / count, -ssim_weight / count
     with Workers(threads) as pool:
         gradients = None if gradient is None else _views(gradient)
-        difference, similarity = difference_and_ssim(_views(image), _views(target), pool, gradients, weights)
-    loss = ((1 - ssim_weight) * difference + ssim_weight * (count - similarity)) / count
+        difference, squares, similarity = differences_and_ssim(_views(image), _views(target), pool, gradients, factors)
+    loss = ((1 - ssim_weight) * difference + mse_weight * squares + ssim_weight * (count - similarity)) / count
     return torch.tensor(loss, dtype=torch.float32)
 
 
@@ -90,7 +97,10 @@ def _views(images: torch.Tensor) -> np.ndarray:
 
 
 def plain_photometric_loss(
-    image: Float[torch.Tensor, "..."], target: Float[torch.Tensor, "..."], ssim_weight: float
+    image: Float[torch.Tensor, "..."],
+    target: Float[torch.Tensor, "..."],
+    ssim_weight: float,
+    mse_weight: float = 0.0,
 ) -> Float[torch.Tensor, ""]:
     """Return the loss of :func:`photometric_loss` by plain torch operations, on any device and in any dtype.
 
@@ -103,7 +113,8 @@ def plain_photometric_loss(
     P, Q = (SS - S * S).clamp_min(0), (DD - D * D).clamp_min(0)
     luminance = (S * S - D * D + 2e-4) / (S * S + D * D + 2e-4)
     structure = (P - Q + 18e-4) / (P + Q + 18e-4)
-    return (1 - ssim_weight) * d.abs().mean() + ssim_weight * (1 - (luminance * structure).mean())
+    dissimilarity = 1 - (luminance * structure).mean()
+    return (1 - ssim_weight) * d.abs().mean() + ssim_weight * dissimilarity + mse_weight * d.square().mean()
 
 
 def _blur(maps: torch.Tensor) -> torch.Tensor:

@@ -53,8 +53,8 @@ def ssim(image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "..."])
     """
     a, b = image_pair(image, reference)
     with Workers(1) as pool:
-        sums = difference_and_ssim(a[None], b[None], pool)
-    return float(sums[1]) / a.size
+        sums = differences_and_ssim(a[None], b[None], pool)
+    return float(sums[2]) / a.size
 
 
 def ms_ssim(image: Shaped[np.ndarray, "..."], reference: Shaped[np.ndarray, "..."]) -> float:
@@ -133,13 +133,13 @@ def _as_floats(image: np.ndarray) -> np.ndarray:
         return np.ascontiguousarray(image, dtype=np.float32)
 
 
-def difference_and_ssim(
+def differences_and_ssim(
     images: Float32[np.ndarray, "V H W 3"],
     targets: Float32[np.ndarray, "V H W 3"],
     pool: Workers,
     gradient: Float32[np.ndarray, "V H W 3"] | None = None,
-    weights: tuple[float, float] = (0.0, 0.0),
-) -> Float64[np.ndarray, "2"]:
+    weights: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Float64[np.ndarray, "3"]:
     """Return sums over all pixels and channels, and compute the gradient of their weighted sum in the same pass.
 
     Args:
@@ -147,23 +147,23 @@ def difference_and_ssim(
         targets: images to compare with.
         pool: threads that process the tiles; the result does not depend on their number.
         gradient: receives the gradient of the weighted sum by ``images``, if given.
-        weights: weights of the two sums.
+        weights: weights of the three sums.
 
     Returns:
-        Σ |image - target| and Σ SSIM.
+        Σ |image - target|, Σ (image - target)² and Σ SSIM.
     """
     from kissgs.rendering import ssim_kernels
 
     count, height, width, _ = images.shape
     tiles = [(view, tile) for view in range(count) for tile in _tiles(height, width)]
     gradients = np.empty((count, 0, 0), dtype=np.float32) if gradient is None else gradient.reshape(count, height, -1)
-    l1, ssim = np.float32(weights[0]), np.float32(2 * weights[1])
+    l1, l2, ssim = np.float32(weights[0]), np.float32(2 * weights[1]), np.float32(2 * weights[2])
     rows = images.reshape(count, height, -1), targets.reshape(count, height, -1)
 
     def work(task: tuple[int, np.ndarray]) -> np.ndarray:
         view, tile = task
-        sums = np.zeros(2)
-        ssim_kernels.ssim_tile(rows[0][view], rows[1][view], tile, l1, ssim, gradients[view], sums)
+        sums = np.zeros(3)
+        ssim_kernels.ssim_tile(rows[0][view], rows[1][view], tile, l1, l2, ssim, gradients[view], sums)
         return sums
 
     return np.sum(pool.map(work, tiles), axis=0)

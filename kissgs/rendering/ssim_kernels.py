@@ -1,4 +1,4 @@
-"""Numba kernels of SSIM: its sum over a tile of an image and, in the same pass, its gradient; sums for MS-SSIM.
+"""Numba kernels of SSIM and of plain differences: sums over a tile and, in the same pass, gradients; sums for MS-SSIM.
 
 SSIM needs the images x and y only as their sum s = x + y and difference d = x - y. With G the blur, S = G s,
 D = G d, p = G s² - S² and q = G d² - D² (four blurs instead of five),
@@ -139,27 +139,32 @@ def _blur_maps(ring: np.ndarray, count: int, out: np.ndarray) -> None:
         out[j + 1024] = _blur(ring, j + 1024, 1536)
 
 
-@compiled("void(float32[::1], float32[::1], float32, float32, float32[::1])", fastmath=_FAST)
-def _gradient(blurred: np.ndarray, row: np.ndarray, l1: np.float32, ssim: np.float32, out: np.ndarray) -> None:
-    """Blur the maps horizontally; write ``l1`` times the gradient of |d| plus ``ssim`` times half that of SSIM."""
+@compiled("void(float32[::1], float32[::1], float32, float32, float32, float32[::1])", fastmath=_FAST)
+def _gradient(
+    blurred: np.ndarray, row: np.ndarray, l1: np.float32, l2: np.float32, ssim: np.float32, out: np.ndarray
+) -> None:
+    """Blur the maps horizontally; write a weighted sum of the gradients of |d|, d² / 2 and SSIM / 2."""
     zero, one = np.float32(0), np.float32(1)
     for j in range(len(out)):
         s = row[j]
         d = row[j + 576]
         sign = one if d > zero else (-one if d < zero else zero)
         slope = _blur(blurred, j, 3) + s * _blur(blurred, j + 512, 3) + d * _blur(blurred, j + 1024, 3)
-        out[j] = l1 * sign + ssim * slope
+        out[j] = l1 * sign + l2 * d + ssim * slope
 
 
 @compiled("void(float32[::1], float32[::1], float64[::1])", fastmath=_FAST)
 def _add(differences: np.ndarray, values: np.ndarray, sums: np.ndarray) -> None:
-    """Add Σ|d| and Σ SSIM of a row, in float64."""
-    total, similar = 0.0, 0.0
+    """Add Σ|d|, Σ d² and Σ SSIM of a row, in float64."""
+    total, squares, similar = 0.0, 0.0, 0.0
     for j in range(len(values)):
-        total += np.float64(abs(differences[j]))
+        d = np.float64(differences[j])
+        total += abs(d)
+        squares += d * d
         similar += np.float64(values[j])
     sums[0] += total
-    sums[1] += similar
+    sums[1] += squares
+    sums[2] += similar
 
 
 @compiled("void(float32[::1], int64, int64)")
@@ -170,27 +175,31 @@ def _clear(ring: np.ndarray, slot: int, length: int) -> None:
         ring[(slot + 11) * length + j] = np.float32(0)
 
 
-@compiled("void(float32[:, ::1], float32[:, ::1], int64[::1], float32, float32, float32[:, ::1], float64[::1])")
+@compiled(
+    "void(float32[:, ::1], float32[:, ::1], int64[::1], float32, float32, float32, float32[:, ::1], float64[::1])"
+)
 def ssim_tile(
     image: np.ndarray,
     target: np.ndarray,
     tile: np.ndarray,
     l1: np.float32,
+    l2: np.float32,
     ssim: np.float32,
     gradient: np.ndarray,
     sums: np.ndarray,
 ) -> None:
-    """Compute sums over one tile, and ``l1`` times the gradient of Σ|image - target| plus ``ssim`` / 2 that of Σ SSIM.
+    """Compute sums over one tile, with d = image - target, and the gradient of l1 Σ|d| + l2 Σ d² / 2 + ssim Σ SSIM / 2.
 
     Args:
         image: ``(H, 3 W)``, interleaved channels of any values.
         target: ``(H, 3 W)``, interleaved channels of any values.
         tile: top, bottom, left, right, ends exclusive; columns count channels, at most 480. Pixels around the tile are
             read too, as far as the gradient depends on them.
-        l1: factor of the gradient of Σ|image - target|.
-        ssim: factor of half the gradient of Σ SSIM.
+        l1: weight of Σ|d|.
+        l2: weight of Σ d² / 2.
+        ssim: weight of Σ SSIM / 2.
         gradient: out, ``(H, 3 W)``, only the tile; ``(0, 0)`` for the sums only.
-        sums: ``(2,)``; Σ|image - target| and Σ SSIM over the tile are added.
+        sums: ``(3,)``; Σ|d|, Σ d² and Σ SSIM over the tile are added.
     """
     height, width = image.shape
     top, bottom, left, right = tile
@@ -224,7 +233,7 @@ def ssim_tile(
             continue
         y -= 5  # row of the gradient
         _blur_maps(map_ring[oldest * 1536 :], count + 30, blurred)
-        _gradient(blurred, ring[oldest * 1152 + 30 :], l1, ssim, gradient[y, left:right])
+        _gradient(blurred, ring[oldest * 1152 + 30 :], l1, l2, ssim, gradient[y, left:right])
 
 
 @compiled("void(float32[:, ::1], float32[:, ::1], int64[::1], float64[:, ::1])")

@@ -21,6 +21,9 @@ GROUPS: dict[str, type[BaseModel]] = {
 }
 
 
+STRUCTURE_WEIGHT = 0.4
+"""Weight of 1 - SSIM in the loss of training towards a limit of the loss of SSIM."""
+
 AIMED_DROP = 0.1
 """Loss of PSNR, decibels, that a search aims at where only its time is limited: few people see it."""
 
@@ -56,7 +59,7 @@ class Settings(BaseModel):
         return self.time_limit is not None and encode.rate_distortion and not encode.has_goal and not encode.rd_lambda
 
     def decided(self, *, photographs: bool, torch: bool) -> Self:
-        """Return settings with what they leave open decided: whether training serves the goal.
+        """Return settings with what they leave open decided: whether training serves the goal, and by which loss.
 
         A size, a loss or the smallest container in a limited time is served best by fewer Gaussians that are trained on
         photographs, and by fine-tuning. Pruning or training without photographs loses more in views that nobody knows
@@ -69,6 +72,9 @@ class Settings(BaseModel):
         """
         trains = (self.encode.has_goal or self.aims) and self.encode.psnr is None and photographs and torch
         compact, finetune = self.compact, self.finetune
+        if self.encode.max_ssim_drop is not None:
+            compact = compact.with_ssim_weight(STRUCTURE_WEIGHT)
+            finetune = finetune.with_ssim_weight(STRUCTURE_WEIGHT)
         if compact.auto_count is None or self.aims:
             wanted = trains and compact.trains and (compact.auto_count or not compact.enabled)
             compact = compact.model_copy(update={"auto_count": wanted})

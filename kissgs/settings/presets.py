@@ -71,6 +71,8 @@ COMPACT: dict[Preset, dict[str, Any]] = {
         "erank_weight": 0.01,
         "min_scale_weight": 1.0,
         "synthetic_view_share": 0.0,
+        "mse_weight": 0.0,
+        "dropout": 0.0,
         "means_lr_scale": 0.01,
         "lr_scale": 1.0,
         "final_lr_scale": 1.0,
@@ -83,7 +85,15 @@ FINETUNE: dict[Preset, dict[str, Any]] = {
     Preset.FAST: {"steps": 200},
     Preset.BALANCED: {},
     Preset.SMALL: {"steps": 2000},
-    Preset.PAPER: {"steps": 4000, "batch": 8, "rate_weight": 0.0, "tv_weight": 1.0, "synthetic_view_share": 0.0},
+    Preset.PAPER: {
+        "steps": 4000,
+        "batch": 8,
+        "mse_weight": 0.0,
+        "dropout": 0.0,
+        "rate_weight": 0.0,
+        "tv_weight": 1.0,
+        "synthetic_view_share": 0.0,
+    },
 }
 
 PRESETS = {

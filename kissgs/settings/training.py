@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Self
+
 from pydantic import BaseModel, ConfigDict, Field
+
+SSIM_WEIGHT = 0.2
+"""Weight of 1 - SSIM in the loss of 3DGS."""
 
 
 class TrainingViewSettings(BaseModel):
@@ -10,7 +15,23 @@ class TrainingViewSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    ssim_weight: float = Field(0.2, ge=0, le=1, description="Weight of 1 - SSIM in the loss; the rest is L1.")
+    ssim_weight: float | None = Field(
+        None,
+        ge=0,
+        le=1,
+        description="Weight of 1 - SSIM in the loss; L1 has the rest. auto: 0.4 where max_ssim_drop of encode is the "
+        "goal, else 0.2.",
+    )
+    mse_weight: float = Field(
+        5.0, ge=0, le=1000, description="Weight of the mean squared error in the loss, added to SSIM and L1."
+    )
+    dropout: float = Field(
+        0.02,
+        ge=0,
+        le=0.5,
+        description="With photographs: share of the Gaussians that each training step leaves out at random, so that "
+        "other views are rendered better.",
+    )
     synthetic_view_share: float = Field(
         0.1,
         ge=0,
@@ -33,3 +54,12 @@ class TrainingViewSettings(BaseModel):
         description="Seed of the order of the training images and of the virtual cameras. Equal seeds give equal "
         "scenes.",
     )
+
+    @property
+    def loss_ssim_weight(self) -> float:
+        """Weight of 1 - SSIM in the loss, as given or the usual one."""
+        return SSIM_WEIGHT if self.ssim_weight is None else self.ssim_weight
+
+    def with_ssim_weight(self, weight: float) -> Self:
+        """Return a copy with this weight of 1 - SSIM, unless one is given."""
+        return self if self.ssim_weight is not None else self.model_copy(update={"ssim_weight": weight})

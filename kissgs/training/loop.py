@@ -33,6 +33,9 @@ MOST_STEPS = 2
 SMOOTHING = 0.98
 """Weight of the former value in the running means of loss and squared error."""
 
+HIDDEN = -30.0
+"""Opacity logit that no renderer draws."""
+
 Parameters = tensors.Parameters
 """Stored parameters of a scene, by name; the type that regularizers receive."""
 
@@ -76,18 +79,22 @@ class TrainingPlan:
         pace: number of steps.
         rates: learning rates.
         ssim_weight: weight of 1 - SSIM in the loss, 0 to 1; the mean absolute difference has the rest.
+        mse_weight: weight of the mean squared difference, beside these.
         seed: seed of the order of the images, one number or several.
         regularizers: further loss terms.
         batch: number of images in each step.
+        dropout: share of the Gaussians that each step leaves out, 0 to 1.
     """
 
     stage: str
     pace: Pace
     rates: LrSchedule
     ssim_weight: float
+    mse_weight: float
     seed: Sequence[int]
     regularizers: tuple[Regularizer, ...] = ()
     batch: int = 1
+    dropout: float = 0.0
 
 
 def train(
@@ -102,7 +109,7 @@ def train(
 ) -> None:
     """Fit a scene to target images, from step ``first`` on.
 
-    The loss is that of 3DGS (Kerbl et al. 2023, equation 7) plus the plan's regularizers. On the CPU, the result
+    The loss is :func:`kissgs.rendering.losses.photometric_loss` plus the plan's regularizers. On the CPU, the result
     depends on the seed but not on the number of threads; on a GPU it is not reproducible.
 
     Args:
@@ -122,10 +129,17 @@ def train(
         while step < pace.steps:
             progress(plan.stage, step / pace.steps, running.text(len(scene)))
             parameters = scene.gaussians()
+            drawn = without_some(parameters, plan.dropout, (*plan.seed, step)) if plan.dropout else parameters
             losses, errors = [], []
             for n in islice(order, plan.batch):
                 loss, error = image_loss(
-                    parameters, targets, n, ssim_weight=plan.ssim_weight, threads=threads, receive=scene.receive
+                    drawn,
+                    targets,
+                    n,
+                    ssim_weight=plan.ssim_weight,
+                    mse_weight=plan.mse_weight,
+                    threads=threads,
+                    receive=scene.receive,
                 )
                 losses.append(loss)
                 errors.append(error)
@@ -144,12 +158,26 @@ def train(
     progress(plan.stage, 1.0, running.text(len(scene)))
 
 
+def without_some(parameters: Parameters, share: float, seed: Sequence[int]) -> Parameters:
+    """Return a scene in which a random ``share`` of the Gaussians is transparent, and the others more opaque.
+
+    So no Gaussian comes to depend on what few others hide, and renderings from other cameras are better: Park, Ryu and
+    Kim, "DropGaussian: Structural Regularization for Sparse-view Gaussian Splatting", CVPR 2025. Its factor
+    1 / (1 - share) of the opacity is one of its odds here: it never exceeds 1, and its gradient is the same.
+    """
+    opacities = parameters["opacities"]
+    dropped = np.random.default_rng(seed).random(len(opacities), dtype=np.float32) < share
+    denser = opacities - math.log1p(-share)
+    return {**parameters, "opacities": denser.masked_fill(torch.from_numpy(dropped).to(denser.device), HIDDEN)}
+
+
 def image_loss(
     parameters: Parameters,
     targets: TrainingTargets,
     n: int,
     *,
     ssim_weight: float,
+    mse_weight: float,
     threads: int,
     receive: Callable[[Gradients], None] | None = None,
 ) -> tuple[Tensor, float]:
@@ -170,7 +198,7 @@ def image_loss(
         receive=receive,
     )
     targets_there = torch.from_numpy(target)[None].to(image.device)
-    loss = photometric_loss(image, targets_there, ssim_weight=ssim_weight, threads=threads)
+    loss = photometric_loss(image, targets_there, ssim_weight=ssim_weight, mse_weight=mse_weight, threads=threads)
     return loss, float(np.square(image[0].detach().cpu().numpy() - target).mean())
 
 

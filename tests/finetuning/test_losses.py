@@ -1,5 +1,6 @@
-"""Rate and total variation losses. Oracle: entropies and differences computed one by one in Python."""
+"""Rate and total variation losses. Oracle: entropies and differences computed one by one in Python; WebP files."""
 
+import io
 import math
 from collections import Counter
 
@@ -8,6 +9,7 @@ import pytest
 import torch
 from helpers.training_scenes import cloud
 from helpers.tuning_scenes import chosen, shuffled
+from PIL import Image
 
 from kissgs.core.deadline import Pace
 from kissgs.finetuning.losses import ENTROPY_FIELDS, PAPER_TV_WEIGHTS, RateLoss, TotalVariationLoss
@@ -32,6 +34,26 @@ def symbols(scene, name):
     return np.rint((scene.planes[name].base_multiples + scene.latents[name]).detach().numpy()).astype(int)
 
 
+def neighbour_bits(levels):
+    """Return bits of ``(S, S, 3, 15)`` levels by the differences of neighbours, after green is subtracted."""
+    side, bits = len(levels), 0.0
+    for color in range(3):
+        for coefficient in range(15):
+            tile = levels[:, :, color, coefficient].astype(float)
+            if color != 1:
+                tile = tile - levels[:, :, 1, coefficient]
+            beside = [abs(tile[y, x] - tile[y, x - 1]) for y in range(side) for x in range(1, side)]
+            above = [abs(tile[y, x] - tile[y - 1, x]) for y in range(1, side) for x in range(side)]
+            both = (np.mean(beside) + np.mean(above)) / 2
+            bits += (sum(beside) + sum(above)) / 2 / ((both + 0.3) * math.log(2))
+    return bits
+
+
+def codebook_levels(scene):
+    side = math.isqrt(len(scene.latents["f_rest_centroids"]))
+    return symbols(scene, "f_rest_centroids").reshape(side, side, 3, 15)
+
+
 @pytest.mark.parametrize("preset", ["balanced", "fast"])
 def test_bits_are_the_entropy_of_levels_per_class(preset):
     scene = quantized(preset=preset)
@@ -43,8 +65,42 @@ def test_bits_are_the_entropy_of_levels_per_class(preset):
         for kind in set(scene.classes):
             for column in rows[scene.classes == kind].T:
                 bits += sum(-times * math.log2(times / len(column)) for times in Counter(column).values())
-    found = value(RateLoss(scene, 0.5).penalty(0, {}))
+    found = value(RateLoss(scene, 0.5).penalty(0, {})) - 0.5 * neighbour_bits(codebook_levels(scene))
     assert found == pytest.approx(0.5 * bits, rel=0.03)  # unused levels have a small probability
+
+
+@pytest.mark.parametrize("degree", [1, 3])
+def test_the_rate_of_a_square_codebook_is_that_of_differences_of_neighbours(degree):
+    scene = quantized(degree=degree)
+    loss = RateLoss(scene, 1.0)
+    former = value(loss.penalty(0, {})), neighbour_bits(codebook_levels(scene))
+    latents = scene.latents["f_rest_centroids"]
+    plane, moves = scene.planes["f_rest_centroids"], np.random.default_rng(0).integers(-2, 3, latents.shape)
+    latents.data += latents.new_tensor(moves)
+    latents.data.clamp_(plane.min_latent, plane.max_latent)
+    round_latents(scene)
+    later = value(loss.penalty(25, {})), neighbour_bits(codebook_levels(scene))
+    assert later[0] - former[0] == pytest.approx(later[1] - former[1], rel=1e-3)
+    assert later[1] > former[1] + 10
+
+
+def test_the_rate_makes_the_image_of_the_codebook_smaller():
+    scene = quantized(degree=3)
+    shuffled(scene, far=1.0)
+    loss, rates = RateLoss(scene, 1e-3), {**dict.fromkeys(scene.latents, 0.2), "attraction": 0.0}
+
+    def size():
+        levels = codebook_levels(scene) - codebook_levels(scene).min()
+        side, stored = len(levels), io.BytesIO()
+        image = levels.reshape(side, side, 3, 3, 5).transpose(3, 0, 4, 1, 2).reshape(3 * side, 5 * side, 3)
+        Image.fromarray(image.astype(np.uint8)).save(stored, "WEBP", lossless=True)
+        return len(stored.getvalue())
+
+    before = size()
+    for step in range(40):
+        loss.penalty(step, {}).backward()
+        scene.step(rates)
+    assert size() < 0.9 * before
 
 
 def test_bits_of_a_sog_codebook_have_one_code_per_colour():

@@ -36,7 +36,7 @@ def trained(splats, camera):
     away = np.linalg.norm(splats.means.astype(np.float64) - camera.position, axis=1)
     targets, rates = stripes(camera), RATES | {"means": RATES["means"] * (np.median(away) if len(away) else 1.0)}
     model = GaussianModel(splats)
-    train(model, targets, TrainingPlan("step", Pace(STEPS), lambda done: rates, 0.2, [0]), threads=1)
+    train(model, targets, TrainingPlan("step", Pace(STEPS), lambda done: rates, 0.2, 0.0, [0]), threads=1)
     wanted, clear = oracle(splats, targets, rates)
     worst = 0.0
     for name in ATTRIBUTES:

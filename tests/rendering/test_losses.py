@@ -12,7 +12,7 @@ from kissgs.rendering.losses import photometric_loss, plain_photometric_loss
 from kissgs.rendering.metrics import ssim
 
 
-def textbook_loss(image, target, weight=0.2):
+def textbook_loss(image, target, weight=0.2, mse_weight=0.0):
     """Return the loss by means, variances and the covariance of both images, in float64."""
     profile = np.exp(-(np.arange(-5.0, 6.0) ** 2) / (2 * 1.5**2))
     profile /= profile.sum()
@@ -24,7 +24,8 @@ def textbook_loss(image, target, weight=0.2):
     mx, my = blur(x), blur(y)
     vx, vy, cov = blur(x * x) - mx**2, blur(y * y) - my**2, blur(x * y) - mx * my
     similarity = (2 * mx * my + 1e-4) * (2 * cov + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))
-    return (1 - weight) * np.abs(x - y).mean() + weight * (1 - similarity.mean())
+    l1, squares = np.abs(x - y).mean(), np.square(x - y).mean()
+    return (1 - weight) * l1 + weight * (1 - similarity.mean()) + mse_weight * squares
 
 
 def pair(*shape, seed=0):
@@ -45,13 +46,17 @@ def gradient_of(loss, image):
 SIZES = [(1, 1), (1, 30), (7, 4), (11, 11), (40, 23), (130, 9), (8, 170), (140, 330)]
 
 
-@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+WEIGHTS = [(0.0, 0.0), (0.2, 0.0), (1.0, 0.0), (0.2, 5.0), (1.0, 100.0)]
+
+
+@pytest.mark.parametrize(("weight", "mse_weight"), WEIGHTS)
 @pytest.mark.parametrize(("height", "width"), SIZES)
-def test_the_value_agrees_with_the_textbook_formula(height, width, weight):
+def test_the_value_agrees_with_the_textbook_formula(height, width, weight, mse_weight):
     image, target = pair(height, width, 3)
-    expected = textbook_loss(image, target, weight)
-    assert photometric_loss(image, target, ssim_weight=weight).item() == pytest.approx(expected, abs=1e-6)
-    plain = plain_photometric_loss(image.double(), target.double(), weight)
+    expected = textbook_loss(image, target, weight, mse_weight)
+    loss = photometric_loss(image, target, ssim_weight=weight, mse_weight=mse_weight)
+    assert loss.item() == pytest.approx(expected, abs=1e-6)
+    plain = plain_photometric_loss(image.double(), target.double(), weight, mse_weight)
     assert plain.item() == pytest.approx(expected, abs=1e-12)
 
 
@@ -68,14 +73,15 @@ def test_the_gradient_agrees_with_finite_differences(weight):
     np.testing.assert_allclose(gradient, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize(("weight", "mse_weight"), WEIGHTS)
 @pytest.mark.parametrize(("height", "width"), SIZES)
 @pytest.mark.quick(8)
-def test_the_gradient_agrees_with_autograd_in_float64(height, width, weight):
+def test_the_gradient_agrees_with_autograd_in_float64(height, width, weight, mse_weight):
     """Sizes include several tiles and images smaller than the window."""
     image, target = pair(height, width, 3)
-    gradient = gradient_of(lambda leaf: photometric_loss(leaf, target, ssim_weight=weight), image)
-    expected = gradient_of(lambda leaf: plain_photometric_loss(leaf, target.double(), weight), image.double())
+    weights = {"ssim_weight": weight, "mse_weight": mse_weight}
+    gradient = gradient_of(lambda leaf: photometric_loss(leaf, target, **weights), image)
+    expected = gradient_of(lambda leaf: plain_photometric_loss(leaf, target.double(), **weights), image.double())
     torch.testing.assert_close(gradient.double(), expected, rtol=0, atol=3e-5 * expected.abs().max().item())
 
 

@@ -17,7 +17,7 @@ from scipy.signal import convolve2d
 
 from kissgs.core.errors import InvalidViewsError
 from kissgs.core.threads import Workers
-from kissgs.rendering.metrics import difference_and_ssim, ms_ssim, psnr, ssim
+from kissgs.rendering.metrics import differences_and_ssim, ms_ssim, psnr, ssim
 
 C1, C2 = 0.01**2, 0.03**2
 
@@ -228,7 +228,7 @@ def test_the_result_does_not_depend_on_threads():
     for threads in (1, 2, 5):
         gradient = np.full_like(images, np.nan)
         with Workers(threads) as pool:
-            sums = difference_and_ssim(images, targets, pool, gradient, (0.3, -0.2))
+            sums = differences_and_ssim(images, targets, pool, gradient, (0.3, 0.7, -0.2))
         results.append((sums.tobytes(), gradient.tobytes()))
         assert np.isfinite(gradient).all()
     assert results[0] == results[1] == results[2]

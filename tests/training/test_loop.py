@@ -7,9 +7,11 @@ from helpers.training_scenes import around, cloud, same, targets_of
 
 import kissgs
 from kissgs.core.deadline import Pace
+from kissgs.rendering.differentiable import rasterize
 from kissgs.rendering.losses import plain_photometric_loss
 from kissgs.rendering.rasterizer import render
-from kissgs.training.loop import TrainingPlan, exponential_lr, train
+from kissgs.rendering.tensors import tensors_of
+from kissgs.training.loop import TrainingPlan, exponential_lr, train, without_some
 from kissgs.training.model import GaussianModel
 
 RATES = {"means": 2e-3, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 1e-2, "shN": 1e-3}
@@ -22,6 +24,7 @@ def plan(steps=30, **changes):
             "pace": Pace(steps),
             "rates": lambda done: RATES,
             "ssim_weight": 0.2,
+            "mse_weight": 0.0,
             "seed": (0,),
             **changes,
         }
@@ -31,6 +34,19 @@ def plan(steps=30, **changes):
 def error(scene, targets):
     images = [render(scene, camera)[0] for camera in targets.cameras]
     return np.mean([(image - targets.image(n)) ** 2 for n, image in enumerate(images)])
+
+
+def rasterize_one(parameters):
+    """Return the rendering of ``parameters`` from the first camera."""
+    camera = around(1)[0].camera
+    image, _ = rasterize(
+        parameters,
+        viewmats=torch.from_numpy(camera.viewmat)[None],
+        Ks=torch.from_numpy(camera.K)[None],
+        width=camera.width,
+        height=camera.height,
+    )
+    return image[0].numpy()
 
 
 def dimmed(scene):
@@ -57,10 +73,11 @@ def test_a_scene_stays_if_its_renderings_are_the_targets():
     np.testing.assert_allclose(model.splats().means, scene.means, atol=1e-7)
 
 
-def test_an_interrupted_training_resumes_exactly():
+@pytest.mark.parametrize("dropout", [0.0, 0.2])
+def test_an_interrupted_training_resumes_exactly(dropout):
     scene = cloud(40)
     targets, whole = targets_of(scene), GaussianModel(dimmed(scene))
-    train(whole, targets, plan(23))
+    train(whole, targets, plan(23, dropout=dropout))
     steps = []
 
     def stop(stage, fraction, note=""):
@@ -69,10 +86,10 @@ def test_an_interrupted_training_resumes_exactly():
 
     first = GaussianModel(dimmed(scene))
     with pytest.raises(kissgs.Cancelled):
-        train(first, targets, plan(23), after=steps.append, progress=stop)
+        train(first, targets, plan(23, dropout=dropout), after=steps.append, progress=stop)
     assert steps == list(range(1, 10))
     second = GaussianModel.restored(first.state())
-    train(second, targets, plan(23), first=9)
+    train(second, targets, plan(23, dropout=dropout), first=9)
     assert same(whole.splats(), second.splats())
 
 
@@ -93,6 +110,40 @@ def test_the_result_depends_on_the_seed():
     for seed in (0, 1):
         model = GaussianModel(dimmed(scene))
         train(model, targets_of(scene), plan(7, seed=(seed,)))
+        found.append(model.splats())
+    assert not same(*found)
+
+
+def test_dropout_leaves_out_a_share_of_the_gaussians_and_others_in_each_step():
+    scene, hidden = cloud(1000, 0), []
+    odds = np.exp(scene.opacities.astype(np.float64))
+    for step in range(20):
+        parameters = without_some(tensors_of(scene), 0.1, (3, step))
+        logits = parameters["opacities"].numpy()
+        hidden.append(logits < -20)
+        rest = scene.select(~hidden[-1])
+        np.testing.assert_allclose(np.exp(logits[~hidden[-1]]), odds[~hidden[-1]] / 0.9, rtol=1e-5)
+        rest.opacities[:] = logits[~hidden[-1]]
+        np.testing.assert_array_equal(rasterize_one(parameters), render(rest, around(1)[0].camera)[0])
+    assert np.mean(hidden) == pytest.approx(0.1, abs=0.01)
+    assert np.any(hidden, axis=0).mean() == pytest.approx(1 - 0.9**20, abs=0.06)
+    again = without_some(tensors_of(scene), 0.1, (3, 19))["opacities"].numpy() < -20
+    assert (again == hidden[-1]).all()
+
+
+def test_hidden_gaussians_are_not_trained_but_seen_by_regularizers():
+    scene, pull = cloud(40), PullToOrigin()
+    model = GaussianModel(scene)
+    train(model, targets_of(dimmed(scene)), plan(1, dropout=1 - 1e-9, regularizers=(pull,)))
+    assert same(model.splats(), scene)
+    assert pull.penalized == [0]
+
+
+def test_the_squared_error_counts_in_the_loss():
+    scene, found = cloud(40), []
+    for weight in (0.0, 50.0):
+        model, targets = GaussianModel(dimmed(scene)), targets_of(scene)
+        train(model, targets, plan(60, mse_weight=weight))
         found.append(model.splats())
     assert not same(*found)
 
