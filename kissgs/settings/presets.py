@@ -71,6 +71,7 @@ COMPACT: dict[Preset, dict[str, Any]] = {
         "erank_weight": 0.01,
         "min_scale_weight": 1.0,
         "synthetic_view_share": 0.0,
+        "ssim_weight": 0.2,
         "mse_weight": 0.0,
         "dropout": 0.0,
         "means_lr_scale": 0.01,
@@ -88,6 +89,7 @@ FINETUNE: dict[Preset, dict[str, Any]] = {
     Preset.PAPER: {
         "steps": 4000,
         "batch": 8,
+        "ssim_weight": 0.2,
         "mse_weight": 0.0,
         "dropout": 0.0,
         "rate_weight": 0.0,

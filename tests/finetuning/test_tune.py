@@ -48,10 +48,13 @@ def tuned(scene, *, checkpoint=None, progress=None, preset="fast", encode=COARSE
 
 
 def test_fine_tuning_raises_the_psnr_to_the_original_scene():
-    """Mean of four scenes: with twelve small training images each, single gains are 0.7 to 2.0 dB."""
+    """Mean of four scenes: with twelve small training images each, single gains are 1.1 to 2.0 dB.
+
+    Bits have no weight, which would trade PSNR for them.
+    """
     gains = []
     for seed in range(4):
-        encoded, report = tuned(cloud(150, 2, seed), steps=150)
+        encoded, report = tuned(cloud(150, 2, seed), steps=150, rate_weight=0)
         gains.append(report.psnr_after - report.psnr_before)
         assert report.kept
         assert report.target_source == "renderings"

@@ -105,6 +105,19 @@ def test_what_settings_leave_open(given, compacts, tunes):
     )
 
 
+@pytest.mark.parametrize(
+    ("goal", "given", "weights"),
+    [
+        ({"max_psnr_drop": 0.1}, {}, (0.3, 0.3)),
+        ({"max_ssim_drop": 0.01}, {}, (0.4, 0.4)),
+        ({"max_psnr_drop": 0.1, "max_ssim_drop": 0.01}, {"compact": {"ssim_weight": 0.1}}, (0.1, 0.4)),
+    ],
+)
+def test_towards_a_goal_of_ssim_training_gives_it_more_weight(goal, given, weights):
+    chosen = Settings.from_preset("balanced", **goal, **given).decided(photographs=True, torch=True)
+    assert (chosen.compact.loss_ssim_weight, chosen.finetune.loss_ssim_weight) == weights
+
+
 def test_without_torch_the_report_says_what_is_missing(tmp_path, monkeypatch):
     monkeypatch.setattr("kissgs.pipeline.training_choice.find_spec", lambda name: None)
     scene = cloud(100)
