@@ -15,8 +15,8 @@ DOUBLINGS_PER_HALVING = 4.0
 MAX_HALVINGS = 1.3
 """Largest step of the search."""
 
-NEAR_HALVINGS, NEAR_IN_TIME = 0.1, 0.03
-"""Step below which a container that meets the goal ends the search: another one would save some 5 % of its bytes, or
+NEAR_HALVINGS, NEAR_IN_TIME = 0.15, 0.03
+"""Step below which a container that meets the goal ends the search: another one would save some 7 % of its bytes, or
 2 %, which is worth a time that the user has given."""
 
 CAUTION_HALVINGS, SIZE_CAUTION_HALVINGS = 0.1, 0.02
