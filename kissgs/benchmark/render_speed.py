@@ -17,6 +17,7 @@ from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.rasterizer import load_kernels, removal_scores, render
+from kissgs.settings import CompactSettings
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -152,7 +153,16 @@ def _training_steps(model: GaussianModel, camera: Camera, threads: int) -> list[
 
     grey = np.full((camera.height, camera.width, 3), 0.5, np.float16)
     targets = TrainingTargets((camera,), (grey,), np.zeros(3, np.float32), "renderings")
-    plan = TrainingPlan("measure", Pace(REPEATS + 1), lambda done: NO_RATES, ssim_weight=0.2, mse_weight=0.0, seed=(0,))
+    settings = CompactSettings()
+    plan = TrainingPlan(
+        "measure",
+        Pace(REPEATS + 1),
+        lambda done: NO_RATES,
+        ssim_weight=settings.used_ssim_weight,
+        mse_weight=settings.mse_weight,
+        seed=(0,),
+        dropout=settings.dropout,
+    )
     ends: list[float] = []
     train(model, targets, plan, after=lambda done: ends.append(time.process_time()), threads=threads)
     return (1e3 * np.diff(ends)).tolist()

@@ -12,8 +12,8 @@ from kissgs.core.array_types import Float32
 from kissgs.finetuning.even_plane import EvenPlane
 from kissgs.planning.sh_codebook import COEFFICIENTS
 
-MIN_DIFFERENCE = 0.3
-"""Added to mean differences, levels: an image of few levels is not worth all its bits."""
+DIFFERENCE_OFFSET = 0.3
+"""Added to mean differences, levels; it bounds the bits of a level where neighbours are nearly equal."""
 
 
 class CodebookRate:
@@ -25,8 +25,8 @@ class CodebookRate:
     constant is left out.
 
     Attributes:
-        table: ``(3, 15)`` float32, mean difference by colour and coefficient, levels; the colours are
-            red - green, green and blue - green.
+        table: ``(3, 15)`` float32, mean difference by colour and coefficient, plus :data:`DIFFERENCE_OFFSET`,
+            levels; the colours are red - green, green and blue - green.
     """
 
     table: Float32[np.ndarray, "3 15"]
@@ -43,7 +43,7 @@ class CodebookRate:
             beside, above = self._differences(torch.round(self._base + latents) - self._base)
         # By NumPy, whose sums do not depend on the number of threads.
         means = [difference.abs().cpu().numpy().mean(axis=(0, 1), dtype=np.float64) for difference in (beside, above)]
-        self.table = (np.mean(means, axis=0) + MIN_DIFFERENCE).astype(np.float32)
+        self.table = (np.mean(means, axis=0) + DIFFERENCE_OFFSET).astype(np.float32)
 
     def bits(self, latents: Float32[Tensor, "entries 45"]) -> Tensor:
         """Return the bits of all levels together but for a constant, a scalar."""

@@ -1,4 +1,4 @@
-"""Loss terms of fine-tuning for the size of the container: entropy of the levels, and total variation."""
+"""Loss terms of fine-tuning for the size of the container: estimated bits of the levels, and total variation."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ In a square they predict each other (:class:`kissgs.finetuning.codebook_rate.Cod
 """
 
 RECOUNT_STEPS = 25
-"""Number of steps between two updates of the histograms."""
+"""Number of steps between two updates of the histograms and of the mean differences."""
 
 
 class RateLoss:
@@ -62,7 +62,7 @@ class RateLoss:
             self._rates["f_rest_centroids"] = _LevelRate(codebook, np.zeros(len(codebook.first), np.int64), colors)
 
     def penalty(self, step: int, parameters: Parameters) -> Tensor | None:
-        """Return the weighted bits of the current levels; ``parameters`` are not used."""
+        """Return the weighted bits of the current levels, but for a constant; ``parameters`` are not used."""
         if self._weight == 0 or len(self._scene) == 0:
             return None
         latents = self._scene.latents
@@ -72,7 +72,7 @@ class RateLoss:
         return self._weight * sum((rate.bits(latents[name]) for name, rate in self._rates.items()), torch.tensor(0.0))
 
     def update(self, step: int, scene: TrainableScene) -> None:
-        """Do nothing: the histograms are updated by :meth:`penalty`."""
+        """Do nothing: :meth:`penalty` updates what it needs."""
 
     def state(self) -> dict[str, np.ndarray]:
         """Return the rate tables by field, see :meth:`restore`."""

@@ -176,9 +176,11 @@ class QuantizedScene:
         for name, latents in self.latents.items():
             after[name] = self.planes[name].quantized(latents, tables.get(name))
         errors = dict(self._plan.errors)
+        used = np.unique(self._labels.index.cpu().numpy())  # the rate moves other entries too, which matter to nothing
         for name, error in errors.items():
             one, other = (_values(name, fields) for fields in (before, after))
-            moved = np.abs(other - one).max(axis=0, initial=0.0)
+            moved = np.abs(other - one)
+            moved = (moved[used] if name == "f_rest_centroids" else moved).max(axis=0, initial=0.0)
             errors[name] = (np.array(error) + moved[: len(error)]).tolist()
         fields = {
             name: after[name] if name == "f_rest_centroids" else after[name].take(grid.cell_to_gaussian)

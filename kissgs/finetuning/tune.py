@@ -260,7 +260,7 @@ class Tuner:
             stage="finetune",
             pace=pace,
             rates=_lr_schedule(settings, self.targets),
-            ssim_weight=settings.loss_ssim_weight,
+            ssim_weight=settings.used_ssim_weight,
             mse_weight=settings.mse_weight,
             seed=(settings.seed,),
             regularizers=(rate_loss, TotalVariationLoss(scene, settings.tv_weight, pace)),
@@ -285,7 +285,7 @@ class Tuner:
                     parameters,
                     self.targets,
                     n,
-                    ssim_weight=settings.loss_ssim_weight,
+                    ssim_weight=settings.used_ssim_weight,
                     mse_weight=0.0,
                     threads=self.threads,
                 )

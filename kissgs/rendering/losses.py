@@ -28,6 +28,7 @@ def photometric_loss(
 ) -> Float[torch.Tensor, ""]:
     """Return (1 - w) · mean |d| + w · (1 - SSIM) + m · mean d², for the difference d = image - target.
 
+    Where |d| is above 1, 2 |d| - 1 takes the place of d², so that a diverged pixel does not outweigh all others.
     SSIM is that of :func:`kissgs.rendering.metrics.ssim`. With m = 0 it is the loss of Kerbl et al., "3D Gaussian
     Splatting for Real-Time Radiance Field Rendering", ACM Transactions on Graphics 42 (2023), equation 7. On the CPU in
     float32 the gradient is computed together with the value; elsewhere by autograd.
@@ -113,8 +114,12 @@ def plain_photometric_loss(
     P, Q = (SS - S * S).clamp_min(0), (DD - D * D).clamp_min(0)
     luminance = (S * S - D * D + 2e-4) / (S * S + D * D + 2e-4)
     structure = (P - Q + 18e-4) / (P + Q + 18e-4)
-    dissimilarity = 1 - (luminance * structure).mean()
-    return (1 - ssim_weight) * d.abs().mean() + ssim_weight * dissimilarity + mse_weight * d.square().mean()
+    dissimilarity, bounded = 1 - (luminance * structure).mean(), d.abs().clamp_max(1)
+    return (
+        (1 - ssim_weight) * d.abs().mean()
+        + ssim_weight * dissimilarity
+        + mse_weight * (bounded * (2 * d.abs() - bounded)).mean()
+    )
 
 
 def _blur(maps: torch.Tensor) -> torch.Tensor:

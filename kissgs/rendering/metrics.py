@@ -150,7 +150,7 @@ def differences_and_ssim(
         weights: weights of the three sums.
 
     Returns:
-        Σ |image - target|, Σ (image - target)² and Σ SSIM.
+        With d = image - target: Σ |d|, Σ d² (for |d| above 1, 2 |d| - 1 in its place) and Σ SSIM.
     """
     from kissgs.rendering import ssim_kernels
 

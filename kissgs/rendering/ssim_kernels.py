@@ -143,24 +143,26 @@ def _blur_maps(ring: np.ndarray, count: int, out: np.ndarray) -> None:
 def _gradient(
     blurred: np.ndarray, row: np.ndarray, l1: np.float32, l2: np.float32, ssim: np.float32, out: np.ndarray
 ) -> None:
-    """Blur the maps horizontally; write a weighted sum of the gradients of |d|, d² / 2 and SSIM / 2."""
+    """Blur the maps horizontally; write a weighted sum of the gradients of |d|, h(d) / 2 and SSIM / 2."""
     zero, one = np.float32(0), np.float32(1)
     for j in range(len(out)):
         s = row[j]
         d = row[j + 576]
         sign = one if d > zero else (-one if d < zero else zero)
         slope = _blur(blurred, j, 3) + s * _blur(blurred, j + 512, 3) + d * _blur(blurred, j + 1024, 3)
-        out[j] = l1 * sign + l2 * d + ssim * slope
+        bounded = one if d > one else (-one if d < -one else d)
+        out[j] = l1 * sign + l2 * bounded + ssim * slope
 
 
 @compiled("void(float32[::1], float32[::1], float64[::1])", fastmath=_FAST)
 def _add(differences: np.ndarray, values: np.ndarray, sums: np.ndarray) -> None:
-    """Add Σ|d|, Σ d² and Σ SSIM of a row, in float64."""
+    """Add Σ|d|, Σ h(d) and Σ SSIM of a row, in float64."""
     total, squares, similar = 0.0, 0.0, 0.0
     for j in range(len(values)):
-        d = np.float64(differences[j])
-        total += abs(d)
-        squares += d * d
+        d = abs(np.float64(differences[j]))
+        bounded = min(d, 1.0)
+        total += d
+        squares += bounded * (2 * d - bounded)
         similar += np.float64(values[j])
     sums[0] += total
     sums[1] += squares
@@ -188,7 +190,9 @@ def ssim_tile(
     gradient: np.ndarray,
     sums: np.ndarray,
 ) -> None:
-    """Compute sums over one tile, with d = image - target, and the gradient of l1 Σ|d| + l2 Σ d² / 2 + ssim Σ SSIM / 2.
+    """Compute sums over one tile, and the gradient of l1 Σ|d| + l2 Σ h(d) / 2 + ssim Σ SSIM / 2.
+
+    d is image - target; h(d) is d² up to |d| = 1, and 2 |d| - 1 beyond.
 
     Args:
         image: ``(H, 3 W)``, interleaved channels of any values.
@@ -196,10 +200,10 @@ def ssim_tile(
         tile: top, bottom, left, right, ends exclusive; columns count channels, at most 480. Pixels around the tile are
             read too, as far as the gradient depends on them.
         l1: weight of Σ|d|.
-        l2: weight of Σ d² / 2.
+        l2: weight of Σ h(d) / 2.
         ssim: weight of Σ SSIM / 2.
         gradient: out, ``(H, 3 W)``, only the tile; ``(0, 0)`` for the sums only.
-        sums: ``(3,)``; Σ|d|, Σ d² and Σ SSIM over the tile are added.
+        sums: ``(3,)``; Σ|d|, Σ h(d) and Σ SSIM over the tile are added.
     """
     height, width = image.shape
     top, bottom, left, right = tile

@@ -51,7 +51,7 @@ class FinetuneSettings(TrainingViewSettings):
         ge=0,
         le=100,
         description="Weight of the estimated rate against the image error, in units of the rd_lambda by which the "
-        "levels were chosen. Moves levels to frequent ones.",
+        "levels were chosen. Moves levels to frequent ones, and entries of the codebook towards their neighbours.",
     )
     tv_weight: float = Field(
         0.0,

@@ -13,6 +13,7 @@ from kissgs.settings.duration import Duration
 from kissgs.settings.encode import EncodeSettings
 from kissgs.settings.finetune import FinetuneSettings
 from kissgs.settings.presets import PRESETS, Preset
+from kissgs.settings.training import SSIM_GOAL_WEIGHT, SSIM_WEIGHT
 
 GROUPS: dict[str, type[BaseModel]] = {
     "compact": CompactSettings,
@@ -20,9 +21,6 @@ GROUPS: dict[str, type[BaseModel]] = {
     "finetune": FinetuneSettings,
 }
 
-
-STRUCTURE_WEIGHT = 0.4
-"""Weight of 1 - SSIM in the loss of training towards a limit of the loss of SSIM."""
 
 AIMED_DROP = 0.1
 """Loss of PSNR, decibels, that a search aims at where only its time is limited: few people see it."""
@@ -72,9 +70,8 @@ class Settings(BaseModel):
         """
         trains = (self.encode.has_goal or self.aims) and self.encode.psnr is None and photographs and torch
         compact, finetune = self.compact, self.finetune
-        if self.encode.max_ssim_drop is not None:
-            compact = compact.with_ssim_weight(STRUCTURE_WEIGHT)
-            finetune = finetune.with_ssim_weight(STRUCTURE_WEIGHT)
+        ssim_weight = SSIM_WEIGHT if self.encode.max_ssim_drop is None else SSIM_GOAL_WEIGHT
+        compact, finetune = compact.with_ssim_weight(ssim_weight), finetune.with_ssim_weight(ssim_weight)
         if compact.auto_count is None or self.aims:
             wanted = trains and compact.trains and (compact.auto_count or not compact.enabled)
             compact = compact.model_copy(update={"auto_count": wanted})

@@ -6,8 +6,9 @@ from typing import Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
-SSIM_WEIGHT = 0.3
-"""Usual weight of 1 - SSIM in the loss; it was 0.2 in 3DGS, without the squared error."""
+SSIM_WEIGHT, SSIM_GOAL_WEIGHT = 0.3, 0.4
+"""Usual weight of 1 - SSIM in the loss, and that where a goal limits the loss of SSIM; 3DGS has 0.2, without the
+squared error."""
 
 
 class TrainingViewSettings(BaseModel):
@@ -19,8 +20,8 @@ class TrainingViewSettings(BaseModel):
         None,
         ge=0,
         le=1,
-        description="Weight of 1 - SSIM in the loss; L1 has the rest. auto: 0.4 where max_ssim_drop of encode is the "
-        "goal, else 0.3.",
+        description=f"Weight of 1 - SSIM in the loss; L1 has the rest of 1. auto: {SSIM_GOAL_WEIGHT} where "
+        f"max_ssim_drop of encode is given, else {SSIM_WEIGHT}.",
     )
     mse_weight: float = Field(
         5.0, ge=0, le=1000, description="Weight of the mean squared error in the loss, added to SSIM and L1."
@@ -56,7 +57,7 @@ class TrainingViewSettings(BaseModel):
     )
 
     @property
-    def loss_ssim_weight(self) -> float:
+    def used_ssim_weight(self) -> float:
         """Weight of 1 - SSIM in the loss, as given or the usual one."""
         return SSIM_WEIGHT if self.ssim_weight is None else self.ssim_weight
 

@@ -33,8 +33,11 @@ MOST_STEPS = 2
 SMOOTHING = 0.98
 """Weight of the former value in the running means of loss and squared error."""
 
-HIDDEN = -30.0
+TRANSPARENT = -30.0
 """Opacity logit that no renderer draws."""
+
+DROPOUT_STREAM = 7919
+"""Number that tells the random numbers of dropout from those of the order of the images."""
 
 Parameters = tensors.Parameters
 """Stored parameters of a scene, by name; the type that regularizers receive."""
@@ -79,11 +82,11 @@ class TrainingPlan:
         pace: number of steps.
         rates: learning rates.
         ssim_weight: weight of 1 - SSIM in the loss, 0 to 1; the mean absolute difference has the rest.
-        mse_weight: weight of the mean squared difference, beside these.
+        mse_weight: weight of the mean squared difference, added to both.
         seed: seed of the order of the images, one number or several.
         regularizers: further loss terms.
         batch: number of images in each step.
-        dropout: share of the Gaussians that each step leaves out, 0 to 1.
+        dropout: share of the Gaussians that each step leaves out, from 0 to below 1.
     """
 
     stage: str
@@ -119,8 +122,8 @@ def train(
         first: number of steps already done; without a deadline of the plan.
         after: called after each step with the number of steps done.
         threads: number of threads; 0 means one per processor.
-        progress: receives the plan's stage, with count, loss and PSNR to the targets as its note. If it raises, the
-            scene is in the state after the last completed step.
+        progress: receives the plan's stage, with count, loss and PSNR to the targets, both with dropout, as its note.
+            If it raises, the scene is in the state after the last completed step.
     """
     order, running = targets.order(plan.seed, first * plan.batch), RunningMeans()
     with torch_threads(threads), keep_free_memory():
@@ -129,11 +132,13 @@ def train(
         while step < pace.steps:
             progress(plan.stage, step / pace.steps, running.text(len(scene)))
             parameters = scene.gaussians()
-            drawn = without_some(parameters, plan.dropout, (*plan.seed, step)) if plan.dropout else parameters
+            rendered: Parameters = parameters
+            if plan.dropout:
+                rendered = with_dropout(parameters, plan.dropout, (*plan.seed, DROPOUT_STREAM, step))
             losses, errors = [], []
             for n in islice(order, plan.batch):
                 loss, error = image_loss(
-                    drawn,
+                    rendered,
                     targets,
                     n,
                     ssim_weight=plan.ssim_weight,
@@ -158,17 +163,19 @@ def train(
     progress(plan.stage, 1.0, running.text(len(scene)))
 
 
-def without_some(parameters: Parameters, share: float, seed: Sequence[int]) -> Parameters:
-    """Return a scene in which a random ``share`` of the Gaussians is transparent, and the others more opaque.
+def with_dropout(parameters: Parameters, share: float, seed: Sequence[int]) -> Parameters:
+    """Return a scene without a random ``share`` of its Gaussians, below 1: they become transparent.
 
-    So no Gaussian comes to depend on what few others hide, and renderings from other cameras are better: Park, Ryu and
-    Kim, "DropGaussian: Structural Regularization for Sparse-view Gaussian Splatting", CVPR 2025. Its factor
-    1 / (1 - share) of the opacity is one of its odds here: it never exceeds 1, and its gradient is the same.
+    Where few photographs are fitted, Gaussians come to correct each other's errors, which other views show; this keeps
+    them from it. Park, Ryu and Kim, "DropGaussian: Structural Regularization for Sparse-view Gaussian Splatting", CVPR
+    2025, multiply the opacities of the others by 1 / (1 - share); here their odds are multiplied, so that opacities
+    stay below 1.
     """
     opacities = parameters["opacities"]
     dropped = np.random.default_rng(seed).random(len(opacities), dtype=np.float32) < share
     denser = opacities - math.log1p(-share)
-    return {**parameters, "opacities": denser.masked_fill(torch.from_numpy(dropped).to(denser.device), HIDDEN)}
+    transparent = torch.from_numpy(dropped).to(denser.device)
+    return {**parameters, "opacities": denser.masked_fill(transparent, TRANSPARENT)}
 
 
 def image_loss(

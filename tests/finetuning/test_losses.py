@@ -12,6 +12,7 @@ from helpers.tuning_scenes import chosen, shuffled
 from PIL import Image
 
 from kissgs.core.deadline import Pace
+from kissgs.finetuning.codebook_rate import CodebookRate
 from kissgs.finetuning.losses import ENTROPY_FIELDS, PAPER_TV_WEIGHTS, RateLoss, TotalVariationLoss
 from kissgs.finetuning.quantized_scene import QuantizedScene
 from kissgs.sog.container_model import SOG
@@ -82,6 +83,30 @@ def test_the_rate_of_a_square_codebook_is_that_of_differences_of_neighbours(degr
     later = value(loss.penalty(25, {})), neighbour_bits(codebook_levels(scene))
     assert later[0] - former[0] == pytest.approx(later[1] - former[1], rel=1e-3)
     assert later[1] > former[1] + 10
+
+
+def test_the_gradient_of_the_codebooks_rate_is_that_of_its_bits():
+    scene = quantized(degree=1)
+    shuffled(scene)
+    loss, latents = RateLoss(scene, 1.0), scene.latents["f_rest_centroids"]
+    loss.penalty(0, {}).backward()
+    slopes = latents.grad.clone()
+    before = value(loss.penalty(1, {}))
+    latents.data += 1e-3 * slopes.sign()
+    assert value(loss.penalty(1, {})) - before == pytest.approx(1e-3 * float(slopes.abs().sum()), rel=0.05)
+
+
+def test_equal_entries_have_no_bits():
+    scene = quantized(degree=1)
+    rate = CodebookRate(scene.planes["f_rest_centroids"])
+    latents = scene.latents["f_rest_centroids"].detach()
+    base = scene.planes["f_rest_centroids"].base_multiples.float()
+    latents = (base[:1] - base).clone().requires_grad_()
+    rate.count(latents)
+    bits = rate.bits(latents)
+    bits.backward()
+    assert float(bits.detach()) == 0
+    assert (latents.grad == 0).all()
 
 
 def test_the_rate_makes_the_image_of_the_codebook_smaller():

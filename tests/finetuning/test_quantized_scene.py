@@ -69,6 +69,18 @@ def test_an_untrained_plan_is_unchanged(preset):
             assert not change.any()
 
 
+def test_errors_count_entries_that_gaussians_use_only():
+    scene = cloud(40, 1)
+    plan = chosen(scene, "fast")
+    work = QuantizedScene(plan, 1)
+    unused = np.setdiff1d(np.arange(len(plan.codebook.centroids.levels)), plan.codebook.labels)
+    assert len(unused) > 0
+    latents = work.latents["f_rest_centroids"]
+    latents.data[unused] += 5
+    latents.data.clamp_(work.planes["f_rest_centroids"].min_latent, work.planes["f_rest_centroids"].max_latent)
+    assert work.plan().errors["f_rest_centroids"] == plan.errors["f_rest_centroids"]
+
+
 def test_rounding_equals_that_of_the_encoder():
     """A value half-way between two levels goes to the same one in both."""
     scene = cloud(300, 1)

@@ -12,7 +12,10 @@ from helpers.tuning_scenes import Interrupted, chosen, stopping_after
 import kissgs
 from kissgs import FinetuneSettings, OutputError, Settings, UnsupportedError, decompress
 from kissgs.cameras.views import Views, black
+from kissgs.compaction.scene_training import SceneTraining
+from kissgs.compaction.schedule import Phase
 from kissgs.core.progress import silent
+from kissgs.finetuning.quantized_scene import QuantizedScene
 from kissgs.finetuning.tune import Tuner, _Result
 from kissgs.pipeline.inspect import describe
 from kissgs.sogxt.container import zip_bytes
@@ -23,6 +26,7 @@ from kissgs.training.checkpoint import Checkpoint
 SHORT = {"enabled": True, "steps": 12, "lr": 0.2, "codebook_lr": 0.3, "synthetic_lr_scale": 1.0}
 SHORT |= {"views": 16, "view_size": 60}
 GENTLE = {"steps": 60, "lr": 0.05, "codebook_lr": 0.05}
+LOSS = {"mse_weight", "dropout"}
 COARSE = {"scale_step": 0.4, "opacity_step": 1.0, "sh0_step": 0.3, "quat_step": 0.1}
 
 
@@ -61,6 +65,52 @@ def test_fine_tuning_raises_the_psnr_to_the_original_scene():
         assert report.bytes_after == len(zip_bytes(encoded.files))
         assert len(decompress(encoded.files)) == 150
     assert np.mean(gains) > 0.8
+
+
+def test_with_a_weight_of_bits_both_error_and_bytes_fall():
+    for seed in range(2):
+        _, report = tuned(cloud(150, 2, seed), steps=150)
+        assert report.kept
+        assert report.psnr_after > report.psnr_before
+        assert report.bytes_after < 0.97 * report.bytes_before
+
+
+@pytest.mark.parametrize(("preset", "weights"), [("balanced", (0.3, 5.0, 0.02)), ("paper", (0.2, 0.0, 0.0))])
+@pytest.mark.parametrize("stage", ["finetune", "compact"])
+@pytest.mark.parametrize("source", ["photos", "renderings"])
+def test_training_has_the_loss_and_the_dropout_of_the_settings(preset, weights, stage, source, monkeypatch):
+    plans, scene = [], cloud(40, 1)
+    monkeypatch.setattr(f"kissgs.{'finetuning.tune' if stage == 'finetune' else 'training.loop'}.train", capture(plans))
+    settings = getattr(Settings.from_preset(preset), stage)
+    work = tuner(scene, steps=2, ssim_weight=settings.ssim_weight, **settings.model_dump(include=LOSS))
+    targets = replace(work.targets, target_source=source)
+    if stage == "finetune":
+        plan = chosen(scene, "fast")
+        files = written(scene, Settings.from_preset("fast").encode)
+        replace(work, targets=targets)(plan, plan, scene, files)
+    else:
+        training = SceneTraining(scene, settings, work.supervision, 1, "cpu")
+        training.begin(targets)
+        training.train(Phase("refine", 1, 40), targets, (0,), progress=silent)
+    ssim, squares, dropout = weights
+    assert [(plan.ssim_weight, plan.mse_weight) for plan in plans] == [(ssim, squares)]
+    assert plans[0].dropout == (dropout if source == "photos" else 0)
+
+
+def test_the_derivative_of_the_loss_contains_the_weight_of_the_squared_error():
+    scene = cloud(100, 1)
+    quantized = QuantizedScene(chosen(scene, "fast"), 1)
+    found = [tuner(scene, mse_weight=weight)._loss_per_error(quantized) for weight in (0.0, 7.0)]
+    assert found[1] - found[0] == pytest.approx(7)
+
+
+def capture(plans):
+    """Return a function in place of the training loop, which keeps the plan."""
+
+    def train(scene, targets, plan, **others):
+        plans.append(plan)
+
+    return train
 
 
 def test_a_scene_without_sh_is_fine_tuned():

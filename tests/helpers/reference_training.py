@@ -36,7 +36,9 @@ def trained(splats, camera):
     away = np.linalg.norm(splats.means.astype(np.float64) - camera.position, axis=1)
     targets, rates = stripes(camera), RATES | {"means": RATES["means"] * (np.median(away) if len(away) else 1.0)}
     model = GaussianModel(splats)
-    train(model, targets, TrainingPlan("step", Pace(STEPS), lambda done: rates, 0.2, 0.0, [0]), threads=1)
+    train(
+        model, targets, TrainingPlan("step", Pace(STEPS), lambda done: rates, 0.2, mse_weight=5.0, seed=[0]), threads=1
+    )
     wanted, clear = oracle(splats, targets, rates)
     worst = 0.0
     for name in ATTRIBUTES:
@@ -58,7 +60,7 @@ def oracle(splats, targets, rates):
     for step in range(1, STEPS + 1):
         params = {name: leaf.clone().requires_grad_() for name, leaf in leaves.items()}
         loss = plain_photometric_loss(
-            reference_float64.draw(params, targets.cameras[0], targets.background).image, target, 0.2
+            reference_float64.draw(params, targets.cameras[0], targets.background).image, target, 0.2, 5.0
         )
         if loss.requires_grad:
             loss.backward()

@@ -115,7 +115,8 @@ def test_what_settings_leave_open(given, compacts, tunes):
 )
 def test_towards_a_goal_of_ssim_training_gives_it_more_weight(goal, given, weights):
     chosen = Settings.from_preset("balanced", **goal, **given).decided(photographs=True, torch=True)
-    assert (chosen.compact.loss_ssim_weight, chosen.finetune.loss_ssim_weight) == weights
+    assert chosen.decided(photographs=True, torch=True) == chosen
+    assert (chosen.compact.used_ssim_weight, chosen.finetune.used_ssim_weight) == weights
 
 
 def test_without_torch_the_report_says_what_is_missing(tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ from kissgs.rendering.differentiable import rasterize
 from kissgs.rendering.losses import plain_photometric_loss
 from kissgs.rendering.rasterizer import render
 from kissgs.rendering.tensors import tensors_of
-from kissgs.training.loop import TrainingPlan, exponential_lr, train, without_some
+from kissgs.training.loop import TrainingPlan, exponential_lr, train, with_dropout
 from kissgs.training.model import GaussianModel
 
 RATES = {"means": 2e-3, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 1e-2, "shN": 1e-3}
@@ -46,7 +46,7 @@ def rasterize_one(parameters):
         width=camera.width,
         height=camera.height,
     )
-    return image[0].numpy()
+    return image[0]
 
 
 def dimmed(scene):
@@ -118,34 +118,50 @@ def test_dropout_leaves_out_a_share_of_the_gaussians_and_others_in_each_step():
     scene, hidden = cloud(1000, 0), []
     odds = np.exp(scene.opacities.astype(np.float64))
     for step in range(20):
-        parameters = without_some(tensors_of(scene), 0.1, (3, step))
+        parameters = with_dropout(tensors_of(scene), 0.1, (3, step))
         logits = parameters["opacities"].numpy()
         hidden.append(logits < -20)
         rest = scene.select(~hidden[-1])
         np.testing.assert_allclose(np.exp(logits[~hidden[-1]]), odds[~hidden[-1]] / 0.9, rtol=1e-5)
         rest.opacities[:] = logits[~hidden[-1]]
-        np.testing.assert_array_equal(rasterize_one(parameters), render(rest, around(1)[0].camera)[0])
+        np.testing.assert_array_equal(rasterize_one(parameters).numpy(), render(rest, around(1)[0].camera)[0])
     assert np.mean(hidden) == pytest.approx(0.1, abs=0.01)
     assert np.any(hidden, axis=0).mean() == pytest.approx(1 - 0.9**20, abs=0.06)
-    again = without_some(tensors_of(scene), 0.1, (3, 19))["opacities"].numpy() < -20
+    again = with_dropout(tensors_of(scene), 0.1, (3, 19))["opacities"].numpy() < -20
     assert (again == hidden[-1]).all()
 
 
-def test_hidden_gaussians_are_not_trained_but_seen_by_regularizers():
-    scene, pull = cloud(40), PullToOrigin()
+def test_transparent_gaussians_are_not_trained_but_seen_by_regularizers():
+    class Opacities:
+        def penalty(self, step, parameters):
+            self.seen = parameters["opacities"].detach().numpy().copy()
+
+        def update(self, step, scene):
+            pass
+
+    scene, opacities = cloud(40), Opacities()
     model = GaussianModel(scene)
-    train(model, targets_of(dimmed(scene)), plan(1, dropout=1 - 1e-9, regularizers=(pull,)))
+    train(model, targets_of(dimmed(scene)), plan(1, dropout=1 - 1e-9, regularizers=(opacities,)))
     assert same(model.splats(), scene)
-    assert pull.penalized == [0]
+    np.testing.assert_array_equal(opacities.seen, scene.opacities)
 
 
 def test_the_squared_error_counts_in_the_loss():
-    scene, found = cloud(40), []
-    for weight in (0.0, 50.0):
-        model, targets = GaussianModel(dimmed(scene)), targets_of(scene)
-        train(model, targets, plan(60, mse_weight=weight))
-        found.append(model.splats())
-    assert not same(*found)
+    """The first step of Adam has the sign of the gradient; it is that of the loss by plain torch."""
+    scene, signs = cloud(40), []
+    targets = targets_of(scene, around(1))
+    for weight in (0.0, 1e3):
+        model = GaussianModel(dimmed(scene))
+        train(model, targets, plan(1, mse_weight=weight))
+        parameters = {name: value.requires_grad_() for name, value in tensors_of(dimmed(scene)).items()}
+        target = torch.from_numpy(targets.image(0))
+        plain_photometric_loss(rasterize_one(parameters), target, 0.2, weight).backward()
+        gradient = parameters["sh0"].grad.numpy()
+        clear = np.abs(gradient) > 1e-3 * np.abs(gradient).max()
+        moved = model.splats().sh0 - dimmed(scene).sh0
+        np.testing.assert_array_equal(np.sign(moved)[clear], -np.sign(gradient)[clear])
+        signs.append(np.sign(gradient))
+    assert (signs[0] != signs[1]).any()
 
 
 class PullToOrigin:
