@@ -161,7 +161,6 @@ def _training_steps(model: GaussianModel, camera: Camera, threads: int) -> list[
         ssim_weight=settings.used_ssim_weight,
         mse_weight=settings.mse_weight,
         seed=(0,),
-        dropout=settings.dropout,
     )
     ends: list[float] = []
     train(model, targets, plan, after=lambda done: ends.append(time.process_time()), threads=threads)

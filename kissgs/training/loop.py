@@ -86,7 +86,8 @@ class TrainingPlan:
         seed: seed of the order of the images, one number or several.
         regularizers: further loss terms.
         batch: number of images in each step.
-        dropout: share of the Gaussians that each step leaves out, from 0 to below 1.
+        dropout: share of the Gaussians that each step on photographs leaves out, from 0 to below 1. Renderings are fitted
+            by all: the noise would move Gaussians that no photograph shows.
     """
 
     stage: str
@@ -132,13 +133,13 @@ def train(
         while step < pace.steps:
             progress(plan.stage, step / pace.steps, running.text(len(scene)))
             parameters = scene.gaussians()
-            rendered: Parameters = parameters
+            fewer: Parameters = parameters
             if plan.dropout:
-                rendered = with_dropout(parameters, plan.dropout, (*plan.seed, DROPOUT_STREAM, step))
+                fewer = with_dropout(parameters, plan.dropout, (*plan.seed, DROPOUT_STREAM, step))
             losses, errors = [], []
             for n in islice(order, plan.batch):
                 loss, error = image_loss(
-                    rendered,
+                    fewer if targets.is_photo(n) else parameters,
                     targets,
                     n,
                     ssim_weight=plan.ssim_weight,

@@ -77,24 +77,20 @@ def test_with_a_weight_of_bits_both_error_and_bytes_fall():
 
 @pytest.mark.parametrize(("preset", "weights"), [("balanced", (0.3, 5.0, 0.02)), ("paper", (0.2, 0.0, 0.0))])
 @pytest.mark.parametrize("stage", ["finetune", "compact"])
-@pytest.mark.parametrize("source", ["photos", "renderings"])
-def test_training_has_the_loss_and_the_dropout_of_the_settings(preset, weights, stage, source, monkeypatch):
+def test_training_has_the_loss_and_the_dropout_of_the_settings(preset, weights, stage, monkeypatch):
     plans, scene = [], cloud(40, 1)
     monkeypatch.setattr(f"kissgs.{'finetuning.tune' if stage == 'finetune' else 'training.loop'}.train", capture(plans))
     settings = getattr(Settings.from_preset(preset), stage)
     work = tuner(scene, steps=2, ssim_weight=settings.ssim_weight, **settings.model_dump(include=LOSS))
-    targets = replace(work.targets, target_source=source)
     if stage == "finetune":
         plan = chosen(scene, "fast")
         files = written(scene, Settings.from_preset("fast").encode)
-        replace(work, targets=targets)(plan, plan, scene, files)
+        work(plan, plan, scene, files)
     else:
         training = SceneTraining(scene, settings, work.supervision, 1, "cpu")
-        training.begin(targets)
-        training.train(Phase("refine", 1, 40), targets, (0,), progress=silent)
-    ssim, squares, dropout = weights
-    assert [(plan.ssim_weight, plan.mse_weight) for plan in plans] == [(ssim, squares)]
-    assert plans[0].dropout == (dropout if source == "photos" else 0)
+        training.begin(work.targets)
+        training.train(Phase("refine", 1, 40), work.targets, (0,), progress=silent)
+    assert [(plan.ssim_weight, plan.mse_weight, plan.dropout) for plan in plans] == [weights]
 
 
 def test_the_derivative_of_the_loss_contains_the_weight_of_the_squared_error():

@@ -1,5 +1,7 @@
 """The training loop. Oracle: the scene that was rendered; for regularizers, the calls they received."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -49,6 +51,12 @@ def rasterize_one(parameters):
     return image[0]
 
 
+def as_photographs(targets):
+    """Return the targets in the type of photographs."""
+    images = tuple(np.rint(255 * image.astype(np.float32)).astype(np.uint8) for image in targets.images)
+    return replace(targets, images=images, target_source="photos")
+
+
 def dimmed(scene):
     return kissgs.Splats(
         **{name: getattr(scene, name).copy() for name in ("means", "quats", "scales", "opacities", "shN")},
@@ -76,7 +84,7 @@ def test_a_scene_stays_if_its_renderings_are_the_targets():
 @pytest.mark.parametrize("dropout", [0.0, 0.2])
 def test_an_interrupted_training_resumes_exactly(dropout):
     scene = cloud(40)
-    targets, whole = targets_of(scene), GaussianModel(dimmed(scene))
+    targets, whole = as_photographs(targets_of(scene)), GaussianModel(dimmed(scene))
     train(whole, targets, plan(23, dropout=dropout))
     steps = []
 
@@ -141,9 +149,18 @@ def test_transparent_gaussians_are_not_trained_but_seen_by_regularizers():
 
     scene, opacities = cloud(40), Opacities()
     model = GaussianModel(scene)
-    train(model, targets_of(dimmed(scene)), plan(1, dropout=1 - 1e-9, regularizers=(opacities,)))
+    train(model, as_photographs(targets_of(dimmed(scene))), plan(1, dropout=1 - 1e-9, regularizers=(opacities,)))
     assert same(model.splats(), scene)
     np.testing.assert_array_equal(opacities.seen, scene.opacities)
+
+
+def test_renderings_are_fitted_by_all_gaussians():
+    scene, found = cloud(40), []
+    for dropout in (0.0, 0.5):
+        model = GaussianModel(dimmed(scene))
+        train(model, targets_of(scene), plan(5, dropout=dropout))
+        found.append(model.splats())
+    assert same(*found)
 
 
 def test_the_squared_error_counts_in_the_loss():
