@@ -30,8 +30,8 @@ class TrainingViewSettings(BaseModel):
         0.02,
         ge=0,
         le=0.5,
-        description="Share of the Gaussians that each training step on a photograph leaves out at random, so that other "
-        "views are rendered better.",
+        description="Share of the Gaussians that each training step on a photograph leaves out at random, so that "
+        "other views are rendered better.",
     )
     synthetic_view_share: float = Field(
         0.1,

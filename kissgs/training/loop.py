@@ -86,8 +86,8 @@ class TrainingPlan:
         seed: seed of the order of the images, one number or several.
         regularizers: further loss terms.
         batch: number of images in each step.
-        dropout: share of the Gaussians that each step on photographs leaves out, from 0 to below 1. Renderings are fitted
-            by all: the noise would move Gaussians that no photograph shows.
+        dropout: share of the Gaussians that each step on photographs leaves out, from 0 to below 1. Renderings are
+            fitted by all: the noise would move Gaussians that no photograph shows.
     """
 
     stage: str
