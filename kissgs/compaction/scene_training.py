@@ -137,7 +137,6 @@ class SceneTraining:
             mse_weight=self.settings.mse_weight,
             seed=seed,
             regularizers=(*self._shape_regularizers(targets), *regularizers),
-            dropout=self.settings.dropout,
         )
         train(self.trained, targets, plan, first=first, after=after, threads=self.threads, progress=progress)
 

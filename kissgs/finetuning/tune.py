@@ -265,7 +265,6 @@ class Tuner:
             seed=(settings.seed,),
             regularizers=(rate_loss, TotalVariationLoss(scene, settings.tv_weight, pace)),
             batch=settings.batch,
-            dropout=settings.dropout,
         )
         train(scene, self.targets, training, first=done, after=after, threads=self.threads, progress=self.progress)
         return scene.plan(), checkpoint_note

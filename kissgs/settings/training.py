@@ -26,13 +26,6 @@ class TrainingViewSettings(BaseModel):
     mse_weight: float = Field(
         5.0, ge=0, le=1000, description="Weight of the mean squared error in the loss, added to SSIM and L1."
     )
-    dropout: float = Field(
-        0.02,
-        ge=0,
-        le=0.5,
-        description="Share of the Gaussians that each training step on a photograph leaves out at random, so that "
-        "other views are rendered better.",
-    )
     synthetic_view_share: float = Field(
         0.1,
         ge=0,

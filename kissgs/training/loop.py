@@ -33,12 +33,6 @@ MOST_STEPS = 2
 SMOOTHING = 0.98
 """Weight of the former value in the running means of loss and squared error."""
 
-TRANSPARENT = -30.0
-"""Opacity logit that no renderer draws."""
-
-DROPOUT_STREAM = 7919
-"""Number that tells the random numbers of dropout from those of the order of the images."""
-
 Parameters = tensors.Parameters
 """Stored parameters of a scene, by name; the type that regularizers receive."""
 
@@ -86,8 +80,6 @@ class TrainingPlan:
         seed: seed of the order of the images, one number or several.
         regularizers: further loss terms.
         batch: number of images in each step.
-        dropout: share of the Gaussians that each step on photographs leaves out, from 0 to below 1. Renderings are
-            fitted by all: the noise would move Gaussians that no photograph shows.
     """
 
     stage: str
@@ -98,7 +90,6 @@ class TrainingPlan:
     seed: Sequence[int]
     regularizers: tuple[Regularizer, ...] = ()
     batch: int = 1
-    dropout: float = 0.0
 
 
 def train(
@@ -123,8 +114,8 @@ def train(
         first: number of steps already done; without a deadline of the plan.
         after: called after each step with the number of steps done.
         threads: number of threads; 0 means one per processor.
-        progress: receives the plan's stage, with count, loss and PSNR to the targets, both with dropout, as its note.
-            If it raises, the scene is in the state after the last completed step.
+        progress: receives the plan's stage, with count, loss and PSNR to the targets as its note. If it raises, the
+            scene is in the state after the last completed step.
     """
     order, running = targets.order(plan.seed, first * plan.batch), RunningMeans()
     with torch_threads(threads), keep_free_memory():
@@ -133,13 +124,10 @@ def train(
         while step < pace.steps:
             progress(plan.stage, step / pace.steps, running.text(len(scene)))
             parameters = scene.gaussians()
-            fewer: Parameters = parameters
-            if plan.dropout:
-                fewer = with_dropout(parameters, plan.dropout, (*plan.seed, DROPOUT_STREAM, step))
             losses, errors = [], []
             for n in islice(order, plan.batch):
                 loss, error = image_loss(
-                    fewer if targets.is_photo(n) else parameters,
+                    parameters,
                     targets,
                     n,
                     ssim_weight=plan.ssim_weight,
@@ -162,21 +150,6 @@ def train(
             after(step)
             pace.update(step)
     progress(plan.stage, 1.0, running.text(len(scene)))
-
-
-def with_dropout(parameters: Parameters, share: float, seed: Sequence[int]) -> Parameters:
-    """Return a scene without a random ``share`` of its Gaussians, below 1: they become transparent.
-
-    Where few photographs are fitted, Gaussians come to correct each other's errors, which other views show; this keeps
-    them from it. Park, Ryu and Kim, "DropGaussian: Structural Regularization for Sparse-view Gaussian Splatting", CVPR
-    2025, multiply the opacities of the others by 1 / (1 - share); here their odds are multiplied, so that opacities
-    stay below 1.
-    """
-    opacities = parameters["opacities"]
-    dropped = np.random.default_rng(seed).random(len(opacities), dtype=np.float32) < share
-    denser = opacities - math.log1p(-share)
-    transparent = torch.from_numpy(dropped).to(denser.device)
-    return {**parameters, "opacities": denser.masked_fill(transparent, TRANSPARENT)}
 
 
 def image_loss(

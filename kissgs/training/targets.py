@@ -44,10 +44,6 @@ class TrainingTargets:
         image = self.images[n]
         return image.astype(np.float32) / np.float32(255 if image.dtype == np.uint8 else 1)
 
-    def is_photo(self, n: int) -> bool:
-        """Return whether the target of camera ``n`` is a photograph."""
-        return self.images[n].dtype == np.uint8
-
     def order(self, seed: Sequence[int], first: int = 0) -> Iterator[int]:
         """Yield the index of the target for step ``first`` and each later one: a new random permutation per epoch.
 

@@ -26,7 +26,6 @@ from kissgs.training.checkpoint import Checkpoint
 SHORT = {"enabled": True, "steps": 12, "lr": 0.2, "codebook_lr": 0.3, "synthetic_lr_scale": 1.0}
 SHORT |= {"views": 16, "view_size": 60}
 GENTLE = {"steps": 60, "lr": 0.05, "codebook_lr": 0.05}
-LOSS = {"mse_weight", "dropout"}
 COARSE = {"scale_step": 0.4, "opacity_step": 1.0, "sh0_step": 0.3, "quat_step": 0.1}
 
 
@@ -75,13 +74,13 @@ def test_with_a_weight_of_bits_both_error_and_bytes_fall():
         assert report.bytes_after < 0.97 * report.bytes_before
 
 
-@pytest.mark.parametrize(("preset", "weights"), [("balanced", (0.3, 5.0, 0.02)), ("paper", (0.2, 0.0, 0.0))])
+@pytest.mark.parametrize(("preset", "weights"), [("balanced", (0.3, 5.0)), ("paper", (0.2, 0.0))])
 @pytest.mark.parametrize("stage", ["finetune", "compact"])
-def test_training_has_the_loss_and_the_dropout_of_the_settings(preset, weights, stage, monkeypatch):
+def test_training_has_the_loss_of_the_settings(preset, weights, stage, monkeypatch):
     plans, scene = [], cloud(40, 1)
     monkeypatch.setattr(f"kissgs.{'finetuning.tune' if stage == 'finetune' else 'training.loop'}.train", capture(plans))
     settings = getattr(Settings.from_preset(preset), stage)
-    work = tuner(scene, steps=2, ssim_weight=settings.ssim_weight, **settings.model_dump(include=LOSS))
+    work = tuner(scene, steps=2, ssim_weight=settings.ssim_weight, mse_weight=settings.mse_weight)
     if stage == "finetune":
         plan = chosen(scene, "fast")
         files = written(scene, Settings.from_preset("fast").encode)
@@ -90,7 +89,7 @@ def test_training_has_the_loss_and_the_dropout_of_the_settings(preset, weights, 
         training = SceneTraining(scene, settings, work.supervision, 1, "cpu")
         training.begin(work.targets)
         training.train(Phase("refine", 1, 40), work.targets, (0,), progress=silent)
-    assert [(plan.ssim_weight, plan.mse_weight, plan.dropout) for plan in plans] == [weights]
+    assert [(plan.ssim_weight, plan.mse_weight) for plan in plans] == [weights]
 
 
 def test_the_derivative_of_the_loss_contains_the_weight_of_the_squared_error():

@@ -1,7 +1,5 @@
 """The training loop. Oracle: the scene that was rendered; for regularizers, the calls they received."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -13,7 +11,7 @@ from kissgs.rendering.differentiable import rasterize
 from kissgs.rendering.losses import plain_photometric_loss
 from kissgs.rendering.rasterizer import render
 from kissgs.rendering.tensors import tensors_of
-from kissgs.training.loop import TrainingPlan, exponential_lr, train, with_dropout
+from kissgs.training.loop import TrainingPlan, exponential_lr, train
 from kissgs.training.model import GaussianModel
 
 RATES = {"means": 2e-3, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 1e-2, "shN": 1e-3}
@@ -51,12 +49,6 @@ def rasterize_one(parameters):
     return image[0]
 
 
-def as_photographs(targets):
-    """Return the targets in the type of photographs."""
-    images = tuple(np.rint(255 * image.astype(np.float32)).astype(np.uint8) for image in targets.images)
-    return replace(targets, images=images, target_source="photos")
-
-
 def dimmed(scene):
     return kissgs.Splats(
         **{name: getattr(scene, name).copy() for name in ("means", "quats", "scales", "opacities", "shN")},
@@ -81,11 +73,10 @@ def test_a_scene_stays_if_its_renderings_are_the_targets():
     np.testing.assert_allclose(model.splats().means, scene.means, atol=1e-7)
 
 
-@pytest.mark.parametrize("dropout", [0.0, 0.2])
-def test_an_interrupted_training_resumes_exactly(dropout):
+def test_an_interrupted_training_resumes_exactly():
     scene = cloud(40)
-    targets, whole = as_photographs(targets_of(scene)), GaussianModel(dimmed(scene))
-    train(whole, targets, plan(23, dropout=dropout))
+    targets, whole = targets_of(scene), GaussianModel(dimmed(scene))
+    train(whole, targets, plan(23))
     steps = []
 
     def stop(stage, fraction, note=""):
@@ -94,10 +85,10 @@ def test_an_interrupted_training_resumes_exactly(dropout):
 
     first = GaussianModel(dimmed(scene))
     with pytest.raises(kissgs.Cancelled):
-        train(first, targets, plan(23, dropout=dropout), after=steps.append, progress=stop)
+        train(first, targets, plan(23), after=steps.append, progress=stop)
     assert steps == list(range(1, 10))
     second = GaussianModel.restored(first.state())
-    train(second, targets, plan(23, dropout=dropout), first=9)
+    train(second, targets, plan(23), first=9)
     assert same(whole.splats(), second.splats())
 
 
@@ -120,47 +111,6 @@ def test_the_result_depends_on_the_seed():
         train(model, targets_of(scene), plan(7, seed=(seed,)))
         found.append(model.splats())
     assert not same(*found)
-
-
-def test_dropout_leaves_out_a_share_of_the_gaussians_and_others_in_each_step():
-    scene, hidden = cloud(1000, 0), []
-    odds = np.exp(scene.opacities.astype(np.float64))
-    for step in range(20):
-        parameters = with_dropout(tensors_of(scene), 0.1, (3, step))
-        logits = parameters["opacities"].numpy()
-        hidden.append(logits < -20)
-        rest = scene.select(~hidden[-1])
-        np.testing.assert_allclose(np.exp(logits[~hidden[-1]]), odds[~hidden[-1]] / 0.9, rtol=1e-5)
-        rest.opacities[:] = logits[~hidden[-1]]
-        np.testing.assert_array_equal(rasterize_one(parameters).numpy(), render(rest, around(1)[0].camera)[0])
-    assert np.mean(hidden) == pytest.approx(0.1, abs=0.01)
-    assert np.any(hidden, axis=0).mean() == pytest.approx(1 - 0.9**20, abs=0.06)
-    again = with_dropout(tensors_of(scene), 0.1, (3, 19))["opacities"].numpy() < -20
-    assert (again == hidden[-1]).all()
-
-
-def test_transparent_gaussians_are_not_trained_but_seen_by_regularizers():
-    class Opacities:
-        def penalty(self, step, parameters):
-            self.seen = parameters["opacities"].detach().numpy().copy()
-
-        def update(self, step, scene):
-            pass
-
-    scene, opacities = cloud(40), Opacities()
-    model = GaussianModel(scene)
-    train(model, as_photographs(targets_of(dimmed(scene))), plan(1, dropout=1 - 1e-9, regularizers=(opacities,)))
-    assert same(model.splats(), scene)
-    np.testing.assert_array_equal(opacities.seen, scene.opacities)
-
-
-def test_renderings_are_fitted_by_all_gaussians():
-    scene, found = cloud(40), []
-    for dropout in (0.0, 0.5):
-        model = GaussianModel(dimmed(scene))
-        train(model, targets_of(scene), plan(5, dropout=dropout))
-        found.append(model.splats())
-    assert same(*found)
 
 
 def test_the_squared_error_counts_in_the_loss():
