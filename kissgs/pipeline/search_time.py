@@ -21,8 +21,8 @@ FIRST_NUMBER, TRAINED_OFFSET_DB = 6, 5.0
 to ``quality_offset_db`` there.
 
 At equal bytes, fewer Gaussians with finer levels lose less than more Gaussians with coarser ones, if they are trained
-long enough. Scenes that have little to learn from few photographs lose more than the search makes up for if it begins
-with fewer.
+long enough. A search that began with a fifth of the Gaussians saved a container on fox, but its result for a scene of
+300 Gaussians was larger than that of the encoder alone.
 """
 
 

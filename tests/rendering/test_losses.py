@@ -168,6 +168,17 @@ def test_extreme_renderings_give_finite_values(value):
     assert torch.isfinite(plain).all()
 
 
+@pytest.mark.parametrize(("difference", "expected", "slope"), [(0.5, 0.25, 1.0), (1.0, 1.0, 2.0), (-3.0, 5.0, -2.0)])
+def test_the_squared_error_is_linear_beyond_1(difference, expected, slope):
+    target = torch.zeros(5, 5, 3)
+    for dtype in (torch.float32, torch.float64):  # the kernel and plain torch
+        leaf = torch.full((5, 5, 3), difference, dtype=dtype).requires_grad_()
+        plain, squared = (photometric_loss(leaf, target.to(dtype), mse_weight=weight) for weight in (0.0, 1.0))
+        (squared - plain).backward()
+        assert float((squared - plain).detach()) == pytest.approx(expected, rel=1e-5)
+        np.testing.assert_allclose(leaf.grad.numpy(), slope / leaf.numel(), rtol=1e-3)
+
+
 @pytest.mark.parametrize("weight", [0.0, 0.2])
 def test_nan_is_not_hidden(weight):
     image, target = pair(30, 30, 3)
