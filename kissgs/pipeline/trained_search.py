@@ -22,6 +22,10 @@ NEAR_HALVINGS, NEAR_IN_TIME = 0.15, 0.03
 CAUTION_HALVINGS, SIZE_CAUTION_HALVINGS = 0.1, 0.02
 """Added on the safe side of the last attempt if none before met the goal; the second for a size, which varies less."""
 
+FAR_HALVINGS, FAR_CAUTION = 0.3, 0.15
+"""Distance to the nearest container that met the goal above which the last attempt is cautious too, since missing the
+goal would lose that much; and the share of this distance that is added at most."""
+
 MIN_STEP = 0.03
 """Smallest step, in halvings, whose effect is measured: that of a smaller one is lost in the noise of training."""
 
@@ -66,7 +70,7 @@ def search_positions(
         near: step, in halvings, below which a container that meets the goal ends the search.
     """
     position = Position(min(max(first, bounds[0]), bounds[1]), None)
-    left_at, figures = dict[float, float](), set[tuple[int, float]]()
+    left_at, figures, met_from = dict[float, float](), set[tuple[int, float]](), list[float]()
     for remaining in reversed(range(attempts)):
         search = encode(position)
         trial = search.trials[-1]
@@ -76,19 +80,33 @@ def search_positions(
         if (met and abs(left) <= near) or (trial.bytes, left) in figures:  # near, or without any effect
             return
         figures.add((trial.bytes, left))
+        if met:
+            met_from.append(abs(left))
         log2_lambda = math.log2(trial.rd_lambda)
         halvings = position.number / points_per_halving + log2_lambda / DOUBLINGS_PER_HALVING
         left_at[halvings] = left
         step = _next_place(left_at, halvings) - halvings
-        missed = all((left > 0) == goal.by_size for left in left_at.values())
-        if remaining == 1 and missed:
-            step += SIZE_CAUTION_HALVINGS if goal.by_size else -CAUTION_HALVINGS
+        if remaining == 1:
+            step += _caution(min(met_from, default=math.inf), by_size=goal.by_size)
         number = min(max(position.number + round(step * points_per_halving), bounds[0]), bounds[1])
         rest = step - (number - position.number) / points_per_halving
-        if remaining == 1 and missed:  # lambda must not take back what the number gives
+        if remaining == 1 and not met_from:  # lambda must not take back what the number gives
             rest = max(rest, 0.0) if goal.by_size else min(rest, 0.0)
         log2_lambda += DOUBLINGS_PER_HALVING * rest
         position = Position(number, min(max(log2_lambda, LOG2_LAMBDA_RANGE[0]), LOG2_LAMBDA_RANGE[1]))
+
+
+def _caution(distance: float, *, by_size: bool) -> float:
+    """Return the halvings that are added to the last step, so that its container meets the goal in spite of chance.
+
+    Args:
+        distance: halvings from the goal to the nearest container that meets it; infinite if none does.
+        by_size: whether the goal is a size.
+    """
+    if distance <= FAR_HALVINGS:
+        return 0.0
+    caution = min(SIZE_CAUTION_HALVINGS if by_size else CAUTION_HALVINGS, FAR_CAUTION * distance)
+    return caution if by_size else -caution
 
 
 def _next_place(left_at: dict[float, float], last: float) -> float:

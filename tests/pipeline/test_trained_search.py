@@ -91,6 +91,20 @@ def test_the_limit_with_the_fewest_halvings_left_decides():
     assert [number for number, _ in positions] == [6, 8]
 
 
+def test_the_last_container_is_cautious_where_the_one_that_met_the_goal_is_far():
+    """Drops like those of fox, whose third container missed 0.3 dB by 0.001, and a hundredth of a decibel of chance."""
+
+    def figures(number, x):
+        halvings = number / PER_HALVING - 2 + 0.25 * (x - START)
+        chance = 0.012 * math.sin(40 * halvings)
+        return {"bytes": round(200_000 * 2**-halvings), "drop": 0.058 + 0.36 * halvings + chance}
+
+    trials, _ = search({"max_psnr_drop": 0.3}, figures)
+    assert len(trials) == 3
+    assert trials[1].drop > 0.3
+    assert 0.25 < trials[2].drop <= 0.3
+
+
 def test_lambda_stays_in_its_range():
     _, positions = search({"max_psnr_drop": 0.2}, lambda number, x: model(0, START, at_start=-9 - x), attempts=40)
     assert max(x for _, x in positions) <= -6
