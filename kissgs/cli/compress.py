@@ -58,7 +58,7 @@ def compress(
             metavar="BUDGET",
             help="First reduce the number of Gaussians, see 'kissgs compact': to a count (200k), a share (20%) or a "
             "PSNR drop (0.2dB); 100% keeps all; auto searches the number that serves a goal best, which is the default "
-            "with photographs.",
+            "where it is fine-tuned.",
         ),
     ] = None,
     finetune: Annotated[
@@ -67,7 +67,7 @@ def compress(
             metavar="[STEPS]",
             help="Fine-tune the quantised values on the photographs of --views, or on renderings of the scene: fewer "
             "bytes at equal PSNR, a minute or two more. Default number of steps: that of the preset; 0: never. "
-            "Default with a goal and photographs.",
+            "Default with a goal.",
         ),
     ] = None,
     seed: SeedOption = None,

@@ -14,15 +14,14 @@ from kissgs.cameras.views import Views
 from kissgs.compaction.evaluate import step_log
 from kissgs.compaction.popspa import Popspa
 from kissgs.compaction.result import Compacted, CompactionReport, CountTrial
+from kissgs.compaction.search_evaluation import SearchEvaluation
 from kissgs.compaction.step_log import StepLog
 from kissgs.compaction.training_path import TrainingPath
 from kissgs.core.errors import StopSearch, UnsupportedError
 from kissgs.core.progress import Progress, as_stage, silent
 from kissgs.core.root_finding import find_root
 from kissgs.core.splats import Splats
-from kissgs.evaluation.cameras import evaluation_views
-from kissgs.evaluation.evaluate import Rendering, compare_images
-from kissgs.evaluation.psnr_loss import ESTIMATED_DROP, SEARCH_SEED, drop_of
+from kissgs.evaluation.psnr_loss import ESTIMATED_DROP, drop_of
 from kissgs.rendering.gsplat_backend import need_cuda
 from kissgs.rendering.rasterizer import Device
 from kissgs.settings import CompactSettings
@@ -146,7 +145,7 @@ class Compactor:
         threads: number of threads; 0 means one per processor.
         device: device of the training.
         progress: receives events, see :func:`compact_scene`.
-        eval_views: views that :meth:`evaluate` uses; None until cameras are drawn over the whole scene.
+        compare: compares a scene with the original one.
     """
 
     splats: Splats
@@ -155,8 +154,7 @@ class Compactor:
     threads: int
     device: Device
     progress: Progress
-    eval_views: Views | None = None
-    _reference_images: dict[str, Rendering] | None = field(init=False, default=None)
+    compare: SearchEvaluation
     _targets: TrainingTargets | None = field(init=False, default=None)
 
     @classmethod
@@ -185,8 +183,8 @@ class Compactor:
             supervision = supervision_views(
                 splats, views, settings, scoring_stride=stride, threads=threads, progress=progress
             )
-        eval_views = None if views is None else supervision.eval_views
-        return cls(splats, settings, supervision, threads, device, progress, eval_views)
+        compare = SearchEvaluation(splats, None if views is None else supervision.eval_views, threads)
+        return cls(splats, settings, supervision, threads, device, progress, compare)
 
     def __call__(self, count: int, *, evaluate: bool = False, checkpoint: Path | None = None) -> Compacted:
         """Return the scene with exactly ``count`` Gaussians, from 1 to fewer than it has.
@@ -218,18 +216,7 @@ class Compactor:
 
     def evaluate(self, splats: Splats) -> Evaluation:
         """Compare a result with the scene in views that no training used; reports the stage "evaluate"."""
-        progress = as_stage("evaluate", self.progress)
-        if self.eval_views is None:
-            drawn = evaluation_views(self.splats, seed=SEARCH_SEED, threads=self.threads, progress=progress)
-            self.eval_views, self._reference_images = drawn, {}
-        return compare_images(
-            self.splats,
-            splats,
-            self.eval_views,
-            threads=self.threads,
-            reference_images=self._reference_images,
-            progress=progress,
-        )
+        return self.compare(splats, as_stage("evaluate", self.progress))
 
     @property
     def note(self) -> str:

@@ -31,12 +31,22 @@ No loss to renderings is negative, so that the mean of all views already limits 
 """
 
 
+def over_scene(evaluation: Evaluation) -> Evaluation:
+    """Return what says how near the candidate's renderings are to the reference's.
+
+    Without photographs, that are the cameras drawn over the whole scene (the surroundings), where there are any.
+    """
+    surroundings = evaluation.surroundings
+    return evaluation if surroundings is None or evaluation.against == "photos" else surroundings
+
+
 def psnr_of(evaluation: Evaluation) -> float:
     """Return the PSNR of the candidate to the reference as goals define it, decibels; NaN if a rendering failed.
 
-    It is the mean over views, limited by the worst views: at most the PSNR of their mean squared error divided by
-    :data:`MAX_ERROR_RATIO`.
+    It is the mean over views (:func:`over_scene`), limited by the worst views: at most the PSNR of their mean squared
+    error divided by :data:`MAX_ERROR_RATIO`.
     """
+    evaluation = over_scene(evaluation)
     mean = evaluation.mean.candidate_vs_reference.psnr
     worst = (
         _mean_of_worst([_squared_error(view.comparison.candidate_vs_reference.psnr) for view in evaluation.views])
@@ -49,22 +59,18 @@ def drop_of(evaluation: Evaluation) -> float:
     """Return the drop of PSNR from reference to candidate as goals define it, decibels; NaN if a rendering failed.
 
     With photographs it is the drop of the mean PSNR to them. Without, the reference is assumed to have
-    :data:`ASSUMED_PSNR` to photographs, with errors independent of the new ones, so that squared errors add up. (For
-    fox this predicts 0.40 dB; measured are 0.38 dB.)
+    :data:`ASSUMED_PSNR` to photographs, with errors independent of the new ones, so that squared errors add up.
 
-    The worst views limit it: it is at least the drop that their additional squared error, divided by
-    :data:`MAX_ERROR_RATIO`, would cause in all views.
+    The worst views limit it, those of the surroundings apart: it is at least the drop that their additional squared
+    error, divided by :data:`MAX_ERROR_RATIO`, would cause in all views.
     """
     mean = evaluation.mean
     if mean.change is None:
         drop = _drop_by(_squared_error(mean.candidate_vs_reference.psnr) / _squared_error(ASSUMED_PSNR))
-        errors = [
-            _squared_error(view.comparison.candidate_vs_reference.psnr) / _squared_error(ASSUMED_PSNR)
-            for view in evaluation.views
-        ]
+        groups = [_errors_to_renderings(evaluation), _errors_to_renderings(over_scene(evaluation))]
     else:
-        drop, errors = -mean.change, _errors_added(evaluation)
-    worst = _mean_of_worst(errors) / MAX_ERROR_RATIO
+        drop, groups = -mean.change, [_errors_added(evaluation)]
+    worst = max(_mean_of_worst(errors) for errors in groups) / MAX_ERROR_RATIO
     return drop if math.isnan(drop) or worst <= 0 else max(drop, _drop_by(worst))
 
 
@@ -72,14 +78,26 @@ def ssim_drop_of(evaluation: Evaluation) -> float:
     """Return the drop of SSIM from reference to candidate as goals define it; NaN if a rendering failed.
 
     With photographs it is the drop of the mean SSIM to them, without photographs 1 - SSIM to the renderings of the
-    reference. The worst views limit it: it is at least their mean drop divided by :data:`MAX_SSIM_RATIO`.
+    reference. The worst views limit it, those of the surroundings apart: it is at least their mean drop divided by
+    :data:`MAX_SSIM_RATIO`.
     """
-    drops = [
+    groups = [_ssim_drops(evaluation), _ssim_drops(over_scene(evaluation))]
+    mean, worst = sum(groups[0]) / len(groups[0]), max(map(_mean_of_worst, groups)) / MAX_SSIM_RATIO
+    return mean if math.isnan(mean) or worst <= 0 else max(mean, worst)
+
+
+def _ssim_drops(evaluation: Evaluation) -> list[float]:
+    """Return each view's drop of SSIM to its photograph, without photographs 1 - SSIM to the rendering."""
+    return [
         (1.0 if view.reference is None else view.reference.ssim) - view.candidate.ssim
         for view in (compared.comparison for compared in evaluation.views)
     ]
-    mean, worst = sum(drops) / len(drops), _mean_of_worst(drops) / MAX_SSIM_RATIO
-    return mean if math.isnan(mean) or worst <= 0 else max(mean, worst)
+
+
+def _errors_to_renderings(evaluation: Evaluation) -> list[float]:
+    """Return each view's squared error to the reference's rendering, in units of that of :data:`ASSUMED_PSNR`."""
+    psnrs = [view.comparison.candidate_vs_reference.psnr for view in evaluation.views]
+    return [_squared_error(psnr) / _squared_error(ASSUMED_PSNR) for psnr in psnrs]
 
 
 def _errors_added(evaluation: Evaluation) -> list[float]:

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from kissgs.compaction.result import CountTrial
+import numpy as np
+
 from kissgs.core.errors import StopSearch
 from kissgs.core.progress import SearchNote, ignore_stop_search
-from kissgs.core.splats import Splats
-from kissgs.evaluation.psnr_loss import drop_of
+from kissgs.evaluation.psnr_loss import drop_of, psnr_of
 from kissgs.pipeline.candidates import Candidates
 from kissgs.pipeline.goal import HALF_ERROR_DB, Goal
-from kissgs.pipeline.path_points import OVERHEAD_BYTES, POINTS_PER_HALVING, count_at, last_number, number_for_size
-from kissgs.pipeline.rate_control import RateControl
+from kissgs.pipeline.path_points import KEEP, OVERHEAD_BYTES, POINTS_PER_HALVING, count_at, last_number, number_for_size
+from kissgs.pipeline.pruning import Pruning
+from kissgs.pipeline.rate_control import Container, RateControl
 from kissgs.pipeline.search_time import SearchPlan, SearchTime
 from kissgs.pipeline.trained_scenes import TrainedScenes
 from kissgs.pipeline.trained_search import NEAR_HALVINGS, NEAR_IN_TIME, Position, search_positions
 from kissgs.pipeline.training_choice import has_photographs
 from kissgs.pipeline.trial import Trial
+from kissgs.settings import EncodeSettings
 
 if TYPE_CHECKING:
     from kissgs.compaction.budget import Compactor
@@ -27,11 +30,20 @@ if TYPE_CHECKING:
     from kissgs.compaction.training_path import PathPoint, TrainingPath
     from kissgs.pipeline.encoding import Encoding
 
+ENCODES = 6
+"""Largest number of containers of the encoder alone where others are trained."""
+
+SIZE_BY_COUNT = 0.6
+"""Exponent of the number of Gaussians to which the size of a container grows at equal lambda, with fewer by pruning."""
+
 PRUNABLE_DROP = 1.0
 """Drop of PSNR, decibels, up to which pruning goes on without training."""
 
 PRUNABLE_POINTS = 3
 """Number of the last point that is pruned without training where there are photographs: half of the Gaussians."""
+
+RENDERED_POINTS = 5
+"""The same where renderings of the scene are the targets: training along the path, at high rates, departs from them."""
 
 BEYOND_PHOTOGRAPHS = (
     "trained for what the photographs show: beyond them it changes more (--evaluate measures how much; --compact 100% "
@@ -43,14 +55,13 @@ BEYOND_PHOTOGRAPHS = (
 class CountSearch:
     """Prune and train a scene along a path, and make containers at the points that promise most.
 
-    Training on photographs starts where pruning alone begins to show. Renderings of the scene itself teach little: with
-    them, training starts only for a size that pruning alone cannot reach. With fine-tuning, a point of the path is
-    encoded as it is, and the training is completed through the decoder.
+    Training on photographs starts where pruning alone begins to show, on renderings of the scene itself much later.
+    With fine-tuning, a point of the path is encoded as it is, and the training is completed through the decoder.
 
     Attributes:
         encoding: encoding of the whole scene.
         compactor: compactor of the same scene.
-        time: the time of the search; None for no limit. It limits training on photographs only.
+        time: the time of the search; None for no limit. It limits training only.
         aims: whether the goal is no more than an aim: if no container meets it in time, the closest one is kept.
         trials: all containers that were made, in order.
     """
@@ -61,8 +72,7 @@ class CountSearch:
     aims: bool = False
     trials: list[Trial] = field(default_factory=list)
     _path: TrainingPath = field(init=False)
-    _pruned: list[Trial] = field(init=False, default_factory=list)
-    _tried: list[CountTrial] = field(init=False, default_factory=list)
+    _pruning: Pruning = field(init=False)
     _candidates: Candidates = field(init=False)
     _scenes: TrainedScenes = field(init=False)
     _whole: RateControl | None = field(init=False, default=None)
@@ -70,23 +80,26 @@ class CountSearch:
     _plan: SearchPlan = field(init=False)
 
     def __post_init__(self) -> None:
-        most = self.compactor.settings.max_compactions
-        if not self._photographs:
+        most, photographs = self.compactor.settings.max_compactions, self._photographs
+        if not self._trains:
             self.time = None
-        plan = SearchPlan(most) if self.time is None else self.time.plan(aims=self.aims)
+        if self.encoding.views is None:
+            self.encoding = replace(self.encoding, compare=self.compactor.compare)
+        plan = SearchPlan(most) if self.time is None else self.time.plan(photographs=photographs, aims=self.aims)
         self._plan = replace(plan, containers=min(plan.containers, most))
         if plan.brief:  # half of the views score nearly as well
             supervision = self.compactor.supervision
             score = supervision.score[::2]
             self.compactor = replace(self.compactor, supervision=replace(supervision, score=score))
         self._path = self.compactor.path(keep_states=not self._tunes)
+        self._pruning = Pruning(self.goal, self.compactor, self._path)
         self._candidates = Candidates(self.goal, self.encoding.packed)
         self._scenes = TrainedScenes(
             encoding=self.encoding,
             compactor=self.compactor,
             path=self._path,
-            photographs=self._photographs,
-            offset_db=self._plan.offset_db if self._photographs else 0.0,
+            untrained=0 if photographs else RENDERED_POINTS,
+            offset_db=self._plan.offset_db if photographs else 0.0,
             time=self.time,
             containers=self._plan.containers,
         )
@@ -119,7 +132,7 @@ class CountSearch:
             compacted = compacted if best.compacted.splats is self.compactor.splats else best.compacted
         trained = best is not None and compacted is best.compacted and self._photographs
         notes = filter(None, [compacted.report.note, self.compactor.note, BEYOND_PHOTOGRAPHS if trained else ""])
-        report = replace(compacted.report, trials=tuple(self._tried), note="; ".join(notes))
+        report = replace(compacted.report, trials=tuple(self._pruning.tried), note="; ".join(notes))
         return replace(compacted, report=report), self._whole if best is None else best.search, tuple(self.trials)
 
     @property
@@ -138,6 +151,11 @@ class CountSearch:
         return trains and has_photographs(self.encoding.views)
 
     @property
+    def _trains(self) -> bool:
+        """Whether containers are trained, on renderings only through the decoder."""
+        return self._photographs or (self._tunes and self.goal.limits[0].setting != "psnr")
+
+    @property
     def _target_size(self) -> int:
         return self.encoding.settings.encode.target_size or 0
 
@@ -145,76 +163,112 @@ class CountSearch:
     def _number_for_size(self) -> int:
         return number_for_size(self.compactor.splats, self._target_size)
 
-    @property
-    def _first_number(self) -> int:
-        """Number of the point that is tried first with photographs."""
-        return self._number_for_size if self.goal.by_size else self._plan.number
-
     def _search(self) -> None:
         if not self._photographs:
             self._search_without_photographs()
         elif not self.goal.by_size or (self._target_size > OVERHEAD_BYTES and self._number_for_size > 0):
+            first = self._number_for_size if self.goal.by_size else self._plan.number
             if self.time is None:
-                self._prune()
+                self._pruning.prune_while(_is_prunable, PRUNABLE_POINTS)
             else:  # what each point loses is not worth the time to measure it
-                self._prune_to(min(self._first_number - 1, PRUNABLE_POINTS))
-            self._search_along_path()
+                self._pruning.prune_to(min(first - 1, PRUNABLE_POINTS))
+            self._search_along_path(first)
 
     def _search_without_photographs(self) -> None:
-        """Encode all Gaussians, then those that leave half of the error to the encoder, or as many as fit the size."""
+        """Encode all Gaussians, then fewer, trained or not, which may serve the goal better."""
         search = self._whole = self._encode(self._path.compacted(self._path.points[0], refine=False))
         if search.stopped or (self.goal.by_size and search.trials[0].bytes <= self._target_size):
             return
-        if not self.goal.by_size:
-            if search.best is not None:
-                self._prune()
-                self._encode_last_pruned(lambda trial: self.goal.margin(trial) >= self.goal.decisive(trial).half)
-        elif self._target_size > search.overhead:
-            self._prune()
-            if search.best is None or self._number_for_size > len(self._pruned):
-                self._search_along_path() if self._tunes else self._encode_by_size()
+        if search.best is None:
+            if self.goal.by_size and self._target_size > search.overhead:
+                self._search_along_path(self._number_for_size) if self._trains else self._encode_by_size()
+        elif self._trains:
+            self._search_on_renderings(search, search.best)
+        else:
+            self._search_without_training(search, search.best)
+
+    def _search_on_renderings(self, whole: RateControl, best: Container) -> None:
+        """Train as many Gaussians as pruning alone nearly serves.
+
+        A scene whose Gaussians are all needed keeps them.
+        """
+        most, rd_lambda = RENDERED_POINTS, best.encoded.rd_lambda
+        serves = self._meets
+        if self.goal.by_size:
+            most, reached = min(most, self._number_for_size), drop_of(whole.evaluate(best.encoded))
+
+            def serves(trial: Trial) -> bool:
+                return (trial.drop or 0.0) <= reached
+
+        self._pruning.prune_while(serves, most)
+        number = self._pruning.last(serves)
+        if number and rd_lambda is not None and self._plan.containers:
+            if self.goal.by_size:
+                rd_lambda = self._lambda_for_size(whole.trials, number)
+            self._search_lambda(number, rd_lambda)
+
+    def _lambda_for_size(self, trials: Sequence[Trial], number: int) -> float:
+        """Return the lambda at which a point should have the target size, by containers of all Gaussians."""
+        wanted = self._target_size / KEEP ** (SIZE_BY_COUNT * number)
+        made = sorted((trial.bytes, trial.rd_lambda) for trial in trials if trial.rd_lambda is not None)
+        sizes, lambdas = np.log2([size for size, _ in made]), np.log2([rd_lambda for _, rd_lambda in made])
+        return float(2.0 ** np.interp(math.log2(wanted), sizes, lambdas))
+
+    def _search_without_training(self, whole: RateControl, best: Container) -> None:
+        """Encode those that leave half of the error to the encoder, or as many as fit the size."""
+        pruning = self._pruning
+        if self.goal.by_size:
+            reached = psnr_of(whole.evaluate(best.encoded))
+            pruning.prune_while(_is_prunable, len(self.compactor.splats))
+            number = 0
+            if self._number_for_size <= len(pruning.losses):
+                number = pruning.last(lambda trial: (trial.psnr or 0.0) >= reached + HALF_ERROR_DB)
             else:
-                error = search.evaluate(search.best.encoded).mean.candidate_vs_reference.psnr
-                self._encode_last_pruned(lambda trial: (trial.psnr or 0.0) >= error + HALF_ERROR_DB)
+                self._encode_by_size()
+        else:
 
-    def _prune(self) -> None:
-        """Prune without training as far as that serves the goal, and record what each point loses."""
-        while len(self._path.points[-1]) > 1:
-            point = self._prune_to(len(self._path.points))
-            trial = self._measure(point.splats)
-            self._pruned.append(trial)
-            useful = self._photographs or self.goal.by_size or self.goal.margin(trial) >= self.goal.decisive(trial).half
-            enough = self._photographs and point.number == PRUNABLE_POINTS
-            if enough or not useful or not (trial.drop or 0.0) <= PRUNABLE_DROP:  # a drop may be NaN
-                break
+            def leaves_half(trial: Trial) -> bool:
+                return self.goal.margin(trial) >= self.goal.decisive(trial).half
 
-    def _prune_to(self, number: int) -> PathPoint:
-        """Prune without training up to a point of the path."""
-        path = self._path
-        while len(path.points) <= number:
-            path.prune(count_at(len(path.points), len(self.compactor.splats)))
-        return path.points[-1]
+            pruning.prune_while(lambda trial: leaves_half(trial) and _is_prunable(trial), len(self.compactor.splats))
+            number = pruning.last(leaves_half)
+        if number:
+            self._encode(self._path.compacted(self._path.points[number], refine=False))
 
-    def _encode_last_pruned(self, serves: Callable[[Trial], bool]) -> None:
-        """Search for the lambda at the last point that ``serves`` the goal."""
-        numbers = [number for number, trial in enumerate(self._pruned, 1) if serves(trial)]
-        if numbers:
-            self._encode(self._path.compacted(self._path.points[numbers[-1]], refine=False))
+    def _meets(self, trial: Trial) -> bool:
+        return self.goal.margin(trial) >= 0
+
+    def _search_lambda(self, number: int, rd_lambda: float) -> None:
+        """Make trained containers of one point of the path, the first one at ``rd_lambda``."""
+        attempts, byte_limit = self._plan.containers, self._candidates.best_bytes
+        trained = self._scenes.scene(number, byte_limit)
+        search = trained.search
+
+        def encoder(settings: EncodeSettings) -> Container:
+            self._scenes.containers = max(attempts - len(search.trials), 1)
+            return self._scenes.scene(number, byte_limit).encoder(settings)
+
+        try:
+            search.run(encoder, rd_lambda, attempts)
+        finally:
+            self.trials += search.trials
+        self._candidates.keep(search, trained.compacted)
+        self._stopped |= search.stopped
 
     def _encode_by_size(self) -> None:
         """Search for the lambda at the point that the size suggests, or at a later one if its containers are larger."""
         for attempt in range(self.compactor.settings.max_compactions):
             compacted = self._path.compacted(self._scenes.point(self._number_for_size + 2 * attempt), refine=True)
-            self._measure(compacted.splats)
+            self._pruning.measure(compacted.splats)
             if self._encode(compacted).best is not None:
                 return
 
-    def _search_along_path(self) -> None:
-        """Make containers of points of the path; see :func:`search_positions`."""
+    def _search_along_path(self, first: int) -> None:
+        """Make containers of points of the path, the first one at point ``first``; see :func:`search_positions`."""
         search_positions(
             self.goal,
             self._encode_position,
-            self._first_number,
+            first,
             (1, last_number(len(self.compactor.splats))),
             POINTS_PER_HALVING,
             self._plan.containers,
@@ -250,27 +304,26 @@ class CountSearch:
 
     def _encoding_of(self, compacted: Compacted) -> Encoding:
         cache = self.encoding.cache if compacted.splats is self.encoding.splats else None
-        return replace(self.encoding, splats=compacted.splats, cache=cache)
-
-    def _measure(self, splats: Splats) -> Trial:
-        """Return the figures of a scene that is not encoded, and record them for the report."""
-        evaluation = self.compactor.evaluate(splats)
-        trial = self.goal.measured(Trial(len(splats), None, 0), evaluation)
-        ssim_decides = self.goal.decisive(trial).setting == "max_ssim_drop"
-        self._tried.append(CountTrial(len(splats), drop_of(evaluation), trial.ssim_drop, ssim_decides))
-        return trial
+        encoding = replace(self.encoding, splats=compacted.splats, cache=cache)
+        if self._photographs or not self._trains or self._plan.containers == 0:
+            return encoding
+        return encoding.with_encode_settings(max_encodes=min(ENCODES, encoding.settings.encode.max_encodes))
 
     def _latest_point(self) -> PathPoint:
         """Return the last point if it is trained, else the last one that loses less than the goal allows."""
         points = self._path.points
         if points[-1].trained or self.goal.by_size:
             return points[-1]
-        met = [number for number, trial in enumerate(self._pruned, 1) if self.goal.margin(trial) >= 0]
-        return points[max(met, default=0)]
+        return points[self._pruning.last(self._meets)]
 
     def _reason_to_keep_all(self) -> str:
-        if self._tried or any(trial.count < len(self.compactor.splats) for trial in self.trials):
+        if self._pruning.tried or any(trial.count < len(self.compactor.splats) for trial in self.trials):
             return "and no smaller number of Gaussians that was tried serves the goal better"
         if self._stopped:
             return "and the search was stopped before a smaller number was tried"
         return "and all of them fit into the target size"
+
+
+def _is_prunable(trial: Trial) -> bool:
+    """Whether a point may be pruned further without training."""
+    return (trial.drop or 0.0) <= PRUNABLE_DROP  # false where a rendering failed

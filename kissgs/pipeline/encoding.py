@@ -38,6 +38,7 @@ from kissgs.rendering.rasterizer import Device
 from kissgs.settings import EncodeSettings, Settings
 
 if TYPE_CHECKING:
+    from kissgs.compaction.search_evaluation import SearchEvaluation
     from kissgs.finetuning.tune import Tuner
     from kissgs.rendering.sensitivity import WeightedCameras
     from kissgs.training.supervision import SupervisionViews
@@ -49,7 +50,7 @@ VIEW_UNCERTAINTY = {True: 0.1, False: 0.55}
 SENSITIVITY_VERSION = 5
 """Version of the measurement of sensitivity; a cache file of another version is measured again and replaced."""
 
-MAX_FINETUNED_ENCODES = 4
+MAX_FINETUNED_ENCODES = 3
 """Largest number of containers that a search for a goal fine-tunes; each takes a training."""
 
 MAX_OFFSET_DB = 30.0
@@ -95,6 +96,7 @@ class Encoding:
         packed: whether the files become a zip, whose size then counts; False for a folder.
         threads: number of threads; 0 means one per processor.
         progress: receives the events of all stages; its note says how far a search has come.
+        compare: compares containers of a search with ``original``; by default in the views that fit ``views``.
         deadline: time until which the container shall be finished; None for no limit.
         disposable: whether nobody needs the scene after the encoding. If so, and it is planned only once, it is
             replaced by an empty one before the images are compressed, so that its memory is free.
@@ -113,6 +115,7 @@ class Encoding:
     packed: bool
     threads: int
     progress: SearchNote
+    compare: SearchEvaluation | None = None
     deadline: Deadline | None = None
     disposable: bool = False
 
@@ -181,26 +184,32 @@ class Encoding:
         search.search_all(self._encoder(planner or self._planner(), None, None))
         return search
 
-    def rate_control(self, *, offset_db: float = 0.0, byte_limit: float = math.inf) -> RateControl:
+    def rate_control(
+        self, *, offset_db: float = 0.0, byte_limit: float = math.inf, tolerance: float = 1.0
+    ) -> RateControl:
         """Return a search that has no container yet.
 
         Args:
             offset_db: added to ``quality_offset_db`` of the settings, for the first container.
             byte_limit: see :class:`RateControl`.
+            tolerance: likewise.
         """
+        from kissgs.compaction.search_evaluation import SearchEvaluation
+
         settings = self.settings.encode
         return RateControl(
             self.original,
             settings.model_copy(
                 update={"quality_offset_db": min(settings.quality_offset_db + offset_db, MAX_OFFSET_DB)}
             ),
-            self.views,
+            self.compare or SearchEvaluation(self.original, self.views, self.threads),
             self.threads,
             self.progress,
             count=len(self.splats),
             packed=self.packed,
             byte_limit=byte_limit,
             deadline=self.deadline,
+            tolerance=tolerance,
         )
 
     def with_encode_settings(self, **changes: float) -> Encoding:

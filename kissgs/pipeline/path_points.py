@@ -29,7 +29,7 @@ def last_number(count: int) -> int:
     return max(1, math.floor(math.log(1 / count) / math.log(KEEP)))
 
 
-def number_for_size(splats: Splats, size: int) -> int:
+def number_for_size(splats: Splats, size: float) -> int:
     """Return the number of the point whose container is expected to have ``size`` bytes; 0: all Gaussians fit."""
     expected = (BYTES_PER_GAUSSIAN + BYTES_OF_SH * (splats.sh_degree > 0)) * len(splats)
     share = max((size - OVERHEAD_BYTES) / expected, 1 / len(splats))

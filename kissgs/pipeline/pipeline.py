@@ -287,8 +287,10 @@ def _check_finetuning(
 
 def _settings_as_used(decided: Settings, used: EncodeSettings, requested: Settings) -> dict[str, Any]:
     """Return the settings with the changes by a search for a goal and by fine-tuning, and the goals as requested."""
-    kept = ("rd_lambda", "quality_offset_db", "color_refit_iterations")  # the same request gives the same bytes
-    changes = {name: getattr(decided.encode, name) for name in kept}
+    kept = ["rd_lambda", "quality_offset_db", "color_refit_iterations", "max_encodes"]
+    if decided.encode.has_goal:
+        kept.append("prune_threshold_bits")  # fine-tuned containers have another one
+    changes = {name: getattr(decided.encode, name) for name in kept}  # the same request gives the same bytes
     changes |= {name: getattr(requested.encode, name) for name in GOALS}
     groups: dict[str, Any] = {"encode": used.model_copy(update=changes)}
     if requested.aims:  # what the time decides

@@ -8,14 +8,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from kissgs.cameras.views import Views
 from kissgs.core.deadline import Deadline
 from kissgs.core.errors import StopSearch, UnsupportedError
 from kissgs.core.limits import MAX_GAUSSIANS
 from kissgs.core.progress import SearchNote
 from kissgs.core.root_finding import StopRule, find_root
 from kissgs.core.splats import Splats
-from kissgs.evaluation.psnr_loss import SEARCH_SEED
 from kissgs.finetuning.result import FinetuneReport
 from kissgs.pipeline.goal import Goal, Limit
 from kissgs.pipeline.read_options import ReadOptions
@@ -28,7 +26,7 @@ from kissgs.settings.encode import GOALS
 from kissgs.sogxt.container import stored_sizes
 
 if TYPE_CHECKING:
-    from kissgs.evaluation.evaluate import Rendering
+    from kissgs.compaction.search_evaluation import SearchEvaluation
     from kissgs.evaluation.results import Evaluation
 
 LOG2_LAMBDA_RANGE = (-70.0, -6.0)
@@ -94,7 +92,7 @@ class RateControl:
         self,
         original: Splats,
         settings: EncodeSettings,
-        views: Views | None,
+        compare: SearchEvaluation,
         threads: int,
         progress: SearchNote,
         *,
@@ -102,22 +100,24 @@ class RateControl:
         packed: bool = True,
         byte_limit: float = math.inf,
         deadline: Deadline | None = None,
+        tolerance: float = 1.0,
     ) -> None:
         """Prepare the search; nothing is encoded yet.
 
         Args:
             original: reference scene of the evaluation.
             settings: settings with a goal.
-            views: views of the evaluation; None for cameras drawn over the whole scene.
+            compare: compares a decoded container with ``original``.
             threads: number of threads; 0 means one per processor.
             progress: receives events; its note is set to the latest trial.
             count: number of Gaussians of the scene that is encoded, if it is not ``original``.
             packed: whether the files become a zip, whose size then counts; False for a folder.
             byte_limit: for a goal that is no size: the search ends if a container of this size or more misses the goal.
             deadline: once a container meets the goal, no other one is begun that would not be finished by then.
+            tolerance: how near the goal a container ends the search, in units of :attr:`Limit.near`.
         """
         self.original, self.settings, self.goal = original, settings, Goal.of(settings)
-        self.views, self.threads, self.progress = views, threads, progress
+        self.compare, self.threads, self.progress = compare, threads, progress
         self.count = len(original) if count is None else count
         self.packed, self.byte_limit = packed, byte_limit
         self.trials: list[Trial] = []
@@ -131,8 +131,7 @@ class RateControl:
         self._jump: tuple[float, int] | None = None
         self._psnr: float | None = None
         self._finetuning: FinetuneReport | None = None
-        self._rendered: dict[str, Rendering] | None = None
-        self._distance = -math.inf
+        self._distance, self._tolerance = -math.inf, tolerance
         self._deadline, self._begun, self._longest = deadline, time.perf_counter(), 0.0
 
     def search_all(self, encoder: Encoder) -> None:
@@ -269,7 +268,7 @@ class RateControl:
             margin_at,
             start,
             first_sample.limit.slope,
-            lambda x: self._samples[x].limit.near,
+            lambda x: self._tolerance * self._samples[x].limit.near,
             LOG2_LAMBDA_RANGE,
             stop=StopRule(attempts, self._is_jump),
             before={x: sample.margin for x, sample in self._samples.items()},
@@ -373,16 +372,10 @@ class RateControl:
 
     def evaluate(self, encoded: Encoded) -> Evaluation:
         """Compare the renderings of a container with those of the original, or both with the photographs."""
-        from kissgs.evaluation.cameras import evaluation_views
-        from kissgs.evaluation.evaluate import compare_images
-
         self.progress("evaluate", 0.0)
-        if self.views is None:
-            self.views = evaluation_views(self.original, seed=SEARCH_SEED, threads=self.threads)
-            self._rendered = {}
         most = max(len(self.original), MAX_GAUSSIANS)
         decoded = read_scene(encoded.files, ReadOptions(max_gaussians=most), threads=self.threads)
-        return compare_images(self.original, decoded, self.views, threads=self.threads, reference_images=self._rendered)
+        return self.compare(decoded)
 
 
 @dataclass(frozen=True, slots=True)

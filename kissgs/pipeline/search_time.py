@@ -63,6 +63,14 @@ MEETING = (
 )
 """Plans where the goal must be met: a single container needs a reserve, two can come near it."""
 
+RENDERED = (
+    (15.0, SearchPlan(0)),
+    (30.0, SearchPlan(1)),
+    (60.0, SearchPlan(2)),
+    (math.inf, SearchPlan(3)),
+)
+"""The same where renderings of the scene are the targets: number and lambda follow from a search of the encoder."""
+
 
 @dataclass(frozen=True, slots=True)
 class SearchTime:
@@ -86,10 +94,16 @@ class SearchTime:
         """Expected seconds to write a fine-tuned container and to evaluate it."""
         return ENDING_SHARE * self.encode_seconds
 
-    def plan(self, *, aims: bool) -> SearchPlan:
-        """Return what to do in the time that is left; ``aims`` says whether the goal is no more than an aim."""
+    def plan(self, *, photographs: bool, aims: bool) -> SearchPlan:
+        """Return what to do in the time that is left.
+
+        Args:
+            photographs: whether photographs are the targets of the training.
+            aims: whether the goal is no more than an aim.
+        """
         left = self.deadline.seconds / self.encode_seconds
-        return next(plan for most, plan in (AIMING if aims else MEETING) if left <= most)
+        plans = RENDERED if not photographs else AIMING if aims else MEETING
+        return next(plan for most, plan in plans if left <= most)
 
     def for_point(self, points: int, containers: int) -> Deadline:
         """Return the deadline for training the next of so many points, before so many containers."""

@@ -24,6 +24,10 @@ A refinement of the scene before its encoding would take more steps for the same
 """
 
 
+TOLERANCE = 2.5
+"""How near the goal a container ends the search, in units of that without training: another one takes a training."""
+
+
 @dataclass(frozen=True, slots=True)
 class TrainedScene:
     """A scene of the path, and what makes containers of it.
@@ -47,7 +51,7 @@ class TrainedScenes:
         encoding: encoding of the whole scene.
         compactor: compactor of the same scene.
         path: training path of the compactor.
-        photographs: whether photographs are the targets.
+        untrained: number of the last point that may be fine-tuned without training along the path.
         offset_db: added to ``quality_offset_db`` for the first container of a scene, decibels.
         time: the time that training shares with encoding; None for no limit.
         containers: number of containers that are still to be made in that time, this one included.
@@ -56,7 +60,7 @@ class TrainedScenes:
     encoding: Encoding
     compactor: Compactor
     path: TrainingPath
-    photographs: bool
+    untrained: int
     offset_db: float
     time: SearchTime | None
     containers: int
@@ -78,10 +82,12 @@ class TrainedScenes:
         """Prune and train up to a point of the path, and return it."""
         path = self.path
         while len(path.points) <= number:
-            if not path.points[-1].trained:
+            trains = len(path.points) > self.untrained
+            if trains and not path.points[-1].trained:
                 self._train(number)
             path.prune(count_at(len(path.points), len(self.compactor.splats)))
-            self._train(number)
+            if trains:
+                self._train(number)
         return path.points[number]
 
     def _train(self, number: int) -> None:
@@ -101,11 +107,11 @@ class TrainedScenes:
         if tunes:  # training replaces the refit of colours
             encoding = encoding.with_encode_settings(color_refit_iterations=0)
             self._tuner = self._tuner or self._first_tuner(encoding)
-        search = encoding.rate_control(offset_db=self.offset_db, byte_limit=byte_limit)
+        search = encoding.rate_control(offset_db=self.offset_db, byte_limit=byte_limit, tolerance=TOLERANCE)
         return TrainedScene(compacted, search, encoding.encoder(self._tuner))
 
     def _first_tuner(self, encoding: Encoding) -> Tuner | None:
-        prepared = (self.compactor.supervision, self.path.targets) if self.photographs else None
+        prepared = (self.compactor.supervision, self.path.targets) if self.compactor.settings.trains else None
         tuner = encoding.tuner(COMPLETING, prepared)
         if tuner is not None and self.time is not None:
             tuner.ending_seconds = self.time.ending_seconds

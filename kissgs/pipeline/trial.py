@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from kissgs.evaluation.psnr_loss import drop_of, psnr_of, ssim_drop_of
+from kissgs.evaluation.psnr_loss import drop_of, over_scene, psnr_of, ssim_drop_of
 from kissgs.evaluation.results import as_json
 
 if TYPE_CHECKING:
@@ -40,7 +40,8 @@ class Trial:
 
     def with_evaluation(self, evaluation: Evaluation, *, ssim: bool = False) -> Trial:
         """Return a copy with the figures of an evaluation, also those of SSIM if requested."""
-        worst, fifth = evaluation.worst.comparison.candidate_vs_reference.psnr, evaluation.fifth_percentile
+        scene = over_scene(evaluation)
+        worst, fifth = scene.worst.comparison.candidate_vs_reference.psnr, scene.fifth_percentile
         return replace(
             self,
             psnr=psnr_of(evaluation),

@@ -72,7 +72,7 @@ class EncodeSettings(BaseModel):
         le=20,
         description="With rate_distortion: search for the smallest container whose renderings of the held-out views "
         "lose at most this PSNR, decibels. Takes a few encodings. Without photographs, the loss is estimated at random "
-        "cameras, other ones than those of 'evaluate', as if the original scene had 30 dB to photographs.",
+        "poses from which photographs might have been taken, as if the original scene had 30 dB to photographs.",
     )
     max_ssim_drop: float | None = Field(
         None,
@@ -80,14 +80,14 @@ class EncodeSettings(BaseModel):
         le=1,
         description="With rate_distortion: search for the smallest container whose renderings of the held-out views "
         "lose at most this SSIM to the photographs; without photographs, SSIM to renderings of the scene is at least 1 "
-        "minus this, at random cameras other than those of 'evaluate'. Takes a few encodings.",
+        "minus this, at random poses from which photographs might have been taken. Takes a few encodings.",
     )
     max_encodes: int = Field(
         10,
         ge=1,
         le=100,
         description="With a goal: largest number of containers that are made of one scene. With fine-tuning, up to as "
-        "many fine-tuned ones, at most four, are added, and one at the finest or coarsest lambda if several missed "
+        "many fine-tuned ones, at most three, are added, and one at the finest or coarsest lambda if several missed "
         "the goal.",
     )
     prune_threshold_bits: float = Field(

@@ -12,8 +12,8 @@ class FinetuneSettings(TrainingViewSettings):
 
     enabled: bool | None = Field(
         None,
-        description="Fine-tune, against photographs if there are any, else renderings. auto: with photographs and a "
-        "goal other than psnr, where torch is installed.",
+        description="Fine-tune, against photographs if there are any, else renderings. auto: with a goal other than "
+        "psnr, where torch is installed.",
     )
     steps: int = Field(
         1000,

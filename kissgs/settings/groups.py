@@ -59,21 +59,22 @@ class Settings(BaseModel):
     def decided(self, *, photographs: bool, torch: bool) -> Self:
         """Return settings with what they leave open decided: whether training serves the goal, and by which loss.
 
-        A size, a loss or the smallest container in a limited time is served best by fewer Gaussians that are trained on
-        photographs, and by fine-tuning. Pruning or training without photographs loses more in views that nobody knows
-        than it saves, and a PSNR to the scene's own renderings falls by training on photographs. With a time limit
-        alone, ``finetune.enabled`` stays open without photographs: it depends on the time.
+        A size or a loss is served best by fewer Gaussians and by training, on photographs or else on renderings of the
+        scene, and so is a time limit alone with photographs. A PSNR to the scene's own renderings falls by training.
+        Without photographs and fine-tuning, pruning loses more in views that nobody knows than it saves.
+        With a time limit alone, ``finetune.enabled`` stays open without photographs: it depends on the time.
 
         Args:
             photographs: whether there are photographs to train on, and others to evaluate the result.
             torch: whether torch is installed, which training needs.
         """
-        trains = (self.encode.has_goal or self.aims) and self.encode.psnr is None and photographs and torch
+        trains = torch and self.encode.psnr is None and (self.encode.has_goal or (self.aims and photographs))
         compact, finetune = self.compact, self.finetune
         ssim_weight = SSIM_WEIGHT if self.encode.max_ssim_drop is None else SSIM_GOAL_WEIGHT
         compact, finetune = compact.with_ssim_weight(ssim_weight), finetune.with_ssim_weight(ssim_weight)
         if compact.auto_count is None or self.aims:
-            wanted = trains and compact.trains and (compact.auto_count or not compact.enabled)
+            serves = compact.trains and (photographs or finetune.enabled is not False)
+            wanted = trains and serves and (compact.auto_count or not compact.enabled)
             compact = compact.model_copy(update={"auto_count": wanted})
         if finetune.enabled is None and (trains or not self.aims):
             finetune = finetune.model_copy(update={"enabled": trains})

@@ -108,7 +108,7 @@ function optionFields(limits, presets) {
         ...(limit && { time_limit: limit }),
         ...(encode && { encode }),
         ...(compact && { compact }),
-        ...(finetune.checked && { finetune: { enabled: true } }),
+        ...((finetune.checked || encode) && { finetune: { enabled: finetune.checked } }), // a goal alone would train
       };
     },
     /** Set the options of an earlier job. @param {import("./api.js").JobOptions} earlier */

@@ -1,6 +1,7 @@
 """PSNR, its drop and that of SSIM as goals define them. Oracle: errors, added and averaged one by one."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kissgs.cameras.views import View
-from kissgs.evaluation.psnr_loss import ASSUMED_PSNR, MAX_ERROR_RATIO, drop_of, psnr_of, ssim_drop_of
+from kissgs.evaluation.psnr_loss import ASSUMED_PSNR, MAX_ERROR_RATIO, MAX_SSIM_RATIO, drop_of, psnr_of, ssim_drop_of
 from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, ViewComparison
 from kissgs.rendering.camera import look_at
 
@@ -82,6 +83,37 @@ def test_difficult_views_do_not_limit_the_ssim():
     """The worst two of 40 views lose four times the mean."""
     found = similarities(*[0.99] * 38, 0.95, 0.95)
     assert ssim_drop_of(found) == pytest.approx(1 - found.mean.candidate.ssim)
+
+
+def with_surroundings(psnrs, drawn, photo_psnrs=None):
+    return replace(evaluation_of(psnrs, photo_psnrs), surroundings=evaluation_of(drawn))
+
+
+def test_the_drop_is_that_of_the_views_and_the_psnr_that_of_the_surroundings():
+    found = with_surroundings([ASSUMED_PSNR + 16.4] * 24, [40.0] * 24)
+    assert drop_of(found) == pytest.approx(0.1, abs=0.002)
+    assert psnr_of(found) == pytest.approx(40)
+    better = with_surroundings([46.4] * 24, [50.0] * 24)
+    assert drop_of(better) == drop_of(found)
+    assert psnr_of(better) == pytest.approx(50)
+
+
+def test_a_part_lost_in_the_surroundings_limits_the_drop():
+    """The worst two of 24 of each group count, so that views of one do not hide the other's."""
+    found = with_surroundings([46.4] * 24, [46.4] * 23 + [9.0])
+    error = np.mean(squared([9.0, 46.4])) / squared(ASSUMED_PSNR)
+    assert drop_of(found) == pytest.approx(10 * math.log10(1 + error / MAX_ERROR_RATIO))
+    assert drop_of(with_surroundings([46.4] * 23 + [9.0], [46.4] * 24)) == pytest.approx(drop_of(found))
+    lost = replace(similarities(*[0.99] * 24), surroundings=similarities(*[0.99] * 23, 0.2))
+    assert ssim_drop_of(lost) == pytest.approx((0.8 + 0.01) / 2 / MAX_SSIM_RATIO)
+    assert ssim_drop_of(replace(lost, surroundings=similarities(*[0.9] * 24))) == pytest.approx(0.1 / MAX_SSIM_RATIO)
+
+
+def test_with_photographs_the_surroundings_do_not_count():
+    pairs = [(32.0, 31.5)] * 24
+    found = with_surroundings([45.0] * 24, [9.0] * 24, pairs)
+    assert drop_of(found) == pytest.approx(0.5)
+    assert psnr_of(found) == psnr_of(evaluation_of([45.0] * 24, pairs))
 
 
 def squared(psnr):

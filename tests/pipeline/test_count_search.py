@@ -20,7 +20,7 @@ from kissgs.evaluation.psnr_loss import drop_of
 from kissgs.rendering.rasterizer import render
 
 SCENE = kissgs.sample_scene(600, sh_degree=0, seed=5)
-FEW_VIEWS = {"sensitivity_views": 16, "sensitivity_view_size": 96}
+FEW_VIEWS = {"sensitivity_views": 16, "sensitivity_view_size": 96, "finetune": {"enabled": False}}
 PRUNE = {
     "sparsify_steps": 0,
     "refine_steps": 0,

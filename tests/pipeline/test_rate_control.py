@@ -8,6 +8,8 @@ import pytest
 
 import kissgs
 from kissgs import FinetuneReport, OutputError, Settings, Splats, StopSearch, UnsupportedError
+from kissgs.cameras.virtual.random_poses import random_poses
+from kissgs.compaction.search_evaluation import SearchEvaluation
 from kissgs.core.progress import SearchNote, silent
 from kissgs.evaluation.cameras import evaluation_views
 from kissgs.pipeline.rate_control import Container, RateControl
@@ -32,6 +34,7 @@ TUNED = FinetuneReport(
 
 
 def settings(compact=None, finetune=None, **goal):
+    finetune = finetune or {"enabled": False}
     return Settings.from_preset("balanced", compact=compact, finetune=finetune, **FEW_VIEWS, **goal)
 
 
@@ -111,7 +114,7 @@ def test_the_smallest_is_best_with_or_without_fine_tuning():
         encode(SCENE, Settings.from_preset("fast", scale_step=step).encode, threads=1) for step in (0.2, 0.1)
     )
     wanted = settings(psnr=20.0).encode
-    search = RateControl(SCENE, wanted, None, 1, SearchNote(silent))
+    search = RateControl(SCENE, wanted, SearchEvaluation(SCENE, None, 1), 1, SearchNote(silent))
     search.run(lambda chosen: Container(small, chosen))
     search.run(lambda chosen: Container(large, chosen, TUNED))
     assert [trial.bytes for trial in search.trials] == sorted(trial.bytes for trial in search.trials)
@@ -126,12 +129,12 @@ def test_the_smallest_is_best_with_or_without_fine_tuning():
 
 def test_the_evaluation_has_other_cameras_than_the_search():
     """An evaluation with the same cameras would favour the container that they have selected."""
-    search = RateControl(SCENE, settings(psnr=20.0).encode, None, 1, SearchNote(silent))
+    search = RateControl(SCENE, settings(psnr=20.0).encode, SearchEvaluation(SCENE, None, 1), 1, SearchNote(silent))
     search.run(lambda chosen: Container(encode(SCENE, chosen, threads=1), chosen))
-    places = [
-        {view.camera.viewmat.tobytes() for view in views.test} for views in (search.views, evaluation_views(SCENE))
-    ]
-    assert not places[0] & places[1]
+    trained = random_poses(SCENE, side=64, count=48)
+    others = (evaluation_views(SCENE).test, trained.train, trained.test)
+    places = [{view.camera.viewmat.tobytes() for view in views} for views in (search.compare.views.test, *others)]
+    assert not places[0] & set().union(*places[1:])
 
 
 @pytest.mark.parametrize("goal", [{"psnr": 30.0}, {"max_psnr_drop": 2.0}])
@@ -140,7 +143,7 @@ def test_no_goal_is_met_if_an_object_is_lost(goal):
     away = Splats(**{name: getattr(SCENE, name) + np.float32(1000 * (name == "means")) for name in ATTRIBUTES})
     both = Splats(**{name: np.concatenate([getattr(SCENE, name), getattr(away, name)]) for name in ATTRIBUTES})
     one = encode(SCENE, Settings.from_preset("fast", quality_offset_db=12).encode, threads=1)
-    search = RateControl(both, settings(**goal).encode, None, 1, SearchNote(silent))
+    search = RateControl(both, settings(**goal).encode, SearchEvaluation(both, None, 1), 1, SearchNote(silent))
     search.run(lambda chosen: Container(one, chosen))
     trial = search.trials[0]
     assert search.best is None
@@ -155,7 +158,9 @@ def test_the_highest_psnr_is_best_if_the_goal_is_a_size(worse):
     small, large = (
         encode(SCENE, Settings.from_preset("fast", scale_step=step).encode, threads=1) for step in (0.2, 0.1)
     )
-    search = RateControl(SCENE, settings(target_size=10**6).encode, None, 1, SearchNote(silent))
+    search = RateControl(
+        SCENE, settings(target_size=10**6).encode, SearchEvaluation(SCENE, None, 1), 1, SearchNote(silent)
+    )
     search.run(lambda chosen: Container(large, chosen))
     report = FinetuneReport(**{**TUNED.as_dict(), "psnr_after": 29.0 if worse else 31.0})
     search.run(lambda chosen: Container(small, chosen, report))

@@ -1,0 +1,64 @@
+"""``SearchEvaluation``: how far the candidates of a search are from the original scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from kissgs.cameras.views import Views
+from kissgs.cameras.virtual.random_poses import random_poses
+from kissgs.core.progress import Progress, silent
+from kissgs.core.splats import Splats
+from kissgs.evaluation.cameras import evaluation_views
+from kissgs.evaluation.evaluate import Rendering, compare_images
+from kissgs.evaluation.psnr_loss import SEARCH_SEED
+from kissgs.evaluation.results import Evaluation
+
+COUNT, SIDE = 24, 320
+"""Number and side, pixels, of the views without a capture, apart from those drawn over the whole scene."""
+
+
+@dataclass(slots=True, eq=False)
+class SearchEvaluation:
+    """Compares candidates with the original scene in views that nothing is trained or planned with.
+
+    With a capture these are its held-out views. Without one they are random poses from which photographs might have
+    been taken, and their ``surroundings`` cameras drawn over the whole scene. What a container loses in such poses is
+    near what it loses in photographs: for fox 1.2 dB more PSNR to the original, with and without training. Drawn
+    cameras find 3 to 4 dB more without training and 0.5 with it, but they see every part of the scene.
+
+    Attributes:
+        original: the original scene, clean.
+        views: the capture; None for no capture.
+        threads: number of threads; 0 means one per processor.
+    """
+
+    original: Splats
+    views: Views | None
+    threads: int = 0
+    _drawn: Views | None = field(init=False, default=None)
+    _images: dict[str, Rendering] = field(init=False, default_factory=dict)
+    _drawn_images: dict[str, Rendering] = field(init=False, default_factory=dict)
+
+    def __call__(self, candidate: Splats, progress: Progress = silent) -> Evaluation:
+        """Evaluate a candidate; reports the stages "cameras", "kernels" and "evaluate".
+
+        Raises:
+            InvalidViewsError: a photograph cannot be read.
+            UnsupportedError: an image would take too much memory.
+        """
+        if self.views is None:
+            scene, threads = self.original, self.threads
+            poses = random_poses(scene, side=SIDE, count=COUNT, seed=SEARCH_SEED, threads=threads, progress=progress)
+            self._drawn = evaluation_views(scene, seed=SEARCH_SEED, threads=threads, progress=progress)
+            self.views = replace(poses, train=(), test=poses.train + poses.test)
+        if self._drawn is None:  # a capture, whose images are too many to be kept
+            return self._compare(candidate, self.views, None, progress)
+        found = self._compare(candidate, self.views, self._images, progress)
+        return replace(found, surroundings=self._compare(candidate, self._drawn, self._drawn_images, progress))
+
+    def _compare(
+        self, candidate: Splats, views: Views, images: dict[str, Rendering] | None, progress: Progress
+    ) -> Evaluation:
+        return compare_images(
+            self.original, candidate, views, threads=self.threads, reference_images=images, progress=progress
+        )

@@ -1,0 +1,83 @@
+"""Goals of a bare scene, which its renderings serve. Oracle: the encoder alone, from cameras that nothing else uses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.photographed import FEW_VIEWS
+
+import kissgs
+from kissgs import Settings
+from kissgs.cameras.views import Views
+from kissgs.cameras.virtual.random_poses import random_poses
+from kissgs.core.splats import ATTRIBUTES, Splats
+from kissgs.evaluation.evaluate import compare_images
+
+VIEWS = {"views": 48, "view_size": 160}
+NEEDED = kissgs.sample_scene(400, sh_degree=1, seed=7)
+
+
+def with_faint(scene):
+    """Return a scene with as many faint Gaussians, elsewhere among those of the scene."""
+    rng = np.random.default_rng(3)
+    shift = np.exp(scene.scales) * rng.standard_normal(scene.means.shape)
+    faint = replace(
+        scene,
+        means=(scene.means + shift).astype(np.float32),
+        opacities=rng.uniform(-2.5, -1.5, scene.opacities.shape).astype(np.float32),
+    )
+    both = {name: np.concatenate([getattr(scene, name), getattr(faint, name)]) for name in ATTRIBUTES}
+    return Splats(**both)
+
+
+SMALL, LARGE = with_faint(NEEDED), with_faint(kissgs.sample_scene(3000, sh_degree=0, seed=7))
+
+
+def settings(tunes=True, steps=200, **goal):
+    finetune = {"enabled": tunes, "steps": steps, **VIEWS}
+    return Settings.from_preset("balanced", compact=VIEWS, finetune=finetune, **FEW_VIEWS, **goal)
+
+
+def psnr(found, scene):
+    """Return the mean PSNR to the scene's renderings, decibels, from poses of a seed that nothing else has."""
+    poses = random_poses(scene, side=96, count=24, seed=999)
+    views = Views((), (*poses.train, *poses.test), poses.background, "")
+    return compare_images(scene, kissgs.decompress(found.files), views).mean.candidate_vs_reference.psnr
+
+
+@pytest.mark.quick(0)
+def test_fewer_gaussians_are_trained_for_a_loss():
+    trained, alone = (kissgs.compress(SMALL, settings=settings(tunes, max_psnr_drop=0.5)) for tunes in (True, False))
+    for found in (trained, alone):
+        kept = [trial for trial in found.report.trials if trial.bytes == len(found.to_zip())]
+        assert any(trial.drop <= 0.5 for trial in kept)
+    assert trained.report.finetuning.target_source == "renderings"
+    assert trained.report.compaction.count == 512
+    assert "it is unchanged" not in trained.report.compaction.note
+    assert len(trained.to_zip()) < 0.97 * len(alone.to_zip())
+
+
+@pytest.mark.quick(0)
+def test_a_size_is_better_used_with_training():
+    plain = kissgs.compress(LARGE, settings=settings(tunes=False))
+    wanted = round(0.6 * len(plain.to_zip()))
+    trained, alone = (kissgs.compress(LARGE, settings=settings(tunes, target_size=wanted)) for tunes in (True, False))
+    assert max(len(trained.to_zip()), len(alone.to_zip())) <= wanted
+    assert psnr(trained, LARGE) > psnr(alone, LARGE) + 1.5
+
+
+def test_a_scene_whose_gaussians_are_all_needed_keeps_them():
+    wanted = round(0.7 * len(kissgs.compress(NEEDED, settings=settings(tunes=False)).to_zip()))
+    trained, alone = (kissgs.compress(NEEDED, settings=settings(tunes, target_size=wanted)) for tunes in (True, False))
+    assert trained.report.compaction.count == len(NEEDED)
+    assert psnr(trained, NEEDED) >= psnr(alone, NEEDED) - 0.1
+
+
+@pytest.mark.parametrize("goal", [{"max_psnr_drop": 1.0}, {"max_ssim_drop": 0.05}])
+def test_the_same_request_gives_the_same_bytes(goal):
+    """Any number of threads, and also the request that the report shows."""
+    few, chosen = with_faint(NEEDED.select(np.arange(100))), settings(steps=20, **goal)
+    one, other = (kissgs.compress(few, settings=chosen, threads=threads) for threads in (1, 2))
+    assert one.files == other.files
+    again = kissgs.compress(few, settings=Settings.model_validate(one.report.settings))
+    assert again.files == one.files
