@@ -153,7 +153,8 @@ class CountSearch:
     @property
     def _trains(self) -> bool:
         """Whether containers are trained, on renderings only through the decoder."""
-        return self._photographs or (self._tunes and self.goal.limits[0].setting != "psnr")
+        bare = self.encoding.views is None and self.goal.limits[0].setting != "psnr"
+        return self._photographs or (bare and self._tunes)
 
     @property
     def _target_size(self) -> int:

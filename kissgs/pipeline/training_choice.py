@@ -30,7 +30,8 @@ def decided(settings: Settings, views: Views | None, *, keep_all: bool = False, 
     """
     if keep_all and settings.compact.auto_count is None:
         settings = settings.model_copy(update={"compact": settings.compact.model_copy(update={"auto_count": False})})
-    return settings.decided(photographs=has_photographs(views), torch=has_torch() if torch is None else torch)
+    photographs = None if views is None else has_photographs(views)
+    return settings.decided(photographs=photographs, torch=has_torch() if torch is None else torch)
 
 
 def work_plan(

@@ -56,19 +56,24 @@ class Settings(BaseModel):
         encode = self.encode
         return self.time_limit is not None and encode.rate_distortion and not encode.has_goal and not encode.rd_lambda
 
-    def decided(self, *, photographs: bool, torch: bool) -> Self:
+    def decided(self, *, photographs: bool | None, torch: bool) -> Self:
         """Return settings with what they leave open decided: whether training serves the goal, and by which loss.
 
-        A size or a loss is served best by fewer Gaussians and by training, on photographs or else on renderings of the
-        scene, and so is a time limit alone with photographs. A PSNR to the scene's own renderings falls by training.
+        A size or a loss is served best by fewer Gaussians and by training, on photographs or without a capture on
+        renderings of the scene, and so is a time limit alone with photographs. A PSNR to the scene's own renderings
+        falls by training, and a capture without photographs to evaluate the result would be overfitted.
         Without photographs and fine-tuning, pruning loses more in views that nobody knows than it saves.
         With a time limit alone, ``finetune.enabled`` stays open without photographs: it depends on the time.
 
         Args:
-            photographs: whether there are photographs to train on, and others to evaluate the result.
+            photographs: whether a capture has photographs to train on, and others to evaluate the result; None for no
+                capture.
             torch: whether torch is installed, which training needs.
         """
-        trains = torch and self.encode.psnr is None and (self.encode.has_goal or (self.aims and photographs))
+        bare = photographs is None and self.encode.has_goal
+        trains = (
+            torch and self.encode.psnr is None and (bare or (bool(photographs) and (self.encode.has_goal or self.aims)))
+        )
         compact, finetune = self.compact, self.finetune
         ssim_weight = SSIM_WEIGHT if self.encode.max_ssim_drop is None else SSIM_GOAL_WEIGHT
         compact, finetune = compact.with_ssim_weight(ssim_weight), finetune.with_ssim_weight(ssim_weight)

@@ -96,7 +96,7 @@ async def submit(
                 submission = await _receive_form(context, request, spool, parsed, name, key)
             else:
                 received = await _receive_raw(context, request, spool)
-                chosen = parsed or JobOptions().decided(photographs=False, torch=can_train())
+                chosen = parsed or JobOptions().decided(photographs=None, torch=can_train())
                 submission = Submission(received, chosen, scene_name(name), key)
             try:
                 job, new = await run_sync(_queue, context, submission, owner)
@@ -118,7 +118,7 @@ def parse_options(text: str | bytes) -> JobOptions:
         ProblemError: they are invalid; the problem lists every invalid field. Or they cannot be met on this server.
     """
     try:
-        options = JobOptions.model_validate_json(text).decided(photographs=False, torch=can_train())
+        options = JobOptions.model_validate_json(text).decided(photographs=None, torch=can_train())
     except ValidationError as error:
         named, found = field_errors(error.errors())
         raise ProblemError(

@@ -94,10 +94,10 @@ def test_what_settings_leave_open(given, compacts, tunes):
     goal = Settings.from_preset("balanced", max_psnr_drop=0.1, **given)
     chosen = goal.decided(photographs=True, torch=True)
     assert (chosen.compact.auto_count, chosen.finetune.enabled) == (compacts, tunes)
-    bare = goal.decided(photographs=False, torch=True)
+    bare = goal.decided(photographs=None, torch=True)
     assert (bare.compact.auto_count, bare.finetune.enabled) == (compacts and tunes, tunes)
-    for photographs_ in (True, False):
-        chosen = goal.decided(photographs=photographs_, torch=False)
+    for photographs_, torch in [(True, False), (None, False), (False, True)]:
+        chosen = goal.decided(photographs=photographs_, torch=torch)
         assert (chosen.compact.auto_count, chosen.finetune.enabled) == (False, False)
     for other in (Settings(), Settings.from_preset("balanced", psnr=40)):
         chosen = other.decided(photographs=True, torch=True)

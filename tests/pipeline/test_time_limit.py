@@ -67,11 +67,17 @@ def test_a_goal_keeps_its_value():
 
 def test_more_time_makes_more_containers():
     for aims in (True, False):
-        plans = [SearchTime(Deadline.after(10 * units), 10).plan(aims=aims) for units in (3, 6, 12, 30, 90)]
+        plans = [
+            SearchTime(Deadline.after(10 * units), 10).plan(photographs=True, aims=aims) for units in (3, 6, 12, 30, 90)
+        ]
         assert [plan.containers for plan in plans] == sorted(plan.containers for plan in plans)
         assert [plan.number for plan in plans] == sorted(plan.number for plan in plans)
         assert (plans[0].containers, plans[-1].containers) == (1, 3)
         assert [plan.brief for plan in plans] == [True, False, False, False, False]
+    rendered = [
+        SearchTime(Deadline.after(10 * units), 10).plan(photographs=False, aims=False) for units in (4, 20, 40, 90)
+    ]
+    assert [plan.containers for plan in rendered] == [0, 1, 2, 3]
 
 
 def test_the_shares_of_a_search_fill_its_time():
@@ -176,7 +182,7 @@ def test_a_short_search_prunes_no_further_than_it_trains(tmp_path, monkeypatch):
     scene = cloud(200)
     views = photographs(scene, tmp_path)
     monkeypatch.setattr("kissgs.pipeline.time_plan.encode_seconds", lambda *found: 1e-3)
-    monkeypatch.setattr(SearchTime, "plan", lambda self, aims: MEETING[0][1])
+    monkeypatch.setattr(SearchTime, "plan", lambda self, photographs, aims: MEETING[0][1])
     requested = with_photographs(max_psnr_drop=0.5).model_copy(update={"time_limit": LONG})
     found = kissgs.compress(scene, settings=requested, views=views)
     assert found.report.trials[0].count == round(200 * 0.8**2)
