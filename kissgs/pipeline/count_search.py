@@ -43,7 +43,7 @@ PRUNABLE_POINTS = 3
 """Number of the last point that is pruned without training where there are photographs: half of the Gaussians."""
 
 RENDERED_POINTS = 5
-"""The same where renderings of the scene are the targets: training along the path, at high rates, departs from them."""
+"""Number of that point where renderings of the scene are the targets, from which training along the path departs."""
 
 BEYOND_PHOTOGRAPHS = (
     "trained for what the photographs show: beyond them it changes more (--evaluate measures how much; --compact 100% "

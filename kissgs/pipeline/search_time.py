@@ -69,7 +69,7 @@ RENDERED = (
     (60.0, SearchPlan(2)),
     (math.inf, SearchPlan(3)),
 )
-"""The same where renderings of the scene are the targets: number and lambda follow from a search of the encoder."""
+"""Plans where renderings of the scene are the targets: number and lambda follow from a search of the encoder."""
 
 
 @dataclass(frozen=True, slots=True)

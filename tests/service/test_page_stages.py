@@ -14,6 +14,7 @@ FEW = {"sensitivity_views": 4, "sensitivity_view_size": 48}
 VIEWS = {"views": 24, "view_size": 48}
 TRAINED = {"sparsify_steps": 4, "refine_steps": 4, "prune_rounds": 2, **VIEWS}
 TUNED = {"enabled": True, "steps": 4, **VIEWS}
+UNTUNED = {"enabled": False}
 
 JOBS = {
     "fast": {"preset": "fast"},
@@ -27,11 +28,25 @@ JOBS = {
     "a size, tuned": {"encode": {"target_size": 6000, **FEW}, "finetune": TUNED},
     "merged": {"encode": FEW, "compact": {"ratio": 0.5, "method": "merge"}},
     "tuned": {"encode": FEW, "finetune": TUNED},
-    "a size": {"encode": {"target_size": 6000, **FEW}},
+    "a size": {"encode": {"target_size": 6000, **FEW}, "finetune": UNTUNED},
+    "a size by training": {
+        "encode": {"target_size": 6000, **FEW},
+        "compact": VIEWS,
+        "finetune": {**TUNED, "enabled": None},
+    },
     "time alone": {"time_limit": LONG, "encode": FEW, "finetune": {**TUNED, "enabled": None}},
-    "a loss": {"encode": {"max_psnr_drop": 0.5, **FEW}},
-    "as many as a loss needs": {"encode": {"max_psnr_drop": 3, **FEW}, "compact": {"auto_count": True, **TRAINED}},
-    "time and a size": {"time_limit": LONG, "encode": {"target_size": 6000, **FEW}},
+    "a loss": {"encode": {"max_psnr_drop": 0.5, **FEW}, "finetune": UNTUNED},
+    "a loss by training": {
+        "encode": {"max_psnr_drop": 3, **FEW},
+        "compact": VIEWS,
+        "finetune": {**TUNED, "enabled": None},
+    },
+    "as many as a loss needs": {
+        "encode": {"max_psnr_drop": 3, **FEW},
+        "compact": {"auto_count": True, **TRAINED},
+        "finetune": UNTUNED,
+    },
+    "time and a size": {"time_limit": LONG, "encode": {"target_size": 6000, **FEW}, "finetune": UNTUNED},
     "time and tuning": {"time_limit": LONG, "encode": FEW, "finetune": TUNED},
 }
 
@@ -71,7 +86,8 @@ def test_time_alone_trains_only_where_the_server_can():
         ({"preset": "fast"}, ""),
         (
             {"encode": {"target_size": "3MB", "max_psnr_drop": 0.1, "max_ssim_drop": 0.003}, "time_limit": "2min"},
-            " · at most 3.00 MB · at most 0.1 dB PSNR loss · at most 0.003 SSIM loss · at most 2 min",
+            " · at most 3.00 MB · at most 0.1 dB PSNR loss · at most 0.003 SSIM loss"
+            " · keep as many as the goal needs · fine-tuning · at most 2 min",
         ),
         ({"encode": {"psnr": 42}, "time_limit": 90}, " · at least 42 dB PSNR · at most 1 min 30 s"),
         ({"compact": {"ratio": 0.125}, "finetune": {"enabled": True}}, " · keep 12.5 % · fine-tuning"),
