@@ -58,11 +58,16 @@ def compress(
         str | None,
         typer.Option(
             metavar="BUDGET",
-            help="First reduce the number of Gaussians: 200k, 20% or 0.2dB; auto: the best for the goal.",
+            help="First reduce the number of Gaussians: 200k, 20% or 0.2dB; 100% keeps all; auto: the best for "
+            "the goal, the default where it is fine-tuned.",
         ),
     ] = None,
     finetune: Annotated[
-        str | None, typer.Option(metavar="[STEPS]", help="Fine-tune the quantised values on renderings of the scene.")
+        str | None,
+        typer.Option(
+            metavar="[STEPS]",
+            help="Fine-tune the quantised values on renderings of the scene; default with a goal. 0: never.",
+        ),
     ] = None,
     evaluate: Annotated[
         bool, typer.Option("--evaluate", help="Decode the result, and measure PSNR and SSIM of its renderings.")

@@ -63,7 +63,8 @@ def compact_scene(
         splats: the scene, clean.
         settings: settings with a budget; a scene with no more Gaussians than that is returned unchanged.
         views: a capture: its training views train and score, its held-out views evaluate. By default, virtual views
-            train and score with renderings of the scene as targets, and cameras drawn over the whole scene evaluate.
+            train and score with renderings of the scene as targets, and cameras drawn over the whole scene evaluate,
+            with ``max_psnr_drop`` beside others, see :class:`kissgs.compaction.search_evaluation.SearchEvaluation`.
         evaluate: measure PSNR, SSIM, MS-SSIM and compressed bytes after every step. Ignored with ``max_psnr_drop``.
         checkpoint: file for the state of the training, see :class:`kissgs.compaction.popspa.Popspa`.
         threads: number of threads; 0 means one per processor. The result does not depend on it.

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-from kissgs.cameras.views import Views
+import numpy as np
+
+from kissgs.cameras.views import View, Views
 from kissgs.cameras.virtual.random_poses import random_poses
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
+from kissgs.evaluation.camera_sampling import BACKGROUNDS
 from kissgs.evaluation.cameras import evaluation_views
 from kissgs.evaluation.evaluate import Rendering, compare_images
 from kissgs.evaluation.psnr_loss import SEARCH_SEED
@@ -35,6 +39,7 @@ class SearchEvaluation:
     original: Splats
     views: Views | None
     threads: int = 0
+    _poses: Views | None = field(init=False, default=None)
     _drawn: Views | None = field(init=False, default=None)
     _images: dict[str, Rendering] = field(init=False, default_factory=dict)
     _drawn_images: dict[str, Rendering] = field(init=False, default_factory=dict)
@@ -46,14 +51,14 @@ class SearchEvaluation:
             InvalidViewsError: a photograph cannot be read.
             UnsupportedError: an image would take too much memory.
         """
-        if self.views is None:
+        if self.views is not None:  # whose images are too many to be kept
+            return self._compare(candidate, self.views, None, progress)
+        if self._poses is None or self._drawn is None:
             scene, threads = self.original, self.threads
             poses = random_poses(scene, side=SIDE, count=COUNT, seed=SEARCH_SEED, threads=threads, progress=progress)
             self._drawn = evaluation_views(scene, seed=SEARCH_SEED, threads=threads, progress=progress)
-            self.views = replace(poses, train=(), test=poses.train + poses.test)
-        if self._drawn is None:  # a capture, whose images are too many to be kept
-            return self._compare(candidate, self.views, None, progress)
-        found = self._compare(candidate, self.views, self._images, progress)
+            self._poses = replace(poses, train=(), test=_over_backgrounds(poses.train + poses.test))
+        found = self._compare(candidate, self._poses, self._images, progress)
         return replace(found, surroundings=self._compare(candidate, self._drawn, self._drawn_images, progress))
 
     def _compare(
@@ -62,3 +67,11 @@ class SearchEvaluation:
         return compare_images(
             self.original, candidate, views, threads=self.threads, reference_images=images, progress=progress
         )
+
+
+def _over_backgrounds(views: Sequence[View]) -> tuple[View, ...]:
+    """Return views over black, grey and white in turn: on black, dark parts do not show."""
+    levels = [BACKGROUNDS[n % len(BACKGROUNDS)] for n in range(len(views))]
+    return tuple(
+        replace(view, background=np.full(3, level, np.float32)) for view, level in zip(views, levels, strict=True)
+    )

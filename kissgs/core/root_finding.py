@@ -21,11 +21,13 @@ class StopRule:
     """When :func:`find_root` ends without a margin within the tolerance.
 
     Attributes:
-        attempts: largest number of evaluations; one at the bound is added if several did not meet the goal.
+        attempts: largest number of evaluations.
+        tries_bound: whether one at the bound is added if several did not meet the goal.
         settled: whether the search between a point that meets the goal and the next one that does not can end.
     """
 
     attempts: int = ATTEMPTS
+    tries_bound: bool = True
     settled: Callable[[float, float], bool] = lambda inside, outside: False
 
 
@@ -75,7 +77,7 @@ def find_root(
         else:
             x = min(max(_rounded(_next(known, slope, tolerance_at(x) / 2), grain), bounds[0]), bounds[1])
     bound = bounds[slope > 0]
-    if len(known) > 1 and bound not in known and all(found < 0 for found in known.values()):
+    if stop.tries_bound and len(known) > 1 and bound not in known and all(found < 0 for found in known.values()):
         known[bound] = margin(bound)
     met = [x for x, found in known.items() if found >= 0 and x not in (before or {})]
     return min(met, key=lambda x: known[x]) if met else None

@@ -70,8 +70,10 @@ def drop_of(evaluation: Evaluation) -> float:
         groups = [_errors_to_renderings(evaluation), _errors_to_renderings(over_scene(evaluation))]
     else:
         drop, groups = -mean.change, [_errors_added(evaluation)]
-    worst = max(_mean_of_worst(errors) for errors in groups) / MAX_ERROR_RATIO
-    return drop if math.isnan(drop) or worst <= 0 else max(drop, _drop_by(worst))
+    worst = _worst(groups) / MAX_ERROR_RATIO
+    if math.isnan(drop) or math.isnan(worst):
+        return math.nan
+    return drop if worst <= 0 else max(drop, _drop_by(worst))
 
 
 def ssim_drop_of(evaluation: Evaluation) -> float:
@@ -82,8 +84,10 @@ def ssim_drop_of(evaluation: Evaluation) -> float:
     :data:`MAX_SSIM_RATIO`.
     """
     groups = [_ssim_drops(evaluation), _ssim_drops(over_scene(evaluation))]
-    mean, worst = sum(groups[0]) / len(groups[0]), max(map(_mean_of_worst, groups)) / MAX_SSIM_RATIO
-    return mean if math.isnan(mean) or worst <= 0 else max(mean, worst)
+    mean, worst = sum(groups[0]) / len(groups[0]), _worst(groups) / MAX_SSIM_RATIO
+    if math.isnan(mean) or math.isnan(worst):
+        return math.nan
+    return mean if worst <= 0 else max(mean, worst)
 
 
 def _ssim_drops(evaluation: Evaluation) -> list[float]:
@@ -109,6 +113,13 @@ def _errors_added(evaluation: Evaluation) -> list[float]:
     ]
     mean_error = sum(reference for _, reference in pairs) / len(pairs)
     return [(candidate - reference) / max(mean_error, 1e-30) for candidate, reference in pairs]
+
+
+def _worst(groups: Sequence[Sequence[float]]) -> float:
+    """Return the largest :func:`_mean_of_worst` of groups of views; NaN if any error is."""
+    if any(math.isnan(error) for errors in groups for error in errors):
+        return math.nan
+    return max(_mean_of_worst(errors) for errors in groups)
 
 
 def _mean_of_worst(errors: Sequence[float]) -> float:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from kissgs.core.errors import StopSearch
+from kissgs.evaluation.psnr_loss import drop_of
 from kissgs.pipeline.goal import Goal
 from kissgs.pipeline.rate_control import Container, RateControl
 from kissgs.sogxt.container import stored_sizes
@@ -15,12 +16,16 @@ if TYPE_CHECKING:
     from kissgs.compaction.result import Compacted
 
 
+UNKNOWN_DROP = 1e6
+"""Larger than any finite drop of PSNR, decibels."""
+
+
 @dataclass(frozen=True, slots=True)
 class Candidate:
     """A number of Gaussians with containers that meet the goal.
 
     Attributes:
-        cost: of the best container, to be minimised: minus PSNR where the goal is a size, else bytes.
+        cost: of the best container, to be minimised: its loss where the goal is a size, else bytes.
         search: the search that made the containers.
         compacted: the scene that they hold.
     """
@@ -62,7 +67,7 @@ class Candidates:
             return
         cost = float(stored_sizes(search.best.encoded.files, packed=self.packed)[0])
         if self.goal.by_size:
-            cost = -self._psnr(search, search.best)
+            cost = self._loss(search, search.best)
         if self.best is None or cost < self.best.cost:
             self.best = Candidate(cost, search, compacted)
 
@@ -74,11 +79,17 @@ class Candidates:
             search.best = search.closest
             self.keep(search, compacted)
 
-    def _psnr(self, search: RateControl, container: Container) -> float:
-        """Return the PSNR of a container, at most 1000 dB; minus infinity if a rendering failed."""
+    def _loss(self, search: RateControl, container: Container) -> float:
+        """Return the drop of PSNR of a container, decibels; infinite if a rendering failed.
+
+        If the photographs equal the scene's renderings, every drop is infinite. It is then a large number minus PSNR.
+        """
         try:
-            psnr = search.evaluate(container.encoded).mean.candidate.psnr
+            evaluation = search.evaluate(container.encoded)
         except StopSearch:  # the container exists, so it is evaluated before the search ends
             search.stopped = True
-            psnr = search.evaluate(container.encoded).mean.candidate.psnr
-        return -math.inf if math.isnan(psnr) else min(psnr, 1e3)
+            evaluation = search.evaluate(container.encoded)
+        drop, psnr = drop_of(evaluation), evaluation.mean.candidate.psnr
+        if math.isnan(drop) or math.isnan(psnr):
+            return math.inf
+        return drop if math.isfinite(drop) else UNKNOWN_DROP - min(psnr, 1e3)

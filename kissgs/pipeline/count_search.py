@@ -11,14 +11,14 @@ import numpy as np
 
 from kissgs.core.errors import StopSearch
 from kissgs.core.progress import SearchNote, ignore_stop_search
-from kissgs.evaluation.psnr_loss import drop_of, psnr_of
+from kissgs.evaluation.psnr_loss import psnr_of
 from kissgs.pipeline.candidates import Candidates
 from kissgs.pipeline.goal import HALF_ERROR_DB, Goal
 from kissgs.pipeline.path_points import KEEP, OVERHEAD_BYTES, POINTS_PER_HALVING, count_at, last_number, number_for_size
 from kissgs.pipeline.pruning import Pruning
 from kissgs.pipeline.rate_control import Container, RateControl
 from kissgs.pipeline.search_time import SearchPlan, SearchTime
-from kissgs.pipeline.trained_scenes import TrainedScenes
+from kissgs.pipeline.trained_scenes import TrainedScene, TrainedScenes
 from kissgs.pipeline.trained_search import NEAR_HALVINGS, NEAR_IN_TIME, Position, search_positions
 from kissgs.pipeline.training_choice import has_photographs
 from kissgs.pipeline.trial import Trial
@@ -98,7 +98,7 @@ class CountSearch:
             encoding=self.encoding,
             compactor=self.compactor,
             path=self._path,
-            untrained=0 if photographs else RENDERED_POINTS,
+            pruned_only=RENDERED_POINTS if self._trains and not photographs else 0,
             offset_db=self._plan.offset_db if photographs else 0.0,
             time=self.time,
             containers=self._plan.containers,
@@ -180,33 +180,30 @@ class CountSearch:
         search = self._whole = self._encode(self._path.compacted(self._path.points[0], refine=False))
         if search.stopped or (self.goal.by_size and search.trials[0].bytes <= self._target_size):
             return
-        if search.best is None:
-            if self.goal.by_size and self._target_size > search.overhead:
-                self._search_along_path(self._number_for_size) if self._trains else self._encode_by_size()
-        elif self._trains:
-            self._search_on_renderings(search, search.best)
+        if self._trains:
+            self._search_on_renderings(search)
         else:
-            self._search_without_training(search, search.best)
+            self._search_without_training(search)
 
-    def _search_on_renderings(self, whole: RateControl, best: Container) -> None:
-        """Train as many Gaussians as pruning alone nearly serves.
+    def _search_on_renderings(self, whole: RateControl) -> None:
+        """Train as many Gaussians as pruning alone nearly serves, or for a size that all of them miss, as many as fit.
 
         A scene whose Gaussians are all needed keeps them.
         """
-        most, rd_lambda = RENDERED_POINTS, best.encoded.rd_lambda
-        serves = self._meets
-        if self.goal.by_size:
-            most, reached = min(most, self._number_for_size), drop_of(whole.evaluate(best.encoded))
+        by_size, best = self.goal.by_size, self._candidates.best
+        if best is None and by_size and self._target_size > whole.overhead:
+            self._search_along_path(self._number_for_size)
+        if best is None or whole.best is None or not self._plan.containers or self._late:
+            return
+        most = min(RENDERED_POINTS, self._number_for_size if by_size else RENDERED_POINTS)
 
-            def serves(trial: Trial) -> bool:
-                return (trial.drop or 0.0) <= reached
+        def serves(trial: Trial) -> bool:
+            return (trial.drop or 0.0) <= best.cost if by_size else self.goal.margin(trial) >= 0
 
-        self._pruning.prune_while(serves, most)
-        number = self._pruning.last(serves)
-        if number and rd_lambda is not None and self._plan.containers:
-            if self.goal.by_size:
-                rd_lambda = self._lambda_for_size(whole.trials, number)
-            self._search_lambda(number, rd_lambda)
+        self._pruning.prune_while(lambda trial: serves(trial) and not self._late, most)
+        number, rd_lambda = self._pruning.last(serves), whole.best.encoded.rd_lambda
+        if number and rd_lambda is not None:
+            self._search_lambda(number, self._lambda_for_size(whole.trials, number) if by_size else rd_lambda)
 
     def _lambda_for_size(self, trials: Sequence[Trial], number: int) -> float:
         """Return the lambda at which a point should have the target size, by containers of all Gaussians."""
@@ -215,18 +212,17 @@ class CountSearch:
         sizes, lambdas = np.log2([size for size, _ in made]), np.log2([rd_lambda for _, rd_lambda in made])
         return float(2.0 ** np.interp(math.log2(wanted), sizes, lambdas))
 
-    def _search_without_training(self, whole: RateControl, best: Container) -> None:
+    def _search_without_training(self, whole: RateControl) -> None:
         """Encode those that leave half of the error to the encoder, or as many as fit the size."""
-        pruning = self._pruning
-        if self.goal.by_size:
-            reached = psnr_of(whole.evaluate(best.encoded))
+        pruning, number = self._pruning, 0
+        if self.goal.by_size and self._target_size > whole.overhead:
             pruning.prune_while(_is_prunable, len(self.compactor.splats))
-            number = 0
-            if self._number_for_size <= len(pruning.losses):
-                number = pruning.last(lambda trial: (trial.psnr or 0.0) >= reached + HALF_ERROR_DB)
-            else:
+            if whole.best is None or self._number_for_size > len(pruning.losses):
                 self._encode_by_size()
-        else:
+            else:
+                psnr = psnr_of(whole.evaluate(whole.best.encoded)) + HALF_ERROR_DB
+                number = pruning.last(lambda trial: (trial.psnr or 0.0) >= psnr)
+        elif not self.goal.by_size and whole.best is not None:
 
             def leaves_half(trial: Trial) -> bool:
                 return self.goal.margin(trial) >= self.goal.decisive(trial).half
@@ -236,25 +232,27 @@ class CountSearch:
         if number:
             self._encode(self._path.compacted(self._path.points[number], refine=False))
 
-    def _meets(self, trial: Trial) -> bool:
-        return self.goal.margin(trial) >= 0
-
     def _search_lambda(self, number: int, rd_lambda: float) -> None:
         """Make trained containers of one point of the path, the first one at ``rd_lambda``."""
-        attempts, byte_limit = self._plan.containers, self._candidates.best_bytes
-        trained = self._scenes.scene(number, byte_limit)
+        trained = self._trained_scene(number, 0)
         search = trained.search
 
         def encoder(settings: EncodeSettings) -> Container:
-            self._scenes.containers = max(attempts - len(search.trials), 1)
-            return self._scenes.scene(number, byte_limit).encoder(settings)
+            if self._late:
+                raise StopSearch
+            return self._trained_scene(number, len(search.trials)).encoder(settings)
 
         try:
-            search.run(encoder, rd_lambda, attempts)
+            search.run(encoder, rd_lambda, self._plan.containers)
         finally:
             self.trials += search.trials
         self._candidates.keep(search, trained.compacted)
         self._stopped |= search.stopped
+
+    @property
+    def _late(self) -> bool:
+        """Whether no time is left for another container."""
+        return self.time is not None and self.time.over
 
     def _encode_by_size(self) -> None:
         """Search for the lambda at the point that the size suggests, or at a later one if its containers are larger."""
@@ -272,28 +270,35 @@ class CountSearch:
             first,
             (1, last_number(len(self.compactor.splats))),
             POINTS_PER_HALVING,
-            self._plan.containers,
+            max(self._plan.containers, 1),
             NEAR_HALVINGS if self.time is None else NEAR_IN_TIME,
         )
-        if self.goal.by_size and self._candidates.best is None:  # lambda alone makes this scene small enough
-            self._encode(self._path.compacted(self._path.points[-1], refine=False))
+        points = self._path.points
+        if (
+            self.goal.by_size and self._candidates.best is None and len(points) > 1
+        ):  # lambda alone makes this scene small enough
+            self._encode(self._path.compacted(points[-1], refine=False))
 
     def _encode_position(self, position: Position) -> RateControl:
         """Make the container of a position of the path; return the search of that number of Gaussians."""
         number, progress = position.number, self.encoding.progress
         last = f"; last: {self.trials[-1].summary()}" if self.trials else ""
         progress.note = f"{count_at(number, len(self.compactor.splats)):,} Gaussians{last}"
-        self._scenes.containers = max(self._plan.containers - len(self.trials), 1)
-        trained = self._scenes.scene(number, self._candidates.best_bytes)
+        trained = self._trained_scene(number, sum(trial.count < len(self.compactor.splats) for trial in self.trials))
         before = len(trained.search.trials)
         try:
             trained.search.make(trained.encoder, None if position.log2_lambda is None else 2.0**position.log2_lambda)
         finally:
             self.trials += trained.search.trials[before:]
-        trained.search.stopped |= self.time is not None and self.time.over
+        trained.search.stopped |= self._late
         self._candidates.keep(trained.search, trained.compacted)
         self._stopped |= trained.search.stopped
         return trained.search
+
+    def _trained_scene(self, number: int, made: int) -> TrainedScene:
+        """Return the scene at a point of the path, ready for the next container after so many trained ones."""
+        self._scenes.containers = max(self._plan.containers - made, 1)
+        return self._scenes.scene(number, self._candidates.best_bytes)
 
     def _encode(self, compacted: Compacted) -> RateControl:
         """Search for the lambda of a scene without fine-tuning."""
@@ -315,14 +320,18 @@ class CountSearch:
         points = self._path.points
         if points[-1].trained or self.goal.by_size:
             return points[-1]
-        return points[self._pruning.last(self._meets)]
+        return points[self._pruning.last(lambda trial: self.goal.margin(trial) >= 0)]
 
     def _reason_to_keep_all(self) -> str:
         if self._pruning.tried or any(trial.count < len(self.compactor.splats) for trial in self.trials):
             return "and no smaller number of Gaussians that was tried serves the goal better"
         if self._stopped:
             return "and the search was stopped before a smaller number was tried"
-        return "and all of them fit into the target size"
+        if not self._plan.containers:
+            return "and there was too little time to train a smaller number"
+        if self.goal.by_size and (self._whole is None or self._whole.trials[0].bytes <= self._target_size):
+            return "and all of them fit into the target size"
+        return "and the goal leaves room for nearly all of them"
 
 
 def _is_prunable(trial: Trial) -> bool:

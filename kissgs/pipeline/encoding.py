@@ -185,14 +185,14 @@ class Encoding:
         return search
 
     def rate_control(
-        self, *, offset_db: float = 0.0, byte_limit: float = math.inf, tolerance: float = 1.0
+        self, *, offset_db: float = 0.0, byte_limit: float = math.inf, trained: bool = False
     ) -> RateControl:
         """Return a search that has no container yet.
 
         Args:
             offset_db: added to ``quality_offset_db`` of the settings, for the first container.
             byte_limit: see :class:`RateControl`.
-            tolerance: likewise.
+            trained: likewise.
         """
         from kissgs.compaction.search_evaluation import SearchEvaluation
 
@@ -209,7 +209,7 @@ class Encoding:
             packed=self.packed,
             byte_limit=byte_limit,
             deadline=self.deadline,
-            tolerance=tolerance,
+            trained=trained,
         )
 
     def with_encode_settings(self, **changes: float) -> Encoding:

@@ -20,6 +20,11 @@ HALF_ERROR_DB = 10 * math.log10(2)
 """Increase of PSNR, decibels, by half of the squared error."""
 
 
+TRAINED_NEAR, MOST_NEAR = 2.5, 0.4
+"""Factor on the room that stops a search where each container takes a training, and the largest such room: with it,
+three quarters of an allowed drop are used."""
+
+
 @dataclass(frozen=True, slots=True)
 class Limit:
     """A limit that one setting names.
@@ -68,6 +73,10 @@ class Limit:
             return math.inf
         # a drop is infinite where the photographs equal the renderings of the scene
         return math.log2(self.value / found) if found < math.inf else -math.inf
+
+    def near_enough(self, *, trained: bool) -> float:
+        """Return the room that is small enough to stop a search, more if each container takes a training."""
+        return min(TRAINED_NEAR * self.near, MOST_NEAR) if trained else self.near
 
     def halvings(self, trial: Trial) -> float:
         """Return how often the number of Gaussians could typically be halved to come near the limit; below 0 for more.

@@ -165,8 +165,9 @@ def compress(
         destination: ``.zip``, ``.sog`` or folder to write; by default nothing is written.
         settings: by default those of the preset ``balanced``. If their group ``compact`` has a budget, the scene is
             compacted first, see :func:`kissgs.compact`; if their group ``finetune`` is ``enabled``, the levels are then
-            fine-tuned on the photographs of ``views``, or on renderings of the scene. Where ``views`` have photographs,
-            some of them held out, a goal other than ``psnr`` does both by itself, see :meth:`kissgs.Settings.decided`.
+            fine-tuned on the photographs of ``views``, or on renderings of the scene. A goal other than ``psnr`` does
+            both by itself, unless there are ``views`` without held-out photographs, see
+            :meth:`kissgs.Settings.decided`.
         reading: options for a ``source`` that is a file.
         container: ``"sogxt"``, or ``"sog"`` for the files of SOG 2, which other viewers open; by default SOG if
             ``destination`` ends in ``.sog``, else SOG-XT.

@@ -100,7 +100,7 @@ class RateControl:
         packed: bool = True,
         byte_limit: float = math.inf,
         deadline: Deadline | None = None,
-        tolerance: float = 1.0,
+        trained: bool = False,
     ) -> None:
         """Prepare the search; nothing is encoded yet.
 
@@ -114,7 +114,8 @@ class RateControl:
             packed: whether the files become a zip, whose size then counts; False for a folder.
             byte_limit: for a goal that is no size: the search ends if a container of this size or more misses the goal.
             deadline: once a container meets the goal, no other one is begun that would not be finished by then.
-            tolerance: how near the goal a container ends the search, in units of :attr:`Limit.near`.
+            trained: whether each container takes a training. Then one that is less near the goal ends the search, and
+                the finest or coarsest one is not tried where all others missed the goal.
         """
         self.original, self.settings, self.goal = original, settings, Goal.of(settings)
         self.compare, self.threads, self.progress = compare, threads, progress
@@ -131,7 +132,7 @@ class RateControl:
         self._jump: tuple[float, int] | None = None
         self._psnr: float | None = None
         self._finetuning: FinetuneReport | None = None
-        self._distance, self._tolerance = -math.inf, tolerance
+        self._distance, self._trained = -math.inf, trained
         self._deadline, self._begun, self._longest = deadline, time.perf_counter(), 0.0
 
     def search_all(self, encoder: Encoder) -> None:
@@ -268,9 +269,9 @@ class RateControl:
             margin_at,
             start,
             first_sample.limit.slope,
-            lambda x: self._tolerance * self._samples[x].limit.near,
+            lambda x: self._samples[x].limit.near_enough(trained=self._trained),
             LOG2_LAMBDA_RANGE,
-            stop=StopRule(attempts, self._is_jump),
+            stop=StopRule(attempts, tries_bound=not self._trained, settled=self._is_jump),
             before={x: sample.margin for x, sample in self._samples.items()},
         )
 

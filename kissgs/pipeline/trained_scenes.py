@@ -24,10 +24,6 @@ A refinement of the scene before its encoding would take more steps for the same
 """
 
 
-TOLERANCE = 2.5
-"""How near the goal a container ends the search, in units of that without training: another one takes a training."""
-
-
 @dataclass(frozen=True, slots=True)
 class TrainedScene:
     """A scene of the path, and what makes containers of it.
@@ -51,7 +47,7 @@ class TrainedScenes:
         encoding: encoding of the whole scene.
         compactor: compactor of the same scene.
         path: training path of the compactor.
-        untrained: number of the last point that may be fine-tuned without training along the path.
+        pruned_only: number of the last point that is pruned without training along the path.
         offset_db: added to ``quality_offset_db`` for the first container of a scene, decibels.
         time: the time that training shares with encoding; None for no limit.
         containers: number of containers that are still to be made in that time, this one included.
@@ -60,7 +56,7 @@ class TrainedScenes:
     encoding: Encoding
     compactor: Compactor
     path: TrainingPath
-    untrained: int
+    pruned_only: int
     offset_db: float
     time: SearchTime | None
     containers: int
@@ -82,7 +78,7 @@ class TrainedScenes:
         """Prune and train up to a point of the path, and return it."""
         path = self.path
         while len(path.points) <= number:
-            trains = len(path.points) > self.untrained
+            trains = len(path.points) > self.pruned_only
             if trains and not path.points[-1].trained:
                 self._train(number)
             path.prune(count_at(len(path.points), len(self.compactor.splats)))
@@ -107,7 +103,7 @@ class TrainedScenes:
         if tunes:  # training replaces the refit of colours
             encoding = encoding.with_encode_settings(color_refit_iterations=0)
             self._tuner = self._tuner or self._first_tuner(encoding)
-        search = encoding.rate_control(offset_db=self.offset_db, byte_limit=byte_limit, tolerance=TOLERANCE)
+        search = encoding.rate_control(offset_db=self.offset_db, byte_limit=byte_limit, trained=tunes)
         return TrainedScene(compacted, search, encoding.encoder(self._tuner))
 
     def _first_tuner(self, encoding: Encoding) -> Tuner | None:

@@ -21,7 +21,8 @@ class Trial:
         rd_lambda: squared error per bit; None if no Gaussian is visible, so that there was no rate-distortion planning.
         bytes: size of the zip, or of all files in the folder.
         psnr: PSNR of its renderings to those of the scene as goals count it, decibels
-            (:func:`kissgs.evaluation.psnr_loss.psnr_of`); None, as all that follow, where the goal is a size.
+            (:func:`kissgs.evaluation.psnr_loss.psnr_of`); without a capture in other views than ``drop``, in those of
+            ``worst`` and ``fifth_percentile``. None, as all that follow, where the goal is a size.
         drop: loss of PSNR as goals count it, decibels (:func:`kissgs.evaluation.psnr_loss.drop_of`).
         ssim_drop: loss of SSIM as goals count it (:func:`kissgs.evaluation.psnr_loss.ssim_drop_of`); None where that is
             no goal.

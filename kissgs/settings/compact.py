@@ -19,15 +19,15 @@ class CompactSettings(TrainingViewSettings):
         gt=0,
         le=20,
         description="Keep as few Gaussians as possible such that renderings of the held-out views lose at most this "
-        "PSNR, decibels. Takes several compactions. Without photographs, the loss is estimated at random poses from "
+        "PSNR, decibels. Takes several compactions. Without a capture, the loss is estimated at random poses from "
         "which photographs might have been taken, as if the original scene had 30 dB to photographs.",
     )
     auto_count: bool | None = Field(
         None,
         description="Choose the number of Gaussians that meets the goal of encode best. Needs target_size, psnr, "
-        "max_psnr_drop or max_ssim_drop of encode. auto: with a goal other than psnr, where torch is installed, unless "
-        "count, ratio or max_psnr_drop is given, or without photographs nothing is fine-tuned. initial_prune_fraction "
-        "and admm_rho do not apply then.",
+        "max_psnr_drop or max_ssim_drop of encode. auto: with a goal other than psnr and held-out photographs, or with "
+        "fine-tuning and no capture, where torch is installed, unless count, ratio or max_psnr_drop is given. "
+        "initial_prune_fraction and admm_rho do not apply then.",
     )
     method: Literal["prune", "merge"] = Field(
         "prune",

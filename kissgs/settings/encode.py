@@ -71,7 +71,7 @@ class EncodeSettings(BaseModel):
         gt=0,
         le=20,
         description="With rate_distortion: search for the smallest container whose renderings of the held-out views "
-        "lose at most this PSNR, decibels. Takes a few encodings. Without photographs, the loss is estimated at random "
+        "lose at most this PSNR, decibels. Takes a few encodings. Without a capture, the loss is estimated at random "
         "poses from which photographs might have been taken, as if the original scene had 30 dB to photographs.",
     )
     max_ssim_drop: float | None = Field(
@@ -79,7 +79,7 @@ class EncodeSettings(BaseModel):
         gt=0,
         le=1,
         description="With rate_distortion: search for the smallest container whose renderings of the held-out views "
-        "lose at most this SSIM to the photographs; without photographs, SSIM to renderings of the scene is at least 1 "
+        "lose at most this SSIM to the photographs; without a capture, SSIM to renderings of the scene is at least 1 "
         "minus this, at random poses from which photographs might have been taken. Takes a few encodings.",
     )
     max_encodes: int = Field(

@@ -13,7 +13,7 @@ class FinetuneSettings(TrainingViewSettings):
     enabled: bool | None = Field(
         None,
         description="Fine-tune, against photographs if there are any, else renderings. auto: with a goal other than "
-        "psnr, where torch is installed.",
+        "psnr and held-out photographs or no capture, where torch is installed.",
     )
     steps: int = Field(
         1000,

@@ -70,6 +70,9 @@ FINETUNING = {
 SEARCH_FACTOR = 4.0
 """Factor on the total time of a job that searches for a goal, which encodes several times."""
 
+TUNED_CONTAINERS = 2.0
+"""Containers that a search for the number of Gaussians fine-tunes."""
+
 
 def usual_seconds(kind: str, evaluate: bool, gaussians: int) -> float:
     """Estimate the wall time of a job on a small server, used until this server has measured jobs of its own.
@@ -78,13 +81,13 @@ def usual_seconds(kind: str, evaluate: bool, gaussians: int) -> float:
     """
     name, *stages = kind.split("+")
     preset, millions = kissgs.Preset(name), gaussians / 1e6
-    cpu = (_FACTS[preset][4] + evaluate * EVALUATION) * millions
-    for suffix, costs in ((COMPACTED, TRAINING), (FINETUNED, FINETUNING)):
-        if suffix.removeprefix("+") in stages:
-            fixed, per_million = costs[preset]
-            cpu += fixed + per_million * millions
-    cpu *= SEARCH_FACTOR if SEARCHED.removeprefix("+") in stages else 1.0
-    return START_SECONDS + cpu / BUSY_CORES
+    encoding = (_FACTS[preset][4] + evaluate * EVALUATION) * millions
+    compacts, tunes, searches = (suffix.removeprefix("+") in stages for suffix in (COMPACTED, FINETUNED, SEARCHED))
+    training, tuning = (fixed + per_million * millions for fixed, per_million in (TRAINING[preset], FINETUNING[preset]))
+    if compacts and tunes and searches:  # nothing is trained but the levels
+        return START_SECONDS + (SEARCH_FACTOR * encoding + TUNED_CONTAINERS * tuning) / BUSY_CORES
+    cpu = encoding + compacts * training + tunes * tuning
+    return START_SECONDS + cpu * (SEARCH_FACTOR if searches else 1.0) / BUSY_CORES
 
 
 LONGEST_FINETUNING = 2.0
@@ -94,10 +97,10 @@ LONGEST_FINETUNING = 2.0
 def limited_seconds(kind: str, evaluate: bool, gaussians: int, unlimited: float, limit: float) -> float:
     """Estimate the wall time of a job with a time limit, which does not include the start and the evaluation.
 
-    Nor does it limit a search for the number of Gaussians. ``kind`` is that of the same job without the limit, and
-    ``unlimited`` its time, in seconds.
+    Nor does it limit a search for the number of Gaussians without fine-tuning. ``kind`` is that of the same job without
+    the limit, and ``unlimited`` its time, in seconds.
     """
-    if COMPACTED.removeprefix("+") in kind.split("+"):
+    if COMPACTED in kind and FINETUNED not in kind:
         return unlimited
     longest = LONGEST_FINETUNING if kind.endswith(FINETUNED) else 1.0
     evaluation = evaluate * EVALUATION * gaussians / 1e6 / BUSY_CORES

@@ -107,7 +107,7 @@ function optionFields(limits, presets) {
         format: format.chosen(),
         ...(limit && { time_limit: limit }),
         ...(encode && { encode }),
-        ...(compact && { compact }),
+        ...(compact ? { compact } : encode && { compact: { auto_count: false } }), // else a goal would choose
         ...((finetune.checked || encode) && { finetune: { enabled: finetune.checked } }), // a goal alone would train
       };
     },

@@ -33,7 +33,7 @@ export function timeField(limits) {
 
   /** Return what the time is used for. @param {Chosen} chosen */
   function use({ preset, plans, goal, tunes, kept }) {
-    if (kept) return UNCOUNTED;
+    if (kept && !tunes) return UNCOUNTED;
     if (goal) return MEETS;
     if (tunes) return TUNES;
     if (preset === "fast") return UNUSED;

@@ -10,7 +10,7 @@ from kissgs.cameras.views import Views, black
 from kissgs.cameras.virtual.random_poses import random_poses
 from kissgs.compaction.search_evaluation import COUNT, SearchEvaluation
 from kissgs.evaluation.cameras import evaluation_views
-from kissgs.evaluation.evaluate import compare_images
+from kissgs.evaluation.evaluate import compare_images, render_clamped
 from kissgs.evaluation.psnr_loss import SEARCH_SEED
 
 SCENE = kissgs.sample_scene(400, sh_degree=1, seed=3)
@@ -29,16 +29,22 @@ def test_without_a_capture_poses_of_photographs_and_cameras_over_the_whole_scene
     drawn = evaluation_views(SCENE, seed=SEARCH_SEED)
     expected = compare_images(SCENE, WORSE, drawn)
     assert found.surroundings.as_dict() == expected.as_dict()
+    assert {view.view.background[0] for view in found.views} == {0.0, 0.5, 1.0}
     again = compare_images(SCENE, WORSE, Views((), tuple(view.view for view in found.views), found.background, ""))
     assert again.mean == found.mean
 
 
 def test_the_views_and_their_renderings_are_made_once(monkeypatch):
-    compare = SearchEvaluation(SCENE, None, 1)
+    compare, rendered = SearchEvaluation(SCENE, None, 1), []
     first = compare(WORSE)
+    monkeypatch.setattr(
+        "kissgs.evaluation.evaluate.render_clamped",
+        lambda *given, **named: rendered.append(1) or render_clamped(*given, **named),
+    )
     monkeypatch.setattr("kissgs.compaction.search_evaluation.random_poses", None)
     monkeypatch.setattr("kissgs.compaction.search_evaluation.evaluation_views", None)
     assert compare(WORSE).as_dict() == first.as_dict()
+    assert len(rendered) == len(first.views) + len(first.surroundings.views)  # the candidate alone
 
 
 def test_a_capture_compares_in_its_held_out_views():

@@ -109,6 +109,13 @@ def test_a_part_lost_in_the_surroundings_limits_the_drop():
     assert ssim_drop_of(replace(lost, surroundings=similarities(*[0.9] * 24))) == pytest.approx(0.1 / MAX_SSIM_RATIO)
 
 
+@pytest.mark.parametrize("failed", [[math.nan] * 24, [46.4] * 23 + [math.nan]])
+def test_a_failed_rendering_of_the_surroundings_is_no_result(failed):
+    assert math.isnan(drop_of(with_surroundings([46.4] * 24, failed)))
+    lost = replace(similarities(*[0.99] * 24), surroundings=similarities(*[0.9] * 23, failed[-1]))
+    assert math.isnan(ssim_drop_of(lost))
+
+
 def test_with_photographs_the_surroundings_do_not_count():
     pairs = [(32.0, 31.5)] * 24
     found = with_surroundings([45.0] * 24, [9.0] * 24, pairs)

@@ -66,6 +66,40 @@ def test_a_size_is_better_used_with_training():
     assert psnr(trained, LARGE) > psnr(alone, LARGE) + 1.5
 
 
+@pytest.mark.parametrize(("units", "trained"), [(1e6, True), (10, False)])
+def test_a_limited_time_trains_if_it_is_long(monkeypatch, units, trained):
+    monkeypatch.setattr("kissgs.pipeline.time_plan.encode_seconds", lambda *found: 1e5 / units)
+    chosen = settings(steps=20, max_psnr_drop=0.5).model_copy(update={"time_limit": 1e5})
+    report = kissgs.compress(SMALL, settings=chosen).report
+    assert any(trial.count < len(SMALL) for trial in report.trials) == trained
+    if not trained:
+        assert "too little time to train a smaller number" in report.compaction.note
+
+
+def test_ctrl_c_keeps_the_container_of_the_encoder():
+    """Pressed in the first training, when containers of the encoder alone exist."""
+    stopped = []
+
+    def stop(stage, fraction, note=""):
+        if stage == "finetune" and not stopped:
+            stopped.append(stage)
+            raise kissgs.StopSearch
+
+    found = kissgs.compress(SMALL, settings=settings(steps=20, max_psnr_drop=0.5), progress=stop)
+    assert stopped
+    assert found.report.finetuning is None
+    met = [trial.bytes for trial in found.report.trials if trial.drop <= 0.5]
+    assert len(found.to_zip()) == min(met)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 7])
+@pytest.mark.parametrize("goal", [{"max_psnr_drop": 1.0}, {"max_ssim_drop": 0.05}, {"target_size": "6kB"}])
+def test_few_gaussians(count, goal):
+    few = SMALL.select(np.arange(count))
+    found = kissgs.compress(few, settings=settings(steps=3, **goal))
+    assert len(kissgs.decompress(found.files)) <= count
+
+
 def test_a_scene_whose_gaussians_are_all_needed_keeps_them():
     wanted = round(0.7 * len(kissgs.compress(NEEDED, settings=settings(tunes=False)).to_zip()))
     trained, alone = (kissgs.compress(NEEDED, settings=settings(tunes, target_size=wanted)) for tunes in (True, False))

@@ -131,9 +131,10 @@ def test_the_evaluation_has_other_cameras_than_the_search():
     """An evaluation with the same cameras would favour the container that they have selected."""
     search = RateControl(SCENE, settings(psnr=20.0).encode, SearchEvaluation(SCENE, None, 1), 1, SearchNote(silent))
     search.run(lambda chosen: Container(encode(SCENE, chosen, threads=1), chosen))
+    poses = [view.view for view in search.compare(SCENE).views]
     trained = random_poses(SCENE, side=64, count=48)
     others = (evaluation_views(SCENE).test, trained.train, trained.test)
-    places = [{view.camera.viewmat.tobytes() for view in views} for views in (search.compare.views.test, *others)]
+    places = [{view.camera.viewmat.tobytes() for view in views} for views in (poses, *others)]
     assert not places[0] & set().union(*places[1:])
 
 

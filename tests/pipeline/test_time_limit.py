@@ -25,7 +25,7 @@ def no_saved_speed(monkeypatch, tmp_path):
 
 def plan_of(seconds, count=100_000, *, photographs=True, **changes):
     requested = Settings.from_preset(changes.pop("preset", "balanced"), time_limit=seconds, **changes)
-    decided = requested.decided(photographs=photographs, torch=True)
+    decided = requested.decided(photographs=photographs or None, torch=True)
     facts = {"captured": photographs, "torch": True, "threads": 2}
     return time_plan(requested, decided, count, Deadline.after(seconds), **facts)
 
@@ -44,6 +44,8 @@ def test_training_is_chosen_where_there_is_time_and_a_capture():
     assert trains(plan_of(10 * plain, photographs=False, finetune={"enabled": False})) == (False, False)
     assert trains(plan_of(10 * plain, photographs=False, psnr=40)) == (False, False)
     assert trains(plan_of(3 * plain, photographs=False)) == (False, False)
+    assert trains(plan_of(10 * plain, photographs=False, max_psnr_drop=0.3)) == (True, True)
+    assert trains(plan_of(3 * plain, photographs=False, max_psnr_drop=0.3)) == (False, False)
     assert trains(plan_of(10 * plain, count=10_000_000)) == (False, False)
     assert trains(plan_of(10 * plain, count=1)) == (False, False)
 

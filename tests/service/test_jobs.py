@@ -91,13 +91,21 @@ def test_goals_and_count_search(service):
         "view_size": 48,
     }
     options = {"encode": {"target_size": "6kB", "sensitivity_views": 4, "sensitivity_view_size": 48}, "compact": prune}
+    options["finetune"] = {"enabled": False}
     assert not parse_options(json.dumps(options)).resumable
     status = service.ended(service.submit(options=json.dumps(options)))
     assert status["state"] == "succeeded", status
     assert status["sizes"]["container"] <= 6000
     report = service.http.get(status["links"]["report"]).json()
     assert len({trial["count"] for trial in report["trials"]}) > 1
-    lost = service.ended(service.submit(options=json.dumps({"encode": {"max_psnr_drop": 0.5, "sensitivity_views": 4}})))
+    few = {"views": 24, "view_size": 48}
+    options = {
+        "encode": {"max_psnr_drop": 0.5, "sensitivity_views": 4},
+        "compact": few,
+        "finetune": {"steps": 4, **few},
+    }
+    assert parse_options(json.dumps(options)).kind == "balanced+compact+finetune+search"
+    lost = service.ended(service.submit(options=json.dumps(options)))
     assert lost["state"] == "succeeded", lost
 
 

@@ -190,7 +190,7 @@ def test_constant_scenes(preset):
 
 def test_a_target_size_counts_the_bytes_of_the_file(tmp_path):
     scene = sample_scene(400, sh_degree=1, seed=4)
-    settings = Settings.from_preset("balanced", target_size=6500, max_encodes=4, **GLANCE)
+    settings = Settings.from_preset("balanced", target_size=6500, max_encodes=4, finetune={"enabled": False}, **GLANCE)
     result = compress(scene, tmp_path / "scene.sog", settings=settings)
     assert result.container == "sog"
     assert (tmp_path / "scene.sog").stat().st_size == result.report.container_bytes <= 6500

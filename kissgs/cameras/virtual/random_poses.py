@@ -1,4 +1,4 @@
-"""``random_poses``: many virtual cameras for training, at random poses from which photographs might have been taken.
+"""``random_poses``: virtual cameras to train or to measure losses with, from where photographs might have been taken.
 
 :func:`kissgs.virtual_views` selects a few cameras that are as good as possible. A scene that is trained from such views
 only falls apart between and beside them. Random cameras are near and far, high and low, around every region; only those
