@@ -172,7 +172,7 @@ class ClusterCompression:
     def _memory(self, scene: Path, size: int) -> int:
         """Return an estimate of the memory that a scene needs, bytes."""
         settings = self.options.settings
-        goal_trains = settings.encode.has_goal and settings.finetune.enabled is not False
+        goal_trains = settings.encode.has_goal and (self.options.views or settings.finetune.enabled is not False)
         trains = settings.compact.enabled or settings.finetune.enabled or goal_trains or settings.aims
         plain = size if scene.suffix.lower() == ".ply" else PACKED_RATIO * size
         return PROCESS_BYTES + (TRAINING_RATIO if trains else MEMORY_RATIO) * plain

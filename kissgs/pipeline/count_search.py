@@ -119,9 +119,11 @@ class CountSearch:
         except StopSearch:
             self._stopped = True
             if self._candidates.best is None and not (self.aims and self._candidates.any_missed):
-                progress = SearchNote(ignore_stop_search(self.encoding.progress))
-                self.encoding = replace(self.encoding, progress=progress)
-                self._encode(self._path.compacted(self._latest_point(), refine=False))
+                point = self._latest_point()
+                if point.number or self._whole is None:  # else all Gaussians have missed the goal already
+                    progress = SearchNote(ignore_stop_search(self.encoding.progress))
+                    self.encoding = replace(self.encoding, progress=progress)
+                    self._encode(self._path.compacted(point, refine=False))
             if self._candidates.best is None and not self.aims:
                 raise
         if self._candidates.best is None and self.aims:
@@ -192,7 +194,11 @@ class CountSearch:
         """
         by_size, best = self.goal.by_size, self._candidates.best
         if best is None and by_size and self._target_size > whole.overhead:
-            self._search_along_path(self._number_for_size)
+            if self._plan.containers and not self._late:
+                self._search_along_path(self._number_for_size)
+            else:
+                point = self._pruning.prune_to(max(self._number_for_size, 1))
+                self._encode(self._path.compacted(point, refine=False))
         if best is None or whole.best is None or not self._plan.containers or self._late:
             return
         most = min(RENDERED_POINTS, self._number_for_size if by_size else RENDERED_POINTS)
@@ -202,7 +208,7 @@ class CountSearch:
 
         self._pruning.prune_while(lambda trial: serves(trial) and not self._late, most)
         number, rd_lambda = self._pruning.last(serves), whole.best.encoded.rd_lambda
-        if number and rd_lambda is not None:
+        if number and rd_lambda is not None and not self._late:
             self._search_lambda(number, self._lambda_for_size(whole.trials, number) if by_size else rd_lambda)
 
     def _lambda_for_size(self, trials: Sequence[Trial], number: int) -> float:
@@ -270,7 +276,7 @@ class CountSearch:
             first,
             (1, last_number(len(self.compactor.splats))),
             POINTS_PER_HALVING,
-            max(self._plan.containers, 1),
+            self._plan.containers,
             NEAR_HALVINGS if self.time is None else NEAR_IN_TIME,
         )
         points = self._path.points
@@ -323,15 +329,16 @@ class CountSearch:
         return points[self._pruning.last(lambda trial: self.goal.margin(trial) >= 0)]
 
     def _reason_to_keep_all(self) -> str:
+        first = self._whole.trials[0] if self._whole is not None else None
         if self._pruning.tried or any(trial.count < len(self.compactor.splats) for trial in self.trials):
             return "and no smaller number of Gaussians that was tried serves the goal better"
+        if self.goal.by_size and (first is None or first.bytes <= self._target_size):
+            return "and all of them fit into the target size"
+        if self._late or not self._plan.containers:
+            return "and there was too little time to train a smaller number"
         if self._stopped:
             return "and the search was stopped before a smaller number was tried"
-        if not self._plan.containers:
-            return "and there was too little time to train a smaller number"
-        if self.goal.by_size and (self._whole is None or self._whole.trials[0].bytes <= self._target_size):
-            return "and all of them fit into the target size"
-        return "and the goal leaves room for nearly all of them"
+        return "and a smaller number would serve the goal less"
 
 
 def _is_prunable(trial: Trial) -> bool:

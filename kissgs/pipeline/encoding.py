@@ -208,7 +208,7 @@ class Encoding:
             count=len(self.splats),
             packed=self.packed,
             byte_limit=byte_limit,
-            deadline=self.deadline,
+            deadline=None if trained else self.deadline,  # a training has a deadline of its own
             trained=trained,
         )
 

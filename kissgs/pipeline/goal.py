@@ -76,7 +76,7 @@ class Limit:
 
     def near_enough(self, *, trained: bool) -> float:
         """Return the room that is small enough to stop a search, more if each container takes a training."""
-        return min(TRAINED_NEAR * self.near, MOST_NEAR) if trained else self.near
+        return max(min(TRAINED_NEAR * self.near, MOST_NEAR), self.near) if trained else self.near
 
     def halvings(self, trial: Trial) -> float:
         """Return how often the number of Gaussians could typically be halved to come near the limit; below 0 for more.

@@ -186,9 +186,6 @@ class RateControl:
             self._sample(container)
         except _CannotImprove:
             self.cannot_improve = True
-        except StopSearch:  # the container exists, so it is evaluated before the search ends
-            self.stopped = True
-            self._sample(container)
 
     def run(self, encoder: Encoder, rd_lambda: float | None = None, attempts: int | None = None) -> None:
         """Make up to ``attempts`` containers, by default ``max_encodes``, the first at ``rd_lambda``."""
@@ -279,8 +276,11 @@ class RateControl:
         """Make a container.
 
         Raises:
-            StopSearch: one that meets the goal exists, and another would not be finished before the deadline.
+            StopSearch: the search was stopped while a container was evaluated; or one that meets the goal exists, and
+                another would not be finished before the deadline.
         """
+        if self.stopped:
+            raise StopSearch
         self._begun = time.perf_counter()
         met = self.best is not None and self._bytes <= (self.goal.most_bytes or math.inf)
         if self._deadline is not None and met and self._deadline.seconds < self._longest:
@@ -342,7 +342,7 @@ class RateControl:
         size, sizes = stored_sizes(encoded.files, packed=self.packed)
         trial = Trial(self.count, encoded.rd_lambda, size)
         if not self.goal.by_size:
-            trial = self.goal.measured(trial, self.evaluate(encoded))
+            trial = self.goal.measured(trial, self._evaluation(encoded))
         self.trials.append(trial)
         self.overhead = size - sum(stored for name, stored in sizes.items() if name.endswith(".webp"))
         self.progress.note = f"try {len(self.trials) + 1}, last: {trial.summary()}"
@@ -370,6 +370,14 @@ class RateControl:
             return False
         self._psnr = psnr
         return True
+
+    def _evaluation(self, encoded: Encoded) -> Evaluation:
+        """Evaluate a container even if the search is stopped meanwhile, and then end it."""
+        try:
+            return self.evaluate(encoded)
+        except StopSearch:
+            self.stopped = True
+            return self.evaluate(encoded)
 
     def evaluate(self, encoded: Encoded) -> Evaluation:
         """Compare the renderings of a container with those of the original, or both with the photographs."""

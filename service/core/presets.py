@@ -84,8 +84,8 @@ def usual_seconds(kind: str, evaluate: bool, gaussians: int) -> float:
     encoding = (_FACTS[preset][4] + evaluate * EVALUATION) * millions
     compacts, tunes, searches = (suffix.removeprefix("+") in stages for suffix in (COMPACTED, FINETUNED, SEARCHED))
     training, tuning = (fixed + per_million * millions for fixed, per_million in (TRAINING[preset], FINETUNING[preset]))
-    if compacts and tunes and searches:  # nothing is trained but the levels
-        return START_SECONDS + (SEARCH_FACTOR * encoding + TUNED_CONTAINERS * tuning) / BUSY_CORES
+    if compacts and tunes and searches:
+        return START_SECONDS + (SEARCH_FACTOR * encoding + training + TUNED_CONTAINERS * tuning) / BUSY_CORES
     cpu = encoding + compacts * training + tunes * tuning
     return START_SECONDS + cpu * (SEARCH_FACTOR if searches else 1.0) / BUSY_CORES
 
@@ -102,7 +102,7 @@ def limited_seconds(kind: str, evaluate: bool, gaussians: int, unlimited: float,
     """
     if COMPACTED in kind and FINETUNED not in kind:
         return unlimited
-    longest = LONGEST_FINETUNING if kind.endswith(FINETUNED) else 1.0
+    longest = LONGEST_FINETUNING if FINETUNED in kind else 1.0
     evaluation = evaluate * EVALUATION * gaussians / 1e6 / BUSY_CORES
     return min(longest * unlimited, START_SECONDS + limit + evaluation)
 

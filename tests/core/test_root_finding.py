@@ -74,6 +74,12 @@ def test_the_bound_is_tried_after_the_last_attempt():
     assert margin.arguments == [30.0, 26.0, -40]
 
 
+def test_the_bound_is_not_tried_where_each_evaluation_is_expensive():
+    margin = Recorded(lambda x: -1.0 - x)
+    assert find_root(margin, 30.0, -1.0, 0.05, (-40, 40), stop=StopRule(2, tries_bound=False)) is None
+    assert margin.arguments == [30.0, 26.0]
+
+
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_a_goal_met_everywhere_ends_at_the_far_bound(sign):
     margin = Recorded(lambda x: 3.0 + 0.01 * sign * x)

@@ -152,3 +152,20 @@ def test_a_trial_names_the_loss_of_ssim_where_it_is_a_goal():
     text = Trial(1, 1e-9, 812_000, psnr=41.2, drop=0.12, ssim_drop=0.00291, worst=35.1).summary()
     assert text == "812 kB at 41.20 dB, drop 0.12 dB, SSIM drop 0.00291, worst view 35.1 dB"
     assert "SSIM drop 2.35e-05" in Trial(1, 1e-9, 812_000, ssim_drop=0.000023456).summary()
+
+
+@pytest.mark.parametrize(
+    ("goal", "plain", "trained"),
+    [
+        ({"max_psnr_drop": 0.3}, 0.28, 0.251),
+        ({"max_psnr_drop": 0.1}, 0.08, 0.076),  # no less than three quarters
+        ({"max_psnr_drop": 0.02}, 0.01, 0.01),
+        ({"max_ssim_drop": 0.01}, 0.0095, 0.0088),
+    ],
+)
+def test_containers_that_take_a_training_need_not_come_as_near(goal, plain, trained):
+    """The smallest figures that end a search."""
+    (limit,) = goal_of(**goal).limits
+    (value,) = goal.values()
+    assert value * 2 ** -limit.near_enough(trained=False) == pytest.approx(plain)
+    assert value * 2 ** -limit.near_enough(trained=True) == pytest.approx(trained, rel=0.01)
