@@ -11,7 +11,7 @@ import kissgs
 from kissgs import CompactSettings, UnsupportedError
 from kissgs.cameras.views import View, Views, black
 from kissgs.compaction.budget import compact_scene
-from kissgs.evaluation.evaluate import evaluate
+from kissgs.evaluation.evaluate import compare_images, evaluate
 from kissgs.evaluation.psnr_loss import ASSUMED_PSNR, drop_of
 from kissgs.evaluation.results import Comparison, Evaluation, ImageMetrics, ViewComparison
 from kissgs.rendering.rasterizer import render
@@ -64,7 +64,7 @@ def test_a_search_with_a_checkpoint_is_rejected(tmp_path):
 def test_the_search_finds_the_smallest_count_tried_that_meets_the_drop(allowed):
     scene = cloud(250)
     result = compacted(scene, max_psnr_drop=allowed)
-    evaluation = evaluate(scene, result.splats, Views((), around(3), black(), ""))
+    evaluation = compare_images(scene, result.splats, Views((), around(3), black(), ""))
     assert drop_of(evaluation) <= allowed
     drops = {trial.count: trial.drop for trial in result.report.trials}
     assert drops[len(result.splats)] == pytest.approx(drop_of(evaluation))
