@@ -157,10 +157,11 @@ def test_a_trial_names_the_loss_of_ssim_where_it_is_a_goal():
 @pytest.mark.parametrize(
     ("goal", "plain", "trained"),
     [
-        ({"max_psnr_drop": 0.3}, 0.28, 0.251),
+        ({"max_psnr_drop": 0.3}, 0.28, 0.2274),
         ({"max_psnr_drop": 0.1}, 0.08, 0.076),  # no less than three quarters
         ({"max_psnr_drop": 0.02}, 0.01, 0.01),
-        ({"max_ssim_drop": 0.01}, 0.0095, 0.0088),
+        ({"max_ssim_drop": 0.01}, 0.0095, 0.00815),
+        ({"target_size": 1e6}, 1e6 * 0.97, 1e6 * 0.97**2.5),
     ],
 )
 def test_containers_that_take_a_training_need_not_come_as_near(goal, plain, trained):
