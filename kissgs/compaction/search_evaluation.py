@@ -27,7 +27,7 @@ class SearchEvaluation:
 
     With a capture these are its held-out views. Without one they are random poses from which photographs might have
     been taken, and their ``surroundings`` cameras drawn over the whole scene. What a container loses in such poses is
-    near what it loses in photographs: for fox 1.2 dB more PSNR to the original, with and without training. Drawn
+    near what it loses in photographs: for fox 0.7 to 1.5 dB more PSNR to the original, with and without training. Drawn
     cameras find 3 to 4 dB more without training and 0.5 with it, but they see every part of the scene.
 
     Attributes:
