@@ -32,6 +32,25 @@ from kissgs.cli.arguments import (
 from kissgs.cli.files import for_each_input
 from kissgs.cli.options import budget_of, chosen, device_of, open_views, refuse_without_training
 
+CompactOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="BUDGET",
+        help="First reduce the number of Gaussians, see 'kissgs compact': to a count (200k), a share (20%) or a "
+        "PSNR drop (0.2dB); 100% keeps all; auto searches the number that serves a goal best, which is the default "
+        "with held-out photographs, and without --views where it is fine-tuned.",
+    ),
+]
+FinetuneOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="[STEPS]",
+        help="Fine-tune the quantised values on the photographs of --views, or on renderings of the scene: fewer "
+        "bytes at equal PSNR, a minute or two more. Default number of steps: that of the preset; 0: never. "
+        "Default with a goal, if photographs are held out or there is no --views.",
+    ),
+]
+
 
 def compress(
     scenes: ScenesArgument,
@@ -52,24 +71,8 @@ def compress(
     max_psnr_drop: MaxPsnrDropOption = None,
     max_ssim_drop: MaxSsimDropOption = None,
     time: TimeOption = None,
-    compact: Annotated[
-        str | None,
-        typer.Option(
-            metavar="BUDGET",
-            help="First reduce the number of Gaussians, see 'kissgs compact': to a count (200k), a share (20%) or a "
-            "PSNR drop (0.2dB); 100% keeps all; auto searches the number that serves a goal best, which is the default "
-            "where it is fine-tuned.",
-        ),
-    ] = None,
-    finetune: Annotated[
-        str | None,
-        typer.Option(
-            metavar="[STEPS]",
-            help="Fine-tune the quantised values on the photographs of --views, or on renderings of the scene: fewer "
-            "bytes at equal PSNR, a minute or two more. Default number of steps: that of the preset; 0: never. "
-            "Default with a goal.",
-        ),
-    ] = None,
+    compact: CompactOption = None,
+    finetune: FinetuneOption = None,
     seed: SeedOption = None,
     unpacked: Annotated[bool, typer.Option("--unpacked", help="Write a folder instead of a zip.")] = False,
     evaluate: Annotated[

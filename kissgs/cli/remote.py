@@ -26,6 +26,21 @@ ServerOption = Annotated[
 KeyOption = Annotated[
     str | None, typer.Option("--key", envvar="KISSGS_KEY", help="API key, if the service needs one; prefer KISSGS_KEY.")
 ]
+CompactOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="BUDGET",
+        help="First reduce the number of Gaussians: 200k, 20% or 0.2dB; 100% keeps all; auto: the best for the goal, "
+        "the default where it is fine-tuned.",
+    ),
+]
+FinetuneOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="[STEPS]",
+        help="Fine-tune the quantised values on renderings of the scene; default with a goal. 0: never.",
+    ),
+]
 
 DEFAULT_SERVER = "http://127.0.0.1:8000"
 
@@ -54,21 +69,8 @@ def compress(
     target_size: TargetSizeOption = None,
     max_psnr_drop: MaxPsnrDropOption = None,
     max_ssim_drop: MaxSsimDropOption = None,
-    compact: Annotated[
-        str | None,
-        typer.Option(
-            metavar="BUDGET",
-            help="First reduce the number of Gaussians: 200k, 20% or 0.2dB; 100% keeps all; auto: the best for "
-            "the goal, the default where it is fine-tuned.",
-        ),
-    ] = None,
-    finetune: Annotated[
-        str | None,
-        typer.Option(
-            metavar="[STEPS]",
-            help="Fine-tune the quantised values on renderings of the scene; default with a goal. 0: never.",
-        ),
-    ] = None,
+    compact: CompactOption = None,
+    finetune: FinetuneOption = None,
     evaluate: Annotated[
         bool, typer.Option("--evaluate", help="Decode the result, and measure PSNR and SSIM of its renderings.")
     ] = False,

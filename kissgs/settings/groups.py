@@ -61,25 +61,23 @@ class Settings(BaseModel):
 
         A size or a loss is served best by fewer Gaussians and by training, on photographs or without a capture on
         renderings of the scene, and so is a time limit alone with photographs. A PSNR to the scene's own renderings
-        falls by training, and a capture without photographs to evaluate the result would be overfitted.
-        Without photographs and fine-tuning, pruning loses more in views that nobody knows than it saves.
-        With a time limit alone, ``finetune.enabled`` stays open without photographs: it depends on the time.
+        falls by training. A capture that holds no photographs out cannot tell whether others are met, so that nothing
+        is trained. Without photographs and fine-tuning, pruning loses more than it saves. With a time limit alone,
+        ``finetune.enabled`` stays open without photographs: it depends on the time.
 
         Args:
             photographs: whether a capture has photographs to train on, and others to evaluate the result; None for no
                 capture.
             torch: whether torch is installed, which training needs.
         """
-        bare = photographs is None and self.encode.has_goal
-        trains = (
-            torch and self.encode.psnr is None and (bare or (bool(photographs) and (self.encode.has_goal or self.aims)))
-        )
+        serves_goal = self.encode.has_goal and photographs is not False
+        trains = torch and self.encode.psnr is None and (serves_goal or (self.aims and bool(photographs)))
         compact, finetune = self.compact, self.finetune
         ssim_weight = SSIM_WEIGHT if self.encode.max_ssim_drop is None else SSIM_GOAL_WEIGHT
         compact, finetune = compact.with_ssim_weight(ssim_weight), finetune.with_ssim_weight(ssim_weight)
         if compact.auto_count is None or self.aims:
-            serves = compact.trains and (photographs or finetune.enabled is not False)
-            wanted = trains and serves and (compact.auto_count or not compact.enabled)
+            keeps_all = not compact.trains or (photographs is None and finetune.enabled is False)
+            wanted = trains and not keeps_all and (compact.auto_count or not compact.enabled)
             compact = compact.model_copy(update={"auto_count": wanted})
         if finetune.enabled is None and (trains or not self.aims):
             finetune = finetune.model_copy(update={"enabled": trains})

@@ -140,6 +140,7 @@ def test_goals(visit, service):
     page.get_by_text("smaller").first.wait_for()
     job = newest(service)
     assert job["options"]["encode"]["target_size"] == 8000
+    assert (job["options"]["compact"]["auto_count"], job["options"]["finetune"]["enabled"]) == (False, False)
     assert 0.9 * 8000 <= job["sizes"]["container"] <= 8000
 
 
@@ -166,6 +167,9 @@ def test_a_time_limit(visit, service):
     page.locator("#amount").fill("0.008")
     keep.select_option("As many as the goal needs")
     assert note.inner_text() == "It does not limit the search for the number of Gaussians."
+    page.get_by_label("Fine-tune").check()
+    assert "not before the goal is met" in note.inner_text()
+    page.get_by_label("Fine-tune").uncheck()
     keep.select_option("Keep all")
     page.get_by_role("button", name="Compress").click()
     page.get_by_text("smaller").first.wait_for()
