@@ -285,8 +285,9 @@ def test_a_target_size_is_met_if_fine_tuned_containers_are_too_large(monkeypatch
 @pytest.mark.quick(0)
 def test_a_search_does_not_change_existing_checkpoints(tmp_path):
     (tmp_path / "c-finetune.npz").write_bytes(b"mine")
+    whole = {"auto_count": False}  # the search for the number of Gaussians refuses a checkpoint
     settings = Settings.from_preset(
-        "balanced", finetune=SHORT, target_size=50_000, sensitivity_views=4, sensitivity_view_size=60
+        "balanced", finetune=SHORT, compact=whole, target_size=50_000, sensitivity_views=4, sensitivity_view_size=60
     )
     found = kissgs.compress(cloud(60), tmp_path / "a.zip", settings=settings, checkpoint=tmp_path / "c.npz")
     assert (tmp_path / "c-finetune.npz").read_bytes() == b"mine"

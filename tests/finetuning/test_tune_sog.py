@@ -50,7 +50,7 @@ def tuned(scene, *, checkpoint=None, progress=silent, work=None, **changes):
 @pytest.mark.quick(1)
 def test_fine_tuning_raises_the_psnr_to_the_original_scene(degree):
     scene = cloud(150, degree)
-    encoded, report = tuned(scene, steps=150, lr=0.05, codebook_lr=0.1)
+    encoded, report = tuned(scene, steps=300, lr=0.01, codebook_lr=0.03)  # for 8 seeds by 0.75 dB at least
     assert report.kept
     assert report.psnr_after > report.psnr_before + 0.4
     assert report.bytes_after == len(zip_bytes(encoded.files))
