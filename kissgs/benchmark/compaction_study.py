@@ -154,7 +154,7 @@ def compare_strategies(
     if any(strategy.training != "none" for strategy in strategies):
         from kissgs.training.targets import training_targets
 
-        targets = training_targets(splats, supervised.train, supervised.background, threads=threads, progress=progress)
+        targets = training_targets(splats, supervised, threads=threads, progress=progress)
     metrics, size = evaluate_scene(splats, splats, supervised, threads, progress)
     points = [_point("input", splats, metrics, size, 0.0, 0.0)]
     for strategy in strategies:

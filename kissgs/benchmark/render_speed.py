@@ -152,7 +152,7 @@ def _training_steps(model: GaussianModel, camera: Camera, threads: int) -> list[
     from kissgs.training.targets import TrainingTargets
 
     grey = np.full((camera.height, camera.width, 3), 0.5, np.float16)
-    targets = TrainingTargets((camera,), (grey,), np.zeros(3, np.float32), "renderings")
+    targets = TrainingTargets((camera,), (grey,), (np.zeros(3, np.float32),), "renderings")
     settings = CompactSettings()
     plan = TrainingPlan(
         "measure",

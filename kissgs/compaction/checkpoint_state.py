@@ -72,8 +72,8 @@ def work_key(
     Raises:
         InvalidViewsError: a photograph cannot be read.
     """
-    text = f"{__version__} {count} {evaluate} {device} {settings.model_dump_json()} {supervision.background}"
-    key = hashlib.sha256(text.encode())
+    text = f"{__version__} {count} {evaluate} {device} {settings.model_dump_json()} {supervision.background} "
+    key = hashlib.sha256(f"{text}{supervision.surrounding} {supervision.in_turn}".encode())
     for view in (*supervision.train, *supervision.score, *supervision.test):
         camera = view.camera
         key.update(camera.viewmat.tobytes() + camera.K.tobytes() + f"{camera.width} {camera.height}".encode())

@@ -85,12 +85,7 @@ class Popspa:
         from kissgs.training.targets import training_targets
 
         return self.targets or training_targets(
-            self.original,
-            self.supervision.train,
-            self.supervision.background,
-            threads=self.threads,
-            device=self.device,
-            progress=self.progress,
+            self.original, self.supervision, threads=self.threads, device=self.device, progress=self.progress
         )
 
 

@@ -125,8 +125,7 @@ class Tuner:
             views_by_role = supervision_views(
                 original, views, settings, scoring_stride=0, threads=threads, progress=progress
             )
-            train, background = views_by_role.train, views_by_role.background
-            targets = training_targets(original, train, background, threads=threads, device=device, progress=progress)
+            targets = training_targets(original, views_by_role, threads=threads, device=device, progress=progress)
             prepared = views_by_role, targets
         return cls(original, settings, *prepared, device, threads, progress, container, decode, deadline)
 
@@ -299,7 +298,7 @@ class Tuner:
         cameras = self.targets.cameras[:: max(1, len(self.targets) // SENSITIVITY_VIEWS)]
         sensitivity = measure_sensitivity(
             splats,
-            WeightedCameras(cameras, [1.0] * len(cameras), self.targets.background),
+            WeightedCameras(cameras, [1.0] * len(cameras), self.supervision.background),
             view_uncertainty=VIEW_UNCERTAINTY,
             threads=self.threads,
             progress=as_stage("finetune", self.progress),
@@ -310,7 +309,7 @@ class Tuner:
         """Return the key of the work's checkpoint: equal only for equal results."""
         targets = self.targets
         settings = f"{__version__} {self.device} {sh_degree} {self.settings.model_dump_json()} {plan.rd_lambda} "
-        key = hashlib.sha256(f"{settings}{targets.background}".encode())
+        key = hashlib.sha256(f"{settings}{targets.surrounding} {targets.in_turn}".encode())
         for name, field in plan.fields.items():
             key.update(f"{name} {field.top} {field.level_offset} {field.levels.shape}".encode())
             table = np.zeros(0) if field.table is None else field.table
@@ -322,9 +321,9 @@ class Tuner:
             key.update(getattr(plan.costs, name).tobytes())
         if (tables := self.container.tables) is not None:
             key.update(tables.opacity_logits.tobytes() + f"{tables.first_drawn} {tables.last_drawn}".encode())
-        for camera, image in zip(targets.cameras, targets.images, strict=True):
+        for camera, image, level in zip(targets.cameras, targets.images, targets.backgrounds, strict=True):
             key.update(f"{image.shape} {image.dtype}".encode())
-            key.update(camera.viewmat.tobytes() + camera.K.tobytes() + image.tobytes())
+            key.update(camera.viewmat.tobytes() + camera.K.tobytes() + image.tobytes() + level.tobytes())
         for name in ATTRIBUTES:
             key.update(getattr(self.original, name).tobytes())
         return key.hexdigest()

@@ -27,11 +27,11 @@ class TrainingViewSettings(BaseModel):
         5.0, ge=0, le=1000, description="Weight of the mean squared error in the loss, added to SSIM and L1."
     )
     synthetic_view_share: float = Field(
-        0.1,
+        0.05,
         ge=0,
         le=0.9,
-        description="With a capture: share of training steps that use a virtual camera around the scene, with a "
-        "rendering of the original scene as target. Preserves parts that no photograph shows.",
+        description="With a capture: share of training steps that use a virtual camera in or around the scene, with a "
+        "rendering of the original scene as target. Preserves what no photograph shows.",
     )
     views: int = Field(
         384,

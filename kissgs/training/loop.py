@@ -174,7 +174,7 @@ def image_loss(
         Ks=torch.from_numpy(camera.K)[None],
         width=camera.width,
         height=camera.height,
-        backgrounds=torch.from_numpy(targets.background)[None],
+        backgrounds=torch.from_numpy(targets.backgrounds[n])[None],
         threads=threads,
         receive=receive,
     )

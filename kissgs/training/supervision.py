@@ -12,6 +12,7 @@ from kissgs.cameras.views import View, Views
 from kissgs.cameras.virtual.close_ups import close_ups
 from kissgs.cameras.virtual.random_poses import random_poses
 from kissgs.cameras.virtual.scene_views import scene_views
+from kissgs.cameras.virtual.surroundings import surrounding_cameras
 from kissgs.core.array_types import Float32
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
@@ -26,6 +27,12 @@ CLOSE_UPS, CLOSE_UP_SHRINK = 4, 4
 BACKGROUNDS = (0.0, 0.5, 1.0)
 """Grey levels of the backgrounds of virtual scoring cameras, in turn."""
 
+MIN_SURROUNDING_VIEWS = 64
+"""Smallest number of virtual views beside those of a capture; fewer are overfitted."""
+
+SCORING_SHARE = 0.25
+"""Number of these that score Gaussians, in units of the number of the capture's training views."""
+
 MAX_EVAL_VIEWS = 16
 """Largest number of evaluation views."""
 
@@ -36,13 +43,15 @@ class SupervisionViews:
 
     Attributes:
         train: training views; none if nothing is trained.
-        score: views that score Gaussians: the training views of a capture, or some virtual cameras and close-ups, each
-            with a background of its own.
+        score: views that score Gaussians: the training views of a capture and some of the surrounding ones, or some
+            virtual cameras and close-ups, each with a background of its own.
         test: evaluation views: held-out views, or some training views if there are none. All have photographs or none.
         background: ``(3,)`` RGB from 0 to 1.
         source: description of the training views.
         captured: whether the training views are those of a capture.
         note: note for the user, a sentence without capital and full stop; may be empty.
+        surrounding: number of the last training views, virtual ones beside a capture, that take turns.
+        in_turn: number of these in each epoch.
     """
 
     train: tuple[View, ...]
@@ -52,6 +61,8 @@ class SupervisionViews:
     source: str
     captured: bool = False
     note: str = ""
+    surrounding: int = 0
+    in_turn: int = 0
 
     @property
     def eval_views(self) -> Views:
@@ -68,7 +79,7 @@ def supervision_views(
     threads: int = 0,
     progress: Progress = silent,
 ) -> SupervisionViews:
-    """Return a capture's training views with a few virtual ones around them, or virtual views alone.
+    """Return a capture's training views with virtual ones of the whole scene, or virtual views alone.
 
     Args:
         splats: the scene, finite.
@@ -84,23 +95,44 @@ def supervision_views(
         if views is None or not views.test:
             return virtual
         return replace(virtual, test=_evaluation_views(views, settings.view_size), background=views.background)
-    size, train, source = settings.view_size, views.train, views.source
-    if settings.synthetic_view_share > 0:
-        camera = views.train[0].camera.at_most(size)
-        side = round(math.sqrt(camera.width * camera.height))
-        count = max(1, round(len(views.train) * settings.synthetic_view_share / (1 - settings.synthetic_view_share)))
-        synthetic = scene_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
-        train, source = (*train, *synthetic.all), f"{source}, and {synthetic.source}"
-    resized = _resized(train, size)
+    surrounding, in_turn = _surrounding_views(splats, views.train, settings, threads, progress)
+    train = _resized(views.train, settings.view_size)
+    source = f"{len(surrounding)} virtual cameras" if surrounding else ""
     return SupervisionViews(
-        train=resized,
-        score=resized,
-        test=_evaluation_views(views, size),
+        train=(*train, *surrounding),
+        score=(*train, *surrounding[: math.ceil(SCORING_SHARE * len(train))]),
+        test=_evaluation_views(views, settings.view_size),
         background=views.background,
-        source=source,
+        source=", and ".join(filter(None, [views.source, source])),
         captured=True,
         note=_note(views),
+        surrounding=len(surrounding),
+        in_turn=in_turn,
     )
+
+
+def _surrounding_views(
+    splats: Splats, train: Sequence[View], settings: TrainingViewSettings, threads: int, progress: Progress
+) -> tuple[tuple[View, ...], int]:
+    """Return virtual views of all that a capture may not show, in random order, and their number in each epoch."""
+    share, camera = settings.synthetic_view_share, train[0].camera.at_most(settings.view_size)
+    if share == 0:
+        return (), 0
+    in_turn, side = max(1, round(len(train) * share / (1 - share))), round(math.sqrt(camera.width * camera.height))
+    count = max(in_turn, MIN_SURROUNDING_VIEWS)
+    regions = scene_views(splats, width=side, height=side, count=count // 4, threads=threads, progress=progress)
+    cameras = [view.camera for view in regions.all]
+    cameras += surrounding_cameras(splats, side=side, count=count - len(cameras), seed=settings.seed)
+    order = np.random.default_rng(settings.seed).permutation(len(cameras))
+    views = [
+        View(f"surroundings {n}", cameras[index], background=_grey(BACKGROUNDS[n % len(BACKGROUNDS)]))
+        for n, index in enumerate(order)
+    ]
+    return tuple(views), min(in_turn, len(views))
+
+
+def _grey(level: float) -> Float32[np.ndarray, "3"]:
+    return np.full(3, level, np.float32)
 
 
 def evaluation_only(views: Views | None, size: int) -> SupervisionViews:
@@ -170,7 +202,7 @@ def _scoring_views(splats: Splats, views: Sequence[View], side: int, seed: int) 
     cameras = close_ups(splats, side=max(1, side // CLOSE_UP_SHRINK), count=CLOSE_UPS * len(views), seed=seed)
     added = [View(f"close-up {n}", camera) for n, camera in enumerate(cameras)]
     return tuple(
-        replace(view, background=np.full(3, BACKGROUNDS[n % len(BACKGROUNDS)], np.float32))
+        replace(view, background=_grey(BACKGROUNDS[n % len(BACKGROUNDS)]))
         for group in (views, added)
         for n, view in enumerate(group)
     )

@@ -8,13 +8,13 @@ from typing import Literal
 
 import numpy as np
 
-from kissgs.cameras.views import View
 from kissgs.core.array_types import Float32, Shaped
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.gsplat_backend import ImageRenderer, image_renderer
 from kissgs.rendering.rasterizer import Device, render
+from kissgs.training.supervision import SupervisionViews
 
 NEAREST_CAMERAS, EXTENT_RATIO = 4, 4.0
 """The local extent of the cameras is estimated as 4 times the distance to the 4th nearest camera."""
@@ -27,14 +27,18 @@ class TrainingTargets:
     Attributes:
         cameras: one or more cameras.
         images: ``(H, W, 3)`` target of each camera: a photograph in uint8, or a rendering in float16 from 0 to 1.
-        background: ``(3,)`` RGB from 0 to 1.
+        backgrounds: ``(3,)`` RGB from 0 to 1 of each camera.
         target_source: "photos" if any target is a photograph, else "renderings".
+        surrounding: number of the last cameras that take turns, instead of having a step in every epoch.
+        in_turn: number of these that have a step in each epoch, at most ``surrounding``.
     """
 
     cameras: tuple[Camera, ...]
     images: tuple[Shaped[np.ndarray, "H W 3"], ...]
-    background: Float32[np.ndarray, "3"]
+    backgrounds: tuple[Float32[np.ndarray, "3"], ...]
     target_source: Literal["photos", "renderings"]
+    surrounding: int = 0
+    in_turn: int = 0
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -49,20 +53,24 @@ class TrainingTargets:
 
         The order depends on the seed and the step only, so that training can be resumed at any step.
         """
-        count = len(self)
+        always = len(self) - self.surrounding
+        turns = np.random.default_rng(seed).permutation(self.surrounding)
+        count = always + self.in_turn
         while True:
             epoch, begin = divmod(first, count)
-            order = np.random.default_rng([*seed, epoch]).permutation(count)
-            yield from order[begin:].tolist()
+            turn = turns.take(range(epoch * self.in_turn, (epoch + 1) * self.in_turn), mode="wrap")
+            targets = np.concatenate([np.arange(always), always + turn])
+            yield from np.random.default_rng([*seed, epoch]).permutation(targets)[begin:].tolist()
             first += count - begin
 
     @property
     def extent(self) -> float:
         """Extent of the cameras, world units: 1.1 times the largest distance to their mean position, as in 3DGS.
 
-        0 if all cameras are at one position.
+        0 if all cameras are at one position. The surrounding ones do not count.
         """
-        positions = np.array([camera.position for camera in self.cameras])
+        cameras = self.cameras[: len(self) - self.surrounding]
+        positions = np.array([camera.position for camera in cameras])
         return 1.1 * float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).max())
 
     def local_extents(self, means: Float32[np.ndarray, "N 3"], largest: float) -> Float32[np.ndarray, " N"]:
@@ -89,19 +97,17 @@ class TrainingTargets:
 
 def training_targets(
     reference: Splats,
-    views: Sequence[View],
-    background: Float32[np.ndarray, "3"],
+    supervision: SupervisionViews,
     *,
     threads: int = 0,
     device: Device = "cpu",
     progress: Progress = silent,
 ) -> TrainingTargets:
-    """Load the photographs of ``views``, and render ``reference`` from those that have none.
+    """Load the photographs of the training views, and render ``reference`` for those that have none.
 
     Args:
         reference: the original scene, finite.
-        views: one or more views at the training resolution.
-        background: ``(3,)`` RGB from 0 to 1.
+        supervision: one or more training views.
         threads: number of threads; 0 means one per processor.
         device: device that renders.
         progress: receives the stage ``"targets"``.
@@ -110,19 +116,23 @@ def training_targets(
         InvalidViewsError: a photograph cannot be read.
         UnsupportedError: an image would take too much memory.
     """
+    views, background = supervision.train, supervision.background
     renderer, images = _renderer(reference, threads, device), []
+    backgrounds = tuple(background if view.background is None else view.background for view in views)
     for done, view in enumerate(views):
         progress("targets", done / len(views))
         if view.photo is not None:
             images.append(view.load_photo())
         else:
-            images.append(np.clip(renderer(view.camera, background.tolist())[0], 0, 1).astype(np.float16))
+            images.append(np.clip(renderer(view.camera, backgrounds[done].tolist())[0], 0, 1).astype(np.float16))
     progress("targets", 1.0)
     return TrainingTargets(
         cameras=tuple(view.camera for view in views),
         images=tuple(images),
-        background=background,
+        backgrounds=backgrounds,
         target_source="photos" if any(view.photo is not None for view in views) else "renderings",
+        surrounding=supervision.surrounding,
+        in_turn=supervision.in_turn,
     )
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers.training_scenes import around, cloud, same
+from helpers.training_scenes import around, cloud, same, targets_of
 from PIL import Image
 
 import kissgs
@@ -21,7 +21,6 @@ from kissgs.rendering.coverage import Coverage
 from kissgs.rendering.rasterizer import render
 from kissgs.training.checkpoint import Checkpoint
 from kissgs.training.supervision import SupervisionViews, supervision_views
-from kissgs.training.targets import training_targets
 
 SHORT = {"sparsify_steps": 8, "refine_steps": 6, "prune_rounds": 2, "min_keep_per_scoring": 0.6, "admm_interval": 3}
 NO_TRAINING = {"sparsify_steps": 0, "refine_steps": 0}
@@ -214,7 +213,7 @@ def test_cameras_at_one_position(turn):
     aims = [np.array([turn * n, 0.0, 0.0]) for n in range(5)]
     cameras = [look_at(position, aim, up, fov=0.9, width=40, height=32) for aim in aims]
     rotated = tuple(View(f"{n}", camera) for n, camera in enumerate(cameras))
-    extent = training_targets(cloud(5), rotated, black()).extent
+    extent = targets_of(cloud(5), rotated).extent
     assert extent < 1e-10
     assert (extent > 0) == (turn > 0)
     scene = cloud(60)
@@ -282,15 +281,17 @@ def test_virtual_views_train_without_a_capture():
     assert result.report.source.startswith(f"{len(found.train)} virtual cameras, and ")
 
 
-@pytest.mark.parametrize(("share", "virtual"), [(0.0, 0), (0.1, 1), (0.5, 5)])
-def test_a_capture_is_mixed_with_virtual_views(share, virtual):
+@pytest.mark.parametrize(("share", "in_turn"), [(0.0, 0), (0.1, 1), (0.5, 5)])
+def test_a_capture_is_mixed_with_virtual_views(share, in_turn):
     """The capture's views come first; held-out views are never used for training."""
     capture = Views(around(5), around(3), black(), "a capture")
     found = supervision_views(kissgs.sample_scene(400, sh_degree=0), capture, settings(synthetic_view_share=share))
-    assert len(found.train) == 5 + virtual
+    virtual = 64 if share else 0
+    assert (len(found.train), found.surrounding, found.in_turn) == (5 + virtual, virtual, in_turn)
     assert [view.name for view in found.train[:5]] == [view.name for view in capture.train]
     assert [view.name for view in found.test] == [view.name for view in capture.test]
-    assert found.score == found.train
+    assert found.score == found.train[: 7 if share else 5]
+    assert [view.background[0] for view in found.train[5:9]] == ([0.0, 0.5, 1.0, 0.0] if share else [])
     assert found.source == "a capture" + (f", and {virtual} virtual cameras" if virtual else "")
 
 

@@ -23,7 +23,7 @@ def stripes(camera):
     """Return stripes as the training target of the camera, unlike any of the scenes."""
     ys, xs = np.mgrid[0 : camera.height, 0 : camera.width]
     image = np.stack([0.5 + 0.4 * np.sin(a * xs + b * ys) for a, b in ((0.3, 0.1), (0.1, 0.4), (0.5, -0.2))], axis=2)
-    return TrainingTargets((camera,), (image.astype(np.float16),), np.float32([0.25, 0.5, 0.75]), "renderings")
+    return TrainingTargets((camera,), (image.astype(np.float16),), (np.float32([0.25, 0.5, 0.75]),), "renderings")
 
 
 def trained(splats, camera):

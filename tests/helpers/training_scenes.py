@@ -5,6 +5,7 @@ import numpy as np
 import kissgs
 from kissgs.cameras.views import View, black
 from kissgs.rendering.camera import look_at
+from kissgs.training.supervision import SupervisionViews
 from kissgs.training.targets import training_targets
 
 
@@ -36,8 +37,9 @@ def around(count=4, size=40):
     return tuple(views)
 
 
-def targets_of(scene, views=None):
-    return training_targets(scene, views or around(), black())
+def targets_of(scene, views=None, background=None, **changes):
+    background = black() if background is None else background
+    return training_targets(scene, SupervisionViews(views or around(), (), (), background, "views", **changes))
 
 
 def same(one, other):

@@ -9,14 +9,13 @@ import pytest
 from helpers.training_scenes import around, cloud, targets_of
 from PIL import Image
 
-from kissgs.cameras.views import View, black
+from kissgs.cameras.views import View
 from kissgs.rendering.rasterizer import render
-from kissgs.training.targets import training_targets
 
 
 def test_without_photographs_the_targets_are_renderings():
     scene, views = cloud(), around(3)
-    found = training_targets(scene, views, np.float32([0.2, 0.4, 0.6]))
+    found = targets_of(scene, views, np.float32([0.2, 0.4, 0.6]))
     assert found.target_source == "renderings"
     assert len(found) == 3
     for n, view in enumerate(views):
@@ -31,10 +30,10 @@ def test_photographs_are_the_targets_if_there_are_any(tmp_path):
     for n, (view, photo) in enumerate(zip(around(2), photos, strict=True)):
         Image.fromarray(photo).save(tmp_path / f"{n}.png")
         views.append(View(view.name, view.camera, tmp_path / f"{n}.png"))
-    found = training_targets(cloud(), views, black())
+    found = targets_of(cloud(), tuple(views))
     assert found.target_source == "photos"
     np.testing.assert_array_equal(found.image(1), photos[1].astype(np.float32) / np.float32(255))
-    mixed = training_targets(cloud(), [views[0], around(2)[1]], black())
+    mixed = targets_of(cloud(), (views[0], around(2)[1]))
     assert mixed.target_source == "photos"
     np.testing.assert_array_equal(mixed.image(0), found.image(0))
     np.testing.assert_array_equal(mixed.image(1), targets_of(cloud(), around(2)).image(1))
@@ -55,6 +54,38 @@ def test_every_target_occurs_once_per_epoch():
     assert len({tuple(steps[n : n + 4]) for n in range(0, 20, 4)}) > 1
 
 
+@pytest.mark.parametrize(("surrounding", "in_turn"), [(7, 2), (7, 1), (3, 3)])
+def test_surrounding_cameras_take_turns(surrounding, in_turn):
+    """Each epoch has all other targets and so many of these, all of which occur equally often."""
+    found = targets_of(cloud(), around(4 + surrounding), surrounding=surrounding, in_turn=in_turn)
+    count = 4 + in_turn
+    steps = list(islice(found.order((5,)), count * surrounding))
+    for n in range(0, len(steps), count):
+        epoch = steps[n : n + count]
+        assert sorted(epoch)[:4] == [0, 1, 2, 3]
+        assert len(set(epoch)) == count
+    assert Counter(step for step in steps if step >= 4) == Counter(list(range(4, 4 + surrounding)) * in_turn)
+    for first in (1, count, 2 * count + 2):
+        assert list(islice(found.order((5,), first), len(steps) - first)) == steps[first:]
+
+
+def test_surrounding_cameras_do_not_change_the_extent():
+    away = np.eye(4)
+    away[:3, 3] = 50, 0, 0
+    far = tuple(replace(view, camera=replace(view.camera, viewmat=view.camera.viewmat @ away)) for view in around(3))
+    found = targets_of(cloud(), (*around(4), *far), surrounding=3, in_turn=1)
+    assert found.extent == targets_of(cloud(), around(4)).extent
+
+
+def test_a_view_has_its_own_background():
+    own = replace(around(1)[0], background=np.float32([0.5, 1.0, 0.0]))
+    found = targets_of(cloud(), (own, around(2)[1]), np.float32([0.2, 0.4, 0.6]))
+    for n, background in enumerate([(0.5, 1.0, 0.0), (0.2, 0.4, 0.6)]):
+        np.testing.assert_array_equal(found.backgrounds[n], np.float32(background))
+        image, _ = render(cloud(), found.cameras[n], background=background)
+        np.testing.assert_allclose(found.image(n), np.clip(image, 0, 1), atol=3e-4)
+
+
 def test_the_extent_is_that_of_3dgs():
     """Cameras on a circle of radius 3; in INRIA's code, 1.1 times the largest distance from the mean."""
     assert targets_of(cloud()).extent == pytest.approx(3.3)
@@ -69,8 +100,8 @@ def test_the_local_extent_of_an_object_is_that_of_the_cameras_around_it():
         return View(view.name, replace(view.camera, viewmat=pose))
 
     small = [smaller(view) for view in around(12)]
-    found = training_targets(cloud(), [*around(12), *small], black())
-    alone = training_targets(cloud(), around(12), black())
+    found = targets_of(cloud(), (*around(12), *small))
+    alone = targets_of(cloud(), around(12))
     means = cloud(30).means
     extents = found.local_extents(
         np.concatenate([means, means * np.float32(0.01) + np.float32([50, 0, 0])]), found.extent
@@ -82,7 +113,7 @@ def test_the_local_extent_of_an_object_is_that_of_the_cameras_around_it():
 
 
 def test_local_extents_are_positive_and_limited():
-    found = training_targets(cloud(), around(3), black())
+    found = targets_of(cloud(), around(3))
     points = np.concatenate([[camera.position for camera in found.cameras], [[1e6, 0, 0]]]).astype(np.float32)
     extents = found.local_extents(points, 2.0)
     assert (extents > 0).all()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kissgs.cameras.virtual.scene_bounds import opacity
+from kissgs.cameras.virtual.scene_bounds import Vec3, opacity
 from kissgs.core.splats import Splats
 from kissgs.rendering.camera import Camera, look_at
 from kissgs.rendering.constants import NEAR
@@ -45,11 +45,26 @@ def close_ups(splats: Splats, *, side: int, count: int, seed: int = 0) -> list[C
     scales = local_scale(splats)
     cameras = []
     for target in rng.choice(len(splats), count, p=weights / weights.sum()):
-        wanted_distance = scales[target] * 2 ** rng.uniform(0, OCTAVES)
-        distance = max(wanted_distance, MIN_DISTANCE)
-        fov = 2 * np.arctan(np.tan(FIELD_OF_VIEW / 2) * wanted_distance / distance)
-        direction = rng.standard_normal(3)
-        direction /= max(float(np.linalg.norm(direction)), 1e-9)
-        centre = splats.means[target].astype(np.float64)
-        cameras.append(look_at(centre + distance * direction, centre, UP, fov=float(fov), width=side, height=side))
+        distance = float(scales[target] * 2 ** rng.uniform(0, OCTAVES))
+        cameras.append(camera_facing(splats.means[target].astype(np.float64), random_direction(rng), distance, side))
     return cameras
+
+
+def camera_facing(target: Vec3, direction: Vec3, distance: float, side: int) -> Camera:
+    """Return a camera for square images with ``target`` in the centre, seen from ``direction``.
+
+    Args:
+        target: ``(3,)`` point, world units.
+        direction: ``(3,)`` unit vector from the target to the camera.
+        distance: of the camera from the target, world units. Below :data:`MIN_DISTANCE`, a longer lens takes its place.
+        side: of the images, pixels.
+    """
+    possible = max(distance, MIN_DISTANCE)
+    fov = 2 * np.arctan(np.tan(FIELD_OF_VIEW / 2) * distance / possible)
+    return look_at(target + possible * direction, target, UP, fov=float(fov), width=side, height=side)
+
+
+def random_direction(rng: np.random.Generator) -> Vec3:
+    """Return a unit vector, ``(3,)``, uniformly distributed over the sphere."""
+    direction = rng.standard_normal(3)
+    return np.asarray(direction / max(float(np.linalg.norm(direction)), 1e-9))

@@ -1,0 +1,86 @@
+"""Oracle: geometry by hand, on scenes whose distances are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.whole_scenes import moved, two
+
+from kissgs import render, sample_scene
+from kissgs.cameras.virtual.scene_bounds import scene_bounds
+from kissgs.cameras.virtual.surroundings import surrounding_cameras
+from kissgs.rendering.local_scale import local_scale
+
+
+def distances(scene, cameras):
+    """Return each camera's distance to the Gaussian in the centre of its image, and the index of that Gaussian."""
+    found = []
+    for camera in cameras:
+        offsets = scene.means.astype(np.float64) - camera.position
+        target = int(np.argmax(offsets @ camera.viewmat[2, :3] / np.linalg.norm(offsets, axis=1)))
+        found.append((float(np.linalg.norm(offsets[target])), target))
+    return found
+
+
+def test_distances_directions_and_fields_of_view():
+    """Log-uniform from 16 local scales or a radius to three radii; every third one stands beside another Gaussian."""
+    scene = sample_scene(2000)
+    spacing, radius = local_scale(scene), scene_bounds(scene).radius
+    cameras = surrounding_cameras(scene, side=16, count=300)
+    assert len(cameras) == 300
+    shares = []
+    for n, (distance, target) in enumerate(distances(scene, cameras)):
+        nearest = min(16 * spacing[target], radius)
+        if n % 3:
+            shares.append(np.log(distance / nearest) / np.log(3 * radius / nearest))
+    assert np.min(shares) > -0.01
+    assert np.max(shares) < 1.01
+    assert 0.4 < np.mean(shares) < 0.6
+    across = [np.linalg.norm(scene.means - camera.position, axis=1) / spacing for camera in cameras[::3]]
+    assert max(ratio.min() for ratio in across) < 8.1
+    assert np.linalg.norm(np.mean([camera.viewmat[2, :3] for camera in cameras], axis=0)) < 0.2
+    assert {(camera.width, camera.height) for camera in cameras} == {(16, 16)}
+
+
+def test_objects_of_all_sizes_are_looked_at():
+    scene = two(1000, 1 / 50)
+    cameras = surrounding_cameras(scene, side=32, count=90, seed=1)
+    small = [target >= len(scene) // 2 for _, target in distances(scene, cameras)]
+    assert 25 < sum(small) < 65, "both objects have equally many Gaussians"
+
+
+@pytest.mark.parametrize("scale", [1e-5, 1e5])
+def test_images_are_alike_at_any_scale(scale):
+    scene = sample_scene(2000)
+    scaled = moved(scene, scale=scale)
+    shown = [
+        np.mean([render(each, camera)[1].mean() for camera in surrounding_cameras(each, side=24, count=40, seed=3)])
+        for each in (scene, scaled)
+    ]
+    assert abs(shown[0] - shown[1]) < 0.1
+    assert shown[0] > 0.1
+
+
+def test_the_same_seed_gives_the_same_cameras():
+    scene = sample_scene(300)
+    found = [[camera.position for camera in surrounding_cameras(scene, side=8, count=9, seed=n)] for n in (2, 2, 3)]
+    assert np.array_equal(found[0], found[1])
+    assert not np.array_equal(found[0], found[2])
+
+
+@pytest.mark.parametrize("count", [1, 2, 7])
+def test_scenes_of_a_few_gaussians(count):
+    for camera in surrounding_cameras(sample_scene(count), side=8, count=6):
+        assert np.isfinite(camera.viewmat).all()
+        assert np.isfinite(camera.K).all()
+
+
+def test_gaussians_at_one_place():
+    scene = sample_scene(5)
+    for camera in surrounding_cameras(replace(scene, means=np.zeros_like(scene.means)), side=8, count=6):
+        assert np.isfinite(camera.viewmat).all()
+
+
+def test_a_scene_without_visible_gaussians_has_none():
+    scene = sample_scene(20)
+    assert surrounding_cameras(replace(scene, opacities=np.full(20, -np.inf, np.float32)), side=8, count=3) == []
