@@ -73,7 +73,7 @@ def work_key(
         InvalidViewsError: a photograph cannot be read.
     """
     text = f"{__version__} {count} {evaluate} {device} {settings.model_dump_json()} {supervision.background} "
-    key = hashlib.sha256(f"{text}{supervision.surrounding} {supervision.in_turn}".encode())
+    key = hashlib.sha256(f"{text}{supervision.synthetic} {supervision.synthetic_per_epoch}".encode())
     for view in (*supervision.train, *supervision.score, *supervision.test):
         camera = view.camera
         key.update(camera.viewmat.tobytes() + camera.K.tobytes() + f"{camera.width} {camera.height}".encode())

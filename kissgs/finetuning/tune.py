@@ -295,10 +295,12 @@ class Tuner:
         """Measure the costs of errors in the training views, for a plan without costs."""
         with torch.no_grad():
             splats = clean(Splats(**{name: value.cpu().numpy() for name, value in scene.gaussians().items()}))[0]
-        cameras = self.targets.cameras[:: max(1, len(self.targets) // SENSITIVITY_VIEWS)]
+        targets = self.targets
+        stride, others = max(1, len(targets) // SENSITIVITY_VIEWS), len(targets) - targets.synthetic
+        weights = [1.0] * others + [targets.synthetic_per_epoch / max(targets.synthetic, 1)] * targets.synthetic
         sensitivity = measure_sensitivity(
             splats,
-            WeightedCameras(cameras, [1.0] * len(cameras), self.supervision.background),
+            WeightedCameras(targets.cameras[::stride], weights[::stride], self.supervision.background),
             view_uncertainty=VIEW_UNCERTAINTY,
             threads=self.threads,
             progress=as_stage("finetune", self.progress),
@@ -309,7 +311,7 @@ class Tuner:
         """Return the key of the work's checkpoint: equal only for equal results."""
         targets = self.targets
         settings = f"{__version__} {self.device} {sh_degree} {self.settings.model_dump_json()} {plan.rd_lambda} "
-        key = hashlib.sha256(f"{settings}{targets.surrounding} {targets.in_turn}".encode())
+        key = hashlib.sha256(f"{settings}{targets.synthetic} {targets.synthetic_per_epoch}".encode())
         for name, field in plan.fields.items():
             key.update(f"{name} {field.top} {field.level_offset} {field.levels.shape}".encode())
             table = np.zeros(0) if field.table is None else field.table

@@ -31,7 +31,8 @@ class TrainingViewSettings(BaseModel):
         ge=0,
         le=0.9,
         description="With a capture: share of training steps that use a virtual camera in or around the scene, with a "
-        "rendering of the original scene as target. Preserves what no photograph shows.",
+        "rendering of the original scene as target; at least one in each round of the photographs, unless it is 0. "
+        "Preserves what no photograph shows.",
     )
     views: int = Field(
         384,

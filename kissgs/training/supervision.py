@@ -11,8 +11,8 @@ import numpy as np
 from kissgs.cameras.views import View, Views
 from kissgs.cameras.virtual.close_ups import close_ups
 from kissgs.cameras.virtual.random_poses import random_poses
+from kissgs.cameras.virtual.scattered import scattered_cameras
 from kissgs.cameras.virtual.scene_views import scene_views
-from kissgs.cameras.virtual.surroundings import surrounding_cameras
 from kissgs.core.array_types import Float32
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
@@ -25,13 +25,13 @@ CLOSE_UPS, CLOSE_UP_SHRINK = 4, 4
 """Number of close-ups per virtual scoring camera, and the factor by which their sides are shorter."""
 
 BACKGROUNDS = (0.0, 0.5, 1.0)
-"""Grey levels of the backgrounds of virtual scoring cameras, in turn."""
+"""Grey levels of the backgrounds, in turn, of virtual cameras that score or stand beside a capture."""
 
-MIN_SURROUNDING_VIEWS = 64
-"""Smallest number of virtual views beside those of a capture; fewer are overfitted."""
+MIN_SYNTHETIC_VIEWS = 64
+"""Smallest number of synthetic views beside those of a capture; fewer are overfitted."""
 
 SCORING_SHARE = 0.25
-"""Number of these that score Gaussians, in units of the number of the capture's training views."""
+"""Number of these that score Gaussians, as a share of the number of the capture's training views."""
 
 MAX_EVAL_VIEWS = 16
 """Largest number of evaluation views."""
@@ -43,15 +43,15 @@ class SupervisionViews:
 
     Attributes:
         train: training views; none if nothing is trained.
-        score: views that score Gaussians: the training views of a capture and some of the surrounding ones, or some
-            virtual cameras and close-ups, each with a background of its own.
+        score: views that score Gaussians: the training views of a capture and some synthetic ones, or some virtual
+            cameras and close-ups, each with a background of its own.
         test: evaluation views: held-out views, or some training views if there are none. All have photographs or none.
         background: ``(3,)`` RGB from 0 to 1.
         source: description of the training views.
         captured: whether the training views are those of a capture.
         note: note for the user, a sentence without capital and full stop; may be empty.
-        surrounding: number of the last training views, virtual ones beside a capture, that take turns.
-        in_turn: number of these in each epoch.
+        synthetic: number of the last training views, virtual ones beside a capture, which take turns.
+        synthetic_per_epoch: number of these in each epoch.
     """
 
     train: tuple[View, ...]
@@ -61,8 +61,8 @@ class SupervisionViews:
     source: str
     captured: bool = False
     note: str = ""
-    surrounding: int = 0
-    in_turn: int = 0
+    synthetic: int = 0
+    synthetic_per_epoch: int = 0
 
     @property
     def eval_views(self) -> Views:
@@ -95,40 +95,53 @@ def supervision_views(
         if views is None or not views.test:
             return virtual
         return replace(virtual, test=_evaluation_views(views, settings.view_size), background=views.background)
-    surrounding, in_turn = _surrounding_views(splats, views.train, settings, threads, progress)
     train = _resized(views.train, settings.view_size)
-    source = f"{len(surrounding)} virtual cameras" if surrounding else ""
+    synthetic, per_epoch = _synthetic_views(splats, train, settings, threads, progress)
+    scoring = math.ceil(SCORING_SHARE * len(train)) if scoring_stride else 0
+    source = f"{len(synthetic)} virtual cameras" if synthetic else ""
+    if synthetic and scoring:
+        source += f", of which {min(scoring, len(synthetic))} score"
     return SupervisionViews(
-        train=(*train, *surrounding),
-        score=(*train, *surrounding[: math.ceil(SCORING_SHARE * len(train))]),
+        train=(*train, *synthetic),
+        score=(*train, *synthetic[:scoring]),
         test=_evaluation_views(views, settings.view_size),
         background=views.background,
         source=", and ".join(filter(None, [views.source, source])),
         captured=True,
         note=_note(views),
-        surrounding=len(surrounding),
-        in_turn=in_turn,
+        synthetic=len(synthetic),
+        synthetic_per_epoch=per_epoch,
     )
 
 
-def _surrounding_views(
+def _synthetic_views(
     splats: Splats, train: Sequence[View], settings: TrainingViewSettings, threads: int, progress: Progress
 ) -> tuple[tuple[View, ...], int]:
-    """Return virtual views of all that a capture may not show, in random order, and their number in each epoch."""
-    share, camera = settings.synthetic_view_share, train[0].camera.at_most(settings.view_size)
+    """Return virtual views of all that a capture may not show, in random order, and their number in each epoch.
+
+    A quarter of them see all regions. Images have the area of the photographs, and at most the side of virtual views
+    without a capture.
+    """
+    share, camera = settings.synthetic_view_share, train[0].camera
     if share == 0:
         return (), 0
-    in_turn, side = max(1, round(len(train) * share / (1 - share))), round(math.sqrt(camera.width * camera.height))
-    count = max(in_turn, MIN_SURROUNDING_VIEWS)
+    per_epoch = max(1, round(len(train) * share / (1 - share)))
+    side = max(1, min(round(math.sqrt(camera.width * camera.height)), _virtual_side(settings)))
+    count = max(per_epoch, MIN_SYNTHETIC_VIEWS)
     regions = scene_views(splats, width=side, height=side, count=count // 4, threads=threads, progress=progress)
     cameras = [view.camera for view in regions.all]
-    cameras += surrounding_cameras(splats, side=side, count=count - len(cameras), seed=settings.seed)
+    cameras += scattered_cameras(splats, side=side, count=count - len(cameras), seed=settings.seed, threads=threads)
     order = np.random.default_rng(settings.seed).permutation(len(cameras))
     views = [
-        View(f"surroundings {n}", cameras[index], background=_grey(BACKGROUNDS[n % len(BACKGROUNDS)]))
+        View(f"synthetic {n}", cameras[index], background=_grey(BACKGROUNDS[n % len(BACKGROUNDS)]))
         for n, index in enumerate(order)
     ]
-    return tuple(views), min(in_turn, len(views))
+    return tuple(views), min(per_epoch, len(views))
+
+
+def _virtual_side(settings: TrainingViewSettings) -> int:
+    """Return the largest side of the images of virtual cameras, pixels."""
+    return settings.view_size * 3 // 5
 
 
 def _grey(level: float) -> Float32[np.ndarray, "3"]:
@@ -173,7 +186,7 @@ def _virtual_views(
     splats: Splats, settings: TrainingViewSettings, stride: int, threads: int, progress: Progress
 ) -> SupervisionViews:
     """Return virtual views only; their targets are renderings of the scene."""
-    side = settings.view_size * 3 // 5
+    side = _virtual_side(settings)
     drawn = random_poses(
         splats,
         side=side,

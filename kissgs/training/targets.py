@@ -29,16 +29,16 @@ class TrainingTargets:
         images: ``(H, W, 3)`` target of each camera: a photograph in uint8, or a rendering in float16 from 0 to 1.
         backgrounds: ``(3,)`` RGB from 0 to 1 of each camera.
         target_source: "photos" if any target is a photograph, else "renderings".
-        surrounding: number of the last cameras that take turns, instead of having a step in every epoch.
-        in_turn: number of these that have a step in each epoch, at most ``surrounding``.
+        synthetic: number of the last cameras, virtual ones beside a capture, which take turns.
+        synthetic_per_epoch: number of these that have a step in each epoch, at most ``synthetic``.
     """
 
     cameras: tuple[Camera, ...]
     images: tuple[Shaped[np.ndarray, "H W 3"], ...]
     backgrounds: tuple[Float32[np.ndarray, "3"], ...]
     target_source: Literal["photos", "renderings"]
-    surrounding: int = 0
-    in_turn: int = 0
+    synthetic: int = 0
+    synthetic_per_epoch: int = 0
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -49,16 +49,17 @@ class TrainingTargets:
         return image.astype(np.float32) / np.float32(255 if image.dtype == np.uint8 else 1)
 
     def order(self, seed: Sequence[int], first: int = 0) -> Iterator[int]:
-        """Yield the index of the target for step ``first`` and each later one: a new random permutation per epoch.
+        """Yield the index of the target for step ``first`` and each later one.
 
+        Each epoch has all targets but the synthetic ones, and the next few of these, in random order.
         The order depends on the seed and the step only, so that training can be resumed at any step.
         """
-        always = len(self) - self.surrounding
-        turns = np.random.default_rng(seed).permutation(self.surrounding)
-        count = always + self.in_turn
+        always, some = len(self) - self.synthetic, self.synthetic_per_epoch
+        turns = np.random.default_rng(seed).permutation(self.synthetic)
+        count = always + some
         while True:
             epoch, begin = divmod(first, count)
-            turn = turns.take(range(epoch * self.in_turn, (epoch + 1) * self.in_turn), mode="wrap")
+            turn = turns.take(range(epoch * some, (epoch + 1) * some), mode="wrap")
             targets = np.concatenate([np.arange(always), always + turn])
             yield from np.random.default_rng([*seed, epoch]).permutation(targets)[begin:].tolist()
             first += count - begin
@@ -67,9 +68,9 @@ class TrainingTargets:
     def extent(self) -> float:
         """Extent of the cameras, world units: 1.1 times the largest distance to their mean position, as in 3DGS.
 
-        0 if all cameras are at one position. The surrounding ones do not count.
+        0 if all cameras are at one position. Synthetic ones do not count.
         """
-        cameras = self.cameras[: len(self) - self.surrounding]
+        cameras = self.cameras[: len(self) - self.synthetic]
         positions = np.array([camera.position for camera in cameras])
         return 1.1 * float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).max())
 
@@ -77,7 +78,8 @@ class TrainingTargets:
         """Return the extent of the cameras around each of these points, world units, above 0 and at most ``largest``.
 
         If a scene has several objects with cameras around each, the extent of all cameras does not represent the size
-        of one object. For a scene of one object, most points get ``largest``.
+        of one object. For a scene of one object, most points get ``largest``. Synthetic cameras count: an object that
+        was not photographed has no others.
 
         Args:
             means: ``(N, 3)`` points, world units.
@@ -131,8 +133,8 @@ def training_targets(
         images=tuple(images),
         backgrounds=backgrounds,
         target_source="photos" if any(view.photo is not None for view in views) else "renderings",
-        surrounding=supervision.surrounding,
-        in_turn=supervision.in_turn,
+        synthetic=supervision.synthetic,
+        synthetic_per_epoch=supervision.synthetic_per_epoch,
     )
 
 

@@ -12,6 +12,7 @@ from PIL import Image
 import kissgs
 from kissgs import CompactSettings, OutputError, UnsupportedError
 from kissgs.cameras.views import View, Views, black
+from kissgs.cameras.virtual.scene_views import scene_views
 from kissgs.compaction.budget import compact_scene
 from kissgs.compaction.popspa import Popspa
 from kissgs.compaction.scoring import highest_indices, prune_by_score
@@ -281,18 +282,37 @@ def test_virtual_views_train_without_a_capture():
     assert result.report.source.startswith(f"{len(found.train)} virtual cameras, and ")
 
 
-@pytest.mark.parametrize(("share", "in_turn"), [(0.0, 0), (0.1, 1), (0.5, 5)])
-def test_a_capture_is_mixed_with_virtual_views(share, in_turn):
+@pytest.mark.parametrize(("share", "some"), [(0.0, 0), (0.1, 1), (0.5, 5)])
+def test_a_capture_is_mixed_with_synthetic_views(share, some):
     """The capture's views come first; held-out views are never used for training."""
     capture = Views(around(5), around(3), black(), "a capture")
-    found = supervision_views(kissgs.sample_scene(400, sh_degree=0), capture, settings(synthetic_view_share=share))
+    scene = kissgs.sample_scene(400, sh_degree=0)
+    found = supervision_views(scene, capture, settings(synthetic_view_share=share))
     virtual = 64 if share else 0
-    assert (len(found.train), found.surrounding, found.in_turn) == (5 + virtual, virtual, in_turn)
+    assert (len(found.train), found.synthetic, found.synthetic_per_epoch) == (5 + virtual, virtual, some)
     assert [view.name for view in found.train[:5]] == [view.name for view in capture.train]
     assert [view.name for view in found.test] == [view.name for view in capture.test]
     assert found.score == found.train[: 7 if share else 5]
     assert [view.background[0] for view in found.train[5:9]] == ([0.0, 0.5, 1.0, 0.0] if share else [])
-    assert found.source == "a capture" + (f", and {virtual} virtual cameras" if virtual else "")
+    assert found.source == "a capture" + (f", and {virtual} virtual cameras, of which 2 score" if virtual else "")
+    assert len(supervision_views(scene, capture, settings(), scoring_stride=0).score) == 5
+
+
+def test_synthetic_views_are_of_two_kinds_in_random_order():
+    capture = Views(around(40), (), black(), "a capture")
+    scene = kissgs.sample_scene(400, sh_degree=0)
+    found, other = (supervision_views(scene, capture, settings(seed=seed)) for seed in (0, 1))
+    side = found.train[-1].camera.width
+    regions = {tuple(view.camera.position) for view in scene_views(scene, width=side, height=side, count=16).all}
+    kinds = [tuple(view.camera.position) in regions for view in found.train[40:]]
+    assert sum(kinds) == 16
+    assert 0 < sum(kinds[:10]) < 10, "both score"
+    places = [{tuple(view.camera.position) for view in each.train[40:]} for each in (found, other)]
+    assert places[0] & places[1] == regions
+    many = supervision_views(scene, capture, settings(synthetic_view_share=0.75))
+    assert (many.synthetic, many.synthetic_per_epoch) == (120, 120)
+    small = supervision_views(scene, capture, settings(view_size=20))
+    assert {view.camera.width for view in small.train[40:]} == {12}
 
 
 @pytest.mark.parametrize("photos", [0, 2, 4])

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from helpers.training_scenes import around, cloud
+from helpers.training_scenes import around, cloud, targets_of
 from helpers.tuning_scenes import Interrupted, chosen, stopping_after
 
 import kissgs
@@ -18,6 +18,7 @@ from kissgs.core.progress import silent
 from kissgs.finetuning.quantized_scene import QuantizedScene
 from kissgs.finetuning.tune import Tuner, _Result
 from kissgs.pipeline.inspect import describe
+from kissgs.rendering.sensitivity import measure_sensitivity
 from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.encode import write_files
 from kissgs.sogxt.names import YAML_NAME
@@ -292,6 +293,22 @@ def test_a_search_does_not_change_existing_checkpoints(tmp_path):
     found = kissgs.compress(cloud(60), tmp_path / "a.zip", settings=settings, checkpoint=tmp_path / "c.npz")
     assert (tmp_path / "c-finetune.npz").read_bytes() == b"mine"
     assert found.checkpoints == ()
+
+
+def test_costs_weigh_views_as_training_does(monkeypatch):
+    """Ten synthetic views, one of which has a step in each epoch, count as one of the others."""
+    measured = []
+
+    def spy(splats, cameras, **options):
+        measured.append(cameras)
+        return measure_sensitivity(splats, cameras, **options)
+
+    monkeypatch.setattr("kissgs.finetuning.tune.measure_sensitivity", spy)
+    scene = cloud(60)
+    work = tuner(scene)
+    work.targets = targets_of(scene, around(22), synthetic=10, synthetic_per_epoch=1)
+    work._measure_costs(QuantizedScene(chosen(scene, "fast"), scene.sh_degree))
+    assert measured[0].weights == pytest.approx([1.0] * 12 + [0.1] * 10)
 
 
 def test_the_coding_error_does_not_depend_on_compaction():

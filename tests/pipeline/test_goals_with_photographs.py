@@ -33,6 +33,10 @@ def test_a_goal_is_served_by_training_where_there_are_photographs(tmp_path, goal
         assert kept.ssim_drop <= 0.02
     else:
         assert len(found.to_zip()) <= 6200
+    report, decoded = found.report, kissgs.decompress(found.files)
+    assert report.compaction.count == report.count + report.pruned_by_rd + report.invisible
+    moved = np.linalg.norm(decoded.means - scene.means[found.order], axis=1)  # planned twice, the order is still right
+    assert np.median(moved) < 0.2 * np.median(np.linalg.norm(decoded.means[::-1] - scene.means[found.order], axis=1))
     plain = {"compact": {"ratio": 1}, "finetune": {"enabled": False}}
     without = kissgs.compress(
         scene, settings=Settings.from_preset("balanced", **plain, **FEW_VIEWS, **goal), views=views, evaluate=True

@@ -1,5 +1,7 @@
 """The training loop. Oracle: the scene that was rendered; for regularizers, the calls they received."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,7 +13,7 @@ from kissgs.rendering.differentiable import rasterize
 from kissgs.rendering.losses import plain_photometric_loss
 from kissgs.rendering.rasterizer import render
 from kissgs.rendering.tensors import tensors_of
-from kissgs.training.loop import TrainingPlan, exponential_lr, train
+from kissgs.training.loop import TrainingPlan, exponential_lr, image_loss, train
 from kissgs.training.model import GaussianModel
 
 RATES = {"means": 2e-3, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 1e-2, "shN": 1e-3}
@@ -111,6 +113,19 @@ def test_the_result_depends_on_the_seed():
         train(model, targets_of(scene), plan(7, seed=(seed,)))
         found.append(model.splats())
     assert not same(*found)
+
+
+def test_every_image_has_its_own_background():
+    """The scene's own renderings on black, grey and white are targets without an error."""
+    scene = cloud()
+    views = [replace(view, background=np.full(3, n / 2, np.float32)) for n, view in enumerate(around(3))]
+    targets = targets_of(scene, tuple(views))
+    parameters = tensors_of(scene)
+    for n in range(3):
+        error = image_loss(parameters, targets, n, ssim_weight=0.2, mse_weight=0.0, threads=1)[1]
+        assert error < 1e-4
+        wrong = replace(targets, backgrounds=targets.backgrounds[1:] + targets.backgrounds[:1])
+        assert image_loss(parameters, wrong, n, ssim_weight=0.2, mse_weight=0.0, threads=1)[1] > 100 * error
 
 
 def test_the_squared_error_counts_in_the_loss():

@@ -54,26 +54,33 @@ def test_every_target_occurs_once_per_epoch():
     assert len({tuple(steps[n : n + 4]) for n in range(0, 20, 4)}) > 1
 
 
-@pytest.mark.parametrize(("surrounding", "in_turn"), [(7, 2), (7, 1), (3, 3)])
-def test_surrounding_cameras_take_turns(surrounding, in_turn):
+@pytest.mark.parametrize(("synthetic", "some"), [(7, 2), (7, 1), (3, 3)])
+def test_synthetic_cameras_take_turns(synthetic, some):
     """Each epoch has all other targets and so many of these, all of which occur equally often."""
-    found = targets_of(cloud(), around(4 + surrounding), surrounding=surrounding, in_turn=in_turn)
-    count = 4 + in_turn
-    steps = list(islice(found.order((5,)), count * surrounding))
+    found = targets_of(cloud(), around(4 + synthetic), synthetic=synthetic, synthetic_per_epoch=some)
+    count = 4 + some
+    steps = list(islice(found.order((5,)), count * synthetic))
     for n in range(0, len(steps), count):
         epoch = steps[n : n + count]
         assert sorted(epoch)[:4] == [0, 1, 2, 3]
         assert len(set(epoch)) == count
-    assert Counter(step for step in steps if step >= 4) == Counter(list(range(4, 4 + surrounding)) * in_turn)
+    assert Counter(step for step in steps if step >= 4) == Counter(list(range(4, 4 + synthetic)) * some)
     for first in (1, count, 2 * count + 2):
         assert list(islice(found.order((5,), first), len(steps) - first)) == steps[first:]
 
 
-def test_surrounding_cameras_do_not_change_the_extent():
+def test_the_turns_of_synthetic_cameras_depend_on_the_seed():
+    found = targets_of(cloud(), around(24), synthetic=20, synthetic_per_epoch=1)
+    turns = [[step for step in islice(found.order((seed,)), 100) if step >= 4] for seed in (1, 2)]
+    assert sorted(turns[0]) == sorted(turns[1]) == list(range(4, 24))
+    assert turns[0] != turns[1]
+
+
+def test_synthetic_cameras_do_not_change_the_extent():
     away = np.eye(4)
     away[:3, 3] = 50, 0, 0
     far = tuple(replace(view, camera=replace(view.camera, viewmat=view.camera.viewmat @ away)) for view in around(3))
-    found = targets_of(cloud(), (*around(4), *far), surrounding=3, in_turn=1)
+    found = targets_of(cloud(), (*around(4), *far), synthetic=3, synthetic_per_epoch=1)
     assert found.extent == targets_of(cloud(), around(4)).extent
 
 

@@ -7,8 +7,8 @@ import pytest
 from helpers.whole_scenes import moved, two
 
 from kissgs import render, sample_scene
+from kissgs.cameras.virtual.scattered import scattered_cameras
 from kissgs.cameras.virtual.scene_bounds import scene_bounds
-from kissgs.cameras.virtual.surroundings import surrounding_cameras
 from kissgs.rendering.local_scale import local_scale
 
 
@@ -23,14 +23,14 @@ def distances(scene, cameras):
 
 
 def test_distances_directions_and_fields_of_view():
-    """Log-uniform from 16 local scales or a radius to three radii; every third one stands beside another Gaussian."""
+    """Log-uniform from 10 local scales or a radius to three radii; every third one stands beside another Gaussian."""
     scene = sample_scene(2000)
     spacing, radius = local_scale(scene), scene_bounds(scene).radius
-    cameras = surrounding_cameras(scene, side=16, count=300)
+    cameras = scattered_cameras(scene, side=16, count=300)
     assert len(cameras) == 300
     shares = []
     for n, (distance, target) in enumerate(distances(scene, cameras)):
-        nearest = min(16 * spacing[target], radius)
+        nearest = min(10 * spacing[target], radius)
         if n % 3:
             shares.append(np.log(distance / nearest) / np.log(3 * radius / nearest))
     assert np.min(shares) > -0.01
@@ -44,7 +44,7 @@ def test_distances_directions_and_fields_of_view():
 
 def test_objects_of_all_sizes_are_looked_at():
     scene = two(1000, 1 / 50)
-    cameras = surrounding_cameras(scene, side=32, count=90, seed=1)
+    cameras = scattered_cameras(scene, side=32, count=90, seed=1)
     small = [target >= len(scene) // 2 for _, target in distances(scene, cameras)]
     assert 25 < sum(small) < 65, "both objects have equally many Gaussians"
 
@@ -54,7 +54,7 @@ def test_images_are_alike_at_any_scale(scale):
     scene = sample_scene(2000)
     scaled = moved(scene, scale=scale)
     shown = [
-        np.mean([render(each, camera)[1].mean() for camera in surrounding_cameras(each, side=24, count=40, seed=3)])
+        np.mean([render(each, camera)[1].mean() for camera in scattered_cameras(each, side=24, count=40, seed=3)])
         for each in (scene, scaled)
     ]
     assert abs(shown[0] - shown[1]) < 0.1
@@ -63,24 +63,24 @@ def test_images_are_alike_at_any_scale(scale):
 
 def test_the_same_seed_gives_the_same_cameras():
     scene = sample_scene(300)
-    found = [[camera.position for camera in surrounding_cameras(scene, side=8, count=9, seed=n)] for n in (2, 2, 3)]
+    found = [[camera.position for camera in scattered_cameras(scene, side=8, count=9, seed=n)] for n in (2, 2, 3)]
     assert np.array_equal(found[0], found[1])
     assert not np.array_equal(found[0], found[2])
 
 
 @pytest.mark.parametrize("count", [1, 2, 7])
 def test_scenes_of_a_few_gaussians(count):
-    for camera in surrounding_cameras(sample_scene(count), side=8, count=6):
+    for camera in scattered_cameras(sample_scene(count), side=8, count=6):
         assert np.isfinite(camera.viewmat).all()
         assert np.isfinite(camera.K).all()
 
 
 def test_gaussians_at_one_place():
     scene = sample_scene(5)
-    for camera in surrounding_cameras(replace(scene, means=np.zeros_like(scene.means)), side=8, count=6):
+    for camera in scattered_cameras(replace(scene, means=np.zeros_like(scene.means)), side=8, count=6):
         assert np.isfinite(camera.viewmat).all()
 
 
 def test_a_scene_without_visible_gaussians_has_none():
     scene = sample_scene(20)
-    assert surrounding_cameras(replace(scene, opacities=np.full(20, -np.inf, np.float32)), side=8, count=3) == []
+    assert scattered_cameras(replace(scene, opacities=np.full(20, -np.inf, np.float32)), side=8, count=3) == []
