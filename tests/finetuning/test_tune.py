@@ -295,7 +295,7 @@ def test_a_search_does_not_change_existing_checkpoints(tmp_path):
     assert found.checkpoints == ()
 
 
-def test_costs_weigh_views_as_training_does(monkeypatch):
+def test_costs_count_views_as_training_does(monkeypatch):
     """Ten synthetic views, one of which has a step in each epoch, count as one of the others."""
     measured = []
 
