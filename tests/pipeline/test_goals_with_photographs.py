@@ -12,7 +12,7 @@ from kissgs import Settings
 from kissgs.rendering.sensitivity import WeightedCameras
 
 
-@pytest.mark.parametrize("goal", [{"max_ssim_drop": 0.02}, {"max_psnr_drop": 0.5}, {"target_size": 6200}])
+@pytest.mark.parametrize("goal", [{"max_ssim_drop": 0.05}, {"max_psnr_drop": 0.5}, {"target_size": 6200}])
 @pytest.mark.quick(2)
 def test_a_goal_is_served_by_training_where_there_are_photographs(tmp_path, goal):
     scene = cloud(300)
@@ -30,7 +30,7 @@ def test_a_goal_is_served_by_training_where_there_are_photographs(tmp_path, goal
         assert mean.reference.psnr - mean.candidate.psnr <= 0.5
         assert kept.drop <= 0.5
     elif "max_ssim_drop" in goal:
-        assert kept.ssim_drop <= 0.02
+        assert kept.ssim_drop <= 0.05
     else:
         assert len(found.to_zip()) <= 6200
     report, decoded = found.report, kissgs.decompress(found.files)
