@@ -119,8 +119,8 @@ def _synthetic_views(
 ) -> tuple[tuple[View, ...], int]:
     """Return virtual views of all that a capture may not show, in random order, and their number in each epoch.
 
-    A quarter of them see all regions. Images have the area of the photographs, and at most the side of virtual views
-    without a capture.
+    A quarter of them together see all regions. Images have the area of the photographs, and at most the side of virtual
+    views without a capture.
     """
     share, camera = settings.synthetic_view_share, train[0].camera
     if share == 0:

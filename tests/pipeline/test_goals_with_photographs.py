@@ -35,7 +35,7 @@ def test_a_goal_is_served_by_training_where_there_are_photographs(tmp_path, goal
         assert len(found.to_zip()) <= 6200
     report, decoded = found.report, kissgs.decompress(found.files)
     assert report.compaction.count == report.count + report.pruned_by_rd + report.invisible
-    moved = np.linalg.norm(decoded.means - scene.means[found.order], axis=1)  # planned twice, the order is still right
+    moved = np.linalg.norm(decoded.means - scene.means[found.order], axis=1)
     assert np.median(moved) < 0.2 * np.median(np.linalg.norm(decoded.means[::-1] - scene.means[found.order], axis=1))
     plain = {"compact": {"ratio": 1}, "finetune": {"enabled": False}}
     without = kissgs.compress(

@@ -114,6 +114,9 @@ def test_the_local_extent_of_an_object_is_that_of_the_cameras_around_it():
         np.concatenate([means, means * np.float32(0.01) + np.float32([50, 0, 0])]), found.extent
     )
     assert found.extent > 20
+    turns = targets_of(cloud(), (*around(12), *small), synthetic=12, synthetic_per_epoch=1)
+    both = np.concatenate([means, means * np.float32(0.01) + np.float32([50, 0, 0])])
+    np.testing.assert_array_equal(turns.local_extents(both, found.extent), extents)  # synthetic cameras count
     np.testing.assert_allclose(extents[:30], alone.local_extents(means, found.extent), rtol=1e-6)
     np.testing.assert_allclose(extents[30:], 0.01 * extents[:30], rtol=1e-3)
     assert (extents[:30] > 0.5 * alone.extent).all()

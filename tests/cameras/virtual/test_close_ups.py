@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.looked_at import looked_at
 from helpers.whole_scenes import moved, two
 
 from kissgs import render, sample_scene
 from kissgs.cameras.virtual.close_ups import close_ups
+from kissgs.cameras.virtual.scattered import scattered_cameras
 from kissgs.rendering.local_scale import local_scale
 
 
@@ -28,17 +30,18 @@ def test_the_target_is_in_the_middle_of_the_image():
         assert np.linalg.norm(offsets / depth[:, None], axis=1)[depth > 0].min() < 1e-4
 
 
+@pytest.mark.parametrize(("draw", "least"), [(close_ups, 0.4), (scattered_cameras, 0.1)])
 @pytest.mark.parametrize("scale", [1e-5, 1e5])
-def test_images_are_alike_at_any_scale(scale):
+def test_images_are_alike_at_any_scale(draw, least, scale):
     """A longer lens takes the place of a camera so close that the near plane would cut the target off."""
     scene = sample_scene(2000)
     scaled = moved(scene, scale=scale)
     shown = [
-        np.mean([render(each, camera)[1].mean() for camera in close_ups(each, side=24, count=40, seed=3)])
+        np.mean([render(each, camera)[1].mean() for camera in draw(each, side=24, count=40, seed=3)])
         for each in (scene, scaled)
     ]
     assert abs(shown[0] - shown[1]) < 0.1
-    assert shown[0] > 0.4
+    assert shown[0] > least
 
 
 def test_distances_directions_and_fields_of_view():
@@ -46,10 +49,9 @@ def test_distances_directions_and_fields_of_view():
     scene = sample_scene(500)
     spacing = local_scale(scene)
     octaves, forward = [], []
-    for camera in close_ups(scene, side=16, count=200):
-        offsets = scene.means - camera.position
-        target = np.argmax(offsets @ camera.viewmat[2, :3] / np.linalg.norm(offsets, axis=1))
-        octaves.append(np.log2(np.linalg.norm(offsets[target]) / spacing[target]))
+    cameras = close_ups(scene, side=16, count=200)
+    for camera, (distance, target) in zip(cameras, looked_at(scene, cameras), strict=True):
+        octaves.append(np.log2(distance / spacing[target]))
         forward.append(camera.viewmat[2, :3])
         assert camera.K[0, 0] == pytest.approx(8 / np.tan(np.radians(35)))
     near, far = np.quantile(octaves, [0.05, 0.95])
@@ -62,16 +64,14 @@ def test_faint_gaussians_are_rarely_targets():
     scene = sample_scene(1000)
     faint = scene.means[:, 0] > np.median(scene.means[:, 0])
     scene = replace(scene, opacities=np.where(faint, np.float32(-7), np.float32(3)))
-    targets = []
-    for camera in close_ups(scene, side=16, count=100):
-        offsets = scene.means - camera.position
-        targets.append(np.argmax(offsets @ camera.viewmat[2, :3] / np.linalg.norm(offsets, axis=1)))
+    targets = [target for _, target in looked_at(scene, close_ups(scene, side=16, count=100))]
     assert faint[targets].sum() < 5
 
 
-def test_the_same_seed_gives_the_same_cameras():
+@pytest.mark.parametrize("draw", [close_ups, scattered_cameras])
+def test_the_same_seed_gives_the_same_cameras(draw):
     scene = sample_scene(300)
-    positions = [[camera.position for camera in close_ups(scene, side=8, count=9, seed=seed)] for seed in (2, 2, 3)]
+    positions = [[camera.position for camera in draw(scene, side=8, count=9, seed=seed)] for seed in (2, 2, 3)]
     assert np.array_equal(positions[0], positions[1])
     assert not np.array_equal(positions[0], positions[2])
 

@@ -1,0 +1,14 @@
+"""What cameras look at."""
+
+import numpy as np
+
+
+def looked_at(scene, cameras):
+    """Return each camera's distance to the Gaussian in the centre of its image, and the index of that Gaussian."""
+    found = []
+    for camera in cameras:
+        offsets = scene.means.astype(np.float64) - camera.position
+        distances = np.linalg.norm(offsets, axis=1)
+        target = int(np.argmax(offsets @ camera.viewmat[2, :3] / distances))
+        found.append((float(distances[target]), target))
+    return found
