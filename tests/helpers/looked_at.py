@@ -1,4 +1,4 @@
-"""What cameras look at."""
+"""The Gaussian in the centre of a camera's image: an oracle for cameras near the surface."""
 
 import numpy as np
 
