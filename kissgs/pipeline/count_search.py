@@ -19,7 +19,13 @@ from kissgs.pipeline.pruning import Pruning
 from kissgs.pipeline.rate_control import Container, RateControl
 from kissgs.pipeline.search_time import SearchPlan, SearchTime
 from kissgs.pipeline.trained_scenes import TrainedScene, TrainedScenes
-from kissgs.pipeline.trained_search import NEAR_HALVINGS, NEAR_IN_TIME, Position, search_positions
+from kissgs.pipeline.trained_search import (
+    NEAR_HALVINGS,
+    NEAR_IN_TIME,
+    Position,
+    first_position,
+    search_positions,
+)
 from kissgs.pipeline.training_choice import has_photographs
 from kissgs.pipeline.trial import Trial
 from kissgs.settings import EncodeSettings
@@ -78,6 +84,7 @@ class CountSearch:
     _whole: RateControl | None = field(init=False, default=None)
     _stopped: bool = field(init=False, default=False)
     _plan: SearchPlan = field(init=False)
+    _first: int = field(init=False)
 
     def __post_init__(self) -> None:
         most, photographs = self.compactor.settings.max_compactions, self._photographs
@@ -94,12 +101,13 @@ class CountSearch:
         self._path = self.compactor.path(keep_states=not self._tunes)
         self._pruning = Pruning(self.goal, self.compactor, self._path)
         self._candidates = Candidates(self.goal, self.encoding.packed)
+        self._first, offset_db = first_position(self.goal, self._plan, self._number_for_size, POINTS_PER_HALVING)
         self._scenes = TrainedScenes(
             encoding=self.encoding,
             compactor=self.compactor,
             path=self._path,
             pruned_only=RENDERED_POINTS if self._trains and not photographs else 0,
-            offset_db=self._plan.offset_db if photographs else 0.0,
+            offset_db=offset_db if photographs else 0.0,
             time=self.time,
             containers=self._plan.containers,
         )
@@ -170,12 +178,11 @@ class CountSearch:
         if not self._photographs:
             self._search_without_photographs()
         elif not self.goal.by_size or (self._target_size > OVERHEAD_BYTES and self._number_for_size > 0):
-            first = self._number_for_size if self.goal.by_size else self._plan.number
             if self.time is None:
                 self._pruning.prune_while(_is_prunable, PRUNABLE_POINTS)
             else:  # what each point loses is not worth the time to measure it
-                self._pruning.prune_to(min(first - 1, PRUNABLE_POINTS))
-            self._search_along_path(first)
+                self._pruning.prune_to(min(self._first - 1, PRUNABLE_POINTS))
+            self._search_along_path(self._first)
 
     def _search_without_photographs(self) -> None:
         """Encode all Gaussians, then fewer, trained or not, which may serve the goal better."""

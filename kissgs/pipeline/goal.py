@@ -37,6 +37,7 @@ class Limit:
         half: room of a scene that has half of the error allowed; 0 for a size.
         per_halving: typical change of :meth:`figure` by half as many Gaussians, for a size of its log2; NaN for a PSNR,
             for which no number is searched with training.
+        usual: figure that a search expects of a quarter of the Gaussians, on the safe side; None for a size or a PSNR.
     """
 
     setting: str
@@ -45,6 +46,7 @@ class Limit:
     near: float
     half: float
     per_halving: float
+    usual: float | None = None
 
     def figure(self, trial: Trial) -> float | None:
         """Return what is limited of a trial, in the unit of ``value``; None if it is unknown."""
@@ -119,12 +121,12 @@ class Goal:
         if settings.max_psnr_drop is not None:
             drop = settings.max_psnr_drop
             near = -math.log2(max(1 - 0.02 / drop, 0.5))
-            limits.append(Limit("max_psnr_drop", drop, slope=-0.5, near=near, half=1.0, per_halving=0.3))
+            limits.append(Limit("max_psnr_drop", drop, slope=-0.5, near=near, half=1.0, per_halving=0.4, usual=0.1))
         if settings.max_ssim_drop is not None:
             drop, near = settings.max_ssim_drop, -math.log2(0.95)
-            limits.append(Limit("max_ssim_drop", drop, slope=-0.6, near=near, half=1.0, per_halving=0.006))
+            limits.append(Limit("max_ssim_drop", drop, slope=-0.6, near=near, half=1.0, per_halving=0.01, usual=0.007))
         if not limits and size is not None:
-            limits.append(Limit("target_size", size, slope=0.2, near=-math.log2(0.97), half=0.0, per_halving=-1.0))
+            limits.append(Limit("target_size", size, slope=0.2, near=-math.log2(0.97), half=0.0, per_halving=-0.7))
             size = None
         return cls(tuple(limits), size)
 
@@ -144,6 +146,12 @@ class Goal:
     def margin(self, trial: Trial) -> float:
         """Return the room of a trial to the limit that decides (:meth:`Limit.room`): at least 0 where all are met."""
         return self.decisive(trial).room(trial)
+
+    @property
+    def allowed_halvings(self) -> float:
+        """How often a quarter of the Gaussians may typically be halved once more; 0 for a size or a PSNR."""
+        allowed = ((limit.value - limit.usual) / limit.per_halving for limit in self.limits if limit.usual is not None)
+        return max(min(allowed, default=0.0), 0.0)
 
     def failure_message(
         self, trials: Sequence[Trial], trained: Sequence[Trial] = (), *, suggest_compaction: bool

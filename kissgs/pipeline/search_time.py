@@ -16,7 +16,7 @@ ENDING_SHARE = 0.38
 LEAST_FOR_CONTAINER = 2.0
 """Time below which another container is not begun, in the same unit."""
 
-FIRST_NUMBER, TRAINED_OFFSET_DB = 6, 5.0
+FIRST_NUMBER, TRAINED_OFFSET_DB = 6, 4.0
 """Number of the point that is tried first where the goal is no size, a quarter of the Gaussians, and the decibels added
 to ``quality_offset_db`` there.
 

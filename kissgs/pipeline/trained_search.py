@@ -6,14 +6,22 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from kissgs.pipeline.goal import Goal
+from kissgs.pipeline.goal import HALF_ERROR_DB, Goal
 from kissgs.pipeline.rate_control import LOG2_LAMBDA_RANGE, RateControl
+from kissgs.pipeline.search_time import FIRST_NUMBER, SearchPlan
 
-DOUBLINGS_PER_HALVING = 4.0
+DOUBLINGS_PER_HALVING = 2.5
 """Doublings of lambda that typically change size and quality as much as half as many Gaussians."""
 
-MAX_HALVINGS = 1.3
-"""Largest step of the search."""
+LAMBDA_SHARE = 0.4
+"""Share of a step that lambda takes; the number of Gaussians takes the rest.
+
+The more may be lost, the fewer Gaussians and the coarser levels the smallest container has (section
+"Compaction" of docs/method/research-log.md).
+"""
+
+MAX_HALVINGS, MOST_HALVINGS = 1.3, 2.0
+"""Largest step of the search; largest distance of its first container from the one that serves a small loss."""
 
 NEAR_HALVINGS, NEAR_IN_TIME = 0.15, 0.03
 """Step below which a container that meets the goal ends the search: another one would save some 7 % of its bytes, or
@@ -57,8 +65,8 @@ def search_positions(
 ) -> None:
     """Make containers at positions that come closer to the goal.
 
-    Fewer Gaussians and a larger lambda both lower size and quality. Each step is taken by the number of Gaussians as
-    far as whole points go, and the rest by lambda, so that lambda stays near the value that serves such scenes best.
+    Fewer Gaussians and a larger lambda both lower size and quality. Each step changes both: the number of Gaussians by
+    whole points, lambda by :data:`LAMBDA_SHARE` and by what the whole points leave.
 
     Args:
         goal: the goal; no PSNR.
@@ -88,12 +96,33 @@ def search_positions(
         step = _next_place(left_at, halvings) - halvings
         if remaining == 1:
             step += _caution(min(met_from, default=math.inf), by_size=goal.by_size)
-        number = min(max(position.number + round(step * points_per_halving), bounds[0]), bounds[1])
+        number = min(max(position.number + _points(step, points_per_halving), bounds[0]), bounds[1])
         rest = step - (number - position.number) / points_per_halving
         if remaining == 1 and not met_from:  # lambda must not take back what the number gives
             rest = max(rest, 0.0) if goal.by_size else min(rest, 0.0)
         log2_lambda += DOUBLINGS_PER_HALVING * rest
         position = Position(number, min(max(log2_lambda, LOG2_LAMBDA_RANGE[0]), LOG2_LAMBDA_RANGE[1]))
+
+
+def first_position(goal: Goal, plan: SearchPlan, number_for_size: int, points_per_halving: float) -> tuple[int, float]:
+    """Return the point of the first container, and the decibels added to ``quality_offset_db`` there.
+
+    The plan says both for a small loss. A larger one begins with fewer Gaussians and a larger lambda, and so does a
+    size for which ``number_for_size``, the point that suits it, is a late one.
+    """
+    if goal.by_size:
+        points = max(number_for_size - FIRST_NUMBER, 0)
+        doublings = DOUBLINGS_PER_HALVING * LAMBDA_SHARE / (1 - LAMBDA_SHARE) * points / points_per_halving
+        return number_for_size, plan.offset_db - HALF_ERROR_DB * doublings
+    step = min(goal.allowed_halvings, MOST_HALVINGS)
+    points = _points(step, points_per_halving)
+    rest = step - points / points_per_halving
+    return plan.number + points, plan.offset_db - HALF_ERROR_DB * DOUBLINGS_PER_HALVING * rest
+
+
+def _points(step: float, points_per_halving: float) -> int:
+    """Return by how many points of the path a step changes the number of Gaussians; lambda takes the rest."""
+    return round((1 - LAMBDA_SHARE) * step * points_per_halving)
 
 
 def _caution(distance: float, *, by_size: bool) -> float:
