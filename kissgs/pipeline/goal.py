@@ -37,7 +37,7 @@ class Limit:
         half: room of a scene that has half of the error allowed; 0 for a size.
         per_halving: typical change of :meth:`figure` by half as many Gaussians, for a size of its log2; NaN for a PSNR,
             for which no number is searched with training.
-        usual: figure that a search expects of a quarter of the Gaussians, on the safe side; None for a size or a PSNR.
+        usual: loss that a search expects of a quarter of the Gaussians, on the safe side; None for a size or a PSNR.
     """
 
     setting: str
@@ -126,7 +126,7 @@ class Goal:
             drop, near = settings.max_ssim_drop, -math.log2(0.95)
             limits.append(Limit("max_ssim_drop", drop, slope=-0.6, near=near, half=1.0, per_halving=0.01, usual=0.007))
         if not limits and size is not None:
-            limits.append(Limit("target_size", size, slope=0.2, near=-math.log2(0.97), half=0.0, per_halving=-0.7))
+            limits.append(Limit("target_size", size, slope=0.2, near=-math.log2(0.97), half=0.0, per_halving=-0.6))
             size = None
         return cls(tuple(limits), size)
 
@@ -149,9 +149,9 @@ class Goal:
 
     @property
     def allowed_halvings(self) -> float:
-        """How often a quarter of the Gaussians may typically be halved once more; 0 for a size or a PSNR."""
+        """How often a quarter of the Gaussians may typically be halved, below 0 if more are needed; 0 for no loss."""
         allowed = ((limit.value - limit.usual) / limit.per_halving for limit in self.limits if limit.usual is not None)
-        return max(min(allowed, default=0.0), 0.0)
+        return min(allowed, default=0.0)
 
     def failure_message(
         self, trials: Sequence[Trial], trained: Sequence[Trial] = (), *, suggest_compaction: bool

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from kissgs.pipeline.goal import HALF_ERROR_DB, Goal
 from kissgs.pipeline.rate_control import LOG2_LAMBDA_RANGE, RateControl
-from kissgs.pipeline.search_time import FIRST_NUMBER, SearchPlan
+from kissgs.pipeline.search_time import SearchPlan
 
 DOUBLINGS_PER_HALVING = 2.5
 """Doublings of lambda that typically change size and quality as much as half as many Gaussians."""
@@ -20,15 +20,18 @@ The more may be lost, the fewer Gaussians and the coarser levels the smallest co
 "Compaction" of docs/method/research-log.md).
 """
 
-MAX_HALVINGS, MOST_HALVINGS = 1.3, 2.0
-"""Largest step of the search; largest distance of its first container from the one that serves a small loss."""
+MAX_STEP = 1.3
+"""Largest step of the search, in halvings."""
+
+FIRST_STEPS = (-1.0, 2.0)
+"""Least and largest step, in halvings, from the first container of the plan to that for the goal."""
 
 NEAR_HALVINGS, NEAR_IN_TIME = 0.15, 0.03
-"""Step below which a container that meets the goal ends the search: another one would save some 7 % of its bytes, or
-2 %, which is worth a time that the user has given."""
+"""Step below which a container that meets the goal ends the search: another one would save some 6 % of its bytes, or
+1 %, which is worth a time that the user has given."""
 
-CAUTION_HALVINGS, SIZE_CAUTION_HALVINGS = 0.1, 0.02
-"""Added on the safe side of the last attempt if none before met the goal; the second for a size, which varies less."""
+CAUTION_HALVINGS = 0.1
+"""Added on the safe side of the last attempt if none before met the goal."""
 
 FAR_HALVINGS, FAR_CAUTION = 0.3, 0.15
 """Distance to the nearest container that met the goal above which the last attempt is cautious too, since missing the
@@ -85,7 +88,8 @@ def search_positions(
         left, met = min(limit.halvings(trial) for limit in goal.limits), goal.margin(trial) >= 0
         if remaining == 0 or search.stopped or trial.rd_lambda is None or not math.isfinite(left):
             return
-        if (met and abs(left) <= near) or (trial.bytes, left) in figures:  # near, or without any effect
+        small = trial.bytes <= (goal.most_bytes or math.inf)
+        if (met and small and abs(left) <= near) or (trial.bytes, left) in figures:  # near, or without any effect
             return
         figures.add((trial.bytes, left))
         if met:
@@ -107,16 +111,15 @@ def search_positions(
 def first_position(goal: Goal, plan: SearchPlan, number_for_size: int, points_per_halving: float) -> tuple[int, float]:
     """Return the point of the first container, and the decibels added to ``quality_offset_db`` there.
 
-    The plan says both for a small loss. A larger one begins with fewer Gaussians and a larger lambda, and so does a
-    size for which ``number_for_size``, the point that suits it, is a late one.
+    The plan says both for the usual loss. Where more may be lost, there are fewer Gaussians, unless the plan has one
+    container only, which must meet the goal. Their lambda is larger at equal quality, so that the quality only makes up
+    for the rounding of the number.
     """
     if goal.by_size:
-        points = max(number_for_size - FIRST_NUMBER, 0)
-        doublings = DOUBLINGS_PER_HALVING * LAMBDA_SHARE / (1 - LAMBDA_SHARE) * points / points_per_halving
-        return number_for_size, plan.offset_db - HALF_ERROR_DB * doublings
-    step = min(goal.allowed_halvings, MOST_HALVINGS)
+        return number_for_size, plan.offset_db
+    step = min(max(goal.allowed_halvings, FIRST_STEPS[0]), FIRST_STEPS[1] if plan.containers > 1 else 0.0)
     points = _points(step, points_per_halving)
-    rest = step - points / points_per_halving
+    rest = (1 - LAMBDA_SHARE) * step - points / points_per_halving
     return plan.number + points, plan.offset_db - HALF_ERROR_DB * DOUBLINGS_PER_HALVING * rest
 
 
@@ -134,7 +137,7 @@ def _caution(distance: float, *, by_size: bool) -> float:
     """
     if distance <= FAR_HALVINGS:
         return 0.0
-    caution = min(SIZE_CAUTION_HALVINGS if by_size else CAUTION_HALVINGS, FAR_CAUTION * distance)
+    caution = min(CAUTION_HALVINGS, FAR_CAUTION * distance)
     return caution if by_size else -caution
 
 
@@ -151,7 +154,7 @@ def _next_place(left_at: dict[float, float], last: float) -> float:
     if others:
         measured = (left_at[others[-1]] - left_at[last]) / (last - others[-1])
         effect = max(measured, 1 / MAX_SLOPE_RATIO)
-    place = last + min(max(left_at[last] / effect, -MAX_HALVINGS), MAX_HALVINGS)
+    place = last + min(max(left_at[last] / effect, -MAX_STEP), MAX_STEP)
     below = max((x for x, left in left_at.items() if left >= 0), default=-math.inf)
     above = min((x for x, left in left_at.items() if left < 0), default=math.inf)
     margin = 0.1 * (above - below)
