@@ -30,12 +30,9 @@ NEAR_HALVINGS, NEAR_IN_TIME = 0.15, 0.03
 """Step below which a container that meets the goal ends the search: another one would save some 6 % of its bytes, or
 1 %, which is worth a time that the user has given."""
 
-CAUTION_HALVINGS = 0.1
-"""Added on the safe side of the last attempt if none before met the goal."""
-
-FAR_HALVINGS, FAR_CAUTION = 0.3, 0.15
-"""Distance to the nearest container that met the goal above which the last attempt is cautious too, since missing the
-goal would lose that much; and the share of this distance that is added at most."""
+CAUTION_SHARE, CAUTION_HALVINGS = 0.15, 0.1
+"""Caution of the last attempt: share of the distance to the nearest container that met the goal, since missing it would
+lose that much, and largest caution."""
 
 MIN_STEP = 0.03
 """Smallest step, in halvings, whose effect is measured: that of a smaller one is lost in the noise of training."""
@@ -135,9 +132,7 @@ def _caution(distance: float, *, by_size: bool) -> float:
         distance: halvings from the goal to the nearest container that meets it; infinite if none does.
         by_size: whether the goal is a size.
     """
-    if distance <= FAR_HALVINGS:
-        return 0.0
-    caution = min(CAUTION_HALVINGS, FAR_CAUTION * distance)
+    caution = min(CAUTION_HALVINGS, CAUTION_SHARE * distance)
     return caution if by_size else -caution
 
 
