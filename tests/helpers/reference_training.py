@@ -60,7 +60,7 @@ def oracle(splats, targets, rates):
     for step in range(1, STEPS + 1):
         params = {name: leaf.clone().requires_grad_() for name, leaf in leaves.items()}
         loss = plain_photometric_loss(
-            reference_float64.draw(params, targets.cameras[0], targets.background).image, target, 0.2, 5.0
+            reference_float64.draw(params, targets.cameras[0], targets.backgrounds[0]).image, target, 0.2, 5.0
         )
         if loss.requires_grad:
             loss.backward()
