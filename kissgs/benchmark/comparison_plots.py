@@ -102,6 +102,7 @@ def quality_panel(axes: Axes, rows: Sequence[Measurement], target: PsnrTarget) -
         if math.isfinite(uncompressed):
             axes.axhline(uncompressed, color=GREY, linewidth=1, linestyle="--", label="uncompressed scene")
     images = "renderings of the scene" if target == "original" else "photographs"
+    axes.margins(y=0.1)  # room for labels
     axes.set(xscale="log", xlabel="kilobytes", ylabel=f"PSNR to {images}, dB")
     set_log_axis(axes, [size for _, (size, _) in known])
     if axes.get_legend_handles_labels()[0]:
