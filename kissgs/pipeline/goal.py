@@ -37,7 +37,8 @@ class Limit:
         half: room of a scene that has half of the error allowed; 0 for a size.
         per_halving: typical change of :meth:`figure` by half as many Gaussians, for a size of its log2; NaN for a PSNR,
             for which no number is searched with training.
-        usual: loss that a search expects of a quarter of the Gaussians, on the safe side; None for a size or a PSNR.
+        quarter_loss: loss expected of a trained container with a quarter of the Gaussians, on the safe side; None for a
+            size or a PSNR.
     """
 
     setting: str
@@ -46,7 +47,7 @@ class Limit:
     near: float
     half: float
     per_halving: float
-    usual: float | None = None
+    quarter_loss: float | None = None
 
     def figure(self, trial: Trial) -> float | None:
         """Return what is limited of a trial, in the unit of ``value``; None if it is unknown."""
@@ -121,10 +122,14 @@ class Goal:
         if settings.max_psnr_drop is not None:
             drop = settings.max_psnr_drop
             near = -math.log2(max(1 - 0.02 / drop, 0.5))
-            limits.append(Limit("max_psnr_drop", drop, slope=-0.5, near=near, half=1.0, per_halving=0.4, usual=0.1))
+            limits.append(
+                Limit("max_psnr_drop", drop, slope=-0.5, near=near, half=1.0, per_halving=0.4, quarter_loss=0.1)
+            )
         if settings.max_ssim_drop is not None:
             drop, near = settings.max_ssim_drop, -math.log2(0.95)
-            limits.append(Limit("max_ssim_drop", drop, slope=-0.6, near=near, half=1.0, per_halving=0.01, usual=0.007))
+            limits.append(
+                Limit("max_ssim_drop", drop, slope=-0.6, near=near, half=1.0, per_halving=0.01, quarter_loss=0.007)
+            )
         if not limits and size is not None:
             limits.append(Limit("target_size", size, slope=0.2, near=-math.log2(0.97), half=0.0, per_halving=-0.6))
             size = None
@@ -149,9 +154,12 @@ class Goal:
 
     @property
     def allowed_halvings(self) -> float:
-        """How often a quarter of the Gaussians may typically be halved, below 0 if more are needed; 0 for no loss."""
-        allowed = ((limit.value - limit.usual) / limit.per_halving for limit in self.limits if limit.usual is not None)
-        return min(allowed, default=0.0)
+        """Halvings of a quarter of the Gaussians that the limits on losses typically allow.
+
+        Below 0 if more than a quarter are needed; 0 if the goal limits no loss.
+        """
+        known = [(limit, limit.quarter_loss) for limit in self.limits if limit.quarter_loss is not None]
+        return min(((limit.value - expected) / limit.per_halving for limit, expected in known), default=0.0)
 
     def failure_message(
         self, trials: Sequence[Trial], trained: Sequence[Trial] = (), *, suggest_compaction: bool

@@ -20,8 +20,8 @@ FIRST_NUMBER, TRAINED_OFFSET_DB = 6, 4.0
 """Number of the point of the first container for a loss of 0.1 dB, a quarter of the Gaussians, and decibels added to
 ``quality_offset_db`` there; :func:`kissgs.pipeline.trained_search.first_position` changes both for other goals.
 
-5 dB instead of 4 take 4 % more bytes and rarely save a second container. A search that began with a fifth of the
-Gaussians ended, for a scene of 300, with more bytes than the encoder alone takes.
+5 dB instead of 4 take 4 % more bytes and rarely save a second container. A search for a small loss that began with a
+fifth of the Gaussians ended, for a scene of 300, with more bytes than the encoder alone takes.
 """
 
 

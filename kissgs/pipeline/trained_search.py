@@ -23,8 +23,8 @@ The more may be lost, the fewer Gaussians and the coarser levels the smallest co
 MAX_STEP = 1.3
 """Largest step of the search, in halvings."""
 
-FIRST_STEPS = (-1.0, 2.0)
-"""Least and largest step, in halvings, from the first container of the plan to that for the goal."""
+MAX_FIRST_STEP = 2.0
+"""Largest step, in halvings, from the first container of the plan to that for the goal."""
 
 NEAR_HALVINGS, NEAR_IN_TIME = 0.15, 0.03
 """Step below which a container that meets the goal ends the search: another one would save some 6 % of its bytes, or
@@ -85,8 +85,8 @@ def search_positions(
         left, met = min(limit.halvings(trial) for limit in goal.limits), goal.margin(trial) >= 0
         if remaining == 0 or search.stopped or trial.rd_lambda is None or not math.isfinite(left):
             return
-        small = trial.bytes <= (goal.most_bytes or math.inf)
-        if (met and small and abs(left) <= near) or (trial.bytes, left) in figures:  # near, or without any effect
+        may_shrink = left > NEAR_IN_TIME and trial.bytes > (goal.most_bytes or math.inf)
+        if (met and abs(left) <= near and not may_shrink) or (trial.bytes, left) in figures:  # near, or without effect
             return
         figures.add((trial.bytes, left))
         if met:
@@ -108,13 +108,19 @@ def search_positions(
 def first_position(goal: Goal, plan: SearchPlan, number_for_size: int, points_per_halving: float) -> tuple[int, float]:
     """Return the point of the first container, and the decibels added to ``quality_offset_db`` there.
 
-    The plan says both for the usual loss. Where more may be lost, there are fewer Gaussians, unless the plan has one
-    container only, which must meet the goal. Their lambda is larger at equal quality, so that the quality only makes up
-    for the rounding of the number.
+    The plan states both for a loss of 0.1 dB. A goal that allows more gets fewer Gaussians, unless there is one
+    container only: no second one could correct a miss. With fewer Gaussians, lambda at equal quality is larger by about
+    :data:`LAMBDA_SHARE` of the step already, so the decibels only make up for the rounding to whole points.
+
+    Args:
+        goal: the goal; no PSNR.
+        plan: containers and training of the search.
+        number_for_size: point that suits a goal that is a size.
+        points_per_halving: points of the path by which the number of Gaussians is halved.
     """
     if goal.by_size:
         return number_for_size, plan.offset_db
-    step = min(max(goal.allowed_halvings, FIRST_STEPS[0]), FIRST_STEPS[1] if plan.containers > 1 else 0.0)
+    step = min(goal.allowed_halvings, MAX_FIRST_STEP if plan.containers > 1 else 0.0)
     points = _points(step, points_per_halving)
     rest = (1 - LAMBDA_SHARE) * step - points / points_per_halving
     return plan.number + points, plan.offset_db - HALF_ERROR_DB * DOUBLINGS_PER_HALVING * rest
