@@ -101,7 +101,9 @@ class CountSearch:
         self._path = self.compactor.path(keep_states=not self._tunes)
         self._pruning = Pruning(self.goal, self.compactor, self._path)
         self._candidates = Candidates(self.goal, self.encoding.packed)
-        self._first, offset_db = first_position(self.goal, self._plan, self._number_for_size, POINTS_PER_HALVING)
+        self._first, offset_db = first_position(
+            self.goal, self._plan, len(self.compactor.splats), self._number_for_size, POINTS_PER_HALVING
+        )
         self._scenes = TrainedScenes(
             encoding=self.encoding,
             compactor=self.compactor,

@@ -26,6 +26,9 @@ MAX_STEP = 1.3
 MAX_FIRST_STEP = 2.0
 """Largest step, in halvings, from the first container of the plan to that for the goal."""
 
+SMALL_SCENE = 10_000
+"""Number of Gaussians below which there is no such step: with some tens left of them, lambda at equal quality falls."""
+
 NEAR_HALVINGS, NEAR_IN_TIME = 0.15, 0.03
 """Step below which a container that meets the goal ends the search: another one would save some 6 % of its bytes, or
 1 %, which is worth a time that the user has given."""
@@ -105,22 +108,26 @@ def search_positions(
         position = Position(number, min(max(log2_lambda, LOG2_LAMBDA_RANGE[0]), LOG2_LAMBDA_RANGE[1]))
 
 
-def first_position(goal: Goal, plan: SearchPlan, number_for_size: int, points_per_halving: float) -> tuple[int, float]:
+def first_position(
+    goal: Goal, plan: SearchPlan, count: int, number_for_size: int, points_per_halving: float
+) -> tuple[int, float]:
     """Return the point of the first container, and the decibels added to ``quality_offset_db`` there.
 
-    The plan states both for a loss of 0.1 dB. A goal that allows more gets fewer Gaussians, unless there is one
-    container only: no second one could correct a miss. With fewer Gaussians, lambda at equal quality is larger by about
-    :data:`LAMBDA_SHARE` of the step already, so the decibels only make up for the rounding to whole points.
+    The plan states both for a loss of 0.1 dB. A goal that allows more gets fewer Gaussians, unless the scene is small,
+    or there is one container only: no second one could correct a miss. With fewer Gaussians, lambda at equal quality is
+    larger by about :data:`LAMBDA_SHARE` of the step already, so the decibels only make up for the rounding to whole
+    points.
 
     Args:
         goal: the goal; no PSNR.
         plan: containers and training of the search.
+        count: number of Gaussians of the scene.
         number_for_size: point that suits a goal that is a size.
         points_per_halving: points of the path by which the number of Gaussians is halved.
     """
     if goal.by_size:
         return number_for_size, plan.offset_db
-    step = min(goal.allowed_halvings, MAX_FIRST_STEP if plan.containers > 1 else 0.0)
+    step = min(goal.allowed_halvings, MAX_FIRST_STEP if plan.containers > 1 and count >= SMALL_SCENE else 0.0)
     points = _points(step, points_per_halving)
     rest = (1 - LAMBDA_SHARE) * step - points / points_per_halving
     return plan.number + points, plan.offset_db - HALF_ERROR_DB * DOUBLINGS_PER_HALVING * rest

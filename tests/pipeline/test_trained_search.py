@@ -89,7 +89,7 @@ def first(plan=PLAN, number_for_size=0, **goal):
 
     At equal quality, lambda grows by half a doubling from point to point.
     """
-    number, offset_db = first_position(Goal.of(EncodeSettings(**goal)), plan, number_for_size, PER_HALVING)
+    number, offset_db = first_position(Goal.of(EncodeSettings(**goal)), plan, 80_000, number_for_size, PER_HALVING)
     return number, (number - 6) / 2 + (plan.offset_db - offset_db) / DOUBLING_DB
 
 
@@ -149,7 +149,13 @@ def test_the_first_container_is_never_far_from_that_of_the_plan():
 @pytest.mark.parametrize("drop", [0.1, 0.5, 20.0])
 def test_a_single_container_keeps_its_reserve(plan, drop):
     goal = Goal.of(EncodeSettings(max_psnr_drop=drop))
-    assert first_position(goal, plan, 0, PER_HALVING) == (plan.number, plan.offset_db)
+    assert first_position(goal, plan, 80_000, 0, PER_HALVING) == (plan.number, plan.offset_db)
+
+
+def test_a_small_scene_begins_as_the_plan_says():
+    goal = Goal.of(EncodeSettings(max_psnr_drop=0.8))
+    assert first_position(goal, PLAN, 9_999, 0, PER_HALVING) == (PLAN.number, PLAN.offset_db)
+    assert first_position(goal, PLAN, 10_000, 0, PER_HALVING)[0] > PLAN.number
 
 
 def test_a_container_above_the_size_that_a_loss_may_take_does_not_end_the_search():
