@@ -20,7 +20,7 @@ The more may be lost, the fewer Gaussians and the coarser levels the smallest co
 "Compaction" of docs/method/research-log.md).
 """
 
-MAX_STEP = 1.3
+MAX_STEP = 2.0
 """Largest step of the search, in halvings."""
 
 MAX_FIRST_STEP = 2.0
@@ -40,7 +40,7 @@ lose that much, and largest caution."""
 MIN_STEP = 0.03
 """Smallest step, in halvings, whose effect is measured: that of a smaller one is lost in the noise of training."""
 
-MAX_SLOPE_RATIO = 3.0
+MAX_SLOPE_RATIO = 4.0
 """Inverse of the smallest ratio of the measured effect of a halving to the typical one."""
 
 

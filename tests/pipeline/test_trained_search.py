@@ -41,7 +41,7 @@ def model(number, x, per_halving=0.3, per_doubling=0.1, at_start=0.1, power=1.0)
 
 
 @example(0.3125, 0.125, 0.109375, 1.0)
-@given(st.floats(-0.6, 0.7), st.floats(0.1, 0.6), st.floats(0.04, 0.2), st.floats(0.8, 1.3))
+@given(st.floats(-0.6, 0.6), st.floats(0.12, 0.6), st.floats(0.04, 0.2), st.floats(0.8, 1.3))
 def test_a_drop_is_met_in_few_containers(at_start, per_halving, per_doubling, power):
     def figures(number, x):
         return model(number, x, per_halving, per_doubling, at_start, power)
