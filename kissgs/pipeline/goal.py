@@ -123,7 +123,7 @@ class Goal:
             drop = settings.max_psnr_drop
             near = -math.log2(max(1 - 0.02 / drop, 0.5))
             limits.append(
-                Limit("max_psnr_drop", drop, slope=-0.5, near=near, half=1.0, per_halving=0.4, quarter_loss=0.1)
+                Limit("max_psnr_drop", drop, slope=-0.5, near=near, half=1.0, per_halving=0.32, quarter_loss=0.1)
             )
         if settings.max_ssim_drop is not None:
             drop, near = settings.max_ssim_drop, -math.log2(0.95)
@@ -131,7 +131,7 @@ class Goal:
                 Limit("max_ssim_drop", drop, slope=-0.6, near=near, half=1.0, per_halving=0.01, quarter_loss=0.007)
             )
         if not limits and size is not None:
-            limits.append(Limit("target_size", size, slope=0.2, near=-math.log2(0.97), half=0.0, per_halving=-0.6))
+            limits.append(Limit("target_size", size, slope=0.2, near=-math.log2(0.97), half=0.0, per_halving=-0.75))
             size = None
         return cls(tuple(limits), size)
 

@@ -41,7 +41,7 @@ def model(number, x, per_halving=0.3, per_doubling=0.1, at_start=0.1, power=1.0)
 
 
 @example(0.3125, 0.125, 0.109375, 1.0)
-@given(st.floats(-0.6, 0.6), st.floats(0.12, 0.6), st.floats(0.04, 0.2), st.floats(0.8, 1.3))
+@given(st.floats(-0.6, 0.7), st.floats(0.1, 0.6), st.floats(0.04, 0.2), st.floats(0.8, 1.3))
 def test_a_drop_is_met_in_few_containers(at_start, per_halving, per_doubling, power):
     def figures(number, x):
         return model(number, x, per_halving, per_doubling, at_start, power)
@@ -58,16 +58,26 @@ def test_three_containers_come_near_a_drop(at_start, per_halving, per_doubling):
     assert max(trial.drop for trial in trials if trial.drop <= 0.2) > 0.2 - 0.1
 
 
+@given(st.integers(20_000, 900_000), st.floats(0.7, 1.4), st.floats(0.15, 0.4))
+def test_a_size_is_met_in_few_containers(target, per_gaussian, per_doubling):
+    def figures(number, x):
+        size = 800_000 * per_gaussian * 2 ** (-number / PER_HALVING - per_doubling * (x - START))
+        return {"bytes": round(size)}
+
+    first = max(1, round(PER_HALVING * math.log2(800_000 / target)))
+    trials, _ = search({"target_size": target}, figures, first, attempts=4)
+    assert any(0.85 * target <= trial.bytes <= target for trial in trials)
+
+
 @given(st.integers(20_000, 900_000), st.floats(0.7, 1.4), st.floats(0.45, 0.8), st.floats(0.15, 0.3))
-def test_a_size_is_met_in_few_containers(target, per_gaussian, per_halving, per_doubling):
+def test_a_size_is_met_in_three_containers(target, per_gaussian, per_halving, per_doubling):
     """Sizes at equal lambda grow with powers of 0.5 (fox) to 0.7 (guitar) of the number of Gaussians."""
-    begin = max(1, round(PER_HALVING * math.log2(800_000 / target)))
 
     def figures(number, x):
-        halvings = (number - begin) / PER_HALVING
+        halvings = number / PER_HALVING - 2
         return {"bytes": round(target * per_gaussian * 2 ** (-per_halving * halvings - per_doubling * (x - START)))}
 
-    trials, _ = search({"target_size": target}, figures, begin, attempts=3)
+    trials, _ = search({"target_size": target}, figures)
     assert any(0.85 * target <= trial.bytes <= target for trial in trials)
 
 
@@ -119,7 +129,7 @@ def test_three_containers_come_near_the_smallest_loss_of_a_size(size, larger):
     trials, _ = search({"target_size": size}, figures, first=number)
     found = max((trial for trial in trials if trial.bytes <= size), key=lambda trial: trial.bytes)
     assert found.bytes > 0.88 * size
-    assert found.bytes / larger <= 1.05 * smallest(found.drop)
+    assert found.bytes / larger <= 1.1 * smallest(found.drop)
 
 
 @pytest.mark.parametrize(
@@ -182,9 +192,9 @@ def test_a_near_container_ends_the_search():
 
 
 def test_a_step_changes_number_and_lambda():
-    """0.85 halvings: 1.5 points, rounded to 2, and 0.46 doublings of lambda."""
+    """1.06 halvings: 1.9 points, rounded to 2, and 0.99 doublings of lambda."""
     _, positions = search({"max_psnr_drop": 0.2}, lambda number, x: model(number, x, at_start=-0.15))
-    assert positions[1] == (8, pytest.approx(START + 0.457, abs=0.001))
+    assert positions[1] == (8, pytest.approx(START + 0.988, abs=0.001))
 
 
 def test_the_limit_with_the_fewest_halvings_left_decides():
@@ -200,12 +210,12 @@ def test_the_limit_with_the_fewest_halvings_left_decides():
 
 
 def test_the_last_container_is_cautious_where_the_one_that_met_the_goal_is_far():
-    """A drop that grows faster than usual, with a hundredth of a decibel of chance."""
+    """A drop that grows a little faster than expected, with a hundredth of a decibel of chance."""
 
     def figures(number, x):
         halvings = number / PER_HALVING - 2 + 0.4 * (x - START)
         chance = 0.012 * math.sin(40 * halvings)
-        return {"bytes": round(200_000 * 2**-halvings), "drop": 0.058 + 0.5 * halvings + chance}
+        return {"bytes": round(200_000 * 2**-halvings), "drop": 0.058 + 0.36 * halvings + chance}
 
     trials, _ = search({"max_psnr_drop": 0.3}, figures)
     assert len(trials) == 3
