@@ -29,8 +29,8 @@ MAX_FIRST_STEP = 2.0
 SMALL_SCENE = 10_000
 """Number of Gaussians below which there is no such step: with some tens left of them, lambda at equal quality falls."""
 
-NEAR_HALVINGS, NEAR_IN_TIME = 0.15, 0.03
-"""Step below which a container that meets the goal ends the search: another one would save some 6 % of its bytes, or
+NEAR_HALVINGS, NEAR_IN_TIME = 0.1, 0.03
+"""Step below which a container that meets the goal ends the search: another one would save some 4 % of its bytes, or
 1 %, which is worth a time that the user has given."""
 
 CAUTION_SHARE, CAUTION_HALVINGS = 0.15, 0.1

@@ -42,6 +42,20 @@ def test_points_have_falling_numbers_and_know_their_gaussians():
     assert moved.max() < 0.2
 
 
+@pytest.mark.parametrize(("sparsify_steps", "expected"), [(12, 12), (2, 0), (0, 0)])
+def test_a_point_is_trained_for_three_times_the_steps_between_two_prunings(sparsify_steps, expected):
+    done = []
+
+    def progress(stage, fraction, note=""):
+        if stage == "sparsify" and fraction < 1:
+            done.append(fraction)
+
+    walked = path(progress=progress, sparsify_steps=sparsify_steps)  # three prunings
+    walked.prune(40)
+    assert walked.train().trained == (expected > 0)
+    assert done == [step / expected for step in range(expected)]
+
+
 def test_an_untrained_point_is_the_pruned_scene():
     walked = path()
     point = walked.prune(30)
