@@ -36,7 +36,7 @@ from kissgs.settings import FinetuneSettings
 from kissgs.sogxt.container import zip_bytes
 from kissgs.sogxt.decode import decode as decode_sogxt
 from kissgs.training.checkpoint import Checkpoint
-from kissgs.training.loop import MOST_STEPS, LrSchedule, TrainingPlan, exponential_lr, image_loss, torch_threads, train
+from kissgs.training.loop import LrSchedule, TrainingPlan, exponential_lr, image_loss, torch_threads, train
 from kissgs.training.supervision import SupervisionViews, supervision_views
 from kissgs.training.targets import TrainingTargets, training_targets
 
@@ -58,6 +58,10 @@ TABLE_LR = 1.0
 NOT_KEPT = "fine-tuning did not help; the container is as it was without it"
 
 NO_TIME = "there was no time for fine-tuning; the container is as it was without it"
+
+MOST_STEPS = {"photos": 1, "renderings": 2}
+"""Most steps before a deadline, in units of the usual number, by the targets: more steps fit the photographs that train
+better, and those that are held out worse."""
 
 Write = Callable[[EncodingPlan, int, Progress], Encoded]
 """Writes a plan that was fine-tuned in a number of steps; the third argument receives progress."""
@@ -165,7 +169,8 @@ class Tuner:
             rd_lambda = implied_lambda(self._coding_error(container, scene, as_finetune), int(start.grid.mask.sum()))
         pace = Pace(self.settings.steps)
         if self.deadline is not None:
-            pace = Pace(MOST_STEPS * self.settings.steps, self.deadline.earlier(self.ending_seconds))
+            most = MOST_STEPS[self.targets.target_source] * self.settings.steps
+            pace = Pace(most, self.deadline.earlier(self.ending_seconds))
             pace.update(0)
         if before is not None and first is not None and pace.steps == 0:
             return before, self._untuned(first, started)

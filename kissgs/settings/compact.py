@@ -55,7 +55,11 @@ class CompactSettings(TrainingViewSettings):
         "shall keep 20 %, 0.43 keeps 50 %.",
     )
     sparsify_steps: int = Field(
-        1500, ge=0, le=1_000_000, description="Training steps during gradual pruning; 0: prune all at once."
+        1500,
+        ge=0,
+        le=1_000_000,
+        description="Training steps during gradual pruning; 0: prune all at once. With auto_count, each number of "
+        "Gaussians on the way takes a share of sparsify_steps / prune_rounds, by photographs three times as many.",
     )
     prune_rounds: int = Field(
         5,

@@ -27,9 +27,6 @@ try:
 except ModuleNotFoundError as error:
     raise UnsupportedError("training needs torch, which is missing: pip install 'kissgs[train]'") from error
 
-MOST_STEPS = 2
-"""Most steps before a deadline, in units of the usual number: more do not improve other views."""
-
 SMOOTHING = 0.98
 """Weight of the former value in the running means of loss and squared error."""
 

@@ -1,7 +1,10 @@
 """Training path. Oracle: its parts called one by one, and the same work without interruption."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from helpers.photographed import photographs
 from helpers.training_scenes import around, cloud, same
 
 import kissgs
@@ -10,6 +13,7 @@ from kissgs.cameras.views import black
 from kissgs.compaction.popspa import Popspa
 from kissgs.compaction.scoring import prune_by_score
 from kissgs.compaction.training_path import TrainingPath
+from kissgs.core.deadline import Deadline
 from kissgs.core.progress import silent
 from kissgs.training.supervision import SupervisionViews
 
@@ -42,17 +46,25 @@ def test_points_have_falling_numbers_and_know_their_gaussians():
     assert moved.max() < 0.2
 
 
-@pytest.mark.parametrize(("sparsify_steps", "expected"), [(12, 12), (2, 0), (0, 0)])
-def test_a_point_is_trained_for_three_times_the_steps_between_two_prunings(sparsify_steps, expected):
+@pytest.mark.parametrize("deadline", [None, Deadline.after(1e6)])
+@pytest.mark.parametrize(
+    ("photographed", "sparsify_steps", "expected"),
+    [(True, 12, 12), (True, 2, 2), (True, 0, 0), (False, 12, 4), (False, 4, 1), (False, 2, 0)],
+)
+def test_a_point_is_trained_for_so_many_steps(photographed, sparsify_steps, expected, deadline, tmp_path):
+    """Three times as many with photographs as between two of the three prunings, however much time there is."""
     done = []
 
     def progress(stage, fraction, note=""):
         if stage == "sparsify" and fraction < 1:
             done.append(fraction)
 
-    walked = path(progress=progress, sparsify_steps=sparsify_steps)  # three prunings
+    walked = path(progress=progress, sparsify_steps=sparsify_steps)
+    if photographed:
+        train = photographs(SCENE, tmp_path, train=5, held_out=0).train
+        walked.task = replace(walked.task, supervision=replace(walked.task.supervision, train=train))
     walked.prune(40)
-    assert walked.train().trained == (expected > 0)
+    assert walked.train(deadline).trained == (expected > 0)
     assert done == [step / expected for step in range(expected)]
 
 

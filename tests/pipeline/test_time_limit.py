@@ -91,6 +91,9 @@ def test_the_shares_of_a_search_fill_its_time():
     spent += SearchTime(Deadline.after(1000 - spent), 10).for_container(1).seconds
     assert spent == pytest.approx(1000, abs=1)
     assert time.for_point(3, 2).seconds < time.for_container(2).seconds
+    single = SearchTime(Deadline.after(1000), 0.0)
+    assert 3.9 < (1000 / single.for_point(1, 1).seconds) - 1 < 4.1  # less time for the points of a single container
+    assert 3.9 < (1000 / single.for_point(1, 2).seconds) - 1 < 4.1
 
 
 def test_the_saved_speed_counts(tmp_path):

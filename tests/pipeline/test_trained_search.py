@@ -191,6 +191,13 @@ def test_a_near_container_ends_the_search():
     assert positions == [(6, START)]
 
 
+@pytest.mark.parametrize(("left", "trials"), [(0.08, 1), (0.12, 2), (0.2, 2)])
+def test_a_container_ends_the_search_if_a_tenth_of_a_halving_or_less_is_left(left, trials):
+    """The aim is a loss of 0.19 dB, and a halving typically loses 0.32 dB."""
+    made, _ = search({"max_psnr_drop": 0.2}, lambda number, x: model(number, x, at_start=0.19 - 0.32 * left))
+    assert len(made) == trials
+
+
 def test_a_step_changes_number_and_lambda():
     """1.06 halvings: 1.9 points, rounded to 2, and 0.99 doublings of lambda."""
     _, positions = search({"max_psnr_drop": 0.2}, lambda number, x: model(number, x, at_start=-0.15))
