@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 from kissgs.core.deadline import Deadline
 
-CONTAINER_SHARE, ONLY_CONTAINER_SHARE = 2.0, 4.0
-"""Time to fine-tune a container, in units of that to train one point of the path; the second for a single container,
-for which there is less time."""
+CONTAINER_SHARE, LAST_CONTAINER_SHARE = 2.0, 4.0
+"""Time to fine-tune a container, in units of that to train one point of the path; the second for the last container,
+which is the only one where time is short."""
 
 ENDING_SHARE = 0.38
 """Time to write a fine-tuned container and to evaluate it, in units of an encoding without training."""
@@ -108,7 +108,7 @@ class SearchTime:
     def for_point(self, points: int, containers: int) -> Deadline:
         """Return the deadline for training the next of so many points, before so many containers."""
         left = self.deadline.seconds - containers * self.encode_seconds
-        share = ONLY_CONTAINER_SHARE if containers == 1 else CONTAINER_SHARE
+        share = LAST_CONTAINER_SHARE if containers == 1 else CONTAINER_SHARE
         return Deadline.after(max(left, 0.0) / (points + share * containers))
 
     def for_container(self, containers: int) -> Deadline:

@@ -58,8 +58,8 @@ class CompactSettings(TrainingViewSettings):
         1500,
         ge=0,
         le=1_000_000,
-        description="Training steps during gradual pruning; 0: prune all at once. With auto_count, each number of "
-        "Gaussians on the way takes a share of sparsify_steps / prune_rounds, by photographs three times as many.",
+        description="Training steps during gradual pruning; 0: prune all at once. With auto_count: "
+        "sparsify_steps / prune_rounds at each number of Gaussians on the way, three times as many with photographs.",
     )
     prune_rounds: int = Field(
         5,

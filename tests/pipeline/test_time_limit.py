@@ -91,9 +91,13 @@ def test_the_shares_of_a_search_fill_its_time():
     spent += SearchTime(Deadline.after(1000 - spent), 10).for_container(1).seconds
     assert spent == pytest.approx(1000, abs=1)
     assert time.for_point(3, 2).seconds < time.for_container(2).seconds
-    single = SearchTime(Deadline.after(1000), 0.0)
-    assert 3.9 < (1000 / single.for_point(1, 1).seconds) - 1 < 4.1  # less time for the points of a single container
-    assert 3.9 < (1000 / single.for_point(1, 2).seconds) - 1 < 4.1
+
+
+@pytest.mark.parametrize(("containers", "point"), [(1, 200), (2, 200), (3, 1000 / 7)])
+def test_a_point_has_half_of_the_time_of_a_container_and_a_quarter_before_the_last_one(containers, point):
+    """1,000 s for one point and so many containers, of which encoding takes no time."""
+    time = SearchTime(Deadline.after(1000), 0.0)
+    assert time.for_point(1, containers).seconds == pytest.approx(point, abs=1)
 
 
 def test_the_saved_speed_counts(tmp_path):
@@ -129,13 +133,21 @@ def test_time_alone_trains_and_keeps_the_closest_container(tmp_path, monkeypatch
     requested = with_photographs().model_copy(update={"time_limit": LONG})
     found = kissgs.compress(scene, settings=requested, views=views)
     assert found.report.compaction.count < 200
-    assert found.report.finetuning.steps == 2 * 24  # twice the usual number, and no more
+    assert found.report.finetuning.steps == 24  # the usual number, and no more
     assert len(found.report.trials) > 1
     assert found.report.settings["encode"]["max_psnr_drop"] is None
     assert found.report.settings["time_limit"] == LONG
     assert min(trial.drop for trial in found.report.trials) > 0.1
     (kept,) = {trial.drop for trial in found.report.trials if trial.bytes == len(found.to_zip())}
     assert kept == min(trial.drop for trial in found.report.trials)
+
+
+@pytest.mark.quick(0)
+def test_much_time_makes_twice_the_usual_steps_on_renderings():
+    tuning = {"steps": 6, "views": 24, "view_size": 40}
+    settings = Settings.from_preset("balanced", finetune=tuning, time_limit=LONG, **FEW_VIEWS)
+    tuned = kissgs.compress(cloud(200), settings=settings).report.finetuning
+    assert (tuned.steps, tuned.target_source) == (12, "renderings")
 
 
 @pytest.mark.quick(0)

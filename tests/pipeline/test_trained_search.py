@@ -129,7 +129,9 @@ def test_three_containers_come_near_the_smallest_loss_of_a_size(size, larger):
     trials, _ = search({"target_size": size}, figures, first=number)
     found = max((trial for trial in trials if trial.bytes <= size), key=lambda trial: trial.bytes)
     assert found.bytes > 0.88 * size
-    assert found.bytes / larger <= 1.1 * smallest(found.drop)
+    # 220 kB of small containers: a search by size alone sees no loss, and ends near the size with too many Gaussians
+    most = 1.09 if (size, larger) == (220_000, 0.8) else 1.05
+    assert found.bytes / larger <= most * smallest(found.drop)
 
 
 @pytest.mark.parametrize(
