@@ -50,6 +50,8 @@ def for_each_input(
             after the last one.
     """
     inputs = expand(names)
+    if writes and output is None:
+        _refuse_output_as_input(inputs, suffix)
     if writes and as_json and str(output) == "-":
         raise OutputError("--json and -o - both write to standard output; choose one")
     targets = _targets(inputs, output, suffix) if writes else [Path("-")] * len(inputs)
@@ -136,6 +138,17 @@ def _targets(inputs: list[str], output: Path | None, suffix: str) -> list[Path]:
     if len(set(targets)) < len(targets):
         raise OutputError("two inputs have the same name and would become one file; process them one by one")
     return targets
+
+
+def _refuse_output_as_input(inputs: list[str], suffix: str) -> None:
+    """Raise OutputError for ``SCENE.ply NEW.zip``, as other tools name their output; -o names it here."""
+    from kissgs.io.container_names import ENDINGS
+
+    if len(inputs) != 2 or os.path.lexists(inputs[1]):
+        return
+    read, written = (Path(name).suffix.lower() for name in inputs)
+    if written != read and written in {suffix, *(ENDINGS if suffix in ENDINGS else ())} - {""}:
+        raise OutputError(f"{inputs[1]:.100} does not exist; if it is the output, name it with -o {inputs[1]:.100}")
 
 
 def _refuse_file_name(folder: Path, suffix: str) -> None:

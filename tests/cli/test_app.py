@@ -63,6 +63,14 @@ def test_several_files_and_patterns(scene: Path, tmp_path: Path) -> None:
     assert "no file matches" in failure("compress", tmp_path / "*.nothing")
 
 
+@pytest.mark.parametrize("words", [["compress", "scene.ply", "new.zip"], ["decompress", "old.zip", "new.ply"]])
+def test_an_output_without_its_option_is_refused_before_any_work(scene: Path, tmp_path: Path, words: list[str]) -> None:
+    (tmp_path / "scene.ply").write_bytes(scene.read_bytes())
+    run("compress", "scene.ply", "-o", "old.zip", "-p", "fast", cwd=tmp_path)
+    assert failure(*words, cwd=tmp_path).endswith(f"does not exist; if it is the output, name it with -o {words[2]}")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["old.zip", "scene.ply"]
+
+
 def test_json_of_one_file_is_one_report(scene: Path, tmp_path: Path) -> None:
     report = json.loads(run("compress", scene, "-o", tmp_path / "a.zip", "--json").stdout)
     assert report["source_count"] == 600
