@@ -17,7 +17,7 @@ from kissgs.pipeline.goal import HALF_ERROR_DB, Goal
 from kissgs.pipeline.path_points import KEEP, OVERHEAD_BYTES, POINTS_PER_HALVING, count_at, last_number, number_for_size
 from kissgs.pipeline.pruning import Pruning
 from kissgs.pipeline.rate_control import Container, RateControl
-from kissgs.pipeline.search_time import SearchPlan, SearchTime
+from kissgs.pipeline.search_time import RECOVERABLE_DB, SearchPlan, SearchTime
 from kissgs.pipeline.trained_scenes import TrainedScene, TrainedScenes
 from kissgs.pipeline.trained_search import (
     NEAR_HALVINGS,
@@ -83,6 +83,7 @@ class CountSearch:
     _scenes: TrainedScenes = field(init=False)
     _whole: RateControl | None = field(init=False, default=None)
     _stopped: bool = field(init=False, default=False)
+    _too_short: bool = field(init=False, default=False)
     _plan: SearchPlan = field(init=False)
     _first: int = field(init=False)
 
@@ -94,16 +95,15 @@ class CountSearch:
             self.encoding = replace(self.encoding, compare=self.compactor.compare)
         plan = SearchPlan(most) if self.time is None else self.time.plan(photographs=photographs, aims=self.aims)
         self._plan = replace(plan, containers=min(plan.containers, most))
-        if plan.brief:  # half of the views score nearly as well
-            supervision = self.compactor.supervision
-            score = supervision.score[::2]
-            self.compactor = replace(self.compactor, supervision=replace(supervision, score=score))
-        self._path = self.compactor.path(keep_states=not self._tunes)
-        self._pruning = Pruning(self.goal, self.compactor, self._path)
-        self._candidates = Candidates(self.goal, self.encoding.packed)
         self._first, offset_db = first_position(
             self.goal, self._plan, len(self.compactor.splats), self._number_for_size, POINTS_PER_HALVING
         )
+        if self.time is not None and photographs:
+            most_views = self.time.scoring_views(max(self._first, 1))
+            self.compactor = replace(self.compactor, supervision=self.compactor.supervision.with_scoring(most_views))
+        self._path = self.compactor.path(keep_states=not self._tunes)
+        self._pruning = Pruning(self.goal, self.compactor, self._path)
+        self._candidates = Candidates(self.goal, self.encoding.packed)
         self._scenes = TrainedScenes(
             encoding=self.encoding,
             compactor=self.compactor,
@@ -184,7 +184,38 @@ class CountSearch:
                 self._pruning.prune_while(_is_prunable, PRUNABLE_POINTS)
             else:  # what each point loses is not worth the time to measure it
                 self._pruning.prune_to(min(self._first - 1, PRUNABLE_POINTS))
-            self._search_along_path(self._first)
+                self._too_short = not self.goal.by_size and not self._recovers()
+            if self._too_short:
+                self._encode_all_in_time()
+            if not self._too_short or self._time_for_several:
+                self._search_along_path(self._first)
+
+    def _recovers(self) -> bool:
+        """Train up to the first point, and return whether fine-tuning can be expected to recover what is still lost.
+
+        The larger and the more detailed a scene is, the less is recovered in a time.
+        """
+        self._scenes.containers = self._plan.containers
+        drop = self._pruning.measure(self._scenes.point(self._first).splats).drop or 0.0
+        return drop <= RECOVERABLE_DB + (self.encoding.settings.encode.max_psnr_drop or 0.0)
+
+    def _encode_all_in_time(self) -> None:
+        """Search for the lambda of all Gaussians without training; for an aim, as long as there is time."""
+        compacted = self._path.compacted(self._path.points[0], refine=False)
+        encoding = self._encoding_of(compacted)
+        search, encoder = encoding.rate_control(), encoding.encoder(None)
+
+        def encoder_in_time(settings: EncodeSettings) -> Container:
+            if self.aims and search.trials and self.time is not None and self.time.over_for_encoding:
+                raise StopSearch
+            return encoder(settings)
+
+        try:
+            search.run(encoder_in_time)
+        finally:
+            self.trials += search.trials
+            search.stopped |= self.aims and self.time is not None and self.time.over_for_encoding
+            self._candidates.keep(search, compacted)
 
     def _search_without_photographs(self) -> None:
         """Encode all Gaussians, then fewer, trained or not, which may serve the goal better."""
@@ -265,6 +296,11 @@ class CountSearch:
         self._stopped |= search.stopped
 
     @property
+    def _time_for_several(self) -> bool:
+        """Whether time is left for more than one trained container."""
+        return self.time is not None and self.time.plan(photographs=True, aims=self.aims).containers > 1
+
+    @property
     def _late(self) -> bool:
         """Whether no time is left for another container."""
         return self.time is not None and self.time.over
@@ -339,7 +375,10 @@ class CountSearch:
 
     def _reason_to_keep_all(self) -> str:
         first = self._whole.trials[0] if self._whole is not None else None
-        if self._pruning.tried or any(trial.count < len(self.compactor.splats) for trial in self.trials):
+        fewer = any(trial.count < len(self.compactor.splats) for trial in self.trials)
+        if self._too_short and not fewer:
+            return "and there was too little time to train a smaller number"
+        if self._pruning.tried or fewer:
             return "and no smaller number of Gaussians that was tried serves the goal better"
         if self.goal.by_size and (first is None or first.bytes <= self._target_size):
             return "and all of them fit into the target size"

@@ -17,6 +17,19 @@ ENDING_SHARE = 0.38
 LEAST_FOR_CONTAINER = 2.0
 """Time below which another container is not begun, in the same unit."""
 
+LEAST_FOR_ENCODING = 1.5
+"""The same for one that is not trained: with a capture, colours are refitted to its images."""
+
+SCORE_SHARE, SCORING_SHARE = 0.004, 0.15
+"""Time to score the Gaussians in one view, in the same unit, and the share of the time that all scoring may take."""
+
+LEAST_SCORING_VIEWS = 16
+"""Number of views that score in any case."""
+
+RECOVERABLE_DB = 1.5
+"""Loss of PSNR at the end of a short training path, decibels beyond the one that is allowed, from which fine-tuning
+does not recover: it makes up for 0.4 dB in the same time."""
+
 FIRST_NUMBER, TRAINED_OFFSET_DB = 6, 4.0
 """Number of the point of the first container for a loss of 0.1 dB, a quarter of the Gaussians, and decibels added to
 ``quality_offset_db`` there; :func:`kissgs.pipeline.trained_search.first_position` changes both for other goals.
@@ -34,17 +47,15 @@ class SearchPlan:
         containers: number of containers.
         number: number of the point of the path that is tried first for a loss of 0.1 dB.
         offset_db: added to ``quality_offset_db`` there, decibels.
-        brief: whether half of the scoring views must do.
     """
 
     containers: int
     number: int = FIRST_NUMBER
     offset_db: float = TRAINED_OFFSET_DB
-    brief: bool = False
 
 
 AIMING = (
-    (4.2, SearchPlan(1, 4, 3.0, brief=True)),
+    (4.2, SearchPlan(1, 4, 3.0)),
     (8.0, SearchPlan(1, 5, 3.0)),
     (16.0, SearchPlan(1)),
     (40.0, SearchPlan(2)),
@@ -56,7 +67,7 @@ With fewer Gaussians, training that is too short loses more than they save.
 """
 
 MEETING = (
-    (4.2, SearchPlan(1, 2, 3.0, brief=True)),
+    (4.2, SearchPlan(1, 2, 3.0)),
     (8.5, SearchPlan(1, 4, 3.0)),
     (40.0, SearchPlan(2, 5, 3.0)),
     (math.inf, SearchPlan(3)),
@@ -90,6 +101,11 @@ class SearchTime:
         return self.deadline.seconds < LEAST_FOR_CONTAINER * self.encode_seconds
 
     @property
+    def over_for_encoding(self) -> bool:
+        """Whether no time is left for another container without training."""
+        return self.deadline.seconds < LEAST_FOR_ENCODING * self.encode_seconds
+
+    @property
     def ending_seconds(self) -> float:
         """Expected seconds to write a fine-tuned container and to evaluate it."""
         return ENDING_SHARE * self.encode_seconds
@@ -104,6 +120,11 @@ class SearchTime:
         left = self.deadline.seconds / self.encode_seconds
         plans = RENDERED if not photographs else AIMING if aims else MEETING
         return next(plan for most, plan in plans if left <= most)
+
+    def scoring_views(self, rounds: int) -> int:
+        """Return the number of views for which there is time in so many rounds of scoring."""
+        seconds = rounds * SCORE_SHARE * self.encode_seconds
+        return max(LEAST_SCORING_VIEWS, int(SCORING_SHARE * max(self.deadline.seconds, 0.0) / seconds))
 
     def for_point(self, points: int, containers: int) -> Deadline:
         """Return the deadline for training the next of so many points, before so many containers."""

@@ -64,6 +64,11 @@ class SupervisionViews:
     synthetic: int = 0
     synthetic_per_epoch: int = 0
 
+    def with_scoring(self, most: int) -> SupervisionViews:
+        """Return these views, of which at most ``most`` score: every so many-th."""
+        chosen = np.unique(np.linspace(0, len(self.score) - 1, min(most, len(self.score))).astype(int))
+        return replace(self, score=tuple(self.score[n] for n in chosen))
+
     @property
     def eval_views(self) -> Views:
         """Evaluation views, for :func:`kissgs.evaluate`."""

@@ -1,7 +1,9 @@
 """Limited time. Oracle: the limit itself, and what the container shows of the work that was done."""
 
+import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from helpers.photographed import FEW_VIEWS, photographs, with_photographs
 from helpers.training_scenes import cloud
@@ -14,6 +16,7 @@ from kissgs.pipeline.machine_speed import encode_seconds, save_speed
 from kissgs.pipeline.search_time import MEETING, SearchTime
 from kissgs.pipeline.time_plan import time_plan
 from kissgs.settings import Preset
+from kissgs.training.supervision import SupervisionViews
 
 LONG = 1e5
 
@@ -75,7 +78,6 @@ def test_more_time_makes_more_containers():
         assert [plan.containers for plan in plans] == sorted(plan.containers for plan in plans)
         assert [plan.number for plan in plans] == sorted(plan.number for plan in plans)
         assert (plans[0].containers, plans[-1].containers) == (1, 3)
-        assert [plan.brief for plan in plans] == [True, False, False, False, False]
     rendered = [
         SearchTime(Deadline.after(10 * units), 10).plan(photographs=False, aims=False) for units in (4, 20, 40, 90)
     ]
@@ -125,9 +127,19 @@ def test_a_speed_that_cannot_be_saved_is_one_sentence(tmp_path, monkeypatch):
         save_speed(1.0, Preset.BALANCED, 9)
 
 
+def test_scoring_takes_a_share_of_the_time():
+    """100 units are left: 0.15 of them for 4 rounds of 0.004 each per view."""
+    assert SearchTime(Deadline.after(1000), 10).scoring_views(4) == pytest.approx(937, abs=2)
+    assert SearchTime(Deadline.after(10), 10).scoring_views(4) == 16
+    views = SupervisionViews((), tuple(range(10)), (), np.zeros(3, np.float32), "")
+    assert views.with_scoring(4).score == (0, 3, 6, 9)
+    assert views.with_scoring(40).score == views.score
+
+
 @pytest.mark.quick(0)
 def test_time_alone_trains_and_keeps_the_closest_container(tmp_path, monkeypatch):
     """The photographs are the scene's own renderings, so that nothing can be lost without missing the aim."""
+    monkeypatch.setattr("kissgs.pipeline.count_search.RECOVERABLE_DB", math.inf)
     scene = cloud(200)
     views = photographs(scene, tmp_path, brightness=1.0)
     requested = with_photographs().model_copy(update={"time_limit": LONG})
@@ -140,6 +152,36 @@ def test_time_alone_trains_and_keeps_the_closest_container(tmp_path, monkeypatch
     assert min(trial.drop for trial in found.report.trials) > 0.1
     (kept,) = {trial.drop for trial in found.report.trials if trial.bytes == len(found.to_zip())}
     assert kept == min(trial.drop for trial in found.report.trials)
+
+
+@pytest.mark.quick(1)
+@pytest.mark.parametrize(("units", "fewer"), [(12.0, False), (1e6, True)])
+def test_a_scene_that_training_does_not_recover_is_encoded_whole(tmp_path, monkeypatch, units, fewer):
+    """Photographs that are the scene's own renderings lose without limit; with much time, fewer Gaussians follow."""
+    scene = cloud(200)
+    views = photographs(scene, tmp_path, brightness=1.0)
+    monkeypatch.setattr("kissgs.pipeline.time_plan.encode_seconds", lambda *found: LONG / units)
+    requested = with_photographs().model_copy(update={"time_limit": LONG})
+    found = kissgs.compress(scene, settings=requested, views=views)
+    counts = [trial.count for trial in found.report.trials]
+    assert counts[0] == 200
+    assert (min(counts) < 200) == fewer
+    (kept,) = {trial.drop for trial in found.report.trials if trial.bytes == len(found.to_zip())}
+    assert kept == min(trial.drop for trial in found.report.trials)
+    if not fewer:
+        assert "too little time to train a smaller number" in found.report.compaction.note
+
+
+@pytest.mark.quick(0)
+def test_a_goal_that_training_does_not_recover_is_met_by_the_encoder(tmp_path, monkeypatch):
+    scene = cloud(200)
+    views = photographs(scene, tmp_path)
+    monkeypatch.setattr("kissgs.pipeline.count_search.RECOVERABLE_DB", -math.inf)
+    monkeypatch.setattr("kissgs.pipeline.time_plan.encode_seconds", lambda *found: LONG / 12.0)
+    requested = with_photographs(max_psnr_drop=0.5).model_copy(update={"time_limit": LONG})
+    found = kissgs.compress(scene, settings=requested, views=views)
+    assert found.report.trials[0].count == 200
+    assert min(trial.drop for trial in found.report.trials if trial.bytes == len(found.to_zip())) <= 0.5
 
 
 @pytest.mark.quick(0)
@@ -176,7 +218,8 @@ class StopIn:
             raise kissgs.StopSearch
 
 
-def test_a_stopped_search_for_an_aim_keeps_the_closest_container(tmp_path):
+def test_a_stopped_search_for_an_aim_keeps_the_closest_container(tmp_path, monkeypatch):
+    monkeypatch.setattr("kissgs.pipeline.count_search.RECOVERABLE_DB", math.inf)
     scene, receiver = cloud(150), StopIn()
     views = photographs(scene, tmp_path, brightness=1.0)
     requested = with_photographs().model_copy(update={"time_limit": LONG})
