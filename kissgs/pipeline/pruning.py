@@ -18,6 +18,15 @@ if TYPE_CHECKING:
     from kissgs.compaction.training_path import PathPoint, TrainingPath
 
 
+PRUNABLE_DROP = 1.0
+"""Drop of PSNR, decibels, up to which pruning goes on without training."""
+
+
+def is_prunable(trial: Trial) -> bool:
+    """Whether a point may be pruned further without training."""
+    return (trial.drop or 0.0) <= PRUNABLE_DROP  # false where a rendering failed
+
+
 @dataclass(slots=True, eq=False)
 class Pruning:
     """Prunes a scene along its path without training, and measures what that loses.
