@@ -102,7 +102,7 @@ class CountSearch:
             containers.pruning.prune_to(min(containers.first - 1, PRUNABLE_POINTS))
         if containers.time is not None and not goal.by_size and not self._recovers():
             self._unrecovered = True
-            containers.encode_all_in_time(containers.time)
+            self._whole = containers.encode_all_in_time(containers.time)
             if containers.time.plan(photographs=True, aims=self.aims).containers < 2:
                 return
         containers.search_along_path(containers.first)

@@ -153,7 +153,7 @@ class PathContainers:
         """Search for the lambda of all Gaussians without fine-tuning."""
         return self.encode(self.path.compacted(self.path.points[0], refine=False))
 
-    def encode_all_in_time(self, time: SearchTime) -> None:
+    def encode_all_in_time(self, time: SearchTime) -> RateControl:
         """Do the same; for an aim, only as long as there is time."""
         compacted = self.path.compacted(self.path.points[0], refine=False)
         encoding = self._encoding_of(compacted)
@@ -165,10 +165,11 @@ class PathContainers:
             return encoder(settings)
 
         try:
-            search.run(encoder_in_time)
+            search.search_all(encoder_in_time)
         finally:
             search.stopped |= self.aims and time.over_for_encoding
             self._keep(search, compacted)
+        return search
 
     def encode_by_size(self) -> None:
         """Search for the lambda at the point that the size suggests, or at a later one if its containers are larger."""

@@ -182,6 +182,9 @@ def test_a_goal_that_training_does_not_recover_is_met_by_the_encoder(tmp_path, m
     found = kissgs.compress(scene, settings=requested, views=views)
     assert found.report.trials[0].count == 200
     assert min(trial.drop for trial in found.report.trials if trial.bytes == len(found.to_zip())) <= 0.5
+    impossible = with_photographs(max_psnr_drop=1e-9).model_copy(update={"time_limit": LONG})
+    with pytest.raises(UnsupportedError, match="max_psnr_drop 1e-09 dB cannot be met"):
+        kissgs.compress(scene, settings=impossible, views=photographs(scene, tmp_path, brightness=1.0))
 
 
 @pytest.mark.quick(0)
