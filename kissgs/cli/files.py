@@ -144,7 +144,7 @@ def _refuse_output_as_input(inputs: list[str], suffix: str) -> None:
     """Raise OutputError for ``SCENE.ply NEW.zip``, as other tools name their output; -o names it here."""
     from kissgs.io.container_names import ENDINGS
 
-    if len(inputs) != 2 or os.path.lexists(inputs[1]):
+    if len(inputs) != 2 or not os.path.lexists(inputs[0]) or os.path.lexists(inputs[1]):
         return
     read, written = (Path(name).suffix.lower() for name in inputs)
     if written != read and written in {suffix, *(ENDINGS if suffix in ENDINGS else ())} - {""}:

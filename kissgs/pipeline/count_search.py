@@ -40,7 +40,7 @@ class CountSearch:
     Attributes:
         encoding: encoding of the whole scene.
         compactor: compactor of the same scene.
-        time: the time of the search; None for no limit. It limits training only.
+        time: the time of the search; None for no limit. It limits training, and everything where the goal is an aim.
         aims: whether the goal is no more than an aim: if no container meets it in time, the closest one is kept.
     """
 
@@ -100,33 +100,47 @@ class CountSearch:
             containers.pruning.prune_while(is_prunable, PRUNABLE_POINTS)
         else:  # what each point loses is not worth the time to measure it
             containers.pruning.prune_to(min(containers.first - 1, PRUNABLE_POINTS))
-        if containers.time is not None and not goal.by_size and not self._recovers():
-            self._unrecovered = True
-            self._whole = containers.encode_all_in_time(containers.time)
-            if containers.time.plan(photographs=True, aims=self.aims).containers < 2:
-                return
-        containers.search_along_path(containers.first)
+        if containers.time is None or self._recovers() or self._several_follow_all(containers.time):
+            containers.search_along_path(containers.first)
+
+    def _several_follow_all(self, time: SearchTime) -> bool:
+        """Encode all Gaussians, and return whether there is time for several trained containers after that."""
+        self._unrecovered = True
+        whole = self._whole = self._containers.encode_all_in_time(time)
+        plan, left = self._containers.plan, time.plan(photographs=True, aims=self.aims).containers
+        self._containers.plan = replace(plan, containers=min(plan.containers, left))
+        several = self._containers.plan.containers > 1 and not whole.stopped
+        whole.stopped |= whole.best is not None or self.aims  # training it takes longer still
+        return several
 
     def _recovers(self) -> bool:
         """Train up to the first point, and return whether fine-tuning can be expected to recover what is still lost.
 
         The larger and the more detailed a scene is, the less is recovered in a time.
         """
-        drop = self._containers.train_to_first().drop or 0.0
-        return drop <= RECOVERABLE_DB + (self.encoding.settings.encode.max_psnr_drop or 0.0)
+        allowed = self.encoding.settings.encode.max_psnr_drop
+        if allowed is None:  # PSNR does not tell what becomes of other goals
+            return True
+        return (self._containers.train_to_first().drop or 0.0) <= RECOVERABLE_DB + allowed
 
     def _encode_latest(self) -> None:
         """Encode the latest point of the path, where the search was stopped before any container."""
         containers, point = self._containers, self._latest_point()
-        if point.number == 0 and self._whole is not None:  # all Gaussians have missed the goal already
+        all_missed = self._whole is not None or (self._unrecovered and containers.trials)
+        if point.number == 0 and all_missed:
             return
         progress = SearchNote(ignore_stop_search(self.encoding.progress))
         containers.encoding = replace(containers.encoding, progress=progress)
-        containers.encode(containers.path.compacted(point, refine=False))
+        if self._unrecovered and containers.time is not None:
+            containers.encode_all_in_time(containers.time)
+        else:
+            containers.encode(containers.path.compacted(point, refine=False))
 
     def _latest_point(self) -> PathPoint:
         """Return the last point if it is trained, else the last one that loses less than the goal allows."""
         points, goal = self._containers.path.points, self._containers.goal
+        if self._unrecovered:
+            return points[0]
         if points[-1].trained or goal.by_size:
             return points[-1]
         return points[self._containers.pruning.last(lambda trial: goal.margin(trial) >= 0)]
@@ -136,7 +150,7 @@ class CountSearch:
         first = self._whole.trials[0] if self._whole is not None else None
         fewer = any(trial.count < containers.count for trial in containers.trials)
         if self._unrecovered and not fewer:
-            return "and there was too little time to train a smaller number"
+            return "and training a smaller number did not recover in this time what it loses"
         if containers.pruning.tried or fewer:
             return "and no smaller number of Gaussians that was tried serves the goal better"
         if containers.goal.by_size and (first is None or first.bytes <= containers.target_size):

@@ -45,7 +45,7 @@ class PathContainers:
     Attributes:
         encoding: encoding of the whole scene.
         compactor: compactor of the same scene.
-        time: the time of the search; None for no limit. It limits training only.
+        time: the time of the search; None for no limit. It limits training, and everything where the goal is an aim.
         aims: whether the goal is no more than an aim: if no container meets it in time, the closest one is kept.
         trials: all containers that were made, in order.
         stopped: whether a search has ended before its end.
@@ -77,9 +77,8 @@ class PathContainers:
             self.encoding = replace(self.encoding, compare=self.compactor.compare)
         plan = SearchPlan(most) if self.time is None else self.time.plan(photographs=photographs, aims=self.aims)
         self.plan = replace(plan, containers=min(plan.containers, most))
-        self.first, offset_db = first_position(
-            self.goal, self.plan, self.count, self.number_for_size, POINTS_PER_HALVING
-        )
+        first, offset_db = first_position(self.goal, self.plan, self.count, self.number_for_size, POINTS_PER_HALVING)
+        self.first = min(first, last_number(self.count))
         if self.time is not None and photographs:
             most_views = self.time.scoring_views(max(self.first, 1))
             self.compactor = replace(self.compactor, supervision=self.compactor.supervision.with_scoring(most_views))
@@ -154,7 +153,7 @@ class PathContainers:
         return self.encode(self.path.compacted(self.path.points[0], refine=False))
 
     def encode_all_in_time(self, time: SearchTime) -> RateControl:
-        """Do the same; for an aim, only as long as there is time."""
+        """Search for the lambda of all Gaussians without fine-tuning; for an aim, only as long as there is time."""
         compacted = self.path.compacted(self.path.points[0], refine=False)
         encoding = self._encoding_of(compacted)
         search, encoder = encoding.rate_control(), encoding.encoder(None)
@@ -167,7 +166,6 @@ class PathContainers:
         try:
             search.search_all(encoder_in_time)
         finally:
-            search.stopped |= self.aims and time.over_for_encoding
             self._keep(search, compacted)
         return search
 

@@ -17,18 +17,18 @@ ENDING_SHARE = 0.38
 LEAST_FOR_CONTAINER = 2.0
 """Time below which another container is not begun, in the same unit."""
 
-LEAST_FOR_ENCODING = 1.5
-"""The same for one that is not trained: with a capture, colours are refitted to its images."""
+CAPTURE_TIME = 1.5
+"""Time of an encoding with a capture, whose images colours are refitted to, in the same unit."""
 
 SCORE_SHARE, SCORING_SHARE = 0.004, 0.15
-"""Time to score the Gaussians in one view, in the same unit, and the share of the time that all scoring may take."""
+"""Time to score the Gaussians in one view, in the same unit, and the share of the time that all scoring shall take."""
 
 LEAST_SCORING_VIEWS = 16
 """Number of views that score in any case."""
 
 RECOVERABLE_DB = 1.5
 """Loss of PSNR at the end of a short training path, decibels beyond the one that is allowed, from which fine-tuning
-does not recover: it makes up for 0.4 dB in the same time."""
+is not expected to recover (docs/method/research-log.md, "Large scenes in a limited time")."""
 
 FIRST_NUMBER, TRAINED_OFFSET_DB = 6, 4.0
 """Number of the point of the first container for a loss of 0.1 dB, a quarter of the Gaussians, and decibels added to
@@ -103,7 +103,7 @@ class SearchTime:
     @property
     def over_for_encoding(self) -> bool:
         """Whether no time is left for another container without training."""
-        return self.deadline.seconds < LEAST_FOR_ENCODING * self.encode_seconds
+        return self.deadline.seconds < CAPTURE_TIME * self.encode_seconds
 
     @property
     def ending_seconds(self) -> float:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from kissgs.core.deadline import Deadline
 from kissgs.pipeline.machine_speed import encode_seconds
-from kissgs.pipeline.search_time import SearchTime
+from kissgs.pipeline.search_time import CAPTURE_TIME, SearchTime
 from kissgs.settings import Preset, Settings
 
 TRAINING_TIME = 3.5
@@ -14,9 +14,6 @@ TRAINING_TIME = 3.5
 
 TUNING_TIME = 5.0
 """Time from which fine-tuning on renderings of the scene pays, in the same unit."""
-
-CAPTURE_TIME = 1.5
-"""Time of an encoding with a capture, whose images colours are refitted to, in units of one without."""
 
 
 @dataclass(frozen=True, slots=True)

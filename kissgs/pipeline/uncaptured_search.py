@@ -1,4 +1,4 @@
-"""``search_without_photographs``: fewer Gaussians, compared with renderings of the scene."""
+"""``search_without_photographs``: fewer Gaussians where no photographs can train them."""
 
 from __future__ import annotations
 

@@ -169,7 +169,44 @@ def test_a_scene_that_training_does_not_recover_is_encoded_whole(tmp_path, monke
     (kept,) = {trial.drop for trial in found.report.trials if trial.bytes == len(found.to_zip())}
     assert kept == min(trial.drop for trial in found.report.trials)
     if not fewer:
-        assert "too little time to train a smaller number" in found.report.compaction.note
+        assert "training a smaller number did not recover" in found.report.compaction.note
+        assert found.report.finetuning is None  # which would have to recover more
+
+
+class StopAt:
+    """Receiver that ends the search at the first event of a stage after another one."""
+
+    def __init__(self, stage, after):
+        self.stage, self.after, self.seen, self.done = stage, after, False, False
+
+    def __call__(self, stage, fraction, note=""):
+        self.seen |= stage == self.after
+        if self.seen and stage == self.stage and not self.done:
+            self.done = True
+            raise kissgs.StopSearch
+
+
+@pytest.mark.quick(0)
+@pytest.mark.parametrize(("stage", "after"), [("sensitivity", "sparsify"), ("evaluate", "images")])
+def test_ctrl_c_while_all_gaussians_are_encoded_keeps_them(tmp_path, monkeypatch, stage, after):
+    scene, receiver = cloud(200), StopAt(stage, after)
+    views = photographs(scene, tmp_path, brightness=1.0)
+    requested = with_photographs().model_copy(update={"time_limit": LONG})
+    found = kissgs.compress(scene, settings=requested, views=views, progress=receiver)
+    assert receiver.done
+    assert {trial.count for trial in found.report.trials} == {200}
+    assert len(found.to_zip()) in {trial.bytes for trial in found.report.trials}
+
+
+@pytest.mark.quick(0)
+def test_an_aim_is_sought_only_while_there_is_time(tmp_path, monkeypatch):
+    scene = cloud(200)
+    views = photographs(scene, tmp_path, brightness=1.0)
+    monkeypatch.setattr("kissgs.pipeline.time_plan.encode_seconds", lambda *found: LONG / 12.0)
+    monkeypatch.setattr(SearchTime, "over_for_encoding", True)
+    requested = with_photographs().model_copy(update={"time_limit": LONG})
+    found = kissgs.compress(scene, settings=requested, views=views)
+    assert [trial.count for trial in found.report.trials] == [200]
 
 
 @pytest.mark.quick(0)
