@@ -76,7 +76,7 @@ class Candidates:
         made = [(search, compacted) for search, compacted in self._missed if search.closest is not None]
         if made:
             search, compacted = max(made, key=lambda each: max(map(self.goal.margin, each[0].trials)))
-            search.best, search.stopped = search.closest, True  # fine-tuning it has no goal to meet
+            search.best, search.stopped = search.closest, True  # a fine-tuned one would not replace it
             self.keep(search, compacted)
 
     def _loss(self, search: RateControl, container: Container) -> float:

@@ -100,17 +100,17 @@ class CountSearch:
             containers.pruning.prune_while(is_prunable, PRUNABLE_POINTS)
         else:  # what each point loses is not worth the time to measure it
             containers.pruning.prune_to(min(containers.first - 1, PRUNABLE_POINTS))
-        if containers.time is None or self._recovers() or self._several_follow_all(containers.time):
+        if containers.time is None or self._recovers() or self._encode_all_before_training(containers.time):
             containers.search_along_path(containers.first)
 
-    def _several_follow_all(self, time: SearchTime) -> bool:
+    def _encode_all_before_training(self, time: SearchTime) -> bool:
         """Encode all Gaussians, and return whether there is time for several trained containers after that."""
         self._unrecovered = True
         whole = self._whole = self._containers.encode_all_in_time(time)
         plan, left = self._containers.plan, time.plan(photographs=True, aims=self.aims).containers
         self._containers.plan = replace(plan, containers=min(plan.containers, left))
         several = self._containers.plan.containers > 1 and not whole.stopped
-        whole.stopped |= whole.best is not None or self.aims  # training it takes longer still
+        whole.stopped |= whole.best is not None or self.aims  # to fine-tune all Gaussians takes longer still
         return several
 
     def _recovers(self) -> bool:
