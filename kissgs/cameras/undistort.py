@@ -77,11 +77,6 @@ class Lens:
         """``(3, 3)`` float64 intrinsics of the pinhole without distortion."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
-    def resized(self, width: int, height: int) -> Lens:
-        """Return the lens for the photograph resized to this size; the distortion has no unit, so it stays."""
-        x, y = width / self.width, height / self.height
-        return Lens(self.fx * x, self.fy * y, self.cx * x, self.cy * y, width, height, self.distortion)
-
 
 @dataclass(frozen=True, slots=True)
 class Window:

@@ -77,7 +77,7 @@ def work_key(
     for view in (*supervision.train, *supervision.score, *supervision.test):
         camera = view.camera
         key.update(camera.viewmat.tobytes() + camera.K.tobytes() + f"{camera.width} {camera.height}".encode())
-        key.update(f"{view.background} {view.undistortion}".encode())
+        key.update(f"{camera.dilation} {view.background} {view.undistortion} {view.sampling}".encode())
         if view.photo is not None:
             with open_file(view.photo) as (file, _):
                 key.update(file.read())

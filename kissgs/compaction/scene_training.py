@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from kissgs.cameras.virtual.scene_bounds import scene_bounds
-from kissgs.compaction.schedule import Phase, lr_schedule
+from kissgs.compaction.schedule import BASE_LR, Phase, lr_schedule
 from kissgs.compaction.scoring import prune_by_score
 from kissgs.core.array_types import Float32, Int
 from kissgs.core.deadline import Deadline, Pace
@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 MIN_RELATIVE_EXTENT = 1e-4
 """Extent of the cameras, in radii of the scene, up to which they count as being at one position: a rotating camera,
 whose extent is 0 except for rounding."""
+
+MOST_STEP_PER_SIZE = 0.05
+"""Largest learning rate of a position, in units of the Gaussian's size: the geometric mean of its three scales."""
 
 MIN_SCORE = {True: 0.05, False: 0.3}
 """Lowest score, in units of the score that an unobstructed camera nearby would find: True with a capture, whose cameras
@@ -154,5 +157,13 @@ class SceneTraining:
         return targets.extent if targets.extent > MIN_RELATIVE_EXTENT * radius else radius
 
     def _position_extents(self, targets: TrainingTargets) -> Float32[np.ndarray, " M"]:
-        """Return the unit of the position learning rate of each Gaussian left, from its position in the source."""
-        return targets.local_extents(self.source.means[self.index], self._camera_extent(targets))
+        """Return the unit of the position learning rate of each Gaussian, from its position and size in the source.
+
+        The rate of 3DGS is a share of the extent of the cameras. In a detailed scene that is much of a Gaussian's size,
+        and positions become noise. So it is at most :data:`MOST_STEP_PER_SIZE` sizes.
+        """
+        largest = self._camera_extent(targets)
+        extents = targets.local_extents(self.source.means[self.index], largest)
+        sizes = np.exp(self.source.scales[self.index].mean(axis=1, dtype=np.float64))
+        limits = MOST_STEP_PER_SIZE * sizes / (BASE_LR["means"] * self.settings.means_lr_scale)
+        return np.clip(limits, MIN_RELATIVE_EXTENT * extents, extents).astype(np.float32)

@@ -329,7 +329,7 @@ class Tuner:
         if (tables := self.container.tables) is not None:
             key.update(tables.opacity_logits.tobytes() + f"{tables.first_drawn} {tables.last_drawn}".encode())
         for camera, image, level in zip(targets.cameras, targets.images, targets.backgrounds, strict=True):
-            key.update(f"{image.shape} {image.dtype}".encode())
+            key.update(f"{image.shape} {image.dtype} {camera.dilation}".encode())
             key.update(camera.viewmat.tobytes() + camera.K.tobytes() + image.tobytes() + level.tobytes())
         for name in ATTRIBUTES:
             key.update(getattr(self.original, name).tobytes())

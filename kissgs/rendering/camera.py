@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from kissgs.core.array_types import Float64
 from kissgs.core.errors import InvalidViewsError
+from kissgs.rendering.constants import DILATION
 
 MAX_SIDE = 1 << 16
 """Largest side of an image, pixels; a square of this size already takes 50 GB."""
@@ -27,6 +28,8 @@ class Camera:
         K: ``(3, 3)`` float64, intrinsics in pixels: fx, fy, cx, cy; no skew.
         width: of the image, pixels, 1 to :data:`MAX_SIDE`.
         height: of the image, pixels, 1 to :data:`MAX_SIDE`.
+        dilation: variance added to both axes of a footprint, pixels²; smaller where pixels are samples of a larger
+            image, see :meth:`sampled`.
 
     Raises:
         InvalidViewsError: a matrix is not finite or not of this kind; a focal length or a side is outside its limits.
@@ -36,6 +39,7 @@ class Camera:
     K: Float64[np.ndarray, "3 3"]
     width: int
     height: int
+    dilation: float = DILATION
 
     def __post_init__(self) -> None:
         for name, side in (("width", self.width), ("height", self.height)):
@@ -67,6 +71,27 @@ class Camera:
         """Return the same view with another number of pixels; the aspect ratio of pixels may change."""
         scale = np.array([[width / self.width], [height / self.height], [1.0]])
         return Camera(self.viewmat, self.K * scale, width, height)
+
+    def sampled(self, stride: int, first: tuple[int, int] = (0, 0)) -> Camera:
+        """Return the camera whose image is every ``stride``-th pixel of every ``stride``-th row of this one's image.
+
+        It renders those pixels, except for Gaussians so far beyond the image that the projection's derivative is
+        clamped. A smaller image of the same view is dilated to its larger pixels instead.
+
+        Args:
+            stride: 1 or more.
+            first: column and row of the first pixel, each below ``stride`` and inside the image.
+        """
+        column, row = first
+        K = self.K / np.array([[stride], [stride], [1.0]])
+        K[:2, 2] = (self.K[:2, 2] - 0.5 - (column, row)) / stride + 0.5
+        width, height = -(-(self.width - column) // stride), -(-(self.height - row) // stride)
+        return Camera(self.viewmat, K, width, height, self.dilation / stride**2)
+
+    def as_sample_of(self, size: int) -> Camera:
+        """Return the camera with pixels that are samples of an image with ``size`` pixels on the longer side."""
+        shrink = max(self.width, self.height) / size
+        return self if shrink >= 1 else replace(self, dilation=self.dilation * shrink**2)
 
     def at_most(self, size: int) -> Camera:
         """Return the same view with at most ``size`` pixels on the longer side."""

@@ -1,10 +1,11 @@
 """The image model: how Gaussians are rendered, with the constants of gsplat's classic mode and the original 3DGS.
 
-A camera (W, t; fx, fy, cx, cy) renders a Gaussian with mean m, rotation R, standard deviations s and opacity o thus:
+A camera (W, t; fx, fy, cx, cy; dilation) renders a Gaussian with mean m, rotation R, standard deviations s and opacity
+o thus:
 
 1. m' = W m + t; it is left out if its depth z' is outside [:data:`NEAR`, :data:`FAR`].
 2. Its footprint has the centre (fx x'/z' + cx, fy y'/z' + cy) and the covariance J W R diag(s²) (J W R)ᵀ +
-   :data:`DILATION` · 1, with J the derivative of that projection at m'. For J alone, x'/z' and y'/z' are clamped to the
+   dilation · 1, with J the derivative of that projection at m'. For J alone, x'/z' and y'/z' are clamped to the
    image widened by :data:`FRUSTUM_MARGIN` of half its size on either side (EWA splatting, Zwicker et al. 2001).
 3. At a pixel centre p, its alpha is o exp(-½ (p - centre)ᵀ covariance⁻¹ (p - centre)), at most :data:`ALPHA_MAX`, and
    0 if that is below :data:`ALPHA_MIN`. The bounding boxes and tiles of renderers leave out only pixels where alpha is
@@ -22,7 +23,7 @@ NEAR = 0.01
 FAR = 1e10
 """Depth of the far plane, world units."""
 DILATION = 0.3
-"""Variance added to both axes of a footprint, pixels², so that none is much narrower than a pixel."""
+"""Usual variance added to both axes of a footprint, pixels², so that none is much narrower than a pixel."""
 FRUSTUM_MARGIN = 0.3
 """Margin around the image within which the projection's derivative is not clamped, in units of half the image."""
 ALPHA_MIN = 1 / 255

@@ -11,6 +11,7 @@ from kissgs.core.errors import InvalidViewsError, UnsupportedError
 from kissgs.core.splats import ATTRIBUTES, Splats
 from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera
+from kissgs.rendering.constants import DILATION
 from kissgs.rendering.cpu.frame import Frame, draw
 from kissgs.rendering.cpu.gradients import Gradients, differentiate
 from kissgs.rendering.tensors import Parameters
@@ -31,6 +32,7 @@ def rasterize(
     height: int,
     *,
     backgrounds: Tensor | None = None,
+    dilation: float = DILATION,
     threads: int = 0,
     receive: Callable[[Gradients], None] | None = None,
 ) -> tuple[Tensor, Tensor]:
@@ -54,6 +56,7 @@ def rasterize(
         width: of the images, pixels.
         height: of the images, pixels.
         backgrounds: ``(C, 3)`` RGB; black by default. No gradient.
+        dilation: variance added to both axes of a footprint, pixels².
         threads: number of CPU threads; 0 means one per processor. The result does not depend on it.
         receive: on the CPU, called in the backward pass with the gradients of each image, in place of autograd: most
             Gaussians have none, and arrays for all of them take longer to fill than to compute.
@@ -76,11 +79,11 @@ def rasterize(
     if device.type == "cuda":
         from kissgs.rendering.gsplat_backend import rasterize_on_cuda
 
-        return rasterize_on_cuda(parameters, viewmats, Ks, width, height, backgrounds)
+        return rasterize_on_cuda(parameters, viewmats, Ks, width, height, backgrounds, dilation)
     if device.type != "cpu":
         raise UnsupportedError(f"the rasteriser runs on cpu and cuda, not on {device.type}; move the parameters")
     poses, pinholes, colours = (tensor.cpu().numpy() for tensor in (viewmats, Ks, backgrounds))
-    cameras = [Camera(pose, K, width, height) for pose, K in zip(poses, pinholes, strict=True)]
+    cameras = [Camera(pose, K, width, height, dilation) for pose, K in zip(poses, pinholes, strict=True)]
     images, alphas = _Rasterize.apply(*tensors, cameras, colours, threads, receive)  # type: ignore[no-untyped-call]
     return images, alphas
 

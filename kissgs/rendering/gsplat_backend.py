@@ -36,6 +36,7 @@ def rasterize_on_cuda(
     width: int,
     height: int,
     backgrounds: Tensor,
+    dilation: float = constants.DILATION,
 ) -> tuple[Tensor, Tensor]:
     """Render as :func:`kissgs.rendering.differentiable.rasterize`, for tensors on CUDA.
 
@@ -66,7 +67,7 @@ def rasterize_on_cuda(
         height=height,
         near_plane=constants.NEAR,
         far_plane=constants.FAR,
-        eps2d=constants.DILATION,
+        eps2d=dilation,
         sh_degree=SH_REST_COUNTS.index(shN.shape[1]),
         tile_size=constants.TILE,
         backgrounds=backgrounds,
@@ -125,6 +126,7 @@ def image_renderer(splats: Splats) -> ImageRenderer:
                 width=camera.width,
                 height=camera.height,
                 backgrounds=torch.tensor([list(background)]),
+                dilation=camera.dilation,
             )
         return images[0].cpu().numpy(), alphas[0].cpu().numpy()
 

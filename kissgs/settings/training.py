@@ -41,7 +41,13 @@ class TrainingViewSettings(BaseModel):
         description="Number of virtual views without a capture, up to four times as many for a scene of several "
         "objects; an eighth of them is held out. Their sides are three fifths of view_size.",
     )
-    view_size: int = Field(640, ge=16, le=8192, description="Largest longer side of the training images, pixels.")
+    view_size: int = Field(
+        640,
+        ge=16,
+        le=8192,
+        description="Longer side of the training images, pixels, at most half as much again: of larger photographs, "
+        "every second, third ... pixel and row is used. Smaller ones stay as they are.",
+    )
     seed: int = Field(
         0,
         ge=0,

@@ -172,6 +172,7 @@ def image_loss(
         width=camera.width,
         height=camera.height,
         backgrounds=torch.from_numpy(targets.backgrounds[n])[None],
+        dilation=camera.dilation,
         threads=threads,
         receive=receive,
     )

@@ -16,6 +16,7 @@ from kissgs.cameras.virtual.scene_views import scene_views
 from kissgs.core.array_types import Float32
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
+from kissgs.rendering.camera import Camera
 from kissgs.settings.training import TrainingViewSettings
 
 SCORING_STRIDE = 4
@@ -100,15 +101,16 @@ def supervision_views(
         if views is None or not views.test:
             return virtual
         return replace(virtual, test=_evaluation_views(views, settings.view_size), background=views.background)
-    train = _resized(views.train, settings.view_size)
-    synthetic, per_epoch = _synthetic_views(splats, train, settings, threads, progress)
+    train = _sampled(views.train, settings.view_size)
+    synthetic, per_epoch = _synthetic_views(splats, views.train, settings, threads, progress)
+    whole = _square_side(views.train[0].camera)
     scoring = math.ceil(SCORING_SHARE * len(train)) if scoring_stride else 0
     source = f"{len(synthetic)} virtual cameras" if synthetic else ""
     if synthetic and scoring:
         source += f", of which {min(scoring, len(synthetic))} score"
     return SupervisionViews(
-        train=(*train, *synthetic),
-        score=(*train, *synthetic[:scoring]),
+        train=(*train, *(_with_camera(view, view.camera.as_sample_of(whole)) for view in synthetic)),
+        score=(*_reduced(views.train, settings.view_size), *synthetic[:scoring]),
         test=_evaluation_views(views, settings.view_size),
         background=views.background,
         source=", and ".join(filter(None, [views.source, source])),
@@ -131,7 +133,7 @@ def _synthetic_views(
     if share == 0:
         return (), 0
     per_epoch = max(1, round(len(train) * share / (1 - share)))
-    side = max(1, min(round(math.sqrt(camera.width * camera.height)), _virtual_side(settings)))
+    side = min(_square_side(camera), _virtual_side(settings))
     count = max(per_epoch, MIN_SYNTHETIC_VIEWS)
     regions = scene_views(splats, width=side, height=side, count=count // 4, threads=threads, progress=progress)
     cameras = [view.camera for view in regions.all]
@@ -142,6 +144,11 @@ def _synthetic_views(
         for n, index in enumerate(order)
     ]
     return tuple(views), min(per_epoch, len(views))
+
+
+def _square_side(camera: Camera) -> int:
+    """Return the side of a square image with the area of the camera's, pixels."""
+    return max(1, round(math.sqrt(camera.width * camera.height)))
 
 
 def _virtual_side(settings: TrainingViewSettings) -> int:
@@ -179,7 +186,7 @@ def _note(views: Views) -> str:
 
 def _evaluation_views(views: Views, size: int) -> tuple[View, ...]:
     """Return the evaluation views of a capture, at most ``size`` pixels on a side: all with photographs, or none."""
-    return _resized(_evenly_selected(_photographed(views.test or views.train)), size)
+    return _sampled(_evenly_selected(_photographed(views.test or views.train)), size)
 
 
 def _photographed(views: Sequence[View]) -> Sequence[View]:
@@ -226,8 +233,30 @@ def _scoring_views(splats: Splats, views: Sequence[View], side: int, seed: int) 
     )
 
 
-def _resized(views: Iterable[View], size: int) -> tuple[View, ...]:
-    return tuple(view.at_most(size) for view in views)
+def _reduced(views: Iterable[View], size: int) -> tuple[View, ...]:
+    """Return cameras with at most ``size`` pixels on the longer side: Gaussians between samples count as well."""
+    return tuple(_with_camera(view, view.camera.at_most(size)) for view in views)
+
+
+def _with_camera(view: View, camera: Camera) -> View:
+    """Return the view with another camera, without the photograph, whose size is that of the former one."""
+    return view if camera is view.camera else replace(view, camera=camera, photo=None)
+
+
+def _sampled(views: Iterable[View], size: int) -> tuple[View, ...]:
+    """Return views of about ``size`` pixels on the longer side, which are samples of the photographs.
+
+    A scene that is trained at a smaller size renders worse at that of the photographs: footprints are dilated to a
+    pixel (docs/method/research-log.md, "Size of the training images").
+    """
+    return tuple(_sample(view, number, size) for number, view in enumerate(views))
+
+
+def _sample(view: View, number: int, size: int) -> View:
+    """Return a sample of a view; those of different numbers begin at different pixels."""
+    width, height = view.camera.width, view.camera.height
+    stride = max(1, round(max(width, height) / size))
+    return view.sampled(stride, (min(number % stride, width - 1), min(number // stride % stride, height - 1)))
 
 
 def _evenly_selected(views: Sequence[View]) -> list[View]:

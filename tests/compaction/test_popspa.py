@@ -1,6 +1,7 @@
 """POPSpa. Oracle: its parts called one by one, the same work without interruption, and renderings of the original."""
 
 import itertools
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -313,6 +314,9 @@ def test_synthetic_views_are_of_two_kinds_in_random_order():
     assert (many.synthetic, many.synthetic_per_epoch) == (120, 120)
     small = supervision_views(scene, capture, settings(view_size=20))
     assert {view.camera.width for view in small.train[40:]} == {12}
+    whole = round(math.sqrt(capture.train[0].camera.width * capture.train[0].camera.height))
+    np.testing.assert_allclose([view.camera.dilation for view in small.train[40:]], 0.3 * (12 / whole) ** 2)
+    assert {view.camera.dilation for view in small.score} == {0.3}
 
 
 @pytest.mark.parametrize("photos", [0, 2, 4])

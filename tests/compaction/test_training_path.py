@@ -11,6 +11,7 @@ import kissgs
 from kissgs import CompactSettings
 from kissgs.cameras.views import black
 from kissgs.compaction.popspa import Popspa
+from kissgs.compaction.scene_training import MOST_STEP_PER_SIZE
 from kissgs.compaction.scoring import prune_by_score
 from kissgs.compaction.training_path import TrainingPath
 from kissgs.core.deadline import Deadline
@@ -44,6 +45,23 @@ def test_points_have_falling_numbers_and_know_their_gaussians():
     assert not same(one.splats, SCENE.select(one.index))  # it was trained
     moved = np.linalg.norm(two.splats.means - SCENE.means[two.index], axis=1)
     assert moved.max() < 0.2
+
+
+def test_the_first_step_of_a_position_is_a_share_of_the_size_of_a_small_gaussian():
+    """Adam's first step has the length of the learning rate in each axis, halved where renderings are the targets."""
+    scales = SCENE.scales.copy()
+    scales[::2] = np.log([0.0005, 0.001, 0.0015])
+    walked = path(sparsify_steps=3)
+    walked.task = replace(walked.task, splats=replace(SCENE, scales=scales))
+    walked.points[0] = replace(walked.points[0], splats=walked.task.splats)
+    point = walked.prune(50)
+    assert walked.train().trained
+    moved = np.abs(walked.points[-1].splats.means - SCENE.means[point.index]).max(axis=1)
+    sizes = np.exp(walked.task.splats.scales[point.index].mean(axis=1))
+    small = point.index % 2 == 0
+    assert (moved[small] <= 0.5 * MOST_STEP_PER_SIZE * sizes[small] + 1e-6).all()
+    assert moved[small].max() > 0.4 * MOST_STEP_PER_SIZE * sizes[small].min()
+    assert moved[~small].max() > 2 * moved[small].max()
 
 
 @pytest.mark.parametrize("deadline", [None, Deadline.after(1e6)])

@@ -20,7 +20,6 @@ from kissgs.rendering import constants
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu import blending, sensitivity
 from kissgs.rendering.cpu.lists import (
-    PROJECTION_CONSTANTS,
     Footprints,
     Slots,
     TileLists,
@@ -29,6 +28,7 @@ from kissgs.rendering.cpu.lists import (
     even_tiles,
     find_footprints,
     number_slots,
+    projection_constants,
     sort_into_tiles,
 )
 
@@ -221,7 +221,7 @@ def add_sensitivities(
                 camera.K,
                 camera.width,
                 camera.height,
-                PROJECTION_CONSTANTS,
+                projection_constants(camera),
                 weight,
                 into.position_hessian,
                 into.shape_hessian,

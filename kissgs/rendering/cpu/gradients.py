@@ -15,7 +15,7 @@ from kissgs.core.splats import SH_C0
 from kissgs.core.threads import Workers
 from kissgs.rendering.cpu import blending_backward, projection_backward, shading
 from kissgs.rendering.cpu.frame import LIMITS, Frame
-from kissgs.rendering.cpu.lists import PROJECTION_CONSTANTS, Slots, each_part, even, even_tiles, number_slots
+from kissgs.rendering.cpu.lists import Slots, each_part, even, even_tiles, number_slots, projection_constants
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +98,7 @@ def differentiate(
             camera.K,
             camera.width,
             camera.height,
-            PROJECTION_CONSTANTS,
+            projection_constants(camera),
             found.gaussians,
             found.means,
             found.quats,

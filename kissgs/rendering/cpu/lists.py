@@ -12,18 +12,13 @@ from typing import TypeVar
 
 import numpy as np
 
-from kissgs.core.array_types import Float32, Int32, Int64, UInt16, UInt32
+from kissgs.core.array_types import Float32, Float64, Int32, Int64, UInt16, UInt32
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.splats import Splats
 from kissgs.core.threads import Workers
 from kissgs.rendering import constants
 from kissgs.rendering.camera import Camera
 from kissgs.rendering.cpu import projection, shading, tiles
-
-PROJECTION_CONSTANTS = np.array(
-    [constants.NEAR, constants.FAR, constants.DILATION, constants.FRUSTUM_MARGIN, constants.ALPHA_MIN], np.float64
-)
-"""Constants of projection, as kernels take them."""
 
 R = TypeVar("R")
 
@@ -95,6 +90,12 @@ class Slots:
     first: Int32[np.ndarray, " N_1"]
 
 
+def projection_constants(camera: Camera) -> Float64[np.ndarray, "5"]:
+    """Return the constants of projection, as kernels take them."""
+    margin, alpha_min = constants.FRUSTUM_MARGIN, constants.ALPHA_MIN
+    return np.array([constants.NEAR, constants.FAR, camera.dilation, margin, alpha_min], np.float64)
+
+
 def find_footprints(splats: Splats, camera: Camera, pool: Workers) -> Footprints:
     """Project and shade all Gaussians; return those that touch the image."""
     count = len(splats)
@@ -113,7 +114,7 @@ def find_footprints(splats: Splats, camera: Camera, pool: Workers) -> Footprints
             camera.K,
             camera.width,
             camera.height,
-            PROJECTION_CONSTANTS,
+            projection_constants(camera),
             visible,
             depths,
             records,

@@ -174,7 +174,7 @@ def project(
         K: ``(3, 3)`` intrinsics.
         width: of the image, pixels.
         height: of the image, pixels.
-        constants: NEAR, FAR, DILATION, FRUSTUM_MARGIN, ALPHA_MIN.
+        constants: NEAR, FAR, the camera's dilation, FRUSTUM_MARGIN, ALPHA_MIN.
         visible: out, from row ``first``, ``(N,)``: the Gaussian of each footprint.
         depths: out, from row ``first``, ``(N,)``: z in the camera.
         records: out, from row ``first``, ``(N, 11)``: centre x, y; l0, l1, l2 of :mod:`kissgs.rendering.cpu.blending`;
