@@ -120,6 +120,7 @@ def _one_view(splats: Splats, model: GaussianModel, camera: Camera, threads: int
             Ks=Ks,
             width=camera.width,
             height=camera.height,
+            dilation=camera.dilation,
             threads=threads,
             receive=received.append,
         )

@@ -122,17 +122,20 @@ def full_window(lens: Lens) -> Window:
     return window
 
 
-def undistort(photo: UInt8[np.ndarray, "H W 3"], lens: Lens, window: Window) -> UInt8[np.ndarray, "h w 3"]:
+def undistort(
+    photo: UInt8[np.ndarray, "H W 3"], lens: Lens, window: Window, stride: int = 1, first: tuple[int, int] = (0, 0)
+) -> UInt8[np.ndarray, "h w 3"]:
     """Return the image that a pinhole with the focal lengths and principal point of ``lens`` would take of ``window``.
 
     Each pixel's ray is projected through the lens, and the photograph is sampled there, bicubically (Catmull-Rom).
+    Of that image, every ``stride``-th pixel of every ``stride``-th row is returned, from column and row ``first``.
     """
     planes = np.ascontiguousarray(photo.transpose(2, 0, 1))
-    result = np.empty((window.height, window.width, 3), dtype=np.uint8)
-    x = (window.left + np.arange(window.width) + 0.5 - lens.cx) / lens.fx
-    y = (window.top + np.arange(window.height) + 0.5 - lens.cy) / lens.fy
-    step = max(1, _BLOCK_PIXELS // window.width)
-    for start in range(0, window.height, step):
+    x = (window.left + np.arange(first[0], window.width, stride) + 0.5 - lens.cx) / lens.fx
+    y = (window.top + np.arange(first[1], window.height, stride) + 0.5 - lens.cy) / lens.fy
+    result = np.empty((len(y), len(x), 3), dtype=np.uint8)
+    step = max(1, _BLOCK_PIXELS // len(x))
+    for start in range(0, len(y), step):
         u, v = _project(lens, *np.meshgrid(x, y[start : start + step]))
         result[start : start + step] = _sample(planes, u - 0.5, v - 0.5)
     return result

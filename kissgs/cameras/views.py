@@ -30,12 +30,12 @@ class UndistortionSpec:
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """The pixels of a photograph that a view has.
+    """The pixels of a view's whole image that it has.
 
     Attributes:
-        width: of the whole photograph, pixels.
-        height: of the whole photograph, pixels.
-        stride: every so many-th pixel of every so many-th row.
+        width: of the whole image, the photograph after undistortion, pixels.
+        height: of the whole image, pixels.
+        stride: distance of neighbouring ones, in columns and in rows, pixels.
         first: column and row of the first of them.
     """
 
@@ -51,14 +51,14 @@ class View:
 
     Attributes:
         name: name of the view.
-        camera: pinhole camera at the resolution to render, that of the photograph after undistortion and reduction.
+        camera: pinhole camera at the resolution to render, that of the photograph after undistortion and sampling.
         photo: file of the photograph; None if there is only a camera.
         background: ``(3,)`` float32 RGB, 0 to 1, behind transparent pixels of the photograph and behind renderings in
             comparisons; None: black for the photograph, that of ``Views`` for renderings.
         undistortion: how to undistort the photograph; None if its lens does not distort.
         target: ``(3,)`` float64 point, world units, that the camera looks at in the centre of its image; None if
             unknown.
-        sampling: the pixels of the photograph that the view has; None for all.
+        sampling: the pixels of the whole image that the view has; None for all.
         added: whether an evaluation added it for an overlooked part of the scene.
     """
 
@@ -73,11 +73,14 @@ class View:
 
     def sampled(self, stride: int, first: tuple[int, int]) -> View:
         """Return the view of every ``stride``-th pixel of every ``stride``-th row, from column and row ``first``."""
-        if stride == 1:
-            return self
-        camera = self.camera
-        sampling = Sampling(camera.width, camera.height, stride, first)
-        return replace(self, camera=camera.sampled(stride, first), sampling=sampling)
+        before = self._sampling
+        column, row = (start + before.stride * more for start, more in zip(before.first, first, strict=True))
+        sampling = replace(before, stride=before.stride * stride, first=(column, row))
+        return replace(self, camera=self.camera.sampled(stride, first), sampling=sampling)
+
+    @property
+    def _sampling(self) -> Sampling:
+        return self.sampling or Sampling(self.camera.width, self.camera.height, 1, (0, 0))
 
     def load_photo(self) -> UInt8[np.ndarray, "H W 3"]:
         """Read the photograph from its file and return it at the camera's size, uint8 ``(height, width, 3)``.
@@ -90,18 +93,16 @@ class View:
             raise InvalidViewsError(
                 f"view {self.name} has no photograph, only a camera; add the photographs of the capture"
             )
-        if self.sampling is None:
-            return self._load(self.photo, self.camera.width, self.camera.height)
-        sampling = self.sampling
-        whole, (column, row) = self._load(self.photo, sampling.width, sampling.height), sampling.first
-        return np.ascontiguousarray(whole[row :: sampling.stride, column :: sampling.stride])
-
-    def _load(self, photo: Path, width: int, height: int) -> UInt8[np.ndarray, "H W 3"]:
         background = black() if self.background is None else self.background
+        sampling = self._sampling
+        stride, (column, row) = sampling.stride, sampling.first
         if self.undistortion is None:
-            return read_photo(photo, width, height, background)
-        lens = self.undistortion.lens
-        return undistort(read_photo(photo, lens.width, lens.height, background), lens, self.undistortion.window)
+            whole = read_photo(self.photo, sampling.width, sampling.height, background)
+            return np.ascontiguousarray(whole[row::stride, column::stride])
+        lens, window = self.undistortion.lens, self.undistortion.window
+        return undistort(
+            read_photo(self.photo, lens.width, lens.height, background), lens, window, stride, (column, row)
+        )
 
 
 TargetSource = Literal["photos", "cameras", "scene"]

@@ -178,7 +178,7 @@ class Compactor:
         if settings.trains and device == "cuda":
             need_cuda()
         if settings.method == "merge":
-            supervision = evaluation_only(views, settings.view_size)
+            supervision = evaluation_only(views)
         else:
             stride = SCORING_STRIDE if settings.trains else 1
             supervision = supervision_views(

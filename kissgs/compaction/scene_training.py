@@ -29,8 +29,8 @@ MIN_RELATIVE_EXTENT = 1e-4
 """Extent of the cameras, in radii of the scene, up to which they count as being at one position: a rotating camera,
 whose extent is 0 except for rounding."""
 
-MOST_STEP_PER_SIZE = 0.05
-"""Largest learning rate of a position, in units of the Gaussian's size: the geometric mean of its three scales."""
+MOST_STEP_PER_SIZE = 0.025
+"""Largest learning rate of a position, in units of the Gaussian's size: the middle one of its three scales."""
 
 MIN_SCORE = {True: 0.05, False: 0.3}
 """Lowest score, in units of the score that an unobstructed camera nearby would find: True with a capture, whose cameras
@@ -160,10 +160,10 @@ class SceneTraining:
         """Return the unit of the position learning rate of each Gaussian, from its position and size in the source.
 
         The rate of 3DGS is a share of the extent of the cameras. In a detailed scene that is much of a Gaussian's size,
-        and positions become noise. So it is at most :data:`MOST_STEP_PER_SIZE` sizes.
+        and positions become noise. So no rate of these settings is more than :data:`MOST_STEP_PER_SIZE` sizes.
         """
-        largest = self._camera_extent(targets)
-        extents = targets.local_extents(self.source.means[self.index], largest)
-        sizes = np.exp(self.source.scales[self.index].mean(axis=1, dtype=np.float64))
-        limits = MOST_STEP_PER_SIZE * sizes / (BASE_LR["means"] * self.settings.means_lr_scale)
-        return np.clip(limits, MIN_RELATIVE_EXTENT * extents, extents).astype(np.float32)
+        settings = self.settings
+        extents = targets.local_extents(self.source.means[self.index], self._camera_extent(targets))
+        sizes = np.exp(np.median(self.source.scales[self.index].astype(np.float64), axis=1))
+        most = BASE_LR["means"] * max(settings.means_lr_scale, settings.final_means_lr_scale)
+        return np.minimum(MOST_STEP_PER_SIZE / most * sizes, extents).astype(np.float32)

@@ -396,7 +396,8 @@ def _sensitivity(
         f"{cameras.weights} {cameras.spread} {cameras.captured}".encode()
     )
     for camera in cameras.cameras:
-        key.update(camera.viewmat.tobytes() + camera.K.tobytes() + f"{camera.width} {camera.height} ".encode())
+        key.update(camera.viewmat.tobytes() + camera.K.tobytes())
+        key.update(f"{camera.width} {camera.height} {camera.dilation} ".encode())
     for values in (cameras.background, *(getattr(splats, name) for name in ATTRIBUTES)):
         key.update(values.tobytes())
     sensitivity = read_sensitivity(cache, key.hexdigest())
@@ -430,6 +431,9 @@ def _refit_cameras(cameras: WeightedCameras) -> WeightedCameras:
     virtual = chosen >= cameras.captured
     return replace(
         cameras,
-        cameras=[cameras.cameras[n].at_most(REFIT_SIZE) for n in chosen],
+        cameras=[
+            cameras.cameras[n].at_most(REFIT_SIZE) if other else cameras.cameras[n].sampled_at_most(REFIT_SIZE)
+            for n, other in zip(chosen, virtual, strict=True)
+        ],
         weights=[cameras.weights[n] * (2.0 if other else 1.0) for n, other in zip(chosen, virtual, strict=True)],
     )

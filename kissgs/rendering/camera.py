@@ -28,11 +28,12 @@ class Camera:
         K: ``(3, 3)`` float64, intrinsics in pixels: fx, fy, cx, cy; no skew.
         width: of the image, pixels, 1 to :data:`MAX_SIDE`.
         height: of the image, pixels, 1 to :data:`MAX_SIDE`.
-        dilation: variance added to both axes of a footprint, pixels²; smaller where pixels are samples of a larger
-            image, see :meth:`sampled`.
+        dilation: variance added to both axes of a footprint, pixels², above 0; smaller where pixels are samples of a
+            larger image, see :meth:`sampled`.
 
     Raises:
-        InvalidViewsError: a matrix is not finite or not of this kind; a focal length or a side is outside its limits.
+        InvalidViewsError: a matrix is not finite or not of this kind; a focal length, a side or the dilation is outside
+            its limits.
     """
 
     viewmat: Float64[np.ndarray, "4 4"]
@@ -59,6 +60,8 @@ class Camera:
             raise InvalidViewsError("a camera's viewmat must end in the row 0 0 0 1")
         if not (0 < K[0, 0] <= MAX_FOCAL and 0 < K[1, 1] <= MAX_FOCAL):
             raise InvalidViewsError(f"a camera's focal lengths must be positive, and at most {MAX_FOCAL:.0e} pixels")
+        if not 0 < self.dilation < np.inf:
+            raise InvalidViewsError("a camera's dilation must be positive and finite")
         if K[0, 1] or K[1, 0] or np.abs(K[2] - (0, 0, 1)).max() > 1e-6:
             raise InvalidViewsError("a camera's K must be fx 0 cx, 0 fy cy, 0 0 1: a pinhole without skew")
 
@@ -68,9 +71,19 @@ class Camera:
         return np.asarray(-self.viewmat[:3, :3].T @ self.viewmat[:3, 3])
 
     def resized(self, width: int, height: int) -> Camera:
-        """Return the same view with another number of pixels; the aspect ratio of pixels may change."""
+        """Return the same view with another number of pixels; the aspect ratio of pixels may change.
+
+        Footprints are dilated to the new pixels, also where those of this camera are samples.
+        """
         scale = np.array([[width / self.width], [height / self.height], [1.0]])
         return Camera(self.viewmat, self.K * scale, width, height)
+
+    def at_most(self, size: int) -> Camera:
+        """Return the same view, resized to at most ``size`` pixels on the longer side."""
+        shrink = size / max(self.width, self.height)
+        if shrink >= 1:
+            return self
+        return self.resized(max(1, round(self.width * shrink)), max(1, round(self.height * shrink)))
 
     def sampled(self, stride: int, first: tuple[int, int] = (0, 0)) -> Camera:
         """Return the camera whose image is every ``stride``-th pixel of every ``stride``-th row of this one's image.
@@ -80,7 +93,7 @@ class Camera:
 
         Args:
             stride: 1 or more.
-            first: column and row of the first pixel, each below ``stride`` and inside the image.
+            first: column and row of the first pixel, inside the image.
         """
         column, row = first
         K = self.K / np.array([[stride], [stride], [1.0]])
@@ -88,17 +101,14 @@ class Camera:
         width, height = -(-(self.width - column) // stride), -(-(self.height - row) // stride)
         return Camera(self.viewmat, K, width, height, self.dilation / stride**2)
 
-    def as_sample_of(self, size: int) -> Camera:
-        """Return the camera with pixels that are samples of an image with ``size`` pixels on the longer side."""
-        shrink = max(self.width, self.height) / size
-        return self if shrink >= 1 else replace(self, dilation=self.dilation * shrink**2)
+    def sampled_at_most(self, size: int) -> Camera:
+        """Return the same view with at most ``size`` pixels on the longer side, which are samples of this one's image.
 
-    def at_most(self, size: int) -> Camera:
-        """Return the same view with at most ``size`` pixels on the longer side."""
-        shrink = size / max(self.width, self.height)
-        if shrink >= 1:
-            return self
-        return self.resized(max(1, round(self.width * shrink)), max(1, round(self.height * shrink)))
+        In contrast to :meth:`sampled`, they need not be at the centres of pixels.
+        """
+        small = self.at_most(size)
+        shrink = max(small.width, small.height) / max(self.width, self.height)
+        return self if small is self else replace(small, dilation=self.dilation * shrink**2)
 
 
 def look_at(

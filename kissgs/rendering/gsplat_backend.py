@@ -36,7 +36,7 @@ def rasterize_on_cuda(
     width: int,
     height: int,
     backgrounds: Tensor,
-    dilation: float = constants.DILATION,
+    dilation: float,
 ) -> tuple[Tensor, Tensor]:
     """Render as :func:`kissgs.rendering.differentiable.rasterize`, for tensors on CUDA.
 

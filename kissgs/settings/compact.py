@@ -91,7 +91,10 @@ class CompactSettings(TrainingViewSettings):
         description="Weight of each Gaussian's smallest scale in the loss, in units of the extent of the cameras.",
     )
     means_lr_scale: float = Field(
-        1.0, gt=0, le=100, description="Learning rate of positions, in units of the initial one of 3DGS."
+        1.0,
+        gt=0,
+        le=100,
+        description="Learning rate of positions, in units of the initial one of 3DGS; lower for small Gaussians.",
     )
     final_means_lr_scale: float = Field(
         0.01,

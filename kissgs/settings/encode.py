@@ -124,7 +124,10 @@ class EncodeSettings(BaseModel):
         "150,000 Gaussians, fewer for more, such as 30 for a million.",
     )
     sensitivity_view_size: int = Field(
-        480, ge=16, le=4096, description="Largest longer side of these renderings, pixels."
+        480,
+        ge=16,
+        le=4096,
+        description="Largest longer side of these renderings, pixels; of larger images of a capture, so many samples.",
     )
     view_uncertainty: float | None = Field(
         None,

@@ -45,8 +45,8 @@ class TrainingViewSettings(BaseModel):
         640,
         ge=16,
         le=8192,
-        description="Longer side of the training images, pixels, at most half as much again: of larger photographs, "
-        "every second, third ... pixel and row is used. Smaller ones stay as they are.",
+        description="Longer side of the training images, pixels. Photographs with up to 1.5 times that are used "
+        "whole; of larger ones every n-th pixel and row, so that the side is 0.75 to 1.5 times that.",
     )
     seed: int = Field(
         0,

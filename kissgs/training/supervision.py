@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,6 @@ from kissgs.cameras.virtual.scene_views import scene_views
 from kissgs.core.array_types import Float32
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
-from kissgs.rendering.camera import Camera
 from kissgs.settings.training import TrainingViewSettings
 
 SCORING_STRIDE = 4
@@ -34,19 +33,24 @@ MIN_SYNTHETIC_VIEWS = 64
 SCORING_SHARE = 0.25
 """Number of these that score Gaussians, as a share of the number of the capture's training views."""
 
+MAX_SIDE = 1.5
+"""Largest longer side of the training images of a capture, in units of the setting ``view_size``."""
+
 MAX_EVAL_VIEWS = 16
 """Largest number of evaluation views."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SupervisionViews:
-    """Views by their role, all at the training resolution.
+    """Views by their role.
 
     Attributes:
-        train: training views; none if nothing is trained.
+        train: training views, samples of larger photographs; none if nothing is trained.
         score: views that score Gaussians: the training views of a capture and some synthetic ones, or some virtual
-            cameras and close-ups, each with a background of its own.
-        test: evaluation views: held-out views, or some training views if there are none. All have photographs or none.
+            cameras and close-ups, each with a background of its own. Virtual ones have the usual dilation, so
+            that Gaussians between the sampled pixels of photographs count too.
+        test: evaluation views: held-out views, or some training views if there are none, whole. All have photographs or
+            none.
         background: ``(3,)`` RGB from 0 to 1.
         source: description of the training views.
         captured: whether the training views are those of a capture.
@@ -90,7 +94,7 @@ def supervision_views(
     Args:
         splats: the scene, finite.
         views: views of a capture. Without training views, virtual ones train and the test views evaluate.
-        settings: number of virtual views, and largest image size; smaller images stay as they are.
+        settings: number of virtual views, and image size; smaller images stay as they are.
         scoring_stride: every so many-th virtual view scores. 1: no view trains, so that :data:`SCORING_STRIDE` times
             fewer are drawn; 0: none scores.
         threads: number of threads; 0 means one per processor.
@@ -100,18 +104,18 @@ def supervision_views(
         virtual = _virtual_views(splats, settings, scoring_stride, threads, progress)
         if views is None or not views.test:
             return virtual
-        return replace(virtual, test=_evaluation_views(views, settings.view_size), background=views.background)
-    train = _sampled(views.train, settings.view_size)
+        return replace(virtual, test=_evaluation_views(views), background=views.background)
+    train = tuple(_thinned(view, number, settings.view_size) for number, view in enumerate(views.train))
     synthetic, per_epoch = _synthetic_views(splats, views.train, settings, threads, progress)
-    whole = _square_side(views.train[0].camera)
+    side = _virtual_side(settings)
     scoring = math.ceil(SCORING_SHARE * len(train)) if scoring_stride else 0
     source = f"{len(synthetic)} virtual cameras" if synthetic else ""
     if synthetic and scoring:
         source += f", of which {min(scoring, len(synthetic))} score"
     return SupervisionViews(
-        train=(*train, *(_with_camera(view, view.camera.as_sample_of(whole)) for view in synthetic)),
-        score=(*_reduced(views.train, settings.view_size), *synthetic[:scoring]),
-        test=_evaluation_views(views, settings.view_size),
+        train=(*train, *(replace(view, camera=view.camera.sampled_at_most(side)) for view in synthetic)),
+        score=(*train, *(replace(view, camera=view.camera.at_most(side)) for view in synthetic[:scoring])),
+        test=_evaluation_views(views),
         background=views.background,
         source=", and ".join(filter(None, [views.source, source])),
         captured=True,
@@ -126,14 +130,13 @@ def _synthetic_views(
 ) -> tuple[tuple[View, ...], int]:
     """Return virtual views of all that a capture may not show, in random order, and their number in each epoch.
 
-    A quarter of them together see all regions. Images have the area of the photographs, and at most the side of virtual
-    views without a capture.
+    A quarter of them together see all regions. Images are square and have the area of the photographs.
     """
     share, camera = settings.synthetic_view_share, train[0].camera
     if share == 0:
         return (), 0
     per_epoch = max(1, round(len(train) * share / (1 - share)))
-    side = min(_square_side(camera), _virtual_side(settings))
+    side = max(1, round(math.sqrt(camera.width * camera.height)))
     count = max(per_epoch, MIN_SYNTHETIC_VIEWS)
     regions = scene_views(splats, width=side, height=side, count=count // 4, threads=threads, progress=progress)
     cameras = [view.camera for view in regions.all]
@@ -146,11 +149,6 @@ def _synthetic_views(
     return tuple(views), min(per_epoch, len(views))
 
 
-def _square_side(camera: Camera) -> int:
-    """Return the side of a square image with the area of the camera's, pixels."""
-    return max(1, round(math.sqrt(camera.width * camera.height)))
-
-
 def _virtual_side(settings: TrainingViewSettings) -> int:
     """Return the largest side of the images of virtual cameras, pixels."""
     return settings.view_size * 3 // 5
@@ -160,8 +158,8 @@ def _grey(level: float) -> Float32[np.ndarray, "3"]:
     return np.full(3, level, np.float32)
 
 
-def evaluation_only(views: Views | None, size: int) -> SupervisionViews:
-    """Return the evaluation views of a capture, at most ``size`` pixels on a side, none of which trains or scores.
+def evaluation_only(views: Views | None) -> SupervisionViews:
+    """Return the evaluation views of a capture, none of which trains or scores.
 
     Without a capture there are none at all.
     """
@@ -170,7 +168,7 @@ def evaluation_only(views: Views | None, size: int) -> SupervisionViews:
     return SupervisionViews(
         train=(),
         score=(),
-        test=_evaluation_views(views, size),
+        test=_evaluation_views(views),
         background=views.background,
         source=views.source,
         captured=True,
@@ -184,9 +182,9 @@ def _note(views: Views) -> str:
     return "; ".join(filter(None, [views.note, note]))
 
 
-def _evaluation_views(views: Views, size: int) -> tuple[View, ...]:
-    """Return the evaluation views of a capture, at most ``size`` pixels on a side: all with photographs, or none."""
-    return _sampled(_evenly_selected(_photographed(views.test or views.train)), size)
+def _evaluation_views(views: Views) -> tuple[View, ...]:
+    """Return the evaluation views of a capture: all with photographs, or none."""
+    return tuple(_evenly_selected(_photographed(views.test or views.train)))
 
 
 def _photographed(views: Sequence[View]) -> Sequence[View]:
@@ -233,29 +231,17 @@ def _scoring_views(splats: Splats, views: Sequence[View], side: int, seed: int) 
     )
 
 
-def _reduced(views: Iterable[View], size: int) -> tuple[View, ...]:
-    """Return cameras with at most ``size`` pixels on the longer side: Gaussians between samples count as well."""
-    return tuple(_with_camera(view, view.camera.at_most(size)) for view in views)
+def _thinned(view: View, number: int, size: int) -> View:
+    """Return every n-th pixel and row of a view, so that the longer side has at most 1.5 times ``size`` pixels.
 
-
-def _with_camera(view: View, camera: Camera) -> View:
-    """Return the view with another camera, without the photograph, whose size is that of the former one."""
-    return view if camera is view.camera else replace(view, camera=camera, photo=None)
-
-
-def _sampled(views: Iterable[View], size: int) -> tuple[View, ...]:
-    """Return views of about ``size`` pixels on the longer side, which are samples of the photographs.
-
-    A scene that is trained at a smaller size renders worse at that of the photographs: footprints are dilated to a
-    pixel (docs/method/research-log.md, "Size of the training images").
+    Views of different numbers begin at different pixels. A scene that is trained on reduced photographs renders worse
+    at their own size, because footprints are dilated to a pixel (docs/method/research-log.md, "Size of the training
+    images").
     """
-    return tuple(_sample(view, number, size) for number, view in enumerate(views))
-
-
-def _sample(view: View, number: int, size: int) -> View:
-    """Return a sample of a view; those of different numbers begin at different pixels."""
     width, height = view.camera.width, view.camera.height
-    stride = max(1, round(max(width, height) / size))
+    stride = math.ceil(max(width, height) / (MAX_SIDE * size))
+    if stride == 1:
+        return view
     return view.sampled(stride, (min(number % stride, width - 1), min(number // stride % stride, height - 1)))
 
 

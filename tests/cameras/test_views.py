@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers.training_scenes import cloud
 from PIL import Image
+from scipy.ndimage import map_coordinates
 
 import kissgs
 from kissgs.rendering.camera import look_at
@@ -67,10 +68,37 @@ def test_gradients_of_samples_are_those_of_their_pixels():
         assert error <= 1e-3 * np.abs(expected).max(initial=0), name
 
 
-def test_pixels_that_are_samples_have_less_dilation():
-    camera = look_at(np.array([0, 0, -4.0]), np.zeros(3), np.array([0, -1.0, 0]), fov=0.9, width=60, height=40)
-    assert camera.as_sample_of(120).dilation == pytest.approx(camera.dilation / 4)
-    assert camera.as_sample_of(60) is camera.as_sample_of(10) is camera
+@pytest.mark.parametrize("distortion", [{}, {"k1": -0.1, "k2": 0.01}])
+def test_samples_can_be_sampled(tmp_path, distortion):
+    write(tmp_path, distortion)
+    (whole,) = kissgs.load_views(tmp_path).all
+    some = whole.sampled(2, (1, 0)).sampled(3, (0, 2))
+    np.testing.assert_array_equal(some.load_photo(), whole.load_photo()[4::6, 1::6])
+    assert some.load_photo().shape[:2] == (some.camera.height, some.camera.width)
+
+
+def test_a_camera_sampled_to_a_size_renders_the_whole_image_between_its_pixels():
+    """Oracle: the whole image, interpolated; it is smooth, while its Gaussians are narrower than the sampled pixels."""
+    scene = cloud(40)
+    scene = replace(scene, scales=scene.scales - 1)
+    camera = look_at(np.array([0, -1.0, -4]), np.zeros(3), np.array([0, -1.0, 0]), fov=0.9, width=400, height=300)
+    small = camera.sampled_at_most(150)
+    assert (small.width, small.height) == (150, 113)
+    image, whole = kissgs.render(scene, small)[0], kissgs.render(scene, camera)[0]
+    y, x = np.meshgrid(
+        (np.arange(113) + 0.5) * 300 / 113 - 0.5, (np.arange(150) + 0.5) * 400 / 150 - 0.5, indexing="ij"
+    )
+    expected = np.stack([map_coordinates(whole[..., c], [y, x], order=3, mode="nearest") for c in range(3)], axis=-1)
+    assert (
+        np.abs(image - expected).mean() < 0.1 * np.abs(kissgs.render(scene, camera.at_most(150))[0] - expected).mean()
+    )
+    assert camera.sampled_at_most(400) is camera
+
+
+@pytest.mark.parametrize("dilation", [0.0, -0.3, np.nan, np.inf])
+def test_dilations_that_are_no_variances_are_refused(dilation):
+    with pytest.raises(kissgs.InvalidViewsError, match="dilation must be positive and finite"):
+        kissgs.Camera(np.eye(4), np.eye(3), 4, 3, dilation)
 
 
 def test_resized_cameras_scale_their_intrinsics():

@@ -1,7 +1,6 @@
 """POPSpa. Oracle: its parts called one by one, the same work without interruption, and renderings of the original."""
 
 import itertools
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -23,6 +22,7 @@ from kissgs.rendering.coverage import Coverage
 from kissgs.rendering.rasterizer import render
 from kissgs.training.checkpoint import Checkpoint
 from kissgs.training.supervision import SupervisionViews, supervision_views
+from kissgs.training.targets import training_targets
 
 SHORT = {"sparsify_steps": 8, "refine_steps": 6, "prune_rounds": 2, "min_keep_per_scoring": 0.6, "admm_interval": 3}
 NO_TRAINING = {"sparsify_steps": 0, "refine_steps": 0}
@@ -235,7 +235,7 @@ def test_renderings_of_the_reference_are_the_targets_of_a_pruned_scene():
     assert error(with_reference, scene, supervision.train) < 0.7 * error(without, scene, supervision.train)
 
 
-@pytest.mark.parametrize("other", ["scene", "count", "settings", "views"])
+@pytest.mark.parametrize("other", ["scene", "count", "settings", "views", "dilation"])
 def test_a_checkpoint_of_other_work_is_rejected(tmp_path, monkeypatch, other):
     monkeypatch.setattr(Checkpoint, "due", True)
     path = tmp_path / "c.npz"
@@ -243,7 +243,9 @@ def test_a_checkpoint_of_other_work_is_rejected(tmp_path, monkeypatch, other):
     with pytest.raises(Interrupted):
         replace(task, progress=stopping_after(3))(20, checkpoint=path)
     four_views = SupervisionViews(around(4), around(4), around(3), black(), "four views")
+    sampled = tuple(replace(view, camera=replace(view.camera, dilation=0.1)) for view in task.supervision.train)
     others = {
+        "dilation": (replace(task, supervision=replace(task.supervision, train=sampled)), 20),
         "scene": (replace(task, splats=cloud(80, seed=5)), 20),
         "count": (task, 21),
         "settings": (replace(task, settings=settings(admm_rho=1e-3)), 20),
@@ -314,9 +316,38 @@ def test_synthetic_views_are_of_two_kinds_in_random_order():
     assert (many.synthetic, many.synthetic_per_epoch) == (120, 120)
     small = supervision_views(scene, capture, settings(view_size=20))
     assert {view.camera.width for view in small.train[40:]} == {12}
-    whole = round(math.sqrt(capture.train[0].camera.width * capture.train[0].camera.height))
+    whole = found.train[-1].camera.width
     np.testing.assert_allclose([view.camera.dilation for view in small.train[40:]], 0.3 * (12 / whole) ** 2)
-    assert {view.camera.dilation for view in small.score} == {0.3}
+    assert {(view.camera.width, view.camera.dilation) for view in small.score[40:]} == {(12, 0.3)}
+
+
+@pytest.mark.parametrize(("size", "stride"), [((40, 30), 1), ((60, 2), 1), ((61, 50), 2), ((1, 130), 3)])
+def test_training_views_are_samples_of_larger_photographs(tmp_path, size, stride):
+    """Oracle: the photographs' pixels; consecutive views begin at different ones."""
+    rng, views = np.random.default_rng(0), []
+    for n in range(10):
+        pixels = rng.integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(tmp_path / f"{n}.png")
+        camera = look_at(
+            np.array([0, 0, -3.0]), np.zeros(3), np.array([0, -1.0, 0]), fov=0.8, width=size[0], height=size[1]
+        )
+        views.append(View(f"{n}", camera, tmp_path / f"{n}.png"))
+    found = supervision_views(cloud(60), Views(tuple(views[1:]), tuple(views[:1]), black(), ""), settings(view_size=40))
+    assert found.test == (views[0],), "evaluation takes the whole photograph"
+    targets, starts = training_targets(cloud(60), found), set()
+    for n in range(9):
+        whole, camera = views[n + 1].load_photo(), targets.cameras[n]
+        assert targets.images[n].shape == (camera.height, camera.width, 3)
+        assert max(camera.width, camera.height) <= 60
+        (start,) = {
+            (c, r)
+            for c in range(min(stride, size[0]))
+            for r in range(min(stride, size[1]))
+            if np.array_equal(whole[r::stride, c::stride], targets.images[n])
+        }
+        starts.add(start)
+        np.testing.assert_allclose(camera.K, views[n + 1].camera.sampled(stride, start).K)
+    assert len(starts) == min(stride, size[0]) * min(stride, size[1])
 
 
 @pytest.mark.parametrize("photos", [0, 2, 4])

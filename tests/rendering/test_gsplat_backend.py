@@ -16,11 +16,11 @@ from kissgs.rendering.differentiable import rasterize
 from kissgs.rendering.gsplat_backend import rasterize_on_cuda
 from kissgs.rendering.tensors import tensors_of
 
-CLASSIC = {"near_plane": 0.01, "far_plane": 1e10, "eps2d": 0.3, "tile_size": 16, "rasterize_mode": "classic"}
+CLASSIC = {"near_plane": 0.01, "far_plane": 1e10, "tile_size": 16, "rasterize_mode": "classic"}
 
 
 def fake_rasterization(
-    means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree, backgrounds, **rest
+    means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree, backgrounds, eps2d, **rest
 ):
     """Render like gsplat.rasterization: scales and opacities are activated, colours are all SH coefficients."""
     assert rest == CLASSIC
@@ -39,6 +39,7 @@ def fake_rasterization(
         width,
         height,
         backgrounds=backgrounds,
+        dilation=eps2d,
     )
     return images, alphas[..., None], {}
 
@@ -50,7 +51,7 @@ def gsplat(monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", module)
 
 
-def arguments(count, degree):
+def arguments(count, degree, dilation=0.3):
     views = [camera(seed=1), camera(seed=2)]
     return {
         "parameters": tensors_of(blobs(count, degree)),
@@ -59,12 +60,13 @@ def arguments(count, degree):
         "width": views[0].width,
         "height": views[0].height,
         "backgrounds": torch.tensor([[0.1, 0.5, 0.9], [1.0, 0.0, 0.3]]),
+        "dilation": dilation,
     }
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_gsplat_gets_the_arguments_of_the_same_image(gsplat, degree):
-    given = arguments(30, degree)
+@pytest.mark.parametrize(("degree", "dilation"), [(0, 0.3), (1, 0.03), (2, 1.0), (3, 0.3)])
+def test_gsplat_gets_the_arguments_of_the_same_image(gsplat, degree, dilation):
+    given = arguments(30, degree, dilation)
     images, alphas = rasterize_on_cuda(**given)
     expected_images, expected_alphas = rasterize(**given)
     torch.testing.assert_close(images, expected_images, atol=2e-5, rtol=0)

@@ -398,6 +398,7 @@ def test_sensitivity_cameras_of_a_capture_are_its_training_cameras_and_some_arou
     assert [(c.width, c.height) for c in found.cameras[:4]] == [(60, 40)] * 4
     given = [view.camera.position.tolist() for view in views[1:]]
     assert [given.index(c.position.tolist()) for c in found.cameras[:4]] == [0, 2, 4, 7]
+    np.testing.assert_allclose([c.dilation for c in found.cameras], [0.3 / 4] * 4 + [0.3] * len(found.cameras[4:]))
     np.testing.assert_allclose(sum(found.weights[4:]), 0.3 * 4)
     assert found.background is BACKGROUND
     virtual = sensitivity_cameras(splats, None, count=4, size=60)

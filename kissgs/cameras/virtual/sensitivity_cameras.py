@@ -53,7 +53,7 @@ def sensitivity_cameras(
             virtual cameras are used.
         count: largest number of a capture's cameras, evenly selected, to which two thirds as many virtual ones are
             added; without a capture, the number of virtual cameras. 1 or more.
-        size: longer side of the images, pixels; a capture's smaller images keep their size.
+        size: longer side of the images, pixels; a capture's smaller images keep their size, larger ones are sampled.
         threads: number of threads; 0 means one per processor.
         progress: receives the stage ``"cameras"``.
 
@@ -66,7 +66,8 @@ def sensitivity_cameras(
         cameras = [_widened(view.camera) if n % 2 else view.camera for n, view in enumerate(virtual.all)]
         return WeightedCameras(cameras, [1.0] * len(virtual.all), virtual.background)
     captured = [view.camera for view in views.train]
-    selected = [captured[n].at_most(size) for n in np.unique(np.linspace(0, len(captured) - 1, count).astype(int))]
+    chosen = np.unique(np.linspace(0, len(captured) - 1, count).astype(int))
+    selected = [captured[n].sampled_at_most(size) for n in chosen]  # virtual cameras see what is between the samples
     side = round(float(np.sqrt(selected[0].width * selected[0].height)))
     virtual = scene_views(
         splats, width=side, height=side, count=max(1, count * 2 // 3), threads=threads, progress=progress
