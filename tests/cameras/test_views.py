@@ -83,10 +83,10 @@ def test_a_camera_sampled_to_a_size_renders_the_whole_image_between_its_pixels()
     scene = replace(scene, scales=scene.scales - 1)
     camera = look_at(np.array([0, -1.0, -4]), np.zeros(3), np.array([0, -1.0, 0]), fov=0.9, width=400, height=300)
     small = camera.sampled_at_most(150)
-    assert (small.width, small.height) == (150, 113)
+    assert (small.width, small.height) == (150, 112)
     image, whole = kissgs.render(scene, small)[0], kissgs.render(scene, camera)[0]
     y, x = np.meshgrid(
-        (np.arange(113) + 0.5) * 300 / 113 - 0.5, (np.arange(150) + 0.5) * 400 / 150 - 0.5, indexing="ij"
+        (np.arange(112) + 0.5) * 300 / 112 - 0.5, (np.arange(150) + 0.5) * 400 / 150 - 0.5, indexing="ij"
     )
     expected = np.stack([map_coordinates(whole[..., c], [y, x], order=3, mode="nearest") for c in range(3)], axis=-1)
     assert (

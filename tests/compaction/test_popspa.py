@@ -295,7 +295,11 @@ def test_a_capture_is_mixed_with_synthetic_views(share, some):
     assert (len(found.train), found.synthetic, found.synthetic_per_epoch) == (5 + virtual, virtual, some)
     assert [view.name for view in found.train[:5]] == [view.name for view in capture.train]
     assert [view.name for view in found.test] == [view.name for view in capture.test]
-    assert found.score == found.train[: 7 if share else 5]
+    scoring = found.train[: 7 if share else 5]
+    assert [(view.name, view.photo, view.background) for view in found.score] == [
+        (view.name, view.photo, view.background) for view in scoring
+    ]
+    assert all(one.camera is other.camera for one, other in zip(found.score, scoring, strict=True))
     assert [view.background[0] for view in found.train[5:9]] == ([0.0, 0.5, 1.0, 0.0] if share else [])
     assert found.source == "a capture" + (f", and {virtual} virtual cameras, of which 2 score" if virtual else "")
     assert len(supervision_views(scene, capture, settings(), scoring_stride=0).score) == 5
