@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -34,11 +35,13 @@ class SearchEvaluation:
         original: the original scene, clean.
         views: the capture; None for no capture.
         threads: number of threads; 0 means one per processor.
+        seconds: time that the latest comparison took; 0 before the first.
     """
 
     original: Splats
     views: Views | None
     threads: int = 0
+    seconds: float = field(init=False, default=0.0)
     _poses: Views | None = field(init=False, default=None)
     _drawn: Views | None = field(init=False, default=None)
     _images: dict[str, Rendering] = field(init=False, default_factory=dict)
@@ -51,6 +54,13 @@ class SearchEvaluation:
             InvalidViewsError: a photograph cannot be read.
             UnsupportedError: an image would take too much memory.
         """
+        started = time.perf_counter()
+        try:
+            return self._evaluation(candidate, progress)
+        finally:
+            self.seconds = time.perf_counter() - started
+
+    def _evaluation(self, candidate: Splats, progress: Progress) -> Evaluation:
         if self.views is not None:  # whose images are too many to be kept
             return self._compare(candidate, self.views, None, progress)
         if self._poses is None or self._drawn is None:

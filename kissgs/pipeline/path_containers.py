@@ -73,8 +73,7 @@ class PathContainers:
         most, photographs = self.compactor.settings.max_compactions, self.photographs
         if not self.trains:
             self.time = None
-        if self.encoding.views is None:
-            self.encoding = replace(self.encoding, compare=self.compactor.compare)
+        self.encoding = replace(self.encoding, compare=self.compactor.compare)
         plan = SearchPlan(most) if self.time is None else self.time.plan(photographs=photographs, aims=self.aims)
         self.plan = replace(plan, containers=min(plan.containers, most))
         first, offset_db = first_position(self.goal, self.plan, self.count, self.number_for_size, POINTS_PER_HALVING)

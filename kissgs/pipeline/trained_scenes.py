@@ -71,7 +71,7 @@ class TrainedScenes:
         if number not in self._scenes:
             self._scenes[number] = self._prepare(number, byte_limit)
         if self.time is not None and self._tuner is not None:
-            self._tuner.deadline = self.time.for_container(self.containers)
+            self._tuner.deadline = self.time.for_container(self.containers).earlier(self.compactor.compare.seconds)
         return self._scenes[number]
 
     def point(self, number: int) -> PathPoint:
@@ -110,7 +110,7 @@ class TrainedScenes:
         prepared = (self.compactor.supervision, self.path.targets) if self.compactor.settings.trains else None
         tuner = encoding.tuner(COMPLETING, prepared)
         if tuner is not None and self.time is not None:
-            tuner.ending_seconds = self.time.ending_seconds
+            tuner.ending_seconds = self.time.ending_seconds + self.compactor.compare.seconds  # it evaluates as well
         elif tuner is not None:
             tuner.deadline = None  # several containers cannot share the one of the whole work
         return tuner
