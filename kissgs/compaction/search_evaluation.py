@@ -26,14 +26,14 @@ COUNT, SIDE = 24, 320
 class SearchEvaluation:
     """Compares candidates with the original scene in views that nothing is trained or planned with.
 
-    With a capture these are its held-out views. Without one they are random poses from which photographs might have
+    With a capture these are held-out views of it. Without one they are random poses from which photographs might have
     been taken, and their ``surroundings`` cameras drawn over the whole scene. What a container loses in such poses is
     near what it loses in photographs: for fox 0.7 to 1.5 dB more PSNR to the original, with and without training. Drawn
     cameras find 3 to 4 dB more without training and 0.5 with it, but they see every part of the scene.
 
     Attributes:
         original: the original scene, clean.
-        views: the capture; None for no capture.
+        views: the capture, or some of its held-out views; None for no capture.
         threads: number of threads; 0 means one per processor.
         seconds: time that the latest comparison took; 0 before the first.
     """
@@ -55,10 +55,9 @@ class SearchEvaluation:
             UnsupportedError: an image would take too much memory.
         """
         started = time.perf_counter()
-        try:
-            return self._evaluation(candidate, progress)
-        finally:
-            self.seconds = time.perf_counter() - started
+        found = self._evaluation(candidate, progress)
+        self.seconds = time.perf_counter() - started
+        return found
 
     def _evaluation(self, candidate: Splats, progress: Progress) -> Evaluation:
         if self.views is not None:  # whose images are too many to be kept

@@ -19,7 +19,7 @@ from kissgs.core.errors import OutputError
 from kissgs.core.limits import MAX_GAUSSIANS
 from kissgs.core.progress import Progress, as_stage, silent
 from kissgs.core.splats import ATTRIBUTES, Splats, clean
-from kissgs.evaluation.evaluate import evaluate
+from kissgs.evaluation.evaluate import compare_images
 from kissgs.evaluation.results import Evaluation
 from kissgs.finetuning.losses import RateLoss, TotalVariationLoss
 from kissgs.finetuning.planes import FIELDS, TABLES
@@ -227,7 +227,7 @@ class Tuner:
 
     def _compare(self, reference: Splats, encoded: Encoded, progress: Progress) -> Evaluation:
         decoded = self.decode(encoded.files, max_gaussians=max(len(reference), MAX_GAUSSIANS), threads=self.threads)
-        return evaluate(
+        return compare_images(
             reference,
             decoded,
             self.supervision.eval_views,

@@ -425,7 +425,7 @@ def _recolor(
 
 
 def _refit_cameras(cameras: WeightedCameras) -> WeightedCameras:
-    """Return smaller cameras of the capture, and every other virtual one with twice its weight."""
+    """Return the capture's cameras with fewer samples, and every other virtual one, smaller and of twice its weight."""
     chosen = np.arange(len(cameras.cameras))
     chosen = chosen[(chosen < cameras.captured) | ((chosen - cameras.captured) % 2 == 0)]
     virtual = chosen >= cameras.captured

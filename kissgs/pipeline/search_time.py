@@ -12,7 +12,7 @@ CONTAINER_SHARE, LAST_CONTAINER_SHARE = 2.0, 4.0
 which is the only one where time is short."""
 
 ENDING_SHARE = 0.38
-"""Time to write a fine-tuned container and to evaluate it, in units of an encoding without training."""
+"""Time to write a fine-tuned container and to evaluate it in small images, in units of an encoding without training."""
 
 LEAST_FOR_CONTAINER = 2.0
 """Time below which another container is not begun, in the same unit."""
@@ -107,7 +107,7 @@ class SearchTime:
 
     @property
     def ending_seconds(self) -> float:
-        """Expected seconds to write a fine-tuned container and to evaluate it."""
+        """Expected seconds to write a fine-tuned container and to evaluate it in small images."""
         return ENDING_SHARE * self.encode_seconds
 
     def plan(self, *, photographs: bool, aims: bool) -> SearchPlan:

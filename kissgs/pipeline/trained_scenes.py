@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from kissgs.pipeline.encoding import FinetuneFactors
+from kissgs.pipeline.goal import Goal
 from kissgs.pipeline.path_points import count_at
 from kissgs.pipeline.rate_control import Encoder, RateControl
 from kissgs.pipeline.search_time import SearchTime
@@ -71,7 +72,7 @@ class TrainedScenes:
         if number not in self._scenes:
             self._scenes[number] = self._prepare(number, byte_limit)
         if self.time is not None and self._tuner is not None:
-            self._tuner.deadline = self.time.for_container(self.containers).earlier(self.compactor.compare.seconds)
+            self._tuner.deadline = self.time.for_container(self.containers).earlier(self._evaluation_seconds)
         return self._scenes[number]
 
     def point(self, number: int) -> PathPoint:
@@ -97,7 +98,8 @@ class TrainedScenes:
         tunes = bool(self.encoding.settings.finetune.enabled)
         point, deadline = self.point(number), None
         if self.time is not None:
-            deadline = self.time.for_container(self.containers).earlier(self.time.encode_seconds)
+            deadline = self.time.for_container(self.containers)
+            deadline = deadline.earlier(self.time.encode_seconds + self._evaluation_seconds)
         compacted = self.path.compacted(point, refine=not tunes, deadline=deadline)
         encoding = replace(self.encoding, splats=compacted.splats, cache=None)
         if tunes:  # training replaces the refit of colours
@@ -106,11 +108,17 @@ class TrainedScenes:
         search = encoding.rate_control(offset_db=self.offset_db, byte_limit=byte_limit, trained=tunes)
         return TrainedScene(compacted, search, encoding.encoder(self._tuner))
 
+    @property
+    def _evaluation_seconds(self) -> float:
+        """Expected time to evaluate a container, seconds: that of the latest evaluation; 0 where sizes are searched."""
+        return 0.0 if Goal.of(self.encoding.settings.encode).by_size else self.compactor.compare.seconds
+
     def _first_tuner(self, encoding: Encoding) -> Tuner | None:
         prepared = (self.compactor.supervision, self.path.targets) if self.compactor.settings.trains else None
         tuner = encoding.tuner(COMPLETING, prepared)
         if tuner is not None and self.time is not None:
-            tuner.ending_seconds = self.time.ending_seconds + self.compactor.compare.seconds  # it evaluates as well
+            seconds = self.compactor.compare.seconds if self.compactor.supervision.captured else 0.0
+            tuner.ending_seconds = self.time.ending_seconds + seconds  # it evaluates in the same images of a capture
         elif tuner is not None:
             tuner.deadline = None  # several containers cannot share the one of the whole work
         return tuner

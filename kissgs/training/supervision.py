@@ -33,7 +33,7 @@ MIN_SYNTHETIC_VIEWS = 64
 SCORING_SHARE = 0.25
 """Number of these that score Gaussians, as a share of the number of the capture's training views."""
 
-MAX_SIDE = 1.5
+MAX_SIDE_RATIO = 1.5
 """Largest longer side of the training images of a capture, in units of the setting ``view_size``."""
 
 MAX_EVAL_VIEWS = 16
@@ -239,7 +239,7 @@ def _thinned(view: View, number: int, size: int) -> View:
     images").
     """
     width, height = view.camera.width, view.camera.height
-    stride = math.ceil(max(width, height) / (MAX_SIDE * size))
+    stride = math.ceil(max(width, height) / (MAX_SIDE_RATIO * size))
     if stride == 1:
         return view
     return view.sampled(stride, (min(number % stride, width - 1), min(number // stride % stride, height - 1)))

@@ -20,7 +20,9 @@ WORSE = replace(SCENE, opacities=SCENE.opacities - 0.5)
 @pytest.mark.quick(0)
 def test_without_a_capture_poses_of_photographs_and_cameras_over_the_whole_scene_compare():
     compare = SearchEvaluation(SCENE, None, 1)
+    assert compare.seconds == 0
     found = compare(WORSE)
+    assert compare.seconds > 0
     assert COUNT <= len(found.views) <= 4 * COUNT  # more for a scene of several objects
     assert found.against == "renderings"
     poses = {view.view.camera.viewmat.tobytes() for view in found.views}

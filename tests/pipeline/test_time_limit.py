@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,11 +11,13 @@ from helpers.training_scenes import cloud
 
 import kissgs
 from kissgs import Settings, UnsupportedError
+from kissgs.compaction.search_evaluation import SearchEvaluation
 from kissgs.core.deadline import Deadline
 from kissgs.pipeline import machine_speed
 from kissgs.pipeline.machine_speed import encode_seconds, save_speed
 from kissgs.pipeline.search_time import MEETING, SearchTime
 from kissgs.pipeline.time_plan import time_plan
+from kissgs.pipeline.trained_scenes import TrainedScenes
 from kissgs.settings import Preset
 from kissgs.training.supervision import SupervisionViews
 
@@ -100,6 +103,37 @@ def test_a_point_has_half_of_the_time_of_a_container_and_a_quarter_before_the_la
     """1,000 s for one point and so many containers, of which encoding takes no time."""
     time = SearchTime(Deadline.after(1000), 0.0)
     assert time.for_point(1, containers).seconds == pytest.approx(point, abs=1)
+
+
+@pytest.mark.parametrize(("goal", "expected"), [({"max_psnr_drop": 0.1}, 970), ({"target_size": 10_000}, 1000)])
+def test_fine_tuning_leaves_the_time_that_an_evaluation_took(goal, expected):
+    scenes = TrainedScenes(
+        encoding=SimpleNamespace(settings=Settings(encode=goal)),
+        compactor=SimpleNamespace(compare=SimpleNamespace(seconds=30.0)),
+        path=None,
+        pruned_only=0,
+        offset_db=0.0,
+        time=SearchTime(Deadline.after(1000), 10.0),
+        containers=1,
+    )
+    scenes._scenes[3] = scenes._tuner = SimpleNamespace()
+    assert scenes.scene(3, math.inf).deadline.seconds == pytest.approx(expected, abs=1)
+
+
+def test_a_search_evaluates_in_at_most_16_held_out_photographs(tmp_path, monkeypatch):
+    seen, compare = [], SearchEvaluation._compare
+
+    def noting(self, candidate, views, images, progress):
+        seen.append([view.name for view in views.test])
+        return compare(self, candidate, views, images, progress)
+
+    monkeypatch.setattr(SearchEvaluation, "_compare", noting)
+    scene = cloud(200)
+    views = photographs(scene, tmp_path, train=12, held_out=20)
+    kissgs.compress(scene, settings=with_photographs(max_psnr_drop=3.0), views=views)
+    assert len(seen) > 1
+    assert {len(names) for names in seen} == {16}
+    assert {(names[0], names[-1]) for names in seen} == {("photo0", "photo19")}
 
 
 def test_the_saved_speed_counts(tmp_path):

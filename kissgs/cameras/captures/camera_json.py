@@ -77,7 +77,7 @@ def read_cameras(path: Path) -> tuple[View, ...]:
 
 
 def camera_as_dict(camera: Camera) -> dict[str, object]:
-    """Return a camera in the JSON format of kissgs; all digits of what it stores are kept, which is not dilation."""
+    """Return a camera in the JSON format of kissgs, with all digits; a camera that is read has the usual dilation."""
     return {
         "viewmat": camera.viewmat.tolist(),
         "K": camera.K.tolist(),
