@@ -30,13 +30,13 @@ class UndistortionSpec:
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """The pixels of a view's whole image that it has.
+    """The pixels of a whole image that a view has.
 
     Attributes:
         width: of the whole image, the photograph after undistortion, pixels.
         height: of the whole image, pixels.
-        stride: distance of neighbouring ones, in columns and in rows, pixels.
-        first: column and row of the first of them.
+        stride: distance of neighbouring pixels of the view in the whole image, in columns and in rows.
+        first: column and row of the view's first pixel.
     """
 
     width: int

@@ -10,7 +10,7 @@ from kissgs.core.array_types import Float32
 from kissgs.core.sensitivity import BLOCK
 from kissgs.core.splats import Splats
 from kissgs.core.threads import Workers
-from kissgs.rendering.constants import NEAR
+from kissgs.rendering.constants import DILATION, NEAR
 from kissgs.rendering.local_scale import local_scale
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ class Coverage:
         from kissgs.rendering.cpu.coverage import raise_coverage
 
         splats, camera = frame.splats, frame.camera
-        limits = np.array([NEAR, VISIBLE, RESOLVED / finer])
+        limits = np.array([NEAR, VISIBLE, RESOLVED / finer, camera.dilation / DILATION])
 
         def part(rows: tuple[int, int]) -> None:
             raise_coverage(

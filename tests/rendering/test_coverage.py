@@ -134,3 +134,17 @@ def test_gaussians_seen_only_from_far_away_are_hardly_covered():
 def test_close_up_does_not_depend_on_the_scale_of_the_scene():
     scene = sample_scene(1500)
     assert Coverage(moved(scene, scale=100)).close_up == pytest.approx(Coverage(scene).close_up, rel=0.05, abs=1e-6)
+
+
+def test_samples_of_an_image_see_hidden_points_as_well_as_the_whole_image_on_average():
+    """So little of them shows that coverage is in proportion to what each sample finds."""
+    points = replace(plate(1.0, opacity=3.0, n=225), scales=np.full((225, 3), -9, np.float32))
+    cover = replace(
+        plate(0.0, opacity=6.0, n=1), means=np.zeros((1, 3), np.float32), scales=np.full((1, 3), 3, np.float32)
+    )
+    hidden = joined(cover, points)
+    camera = look_at(np.array([0, 0, -3.0]), np.zeros(3), UP, fov=0.9, width=301, height=301)
+    behind = hidden.means[:, 2] > 0.5
+    samples = [coverage_of(hidden, camera.sampled(3, (x, y)))[behind] for x in range(3) for y in range(3)]
+    assert 0 < np.max(samples) < 1
+    assert np.mean(samples) == pytest.approx(coverage_of(hidden, camera)[behind].mean(), rel=0.02)

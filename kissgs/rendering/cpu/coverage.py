@@ -39,17 +39,18 @@ def raise_coverage(
         focal: focal length, pixels.
         pixels: number of pixels of the image.
         limits: smallest depth; share of the squared alpha from which a Gaussian counts as seen; length in the image of
-            the local scale from which it counts as resolved, pixels.
+            the local scale from which it counts as resolved, pixels; area of a squared Gaussian that is a dilated
+            point, pixels.
         share: ``(N,)`` coverage; modified.
     """
-    near, seen_share, resolved_length = limits[0], limits[1], limits[2]
+    near, seen_share, resolved_length, dilated_area = limits[0], limits[1], limits[2], limits[3]
     for row in range(first, last):
         n = visible[row]
         x, y, z = means[n, 0] - eye[0], means[n, 1] - eye[1], means[n, 2] - eye[2]
         per_unit = focal / max(np.sqrt(x * x + y * y + z * z), near)
         a, b, c = np.float64(scales[n, 0]), np.float64(scales[n, 1]), np.float64(scales[n, 2])
         across = a + b + c - min(a, b, c)  # of the two largest
-        area = np.pi * np.exp(across) * per_unit * per_unit + 1.0  # of a squared Gaussian
+        area = np.pi * np.exp(across) * per_unit * per_unit + dilated_area  # of a squared Gaussian
         opacity = 1.0 / (1.0 + np.exp(-np.float64(opacities[n])))
         shown = max(opacity * opacity * min(area, pixels), 1e-300)
         visibility = min(seen[row] / (seen_share * shown), 1.0)
