@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 
 PROGRAM = """
+import os
 import time
 from pathlib import Path
 
@@ -17,6 +18,7 @@ folder, saved, save = Path({folder!r}), [], Checkpoint.save
 def save_and_wait(self, state):
     save(self, state)
     saved.append(len(saved))
+    (folder / f"saves-{{os.getpid()}}").write_text(str(len(saved)))
     time.sleep({pause})
     while len(saved) == {saves} and (folder / "hold").exists():
         (folder / "waiting").touch()
@@ -47,6 +49,12 @@ class HeldTraining:
         while not (self._folder / "waiting").exists():
             assert time.monotonic() < end, "training has not come so far"
             time.sleep(0.02)
+
+    @property
+    def saves(self) -> list[int]:
+        """Number of checkpoints saved by each process, in the order of their last ones."""
+        files = sorted(self._folder.glob("saves-*"), key=lambda path: path.stat().st_mtime_ns)
+        return [int(path.read_text()) for path in files]
 
     def release(self) -> None:
         """Let training run to its end, in its process or in the next one."""
