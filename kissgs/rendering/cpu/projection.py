@@ -143,6 +143,15 @@ def _whitened(w: Vector, v: Vector, dilation: float) -> tuple[Vector, Vector]:
     return _mix(scale * dilation, w, scale, _cross(v, _cross(w, v))), _scaled(v, (l2, l2, l2))
 
 
+@_helper
+def _out_of_reach(beyond: float, size: float, clamped: float, most: float, dilation: float) -> bool:
+    """Return whether no footprint of a Gaussian reaches the image from ``beyond`` pixels outside it along an axis.
+
+    ``size`` is its largest deviation in pixels, ``clamped`` its x/z or y/z, and ``most`` the largest 2 tau.
+    """
+    return beyond > 0 and beyond * beyond > most * (size * size * (1 + clamped * clamped) + dilation)
+
+
 @compiled(
     "int64(float32[:, ::1], float32[:, ::1], float32[:, ::1], float32[::1],"
     " int64, int64, float64[:, ::1], float64[:, ::1], int64, int64, float64[::1],"
@@ -198,14 +207,12 @@ def project(
         x, y = (_dot(rotation[0], mean) + translation[0]) / z, (_dot(rotation[1], mean) + translation[1]) / z
         centre_x, centre_y = fx * x + cx, fy * y + cy
         clamped_x, clamped_y = min(right, max(left, x)), min(bottom, max(top, y))
+        # Most Gaussians outside the image are far from it: a bound on the footprint's size needs less arithmetic.
         beyond_x, beyond_y = max(-centre_x, centre_x - width), max(-centre_y, centre_y - height)
         if beyond_x > 0 or beyond_y > 0:
-            # Most Gaussians outside the image are far from it: a bound on the footprint's size needs less arithmetic.
-            longest = np.exp(np.float64(max(scales[n, 0], scales[n, 1], scales[n, 2])))
-            squared = longest * longest / (z * z)
-            reach_x = most * (fx * fx * (1 + clamped_x * clamped_x) * squared + dilation)
-            reach_y = most * (fy * fy * (1 + clamped_y * clamped_y) * squared + dilation)
-            if (beyond_x > 0 and beyond_x * beyond_x > reach_x) or (beyond_y > 0 and beyond_y * beyond_y > reach_y):
+            longest = np.exp(np.float64(max(scales[n, 0], scales[n, 1], scales[n, 2]))) / z
+            far_x = _out_of_reach(beyond_x, fx * longest, clamped_x, most, dilation)
+            if far_x or _out_of_reach(beyond_y, fy * longest, clamped_y, most, dilation):
                 continue
         opacity = 1.0 / (1.0 + np.exp(-np.float64(opacities[n])))
         if not opacity >= alpha_min:
