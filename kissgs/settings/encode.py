@@ -127,7 +127,8 @@ class EncodeSettings(BaseModel):
         480,
         ge=16,
         le=4096,
-        description="Largest longer side of these renderings, pixels; of larger images of a capture, so many samples.",
+        description="Largest longer side of these renderings, pixels; of larger images of a capture, so many samples. "
+        "Without a capture, four fifths of it, samples of images with twice as many.",
     )
     view_uncertainty: float | None = Field(
         None,

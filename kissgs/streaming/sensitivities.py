@@ -51,7 +51,12 @@ def cameras_json(cameras: WeightedCameras) -> dict[str, Any]:
     return {
         "background": cameras.background.tolist(),
         "cameras": [
-            {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist(), "size": [camera.width, camera.height]}
+            {
+                "viewmat": camera.viewmat.tolist(),
+                "K": camera.K.tolist(),
+                "size": [camera.width, camera.height],
+                "dilation": camera.dilation,
+            }
             for camera in cameras.cameras
         ],
     }
@@ -60,7 +65,8 @@ def cameras_json(cameras: WeightedCameras) -> dict[str, Any]:
 def cameras_of(document: dict[str, Any]) -> WeightedCameras:
     """Return cameras of equal weight from their JSON."""
     cameras = [
-        Camera(np.array(camera["viewmat"]), np.array(camera["K"]), *camera["size"]) for camera in document["cameras"]
+        Camera(np.array(camera["viewmat"]), np.array(camera["K"]), *camera["size"], camera["dilation"])
+        for camera in document["cameras"]
     ]
     return WeightedCameras(cameras, [1.0] * len(cameras), np.array(document["background"], np.float32))
 
@@ -88,7 +94,7 @@ def measure_file(
     size = max(MIN_SIZE, settings.sensitivity_view_size >> level)
     shown = [_shown(camera, splats) for camera in cameras.cameras]
     best = sorted(np.argsort(np.negative(shown), kind="stable")[:MAX_VIEWS])  # else each file would take more and more
-    seeing = [cameras.cameras[n].at_most(size) for n in best if shown[n] > 0]
+    seeing = [_smaller(cameras.cameras[n], size) for n in best if shown[n] > 0]
     if not seeing:
         return Sensitivity.none(len(splats), splats.sh_degree)
     uncertainty = VIEW_UNCERTAINTY if settings.view_uncertainty is None else settings.view_uncertainty
@@ -104,6 +110,11 @@ def measure_file(
     for values in (own.position_hessian, own.shape_hessian, own.color_weight, own.prior):
         values *= share
     return own
+
+
+def _smaller(camera: Camera, size: int) -> Camera:
+    """Return the camera for an image of at most ``size`` pixels; its pixels are samples of a smaller image, too."""
+    return replace(camera.at_most(size), dilation=camera.dilation)
 
 
 def _shown(camera: Camera, splats: Splats) -> float:

@@ -5,6 +5,8 @@ These are a capture's cameras and some virtual ones around the scene, or virtual
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from kissgs.cameras.views import Views
@@ -20,6 +22,10 @@ fall apart, and the photographed parts lose almost nothing by it."""
 
 WIDE_FOCAL_SCALE = 0.6
 """Focal length of every other virtual camera, relative to the others: parts just outside their images count too."""
+
+SAMPLE_STRIDE = 2
+"""Without a capture, images are samples of images that have so many times as many pixels in each direction, in which
+small Gaussians are less dilated, as on the screens that a scene will be seen on."""
 
 MAX_VIEWS, MIN_VIEWS = 48, 16
 """Largest and smallest number of cameras that are chosen by the size of the scene."""
@@ -53,7 +59,8 @@ def sensitivity_cameras(
             virtual cameras are used.
         count: largest number of a capture's cameras, evenly selected, to which two thirds as many virtual ones are
             added; without a capture, the number of virtual cameras. 1 or more.
-        size: longer side of the images, pixels; a capture's smaller images keep their size, larger ones are sampled.
+        size: longer side of the images, pixels, of virtual ones alone four fifths of it, since they are square; a
+            capture's smaller images keep their size, larger ones are sampled.
         threads: number of threads; 0 means one per processor.
         progress: receives the stage ``"cameras"``.
 
@@ -62,8 +69,10 @@ def sensitivity_cameras(
     """
     if views is None or not views.train:
         side = size * 4 // 5
-        virtual = scene_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
-        cameras = [_widened(view.camera) if n % 2 else view.camera for n, view in enumerate(virtual.all)]
+        whole = SAMPLE_STRIDE * side
+        virtual = scene_views(splats, width=whole, height=whole, count=count, threads=threads, progress=progress)
+        sampled = [view.camera.sampled_at_most(side) for view in virtual.all]
+        cameras = [_widened(camera) if n % 2 else camera for n, camera in enumerate(sampled)]
         return WeightedCameras(cameras, [1.0] * len(virtual.all), virtual.background)
     captured = [view.camera for view in views.train]
     chosen = np.unique(np.linspace(0, len(captured) - 1, count).astype(int))
@@ -82,4 +91,4 @@ def _widened(camera: Camera) -> Camera:
     """Return the camera with a shorter focal length, that is, a wider field of view."""
     K = camera.K.copy()
     K[[0, 1], [0, 1]] *= WIDE_FOCAL_SCALE
-    return Camera(camera.viewmat, K, camera.width, camera.height)
+    return replace(camera, K=K)
