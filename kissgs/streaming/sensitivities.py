@@ -64,10 +64,11 @@ def cameras_json(cameras: WeightedCameras) -> dict[str, Any]:
 
 def cameras_of(document: dict[str, Any]) -> WeightedCameras:
     """Return cameras of equal weight from their JSON."""
-    cameras = [
-        Camera(np.array(camera["viewmat"]), np.array(camera["K"]), *camera["size"], camera["dilation"])
-        for camera in document["cameras"]
-    ]
+    cameras = []
+    for camera in document["cameras"]:
+        width, height = camera["size"]
+        viewmat, K = np.array(camera["viewmat"]), np.array(camera["K"])
+        cameras.append(Camera(viewmat, K, width, height, camera["dilation"]))
     return WeightedCameras(cameras, [1.0] * len(cameras), np.array(document["background"], np.float32))
 
 
