@@ -87,7 +87,8 @@ def measure_file(
         splats: the Gaussians of the file.
         others: those of other chunks, from a coarse level.
         cameras: cameras that see the scene.
-        level: level of the file. A level of half the Gaussians is meant for images of half the size.
+        level: level of the file. A level of half the Gaussians is meant for images of half the size, which are not
+            sampled: samples cost 1.5 % of the bytes of level 1 at equal PSNR (flowers).
         settings: settings of the encoder.
         threads: number of threads; 0 means one per processor. The result does not depend on it.
         progress: receives the stage "sensitivity".
@@ -95,7 +96,7 @@ def measure_file(
     size = max(MIN_SIZE, settings.sensitivity_view_size >> level)
     shown = [_shown(camera, splats) for camera in cameras.cameras]
     best = sorted(np.argsort(np.negative(shown), kind="stable")[:MAX_VIEWS])  # else each file would take more and more
-    seeing = [_smaller(cameras.cameras[n], size) for n in best if shown[n] > 0]
+    seeing = [cameras.cameras[n].at_most(size) for n in best if shown[n] > 0]
     if not seeing:
         return Sensitivity.none(len(splats), splats.sh_degree)
     uncertainty = VIEW_UNCERTAINTY if settings.view_uncertainty is None else settings.view_uncertainty
@@ -111,11 +112,6 @@ def measure_file(
     for values in (own.position_hessian, own.shape_hessian, own.color_weight, own.prior):
         values *= share
     return own
-
-
-def _smaller(camera: Camera, size: int) -> Camera:
-    """Return the camera for an image of at most ``size`` pixels; its pixels are samples of a smaller image, too."""
-    return replace(camera.at_most(size), dilation=camera.dilation)
 
 
 def _shown(camera: Camera, splats: Splats) -> float:

@@ -67,15 +67,6 @@ def test_cameras_are_the_same_after_a_file():
     np.testing.assert_array_equal(read.background, CAMERAS.background)
 
 
-def test_a_level_of_half_the_gaussians_is_measured_in_samples_of_an_image_of_half_the_size():
-    own, others = blobs(40, seed=1), blobs(0)
-    sampled = WeightedCameras([seen_from((0, 0, -6)).resized(192, 144).sampled_at_most(96)], [1.0], CAMERAS.background)
-    half = WeightedCameras([seen_from((0, 0, -6)).resized(128, 96).sampled_at_most(64)], [1.0], CAMERAS.background)
-    settings = EncodeSettings(view_uncertainty=0.0, sensitivity_view_size=128)
-    found = measure_file(own, others, sampled, 1, settings, 1)
-    np.testing.assert_allclose(found.color_weight, measure_sensitivity(own, half).color_weight, rtol=1e-4)
-
-
 class Stop(Exception):
     pass
 
