@@ -39,7 +39,8 @@ class TrainingViewSettings(BaseModel):
         ge=1,
         le=10_000,
         description="Number of virtual views without a capture, up to four times as many for a scene of several "
-        "objects; an eighth of them is held out. Their sides are three fifths of view_size.",
+        "objects; an eighth of them is held out. Their sides are three fifths of view_size, samples of twice as many "
+        "pixels.",
     )
     view_size: int = Field(
         640,

@@ -48,6 +48,10 @@ PROBE_SIZE = 160
 TYPICAL_SIZE = 384
 """Longer side of the images that the selected cameras will have, pixels; what they resolve depends on it."""
 
+SAMPLE_STRIDE = 2
+"""Without a capture, images are samples of images that have so many times as many pixels in each direction, in which
+small Gaussians are less dilated, as on the screens that a scene will be seen on."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Region:

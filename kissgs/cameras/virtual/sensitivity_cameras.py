@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from kissgs.cameras.views import Views
+from kissgs.cameras.virtual.regions import SAMPLE_STRIDE
 from kissgs.cameras.virtual.scene_views import scene_views
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
@@ -22,10 +23,6 @@ fall apart, and the photographed parts lose almost nothing by it."""
 
 WIDE_FOCAL_SCALE = 0.6
 """Focal length of every other virtual camera, relative to the others: parts just outside their images count too."""
-
-SAMPLE_STRIDE = 2
-"""Without a capture, images are samples of images that have so many times as many pixels in each direction, in which
-small Gaussians are less dilated, as on the screens that a scene will be seen on."""
 
 MAX_VIEWS, MIN_VIEWS = 48, 16
 """Largest and smallest number of cameras that are chosen by the size of the scene."""
