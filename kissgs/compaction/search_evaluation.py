@@ -10,7 +10,6 @@ import numpy as np
 
 from kissgs.cameras.views import View, Views
 from kissgs.cameras.virtual.random_poses import random_poses
-from kissgs.cameras.virtual.regions import SAMPLE_STRIDE
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
 from kissgs.evaluation.camera_sampling import BACKGROUNDS
@@ -20,8 +19,7 @@ from kissgs.evaluation.psnr_loss import SEARCH_SEED
 from kissgs.evaluation.results import Evaluation
 
 COUNT, SIDE = 24, 320
-"""Number and side, pixels, of the views without a capture, beside those drawn over the whole scene: samples of images
-that are twice as large."""
+"""Number and side, pixels, of the views without a capture, apart from those drawn over the whole scene."""
 
 
 @dataclass(slots=True, eq=False)
@@ -66,11 +64,9 @@ class SearchEvaluation:
             return self._compare(candidate, self.views, None, progress)
         if self._poses is None or self._drawn is None:
             scene, threads = self.original, self.threads
-            whole = SAMPLE_STRIDE * SIDE
-            poses = random_poses(scene, side=whole, count=COUNT, seed=SEARCH_SEED, threads=threads, progress=progress)
+            poses = random_poses(scene, side=SIDE, count=COUNT, seed=SEARCH_SEED, threads=threads, progress=progress)
             self._drawn = evaluation_views(scene, seed=SEARCH_SEED, threads=threads, progress=progress)
-            sampled = [replace(view, camera=view.camera.sampled_at_most(SIDE)) for view in poses.train + poses.test]
-            self._poses = replace(poses, train=(), test=_over_backgrounds(sampled))
+            self._poses = replace(poses, train=(), test=_over_backgrounds(poses.train + poses.test))
         found = self._compare(candidate, self._poses, self._images, progress)
         return replace(found, surroundings=self._compare(candidate, self._drawn, self._drawn_images, progress))
 

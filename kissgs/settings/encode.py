@@ -128,7 +128,7 @@ class EncodeSettings(BaseModel):
         ge=16,
         le=4096,
         description="Largest longer side of these renderings, pixels; of larger images of a capture, so many samples. "
-        "Without a capture, four fifths of it, samples of images with twice as many.",
+        "Without a capture, images have four fifths of that, and are samples of images of twice the size.",
     )
     view_uncertainty: float | None = Field(
         None,

@@ -15,6 +15,7 @@ from kissgs.core.progress import Progress, silent
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats, concatenate
 from kissgs.rendering.camera import Camera
+from kissgs.rendering.constants import DILATION
 from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
 from kissgs.settings import EncodeSettings
 
@@ -87,8 +88,8 @@ def measure_file(
         splats: the Gaussians of the file.
         others: those of other chunks, from a coarse level.
         cameras: cameras that see the scene.
-        level: level of the file. A level of half the Gaussians is meant for images of half the size, which are not
-            sampled: samples cost 1.5 % of the bytes of level 1 at equal PSNR (flowers).
+        level: level of the file. A level of half the Gaussians is meant for images of half the size. Coarser levels
+            than the finest are measured in images, not in samples of larger ones.
         settings: settings of the encoder.
         threads: number of threads; 0 means one per processor. The result does not depend on it.
         progress: receives the stage "sensitivity".
@@ -96,7 +97,9 @@ def measure_file(
     size = max(MIN_SIZE, settings.sensitivity_view_size >> level)
     shown = [_shown(camera, splats) for camera in cameras.cameras]
     best = sorted(np.argsort(np.negative(shown), kind="stable")[:MAX_VIEWS])  # else each file would take more and more
-    seeing = [cameras.cameras[n].at_most(size) for n in best if shown[n] > 0]
+    seeing = [cameras.cameras[n] for n in best if shown[n] > 0]
+    if level:
+        seeing = [replace(camera.at_most(size), dilation=DILATION) for camera in seeing]
     if not seeing:
         return Sensitivity.none(len(splats), splats.sh_degree)
     uncertainty = VIEW_UNCERTAINTY if settings.view_uncertainty is None else settings.view_uncertainty

@@ -11,7 +11,6 @@ import numpy as np
 from kissgs.cameras.views import View, Views
 from kissgs.cameras.virtual.close_ups import close_ups
 from kissgs.cameras.virtual.random_poses import random_poses
-from kissgs.cameras.virtual.regions import SAMPLE_STRIDE
 from kissgs.cameras.virtual.scattered import scattered_cameras
 from kissgs.cameras.virtual.scene_views import scene_views
 from kissgs.core.array_types import Float32
@@ -46,12 +45,13 @@ class SupervisionViews:
     """Views by their role.
 
     Attributes:
-        train: training views, samples of larger images; none if nothing is trained.
+        train: training views, samples of larger photographs, half of virtual ones samples of larger images; none if
+            nothing is trained.
         score: views that score Gaussians: the training views of a capture and some synthetic ones, or some virtual
             cameras and close-ups, each with a background of its own. Virtual ones have the usual dilation, so
-            that Gaussians between the sampled pixels of photographs count too.
-        test: evaluation views: held-out views, or some training views if there are none; those of a capture are whole,
-            virtual ones are samples. All have photographs or none.
+            that Gaussians between sampled pixels count too.
+        test: evaluation views: held-out views, or some training views if there are none, whole. All have photographs or
+            none.
         background: ``(3,)`` RGB from 0 to 1.
         source: description of the training views.
         captured: whether the training views are those of a capture.
@@ -114,7 +114,7 @@ def supervision_views(
     if synthetic and scoring:
         source += f", of which {min(scoring, len(synthetic))} score"
     return SupervisionViews(
-        train=(*train, *_sampled(synthetic, side)),
+        train=(*train, *(replace(view, camera=view.camera.sampled_at_most(side)) for view in synthetic)),
         score=(*train, *(replace(view, camera=view.camera.at_most(side)) for view in synthetic[:scoring])),
         test=_evaluation_views(views),
         background=views.background,
@@ -196,36 +196,27 @@ def _photographed(views: Sequence[View]) -> Sequence[View]:
 def _virtual_views(
     splats: Splats, settings: TrainingViewSettings, stride: int, threads: int, progress: Progress
 ) -> SupervisionViews:
-    """Return virtual views only; their targets are renderings of the scene.
-
-    Those that train and evaluate are samples of larger images.
-    """
+    """Return virtual views only; their targets are renderings of the scene."""
     side = _virtual_side(settings)
     drawn = random_poses(
         splats,
-        side=SAMPLE_STRIDE * side,
+        side=side,
         count=max(1, settings.views * (stride or SCORING_STRIDE) // SCORING_STRIDE),
         seed=settings.seed,
         threads=threads,
         progress=progress,
     )
-    scored = drawn.train[::stride] if stride else ()
-    reduced = [replace(view, camera=view.camera.at_most(side)) for view in scored]
-    scoring = _scoring_views(splats, reduced, side, settings.seed) if stride else ()
+    scored = [replace(view, camera=view.camera.resized(side, side)) for view in drawn.train[::stride]] if stride else []
+    scoring = _scoring_views(splats, scored, side, settings.seed) if stride else ()
     close_up_count = len(scoring) - len(scored)
     return SupervisionViews(
-        train=_sampled(drawn.train, side),
+        train=drawn.train,
         score=scoring,
-        test=_sampled(_evenly_selected(drawn.test or drawn.train), side),
+        test=tuple(_evenly_selected(drawn.test or drawn.train)),
         background=drawn.background,
         source=f"{len(drawn.train)} virtual camera{'' if len(drawn.train) == 1 else 's'}"
         + (f", and {close_up_count} close-ups that score" if close_up_count else ""),
     )
-
-
-def _sampled(views: Sequence[View], side: int) -> tuple[View, ...]:
-    """Return views of which at most ``side`` pixels in each direction are sampled."""
-    return tuple(replace(view, camera=view.camera.sampled_at_most(side)) for view in views)
 
 
 def _scoring_views(splats: Splats, views: Sequence[View], side: int, seed: int) -> tuple[View, ...]:

@@ -51,7 +51,7 @@ class HeldTraining:
             time.sleep(0.02)
 
     @property
-    def saves(self) -> list[int]:
+    def saves_by_process(self) -> list[int]:
         """Number of checkpoints saved by each process, in the order of their last ones."""
         files = sorted(self._folder.glob("saves-*"), key=lambda path: path.stat().st_mtime_ns)
         return [int(path.read_text()) for path in files]

@@ -67,6 +67,16 @@ def test_cameras_are_the_same_after_a_file():
     np.testing.assert_array_equal(read.background, CAMERAS.background)
 
 
+@pytest.mark.parametrize("size", [256, 32])
+def test_coarser_levels_are_measured_in_images_of_half_the_size_instead_of_samples(size):
+    own, nothing = blobs(40, seed=1), blobs(0)
+    sampled = WeightedCameras([replace(CAMERAS.cameras[0], dilation=0.075)], [1.0], CAMERAS.background)
+    images = WeightedCameras([seen_from((0, 0, -6)).at_most(max(size // 2 // 2, 64))], [1.0], CAMERAS.background)
+    settings = EncodeSettings(view_uncertainty=0.0, sensitivity_view_size=size)
+    found = measure_file(own, nothing, sampled, 2, settings, 1)
+    np.testing.assert_allclose(found.color_weight, measure_sensitivity(own, images).color_weight, rtol=1e-4)
+
+
 class Stop(Exception):
     pass
 

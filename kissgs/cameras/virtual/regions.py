@@ -49,8 +49,8 @@ TYPICAL_SIZE = 384
 """Longer side of the images that the selected cameras will have, pixels; what they resolve depends on it."""
 
 SAMPLE_STRIDE = 2
-"""Without a capture, images are samples of images that have so many times as many pixels in each direction, in which
-small Gaussians are less dilated, as on the screens that a scene will be seen on."""
+"""Without a capture, images in which sensitivity is measured, and half of those that train, are samples of images that
+have so many times as many pixels in each direction: large screens dilate small Gaussians less."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -66,9 +66,8 @@ def sensitivity_cameras(
     """
     if views is None or not views.train:
         side = size * 4 // 5
-        whole = SAMPLE_STRIDE * side
-        virtual = scene_views(splats, width=whole, height=whole, count=count, threads=threads, progress=progress)
-        sampled = [view.camera.sampled_at_most(side) for view in virtual.all]
+        virtual = scene_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
+        sampled = [view.camera.as_samples(SAMPLE_STRIDE) for view in virtual.all]
         cameras = [_widened(camera) if n % 2 else camera for n, camera in enumerate(sampled)]
         return WeightedCameras(cameras, [1.0] * len(virtual.all), virtual.background)
     captured = [view.camera for view in views.train]

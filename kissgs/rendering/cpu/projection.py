@@ -145,9 +145,9 @@ def _whitened(w: Vector, v: Vector, dilation: float) -> tuple[Vector, Vector]:
 
 @_helper
 def _out_of_reach(beyond: float, size: float, clamped: float, most: float, dilation: float) -> bool:
-    """Return whether no footprint of a Gaussian reaches the image from ``beyond`` pixels outside it along an axis.
+    """Return whether a Gaussian ``beyond`` pixels outside the image along an axis cannot reach it at any opacity.
 
-    ``size`` is its largest deviation in pixels, ``clamped`` its x/z or y/z, and ``most`` the largest 2 tau.
+    ``size`` is its largest standard deviation in pixels, ``clamped`` its x/z or y/z, and ``most`` the largest 2 tau.
     """
     return beyond > 0 and beyond * beyond > most * (size * size * (1 + clamped * clamped) + dilation)
 
