@@ -45,13 +45,13 @@ class SupervisionViews:
     """Views by their role.
 
     Attributes:
-        train: training views, samples of larger photographs, half of virtual ones samples of larger images; none if
-            nothing is trained.
+        train: training views; none if nothing is trained. Large photographs are sampled, and virtual ones beside them;
+            without a capture every second virtual one.
         score: views that score Gaussians: the training views of a capture and some synthetic ones, or some virtual
             cameras and close-ups, each with a background of its own. Virtual ones have the usual dilation, so
             that Gaussians between sampled pixels count too.
-        test: evaluation views: held-out views, or some training views if there are none, whole. All have photographs or
-            none.
+        test: evaluation views: held-out views, or some training views if there are none. All have photographs or none.
+            Those of a capture are whole.
         background: ``(3,)`` RGB from 0 to 1.
         source: description of the training views.
         captured: whether the training views are those of a capture.
