@@ -127,8 +127,7 @@ class EncodeSettings(BaseModel):
         480,
         ge=16,
         le=4096,
-        description="Largest longer side of these renderings, pixels; of larger images of a capture, so many samples. "
-        "Without a capture, images have four fifths of that, and are samples of images of twice the size.",
+        description="Largest longer side of these renderings, pixels; of larger images of a capture, so many samples.",
     )
     view_uncertainty: float | None = Field(
         None,

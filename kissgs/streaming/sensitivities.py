@@ -15,7 +15,6 @@ from kissgs.core.progress import Progress, silent
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats, concatenate
 from kissgs.rendering.camera import Camera
-from kissgs.rendering.constants import DILATION
 from kissgs.rendering.sensitivity import WeightedCameras, measure_sensitivity
 from kissgs.settings import EncodeSettings
 
@@ -52,12 +51,7 @@ def cameras_json(cameras: WeightedCameras) -> dict[str, Any]:
     return {
         "background": cameras.background.tolist(),
         "cameras": [
-            {
-                "viewmat": camera.viewmat.tolist(),
-                "K": camera.K.tolist(),
-                "size": [camera.width, camera.height],
-                "dilation": camera.dilation,
-            }
+            {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist(), "size": [camera.width, camera.height]}
             for camera in cameras.cameras
         ],
     }
@@ -65,11 +59,9 @@ def cameras_json(cameras: WeightedCameras) -> dict[str, Any]:
 
 def cameras_of(document: dict[str, Any]) -> WeightedCameras:
     """Return cameras of equal weight from their JSON."""
-    cameras = []
-    for camera in document["cameras"]:
-        width, height = camera["size"]
-        viewmat, K = np.array(camera["viewmat"]), np.array(camera["K"])
-        cameras.append(Camera(viewmat, K, width, height, camera["dilation"]))
+    cameras = [
+        Camera(np.array(camera["viewmat"]), np.array(camera["K"]), *camera["size"]) for camera in document["cameras"]
+    ]
     return WeightedCameras(cameras, [1.0] * len(cameras), np.array(document["background"], np.float32))
 
 
@@ -88,8 +80,7 @@ def measure_file(
         splats: the Gaussians of the file.
         others: those of other chunks, from a coarse level.
         cameras: cameras that see the scene.
-        level: level of the file. A level of half the Gaussians is meant for images of half the size. Coarser levels
-            than the finest are measured in images, not in samples of larger ones.
+        level: level of the file. A level of half the Gaussians is meant for images of half the size.
         settings: settings of the encoder.
         threads: number of threads; 0 means one per processor. The result does not depend on it.
         progress: receives the stage "sensitivity".
@@ -97,9 +88,7 @@ def measure_file(
     size = max(MIN_SIZE, settings.sensitivity_view_size >> level)
     shown = [_shown(camera, splats) for camera in cameras.cameras]
     best = sorted(np.argsort(np.negative(shown), kind="stable")[:MAX_VIEWS])  # else each file would take more and more
-    seeing = [cameras.cameras[n] for n in best if shown[n] > 0]
-    if level:
-        seeing = [replace(camera.at_most(size), dilation=DILATION) for camera in seeing]
+    seeing = [cameras.cameras[n].at_most(size) for n in best if shown[n] > 0]
     if not seeing:
         return Sensitivity.none(len(splats), splats.sh_degree)
     uncertainty = VIEW_UNCERTAINTY if settings.view_uncertainty is None else settings.view_uncertainty

@@ -16,8 +16,8 @@ EVALUATION = 60.0
 
 _FACTS: dict[kissgs.Preset, tuple[str, str, float, float, float]] = {
     kissgs.Preset.FAST: ("Fast", "Takes seconds; for previews and quick checks.", 13.02, -0.37, 13),
-    kissgs.Preset.BALANCED: ("Balanced", "The best quality for its size. The default.", 11.95, -0.29, 205),
-    kissgs.Preset.SMALL: ("Small", "Slightly smaller, and slower.", 11.38, -0.33, 380),
+    kissgs.Preset.BALANCED: ("Balanced", "The best quality for its size. The default.", 11.90, -0.28, 205),
+    kissgs.Preset.SMALL: ("Small", "Slightly smaller, and slower.", 11.71, -0.27, 380),
     kissgs.Preset.PAPER: ("Paper", "KISS-GS as published, for comparison.", 17.20, -0.36, 260),
 }
 

@@ -5,12 +5,9 @@ These are a capture's cameras and some virtual ones around the scene, or virtual
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from kissgs.cameras.views import Views
-from kissgs.cameras.virtual.regions import SAMPLE_STRIDE
 from kissgs.cameras.virtual.scene_views import scene_views
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
@@ -56,8 +53,7 @@ def sensitivity_cameras(
             virtual cameras are used.
         count: largest number of a capture's cameras, evenly selected, to which two thirds as many virtual ones are
             added; without a capture, the number of virtual cameras. 1 or more.
-        size: longer side of the images, pixels, of virtual ones alone four fifths of it, since they are square; a
-            capture's smaller images keep their size, larger ones are sampled.
+        size: longer side of the images, pixels; a capture's smaller images keep their size, larger ones are sampled.
         threads: number of threads; 0 means one per processor.
         progress: receives the stage ``"cameras"``.
 
@@ -67,8 +63,7 @@ def sensitivity_cameras(
     if views is None or not views.train:
         side = size * 4 // 5
         virtual = scene_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
-        sampled = [view.camera.as_samples(SAMPLE_STRIDE) for view in virtual.all]
-        cameras = [_widened(camera) if n % 2 else camera for n, camera in enumerate(sampled)]
+        cameras = [_widened(view.camera) if n % 2 else view.camera for n, view in enumerate(virtual.all)]
         return WeightedCameras(cameras, [1.0] * len(virtual.all), virtual.background)
     captured = [view.camera for view in views.train]
     chosen = np.unique(np.linspace(0, len(captured) - 1, count).astype(int))
@@ -87,4 +82,4 @@ def _widened(camera: Camera) -> Camera:
     """Return the camera with a shorter focal length, that is, a wider field of view."""
     K = camera.K.copy()
     K[[0, 1], [0, 1]] *= WIDE_FOCAL_SCALE
-    return replace(camera, K=K)
+    return Camera(camera.viewmat, K, camera.width, camera.height)
