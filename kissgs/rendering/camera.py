@@ -101,10 +101,6 @@ class Camera:
         width, height = -(-(self.width - column) // stride), -(-(self.height - row) // stride)
         return Camera(self.viewmat, K, width, height, self.dilation / stride**2)
 
-    def as_samples(self, stride: float) -> Camera:
-        """Return the camera whose pixels are samples of an image with ``stride`` times as many in each direction."""
-        return replace(self, dilation=self.dilation / stride**2)
-
     def sampled_at_most(self, size: int) -> Camera:
         """Return the same view with at most ``size`` pixels on the longer side, which are samples of this one's image.
 

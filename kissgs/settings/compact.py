@@ -124,9 +124,8 @@ class CompactSettings(TrainingViewSettings):
         le=10_000,
         description="Number of virtual views without a capture, up to four times as many for a scene of several "
         "objects; an eighth of them is held out, and every fourth of the rest is used for scoring. Without training, "
-        "a quarter of the number, all used for scoring. Their sides are three fifths of view_size; half of those "
-        "that train are samples of images of twice the size. Each scoring view comes with four close-ups, with sides a "
-        "quarter as long.",
+        "a quarter of the number, all used for scoring. Their sides are three fifths of view_size. Each scoring view "
+        "comes with four close-ups, with sides a quarter as long.",
     )
 
     @property

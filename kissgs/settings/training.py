@@ -39,8 +39,7 @@ class TrainingViewSettings(BaseModel):
         ge=1,
         le=10_000,
         description="Number of virtual views without a capture, up to four times as many for a scene of several "
-        "objects; an eighth of them is held out. Their sides are three fifths of view_size; half of them are samples "
-        "of images of twice the size.",
+        "objects; an eighth of them is held out. Their sides are three fifths of view_size.",
     )
     view_size: int = Field(
         640,

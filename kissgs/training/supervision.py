@@ -45,13 +45,12 @@ class SupervisionViews:
     """Views by their role.
 
     Attributes:
-        train: training views; none if nothing is trained. Large photographs are sampled, and virtual ones beside them;
-            without a capture every second virtual one.
+        train: training views, samples of larger photographs; none if nothing is trained.
         score: views that score Gaussians: the training views of a capture and some synthetic ones, or some virtual
             cameras and close-ups, each with a background of its own. Virtual ones have the usual dilation, so
-            that Gaussians between sampled pixels count too.
-        test: evaluation views: held-out views, or some training views if there are none. All have photographs or none.
-            Those of a capture are whole.
+            that Gaussians between the sampled pixels of photographs count too.
+        test: evaluation views: held-out views, or some training views if there are none, whole. All have photographs or
+            none.
         background: ``(3,)`` RGB from 0 to 1.
         source: description of the training views.
         captured: whether the training views are those of a capture.
@@ -206,9 +205,8 @@ def _virtual_views(
         threads=threads,
         progress=progress,
     )
-    scored = [replace(view, camera=view.camera.resized(side, side)) for view in drawn.train[::stride]] if stride else []
-    scoring = _scoring_views(splats, scored, side, settings.seed) if stride else ()
-    close_up_count = len(scoring) - len(scored)
+    scoring = _scoring_views(splats, drawn.train[::stride], side, settings.seed) if stride else ()
+    close_up_count = len(scoring) - len(drawn.train[::stride]) if stride else 0
     return SupervisionViews(
         train=drawn.train,
         score=scoring,

@@ -3,21 +3,15 @@
 :func:`kissgs.virtual_views` selects a few cameras that are as good as possible. A scene that is trained from such views
 only falls apart between and beside them. Random cameras are near and far, high and low, around every region; only those
 with a low view score are left out.
-
-A scene will be seen on small and large screens. Renderers dilate every Gaussian by about half a pixel, so a scene that
-is trained in images of one size is wrong in others. So the pixels of every second view are samples of a larger image.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-
 import numpy as np
 
-from kissgs.cameras.views import View, Views
+from kissgs.cameras.views import Views
 from kissgs.cameras.virtual.candidates import horizontal_axes
-from kissgs.cameras.virtual.regions import SAMPLE_STRIDE, Region, allocate_cameras, find_regions
+from kissgs.cameras.virtual.regions import Region, allocate_cameras, find_regions
 from kissgs.cameras.virtual.scene_bounds import Vec3
 from kissgs.cameras.virtual.scene_views import scene_views
 from kissgs.cameras.virtual.scored_candidates import ScoredCandidates
@@ -58,8 +52,7 @@ def random_poses(
 ) -> Views:
     """Return views for square images from random poses around every region of a scene; every 8th is held out.
 
-    The pixels of every second training view, and of every second of the others, are samples of an image
-    ``SAMPLE_STRIDE`` times as large. The result is the same for any number of threads.
+    The result is the same for any number of threads.
 
     Args:
         splats: the scene, finite (:func:`kissgs.clean`).
@@ -85,17 +78,9 @@ def random_poses(
         for region, region_count in zip(regions, allocate_cameras(regions, total), strict=True):
             cameras += _random_cameras(region, region_count, side, rng)
     if len(cameras) < min(2, count):
-        views = scene_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
-    else:
-        views = split_views(cameras[:total])
+        return scene_views(splats, width=side, height=side, count=count, threads=threads, progress=progress)
     progress("cameras", 1.0)
-    return replace(views, train=_every_second_sampled(views.train), test=_every_second_sampled(views.test))
-
-
-def _every_second_sampled(views: Sequence[View]) -> tuple[View, ...]:
-    return tuple(
-        view if n % 2 else replace(view, camera=view.camera.as_samples(SAMPLE_STRIDE)) for n, view in enumerate(views)
-    )
+    return split_views(cameras[:total])
 
 
 def _random_cameras(region: Region, count: int, side: int, rng: np.random.Generator) -> list[Camera]:

@@ -48,10 +48,6 @@ PROBE_SIZE = 160
 TYPICAL_SIZE = 384
 """Longer side of the images that the selected cameras will have, pixels; what they resolve depends on it."""
 
-SAMPLE_STRIDE = 2
-"""Without a capture, half of the images that train are samples of images that have so many times as many pixels in each
-direction: large screens dilate small Gaussians less."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Region:
