@@ -144,12 +144,28 @@ def _whitened(w: Vector, v: Vector, dilation: float) -> tuple[Vector, Vector]:
 
 
 @_helper
-def _out_of_reach(beyond: float, size: float, clamped: float, most: float, dilation: float) -> bool:
-    """Return whether a Gaussian ``beyond`` pixels outside the image along an axis cannot reach it at any opacity.
+def _is_far_outside(centre: float, side: int, deviation: float, clamped: float, most: float, dilation: float) -> bool:
+    """Return whether a Gaussian is so far outside the image along an axis that it cannot reach it at any opacity.
 
-    ``size`` is its largest standard deviation in pixels, ``clamped`` its x/z or y/z, and ``most`` the largest 2 tau.
+    ``side`` is that of the image, ``deviation`` the largest standard deviation in pixels, ``clamped`` x/z or y/z, and
+    ``most`` the largest 2 tau.
     """
-    return beyond > 0 and beyond * beyond > most * (size * size * (1 + clamped * clamped) + dilation)
+    beyond = max(-centre, centre - side)
+    return beyond > 0 and beyond * beyond > most * (deviation * deviation * (1 + clamped * clamped) + dilation)
+
+
+@_helper
+def _image_axes(p: Vector, q: Vector, quats: np.ndarray, scales: np.ndarray, n: int) -> tuple[Vector, Vector]:
+    """Return the rows of W, given those of J Rc."""
+    w, x, y, z, _ = _unit_quat(quats, n)
+    R, s = _rotation(w, x, y, z), _deviations(scales, n)
+    return _scaled(_times(p, R), s), _scaled(_times(q, R), s)
+
+
+@_helper
+def _overlaps(centre: float, half: float, side: int) -> bool:
+    """Return whether the interval of half length ``half`` around ``centre`` overlaps that from 0 to ``side``."""
+    return centre + half > 0 and centre - half < side
 
 
 @compiled(
@@ -207,32 +223,27 @@ def project(
         x, y = (_dot(rotation[0], mean) + translation[0]) / z, (_dot(rotation[1], mean) + translation[1]) / z
         centre_x, centre_y = fx * x + cx, fy * y + cy
         clamped_x, clamped_y = min(right, max(left, x)), min(bottom, max(top, y))
-        # Most Gaussians outside the image are far from it: a bound on the footprint's size needs less arithmetic.
-        beyond_x, beyond_y = max(-centre_x, centre_x - width), max(-centre_y, centre_y - height)
-        if beyond_x > 0 or beyond_y > 0:
-            longest = np.exp(np.float64(max(scales[n, 0], scales[n, 1], scales[n, 2]))) / z
-            far_x = _out_of_reach(beyond_x, fx * longest, clamped_x, most, dilation)
-            if far_x or _out_of_reach(beyond_y, fy * longest, clamped_y, most, dilation):
+        if not (0 <= centre_x <= width and 0 <= centre_y <= height):
+            # Most Gaussians outside the image are far from it: a bound on the footprint's size needs less arithmetic.
+            angle = np.exp(np.float64(max(scales[n, 0], scales[n, 1], scales[n, 2]))) / z
+            far_x = _is_far_outside(centre_x, width, fx * angle, clamped_x, most, dilation)
+            if far_x or _is_far_outside(centre_y, height, fy * angle, clamped_y, most, dilation):
                 continue
         opacity = 1.0 / (1.0 + np.exp(-np.float64(opacities[n])))
         if not opacity >= alpha_min:
             continue
         p = _mix(fx / z, rotation[0], -fx / z * clamped_x, rotation[2])
         q = _mix(fy / z, rotation[1], -fy / z * clamped_y, rotation[2])
-        qw, qx, qy, qz, _ = _unit_quat(quats, n)
-        R, s = _rotation(qw, qx, qy, qz), _deviations(scales, n)
-        w, v = _scaled(_times(p, R), s), _scaled(_times(q, R), s)
+        w, v = _image_axes(p, q, quats, scales, n)
         tau = np.log(opacity / alpha_min)
         half_width, half_height = np.sqrt(2 * tau * (_dot(w, w) + dilation)), np.sqrt(2 * tau * (_dot(v, v) + dilation))
-        across = centre_x + half_width > 0 and centre_x - half_width < width
-        if not (across and centre_y + half_height > 0 and centre_y - half_height < height):
+        if not (_overlaps(centre_x, half_width, width) and _overlaps(centre_y, half_height, height)):
             continue
         row = first + found
         found += 1
         visible[row] = n
         depths[row] = z
-        records[row, 0] = centre_x
-        records[row, 1] = centre_y
+        records[row, 0], records[row, 1] = centre_x, centre_y
         records[row, 2], records[row, 3], records[row, 4] = _cholesky(w, v, dilation)
         records[row, 5] = opacity
         records[row, 9] = tau
