@@ -224,5 +224,5 @@ def test_fine_tuning_continues_and_its_gain_is_reported(start_held):
     before, after = training.saves_by_process
     assert before >= DONE
     assert before + after == STEPS  # no step was made twice
-    assert all(done >= DONE / STEPS for _, done in training_events(service, job)[1])  # often too brief for any
+    assert all(done >= DONE / STEPS for _, done in training_events(service, job)[1])  # few events, or none, are sent
     assert sorted(path.name for path in folder_of(service, job).iterdir()) == ["result", "scene.ply"]
