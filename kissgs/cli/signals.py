@@ -10,7 +10,14 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
-from kissgs.cli.interrupts import Interrupted, exit_by_signal, exit_on_signal, signal_behind, unwind_on_signal
+from kissgs.cli.interrupts import (
+    Interrupted,
+    exit_by_signal,
+    exit_on_signal,
+    say_when_interrupted,
+    signal_behind,
+    unwind_on_signal,
+)
 from kissgs.core.errors import StopSearch
 
 if TYPE_CHECKING:
@@ -19,7 +26,9 @@ if TYPE_CHECKING:
     from kissgs.core.progress import Progress
 
 
-STOPPING = b"\nkissgs: stopping: keeping the best result so far, if any; Ctrl-C again aborts\n"
+STOPPING = b"\nkissgs: stopping: the best result so far is completed, which may take a minute; Ctrl-C again aborts\n"
+
+NOTHING_FOUND = "no container met the goal yet, and none is written"
 
 
 def unwinding(work: Callable[[], None]) -> None:
@@ -70,6 +79,7 @@ def stoppable(progress: Progress, searches: bool) -> Iterator[Progress]:
     try:
         yield receive
     except StopSearch as error:
+        say_when_interrupted(NOTHING_FOUND)
         raise Interrupted(signal.SIGINT) from error
     finally:
         signal.signal(signal.SIGINT, before)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from kissgs.core.numba_kernels import compiled
+
 
 @njit(nogil=True, error_model="numpy")
 def write_harmonics(x: float, y: float, z: float, degree: int, basis: np.ndarray) -> None:
@@ -38,3 +40,10 @@ def write_harmonics(x: float, y: float, z: float, degree: int, basis: np.ndarray
             else:
                 basis[center + m] = value * cosine
                 basis[center - m] = value * sine
+
+
+@compiled("void(float64[:, ::1], int64, float64[:, ::1])")
+def write_harmonics_of(directions: np.ndarray, degree: int, basis: np.ndarray) -> None:
+    """Write :func:`write_harmonics` of each row of ``directions``, ``(P, 3)`` unit vectors, into a row of ``basis``."""
+    for row in range(len(directions)):
+        write_harmonics(directions[row, 0], directions[row, 1], directions[row, 2], degree, basis[row])

@@ -81,7 +81,7 @@ class CountSearch:
             best.search.stopped |= containers.stopped
             compacted = compacted if best.compacted.splats is self.compactor.splats else best.compacted
         trained = best is not None and compacted is best.compacted and containers.photographs
-        notes = filter(None, [compacted.report.note, self.compactor.note, BEYOND_PHOTOGRAPHS if trained else ""])
+        notes = filter(None, [compacted.report.note, BEYOND_PHOTOGRAPHS if trained else ""])
         report = replace(compacted.report, trials=tuple(containers.pruning.tried), note="; ".join(notes))
         return replace(compacted, report=report), self._whole if best is None else best.search, tuple(containers.trials)
 
@@ -124,26 +124,36 @@ class CountSearch:
         return (self._containers.train_to_first().drop or 0.0) <= RECOVERABLE_DB + allowed
 
     def _encode_latest(self) -> None:
-        """Encode the latest point of the path, where the search was stopped before any container."""
-        containers, point = self._containers, self._latest_point()
-        all_missed = self._whole is not None or (self._unrecovered and containers.trials)
-        if point.number == 0 and all_missed:
-            return
+        """Encode the latest point of the path that can meet the goal, where the search was stopped before that.
+
+        What a trained point loses is measured only here: most are to be fine-tuned before they meet the goal.
+        """
+        containers = self._containers
         progress = SearchNote(ignore_stop_search(self.encoding.progress))
         containers.encoding = replace(containers.encoding, progress=progress)
-        if self._unrecovered and containers.time is not None:
-            containers.encode_all_in_time(containers.time)
-        else:
-            containers.encode(containers.path.compacted(point, refine=False))
+        for point in self._latest_points():
+            all_missed = self._whole is not None or (self._unrecovered and containers.trials)
+            if containers.candidates.best is not None or (point.number == 0 and all_missed):
+                return
+            if self._unrecovered and containers.time is not None:
+                containers.encode_all_in_time(containers.time)
+            else:
+                containers.encode(containers.path.compacted(point, refine=False))
 
-    def _latest_point(self) -> PathPoint:
-        """Return the last point if it is trained, else the last one that loses less than the goal allows."""
-        points, goal = self._containers.path.points, self._containers.goal
+    def _latest_points(self) -> list[PathPoint]:
+        """Return the last point if it is trained and loses less than the goal allows, and the last such untrained one.
+
+        For a size, return the last point.
+        """
+        points, goal, pruning = self._containers.path.points, self._containers.goal, self._containers.pruning
         if self._unrecovered:
-            return points[0]
-        if points[-1].trained or goal.by_size:
-            return points[-1]
-        return points[self._containers.pruning.last(lambda trial: goal.margin(trial) >= 0)]
+            return [points[0]]
+        if goal.by_size:
+            return [points[-1]]
+        untrained = points[pruning.last(lambda trial: goal.margin(trial) >= 0)]
+        if points[-1].trained and goal.margin(pruning.measure(points[-1].splats)) >= 0:
+            return [points[-1], untrained]
+        return [untrained]
 
     def _reason_to_keep_all(self) -> str:
         containers = self._containers

@@ -14,6 +14,7 @@ from kissgs.core.limits import MAX_GAUSSIANS
 from kissgs.core.progress import SearchNote
 from kissgs.core.root_finding import StopRule, find_root
 from kissgs.core.splats import Splats
+from kissgs.evaluation.psnr_loss import ESTIMATED_DROP
 from kissgs.finetuning.result import FinetuneReport
 from kissgs.pipeline.goal import Goal, Limit
 from kissgs.pipeline.read_options import ReadOptions
@@ -132,6 +133,7 @@ class RateControl:
         self._jump: tuple[float, int] | None = None
         self._psnr: float | None = None
         self._finetuning: FinetuneReport | None = None
+        self._against_renderings = False
         self._distance, self._trained = -math.inf, trained
         self._deadline, self._begun, self._longest = deadline, time.perf_counter(), 0.0
 
@@ -217,9 +219,10 @@ class RateControl:
             verb = "were not met before the search was stopped" if self.stopped else "cannot be met together"
             raise UnsupportedError(
                 f"{names} {verb}: the smallest container found with that quality has {self._bytes:,} bytes; allow at "
-                "least that"
+                f"least that{'' if self._deadline is None else ', or more time'}"
             )
-        best = replace(self.best, note=self._surplus_note(self.best))
+        estimated = self.settings.max_psnr_drop is not None and self._against_renderings
+        best = replace(self.best, note=ESTIMATED_DROP if estimated else self._surplus_note(self.best))
         if self._finetuning is None or best.finetuning is not None:
             return best
         return replace(best, finetuning=replace(self._finetuning, kept=False, note=NOT_FINETUNED))
@@ -342,7 +345,9 @@ class RateControl:
         size, sizes = stored_sizes(encoded.files, packed=self.packed)
         trial = Trial(self.count, encoded.rd_lambda, size)
         if not self.goal.by_size:
-            trial = self.goal.measured(trial, self._evaluation(encoded))
+            evaluation = self._evaluation(encoded)
+            trial = self.goal.measured(trial, evaluation)
+            self._against_renderings = evaluation.against == "renderings"
         self.trials.append(trial)
         self.overhead = size - sum(stored for name, stored in sizes.items() if name.endswith(".webp"))
         self.progress.note = f"try {len(self.trials) + 1}, last: {trial.summary()}"

@@ -15,6 +15,10 @@ TRAINING_TIME = 3.5
 TUNING_TIME = 5.0
 """Time from which fine-tuning on renderings of the scene pays, in the same unit."""
 
+NOT_TRAINED = "there was too little time for training"
+
+NOT_MEASURED = "what this container loses was not measured (--evaluate measures it)"
+
 
 @dataclass(frozen=True, slots=True)
 class TimePlan:
@@ -67,7 +71,9 @@ def time_plan(
         return TimePlan(settings, time)
     trained = settings.compact.auto_count and not requested.compact.auto_count
     settings = requested.decided(photographs=False, torch=False)
-    note = "there was too little time for training" if trained and count > 1 else ""
+    note = ""
+    if trained and count > 1:
+        note = NOT_TRAINED if settings.encode.has_goal else f"{NOT_TRAINED}; {NOT_MEASURED}"
     usual = Settings.from_preset(settings.preset, seed=settings.encode.seed).encode
     takes = plain * (CAPTURE_TIME if captured and settings.encode.rate_distortion else 1.0)
     if left >= takes or settings.preset == Preset.FAST or settings.encode != usual or settings.finetune.enabled:

@@ -136,15 +136,15 @@ def _products(degree: int) -> Float32[np.ndarray, "J P"]:
     Column a · K + b has the coefficients of the product of harmonics a + 1 and b + 1, without the constant one: that is
     1 / SPHERE for a = b, and 0 else.
     """
-    from kissgs.core.harmonics_kernel import write_harmonics
+    from kissgs.core.harmonics_kernel import write_harmonics_of
 
     number, count = (degree + 1) ** 2 - 1, (2 * degree + 1) ** 2 - 1
     points = 4 * count
     height = 1 - (2 * np.arange(points) + 1) / points
     turn, radius = np.pi * (3 - 5**0.5) * np.arange(points), np.sqrt(1 - height**2)
     values = np.empty((points, count))
-    for row, (x, y, z) in zip(values, np.stack([radius * np.cos(turn), radius * np.sin(turn), height], 1), strict=True):
-        write_harmonics(x, y, z, 2 * degree, row)
+    directions = np.stack([radius * np.cos(turn), radius * np.sin(turn), height], axis=1)
+    write_harmonics_of(directions, 2 * degree, values)
     pairs = (values[:, :number, None] * values[:, None, :number]).reshape(points, -1)
     with_constant = np.concatenate([np.ones((points, 1)), values], axis=1)
     return np.linalg.lstsq(with_constant, pairs, rcond=None)[0][1:].astype(np.float32)

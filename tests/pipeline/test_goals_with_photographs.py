@@ -9,6 +9,7 @@ from helpers.training_scenes import around, cloud
 
 import kissgs
 from kissgs import Settings
+from kissgs.pipeline.pruning import Pruning
 from kissgs.rendering.sensitivity import WeightedCameras
 
 
@@ -180,3 +181,26 @@ def test_a_stopped_search_for_a_count_encodes_what_it_has(tmp_path, stage):
     stopped.clear()
     with pytest.raises(kissgs.StopSearch):
         kissgs.compress(scene, settings=with_photographs(target_size=4100), views=views, progress=stop)
+
+
+def test_a_search_that_is_stopped_at_a_point_that_loses_too_much_encodes_the_one_before(tmp_path, monkeypatch):
+    """Regression: the trained point was encoded, missed the goal, and nothing was kept."""
+    measure, stopped = Pruning.measure, []
+
+    def measured(pruning, splats):
+        found = measure(pruning, splats)
+        return replace(found, drop=5.0) if len(splats) < 150 else found
+
+    def stop(now, fraction, note=""):
+        if now == "finetune" and fraction > 0 and not stopped:
+            stopped.append(now)
+            raise kissgs.StopSearch
+
+    monkeypatch.setattr(Pruning, "measure", measured)
+    scene = cloud(300)
+    views = photographs(scene, tmp_path)
+    found = kissgs.compress(scene, settings=with_photographs(max_psnr_drop=0.3), views=views, progress=stop)
+    assert stopped
+    assert found.report.compaction.count == round(300 * 0.8**3)
+    (kept,) = {trial for trial in found.report.trials if trial.bytes == len(found.to_zip())}
+    assert kept.drop <= 0.3

@@ -168,7 +168,8 @@ def _sizes(posed: PosedImage, photo: _Photo | None, scale: int) -> tuple[tuple[i
     if abs(size[1] - expected) > MAX_ASPECT_ERROR * size[1] + 2:
         raise InvalidViewsError(
             f"{photo.found.path} has {size[0]}x{size[1]} pixels, but its camera ({posed.where}) is for "
-            f"{nominal[0]}x{nominal[1]}, another aspect ratio; name the folder of the cameras' photographs (--images)"
+            f"{nominal[0]}x{nominal[1]}, another aspect ratio; name the folder of the cameras' "
+            "photographs (--images, where a command has it)"
         )
     return nominal, size
 

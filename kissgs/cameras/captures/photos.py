@@ -98,8 +98,9 @@ def find_photos(
         folders = searched[missing[0]]
         folder = next((entry.folder for entry in folders if entry.has_photos), folders[0].folder)
         raise InvalidViewsError(
-            f"{len(missing)} of {len(names)} photographs are missing; the first is {quoted(names[missing[0]])}, "
-            f"searched in {folder}; add them, or name the folder that has all of them (--images)"
+            f"{len(missing)} of {len(names)} photographs {'is' if len(missing) == 1 else 'are'} missing; the first is "
+            f"{quoted(names[missing[0]])}, searched in {folder}; add what is missing, or name the folder that has all "
+            "of them (--images, where a command has it)"
         )
     return tuple(photo for photo in found if photo is not None)
 

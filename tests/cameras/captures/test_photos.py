@@ -141,18 +141,18 @@ def message(root, *names, **options):
 
 def test_missing_photographs(tmp_path):
     touch(tmp_path, "images_2/a.jpg", "images_2/c.png")
-    remedy = "; add them, or name the folder that has all of them (--images)"
+    remedy = "; add what is missing, or name the folder that has all of them (--images, where a command has it)"
     assert message(tmp_path, *(f"images/{x}.jpg" for x in "abcd")) == (
         f"2 of 4 photographs are missing; the first is 'images/b.jpg', searched in {tmp_path}/images_2{remedy}"
     )
     assert message(tmp_path, "images/b.jpg") == (
-        f"1 of 1 photographs are missing; the first is 'images/b.jpg', searched in {tmp_path}/images_2{remedy}"
+        f"1 of 1 photographs is missing; the first is 'images/b.jpg', searched in {tmp_path}/images_2{remedy}"
     )
     assert message(tmp_path, "/else/images/b.jpg", "C:\\else\\rgb\\b.jpg").startswith(
         f"2 of 2 photographs are missing; the first is '/else/images/b.jpg', searched in {tmp_path}/images_2; "
     )
     assert message(tmp_path, "images/a.jpg", "test/b.jpg") == (
-        f"1 of 2 photographs are missing; the first is 'test/b.jpg', searched in {tmp_path}/test{remedy}"
+        f"1 of 2 photographs is missing; the first is 'test/b.jpg', searched in {tmp_path}/test{remedy}"
     )
 
 

@@ -1,0 +1,43 @@
+"""Kernels are compiled on import or loaded from the cache, and never again while a command works."""
+
+import os
+import subprocess
+import sys
+
+PROGRAM = """
+import importlib, pkgutil, sys, tempfile
+from pathlib import Path
+import kissgs
+for module in pkgutil.walk_packages(kissgs.__path__, "kissgs."):
+    if module.name.endswith("_kernels") or module.name.startswith(("kissgs.core.", "kissgs.rendering.cpu")):
+        importlib.import_module(module.name)
+from numba.core import event
+
+class Printer(event.Listener):
+    def on_start(self, event):
+        print(event.data["dispatcher"].py_func.__name__)
+
+    def on_end(self, event):
+        pass
+
+event.register("numba:compile", Printer())
+from helpers.photographed import photographs, with_photographs
+from helpers.training_scenes import cloud
+scene = cloud(150)
+views = photographs(scene, Path(tempfile.mkdtemp()))
+kissgs.compress(scene, settings=with_photographs(max_psnr_drop=1, max_ssim_drop=0.05), views=views, evaluate=True)
+kissgs.compact(scene, settings=kissgs.Settings.from_preset("balanced", compact={"ratio": 0.5, "method": "merge"}))
+"""
+
+
+def test_no_kernel_is_compiled_while_a_scene_is_compressed():
+    """Regression: one without a signature was compiled by every process, which announced that it was cached."""
+    paths = os.pathsep.join(path for path in sys.path if path)
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": paths},
+        check=False,
+    )
+    assert (done.returncode, done.stdout) == (0, ""), done.stderr[-2000:]
