@@ -26,7 +26,9 @@ if TYPE_CHECKING:
     from kissgs.core.progress import Progress
 
 
-STOPPING = b"\nkissgs: stopping: the best result so far is completed, which may take a minute; Ctrl-C again aborts\n"
+STOPPING = (
+    b"\nkissgs: stopping: the best result so far is completed, which may take a minute or two; Ctrl-C again aborts\n"
+)
 
 NOTHING_FOUND = "no container met the goal yet, and none is written"
 

@@ -124,10 +124,7 @@ class CountSearch:
         return (self._containers.train_to_first().drop or 0.0) <= RECOVERABLE_DB + allowed
 
     def _encode_latest(self) -> None:
-        """Encode the latest point of the path that can meet the goal, where the search was stopped before that.
-
-        What a trained point loses is measured only here: most are to be fine-tuned before they meet the goal.
-        """
+        """Encode the latest point of the path that can meet the goal, where the search was stopped before that."""
         containers = self._containers
         progress = SearchNote(ignore_stop_search(self.encoding.progress))
         containers.encoding = replace(containers.encoding, progress=progress)
@@ -141,19 +138,21 @@ class CountSearch:
                 containers.encode(containers.path.compacted(point, refine=False))
 
     def _latest_points(self) -> list[PathPoint]:
-        """Return the last point if it is trained and loses less than the goal allows, and the last such untrained one.
+        """Return points that can meet the goal without further training, the most promising first.
 
-        For a size, return the last point.
+        These are the last one if it is trained, and the last one that is only pruned, if they leave half of the error
+        to the encoder. What a trained point loses is measured only here: most are to be fine-tuned before they meet
+        the goal. For a size, that is the last point.
         """
         points, goal, pruning = self._containers.path.points, self._containers.goal, self._containers.pruning
         if self._unrecovered:
             return [points[0]]
         if goal.by_size:
             return [points[-1]]
-        untrained = points[pruning.last(lambda trial: goal.margin(trial) >= 0)]
-        if points[-1].trained and goal.margin(pruning.measure(points[-1].splats)) >= 0:
-            return [points[-1], untrained]
-        return [untrained]
+        pruned = points[pruning.last(goal.leaves_half)]
+        if points[-1].trained and goal.leaves_half(pruning.measure(points[-1].splats)):
+            return [points[-1], pruned]
+        return [pruned]
 
     def _reason_to_keep_all(self) -> str:
         containers = self._containers

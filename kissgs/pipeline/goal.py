@@ -152,6 +152,11 @@ class Goal:
         """Return the room of a trial to the limit that decides (:meth:`Limit.room`): at least 0 where all are met."""
         return self.decisive(trial).room(trial)
 
+    def leaves_half(self, trial: Trial) -> bool:
+        """Whether a scene that is not encoded leaves half of the allowed error to the encoder."""
+        limit = self.decisive(trial)
+        return limit.room(trial) >= limit.half
+
     @property
     def allowed_halvings(self) -> float:
         """Halvings of a quarter of the Gaussians that the limits on losses typically allow.

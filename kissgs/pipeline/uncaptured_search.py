@@ -84,11 +84,7 @@ def _search_without_training(containers: PathContainers, whole: RateControl) -> 
             psnr = psnr_of(whole.evaluate(whole.best.encoded)) + HALF_ERROR_DB
             number = pruning.last(lambda trial: (trial.psnr or 0.0) >= psnr)
     elif not goal.by_size and whole.best is not None:
-
-        def leaves_half(trial: Trial) -> bool:
-            return goal.margin(trial) >= goal.decisive(trial).half
-
-        pruning.prune_while(lambda trial: leaves_half(trial) and is_prunable(trial), containers.count)
-        number = pruning.last(leaves_half)
+        pruning.prune_while(lambda trial: goal.leaves_half(trial) and is_prunable(trial), containers.count)
+        number = pruning.last(goal.leaves_half)
     if number:
         containers.encode(containers.path.compacted(containers.path.points[number], refine=False))
