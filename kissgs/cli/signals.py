@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 from kissgs.cli.interrupts import (
+    NOTHING_LEFT,
     Interrupted,
     exit_by_signal,
     exit_on_signal,
@@ -27,10 +28,10 @@ if TYPE_CHECKING:
 
 
 STOPPING = (
-    b"\nkissgs: stopping: the best result so far is completed, which may take a minute or two; Ctrl-C again aborts\n"
+    b"\nkissgs: stopping: completing the best result so far, if any, which may take minutes; Ctrl-C again aborts\n"
 )
 
-NOTHING_FOUND = "no container met the goal yet, and none is written"
+NOTHING_FOUND = f"nothing met the goal yet, and {NOTHING_LEFT}"
 
 
 def unwinding(work: Callable[[], None]) -> None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from kissgs.core.errors import StopSearch
-from kissgs.core.progress import SearchNote, ignore_stop_search
+from kissgs.core.progress import Progress, SearchNote, as_stage, ignore_stop_search
 from kissgs.pipeline.path_containers import PathContainers
 from kissgs.pipeline.path_points import OVERHEAD_BYTES
 from kissgs.pipeline.pruning import is_prunable
@@ -77,11 +79,13 @@ class CountSearch:
         if candidates.best is None and self.aims:
             candidates.keep_closest()
         best, compacted = candidates.best, unchanged(self.compactor.splats, self._reason_to_keep_all())
+        trained = False
         if best is not None:
             best.search.stopped |= containers.stopped
             compacted = compacted if best.compacted.splats is self.compactor.splats else best.compacted
-        trained = best is not None and compacted is best.compacted and containers.photographs
-        notes = filter(None, [compacted.report.note, BEYOND_PHOTOGRAPHS if trained else ""])
+            trained = compacted.report.target_source == "photos" or best.search.finetuned
+            trained &= compacted is best.compacted and containers.photographs
+        notes = filter(None, [compacted.report.note, BEYOND_PHOTOGRAPHS if trained else "", self._note_of_estimates()])
         report = replace(compacted.report, trials=tuple(containers.pruning.tried), note="; ".join(notes))
         return replace(compacted, report=report), self._whole if best is None else best.search, tuple(containers.trials)
 
@@ -125,10 +129,9 @@ class CountSearch:
 
     def _encode_latest(self) -> None:
         """Encode the latest point of the path that can meet the goal, where the search was stopped before that."""
-        containers = self._containers
-        progress = SearchNote(ignore_stop_search(self.encoding.progress))
-        containers.encoding = replace(containers.encoding, progress=progress)
-        for point in self._latest_points():
+        containers, progress = self._containers, ignore_stop_search(self.encoding.progress)
+        containers.encoding = replace(containers.encoding, progress=SearchNote(progress))
+        for point in self._latest_points(progress):
             all_missed = self._whole is not None or (self._unrecovered and containers.trials)
             if containers.candidates.best is not None or (point.number == 0 and all_missed):
                 return
@@ -137,22 +140,34 @@ class CountSearch:
             else:
                 containers.encode(containers.path.compacted(point, refine=False))
 
-    def _latest_points(self) -> list[PathPoint]:
+    def _latest_points(self, progress: Progress) -> list[PathPoint]:
         """Return points that can meet the goal without further training, the most promising first.
 
-        These are the last one if it is trained, and the last one that is only pruned, if they leave half of the error
-        to the encoder. What a trained point loses is measured only here: most are to be fine-tuned before they meet
-        the goal. For a size, that is the last point.
+        The last point serves a size or an aim. For a quality, it is left out if it is trained and leaves less than half
+        of the error to the encoder, as most do that are still to be fine-tuned; then comes the last of those that are
+        only pruned and leave half.
         """
-        points, goal, pruning = self._containers.path.points, self._containers.goal, self._containers.pruning
+        from kissgs.compaction.training_path import PathPoint
+
+        points, goal = self._containers.path.points, self._containers.goal
         if self._unrecovered:
             return [points[0]]
-        if goal.by_size:
+        if goal.by_size or (self.aims and points[-1].trained):
             return [points[-1]]
-        pruned = points[pruning.last(goal.leaves_half)]
-        if points[-1].trained and goal.leaves_half(pruning.measure(points[-1].splats)):
-            return [points[-1], pruned]
-        return [pruned]
+        lost = dict(enumerate(self._containers.pruning.losses, 1))
+        pruned = [points[n] for n, trial in lost.items() if goal.leaves_half(trial) and not points[n].trained]
+        whole = PathPoint(0, self.compactor.splats, np.arange(len(self.compactor.splats)))
+        found = [pruned[-1] if pruned else whole]
+        if points[-1].trained:
+            evaluation = self.compactor.compare(points[-1].splats, as_stage("evaluate", progress))
+            trial = goal.measured(Trial(len(points[-1]), None, 0), evaluation)
+            found = [points[-1], *found] if goal.leaves_half(trial) else found
+        return found
+
+    def _note_of_estimates(self) -> str:
+        """Return the note that losses are estimates, unless the search for lambda gives it."""
+        noted = self.encoding.settings.encode.max_psnr_drop is not None or not self._containers.pruning.tried
+        return "" if noted else self.compactor.note
 
     def _reason_to_keep_all(self) -> str:
         containers = self._containers

@@ -176,11 +176,6 @@ class RateControl:
         return self._finetuning is not None
 
     @property
-    def _no_size_suffices(self) -> bool:
-        """Whether a container without any image would exceed the target size."""
-        return self.goal.by_size and self.overhead > (self.settings.target_size or 0)
-
-    @property
     def _short(self) -> bool:
         """Whether all samples are well below the target size, or all miss the quality goal."""
         margins = [sample.margin for sample in self._samples.values()]
@@ -216,12 +211,6 @@ class RateControl:
             UnsupportedError: no container meets the goal. With ``suggest_compaction``, the message may advise fewer
                 Gaussians.
         """
-        if self.best is None and self._no_size_suffices:
-            target = int(self.settings.target_size or 0)
-            raise UnsupportedError(
-                f"target_size {target:,} byte{'' if target == 1 else 's'} cannot be met: the metadata of a container "
-                f"alone takes {self.overhead:,}; ask for more"
-            )
         if self.best is None:
             suggest = suggest_compaction and self.count > 1 and self.overhead < (self.settings.target_size or 0)
             raise UnsupportedError(self.goal.failure_message(self.trials, trained, suggest_compaction=suggest))
@@ -367,9 +356,6 @@ class RateControl:
         if margin < 0 and (self.closest is None or margin > self._distance):
             self.closest, self._distance = container, margin
         self._longest = max(self._longest, time.perf_counter() - self._begun)
-        if self._no_size_suffices:
-            self.stopped = True
-            raise _CannotImprove
         self._finetuning = container.finetuning or self._finetuning
         if margin >= 0 and self._is_better(container, size):
             self.best, self._bytes = container, size
@@ -416,4 +402,4 @@ class _Sample:
 
 
 class _CannotImprove(Exception):
-    """Raised when no container of this scene can meet the goal, or become smaller than one of another scene."""
+    """Raised when no container of this scene can become smaller than one that is known of another scene."""

@@ -17,7 +17,7 @@ TUNING_TIME = 5.0
 
 NOT_TRAINED = "there was too little time for training"
 
-NOT_MEASURED = "what this container loses was not measured (--evaluate measures it)"
+LOSS_OF_PRESET = "so nothing limits the loss but the preset"
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ def time_plan(
     settings = requested.decided(photographs=False, torch=False)
     note = ""
     if trained and count > 1:
-        note = NOT_TRAINED if settings.encode.has_goal else f"{NOT_TRAINED}; {NOT_MEASURED}"
+        note = NOT_TRAINED if settings.encode.has_goal else f"{NOT_TRAINED}, {LOSS_OF_PRESET}"
     usual = Settings.from_preset(settings.preset, seed=settings.encode.seed).encode
     takes = plain * (CAPTURE_TIME if captured and settings.encode.rate_distortion else 1.0)
     if left >= takes or settings.preset == Preset.FAST or settings.encode != usual or settings.finetune.enabled:

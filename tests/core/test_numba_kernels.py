@@ -24,8 +24,11 @@ event.register("numba:compile", Printer())
 from helpers.photographed import photographs, with_photographs
 from helpers.training_scenes import cloud
 scene = cloud(150)
-views = photographs(scene, Path(tempfile.mkdtemp()))
-kissgs.compress(scene, settings=with_photographs(max_psnr_drop=1, max_ssim_drop=0.05), views=views, evaluate=True)
+with tempfile.TemporaryDirectory() as folder:
+    views = photographs(scene, Path(folder))
+    kissgs.compress(scene, settings=with_photographs(max_psnr_drop=1, max_ssim_drop=0.05), views=views, evaluate=True)
+tuned = kissgs.Settings.from_preset("small", finetune={"enabled": True, "steps": 2})
+kissgs.compress(scene, settings=tuned, container="sog")
 kissgs.compact(scene, settings=kissgs.Settings.from_preset("balanced", compact={"ratio": 0.5, "method": "merge"}))
 """
 

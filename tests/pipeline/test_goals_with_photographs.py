@@ -9,7 +9,7 @@ from helpers.training_scenes import around, cloud
 
 import kissgs
 from kissgs import Settings
-from kissgs.pipeline.pruning import Pruning
+from kissgs.compaction.training_path import TrainingPath
 from kissgs.rendering.sensitivity import WeightedCameras
 
 
@@ -183,24 +183,46 @@ def test_a_stopped_search_for_a_count_encodes_what_it_has(tmp_path, stage):
         kissgs.compress(scene, settings=with_photographs(target_size=4100), views=views, progress=stop)
 
 
-def test_a_search_that_is_stopped_at_a_point_that_loses_too_much_encodes_the_one_before(tmp_path, monkeypatch):
-    """Regression: the trained point was encoded, missed the goal, and nothing was kept."""
-    measure, stopped = Pruning.measure, []
+def darkening(monkeypatch):
+    """Let what is trained along the path look black until it is trained on."""
+    train = TrainingPath.train
 
-    def measured(pruning, splats):
-        found = measure(pruning, splats)
-        return replace(found, drop=5.0) if len(splats) < 150 else found
+    def trained(path, deadline=None):
+        point = train(path, deadline)
+        dark = replace(point.splats, sh0=np.full_like(point.splats.sh0, -9))
+        path.points[-1] = replace(point, splats=dark)
+        return path.points[-1]
+
+    monkeypatch.setattr(TrainingPath, "train", trained)
+
+
+@pytest.mark.parametrize("goal", [{"max_psnr_drop": 0.3}, {"max_ssim_drop": 0.05}])
+@pytest.mark.parametrize("stage", ["sparsify", "finetune"])
+@pytest.mark.quick(1)
+def test_a_search_that_is_stopped_at_a_point_that_loses_too_much_encodes_one_without_training(
+    tmp_path, monkeypatch, goal, stage
+):
+    """Regression: the trained point was encoded, missed the goal, and nothing was kept.
+
+    From then on every event raises, as it does where a flag of the caller stays set.
+    """
+    darkening(monkeypatch)
+    reached = []
 
     def stop(now, fraction, note=""):
-        if now == "finetune" and fraction > 0 and not stopped:
-            stopped.append(now)
+        reached.extend([now] * (now == stage and fraction > 0))
+        if reached:
             raise kissgs.StopSearch
 
-    monkeypatch.setattr(Pruning, "measure", measured)
     scene = cloud(300)
     views = photographs(scene, tmp_path)
-    found = kissgs.compress(scene, settings=with_photographs(max_psnr_drop=0.3), views=views, progress=stop)
-    assert stopped
-    assert found.report.compaction.count == round(300 * 0.8**3)
-    (kept,) = {trial for trial in found.report.trials if trial.bytes == len(found.to_zip())}
-    assert kept.drop <= 0.3
+    found = kissgs.compress(scene, settings=with_photographs(**goal), views=views, progress=stop)
+    assert reached
+    assert found.report.compaction.target_source == "nothing"
+    assert found.report.compaction.count >= round(300 * 0.8**3)
+    assert "beyond them it changes more" not in found.report.compaction.note
+    plain = kissgs.evaluate(scene, kissgs.decompress(found.files), views).mean
+    if "max_psnr_drop" in goal:
+        assert plain.reference.psnr - plain.candidate.psnr <= 0.3
+    else:
+        assert plain.reference.ssim - plain.candidate.ssim <= 0.05

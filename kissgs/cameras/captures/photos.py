@@ -100,7 +100,7 @@ def find_photos(
         raise InvalidViewsError(
             f"{len(missing)} of {len(names)} photographs {'is' if len(missing) == 1 else 'are'} missing; the first is "
             f"{quoted(names[missing[0]])}, searched in {folder}; add what is missing, or name the folder that has all "
-            "of them (--images, where a command has it)"
+            "of them (--images of kissgs evaluate, render and bench)"
         )
     return tuple(photo for photo in found if photo is not None)
 
