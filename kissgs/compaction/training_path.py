@@ -64,15 +64,18 @@ class TrainingPath:
         task: scene, settings and views.
         keep_states: whether every point, not just the last one, can be refined: that takes three times the memory.
         points: the points so far, the whole scene first.
+        whole: the whole scene without training, also after the first point was trained.
     """
 
     task: Popspa
     keep_states: bool = True
     points: list[PathPoint] = field(init=False)
+    whole: PathPoint = field(init=False)
     _loaded: TrainingTargets | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
-        self.points = [PathPoint(0, self.task.splats, np.arange(len(self.task.splats)))]
+        self.whole = PathPoint(0, self.task.splats, np.arange(len(self.task.splats)))
+        self.points = [self.whole]
 
     def prune(self, count: int) -> PathPoint:
         """Prune to ``count`` Gaussians, and return the new point; reports the stages "kernels" and "score".

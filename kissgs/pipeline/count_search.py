@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from kissgs.core.errors import StopSearch
 from kissgs.core.progress import Progress, SearchNote, as_stage, ignore_stop_search
 from kissgs.pipeline.path_containers import PathContainers
@@ -135,7 +133,7 @@ class CountSearch:
             all_missed = self._whole is not None or (self._unrecovered and containers.trials)
             if containers.candidates.best is not None or (point.number == 0 and all_missed):
                 return
-            if self._unrecovered and containers.time is not None:
+            if point is containers.path.whole and containers.time is not None:
                 containers.encode_all_in_time(containers.time)
             else:
                 containers.encode(containers.path.compacted(point, refine=False))
@@ -143,21 +141,19 @@ class CountSearch:
     def _latest_points(self, progress: Progress) -> list[PathPoint]:
         """Return points that can meet the goal without further training, the most promising first.
 
-        The last point serves a size or an aim. For a quality, it is left out if it is trained and leaves less than half
-        of the error to the encoder, as most do that are still to be fine-tuned; then comes the last of those that are
-        only pruned and leave half.
+        The last point serves a size. For a quality, it is left out if it is trained and leaves less than half of the
+        error to the encoder, as most do that are still to be fine-tuned; then comes the last of those that are only
+        pruned and leave half.
         """
-        from kissgs.compaction.training_path import PathPoint
-
-        points, goal = self._containers.path.points, self._containers.goal
+        path, goal = self._containers.path, self._containers.goal
+        points = path.points
         if self._unrecovered:
-            return [points[0]]
-        if goal.by_size or (self.aims and points[-1].trained):
+            return [path.whole]
+        if goal.by_size:
             return [points[-1]]
         lost = dict(enumerate(self._containers.pruning.losses, 1))
         pruned = [points[n] for n, trial in lost.items() if goal.leaves_half(trial) and not points[n].trained]
-        whole = PathPoint(0, self.compactor.splats, np.arange(len(self.compactor.splats)))
-        found = [pruned[-1] if pruned else whole]
+        found = [pruned[-1] if pruned else path.whole]
         if points[-1].trained:
             evaluation = self.compactor.compare(points[-1].splats, as_stage("evaluate", progress))
             trial = goal.measured(Trial(len(points[-1]), None, 0), evaluation)

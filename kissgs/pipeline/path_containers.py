@@ -149,11 +149,11 @@ class PathContainers:
 
     def encode_all(self) -> RateControl:
         """Search for the lambda of all Gaussians without fine-tuning."""
-        return self.encode(self.path.compacted(self.path.points[0], refine=False))
+        return self.encode(self.path.compacted(self.path.whole, refine=False))
 
     def encode_all_in_time(self, time: SearchTime) -> RateControl:
         """Search for the lambda of all Gaussians without fine-tuning; for an aim, only as long as there is time."""
-        compacted = self.path.compacted(self.path.points[0], refine=False)
+        compacted = self.path.compacted(self.path.whole, refine=False)
         encoding = self._encoding_of(compacted)
         search, encoder = encoding.rate_control(), encoding.encoder(None)
 

@@ -196,7 +196,7 @@ def darkening(monkeypatch):
     monkeypatch.setattr(TrainingPath, "train", trained)
 
 
-@pytest.mark.parametrize("goal", [{"max_psnr_drop": 0.3}, {"max_ssim_drop": 0.05}])
+@pytest.mark.parametrize("goal", [{"max_psnr_drop": 0.3}, {"max_ssim_drop": 0.05}, {"time_limit": 600}])
 @pytest.mark.parametrize("stage", ["sparsify", "finetune"])
 @pytest.mark.quick(1)
 def test_a_search_that_is_stopped_at_a_point_that_loses_too_much_encodes_one_without_training(
@@ -222,7 +222,7 @@ def test_a_search_that_is_stopped_at_a_point_that_loses_too_much_encodes_one_wit
     assert found.report.compaction.count >= round(300 * 0.8**3)
     assert "beyond them it changes more" not in found.report.compaction.note
     plain = kissgs.evaluate(scene, kissgs.decompress(found.files), views).mean
-    if "max_psnr_drop" in goal:
-        assert plain.reference.psnr - plain.candidate.psnr <= 0.3
-    else:
+    if "max_ssim_drop" in goal:
         assert plain.reference.ssim - plain.candidate.ssim <= 0.05
+    else:  # with time alone the aim is a tenth of a decibel
+        assert plain.reference.psnr - plain.candidate.psnr <= goal.get("max_psnr_drop", 0.1)
