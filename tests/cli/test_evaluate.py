@@ -143,7 +143,7 @@ def test_errors_are_one_line(folder: Path, tmp_path: Path) -> None:
     assert "exclude each other" in failure("evaluate", *pair, "--views", capture, "--scale", 2, "--images", tmp_path)
     (capture / "images" / "a.png").rename(capture / "images" / "a.away")
     try:
-        assert "photographs are missing" in failure("evaluate", *pair, "--views", capture)
+        assert "1 of 3 photographs is missing" in failure("evaluate", *pair, "--views", capture)
     finally:
         (capture / "images" / "a.away").rename(capture / "images" / "a.png")
 
