@@ -9,7 +9,7 @@ import importlib, pkgutil, sys, tempfile
 from pathlib import Path
 import kissgs
 for module in pkgutil.walk_packages(kissgs.__path__, "kissgs."):
-    if module.name.endswith("_kernels") or module.name.startswith(("kissgs.core.", "kissgs.rendering.cpu")):
+    if "kernel" in module.name or module.name.startswith(("kissgs.core.", "kissgs.rendering.")):
         importlib.import_module(module.name)
 from numba.core import event
 
