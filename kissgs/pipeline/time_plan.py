@@ -15,9 +15,8 @@ TRAINING_TIME = 3.5
 TUNING_TIME = 5.0
 """Time from which fine-tuning on renderings of the scene pays, in the same unit."""
 
-NOT_TRAINED = "there was too little time for training"
-
-LOSS_OF_PRESET = "so nothing limits the loss but the preset"
+TOO_LITTLE_TIME = "there was too little time for training"
+"""Note where training is left out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,9 +70,9 @@ def time_plan(
         return TimePlan(settings, time)
     trained = settings.compact.auto_count and not requested.compact.auto_count
     settings = requested.decided(photographs=False, torch=False)
-    note = ""
-    if trained and count > 1:
-        note = NOT_TRAINED if settings.encode.has_goal else f"{NOT_TRAINED}, {LOSS_OF_PRESET}"
+    note = TOO_LITTLE_TIME if trained and count > 1 else ""
+    if note and not settings.encode.has_goal:
+        note += ", so nothing limits the loss but the preset"
     usual = Settings.from_preset(settings.preset, seed=settings.encode.seed).encode
     takes = plain * (CAPTURE_TIME if captured and settings.encode.rate_distortion else 1.0)
     if left >= takes or settings.preset == Preset.FAST or settings.encode != usual or settings.finetune.enabled:

@@ -134,6 +134,7 @@ def test_without_torch_the_report_says_what_is_missing(tmp_path, monkeypatch):
     assert found.report.compaction is None
     assert found.report.finetuning is None
     assert "torch is missing: pip install 'kissgs[train]'" in found.report.note
+    assert "estimated" not in found.report.note
     kept = kissgs.compress(scene, settings=with_photographs({"enabled": False}, target_size="1MB"))
     assert "torch" not in kept.report.note
 

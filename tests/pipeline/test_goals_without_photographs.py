@@ -76,6 +76,17 @@ def test_a_limited_time_trains_if_it_is_long(monkeypatch, units, trained):
         assert "too little time to train a smaller number" in report.compaction.note
 
 
+def test_a_loss_that_is_estimated_is_called_so_once():
+    """Regression: not where the encoder alone searched."""
+    alone = {"compact": {"auto_count": False}, "finetune": {"enabled": False}}
+    few = {"sensitivity_views": 16, "sensitivity_view_size": 96}
+    for changes in (alone, {"finetune": {"enabled": False}}):
+        chosen = kissgs.Settings.from_preset("balanced", max_psnr_drop=0.5, **changes, **few)
+        report = kissgs.compress(SMALL, settings=chosen).report
+        notes = report.note + ("" if report.compaction is None else report.compaction.note)
+        assert notes.count("the drop of PSNR is estimated for a scene that has 30 dB") == 1
+
+
 def test_ctrl_c_keeps_the_container_of_the_encoder():
     """Pressed in the first training, when containers of the encoder alone exist."""
     stopped = []

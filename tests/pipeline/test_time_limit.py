@@ -46,6 +46,9 @@ def test_training_is_chosen_where_there_is_time_and_a_capture():
     assert plan_of(10 * plain).settings.encode.max_psnr_drop == 0.1
     assert trains(plan_of(2 * plain)) == (False, False)
     assert plan_of(2 * plain).settings.encode.has_goal is False
+    note = "there was too little time for training"
+    assert plan_of(2 * plain).note == f"{note}, so nothing limits the loss but the preset"
+    assert plan_of(2 * plain, max_psnr_drop=0.3).note == note
     assert trains(plan_of(10 * plain, photographs=False)) == (False, True)  # levels alone, on renderings
     assert trains(plan_of(10 * plain, photographs=False, finetune={"enabled": False})) == (False, False)
     assert trains(plan_of(10 * plain, photographs=False, psnr=40)) == (False, False)
