@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -71,7 +72,8 @@ class CountSearch:
         except StopSearch:
             containers.stopped = True
             if candidates.best is None and not (self.aims and candidates.any_missed):
-                self._encode_latest()
+                with suppress(StopSearch):  # raised where the time of an aim is over
+                    self._encode_latest()
             if candidates.best is None and not self.aims:
                 raise
         if candidates.best is None and self.aims:
@@ -127,6 +129,7 @@ class CountSearch:
 
     def _encode_latest(self) -> None:
         """Encode the latest point of the path that can meet the goal, where the search was stopped before that."""
+        self.encoding.progress.note = ""
         containers, progress = self._containers, ignore_stop_search(self.encoding.progress)
         containers.encoding = replace(containers.encoding, progress=SearchNote(progress))
         for point in self._latest_points(progress):

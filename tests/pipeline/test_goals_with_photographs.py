@@ -10,6 +10,7 @@ from helpers.training_scenes import around, cloud
 import kissgs
 from kissgs import Settings
 from kissgs.compaction.training_path import TrainingPath
+from kissgs.pipeline.search_time import SearchTime
 from kissgs.rendering.sensitivity import WeightedCameras
 
 
@@ -227,3 +228,23 @@ def test_a_search_that_is_stopped_at_a_point_that_loses_too_much_encodes_one_wit
         assert plain.reference.ssim - plain.candidate.ssim <= 0.05
     else:  # with time alone the aim is a tenth of a decibel
         assert plain.reference.psnr - plain.candidate.psnr <= goal.get("max_psnr_drop", 0.1)
+
+
+def test_a_search_for_an_aim_that_is_stopped_when_its_time_is_over_keeps_the_closest_container(tmp_path, monkeypatch):
+    """Regression: with one container that missed the aim, it was lost."""
+    monkeypatch.setattr(SearchTime, "over_for_encoding", True)
+    reached = []
+
+    def stop(now, fraction, note=""):
+        reached.extend([now] * (now == "sparsify" and fraction > 0))
+        if reached:
+            raise kissgs.StopSearch
+
+    scene = cloud(300)
+    views = photographs(scene, tmp_path, brightness=1)
+    found = kissgs.compress(scene, settings=with_photographs(time_limit=600), views=views, progress=stop)
+    (only,) = found.report.trials
+    assert reached
+    assert only.count == 300
+    assert only.drop > 0.1
+    assert only.bytes == len(found.to_zip())
