@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -201,14 +201,7 @@ def resampled(splats: Splats, count: int, *, seed: int = 0) -> Splats:
 
 
 def _rescaled(splats: Splats, means: np.ndarray, log_growth: float) -> Splats:
-    return Splats(
-        means=np.ascontiguousarray(means),
-        quats=splats.quats,
-        scales=splats.scales + np.float32(log_growth),
-        opacities=splats.opacities,
-        sh0=splats.sh0,
-        shN=splats.shN,
-    )
+    return replace(splats, means=np.ascontiguousarray(means), scales=splats.scales + np.float32(log_growth))
 
 
 def _cpu_milliseconds(operation: Callable[[], object]) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -41,6 +41,11 @@ class Splats:
         opacities: ``(N,)`` float32, logits.
         sh0: ``(N, 3)`` float32, constant SH coefficient of R, G, B.
         shN: ``(N, K, 3)`` float32, the other SH coefficients, first band first; K is 0, 3, 8 or 15.
+        antialiased: whether the scene was trained with opacities compensated for the dilation of footprints (Mip-
+            Splatting's 2D filter), and has to be drawn so.
+        origin: point of the world at which ``means`` is zero, world units: coordinates beyond float32 are near
+            ``origin``.
+        notes: what reading the scene's file left out or changed, one phrase each.
 
     Raises:
         InvalidSceneError: an array has a wrong dtype or shape.
@@ -52,6 +57,9 @@ class Splats:
     opacities: Float32[np.ndarray, " N"]
     sh0: Float32[np.ndarray, "N 3"]
     shN: Float32[np.ndarray, "N K 3"]
+    antialiased: bool = False
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         n = len(self.means) if self.means.ndim else -1
@@ -90,12 +98,15 @@ class Splats:
 
     def select(self, index: Int[np.ndarray, " M"] | Bool[np.ndarray, " N"] | slice) -> Splats:
         """Return the Gaussians at ``index`` (indices, a boolean mask or a slice), in that order."""
-        return Splats(**{name: getattr(self, name)[index] for name in ATTRIBUTES})
+        return replace(self, **{name: getattr(self, name)[index] for name in ATTRIBUTES})
 
 
 def concatenate(scenes: Sequence[Splats]) -> Splats:
-    """Return one scene with the Gaussians of all scenes, at least one, in their order; their SH degrees are equal."""
-    return Splats(**{name: np.concatenate([getattr(scene, name) for scene in scenes]) for name in ATTRIBUTES})
+    """Return one scene with the Gaussians of all scenes, at least one, in their order.
+
+    All else, such as their SH degrees and origins, is equal.
+    """
+    return replace(scenes[0], **{name: np.concatenate([getattr(scene, name) for scene in scenes]) for name in ATTRIBUTES})
 
 
 def float32_bytes(count: int, sh_degree: int) -> int:
@@ -188,7 +199,7 @@ def clean(splats: Splats) -> tuple[Splats, Cleaned]:
         clamped_scales=int(clamped_scales.sum()),
         clamped_sh=int((clamped_sh0 | clamped_shN).sum()),
     )
-    cleaned = Splats(means=splats.means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN)
+    cleaned = replace(splats, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN)
     return cleaned, report
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -66,11 +67,4 @@ def share_shown(splats: Splats, cameras: Sequence[Camera], *, threads: int = 0) 
 
 def base_colors_only(splats: Splats) -> Splats:
     """Return the scene without shN, for renderings whose colours do not matter: shN costs as much as all else."""
-    return Splats(
-        means=splats.means,
-        quats=splats.quats,
-        scales=splats.scales,
-        opacities=splats.opacities,
-        sh0=splats.sh0,
-        shN=np.empty((len(splats), 0, 3), np.float32),
-    )
+    return replace(splats, shN=np.empty((len(splats), 0, 3), np.float32))

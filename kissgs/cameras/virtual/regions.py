@@ -21,7 +21,7 @@ from kissgs.cameras.virtual.select import select_diverse
 from kissgs.core.array_types import Bool, Float32, Float64, Int
 from kissgs.core.progress import Progress
 from kissgs.core.sensitivity import BLOCK, Sensitivity
-from kissgs.core.splats import Splats
+from kissgs.core.splats import Splats, concatenate
 from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera, look_at
 from kissgs.rendering.coverage import Coverage
@@ -160,10 +160,8 @@ def _further_region(splats: Splats, bounds: SceneBounds, like: Camera, pool: Wor
     Half of the proxy scene shows what is near the region, the other half what is in front of it and behind.
     """
     near = _within(splats.means, bounds.centre, 6 * bounds.radius)
-    proxy = _concatenated(
-        proxy_scene(splats, PROXY_GAUSSIANS // 2, np.flatnonzero(near)),
-        proxy_scene(splats, PROXY_GAUSSIANS // 2, np.flatnonzero(~near)),
-    )
+    parts = np.flatnonzero(near), np.flatnonzero(~near)
+    proxy = concatenate([proxy_scene(splats, PROXY_GAUSSIANS // 2, part) for part in parts])
     scorer = ViewScorer(proxy, bounds, pool, progress)
     cameras = list(_surrounding_cameras(bounds, like))
     return Region(ScoredCandidates(scorer, "object", cameras, scorer.measure(cameras), np.zeros(len(cameras))), 0.0)
@@ -190,7 +188,3 @@ def _surrounding_cameras(bounds: SceneBounds, like: Camera) -> Iterator[Camera]:
         position = bounds.centre + bounds.radius * (1.3, 2.0, 3.0)[n % 3] * direction
         yield look_at(position, bounds.centre, bounds.up, fov=FIELD_OF_VIEW, width=like.width, height=like.height)
 
-
-def _concatenated(first: Splats, second: Splats) -> Splats:
-    names = ("means", "quats", "scales", "opacities", "sh0", "shN")
-    return Splats(**{name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names})

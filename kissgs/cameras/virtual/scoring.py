@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -87,14 +87,7 @@ class ViewScorer:
         log_depth = np.log(np.maximum(proxy.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3], 1e-12))
         values = self._log_sizes, log_depth, CENTRE_SCALE * self._central
         colours = np.stack([_to_sh0(value) for value in values], axis=1)
-        coloured = Splats(
-            means=proxy.means,
-            quats=proxy.quats,
-            scales=proxy.scales,
-            opacities=proxy.opacities,
-            sh0=colours.astype(np.float32),
-            shN=np.empty((len(proxy), 0, 3), np.float32),
-        )
+        coloured = replace(proxy, sh0=colours.astype(np.float32), shN=np.empty((len(proxy), 0, 3), np.float32))
         with Workers(1) as single:  # cameras are already rendered in parallel
             frame = draw(coloured, camera, black(), single, OPAQUE)
         alpha = 1 - frame.transmittance.astype(np.float64)
@@ -130,7 +123,8 @@ def proxy_scene(splats: Splats, max_count: int = PROXY_GAUSSIANS, among: Int[np.
     count = len(splats) if among is None else len(among)
     step = max(1, -(-count // max_count))
     chosen = slice(None, None, step) if among is None else among[::step]
-    return Splats(
+    return replace(
+        splats,
         means=np.ascontiguousarray(splats.means[chosen]),
         quats=np.ascontiguousarray(splats.quats[chosen]),
         scales=splats.scales[chosen] + np.float32(np.log(step) / 2),

@@ -7,7 +7,7 @@ writes its own slots, and the slots of a footprint are added in order.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -251,4 +251,4 @@ def _colour(background: Shaped[np.ndarray, "..."]) -> Float32[np.ndarray, "3"]:
 def for_kernels(splats: Splats) -> Splats:
     """Return the scene with contiguous, writeable arrays, as kernels need them; copied only where necessary."""
     arrays = {name: np.require(getattr(splats, name), requirements=("C", "W")) for name in ATTRIBUTES}
-    return splats if all(array is getattr(splats, name) for name, array in arrays.items()) else Splats(**arrays)
+    return splats if all(array is getattr(splats, name) for name, array in arrays.items()) else replace(splats, **arrays)
