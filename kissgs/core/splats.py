@@ -106,7 +106,9 @@ def concatenate(scenes: Sequence[Splats]) -> Splats:
 
     All else, such as their SH degrees and origins, is equal.
     """
-    return replace(scenes[0], **{name: np.concatenate([getattr(scene, name) for scene in scenes]) for name in ATTRIBUTES})
+    return replace(
+        scenes[0], **{name: np.concatenate([getattr(scene, name) for scene in scenes]) for name in ATTRIBUTES}
+    )
 
 
 def float32_bytes(count: int, sh_degree: int) -> int:

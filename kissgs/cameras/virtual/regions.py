@@ -187,4 +187,3 @@ def _surrounding_cameras(bounds: SceneBounds, like: Camera) -> Iterator[Camera]:
         direction = np.array([horizontal * np.cos(azimuth), height, horizontal * np.sin(azimuth)])
         position = bounds.centre + bounds.radius * (1.3, 2.0, 3.0)[n % 3] * direction
         yield look_at(position, bounds.centre, bounds.up, fov=FIELD_OF_VIEW, width=like.width, height=like.height)
-

@@ -251,4 +251,6 @@ def _colour(background: Shaped[np.ndarray, "..."]) -> Float32[np.ndarray, "3"]:
 def for_kernels(splats: Splats) -> Splats:
     """Return the scene with contiguous, writeable arrays, as kernels need them; copied only where necessary."""
     arrays = {name: np.require(getattr(splats, name), requirements=("C", "W")) for name in ATTRIBUTES}
-    return splats if all(array is getattr(splats, name) for name, array in arrays.items()) else replace(splats, **arrays)
+    return (
+        splats if all(array is getattr(splats, name) for name, array in arrays.items()) else replace(splats, **arrays)
+    )
