@@ -77,7 +77,7 @@ class RenderJob:
         """
         load_kernels(self.progress)
         if which is not None and is_camera_file(which):
-            view, source = view_of_file(which), "camera file"
+            view, source = view_of_file(which).relative_to(self.splats.origin), "camera file"
         elif capture is not None:
             view, source = pick_view(capture.all, which or "0", capture.source), capture.source
         elif which is None:

@@ -12,6 +12,7 @@ from kissgs.cameras.pixels import read_photo
 from kissgs.cameras.undistort import Lens, Window, undistort
 from kissgs.core.array_types import Float32, Float64, UInt8
 from kissgs.core.errors import InvalidViewsError
+from kissgs.core.origin import WORLD, Origin
 from kissgs.rendering.camera import Camera
 
 
@@ -78,6 +79,11 @@ class View:
         sampling = replace(before, stride=before.stride * stride, first=(column, row))
         return replace(self, camera=self.camera.sampled(stride, first), sampling=sampling)
 
+    def relative_to(self, origin: Origin) -> View:
+        """Return the view in coordinates relative to ``origin``, world units."""
+        target = None if self.target is None else self.target - origin
+        return replace(self, camera=self.camera.relative_to(origin), target=target)
+
     @property
     def _sampling(self) -> Sampling:
         return self.sampling or Sampling(self.camera.width, self.camera.height, 1, (0, 0))
@@ -132,6 +138,13 @@ class Views:
     def all(self) -> tuple[View, ...]:
         """Training and held-out views, sorted by name."""
         return tuple(sorted(self.train + self.test, key=lambda view: view.name))
+
+    def relative_to(self, origin: Origin) -> Views:
+        """Return the views in coordinates relative to ``origin``, world units, as those of a scene with that origin."""
+        if origin == WORLD:
+            return self
+        train, test = (tuple(view.relative_to(origin) for view in part) for part in (self.train, self.test))
+        return replace(self, train=train, test=test)
 
     def for_training(self, source: TargetSource) -> Views:
         """Return views whose training part suits ``source``; evaluation uses the held-out views, or all if none is."""

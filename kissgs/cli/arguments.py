@@ -52,6 +52,14 @@ RawAxesOption = Annotated[
         help="Take the axes of .spz as those of a .ply, as splat-transform writes and reads them. Default: y up.",
     ),
 ]
+OriginOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="auto",
+        help="auto: make positions relative to the middle of the scene, where they have fine steps, and record it: for "
+        "scenes far from the origin. Default: as in the file.",
+    ),
+]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")]
 ThreadsOption = Annotated[
     int, typer.Option(min=0, help="Number of threads; 0 for one per processor. The output does not depend on it.")

@@ -17,6 +17,7 @@ from kissgs.cli.arguments import (
     MaxGaussiansOption,
     MaxPsnrDropOption,
     MaxSsimDropOption,
+    OriginOption,
     PresetOption,
     PsnrOption,
     QuietOption,
@@ -30,7 +31,7 @@ from kissgs.cli.arguments import (
     TimeOption,
 )
 from kissgs.cli.files import for_each_input
-from kissgs.cli.options import budget_of, chosen, device_of, open_views, refuse_without_training
+from kissgs.cli.options import budget_of, chosen, device_of, open_views, origin_of, refuse_without_training
 
 CompactOption = Annotated[
     str | None,
@@ -99,6 +100,7 @@ def compress(
     max_gaussians: MaxGaussiansOption = None,
     level: LevelOption = 0,
     raw_axes: RawAxesOption = False,
+    origin: OriginOption = None,
     device: Annotated[str, typer.Option(help="Device of --compact and --finetune: cpu or cuda.")] = "cpu",
     threads: ThreadsOption = 0,
     ray: RayOption = None,
@@ -114,7 +116,7 @@ def compress(
 
     manifest = None if output is None else named_manifest(output)
     kind = named_container(container, None if manifest else output)
-    reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes)
+    reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes, origin=origin_of(origin))
     settings = chosen(
         preset,
         changes,

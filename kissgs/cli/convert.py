@@ -13,12 +13,14 @@ from kissgs.cli.arguments import (
     JsonOption,
     LevelOption,
     MaxGaussiansOption,
+    OriginOption,
     QuietOption,
     RawAxesOption,
     ThreadsOption,
 )
 from kissgs.cli.console import progress_bar
 from kissgs.cli.files import for_each_input, show, source, stdout
+from kissgs.cli.options import origin_of
 from kissgs.core.errors import InvalidSceneError, OutputError
 
 if TYPE_CHECKING:
@@ -42,6 +44,7 @@ def convert(
     max_gaussians: MaxGaussiansOption = None,
     level: LevelOption = 0,
     raw_axes: RawAxesOption = False,
+    origin: OriginOption = None,
     threads: ThreadsOption = 0,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -58,7 +61,7 @@ def convert(
     if not inputs:
         raise OutputError("convert needs an input and an output: kissgs convert IN OUT")
     kind = _output_format(output, to)
-    reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes)
+    reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes, origin=origin_of(origin))
 
     def work(scene: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"
@@ -69,7 +72,7 @@ def convert(
             with stdout() if piped else atomic_file(target, overwrite=force) as file:
                 stream = sys.stdout.buffer if file is None else file
                 losses = write_scene(stream, splats, kind, raw_axes=raw_axes, progress=progress)
-        notes = [*_removed(cleaned), *losses]
+        notes = [*splats.notes, *_removed(cleaned), *losses]
         if notes and not (quiet or as_json):
             sys.stderr.write(f"kissgs: {target}: {'; '.join(notes)}\n")
         if piped:

@@ -184,6 +184,11 @@ def device_of(name: str) -> Literal["cpu", "cuda"]:
     return cast(Literal["cpu", "cuda"], choice("--device", name, Literal["cpu", "cuda"]))
 
 
+def origin_of(name: str | None) -> Literal["auto"] | None:
+    """Check the value of ``--origin``."""
+    return None if name is None else cast(Literal["auto"], choice("--origin", name, Literal["auto"]))
+
+
 def refuse_without_training(settings: Settings, *, checkpoint: bool, device: str) -> None:
     """Raise UnsupportedError if ``--checkpoint`` or ``--device`` is given where nothing could train.
 

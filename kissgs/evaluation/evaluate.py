@@ -15,6 +15,7 @@ import numpy as np
 from kissgs.cameras.views import View, Views
 from kissgs.core.array_types import Float32, Shaped
 from kissgs.core.errors import InvalidViewsError, UnsupportedError
+from kissgs.core.origin import with_origin
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats, clean
 from kissgs.evaluation.cameras import evaluation_views, farther
@@ -76,9 +77,9 @@ def evaluate(
             or one cannot be read.
         UnsupportedError: an image would take too much memory, CUDA, FLIP or LPIPS is missing, or the split is unknown.
     """
-    reference, candidate = clean(reference)[0], clean(candidate)[0]
+    reference, candidate = clean(reference)[0], with_origin(clean(candidate)[0], reference.origin)
     measure = _measure(flip, lpips, device)
-    given = [] if views is None else [_select_split(views, split)]
+    given = [] if views is None else [_select_split(views.relative_to(reference.origin), split)]
     load_kernels(progress)
     drawn = farther(evaluation_views(reference, seed=seed, threads=threads, progress=progress), distance)
     groups = [*given, _select_split(drawn, "all")]

@@ -7,7 +7,7 @@ z forward) to those of a ``.ply``.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from kissgs.core.array_types import Float64
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
+from kissgs.core.origin import WORLD, Origin, origin_for
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats, empty_splats
 from kissgs.io.activations import log_scales, opacity_logits, steps
@@ -103,18 +104,31 @@ def read_gltf(source: Path | bytes, *, max_gaussians: int | None = None, progres
         refuse_more_than(max_gaussians, count, document.name)
         progress("read", 0.0)
         splats = empty_splats(count, SH_REST_COUNTS[max(primitive.degree for primitive in found)])
-        start = 0
+        start, origin = 0, None
         for primitive in found:
             part = splats.select(slice(start, start + primitive.count))
             if primitive.spz is None:
                 _read_attributes(document, primitive, part)
             else:
                 _read_spz(document, primitive.spz, part)
-            _apply(document, primitive.matrix, part)
+            if origin is None:
+                origin = _origin(primitive.matrix, part)
+            matrix = primitive.matrix.copy()  # several primitives may share it
+            matrix[:3, 3] -= origin
+            _apply(document, matrix, part)
             start += primitive.count
             progress("read", start / max(count, 1))
     _turn_to_ply(splats)
-    return splats
+    x, y, z = (float(sign * value) + 0.0 for sign, value in zip(TO_PLY, origin or WORLD, strict=True))
+    return replace(splats, origin=(x, y, z))
+
+
+@np.errstate(all="ignore")  # numbers that overflow are refused where they are used
+def _origin(matrix: Float64[np.ndarray, "4 4"], splats: Splats) -> Origin:
+    """Return the origin that Gaussians need once the transform of their node has moved them."""
+    linear = matrix[:3, :3]
+    growth = np.float32(np.log(np.abs(np.linalg.det(linear))) / 3)
+    return origin_for(splats.means.astype(np.float64) @ linear.T + matrix[:3, 3], splats.scales + growth)
 
 
 def _primitives(document: Document) -> Iterator[_Primitive]:

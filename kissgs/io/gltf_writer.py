@@ -18,6 +18,7 @@ import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Shaped
 from kissgs.core.errors import UnsupportedError
+from kissgs.core.origin import WORLD, Origin
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
 from kissgs.io.activations import steps
@@ -75,7 +76,7 @@ def write_glb(file: BinaryWriter, splats: Splats, *, progress: Progress = silent
     accessors = _accessors(count, attributes, ends)
     for i, accessor in enumerate(accessors):
         accessor["bufferView"] = i
-    _write_head(file, count, _json(attributes, accessors, views, {}), body)
+    _write_head(file, count, _json(attributes, accessors, views, {}, splats.origin), body)
     for done, attribute in enumerate(attributes, 1):
         dtype = np.uint8 if attribute.is_byte else "<f4"
         for part in steps(count):
@@ -108,10 +109,15 @@ def write_spz_glb(file: BinaryWriter, splats: Splats, *, progress: Progress = si
     attributes = [attribute for attribute in _attributes(splats) if attribute.name not in _NOT_IN_SPZ]
     view = {"buffer": 0, "byteOffset": 0, "byteLength": len(body)}
     accessors = _accessors(count, attributes, ends * np.array(TO_PLY, np.float32))
-    _write_head(file, count, _json(attributes, accessors, [view], {SPZ_EXTENSIONS[0]: {"bufferView": 0}}), len(body))
+    compression = {SPZ_EXTENSIONS[0]: {"bufferView": 0}}
+    _write_head(file, count, _json(attributes, accessors, [view], compression, splats.origin), len(body))
     file.write(body)
     file.write(bytes(-len(body) % 4))
     return notes
+
+
+def _in_gltf(origin: Origin) -> list[float]:
+    return [sign * value + 0.0 for sign, value in zip(TO_PLY, origin, strict=True)]
 
 
 def _count(splats: Splats, ending: str) -> int:
@@ -185,10 +191,12 @@ def _json(
     accessors: list[dict[str, Any]],
     views: list[dict[str, Any]],
     compression: dict[str, Any],
+    origin: Origin,
 ) -> bytes:
     """Return the JSON, filled up with spaces to a multiple of four bytes.
 
-    ``compression`` holds the extension without which the accessors have no data; it is empty where they have it.
+    ``compression`` holds the extension without which the accessors have no data; it is empty where they have it. The
+    node moves positions to the world from ``origin``.
     """
     splatting: dict[str, Any] = {
         "kernel": "ellipse",
@@ -211,7 +219,7 @@ def _json(
         **required,
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
+        "nodes": [{"mesh": 0, **({} if origin == WORLD else {"translation": _in_gltf(origin)})}],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from kissgs.core.array_types import Float32
+from kissgs.core.array_types import Float32, Float64
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
+from kissgs.core.origin import WORLD, in_world, origin_for, world_positions
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import BLOCK, SH_C0, SH_REST_COUNTS, Splats, concatenate, empty_splats
 from kissgs.io.compressed_ply import check_compressed, is_compressed, read_compressed
@@ -109,23 +110,34 @@ def read_ply_blocks(source: Path, *, progress: Progress = silent) -> Iterator[Sp
 def write_ply(file: BinaryWriter, splats: Splats, *, progress: Progress = silent) -> None:
     """Write ``splats`` in INRIA's layout: float32, little-endian, normals zero, the ``f_rest_*`` of the SH degree.
 
+    Positions are those of the world: float64 (``property double``) where float32 cannot hold them.
+
     Args:
         file: The stream; it is not flushed or closed, and its OSErrors are not caught.
-        splats: The scene; its float32 values are written bit-identically.
+        splats: The scene; its float32 values are written bit-identically, except positions relative to an origin.
         progress: Receives events of stage ``write``.
     """
+    splats = in_world(splats)
+    wide = _POSITION if splats.origin != WORLD else ()
     n, k = len(splats), splats.shN.shape[1]
     names = (*_POSITION, *_NORMAL, *_COLOUR, *_rest(k), *_OPACITY, *_SCALE, *_ROTATION)
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
-    header += [f"property float {name}" for name in names]
+    header += [f"property {'double' if name in wide else 'float'} {name}" for name in names]
     file.write("\n".join([*header, "end_header\n"]).encode("ascii"))
     for start in range(0, n, _WRITE_ROWS):
         part = splats.select(slice(start, start + _WRITE_ROWS))
         rest = part.shN.transpose(0, 2, 1).reshape(len(part), 3 * k)  # all of R, then G, then B
         normals, opacities = np.zeros_like(part.means), part.opacities[:, None]
         table = np.concatenate([part.means, normals, part.sh0, rest, opacities, part.scales, part.quats], axis=1)
-        file.write(table.astype("<f4", copy=False).data)
+        file.write((_with_doubles(part, table) if wide else table.astype("<f4", copy=False)).data)
         progress("write", min(1.0, (start + _WRITE_ROWS) / n))
+
+
+def _with_doubles(splats: Splats, table: Float32[np.ndarray, "B F"]) -> np.ndarray:
+    """Return rows whose positions are float64."""
+    rows = np.empty(len(table), np.dtype([("positions", "<f8", 3), ("others", "<f4", table.shape[1] - 3)]))
+    rows["positions"], rows["others"] = world_positions(splats), table[:, 3:]
+    return rows
 
 
 def _check(ply: PlyFile) -> PlyInfo:
@@ -177,7 +189,7 @@ def _read_columns(ply: PlyFile, degree: int, progress: Progress) -> Splats:
         columns.copy(block, splats.select(slice(start, start + len(block))))
         start += len(block)
         progress("read", start / count)
-    return splats
+    return replace(splats, origin=columns.origin)
 
 
 class _Columns:
@@ -187,12 +199,18 @@ class _Columns:
         self.vertex = vertex
         self._k = SH_REST_COUNTS[degree]
         self._rgb = _has_rgb(vertex)
+        self._origin: tuple[float, float, float] | None = None
+
+    @property
+    def origin(self) -> tuple[float, float, float]:
+        """Origin of the positions, which the first rows decide."""
+        return self._origin or WORLD
 
     def splats(self, block: np.ndarray) -> Splats:
         """Return the Gaussians of some rows."""
         splats = empty_splats(len(block), self._k)
         self.copy(block, splats)
-        return splats
+        return replace(splats, origin=self.origin)
 
     def copy(self, block: np.ndarray, out: Splats) -> None:
         """Copy rows to the arrays of ``out``, of the same length."""
@@ -211,8 +229,16 @@ class _Columns:
             for names, array in groups.items():
                 for i, name in enumerate(names):
                     array[:, i] = block[name]
+            if self._origin is None:
+                self._origin = origin_for(_float64(block, _POSITION), out.scales)
+            if self.origin != WORLD:
+                out.means[:] = _float64(block, _POSITION) - np.array(self.origin)
         if self._rgb:
             _colour_to_sh(out.sh0)
+
+
+def _float64(block: np.ndarray, names: tuple[str, ...]) -> Float64[np.ndarray, "B C"]:
+    return np.stack([block[name].astype(np.float64) for name in names], axis=1)
 
 
 def _colour_to_sh(colour: Float32[np.ndarray, "N 3"]) -> None:

@@ -11,12 +11,13 @@ import itertools
 import os
 import posixpath
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
 from kissgs.core.limits import MAX_GAUSSIANS
+from kissgs.core.origin import Origin, read_origin
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats, empty_splats
 from kissgs.core.threads import Workers
@@ -59,12 +60,14 @@ class Manifest:
         filenames: files of the containers: their metadata, or they themselves.
         rows: per level, the row ranges ``(file, offset, count)`` of the leaves, by file and offset, without overlap.
         environment: file of the environment; None without one.
+        origin: see :class:`kissgs.Splats`.
     """
 
     levels: int
     filenames: tuple[str, ...]
     rows: tuple[tuple[tuple[int, int, int], ...], ...]
     environment: str | None
+    origin: Origin
 
     def count(self, level: int) -> int:
         """Return the number of Gaussians of a level, without the environment."""
@@ -168,7 +171,8 @@ class StreamedFormat(Generic[C]):
             UnsupportedError: there is no such level, another version, or more Gaussians than ``max_gaussians``.
         """
         with self.open(source) as files, Workers(threads) as pool:
-            parts = list(self.parts(files, self.read_manifest(files), level))
+            manifest = self.read_manifest(files)
+            parts = list(self.parts(files, manifest, level))
             count = sum(part.count for part in parts)
             refuse_more_than(max_gaussians, count, f"level {level}")
             splats = empty_splats(count, max((SH_REST_COUNTS[part.container.sh_degree] for part in parts), default=0))
@@ -178,7 +182,7 @@ class StreamedFormat(Generic[C]):
                 progress("decode", start / max(count, 1))
                 start = part.decode(splats, start, pool)
             progress("decode", 1.0)
-            return splats
+            return replace(splats, origin=manifest.origin)
 
     def read_manifest(self, files: Source) -> Manifest:
         """Read and check the manifest.
@@ -217,7 +221,7 @@ class StreamedFormat(Generic[C]):
             for (file, offset, count), (next_file, next_offset, _) in itertools.pairwise(own):
                 if file == next_file and offset + count > next_offset:
                     raise _invalid(name, f"two leaves share rows of {names[file]}")
-        return Manifest(levels, tuple(names), tuple(map(tuple, rows)), environment)
+        return Manifest(levels, tuple(names), tuple(map(tuple, rows)), environment, read_origin(document, name))
 
     def parts(self, files: Source, manifest: Manifest, level: int) -> Iterator[Part[C]]:
         """Yield the containers of a level, then the environment; their metadata is read and checked.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from kissgs.core.origin import in_world
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats
 from kissgs.pipeline.read_options import ReadOptions
@@ -36,7 +37,8 @@ def decompress(
         progress: receives events.
 
     Returns:
-        The scene exactly as stored: quaternions are as quantised, so their length is only approximately 1.
+        The scene exactly as stored: quaternions are as quantised, so their length is only approximately 1. Positions
+        are those of the world where float32 can hold them, else relative to its ``origin``.
 
     Raises:
         InvalidContainerError: the container is damaged.
@@ -53,6 +55,7 @@ def decompress(
         progress=progress,
         only_containers=True,
     )
+    splats = in_world(splats)
     if destination is not None:
         save_ply(splats, destination, overwrite=overwrite, progress=progress)
     return splats

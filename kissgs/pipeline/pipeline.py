@@ -14,6 +14,7 @@ from kissgs.core.array_types import Int
 from kissgs.core.deadline import Deadline
 from kissgs.core.errors import UnsupportedError
 from kissgs.core.limits import MAX_GAUSSIANS
+from kissgs.core.origin import WORLD, relative_to
 from kissgs.core.progress import Progress, SearchNote, as_stage, ignore_stop_search, silent
 from kissgs.core.sensitivity import Sensitivity
 from kissgs.core.splats import Splats
@@ -120,7 +121,7 @@ def compact(
     result = compact_scene(
         splats,
         settings.compact,
-        views,
+        None if views is None else views.relative_to(splats.origin),
         evaluate=evaluate,
         checkpoint=Path(checkpoint) if checkpoint is not None else None,
         threads=threads,
@@ -205,6 +206,7 @@ def compress(
     deadline = None if settings.time_limit is None else Deadline.after(settings.time_limit)
     clock = StageTimer(progress)
     original, cleaned, source_bytes = open_scene(source, reading, threads, clock)
+    views = None if views is None else views.relative_to(original.origin)
     source_count, sh_degree = len(original) + cleaned.removed, original.sh_degree
     keep_all = sensitivity is not None
     plan = work_plan(requested, views, len(original), deadline, keep_all=keep_all, threads=threads)
@@ -226,6 +228,9 @@ def compress(
         deadline=deadline,
         disposable=not (evaluate or isinstance(source, Splats)),
     )
+    notes = list(original.notes)
+    if original.origin != WORLD:
+        notes.append(f"{relative_to(original.origin)}, which the container records")
     del original
     compacted, search, trials = _compact_first(encoding, checkpoint, plan.time, aims=requested.aims)
     after_search = ignore_stop_search(clock) if settings.searches else clock
@@ -255,7 +260,7 @@ def compress(
         finetuning=result.finetuning,
         invisible=encoded.invisible,
         pruned_by_rd=encoded.pruned_by_rd,
-        note="; ".join(filter(None, [encoded.note, result.note, plan.note])),
+        note="; ".join(filter(None, [*notes, encoded.coarse, encoded.note, result.note, plan.note])),
         clipped_colors=encoded.clipped_colors,
         form_error=encoded.form_error,
         max_quantization_error=encoded.errors,

@@ -213,7 +213,9 @@ class RateControl:
         """
         if self.best is None:
             suggest = suggest_compaction and self.count > 1 and self.overhead < (self.settings.target_size or 0)
-            raise UnsupportedError(self.goal.failure_message(self.trials, trained, suggest_compaction=suggest))
+            message = self.goal.failure_message(self.trials, trained, suggest_compaction=suggest)
+            coarse = "" if self.closest is None else self.closest.encoded.coarse
+            raise UnsupportedError("; ".join(filter(None, [message, coarse])))
         if self.goal.most_bytes is not None and self._bytes > self.goal.most_bytes:
             names = " and ".join(["target_size", *(limit.setting for limit in self.goal.limits)])
             verb = "were not met before the search was stopped" if self.stopped else "cannot be met together"

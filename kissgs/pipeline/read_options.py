@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from kissgs.core.limits import MAX_GAUSSIANS
 
@@ -17,11 +18,15 @@ class ReadOptions:
             ``.ksplat``, whose scene takes at most four times the bytes of the file.
         level: level of detail of a streamed scene; 0 is the finest.
         raw_axes: read ``.spz`` that stores the axes of a ``.ply`` without saying so, as some tools write it.
+        origin: "auto" makes positions relative to the whole numbers nearest to the middle of the scene
+            (:attr:`kissgs.Splats.origin`), where containers have the finest steps. By default the origin is that of the
+            file, or the middle of the scene where float32 cannot hold its positions.
     """
 
     max_gaussians: int | None = None
     level: int = 0
     raw_axes: bool = False
+    origin: Literal["auto"] | None = None
 
     @property
     def max_compressed(self) -> int:

@@ -8,8 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from os import PathLike
 from pathlib import Path
+from typing import Literal
 
 from kissgs.core.errors import InvalidContainerError, OutputError
+from kissgs.core.origin import centred, in_world
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Cleaned, Splats, clean
 from kissgs.io.atomic import atomic_file, reason_of, refuse_existing
@@ -26,6 +28,7 @@ def load(
     max_gaussians: int | None = None,
     level: int = 0,
     raw_axes: bool = False,
+    origin: Literal["auto"] | None = None,
     threads: int = 0,
     progress: Progress = silent,
 ) -> Splats:
@@ -37,6 +40,8 @@ def load(
         max_gaussians: see :class:`kissgs.ReadOptions`, as for ``level`` and ``raw_axes``.
         level: level of detail of a streamed scene; 0 is the finest.
         raw_axes: read ``.spz`` that stores the axes of a ``.ply`` without saying so.
+        origin: see :class:`kissgs.ReadOptions`. By default, positions are those of the world wherever float32 can hold
+            them; else they are relative to ``origin`` of the scene.
         threads: number of threads; 0 means one per processor.
         progress: receives events.
 
@@ -45,8 +50,9 @@ def load(
         InvalidContainerError: the container is damaged.
         UnsupportedError: the file is valid, but uses a feature that kissgs does not read.
     """
-    reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes)
-    return clean(read_scene(Path(path), reading, threads=threads, progress=progress))[0]
+    reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes, origin=origin)
+    splats = clean(read_scene(Path(path), reading, threads=threads, progress=progress))[0]
+    return splats if origin == "auto" else in_world(splats)
 
 
 def save(
@@ -108,7 +114,7 @@ def open_scene(
         KissgsError: the scene cannot be read.
     """
     if isinstance(source, Splats):
-        splats, cleaned = clean(source)
+        splats, cleaned = clean(centred(source) if reading.origin == "auto" else source)
         return splats, cleaned, source.nbytes
     progress("read", 0.0)
     scene = source if isinstance(source, bytes) else Path(source)
@@ -129,6 +135,17 @@ def read_scene(
     Raises:
         KissgsError: the scene cannot be read.
     """
+    splats = _read(source, reading, threads, progress, only_containers)
+    return centred(splats) if reading.origin == "auto" else splats
+
+
+def _read(
+    source: Path | bytes | Mapping[str, bytes],
+    reading: ReadOptions,
+    threads: int,
+    progress: Progress,
+    only_containers: bool,
+) -> Splats:
     found = recognise(source)
     root = scene_root(source) if isinstance(source, Path) else source
     most = reading.max_compressed

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from kissgs.core.errors import OutputError
+from kissgs.core.origin import WORLD, relative_to
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import Splats, clean
 from kissgs.io.container_names import ENDINGS
@@ -49,6 +50,16 @@ def write_scene(
         write_ply(file, splats, progress=progress)
         return ()
     splats = clean(splats)[0]
+    notes = _write_cleaned(file, splats, kind, raw_axes, progress)
+    if splats.origin != WORLD:
+        kept = "records it as a translation" if kind.endswith("glb") else "does not record it"
+        notes = (*notes, f"{relative_to(splats.origin)}, because float32 would round them; .{kind} {kept}")
+    return notes
+
+
+def _write_cleaned(
+    file: BinaryWriter, splats: Splats, kind: OutputFormat, raw_axes: bool, progress: Progress
+) -> tuple[str, ...]:
     if kind == "spz":
         from kissgs.io.spz_writer import write_spz
 

@@ -25,6 +25,7 @@ class Encoded:
         rd_lambda: squared error per bit; None for uniform planning.
         codebook_side: S; the codebook has up to S × S entries.
         note: a sentence for the user if many Gaussians were pruned; else empty.
+        coarse: a sentence for the user if the positions are too coarse for the Gaussians; else empty.
     """
 
     files: dict[str, bytes]
@@ -37,6 +38,7 @@ class Encoded:
     rd_lambda: float | None
     codebook_side: int
     note: str = ""
+    coarse: str = ""
 
     @classmethod
     def of(cls, plan: EncodingPlan, files: dict[str, bytes]) -> Encoded:
@@ -53,4 +55,5 @@ class Encoded:
             rd_lambda=plan.rd_lambda,
             codebook_side=plan.codebook.side,
             note=plan.note,
+            coarse=plan.coarse,
         )

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kissgs.core.array_types import UInt8
+from kissgs.core.origin import Origin
 from kissgs.planning.gaussian_costs import Costs
 from kissgs.planning.layout import Grid
 from kissgs.planning.quantize import Quantized
@@ -21,11 +22,13 @@ class PlannedScene:
         count: number of Gaussians.
         visible: number of Gaussians that the plan could keep: those that a renderer draws, or all.
         sh_degree: 0 to 3.
+        origin: see :class:`kissgs.Splats`.
     """
 
     count: int
     visible: int
     sh_degree: int
+    origin: Origin
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,6 +49,7 @@ class EncodingPlan:
         costs: squared error of one unit in each attribute, ``(M,)`` each; None for uniform planning.
         rd_lambda: squared error per bit; None for uniform planning.
         note: a sentence for the user if many Gaussians were pruned; else empty.
+        coarse: a sentence for the user if the positions are too coarse for the Gaussians; else empty.
     """
 
     scene: PlannedScene
@@ -59,3 +63,4 @@ class EncodingPlan:
     costs: Costs | None = None
     rd_lambda: float | None = None
     note: str = ""
+    coarse: str = ""

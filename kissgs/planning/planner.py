@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from kissgs.core.array_types import Int32, UInt16
 from kissgs.core.errors import UnsupportedError
+from kissgs.core.origin import coarse_note
 from kissgs.core.progress import Progress, silent
 from kissgs.core.sensitivity import Sensitivity
+from kissgs.core.signed_log import signed_exp
 from kissgs.core.splats import Splats
 from kissgs.core.threads import blas_workers
 from kissgs.planning.container_model import EVEN_LEVELS, ContainerModel
@@ -19,6 +23,9 @@ from kissgs.settings import EncodeSettings
 
 INVISIBLE_LOGIT = -5.5373
 """Logit of opacity 1/255, rounded up; no renderer draws Gaussians of this opacity or less."""
+
+SAMPLED = 1 << 18
+"""Number of Gaussians whose positions are compared with those of the scene."""
 
 MAX_GROUPS = 1 << 14
 """Largest number of groups of Gaussians in a container: group and class of steps together are a number of 16 bits."""
@@ -83,7 +90,14 @@ def plan_encoding(
             plan = plan_uniform(splats, kept, settings, container, pool, progress, groups)
         if settings.order == "refined":
             plan = refine_order(plan, groups, pool, progress)
-        return plan
+        return replace(plan, coarse=_coarse(splats, plan))
+
+
+def _coarse(splats: Splats, plan: EncodingPlan) -> str:
+    """Return the sentence about coarse positions, by at most :data:`SAMPLED` Gaussians."""
+    cells = np.flatnonzero(plan.grid.mask)
+    cells = cells[:: 1 + len(cells) // SAMPLED]
+    return coarse_note(splats, plan.grid.cells[cells], signed_exp(plan.fields["means"].take(cells).values()))
 
 
 def visible_gaussians(splats: Splats, settings: EncodeSettings) -> Int32[np.ndarray, " K"]:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import io
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from kissgs.core.errors import InvalidSceneError
+from kissgs.core.origin import WORLD
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import clean
 from kissgs.io.atomic import reason_of
@@ -57,7 +58,7 @@ def page_scene(
     container = _as_container(source)
     if container is not None:
         return container
-    splats = clean(read)[0]
+    splats = replace(clean(read)[0], origin=WORLD)  # viewers draw a scene better near the origin
     file = io.BytesIO()
     write_ply(file, splats, progress=progress)
     return PageScene(f"{_stem(source)}.ply", file.getvalue(), converted=recognise(source) != "ply")

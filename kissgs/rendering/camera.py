@@ -70,6 +70,12 @@ class Camera:
         """Centre of projection, ``(3,)``, world units."""
         return np.asarray(-self.viewmat[:3, :3].T @ self.viewmat[:3, 3])
 
+    def relative_to(self, origin: tuple[float, float, float]) -> Camera:
+        """Return the same camera in coordinates relative to ``origin``, world units."""
+        viewmat = self.viewmat.copy()
+        viewmat[:3, 3] += viewmat[:3, :3] @ origin
+        return replace(self, viewmat=viewmat)
+
     def resized(self, width: int, height: int) -> Camera:
         """Return the same view with another number of pixels; the aspect ratio of pixels may change.
 

@@ -10,6 +10,7 @@ import numpy as np
 from kissgs._version import __version__
 from kissgs.core.array_types import UInt8
 from kissgs.core.errors import UnsupportedError
+from kissgs.core.origin import recorded
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.core.threads import blas_workers
@@ -113,6 +114,8 @@ def metadata(plan: EncodingPlan, sh_degree: int) -> bytes:
         centroids = plan.codebook.centroids
         codebook = {"count": len(centroids.levels), "bands": sh_degree, "codebook": _table(centroids)}
         document["shN"] = {**codebook, "files": list(SHN)}
+    if own := recorded(plan.scene.origin):
+        document["kissgs"] = own
     return json.dumps(document, separators=(",", ":")).encode()
 
 

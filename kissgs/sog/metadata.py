@@ -10,6 +10,7 @@ import numpy as np
 
 from kissgs.core.array_types import Float32, Float64
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
+from kissgs.core.origin import WORLD, Origin, read_origin
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.io.activations import OPACITY_OF_BYTE
 from kissgs.io.json_files import parse_json
@@ -67,6 +68,7 @@ class SogLayout:
         rest: the view-dependent colour; None at degree 0.
         model: variant of the renderer that the scene was made for, such as "antialiased"; None if not stated.
         generator: program that wrote the file; None if not stated.
+        origin: see :class:`kissgs.Splats`.
     """
 
     version: int
@@ -80,6 +82,7 @@ class SogLayout:
     rest: Rest | None
     model: str | None
     generator: str | None
+    origin: Origin
 
     @property
     def sh_degree(self) -> int:
@@ -124,6 +127,7 @@ def _read_v2(document: dict[str, Any]) -> SogLayout:
         rest=None if rest is None else _rest_v2(document, rest),
         model=_text(document.get("model")) or (_text(asset.get("model")) if isinstance(asset, dict) else None),
         generator=_text(asset.get("generator")) if isinstance(asset, dict) else None,
+        origin=read_origin(document, META_NAME),
     )
 
 
@@ -159,6 +163,7 @@ def _read_v1(document: dict[str, Any]) -> SogLayout:
         rest=None if rest is None else _rest_v1(document, rest),
         model=None,
         generator=None,
+        origin=WORLD,
     )
 
 

@@ -16,6 +16,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
 from pydantic_core import PydanticCustomError
 
 from kissgs.core.limits import MAX_CODEBOOK_SIDE, MAX_GRID_SIDE
+from kissgs.core.origin import WORLD, Origin, recorded
 from kissgs.core.splats import SH_REST_COUNTS
 from kissgs.sogxt.names import CHECKSUM, FORMAT, JSON_NAME
 
@@ -109,6 +110,7 @@ class Layout(BaseModel):
     ranges: dict[str, tuple[list[Limit], list[Limit]]]
     count: int | None = Field(None, ge=0)
     provenance: Provenance | None = None
+    origin: Origin = WORLD
     crc32: dict[str, Annotated[int, Field(ge=0, lt=1 << 32)]] = Field(default_factory=dict)
     """CRC-32 of each image's pixels (:func:`kissgs.io.webp.pixels_crc32`); in ``meta.json`` only."""
 
@@ -150,7 +152,7 @@ class Layout(BaseModel):
             ],
         }
         if self.provenance:
-            document["kissgs"] = self.provenance.model_dump()
+            document["kissgs"] = {**self.provenance.model_dump(), **recorded(self.origin)}
             document[CHECKSUM] = self.checksum
         dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
         return yaml.dump(document, Dumper=dumper, sort_keys=False, allow_unicode=False, width=120).encode("ascii")
@@ -187,8 +189,8 @@ class Layout(BaseModel):
             },
         }
         if self.provenance:
-            recorded = self.provenance.model_dump(include={"version", "sh_degree"})
-            document["kissgs"] = {**recorded, "crc32": self.crc32}
+            own = self.provenance.model_dump(include={"version", "sh_degree"})
+            document["kissgs"] = {**own, **recorded(self.origin), "crc32": self.crc32}
             document[CHECKSUM] = self.checksum
         return json.dumps(document, separators=(",", ":"), allow_nan=False).encode("ascii")
 

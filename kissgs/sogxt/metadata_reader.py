@@ -11,6 +11,7 @@ import yaml
 from pydantic import ValidationError
 
 from kissgs.core.errors import InvalidContainerError, UnsupportedError
+from kissgs.core.origin import read_origin
 from kissgs.io.container_names import LEVELS_NAME, LOD_NAME
 from kissgs.io.packed_files import Source
 from kissgs.sogxt.metadata import CHANNELS, TILE_COLUMNS, TILE_ROWS, Layout
@@ -96,6 +97,7 @@ def _from_yaml(data: bytes) -> dict[str, Any]:
         "codebook_side": sides.get("f_rest_centroids_side"),
         "ranges": ranges,
         "provenance": recorded,
+        "origin": read_origin(document, YAML_NAME),
         CHECKSUM: document.get(CHECKSUM, MISSING),
     }
 
@@ -149,6 +151,7 @@ def _from_json(data: bytes) -> dict[str, Any]:
             "grid_side": _whole(document["gridSide"]),
             "codebook_side": _whole(rest["centroidSide"]),
             "ranges": ranges,
+            "origin": read_origin(document, JSON_NAME),
             CHECKSUM: document.get(CHECKSUM, MISSING),
         }
         if "kissgs" in document:

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from kissgs.core.array_types import Float32, UInt16
+from kissgs.core.origin import WORLD
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import SH_REST_COUNTS, Splats, clean, concatenate, empty_splats
 from kissgs.io.atomic import atomic_file
@@ -81,6 +82,7 @@ def partition(
         progress: receives "partition".
     """
     done = visible_count = 0
+    origin = WORLD
 
     def counted() -> Iterator[Splats]:
         nonlocal done
@@ -110,7 +112,7 @@ def partition(
         splats, sh_degree = splats.select(visible), splats.sh_degree
         far = environment.contains(splats.means)
         append_rows(environment_file(work), to_rows(splats.select(far)))
-        far_count, splats = far_count + int(far.sum()), splats.select(~far)
+        far_count, splats, origin = far_count + int(far.sum()), splats.select(~far), splats.origin
         chunks = cuts.chunk_of(splats.means)
         rows = to_rows(splats)
         for chunk in np.unique(chunks):
@@ -129,6 +131,7 @@ def partition(
         leaf=leaf_size(total, cuts.chunks, levels),
         environment=far_count,
         changed=dict(changed),
+        origin=origin,
     )
     for path in (environment_file(work), *(chunk_file(work, chunk) for chunk in layout.filled)):
         sync(path)
@@ -310,4 +313,4 @@ def make_manifest(work: Path, layout: Layout) -> None:
     environment = layout.entry(path) if (work / OUT / path).exists() else None
     containers = FORMAT if layout.container == "sogxt" else None
     with atomic_file(work / OUT / layout.manifest, overwrite=True) as out:
-        out.write(manifest(leaves, layout.levels, filenames, environment, containers))
+        out.write(manifest(leaves, layout.levels, filenames, environment, containers, layout.origin))

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from kissgs._version import __version__
 from kissgs.core.errors import InvalidSceneError, OutputError, UnsupportedError
+from kissgs.core.origin import middle_of, with_origin
 from kissgs.core.progress import Progress, as_stage, silent
 from kissgs.core.splats import BLOCK
 from kissgs.io.atomic import atomic_file, reason_of
@@ -188,7 +190,8 @@ def _reader(source: Path, reading: ReadOptions, threads: int) -> tuple[Blocks, i
     if recognise(source) == "ply":
         info = read_ply_info(source)
         if not info.compressed:
-            return lambda: read_ply_blocks(source), info.count, info.sh_degree
+            origin = middle_of(read_ply_blocks(source)) if reading.origin == "auto" else None
+            return lambda: map(partial(with_origin, origin=origin), read_ply_blocks(source)), info.count, info.sh_degree
     scene = read_scene(source, reading, threads=threads)
     starts = range(0, len(scene), BLOCK)
     return lambda: (scene.select(slice(start, start + BLOCK)) for start in starts), len(scene), scene.sh_degree

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from kissgs.core.origin import Origin
 from kissgs.io.atomic import atomic_file
 from kissgs.io.container_names import MANIFESTS, ContainerName
 from kissgs.sog.names import META_NAME
@@ -32,6 +33,7 @@ class Layout:
         leaf: largest number of Gaussians in a leaf.
         environment: number of Gaussians in the environment; 0 without one.
         changed: number of Gaussians that cleaning removed or changed, by kind, and of those that are invisible.
+        origin: see :class:`kissgs.Splats`.
     """
 
     container: ContainerName
@@ -43,6 +45,7 @@ class Layout:
     leaf: int
     environment: int
     changed: dict[str, int]
+    origin: Origin
 
     @property
     def filled(self) -> list[int]:
@@ -102,7 +105,7 @@ def continuation(work: Path) -> str:
 def read_layout(work: Path) -> Layout:
     """Return the layout of a scene that is partitioned."""
     found = json.loads((work / PARTITION).read_bytes())
-    return Layout(**{**found, "counts": tuple(found["counts"])})
+    return Layout(**{**found, "counts": tuple(found["counts"]), "origin": tuple(found["origin"])})
 
 
 def keep_layout(work: Path, layout: Layout) -> None:

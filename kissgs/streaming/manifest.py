@@ -11,6 +11,7 @@ import numpy as np
 
 from kissgs._version import __version__
 from kissgs.core.array_types import Float64
+from kissgs.core.origin import WORLD, Origin, recorded
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,7 +30,12 @@ class Leaf:
 
 
 def manifest(
-    leaves: Sequence[Leaf], levels: int, filenames: Sequence[str], environment: str | None, containers: str | None
+    leaves: Sequence[Leaf],
+    levels: int,
+    filenames: Sequence[str],
+    environment: str | None,
+    containers: str | None,
+    origin: Origin,
 ) -> bytes:
     """Return the manifest.
 
@@ -39,12 +45,14 @@ def manifest(
         filenames: file of each container, relative to the manifest.
         environment: file of the environment; None without one.
         containers: format of the containers; None for SOG, whose manifests do not name it.
+        origin: see :class:`kissgs.Splats`.
     """
     counts = [sum(leaf.lods[level][2] for leaf in leaves if level in leaf.lods) for level in range(levels)]
     document = {
         "version": 1,
         **({} if containers is None else {"format": containers}),
         "asset": {"generator": f"kissgs {__version__}"},
+        **({} if origin == WORLD else {"kissgs": recorded(origin)}),
         "count": counts[0],
         "counts": counts,
         "lodLevels": levels,
