@@ -1,0 +1,154 @@
+"""The origin of a scene, near which the steps of float32 and of containers are finer than any Gaussian.
+
+float32 has 24 bits, and a container 16 bits for the logarithm of a position: far from zero, as in geo-referenced
+scenes, both have coarse steps. So positions may be relative to :attr:`kissgs.Splats.origin`, which is float64.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from kissgs.core.array_types import Float, Float32, Float64, Int
+from kissgs.core.errors import InvalidContainerError
+from kissgs.core.signed_log import signed_log
+from kissgs.core.splats import Splats
+
+Origin = tuple[float, float, float]
+
+WORLD: Origin = (0.0, 0.0, 0.0)
+"""Origin of a scene whose positions are those of the world."""
+
+COARSE_ERROR = 0.25
+"""Error of a position, in units of the Gaussian's size, above which it is coarse."""
+
+COARSE_SHARE = 0.01
+"""Share of coarse positions above which a scene has lost something."""
+
+CONTAINER_LEVELS = (1 << 16) - 1
+"""Steps between the smallest and the largest signed logarithm of a container's positions."""
+
+
+def world_positions(splats: Splats) -> Float64[np.ndarray, "N 3"]:
+    """Return the positions in the world, float64 ``(N, 3)``."""
+    return splats.means.astype(np.float64) + np.array(splats.origin)
+
+
+def with_origin(splats: Splats, origin: Origin | None) -> Splats:
+    """Return the scene with positions relative to another origin; None: to its own."""
+    if origin in (None, splats.origin):
+        return splats
+    means = (world_positions(splats) - np.array(origin)).astype(np.float32)
+    return replace(splats, means=means, origin=origin)
+
+
+def in_world(splats: Splats) -> Splats:
+    """Return the scene with the positions of the world where float32 can hold them, else the same scene."""
+    fits = splats.origin != WORLD and origin_for(world_positions(splats), splats.scales) == WORLD
+    return with_origin(splats, WORLD) if fits else splats
+
+
+def centred(splats: Splats) -> Splats:
+    """Return the scene with its origin at the whole numbers nearest to the middle of its Gaussians (their median)."""
+    return with_origin(splats, _middle(world_positions(splats)))
+
+
+def middle_of(blocks: Iterable[Splats]) -> Origin:
+    """Return the origin of :func:`centred` for a scene in blocks, by every 16th Gaussian."""
+    return _middle(np.concatenate([world_positions(block)[::16] for block in blocks]))
+
+
+def origin_for(positions: Float64[np.ndarray, "N 3"], scales: Float32[np.ndarray, "N 3"]) -> Origin:
+    """Return the origin for positions as float32: that of the world unless they would be coarse, else their middle.
+
+    Args:
+        positions: ``(N, 3)`` in the world, world units; NaN and infinities are left out.
+        scales: ``(N, 3)`` logarithms of standard deviations.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        errors = np.abs(positions - positions.astype(np.float32)).max(axis=1, initial=0)
+    finite = np.isfinite(errors)
+    return _middle(positions) if coarse_share(errors[finite], scales[finite]) > COARSE_SHARE else WORLD
+
+
+def coarse_share(errors: Float[np.ndarray, " N"], scales: Float32[np.ndarray, "N 3"]) -> float:
+    """Return the share of Gaussians whose position is off by more than a quarter of their size.
+
+    The size is the second of the three standard deviations: the smaller one that a flat Gaussian shows from its front.
+
+    Args:
+        errors: ``(N,)`` largest error of a coordinate, world units.
+        scales: ``(N, 3)`` logarithms of standard deviations.
+    """
+    return float((errors > COARSE_ERROR * _sizes(scales)).mean()) if len(errors) else 0.0
+
+
+def coarse_note(splats: Splats, order: Int[np.ndarray, " M"], decoded: Float[np.ndarray, "M 3"]) -> str:
+    """Return a sentence if a container's positions lose something of a scene, with the remedy; else an empty string.
+
+    Args:
+        splats: the scene.
+        order: ``(M,)`` index of Gaussians of the container in the scene.
+        decoded: ``(M, 3)`` their positions in the container, world units.
+    """
+    means, scales = splats.means[order], splats.scales[order]
+    errors = np.abs(means - decoded.astype(np.float64)).max(axis=1, initial=0)
+    share = coarse_share(errors, scales)
+    if share <= COARSE_SHARE:
+        return ""
+    step = 2 * float(np.median(errors[errors > COARSE_ERROR * _sizes(scales)]))
+    near = means.astype(np.float64) - np.rint(np.median(means, axis=0))
+    moved = coarse_share(_expected_errors(near), scales) <= COARSE_SHARE
+    remedy = "origin=auto moves the scene there" if moved else "streamed SOG (lod-meta.json) has a range for each chunk"
+    return (
+        f"positions have steps of about {step:.2g}, too coarse for {share:.0%} of the Gaussians, because a container "
+        f"has fine steps only near the origin: {remedy}"
+    )
+
+
+def relative_to(origin: Origin) -> str:
+    """Return the clause that says where the positions of a scene are."""
+    return "positions are relative to the point ({:,.0f}, {:,.0f}, {:,.0f})".format(*origin)
+
+
+def recorded(origin: Origin) -> dict[str, list[float]]:
+    """Return the entry of a container's metadata under the key "kissgs"; nothing for the origin of the world."""
+    return {} if origin == WORLD else {"origin": list(origin)}
+
+
+def read_origin(document: Mapping[str, Any], name: str) -> Origin:
+    """Return the origin that the metadata ``document`` of the file ``name`` records.
+
+    Raises:
+        InvalidContainerError: it is not three finite numbers.
+    """
+    own = document.get("kissgs")
+    found = own.get("origin", WORLD) if isinstance(own, dict) else WORLD
+    try:
+        x, y, z = (float(value) if isinstance(value, int | float) else math.nan for value in found)
+    except (TypeError, ValueError, OverflowError):
+        x = y = z = math.nan
+    if not all(map(math.isfinite, (x, y, z))):
+        raise InvalidContainerError(f"{name}: kissgs.origin is not three finite numbers; export the scene again")
+    return x, y, z
+
+
+def _expected_errors(positions: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
+    """Return the largest error of each position in a container, all of whose axes have one range."""
+    step = float(np.ptp(signed_log(positions))) / CONTAINER_LEVELS
+    return (1 + np.abs(positions).max(axis=1)) * step / 2
+
+
+def _sizes(scales: Float32[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
+    sizes: Float64[np.ndarray, " N"] = np.exp(np.sort(scales, axis=1)[:, 1].astype(np.float64))
+    return sizes
+
+
+def _middle(positions: Float64[np.ndarray, "N 3"]) -> Origin:
+    finite = positions[np.isfinite(positions).all(axis=1)]
+    x, y, z = np.rint(np.median(finite, axis=0)) + 0.0 if len(finite) else WORLD
+    return float(x), float(y), float(z)
