@@ -105,7 +105,8 @@ def streamed_table(report: StreamedReport, target: str) -> RenderableType:
     if count := report.environment_count:
         taken = report.environment_bytes
         table.add_row("environment", f"{count:,}", f"{taken:,}", f"{taken / count:.2f}")
-    return Group(head, table, *_changes(report.changed))
+    note = [Text(report.note, style="yellow")] if report.note else []
+    return Group(head, *note, table, *_changes(report.changed))
 
 
 def _compaction(report: CompactionReport, *, search: bool = True) -> list[RenderableType]:

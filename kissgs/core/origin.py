@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from kissgs.core.array_types import Float, Float32, Float64, Int
+from kissgs.core.array_types import Float, Float32, Float64
 from kissgs.core.errors import InvalidContainerError
 from kissgs.core.signed_log import signed_log
 from kissgs.core.splats import Splats
@@ -76,33 +76,39 @@ def origin_for(positions: Float64[np.ndarray, "N 3"], scales: Float32[np.ndarray
 
 
 def coarse_share(errors: Float[np.ndarray, " N"], scales: Float32[np.ndarray, "N 3"]) -> float:
-    """Return the share of Gaussians whose position is off by more than a quarter of their size.
-
-    The size is the second of the three standard deviations: the smaller one that a flat Gaussian shows from its front.
+    """Return the share of Gaussians whose position is off by more than a quarter of their visible size.
 
     Args:
         errors: ``(N,)`` largest error of a coordinate, world units.
         scales: ``(N, 3)`` logarithms of standard deviations.
     """
-    return float((errors > COARSE_ERROR * _sizes(scales)).mean()) if len(errors) else 0.0
+    return float((errors > COARSE_ERROR * visible_sizes(scales)).mean()) if len(errors) else 0.0
 
 
-def coarse_note(splats: Splats, order: Int[np.ndarray, " M"], decoded: Float[np.ndarray, "M 3"]) -> str:
-    """Return a sentence if a container's positions lose something of a scene, with the remedy; else an empty string.
+def coarse_note(
+    means: Float32[np.ndarray, "N 3"],
+    scales: Float32[np.ndarray, "N 3"],
+    low: Float32[np.ndarray, " 3"],
+    high: Float32[np.ndarray, " 3"],
+) -> str:
+    """Return a sentence with the remedy if a container's finest steps are too coarse for a scene, else an empty string.
 
     Args:
-        splats: the scene.
-        order: ``(M,)`` index of Gaussians of the container in the scene.
-        decoded: ``(M, 3)`` their positions in the container, world units.
+        means: ``(N, 3)`` positions, world units.
+        scales: ``(N, 3)`` logarithms of standard deviations.
+        low: ``(3,)`` smallest signed logarithm of the positions in the container, per axis.
+        high: ``(3,)`` largest one.
     """
-    means, scales = splats.means[order], splats.scales[order]
-    errors = np.abs(means - decoded.astype(np.float64)).max(axis=1, initial=0)
-    share = coarse_share(errors, scales)
+    wide = means.astype(np.float64)
+    extents, sizes = high.astype(np.float64) - low, visible_sizes(scales)
+    chances = coarse_chances(wide, sizes, extents)
+    share = float(chances.mean()) if len(chances) else 0.0
     if share <= COARSE_SHARE:
         return ""
-    step = 2 * float(np.median(errors[errors > COARSE_ERROR * _sizes(scales)]))
-    near = means.astype(np.float64) - np.rint(np.median(means, axis=0))
-    moved = coarse_share(_expected_errors(near), scales) <= COARSE_SHARE
+    steps = ((1 + np.abs(wide)) * extents).max(axis=1) / CONTAINER_LEVELS
+    step = float(np.median(steps[chances > 0]))
+    near = wide - np.rint(np.median(wide, axis=0))
+    moved = coarse_chances(near, sizes, np.ptp(signed_log(near)).repeat(3)).mean() <= COARSE_SHARE
     remedy = "origin=auto moves the scene there" if moved else "streamed SOG (lod-meta.json) has a range for each chunk"
     return (
         f"positions have steps of about {step:.2g}, too coarse for {share:.0%} of the Gaussians, because a container "
@@ -137,13 +143,26 @@ def read_origin(document: Mapping[str, Any], name: str) -> Origin:
     return x, y, z
 
 
-def _expected_errors(positions: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
-    """Return the largest error of each position in a container, all of whose axes have one range."""
-    step = float(np.ptp(signed_log(positions))) / CONTAINER_LEVELS
-    return (1 + np.abs(positions).max(axis=1)) * step / 2
+def coarse_chances(
+    positions: Float64[np.ndarray, "N 3"], sizes: Float64[np.ndarray, " N"], extents: Float64[np.ndarray, " 3"]
+) -> Float64[np.ndarray, " N"]:
+    """Return the chance of each position to be coarse in a container: errors are even, up to half a step of each axis.
+
+    Args:
+        positions: ``(N, 3)`` world units.
+        sizes: ``(N,)`` those of :func:`visible_sizes`.
+        extents: ``(3,)`` extents of the signed logarithms' ranges, per axis.
+    """
+    half_steps = np.maximum((1 + np.abs(positions)) * extents / CONTAINER_LEVELS / 2, 1e-300)
+    chances: Float64[np.ndarray, " N"] = 1 - np.minimum(COARSE_ERROR * sizes[:, None] / half_steps, 1).prod(axis=1)
+    return chances
 
 
-def _sizes(scales: Float32[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
+def visible_sizes(scales: Float32[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
+    """Return the second of the three standard deviations: the smaller one that a flat Gaussian shows from its front.
+
+    ``scales`` are logarithms of standard deviations; the sizes are in world units.
+    """
     sizes: Float64[np.ndarray, " N"] = np.exp(np.sort(scales, axis=1)[:, 1].astype(np.float64))
     return sizes
 

@@ -11,7 +11,6 @@ from kissgs.core.errors import UnsupportedError
 from kissgs.core.origin import coarse_note
 from kissgs.core.progress import Progress, silent
 from kissgs.core.sensitivity import Sensitivity
-from kissgs.core.signed_log import signed_exp
 from kissgs.core.splats import Splats
 from kissgs.core.threads import blas_workers
 from kissgs.planning.container_model import EVEN_LEVELS, ContainerModel
@@ -25,7 +24,7 @@ INVISIBLE_LOGIT = -5.5373
 """Logit of opacity 1/255, rounded up; no renderer draws Gaussians of this opacity or less."""
 
 SAMPLED = 1 << 18
-"""Number of Gaussians whose positions are compared with those of the scene."""
+"""Number of Gaussians whose sizes are compared with the steps of positions."""
 
 MAX_GROUPS = 1 << 14
 """Largest number of groups of Gaussians in a container: group and class of steps together are a number of 16 bits."""
@@ -95,9 +94,9 @@ def plan_encoding(
 
 def _coarse(splats: Splats, plan: EncodingPlan) -> str:
     """Return the sentence about coarse positions, by at most :data:`SAMPLED` Gaussians."""
-    cells = np.flatnonzero(plan.grid.mask)
-    cells = cells[:: 1 + len(cells) // SAMPLED]
-    return coarse_note(splats, plan.grid.cells[cells], signed_exp(plan.fields["means"].take(cells).values()))
+    order, means = plan.grid.cells[plan.grid.mask], plan.fields["means"]
+    some = order[:: 1 + len(order) // SAMPLED]
+    return coarse_note(splats.means[some], splats.scales[some], means.low, means.high)
 
 
 def visible_gaussians(splats: Splats, settings: EncodeSettings) -> Int32[np.ndarray, " K"]:

@@ -156,10 +156,13 @@ def _strides(bits: int | Int[np.ndarray, " N"]) -> tuple[int | Int[np.ndarray, "
     return (1 << (16 - bits),) if isinstance(bits, int) else (np.left_shift(1, 16 - bits.astype(np.int16)),)
 
 
-def means_bits(splats: Splats, kept: Int[np.ndarray, " M"], tolerance: float, pool: Workers | None = None) -> int:
-    """Return the position bits, 8 to 16, with which the median Gaussian moves by at most ``tolerance`` of its size.
+def means_bits(
+    splats: Splats, kept: Int[np.ndarray, " M"], tolerance: float, pool: Workers | None = None, *, most: int = 16
+) -> int:
+    """Return the position bits, 8 to ``most``, with which the median Gaussian moves at most ``tolerance`` of its size.
 
-    The step of a signed logarithm grows as 1 + |x|; size is the geometric mean of the two longest axes.
+    The step of a signed logarithm grows as 1 + |x|; size is the geometric mean of the two longest axes. More than 16
+    bits of the range of all axes are for containers with a range of each axis, which may be smaller.
     """
     if len(kept) == 0:
         return 16
@@ -177,7 +180,7 @@ def means_bits(splats: Splats, kept: Int[np.ndarray, " M"], tolerance: float, po
     for_each_block(len(kept), work, pool)
     allowed = tolerance * np.exp(np.median(ratio, overwrite_input=True))
     levels = log_extent(selected(splats.means, kept), pool) / (2 * allowed)  # half a step is the largest error
-    return int(np.clip(np.ceil(np.log2(max(levels, 1))), 8, 16))
+    return int(np.clip(np.ceil(np.log2(max(levels, 1))), 8, most))
 
 
 def log_extent(means: Float32[np.ndarray, "N 3"] | Rows, pool: Workers | None = None) -> float:

@@ -48,9 +48,10 @@ def plan_uniform(
 ) -> EncodingPlan:
     """Plan the Gaussians ``kept``, which may be none, for a container."""
     progress("order", 0.0)
-    bits = settings.means_bits or means_bits(splats, kept, settings.means_tolerance, pool)
+    most = 16 if container.tables is None else 32
+    bits = settings.means_bits or means_bits(splats, kept, settings.means_tolerance, pool, most=most)
     grid = layout_grid(
-        splats.means, kept, bits, settings, pool, lambda fraction: progress("order", fraction), None, groups
+        splats.means, kept, min(bits, 16), settings, pool, lambda fraction: progress("order", fraction), None, groups
     )
     grid = grid.with_padding_last() if container.padding_last else grid
     # Padding repeats Gaussians of the scene; in a scene without any, padding is a neutral Gaussian.

@@ -11,11 +11,12 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from kissgs.core.array_types import Float32, UInt16
-from kissgs.core.origin import WORLD
+from kissgs.core.origin import WORLD, visible_sizes
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import SH_REST_COUNTS, Splats, clean, concatenate, empty_splats
 from kissgs.io.atomic import atomic_file
@@ -42,7 +43,7 @@ from kissgs.streaming.layout import (
 )
 from kissgs.streaming.levels import chunk_levels, level_count
 from kissgs.streaming.manifest import Leaf, manifest
-from kissgs.streaming.partition import Cuts, chunk_depth, sampled_positions
+from kissgs.streaming.partition import Cuts, chunk_depth, coarse_in_chunks, sampled_rows
 from kissgs.streaming.rows import append_rows, from_rows, read_rows, sync, to_rows, write_rows
 from kissgs.streaming.sensitivities import cameras_json, cameras_of, choose_cameras, measure_file
 
@@ -51,6 +52,9 @@ Blocks = Callable[[], Iterable[Splats]]
 
 CHUNK = 400_000
 """Largest number of Gaussians in a chunk, but for the scatter of estimated medians."""
+
+LEAST = 512
+"""Number of Gaussians in a chunk below which it is not cut to give its positions finer steps."""
 
 LEAF, MOST_ENTRIES = 32_768, 4096
 """Largest number of Gaussians in a leaf; and about that of leaves times levels, because the manifest takes about 105
@@ -91,17 +95,20 @@ def partition(
             done += len(block)
             progress("partition", done / (2 * count))
 
-    def visible_means(block: Splats) -> Float32[np.ndarray, "n 3"]:
+    def visible_rows(block: Splats) -> Float32[np.ndarray, "n 4"]:
         nonlocal visible_count
-        splats = clean(block)[0]
-        visible = visible_gaussians(splats, settings)
-        visible_count += len(visible)
-        return splats.means[visible]
+        splats = clean(block)[0].select(visible_gaussians(clean(block)[0], settings))
+        visible_count += len(splats)
+        return np.column_stack([splats.means, visible_sizes(splats.scales).astype(np.float32)])
 
-    positions = sampled_positions(map(visible_means, counted()), count)
-    environment = Environment.of(positions, visible_count)
+    sample = sampled_rows(map(visible_rows, counted()), count)
+    environment = Environment.of(sample[:, :3], visible_count)
+    sample = sample[~environment.contains(sample[:, :3])]
     depth = chunk_depth(count, CHUNK)
-    cuts = Cuts.of(positions[~environment.contains(positions)], depth)
+    cuts = Cuts.of(sample[:, :3], depth)
+    while container == "sog" and count >> depth > LEAST and coarse_in_chunks(sample, cuts):
+        depth += 1
+        cuts = Cuts.of(sample[:, :3], depth)
     for path in (environment_file(work), *(chunk_file(work, chunk) for chunk in range(cuts.chunks))):
         path.unlink(missing_ok=True)
     far_count, counts, sh_degree, changed = 0, np.zeros(cuts.chunks, np.int64), 0, Counter[str]()
@@ -196,7 +203,7 @@ def make_file(
     stored = _encode(
         work, layout, splats, groups, settings, level, members, layout.path(level, file), threads, progress
     )
-    write_json(rows_file(work, level, file), {"counts": stored})
+    write_json(rows_file(work, level, file), stored)
     if level != layout.context:
         for chunk in members:
             level_file(work, chunk, level).unlink(missing_ok=True)
@@ -214,7 +221,7 @@ def make_environment(
     splats = read_environment(work, layout)
     groups = np.zeros(len(splats), np.uint16)
     stored = _encode(work, layout, splats, groups, settings, 0, None, layout.environment_path, threads, progress)
-    write_json(environment_marker(work), {"counts": stored})
+    write_json(environment_marker(work), stored)
 
 
 def _encode(
@@ -228,8 +235,8 @@ def _encode(
     path: str,
     threads: int,
     progress: Progress,
-) -> list[int]:
-    """Write a container; return the number of rows of each group in it.
+) -> dict[str, Any]:
+    """Write a container; return the number of rows of each group in it, and a note if its positions are coarse.
 
     Args:
         work: the work folder.
@@ -245,7 +252,7 @@ def _encode(
     """
     settings, count = file_settings(settings, level, layout.sh_degree), int(groups[-1]) + 1
     if not len(visible_gaussians(splats, settings)):  # merging may have made all of them invisible
-        return [0] * count
+        return {"counts": [0] * count, "note": ""}
     sensitivity = None
     if settings.rate_distortion:
         others = [_read_level(work, layout, layout.context, sorted({*layout.filled} - {*(members or ())}))]
@@ -267,7 +274,13 @@ def _encode(
     del sensitivity, splats
     encoded = write_files(layout.container, plan, settings, threads=threads, progress=progress)
     write_container(encoded.files, work / OUT / path, overwrite=True)
-    return np.bincount(groups[encoded.order], minlength=count).tolist()
+    return {"counts": np.bincount(groups[encoded.order], minlength=count).tolist(), "note": encoded.coarse}
+
+
+def coarse_note(work: Path, layout: Layout) -> str:
+    """Return the note of the first file of the finest level whose positions are coarse; else an empty string."""
+    notes = (json.loads(rows_file(work, *each).read_bytes())["note"] for each in layout.files() if each[0] == 0)
+    return next(filter(None, notes), "")
 
 
 def environment_count(work: Path) -> int:

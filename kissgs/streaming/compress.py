@@ -38,7 +38,7 @@ from kissgs.streaming.work_folder import (
     remove,
 )
 
-WORK_LAYOUT = 2
+WORK_LAYOUT = 3
 """Version of the files in the work folder; another one's are not continued."""
 
 REPORT = "report.json"
@@ -60,6 +60,7 @@ class StreamedReport:
             one. It belongs to every level, but is not counted there.
         chunks: number of chunks of the finest level.
         total_bytes: bytes of all files, the manifest included.
+        note: what the user may not expect: coarse positions; empty if there is nothing to say.
     """
 
     source_count: int
@@ -70,6 +71,7 @@ class StreamedReport:
     environment_bytes: int
     chunks: int
     total_bytes: int
+    note: str = ""
 
 
 def compress_streamed(
@@ -278,5 +280,6 @@ def _report(work: Path, layout: Layout, chunks: int) -> StreamedReport:
         environment_count=environment_count,
         environment_bytes=environment_bytes,
         chunks=chunks,
+        note=build.coarse_note(work, layout),
         total_bytes=sum(sizes) + environment_bytes + (out / layout.manifest).stat().st_size,
     )

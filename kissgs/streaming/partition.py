@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from kissgs.core.array_types import Float32, Float64, Int64, UInt8, UInt16
+from kissgs.core.origin import COARSE_SHARE, coarse_chances
+from kissgs.core.signed_log import signed_log
 
 SAMPLED = 1 << 20
 """Largest number of positions that choose the cuts between chunks."""
@@ -55,13 +57,26 @@ class Cuts:
         return (node - self.chunks).astype(np.uint16)
 
 
-def sampled_positions(blocks: Iterable[Float32[np.ndarray, "n 3"]], count: int) -> Float32[np.ndarray, "S 3"]:
-    """Return every k-th of ``count`` positions that come in blocks, at most :data:`SAMPLED`."""
+def sampled_rows(blocks: Iterable[Float32[np.ndarray, "n 4"]], count: int) -> Float32[np.ndarray, "S 4"]:
+    """Return every k-th of ``count`` rows, position and size, that come in blocks, at most :data:`SAMPLED`."""
     stride, first, found = max(1, -(-count // SAMPLED)), 0, []
     for block in blocks:
         found.append(block[first::stride].copy())
         first = (first - len(block)) % stride
-    return np.concatenate(found) if found else np.zeros((0, 3), np.float32)
+    return np.concatenate(found) if found else np.zeros((0, 4), np.float32)
+
+
+def coarse_in_chunks(rows: Float32[np.ndarray, "S 4"], cuts: Cuts) -> bool:
+    """Return whether too many positions are coarse in containers with a range of each axis, one for each chunk.
+
+    ``rows`` are positions and visible sizes.
+    """
+    chunks, coarse = cuts.chunk_of(rows[:, :3]), 0.0
+    for chunk in np.unique(chunks):
+        part = rows[chunks == chunk].astype(np.float64)
+        extents = np.ptp(signed_log(part[:, :3]), axis=0)
+        coarse += float(coarse_chances(part[:, :3], part[:, 3], extents).sum())
+    return coarse > COARSE_SHARE * len(rows)
 
 
 def chunk_depth(count: int, chunk: int) -> int:

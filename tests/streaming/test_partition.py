@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from kissgs.streaming.partition import Cuts, chunk_depth, leaf_groups, sampled_positions
+from kissgs.streaming.partition import Cuts, chunk_depth, leaf_groups, sampled_rows
 
 
 def positions(count, seed=0):
@@ -42,7 +42,7 @@ def test_a_sample_has_every_kth_position_whatever_the_blocks(sizes, monkeypatch)
     monkeypatch.setattr("kissgs.streaming.partition.SAMPLED", 4)
     means = positions(sum(sizes))
     blocks = np.split(means, np.cumsum(sizes)[:-1])
-    found = sampled_positions(blocks, sum(sizes))
+    found = sampled_rows(blocks, sum(sizes))
     stride = -(-sum(sizes) // 4)
     assert (found == means[::stride]).all()
 
