@@ -12,6 +12,7 @@ from kissgs.cli.arguments import (
     ContainerOption,
     MaxPsnrDropOption,
     MaxSsimDropOption,
+    OriginOption,
     PsnrOption,
     TargetSizeOption,
 )
@@ -74,13 +75,14 @@ def compress(
     evaluate: Annotated[
         bool, typer.Option("--evaluate", help="Decode the result, and measure PSNR and SSIM of its renderings.")
     ] = False,
+    origin: OriginOption = None,
     force: Annotated[bool, typer.Option("--force", "-f", help="Overwrite existing output files.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the response of the service as JSON.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")] = False,
 ) -> None:
     """Compress scenes on a server. Ctrl-C cancels the job."""
     from kissgs.cli.console import progress_bar
-    from kissgs.cli.options import budget_of, chosen
+    from kissgs.cli.options import budget_of, chosen, origin_of
     from kissgs.client.remote import Remote
     from kissgs.core.errors import UnsupportedError
     from kissgs.io.container_names import ending_of, named_container
@@ -108,6 +110,7 @@ def compress(
                     settings=settings,
                     container=kind,
                     evaluate=evaluate,
+                    origin=origin_of(origin),
                     overwrite=force,
                     progress=_announcing(progress, server, quiet),
                 )

@@ -12,7 +12,7 @@ import uuid
 from collections.abc import Callable, Iterator
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
 from urllib.parse import urlsplit
 
 from kissgs.core.errors import Cancelled, InvalidSceneError, KissgsError, RemoteError, UnsupportedError
@@ -87,6 +87,7 @@ class Remote:
         settings: Settings | None = None,
         container: ContainerName | None = None,
         evaluate: bool = False,
+        origin: Literal["auto"] | None = None,
         overwrite: bool = False,
         progress: Progress = silent,
     ) -> dict[str, Any]:
@@ -98,6 +99,7 @@ class Remote:
             settings: None for the preset ``balanced``.
             container: ``"sogxt"`` or ``"sog"``; by default SOG if ``destination`` ends in ``.sog``, else SOG-XT.
             evaluate: whether the service also compares rendered images.
+            origin: see :class:`kissgs.ReadOptions`.
             overwrite: whether to replace ``destination`` if it exists.
             progress: receives "upload", "queue", the stages of the service, "download", and "wait for server" with the
                 reason as a note. An exception that it raises cancels the job.
@@ -114,7 +116,9 @@ class Remote:
         target = Path(destination)
         kind = named_container(container, target)
         refuse_existing(target, overwrite=overwrite)
-        status = self.submit(source, settings=settings, container=kind, evaluate=evaluate, progress=progress)
+        status = self.submit(
+            source, settings=settings, container=kind, evaluate=evaluate, origin=origin, progress=progress
+        )
         try:
             status = self.follow(status["id"], progress)
             self.download(status, target, overwrite=overwrite, progress=progress)
@@ -138,6 +142,7 @@ class Remote:
         settings: Settings | None = None,
         container: ContainerName = "sogxt",
         evaluate: bool = False,
+        origin: Literal["auto"] | None = None,
         progress: Progress = silent,
     ) -> dict[str, Any]:
         """Upload a scene; retry if the connection breaks or the service is overloaded, without a second job.
@@ -147,6 +152,7 @@ class Remote:
             settings: None for the preset ``balanced``.
             container: ``"sogxt"`` or ``"sog"``.
             evaluate: whether the service also compares rendered images.
+            origin: see :class:`kissgs.ReadOptions`.
             progress: receives "upload" and "wait for server".
 
         Returns:
@@ -160,6 +166,7 @@ class Remote:
             **(settings or Settings()).model_dump(mode="json", exclude_unset=True),
             "format": container,
             "evaluate": evaluate,
+            **({} if origin is None else {"origin": origin}),
         }
         size = _size(path)
         headers = {

@@ -43,7 +43,7 @@ from kissgs.streaming.layout import (
 )
 from kissgs.streaming.levels import chunk_levels, level_count
 from kissgs.streaming.manifest import Leaf, manifest
-from kissgs.streaming.partition import Cuts, chunk_depth, coarse_in_chunks, sampled_rows
+from kissgs.streaming.partition import Cuts, chunk_depth, cuts_without_coarse, sampled_rows
 from kissgs.streaming.rows import append_rows, from_rows, read_rows, sync, to_rows, write_rows
 from kissgs.streaming.sensitivities import cameras_json, cameras_of, choose_cameras, measure_file
 
@@ -52,9 +52,6 @@ Blocks = Callable[[], Iterable[Splats]]
 
 CHUNK = 400_000
 """Largest number of Gaussians in a chunk, but for the scatter of estimated medians."""
-
-LEAST = 512
-"""Number of Gaussians in a chunk below which it is not cut to give its positions finer steps."""
 
 LEAF, MOST_ENTRIES = 32_768, 4096
 """Largest number of Gaussians in a leaf; and about that of leaves times levels, because the manifest takes about 105
@@ -97,18 +94,17 @@ def partition(
 
     def visible_rows(block: Splats) -> Float32[np.ndarray, "n 4"]:
         nonlocal visible_count
-        splats = clean(block)[0].select(visible_gaussians(clean(block)[0], settings))
+        splats = clean(block)[0]
+        splats = splats.select(visible_gaussians(splats, settings))
         visible_count += len(splats)
         return np.column_stack([splats.means, visible_sizes(splats.scales).astype(np.float32)])
 
     sample = sampled_rows(map(visible_rows, counted()), count)
     environment = Environment.of(sample[:, :3], visible_count)
     sample = sample[~environment.contains(sample[:, :3])]
-    depth = chunk_depth(count, CHUNK)
-    cuts = Cuts.of(sample[:, :3], depth)
-    while container == "sog" and count >> depth > LEAST and coarse_in_chunks(sample, cuts):
-        depth += 1
-        cuts = Cuts.of(sample[:, :3], depth)
+    cuts = Cuts.of(sample[:, :3], chunk_depth(count, CHUNK))
+    if container == "sog":  # which has a range of each axis
+        cuts = cuts_without_coarse(sample, cuts, count)
     for path in (environment_file(work), *(chunk_file(work, chunk) for chunk in range(cuts.chunks))):
         path.unlink(missing_ok=True)
     far_count, counts, sh_degree, changed = 0, np.zeros(cuts.chunks, np.int64), 0, Counter[str]()
@@ -133,7 +129,7 @@ def partition(
         source_count=count,
         sh_degree=sh_degree,
         counts=tuple(map(int, counts)),
-        depth=depth,
+        depth=cuts.depth,
         levels=levels,
         leaf=leaf_size(total, cuts.chunks, levels),
         environment=far_count,

@@ -12,6 +12,9 @@ from kissgs.core.array_types import Float32, Float64, Int64, UInt8, UInt16
 from kissgs.core.origin import COARSE_SHARE, coarse_chances
 from kissgs.core.signed_log import signed_log
 
+LEAST = 512
+"""Number of Gaussians in a chunk up to which it is not cut further."""
+
 SAMPLED = 1 << 20
 """Largest number of positions that choose the cuts between chunks."""
 
@@ -77,6 +80,22 @@ def coarse_in_chunks(rows: Float32[np.ndarray, "S 4"], cuts: Cuts) -> bool:
         extents = np.ptp(signed_log(part[:, :3]), axis=0)
         coarse += float(coarse_chances(part[:, :3], part[:, 3], extents).sum())
     return coarse > COARSE_SHARE * len(rows)
+
+
+def cuts_without_coarse(sample: Float32[np.ndarray, "S 4"], cuts: Cuts, count: int) -> Cuts:
+    """Return deeper cuts if positions are coarse in the chunks of ``cuts``, unless they are coarse in small chunks too.
+
+    Args:
+        sample: positions and visible sizes.
+        cuts: the fewest cuts.
+        count: number of Gaussians of the scene.
+    """
+    deeper = cuts
+    while coarse_in_chunks(sample, deeper):
+        if count >> deeper.depth <= LEAST:
+            return cuts
+        deeper = Cuts.of(sample[:, :3], deeper.depth + 1)
+    return deeper
 
 
 def chunk_depth(count: int, chunk: int) -> int:

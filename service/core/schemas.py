@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -43,6 +43,12 @@ class JobOptions(kissgs.Settings):
     )
     evaluate: bool = Field(
         False, description="Also render both scenes and compare the images (PSNR, SSIM, MS-SSIM), which takes longer."
+    )
+
+    origin: Literal["auto"] | None = Field(
+        None,
+        description="auto: make positions relative to the middle of the scene, where containers have the finest steps, "
+        "and record it; by default as in the file. For scenes far from the origin.",
     )
 
     @property

@@ -80,12 +80,13 @@ class Workplace(ABC):
         """Remove what belongs to this start alone, because another start of the job may be running."""
 
     def _common(self) -> dict[str, Any]:
-        left_out = ("format", "evaluate")
+        left_out = ("format", "evaluate", "origin")
         return {
             "settings": {name: value for name, value in self._job.options.items() if name not in left_out},
             "format": self._options.format,
             "container": self._container.name,
             "evaluate": self._options.evaluate,
+            "origin": self._options.origin,
         }
 
 

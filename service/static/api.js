@@ -7,7 +7,7 @@
  *   psnr?: number | null}} Goals
  * @typedef {{ratio?: number | null, count?: number | null, max_psnr_drop?: number | null,
  *   auto_count?: boolean | null}} Budget
- * @typedef {{preset: string, format?: string, evaluate: boolean, time_limit?: number | null,
+ * @typedef {{preset: string, format?: string, evaluate: boolean, origin?: string | null, time_limit?: number | null,
  *   encode: {rate_distortion: boolean, order: string} & Goals,
  *   compact: {method: string, sparsify_steps: number, refine_steps: number} & Budget,
  *   finetune: {enabled: boolean | null}}} JobOptions

@@ -10,7 +10,7 @@ import { presetList } from "./presets.js";
 import { timeField } from "./time_limit.js";
 
 /**
- * @typedef {{preset: string, evaluate: boolean, format: string, time_limit?: number, encode?: import("./api.js").Goals,
+ * @typedef {{preset: string, evaluate: boolean, format: string, origin?: string, time_limit?: number, encode?: import("./api.js").Goals,
  *   compact?: import("./api.js").Budget, finetune?: {enabled: boolean}}} Options options that differ from the preset
  * @typedef {{file: File, options: Options}} Submission
  */
@@ -79,7 +79,7 @@ export function composer(limits, presets, submit) {
 function optionFields(limits, presets) {
   const [list, goal, format] = [presetList(presets), goalField(), formatField()];
   const [time, keep] = [timeField(limits), keepField(limits.training)];
-  const [finetune, evaluate] = [byId("finetune"), byId("evaluate")];
+  const [finetune, evaluate, origin] = [byId("finetune"), byId("evaluate"), byId("origin")];
 
   finetune.disabled = !limits.training;
   byId("finetune-note").textContent = limits.training
@@ -105,6 +105,7 @@ function optionFields(limits, presets) {
         preset: list.chosen(),
         evaluate: evaluate.checked,
         format: format.chosen(),
+        ...(origin.checked && { origin: "auto" }),
         ...(limit && { time_limit: limit }),
         ...(encode && { encode }),
         ...(compact ? { compact } : encode && { compact: { auto_count: false } }), // else a goal would choose
@@ -119,6 +120,7 @@ function optionFields(limits, presets) {
       keep.prefer(earlier.compact);
       format.prefer(earlier.format);
       evaluate.checked = earlier.evaluate;
+      origin.checked = earlier.origin === "auto";
       finetune.checked = limits.training && (earlier.finetune.enabled ?? false);
       refresh();
     },
