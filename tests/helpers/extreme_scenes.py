@@ -93,6 +93,20 @@ def displaced_camera():
     return _seen_from([1e6 + 0.3, -1e6 - 0.4, 1e6 - 3], [1e6, -1e6, 1e6], 0.8)
 
 
+def offset_of_two_axes():
+    return changed(means=cloud()["means"] + [1000, 1000, 0])
+
+
+def offset_camera():
+    return _seen_from([1000.3, 999.6, -3], [1000, 1000, 0], 0.8)
+
+
+def long_scan():
+    arrays = cloud()
+    arrays["means"][:, 0] = np.linspace(0, 3000, 12)
+    return arrays
+
+
 def up_to_1e15():
     arrays = cloud()
     arrays["means"][6:] *= 10.0 ** np.array([-6, -3, 2, 6, 9, 14])[:, None]

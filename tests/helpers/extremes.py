@@ -69,6 +69,19 @@ EXTREMES = [
         extreme_scenes.displaced_camera,
         bounds={"step": 5e-2},  # positions cannot move, so the next images differ a little
     ),
+    Extreme(
+        "two-axes-away",
+        "a world of 1, 1000 from the origin along two axes",
+        "kept; a container's steps are 0.13 there, which the report says: origin=auto keeps positions",
+        extreme_scenes.offset_of_two_axes,
+        extreme_scenes.offset_camera,
+    ),
+    Extreme(
+        "long-scan",
+        "3 km along one axis",
+        "kept; a container's steps grow to 0.4 at its end, which the report says",
+        extreme_scenes.long_scan,
+    ),
     Extreme("1e15", "positions from 1e-6 to 1e15", "kept; nothing beyond 1e10 is drawn", extreme_scenes.up_to_1e15),
     Extreme(
         *("beyond-1e15", "positions beyond ±1e15", "removed: renderers' float32 squares overflow soon after"),

@@ -1,0 +1,207 @@
+"""Scenes far from the origin. Oracle: the float64 positions that a naive writer has put into the file."""
+
+import base64
+import json
+import struct
+import zipfile
+
+import numpy as np
+import pytest
+from helpers import reference_ply
+
+import kissgs
+from kissgs.cameras.views import View, Views, black
+from kissgs.core.origin import coarse_share
+from kissgs.rendering.camera import look_at
+from kissgs.sogxt.names import JSON_NAME, YAML_NAME
+
+SIZE = 0.03
+"""Standard deviation of every Gaussian."""
+
+FAST = kissgs.Settings(preset="fast")
+AUTO = kissgs.ReadOptions(origin="auto")
+OFFSETS = {"two axes": (1000.0, 1000.0, 0.0), "one axis": (10_000.0, 0.0, 0.0), "all": (-2000.0, 2000.0, 2000.0)}
+MAP = (452_345.25, 4_512_345.75, 120.0)
+"""Projected coordinates, whose steps in float32 are half a metre."""
+
+
+def columns(positions, size=SIZE):
+    rng = np.random.default_rng(7)
+    count = len(positions)
+    values = {name: np.zeros(count) for name in reference_ply.names(0)}
+    values |= dict(zip("xyz", positions.T, strict=True))
+    values |= {f"scale_{axis}": np.log(np.broadcast_to(size, count)) for axis in range(3)}
+    values |= {f"f_dc_{i}": rng.normal(size=count) for i in range(3)}
+    values["opacity"], values["rot_0"] = np.full(count, 2.0), np.ones(count)
+    return {name: each.tolist() for name, each in values.items()}
+
+
+def around(offset, count=300):
+    return np.random.default_rng(3).normal(size=(count, 3)) + offset
+
+
+def write(path, positions, kind="float", encoding="binary_little_endian", size=SIZE):
+    path.write_bytes(reference_ply.ply_bytes(columns(positions, size), encoding, kind))
+    return path
+
+
+def positions_of(path):
+    """Read the positions of a ``.ply`` that this library wrote, float64."""
+    data = path.read_bytes()
+    head, _, body = data.partition(b"end_header\n")
+    words = [line.split() for line in head.decode().splitlines()]
+    count = next(int(word[2]) for word in words if word[:2] == ["element", "vertex"])
+    codes = "".join("d" if word[1] == "double" else "f" for word in words if word[0] == "property")
+    return np.array([row[:3] for row in struct.iter_unpack(f"<{codes}", body)])[:count]
+
+
+def largest_error(wanted, found):
+    """Return the largest error of a coordinate; Gaussians may have another order."""
+    nearest = ((wanted[:, None] - found[None]) ** 2).sum(axis=2).argmin(axis=1)
+    return np.abs(wanted - found[nearest]).max()
+
+
+@pytest.mark.parametrize("ending", [".zip", ".sog"])
+@pytest.mark.parametrize("offset", OFFSETS.values(), ids=OFFSETS)
+def test_coarse_steps_are_named_and_an_origin_mends_them(offset, ending, tmp_path):
+    scene, out, decoded = write(tmp_path / "a.ply", around(offset)), tmp_path / f"a{ending}", tmp_path / "b.ply"
+    wanted = around(offset).astype(np.float32).astype(float)
+    plain = kissgs.compress(scene, out, settings=FAST)
+    kissgs.decompress(out, decoded)
+    coarse = largest_error(wanted, positions_of(decoded)) > SIZE / 4
+    assert coarse == ("positions have steps of" in plain.report.note)
+    assert coarse == ("origin=auto" in plain.report.note)
+    assert coarse or ending == ".sog"  # which has a range of each axis
+
+    moved = kissgs.compress(scene, out, settings=FAST, reading=AUTO, overwrite=True)
+    kissgs.decompress(out, decoded, overwrite=True)
+    assert "steps" not in moved.report.note
+    assert "positions are relative to the point" in moved.report.note
+    assert largest_error(wanted, positions_of(decoded)) < SIZE / 8
+
+
+def test_a_scene_near_the_origin_is_not_moved():
+    scene = kissgs.sample_scene(500, sh_degree=0)
+    plain, auto = (kissgs.compress(scene, settings=FAST, reading=each) for each in (kissgs.ReadOptions(), AUTO))
+    assert plain.files == auto.files
+    assert plain.report.note == auto.report.note == ""
+
+
+@pytest.mark.parametrize("encoding", ["binary_little_endian", "binary_big_endian", "ascii"])
+def test_doubles_are_read_as_doubles(encoding, tmp_path):
+    scene = write(tmp_path / "a.ply", around(MAP), "double", encoding)
+    splats = kissgs.load(scene)
+    assert largest_error(around(MAP), splats.means + np.array(splats.origin)) < 1e-5
+    kissgs.save(splats, tmp_path / "b.ply")
+    assert largest_error(around(MAP), positions_of(tmp_path / "b.ply")) < 1e-5
+
+
+def test_doubles_that_float32_holds_are_floats(tmp_path):
+    scene = write(tmp_path / "a.ply", around((0, 0, 3)), "double")
+    splats = kissgs.load(scene)
+    assert splats.origin == (0, 0, 0)
+    assert (splats.means == around((0, 0, 3)).astype(np.float32)).all()
+
+
+@pytest.mark.parametrize("ending", [".zip", ".sog", ".glb", ".spz.glb", ".ply"])
+def test_what_can_hold_an_origin_gives_the_positions_back(ending, tmp_path):
+    scene, out = write(tmp_path / "a.ply", around(MAP), "double"), tmp_path / f"b{ending}"
+    if ending in (".zip", ".sog"):
+        kissgs.compress(scene, out, settings=FAST)
+    else:
+        kissgs.save(kissgs.load(scene), out)
+    found = kissgs.load(out)
+    assert largest_error(around(MAP), found.means + np.array(found.origin)) < SIZE / 4
+    again = kissgs.compress(out, settings=FAST)  # the origin goes on
+    assert "(452,34" in again.report.note
+
+
+@pytest.mark.parametrize("ending", [".spz", ".splat", ".compressed.ply"])
+def test_what_cannot_hold_an_origin_says_so(ending, tmp_path):
+    *_, note = kissgs.save(kissgs.load(write(tmp_path / "a.ply", around(MAP), "double")), tmp_path / f"b{ending}")
+    assert "relative to the point" in note
+    assert f"{ending} does not record it" in note
+
+
+def test_a_gltf_node_far_away(tmp_path):
+    """Geo-referenced glTF has a small mesh and a node with a large translation, in glTF's axes."""
+    near = kissgs.load(write(tmp_path / "a.ply", around((0, 0, 0))))
+    kissgs.save(near, tmp_path / "a.glb")
+    data = (tmp_path / "a.glb").read_bytes()
+    length = int.from_bytes(data[12:16], "little")
+    document, body = json.loads(data[20 : 20 + length]), data[28 + length :]
+    document["nodes"][0]["translation"] = [-MAP[0], -MAP[1], MAP[2]]
+    document["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(body).decode()
+    (tmp_path / "b.gltf").write_text(json.dumps(document))
+    found = kissgs.load(tmp_path / "b.gltf")
+    assert largest_error(near.means + np.array(MAP), found.means + np.array(found.origin)) < 1e-4
+
+
+def test_scenes_of_two_origins_and_a_capture_are_compared_in_one_world(tmp_path):
+    scene = write(tmp_path / "a.ply", around(MAP), "double")
+    kissgs.compress(scene, tmp_path / "a.zip", settings=FAST)
+    reference, candidate = kissgs.load(scene), kissgs.load(tmp_path / "a.zip")
+    origin = np.array(candidate.origin) + np.array([5, -3, 2])
+    means = (candidate.means + np.array(candidate.origin) - origin).astype(np.float32)
+    other = kissgs.Splats(
+        **{name: getattr(candidate, name) for name in ("quats", "scales", "opacities", "sh0", "shN")},
+        means=means,
+        origin=tuple(map(float, origin)),
+    )
+    eye = look_at(
+        np.array(MAP) - np.array([0, 0, 6]), np.array(MAP), np.array([0.0, -1, 0]), fov=1.0, width=64, height=48
+    )
+    views = Views((), (View("a", eye),), black(), "a test")
+    found = kissgs.evaluate(reference, other, views)
+    assert found.mean.candidate_vs_reference.psnr > 35
+    assert found.shown > 0.5
+
+
+def test_objects_far_apart_are_kept_by_streamed_sog(tmp_path):
+    """The second object, a fiftieth of the size, is 1,000 units away: no origin serves both."""
+    rng = np.random.default_rng(1)
+    near, far = rng.normal(size=(1500, 3)), 0.02 * rng.normal(size=(1500, 3)) + (1000, 0, 0)
+    positions, sizes = np.concatenate([near, far]), np.repeat([0.05, 0.001], 1500)
+    scene = write(tmp_path / "a.ply", positions, size=sizes)
+    note = kissgs.compress(scene, settings=FAST, reading=AUTO).report.note
+    assert "positions have steps of" in note
+    assert "lod-meta.json" in note
+    report = kissgs.compress_streamed(scene, tmp_path / "tree" / "lod-meta.json", settings=FAST)
+    assert report.note == ""
+    found = kissgs.load(tmp_path / "tree").means.astype(float)
+    wanted = far.astype(np.float32).astype(float)
+    nearest = np.array([np.abs(found - one).max(axis=1).min() for one in wanted])
+    assert coarse_share(nearest, np.full((1500, 3), np.log(0.001), np.float32)) < 0.05
+    assert "steps" in kissgs.compress_streamed(scene, tmp_path / "tree.sogxt", settings=FAST).note
+
+
+@pytest.mark.parametrize("manifest", ["lod-meta.json", "levels.json"])
+def test_a_streamed_scene_records_its_origin(manifest, tmp_path):
+    scene = write(tmp_path / "a.ply", around(OFFSETS["two axes"]))
+    kissgs.compress_streamed(scene, tmp_path / "tree" / manifest, settings=FAST, reading=AUTO)
+    assert json.loads((tmp_path / "tree" / manifest).read_bytes())["kissgs"] == {"origin": [1000.0, 1000.0, 0.0]}
+    assert largest_error(around(OFFSETS["two axes"]), kissgs.load(tmp_path / "tree").means.astype(float)) < SIZE / 4
+
+
+def test_a_goal_that_coarse_positions_prevent_names_them(tmp_path):
+    scene = write(tmp_path / "a.ply", around(OFFSETS["one axis"]))
+    settings = kissgs.Settings.from_preset("balanced", psnr=60.0, sensitivity_views=4, sensitivity_view_size=64)
+    with pytest.raises(kissgs.UnsupportedError, match="positions have steps of"):
+        kissgs.compress(scene, settings=settings)
+
+
+@pytest.mark.parametrize("origin", [[1, 2], [1, 2, "x"], "far", [1, 2, None], [1, 2, 1e999]])
+@pytest.mark.parametrize("ending", [".zip", ".sog"])
+def test_a_damaged_origin_is_refused(origin, ending, tmp_path):
+    files = kissgs.compress(
+        kissgs.sample_scene(40, sh_degree=0), settings=FAST, container="sog" if ending == ".sog" else None
+    ).files
+    name = JSON_NAME if ending == ".zip" else "meta.json"
+    document = json.loads(files[name])
+    document["kissgs"] = {**document.get("kissgs", {}), "origin": origin}
+    with zipfile.ZipFile(tmp_path / f"a{ending}", "w") as archive:
+        for each, data in files.items():
+            if each != YAML_NAME:
+                archive.writestr(each, json.dumps(document) if each == name else data)
+    with pytest.raises(kissgs.InvalidContainerError):
+        kissgs.load(tmp_path / f"a{ending}")
