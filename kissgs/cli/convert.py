@@ -80,7 +80,7 @@ def convert(
         size = target.stat().st_size
         return {"format": kind, "count": len(splats), "sh_degree": degree, "bytes": size, "notes": notes}
 
-    for_each_input(inputs, Path(output), f".{kind}", as_json, work, unreadable=InvalidSceneError)
+    for_each_input(inputs, output, f".{kind}", as_json, work, unreadable=InvalidSceneError)
 
 
 def _output_format(output: str, to: str | None) -> OutputFormat:

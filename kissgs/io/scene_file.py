@@ -87,7 +87,7 @@ def open_scene_file(source: Path | bytes, remedy: str = "name a scene file") -> 
 
 def listed(names: Sequence[str]) -> str:
     """Return names from a file for a message, of bounded length: the first six, and how many more there are."""
-    shown = [name if len(name) <= 40 and name.isprintable() else repr(name[:40]) for name in names[:6]]
+    shown = [name if len(name) <= 100 and name.isprintable() else repr(name[:100]) for name in names[:6]]
     more = f" and {len(names) - 6:,} more" if len(names) > 6 else ""
     return ", ".join(shown) + more
 

@@ -85,7 +85,7 @@ def test_several_files_into_a_folder(scene: Path, tmp_path: Path) -> None:
     assert "cannot all become" in failure("convert", tmp_path / "*.ply", tmp_path / "a.spz")
     (tmp_path / "boxes").mkdir()
     message = failure("convert", tmp_path / "boxes", tmp_path / "two.ply", tmp_path / "more", "--to", "spz")
-    assert message.startswith(f"kissgs: {tmp_path}/boxes: this is no container")
+    assert message.startswith(f"kissgs: {tmp_path}/boxes is a folder without a scene")
 
 
 def test_compressed_ply_is_an_ending(scene: Path, tmp_path: Path) -> None:
