@@ -260,7 +260,7 @@ def test_a_folder_that_is_no_container_is_named_with_what_to_give(scene: Path, t
 
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp1252"])
 def test_standard_output_escapes_what_its_encoding_lacks(scene: Path, tmp_path: Path, encoding: str) -> None:
-    """As Python's own standard error does."""
+    """The expected bytes are those of Python's own error handler for standard error."""
     name = "日本 ü\udcff.ply"
     (tmp_path / name).write_bytes(scene.read_bytes())
     done = run("info", name, cwd=tmp_path, encoding=encoding)

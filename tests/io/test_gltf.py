@@ -179,7 +179,7 @@ def instanced(root, buffer, **columns):
 
 @pytest.mark.parametrize("required", [True, False])
 def test_instances_are_nodes_below_their_node(required):
-    """The same file with a child node for each instance."""
+    """Expected is what a file with a child node for each instance gives."""
     scene = made_scene(5, 1, extremes=False)
     root, buffer = document(attributes(scene))
     root["extensionsRequired"] = ["EXT_mesh_gpu_instancing"] * required

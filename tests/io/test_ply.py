@@ -188,7 +188,7 @@ def test_ascii_is_read_as_people_write_it():
     ],
 )
 def test_nan_and_infinity_of_c_libraries(words, value):
-    """What printf of glibc, AIX and Visual C++, old and new, writes; rounded to few digits, they are the same."""
+    """The words that printf of glibc, AIX and Visual C++, old and new, writes, some rounded to few digits."""
     rows = [["1"] * 14 for _ in words.split()]
     for number, word in enumerate(words.split()):
         rows[number][number % 14] = word
