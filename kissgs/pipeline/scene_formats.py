@@ -114,11 +114,12 @@ def _check_folder(folder: Path) -> None:
         if any((folder / name).is_file() for name in (YAML_NAME, META_NAME, *_STREAMED)):
             return
         found = [path for pattern in ("*", "point_cloud/iteration_*/*") for path in sorted(folder.glob(pattern))]
-        scenes = [str(path) for path in found if path.suffix.lower() in (*ENDINGS, *SCENE_ENDINGS) and path.is_file()]
+        scenes = [path for path in found if path.suffix.lower() in (*ENDINGS, *SCENE_ENDINGS) and path.is_file()]
     except (OSError, ValueError):
         return  # the reader says why
     if scenes:
-        raise InvalidContainerError(f"{folder!s:.200} is a folder, not a scene; name a file in it: {listed(scenes)}")
+        names = listed([str(path.relative_to(folder)) for path in scenes])
+        raise InvalidContainerError(f"{folder!s:.200} is a folder, not a scene; name a file in it: {names}")
     raise InvalidContainerError(
         f"{folder!s:.200} is a folder without a scene: it has neither {YAML_NAME} nor {META_NAME}, {LOD_NAME} or "
         f"{LEVELS_NAME}; name the file of a scene, or the folder of a container"

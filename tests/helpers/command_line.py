@@ -86,7 +86,8 @@ def _standard_files(encoding: str, *files: BinaryIO) -> Iterator[None]:
     for number, file in enumerate(files):
         os.dup2(file.fileno(), number)
     sys.stdin, sys.stdout, sys.stderr = (
-        os.fdopen(number, mode, encoding=encoding, closefd=False) for number, mode in enumerate("rww")
+        os.fdopen(number, mode, encoding=encoding, errors=errors, closefd=False)
+        for number, (mode, errors) in enumerate((("r", None), ("w", None), ("w", "backslashreplace")))
     )
     try:
         yield
