@@ -157,7 +157,7 @@ def _primitives(document: Document, left_out: dict[str, None]) -> Iterator[_Prim
             if EXTENSION in document.child(primitive, "extensions"):
                 number += 1
                 found = _primitive(document, primitive, splatting, matrix)
-                unread = [key for key in ("indices", "targets") if key in primitive]
+                unread = [str(key) for key in ("indices", "targets") if key in primitive]
                 unread += [
                     key for key in found.attributes if found.spz is None and not _KNOWN_ATTRIBUTES.fullmatch(key)
                 ]
