@@ -28,8 +28,10 @@ CHECKPOINT = ".checkpoint.npz"
 def compact(
     scenes: ScenesArgument,
     output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", help="Output NAME.ply, a folder, or '-' for standard output. Required."),
+        str | None,
+        typer.Option(
+            "--output", "-o", metavar="PATH", help="Output NAME.ply, a folder, or '-' for standard output. Required."
+        ),
     ] = None,
     count: Annotated[
         str | None,

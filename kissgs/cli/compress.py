@@ -56,10 +56,11 @@ FinetuneOption = Annotated[
 def compress(
     scenes: ScenesArgument,
     output: Annotated[
-        Path | None,
+        str | None,
         typer.Option(
             "--output",
             "-o",
+            metavar="PATH",
             help="Output NAME.zip, NAME.sog, FOLDER/lod-meta.json or NAME.sogxt/ for levels of detail, a folder, or "
             "'-' for standard output. Default: next to the scene.",
         ),
@@ -114,8 +115,9 @@ def compress(
     from kissgs.pipeline.read_options import ReadOptions
     from kissgs.pipeline.training_choice import decided
 
-    manifest = None if output is None else named_manifest(output)
-    kind = named_container(container, None if manifest else output)
+    named = None if output is None else Path(output)
+    manifest = None if named is None else named_manifest(named)
+    kind = named_container(container, None if manifest else named)
     reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes, origin=origin_of(origin))
     settings = chosen(
         preset,

@@ -24,7 +24,6 @@ from kissgs.cli.options import origin_of
 from kissgs.core.errors import InvalidSceneError, OutputError
 
 if TYPE_CHECKING:
-    from kissgs.core.splats import Cleaned
     from kissgs.pipeline.scene_output import OutputFormat
 
 
@@ -51,6 +50,7 @@ def convert(
     quiet: QuietOption = False,
 ) -> None:
     """Convert scenes into .ply, .compressed.ply, .spz, .splat, .glb or .spz.glb; the ending of OUT decides."""
+    from kissgs.cli.tables import changes
     from kissgs.core.splats import clean
     from kissgs.io.atomic import atomic_file, refuse_existing
     from kissgs.pipeline.read_options import ReadOptions
@@ -72,7 +72,7 @@ def convert(
             with stdout() if piped else atomic_file(target, overwrite=force) as file:
                 stream = sys.stdout.buffer if file is None else file
                 losses = write_scene(stream, splats, kind, raw_axes=raw_axes, progress=progress)
-        notes = [*splats.notes, *_removed(cleaned), *losses]
+        notes = [*splats.notes, *changes(cleaned.visible), *losses]
         if notes and not (quiet or as_json):
             sys.stderr.write(f"kissgs: {target}: {'; '.join(notes)}\n")
         if piped:
@@ -83,7 +83,7 @@ def convert(
         size = target.stat().st_size
         return {"format": kind, "count": len(splats), "sh_degree": degree, "bytes": size, "notes": notes}
 
-    for_each_input(inputs, Path(output), f".{kind}", as_json, work, unreadable=InvalidSceneError)
+    for_each_input(inputs, output, f".{kind}", as_json, work, unreadable=InvalidSceneError)
 
 
 def _output_format(output: str, to: str | None) -> OutputFormat:
@@ -103,12 +103,3 @@ def _output_format(output: str, to: str | None) -> OutputFormat:
         if found != wanted:
             raise OutputError(f"{output[:100]} has the ending of {found}, but --to asks for {wanted}; choose one")
     return wanted
-
-
-def _removed(cleaned: Cleaned) -> list[str]:
-    """Return what cleaning has left out of a scene."""
-    if not cleaned.removed:
-        return []
-    several = cleaned.removed > 1
-    gaussians = f"{cleaned.removed:,} Gaussian{'s' if several else ''}"
-    return [f"{gaussians} with NaN, infinite or huge values {'are' if several else 'is'} left out"]

@@ -26,10 +26,11 @@ from kissgs.core.errors import InvalidContainerError
 def decompress(
     containers: ScenesArgument,
     output: Annotated[
-        Path | None,
+        str | None,
         typer.Option(
             "--output",
             "-o",
+            metavar="PATH",
             help="Output NAME.ply, a folder, or '-' for standard output. Default: next to the container.",
         ),
     ] = None,

@@ -21,11 +21,12 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 _DOUBLE_ENDINGS = (".compressed.ply", ".spz.glb")
+_SLASHES = tuple({"/", os.sep})
 
 
 def for_each_input(
     names: list[str],
-    output: Path | None,
+    output: str | Path | None,
     suffix: str,
     as_json: bool,
     work: Callable[[str, Path], dict[str, Any]],
@@ -40,7 +41,7 @@ def for_each_input(
 
     Args:
         names: inputs as given: paths, patterns or "-".
-        output: value of ``--output``; None if not given.
+        output: value of ``--output``, as text if a slash at its end counts; None if not given.
         suffix: file ending of the outputs.
         as_json: whether to print reports as JSON.
         work: processes one input, given the path of its output, and returns the report.
@@ -54,7 +55,9 @@ def for_each_input(
         _refuse_output_as_input(inputs, suffix)
     if writes and as_json and str(output) == "-":
         raise OutputError("--json and -o - both write to standard output; choose one")
-    targets = _targets(inputs, output, suffix) if writes else [Path("-")] * len(inputs)
+    folder = output is not None and str(output).endswith(_SLASHES)
+    output = None if output is None else Path(output)
+    targets = _targets(inputs, output, suffix, folder) if writes else [Path("-")] * len(inputs)
     pairs = list(zip(inputs, targets, strict=True))
     with contextlib.ExitStack() as ending:
         if writes and output is not None and output not in targets:
@@ -113,21 +116,21 @@ def _entry(name: str, target: Path, writes: bool, report: dict[str, Any]) -> dic
     return {"input": name, **({"output": str(target)} if writes else {}), **report}
 
 
-def _targets(inputs: list[str], output: Path | None, suffix: str) -> list[Path]:
+def _targets(inputs: list[str], output: Path | None, suffix: str, is_named_folder: bool) -> list[Path]:
     """Return the output path of each input: next to it, in the folder ``output``, or the file ``output``."""
     from kissgs.io.container_names import named_manifest
 
     if "-" in inputs and (len(inputs) > 1 or output is None):
         raise OutputError("standard input has no name and must be the only input; give the output with -o")
-    if output is not None and (str(output) == "-" or _ends_with(output, suffix)):
+    if output is not None and not is_named_folder and (str(output) == "-" or _ends_with(output, suffix)):
         if len(inputs) > 1:
             remedy = "compress one scene at a time" if named_manifest(output) else "give a folder with -o"
             raise OutputError(f"{len(inputs)} inputs cannot all become {output}; {remedy}")
         return [output]
+    if output is not None and not names_folder(str(output) + "/" * is_named_folder):
+        _refuse_file_name(output, suffix)
     if output is not None and "-" in inputs:
         raise OutputError(f"-o {output} is a folder, but standard input has no name; give -o NAME{suffix}")
-    if output is not None and not is_folder(output):
-        _refuse_file_name(output, suffix)
     targets = []
     for name in inputs:
         stem = _stem(name)
@@ -153,19 +156,18 @@ def _refuse_output_as_input(inputs: list[str], suffix: str) -> None:
 
 def _refuse_file_name(folder: Path, suffix: str) -> None:
     """Raise OutputError if the name of a folder to be made is that of a scene's file, which somebody expects there."""
-    from kissgs.io.container_names import ENDINGS, FILE_ENDINGS, SCENE_ENDINGS
+    from kissgs.io.container_names import ENDINGS, SCENE_ENDINGS
 
     ending = folder.suffix.lower()
-    if ending not in (*ENDINGS, *FILE_ENDINGS):
-        return
     if not suffix:
-        raise OutputError(f"{folder!s:.100} is the name of a file, but --unpacked writes folders; name a folder")
-    remedy = f"end it in {suffix}, or name a folder"
+        raise OutputError(f"{folder!s:.100} is the name of a file, but --unpacked writes folders; end it in a slash")
     if ending in (*ENDINGS, *SCENE_ENDINGS):
-        remedy = "use kissgs " + ("compress" if ending in ENDINGS else "convert")
-    raise OutputError(
-        f"{folder!s:.100} has the ending of another format than {suffix}, which this command writes; {remedy}"
-    )
+        raise OutputError(
+            f"{folder!s:.100} has the ending of another format than {suffix}, which this command writes; use kissgs "
+            + ("compress" if ending in ENDINGS else "convert")
+        )
+    known = " or ".join(ENDINGS if suffix in ENDINGS else (suffix,))
+    raise OutputError(f"{folder!s:.100} has an unknown ending; end it in {known}, or if it is a folder, in a slash")
 
 
 def _ends_with(path: Path, suffix: str) -> bool:
@@ -196,6 +198,12 @@ def _stem(name: str) -> str:
         return path.name
     ending = next((ending for ending in _DOUBLE_ENDINGS if path.name.lower().endswith(ending)), path.suffix)
     return path.name[: len(path.name) - len(ending)]
+
+
+def names_folder(output: str) -> bool:
+    """Whether an output is a folder: it exists, or ends in a slash, or has no ending, or one of digits (``v1.2``)."""
+    ending = Path(output).suffix[1:]
+    return output.endswith(_SLASHES) or not ending or ending.isdecimal() or is_folder(Path(output))
 
 
 def is_folder(path: Path) -> bool:

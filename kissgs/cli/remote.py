@@ -52,8 +52,10 @@ app = typer.Typer(name="remote", help="Compress with a kissgs service.", no_args
 def compress(
     scenes: Annotated[list[str], typer.Argument(metavar="FILE…", help="Files or glob patterns.")],
     output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", help="Output NAME.zip, NAME.sog or a folder. Default: next to the scene."),
+        str | None,
+        typer.Option(
+            "--output", "-o", metavar="PATH", help="Output NAME.zip, NAME.sog or a folder. Default: next to the scene."
+        ),
     ] = None,
     container: ContainerOption = None,
     server: ServerOption = DEFAULT_SERVER,
@@ -89,7 +91,7 @@ def compress(
 
     if "-" in scenes or str(output) == "-":
         raise UnsupportedError("kissgs remote reads and writes files only; '-' is not possible")
-    kind = named_container(container, output)
+    kind = named_container(container, None if output is None else Path(output))
     settings = chosen(
         preset,
         changes,
@@ -154,9 +156,12 @@ def get(
     """Wait for a job to finish, and download its container."""
     from kissgs.cli.console import progress_bar
     from kissgs.client.remote import Remote
+    from kissgs.core.errors import OutputError
     from kissgs.io.atomic import refuse_existing
-    from kissgs.io.container_names import ending_of, named_container
+    from kissgs.io.container_names import ENDINGS, ending_of, named_container
 
+    if output is not None and output.suffix.lower() not in ENDINGS:
+        raise OutputError(f"{output!s:.100} is not the name of a container; end it in {' or '.join(ENDINGS)}")
     with Remote(server, key=key) as remote, progress_bar(False) as bar:
         progress = _announcing(bar, server, False)
         known = remote.status(job)

@@ -21,7 +21,7 @@ from kissgs.cli.arguments import (
     ScaleOption,
     ViewsOption,
 )
-from kissgs.cli.files import for_each_input, is_folder, show, write_stdout
+from kissgs.cli.files import for_each_input, names_folder, show, write_stdout
 from kissgs.cli.options import device_of, open_views
 from kissgs.core.errors import UnsupportedError
 
@@ -33,10 +33,11 @@ FPS, QUALITY = 12, 85
 COLOURS = {"black": "#000000", "white": "#ffffff"}
 
 OutputOption = Annotated[
-    Path | None,
+    str | None,
     typer.Option(
         "--output",
         "-o",
+        metavar="PATH",
         help="Output NAME.png, NAME.webp, a folder, or '-' for a PNG on standard output. Default: a .png next "
         "to the scene.",
     ),
@@ -196,15 +197,16 @@ def _deliver(data: bytes, target: Path, *, force: bool) -> None:
         file.write(data)
 
 
-def _suffix(file: str, output: Path | None) -> str:
+def _suffix(file: str, output: str | None) -> str:
     """Return the ending of the output: .png unless ``output`` ends in .webp."""
     if file == "-":
         raise UnsupportedError("kissgs render reads a file, not standard input")
-    if output is None or is_folder(output) or str(output) == "-" or not output.suffix:
+    if output is None or names_folder(output):
         return ".png"
-    if output.suffix.lower() not in (".png", ".webp"):
+    suffix = Path(output).suffix.lower()
+    if suffix not in (".png", ".webp"):
         raise UnsupportedError(f"{output}: images are written as .png or .webp")
-    return output.suffix.lower()
+    return suffix
 
 
 def _refuse(options: dict[str, object], *, why: str, most: int = 0) -> None:

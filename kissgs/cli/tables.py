@@ -51,6 +51,11 @@ def gaussians(count: int) -> str:
     return f"{count:,} Gaussian{'' if count == 1 else 's'}"
 
 
+def changes(counts: Mapping[str, int]) -> list[str]:
+    """Return a phrase for each kind of removed or changed Gaussians that occurs, by key of the report."""
+    return [f"{gaussians(count)} {CHANGES[name]}" for name, count in counts.items() if count and name in CHANGES]
+
+
 def report_table(report: Report, target: str) -> RenderableType:
     """Format the report of one compression."""
     head = Text.assemble(
@@ -70,12 +75,11 @@ def report_table(report: Report, target: str) -> RenderableType:
     }
     search = [_search_table(report)] if report.trials else []
     evaluation = [] if report.evaluation is None else [_evaluation(report.evaluation)]
-    changes = _changes(changed)
     compaction = [] if report.compaction is None else _compaction(report.compaction, search=not report.trials)
     finetuning = [] if report.finetuning is None else _finetuning(report.finetuning)
     note = [Text(report.note, style="yellow")] if report.note else []
     details = [*compaction, *search, *finetuning, *note, *evaluation]
-    return Group(head, Text(body), *details, parts_table(report.file_bytes, report.count), *changes)
+    return Group(head, Text(body), *details, parts_table(report.file_bytes, report.count), *_changes(changed))
 
 
 def compaction_table(report: CompactionReport, target: str) -> RenderableType:
@@ -249,11 +253,7 @@ def _kind(info: Info) -> str:
 
 
 def _changes(changed: Mapping[str, int]) -> list[Text]:
-    return [
-        Text(f"{gaussians(count)} {CHANGES[name]}", style="yellow")
-        for name, count in changed.items()
-        if count and name in CHANGES
-    ]
+    return [Text(phrase, style="yellow") for phrase in changes(changed)]
 
 
 def _right(title: str) -> Column:

@@ -157,6 +157,12 @@ class Cleaned:
         """Number of Gaussians that were removed."""
         return self.non_finite + self.far_away
 
+    @property
+    def visible(self) -> dict[str, int]:
+        """Counts, by name, of the changes that images can show: renderers draw the others alike."""
+        invisible = ("infinite_opacities", "saturated_opacities", "unnormalised_quats")
+        return {name: count for name, count in self.as_dict().items() if name not in invisible}
+
     def as_dict(self) -> dict[str, int]:
         """Return all counts by name."""
         return asdict(self)

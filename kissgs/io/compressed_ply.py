@@ -22,7 +22,8 @@ from kissgs.io.scene_file import BinaryWriter
 _CHUNK = BLOCK_ALIGNMENT
 """Gaussians per row of element ``chunk``, given by the format; blocks of rows are multiples of it."""
 
-_PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+"""Properties of element ``vertex``: one word each."""
 
 _HALVES = (slice(0, 3), slice(3, 6))
 """Columns of minima and of maxima among the six bounds of an attribute."""
@@ -51,7 +52,7 @@ def check_compressed(ply: PlyFile) -> int:
     if "chunk" not in elements:
         raise InvalidSceneError(f"{ply.name} is a compressed .ply without element 'chunk'; export it again")
     vertex, chunk = elements["vertex"], elements["chunk"]
-    _require(ply, vertex, _PACKED, "u4")
+    _require(ply, vertex, PACKED, "u4")
     _require(ply, chunk, _bounds("", "xyz") + _bounds("scale_", "xyz"), "f4")
     if _has_colour_bounds(chunk):
         _require(ply, chunk, _bounds("", "rgb"), "f4")
@@ -201,7 +202,7 @@ def _header(count: int, chunks: int, rest: int) -> bytes:
     bounds = [name for prefix, axes in (("", "xyz"), ("scale_", "xyz"), ("", "rgb")) for name in _bounds(prefix, axes)]
     lines = ["ply", "format binary_little_endian 1.0", f"element chunk {chunks}"]
     lines += [f"property float {name}" for name in bounds]
-    lines += [f"element vertex {count}", *(f"property uint {name}" for name in _PACKED)]
+    lines += [f"element vertex {count}", *(f"property uint {name}" for name in PACKED)]
     if rest:
         lines += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(rest))]
     return "\n".join([*lines, "end_header\n"]).encode("ascii")

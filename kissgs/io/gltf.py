@@ -1,11 +1,12 @@
 """glTF with ``KHR_gaussian_splatting``: GLB or JSON; also with the attributes in ``.spz`` inside it.
 
-All primitives of the scene's nodes are read, moved by the nodes' transforms, and turned from glTF's axes (x left, y up,
-z forward) to those of a ``.ply``.
+All primitives of the scene's nodes are read, at each of their instances, moved by the transforms of both, and turned
+from glTF's axes (x left, y up, z forward) to those of a ``.ply``.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,14 +22,28 @@ from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats, empty_splats
 from kissgs.io.activations import log_scales, opacity_logits, steps
 from kissgs.io.frames import Signs, mirror, move
 from kissgs.io.gltf_document import GLB_MAGIC, Document, node_matrix
-from kissgs.io.scene_file import open_scene_file, refuse_more_than
+from kissgs.io.scene_file import listed, open_scene_file, refuse_more_than
 from kissgs.io.spz import largest_spz, read_spz, read_spz_info
 
 EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSIONS = ("KHR_gaussian_splatting_compression_spz_2", "KHR_gaussian_splatting_compression_spz")
+INSTANCING, VISIBILITY = "EXT_mesh_gpu_instancing", "KHR_node_visibility"
+
+_COMPRESSIONS = ("EXT_meshopt_compression", "KHR_meshopt_compression", "KHR_draco_mesh_compression")
+
+_READ = {EXTENSION, *SPZ_EXTENSIONS, INSTANCING, VISIBILITY, "KHR_mesh_quantization"}
+"""Extensions that are read. Quantised meshes have integers where others have floats, which need nothing special."""
+
+_OF_SURFACES = re.compile(r"(KHR_materials|KHR_texture|EXT_texture|MSFT_texture|KHR_lights)_.*")
+"""Extensions that say nothing about Gaussians."""
+
+_KNOWN_ATTRIBUTES = re.compile(
+    rf"POSITION|NORMAL|COLOR_0|{EXTENSION}:(ROTATION|SCALE|OPACITY|SH_DEGREE_[0-3]_COEF_[0-6])"
+)
+"""Attributes that are read or repeat what others say, as ``COLOR_0`` does."""
 
 _MAX_INSTANCES = 1000
-"""Largest number of nodes, and of primitives, each counted at every node that shows it."""
+"""Largest number of nodes, and of primitives, each counted at every node and instance that shows it."""
 
 _MAX_ATTRIBUTES = 100
 """Largest number of attributes of a primitive; a scene of SH degree 3 has 21."""
@@ -74,7 +89,7 @@ def read_gltf_info(source: Path | bytes) -> GltfInfo:
     with open_scene_file(source) as opened:
         binary = opened.file.read(4) == GLB_MAGIC
         document = Document(opened, None if isinstance(source, bytes) else source.parent)
-        found = list(_primitives(document))
+        found = list(_primitives(document, {}))
     return GltfInfo(
         count=sum(primitive.count for primitive in found),
         sh_degree=max(primitive.degree for primitive in found),
@@ -87,6 +102,8 @@ def read_gltf_info(source: Path | bytes) -> GltfInfo:
 def read_gltf(source: Path | bytes, *, max_gaussians: int | None = None, progress: Progress = silent) -> Splats:
     """Read a scene without cleaning it. Primitives of a lower SH degree get zeros for the coefficients above it.
 
+    What the scene has beyond Gaussians is named in ``notes``; so are hidden nodes, which are left out too.
+
     Args:
         source: A ``.glb`` or ``.gltf`` file, or the bytes of one. Buffers in other files must be below its folder.
         max_gaussians: Largest number of Gaussians; more are refused before memory is allocated. None: no limit.
@@ -94,12 +111,13 @@ def read_gltf(source: Path | bytes, *, max_gaussians: int | None = None, progres
 
     Raises:
         InvalidSceneError: the file cannot be read, is not valid glTF, or has no Gaussians.
-        UnsupportedError: another kernel or colour space, an unknown compression, a node that stretches or mirrors, or
-            more Gaussians than ``max_gaussians``.
+        UnsupportedError: a required extension that is unknown, another kernel or colour space, an unknown compression,
+            a node that stretches or mirrors, or more Gaussians than ``max_gaussians``.
     """
     with open_scene_file(source) as opened:
         document = Document(opened, None if isinstance(source, bytes) else source.parent)
-        found = list(_primitives(document))
+        left_out: dict[str, None] = {}
+        found, notes = list(_primitives(document, left_out)), dict[str, None]()
         count = sum(primitive.count for primitive in found)
         refuse_more_than(max_gaussians, count, document.name)
         progress("read", 0.0)
@@ -110,7 +128,7 @@ def read_gltf(source: Path | bytes, *, max_gaussians: int | None = None, progres
             if primitive.spz is None:
                 _read_attributes(document, primitive, part)
             else:
-                _read_spz(document, primitive.spz, part)
+                notes |= dict.fromkeys(_read_spz(document, primitive.spz, part))
             if origin is None:
                 origin = _origin(primitive.matrix, part)
             matrix = primitive.matrix.copy()  # several primitives may share it
@@ -119,8 +137,10 @@ def read_gltf(source: Path | bytes, *, max_gaussians: int | None = None, progres
             start += primitive.count
             progress("read", start / max(count, 1))
     _turn_to_ply(splats)
+    if left_out:
+        notes[f"left out: {listed(list(left_out))}"] = None
     x, y, z = (float(sign * value) + 0.0 for sign, value in zip(TO_PLY, origin or WORLD, strict=True))
-    return replace(splats, origin=(x, y, z))
+    return replace(splats, origin=(x, y, z), notes=tuple(notes))
 
 
 @np.errstate(all="ignore")  # numbers that overflow are refused where they are used
@@ -131,30 +151,56 @@ def _origin(matrix: Float64[np.ndarray, "4 4"], splats: Splats) -> Origin:
     return origin_for(splats.means.astype(np.float64) @ linear.T + matrix[:3, 3], splats.scales + growth)
 
 
-def _primitives(document: Document) -> Iterator[_Primitive]:
-    """Yield the primitives that hold Gaussians.
+def _primitives(document: Document, left_out: dict[str, None]) -> Iterator[_Primitive]:
+    """Yield the primitives that hold Gaussians; add what else the scene has to the keys of ``left_out``.
 
     Raises:
         InvalidSceneError: there is none.
+        UnsupportedError: the file requires an extension that is not read.
     """
+    _check_required(document)
+    left_out |= dict.fromkeys(key for key in ("animations", "skins") if document.items(key))
     seen, number = 0, 0
-    for mesh, matrix in _instances(document):
+    for mesh, matrix in _instances(document, left_out):
         primitives = document.items("primitives", mesh)
-        seen += len(primitives)
+        seen += len(primitives) or 1
         if seen > _MAX_INSTANCES:
             raise document.invalid(f"its nodes show more than {_MAX_INSTANCES:,} primitives")
         for primitive in primitives:
             splatting = document.child(document.child(primitive, "extensions"), EXTENSION)
             if EXTENSION in document.child(primitive, "extensions"):
                 number += 1
-                yield _primitive(document, primitive, splatting, matrix)
+                found = _primitive(document, primitive, splatting, matrix)
+                unread = [str(key) for key in ("indices", "targets") if key in primitive]
+                unread += [
+                    key for key in found.attributes if found.spz is None and not _KNOWN_ATTRIBUTES.fullmatch(key)
+                ]
+                left_out |= dict.fromkeys(unread)
+                yield found
+            else:
+                left_out["meshes without Gaussians"] = None
     if not number:
         raise InvalidSceneError(
             f"{document.name} has no Gaussians: none of its meshes uses {EXTENSION}; name a 3DGS scene"
         )
 
 
-def _instances(document: Document) -> Iterator[tuple[dict[str, Any], Float64[np.ndarray, "4 4"]]]:
+def _check_required(document: Document) -> None:
+    required = document.root.get("extensionsRequired", [])
+    if not isinstance(required, list) or not all(isinstance(name, str) for name in required):
+        raise document.invalid("extensionsRequired is not a list of names")
+    for name in required:
+        if name in _COMPRESSIONS:
+            raise UnsupportedError(f"{document.name} is compressed by {name!r}; export it without or with .spz")
+        if name not in _READ and not _OF_SURFACES.fullmatch(name):
+            raise UnsupportedError(
+                f"{document.name} requires the extension {name[:60]!r}, which is not read; export it without"
+            )
+
+
+def _instances(
+    document: Document, left_out: dict[str, None]
+) -> Iterator[tuple[dict[str, Any], Float64[np.ndarray, "4 4"]]]:
     """Yield every mesh that the scene's nodes show, with its transform; without scenes, all meshes as they are."""
     scenes = document.items("scenes")
     if not scenes:
@@ -167,14 +213,43 @@ def _instances(document: Document) -> Iterator[tuple[dict[str, Any], Float64[np.
             return
         index, above = waiting.pop(0)
         node = document.item("nodes", index)
+        extensions = document.child(node, "extensions")
+        if document.child(extensions, VISIBILITY).get("visible") is False:
+            left_out["hidden nodes"] = None
+            continue
         with np.errstate(all="ignore"):  # numbers that overflow are refused where they are used
             matrix = above @ node_matrix(document, node)
+            placed = [matrix]
+            if INSTANCING in extensions:
+                placed = [matrix @ inner for inner in _placements(document, document.child(extensions, INSTANCING))]
         if "mesh" in node:
-            yield document.item("meshes", node["mesh"]), matrix
+            mesh = document.item("meshes", node["mesh"])
+            yield from ((mesh, place) for place in placed)
         waiting += [(child, matrix) for child in _indices(document, node, "children")]
         if len(waiting) > _MAX_INSTANCES - visited:
             break
     raise document.invalid(f"its nodes form a circle or are more than {_MAX_INSTANCES:,}")
+
+
+def _placements(document: Document, instancing: dict[str, Any]) -> Iterator[Float64[np.ndarray, "4 4"]]:
+    """Yield the transform of each instance within its node."""
+    attributes = document.child(instancing, "attributes")
+    counts = {document.count(index) for index in attributes.values()}
+    if len(counts) != 1:
+        raise document.invalid(f"the attributes of {INSTANCING} have different counts, or there are none")
+    (count,) = counts
+    if count > _MAX_INSTANCES:
+        raise UnsupportedError(f"{document.name} shows a mesh {count:,} times; {_MAX_INSTANCES:,} instances are read")
+    widths = {"TRANSLATION": 3, "ROTATION": 4, "SCALE": 3}
+    columns = {
+        name.lower(): document.numbers(index, widths[name], name).astype(np.float64)
+        for name, index in attributes.items()
+        if name in widths
+    }
+    if "rotation" in columns:  # of integers they are not quite of unit length
+        columns["rotation"] /= np.linalg.norm(columns["rotation"], axis=1, keepdims=True)
+    for row in range(count):
+        yield node_matrix(document, {name: values[row].tolist() for name, values in columns.items()})
 
 
 def _indices(document: Document, parent: dict[str, Any], key: str) -> list[Any]:
@@ -258,8 +333,8 @@ def _read_attributes(document: Document, primitive: _Primitive, out: Splats) -> 
         out.shN[:, len(bands) :] = 0
 
 
-def _read_spz(document: Document, view: int, out: Splats) -> None:
-    """Read a ``.spz`` inside the file into ``out``, in glTF's axes (x left, y up, z forward)."""
+def _read_spz(document: Document, view: int, out: Splats) -> tuple[str, ...]:
+    """Read a ``.spz`` inside the file into ``out``, in glTF's axes (x left, y up, z forward); return its notes."""
     stored = read_spz(bytes(document.view(view, most=largest_spz(len(out)))), max_gaussians=len(out))
     mirror(stored, TO_PLY)
     for name in ATTRIBUTES:
@@ -268,6 +343,7 @@ def _read_spz(document: Document, view: int, out: Splats) -> None:
     coefficients = stored.shN.shape[1]
     out.shN[:, :coefficients] = stored.shN
     out.shN[:, coefficients:] = 0
+    return stored.notes
 
 
 @np.errstate(all="ignore")  # numbers that overflow are refused

@@ -137,15 +137,17 @@ class Document:
         uri = buffer.get("uri")
         inside = self._binary if uri is None and number == 0 else None
         if inside is None and number not in self._buffers:
-            self._buffers[number] = self._load(uri, number)
+            self._buffers[number] = self._load(uri, number, self.child(buffer, "extensions"))
         if offset + size > (len(self._buffers[number]) if inside is None else inside[1]):
             raise self.invalid("a buffer view reaches beyond its buffer")
         if inside is None:
             return memoryview(self._buffers[number])[offset + first :][:wanted]
         return memoryview(self._opened.read(inside[0] + offset + first, wanted))
 
-    def _load(self, uri: object, index: int) -> bytes:
+    def _load(self, uri: object, index: int, extensions: dict[str, Any]) -> bytes:
         """Return the bytes of a buffer: text in the JSON, or a file beside the scene."""
+        if uri is None and extensions:  # the buffer stands for one that has to be decompressed
+            raise UnsupportedError(f"{self.name} is compressed by {next(iter(extensions))[:60]!r}; export it without")
         if not isinstance(uri, str):
             raise self.invalid(f"buffers[{index}] has no data")
         if uri.startswith("data:"):

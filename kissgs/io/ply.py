@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from kissgs.core.array_types import Float32, Float64
+from kissgs.core.array_types import Float32, Float64, Shaped
 from kissgs.core.errors import InvalidSceneError, UnsupportedError
 from kissgs.core.origin import WORLD, in_world, origin_for, world_positions
 from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import BLOCK, SH_C0, SH_REST_COUNTS, Splats, concatenate, empty_splats
-from kissgs.io.compressed_ply import check_compressed, is_compressed, read_compressed
+from kissgs.io.compressed_ply import PACKED, check_compressed, is_compressed, read_compressed
 from kissgs.io.ply_body import check_complete, rows
-from kissgs.io.ply_header import Element, Encoding, PlyFile, open_ply, sh_degree
-from kissgs.io.scene_file import BinaryWriter, refuse_more_than
+from kissgs.io.ply_header import Element, Encoding, Header, PlyFile, open_ply, sh_degree
+from kissgs.io.scene_file import BinaryWriter, listed, refuse_more_than
 
 _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
@@ -25,6 +26,22 @@ _SCALE = ("scale_0", "scale_1", "scale_2")
 _OPACITY = ("opacity",)
 _COLOUR = ("f_dc_0", "f_dc_1", "f_dc_2")
 _RGB = ("red", "green", "blue")
+_FILTER = "filter_3D"
+
+_KNOWN = {*_POSITION, *_NORMAL, *_ROTATION, *_SCALE, *_OPACITY, *_COLOUR, *_RGB, "alpha", _FILTER, *PACKED}
+"""Properties that are read or repeat what others say, as ``red`` does beside ``f_dc_0``; INRIA's normals are zero."""
+
+_KNOWN_ELEMENTS = {
+    *("vertex", "chunk", "sh", "camera", "extrinsic", "intrinsic", "image_size", "frame", "disparity", "color_space"),
+    "version",
+}
+"""Elements that are read or say how the scene was taken, as those of PCL and SHARP do."""
+
+_IN_TIME = re.compile(
+    r"(trbf|motion|omega|velocity|rot_r|f_t|f_dc_t|f_rest_t|scale_t|scaling_t|delta_[xyz]|delta_rot)(_\w+)?"
+    r"|t|mu_t|t_scale|time|dt|duration|v[xyz]"
+)
+"""Properties that move Gaussians or change them in time, as SpacetimeGaussians, 4DGS and FreeTimeGS name them."""
 
 _WRITE_ROWS = 4096
 
@@ -62,8 +79,9 @@ def read_ply(source: Path | bytes, *, max_gaussians: int | None = None, progress
     """Read a scene without cleaning it: NaN, infinities and quaternions of any length are kept.
 
     Reads binary and ascii files, with properties in any order and of any type, and PlayCanvas' compressed ``.ply``.
-    Elements and properties that Gaussians do not need are ignored, as are bytes after the end. 8-bit ``red``,
-    ``green``, ``blue``, which nerfstudio may write instead of ``f_dc_*``, become the constant SH coefficients.
+    8-bit ``red``, ``green``, ``blue``, which nerfstudio may write instead of ``f_dc_*``, become the constant SH
+    coefficients. The filters of Mip-Splatting, ``filter_3D``, are applied to scales and opacities. Elements and
+    properties that are unknown are left out and named in ``notes``; bytes after the end are ignored.
     Needs some megabytes of memory besides the scene itself.
 
     Args:
@@ -73,16 +91,15 @@ def read_ply(source: Path | bytes, *, max_gaussians: int | None = None, progress
 
     Raises:
         InvalidSceneError: the file cannot be read, is not a PLY file, is damaged or cut short, or has no Gaussians.
-        UnsupportedError: 2D Gaussians, an SH degree above 3, lists before or among the Gaussians, or more Gaussians
-            than ``max_gaussians``.
+        UnsupportedError: 2D Gaussians, Gaussians that move, an SH degree above 3, lists before or among the Gaussians,
+            or more Gaussians than ``max_gaussians``.
     """
     with open_ply(source) as ply:
         info = _check(ply)
         refuse_more_than(max_gaussians, info.count, ply.name)
         progress("read", 0.0)
-        if info.compressed:
-            return read_compressed(ply, info.sh_degree, progress)
-        return _read_columns(ply, info.sh_degree, progress)
+        read = read_compressed if info.compressed else _read_columns
+        return replace(read(ply, info.sh_degree, progress), notes=_notes(ply.header))
 
 
 def read_ply_blocks(source: Path, *, progress: Progress = silent) -> Iterator[Splats]:
@@ -95,14 +112,14 @@ def read_ply_blocks(source: Path, *, progress: Progress = silent) -> Iterator[Sp
         info = _check(ply)
         progress("read", 0.0)
         if info.compressed:
-            yield read_compressed(ply, info.sh_degree, progress)
+            yield replace(read_compressed(ply, info.sh_degree, progress), notes=_notes(ply.header))
             return
         columns, waiting, done = _Columns(ply.header.elements["vertex"], info.sh_degree), [], 0
         for block in rows(ply, columns.vertex):
             waiting.append(columns.splats(block))
             done += len(block)
             if sum(map(len, waiting)) >= BLOCK or done == info.count:
-                yield concatenate(waiting)
+                yield replace(concatenate(waiting), notes=_notes(ply.header))
                 waiting = []
                 progress("read", done / info.count)
 
@@ -149,26 +166,46 @@ def _check(ply: PlyFile) -> PlyInfo:
     if compressed:
         degree = check_compressed(ply)
     else:
-        _require_gaussians(vertex, ply.name)
+        _require_gaussians(ply.header, ply.name)
         degree = sh_degree(vertex, ply.name)
         check_complete(ply, vertex)
     return PlyInfo(count=vertex.count, sh_degree=degree, encoding=ply.header.encoding, compressed=compressed)
 
 
-def _require_gaussians(vertex: Element, name: str) -> None:
+def _require_gaussians(header: Header, name: str) -> None:
+    vertex = header.elements["vertex"]
     present = {p.name for p in vertex.properties}
     colour = () if _has_rgb(vertex) else _COLOUR
     missing = [p for p in (*_POSITION, *_OPACITY, *_SCALE, *_ROTATION, *colour) if p not in present]
-    if not missing:
-        return
     if present.isdisjoint({*_OPACITY, *_SCALE, *_ROTATION}):
         raise InvalidSceneError(
             f"{name} is a point cloud or a mesh, not a trained 3DGS scene: it has no {', '.join(missing)}; "
             "name the output of a 3DGS trainer"
         )
+    moving = [p.name for p in vertex.properties if _IN_TIME.fullmatch(p.name)]
+    moving += [element for element in header.elements if element.startswith("delta_vertex")]
+    if moving:
+        raise UnsupportedError(
+            f"{name} holds Gaussians that move or change in time ({listed(moving)}), which are not supported; export "
+            "one moment of the scene as 3D Gaussians"
+        )
     if missing == ["scale_2"]:
         raise UnsupportedError(f"{name} holds 2D Gaussians (no scale_2), which are not supported; train 3D Gaussians")
-    raise InvalidSceneError(f"{name} has no {', '.join(missing)}; export the scene with all its properties")
+    if missing:
+        raise InvalidSceneError(f"{name} has no {', '.join(missing)}; export the scene with all its properties")
+
+
+def _notes(header: Header) -> tuple[str, ...]:
+    """Return what becomes of properties and elements beyond those of 3D Gaussians."""
+    names = [p.name for p in header.elements["vertex"].properties]
+    unknown = [name for name in names if name not in _KNOWN and not re.fullmatch(r"f_rest_[0-9]+", name)]
+    unknown += [f"element {e.name}" for e in header.elements.values() if e.count and e.name not in _KNOWN_ELEMENTS]
+    notes = []
+    if _FILTER in names:
+        notes.append(f"the filters of Mip-Splatting ({_FILTER}) are applied to scales and opacities")
+    if unknown:
+        notes.append(f"left out: {listed(unknown)}")
+    return tuple(notes)
 
 
 def _has_rgb(vertex: Element) -> bool:
@@ -199,6 +236,7 @@ class _Columns:
         self.vertex = vertex
         self._k = SH_REST_COUNTS[degree]
         self._rgb = _has_rgb(vertex)
+        self._filtered = any(p.name == _FILTER for p in vertex.properties)
         self._origin: tuple[float, float, float] | None = None
 
     @property
@@ -235,6 +273,23 @@ class _Columns:
                 out.means[:] = _float64(block, _POSITION) - np.array(self.origin)
         if self._rgb:
             _colour_to_sh(out.sh0)
+        if self._filtered:
+            _apply_filters(block[_FILTER], out)
+
+
+@np.errstate(all="ignore")  # values may be any floats; they are not cleaned here
+def _apply_filters(filters: Shaped[np.ndarray, " N"], out: Splats) -> None:
+    """Widen Gaussians by the standard deviations of their filters, and fade them as their volumes grow, in place.
+
+    Only squares of the filters count: 0 changes nothing, and NaN makes a Gaussian NaN, which cleaning removes.
+    """
+    rows = np.flatnonzero(filters != 0)
+    log_filters = np.log(np.abs(filters[rows].astype(np.float64)))[:, None]
+    scales, logits = out.scales[rows].astype(np.float64), out.opacities[rows].astype(np.float64)
+    out.scales[rows] = np.logaddexp(2 * scales, 2 * log_filters) / 2
+    # the scale over the wider one is (1 + (filter / scale)²)^(-1/2), for any numbers without overflow
+    log_opacities = -np.logaddexp(0, -logits) - np.logaddexp(0, 2 * (log_filters - scales)).sum(axis=1) / 2
+    out.opacities[rows] = log_opacities - np.log(-np.expm1(log_opacities))
 
 
 def _float64(block: np.ndarray, names: tuple[str, ...]) -> Float64[np.ndarray, "B C"]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 
 import numpy as np
@@ -14,6 +15,14 @@ BLOCK_BYTES = 1 << 20
 
 BLOCK_ALIGNMENT = 256
 """Row count that the blocks of :func:`rows`, except the last, are multiples of in binary files."""
+
+_INFINITY = re.compile(r"(?<!\S)([+-]?)1\.#inf\d*(e[+-]?\d+)?(?!\S)", re.IGNORECASE)
+_NAN = re.compile(r"(?<!\S)[+-]?(nan(\([^\s()]*\)|[qs])|1\.#[a-z]+\d*(e[+-]?\d+)?|1\.\$)(?!\S)", re.IGNORECASE)
+"""Infinity and NaN as C libraries print them, and Python does not read them.
+
+``nan(snan)``, ``-nan(ind)``, ``nan(0x7fc00000)``, ``nanq``; of Visual C++ before 2015 ``1.#INF``, ``-1.#IND``,
+``1.#QNAN0``, and rounded to few digits ``1.#J``, ``1.#R``, ``1.$``, which may have been either.
+"""
 
 
 def check_complete(ply: PlyFile, element: Element) -> None:
@@ -101,7 +110,7 @@ def _numbered_lines(ply: PlyFile, width: int) -> Iterator[list[tuple[int, str]]]
     number = ply.header.lines
     rest = b""
     while block := ply.file.read(BLOCK_BYTES):
-        *complete, rest = (rest + block).split(b"\n")
+        *complete, rest = (rest + block).split(ply.header.newline)
         if len(rest) > BLOCK_BYTES:
             raise InvalidSceneError(f"{ply.name}, line {number + 1}: longer than {BLOCK_BYTES} bytes; it is damaged")
         yield [(number + i, text) for i, line in enumerate(complete, 1) if (text := line.decode("latin-1").strip())]
@@ -114,6 +123,9 @@ def _parse(lines: list[tuple[int, str]], dtype: np.dtype, name: str) -> np.ndarr
     try:
         return np.loadtxt([text for _, text in lines], dtype, comments=None, ndmin=1)
     except ValueError as error:
+        plain = [(number, _NAN.sub("nan", _INFINITY.sub(r"\1inf", text))) for number, text in lines]
+        if plain != lines:
+            return _parse(plain, dtype, name)
         for number, text in lines:
             _check_line(text.split(), dtype.names or (), f"{name}, line {number}")
         first, last = lines[0][0], lines[-1][0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import io
 import itertools
@@ -52,6 +53,8 @@ _LOOKALIKES = {
     b"<!doctype": "this is an HTML page, download the file that it links to",
     b"<html": "this is an HTML page, download the file that it links to",
     b"\x1f\x8b": "this is compressed with gzip, unpack it first",
+    codecs.BOM_UTF16_LE: "this is text in UTF-16, save it as ASCII or UTF-8",
+    codecs.BOM_UTF16_BE: "this is text in UTF-16, save it as ASCII or UTF-8",
     b"pk\x03\x04": "this is a ZIP archive, unpack it or name the scene by its real extension",
 }
 """Hints for other files that are often given as a scene, by their first bytes in lower case."""
@@ -84,12 +87,13 @@ class Element:
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """Parsed header; ``nbytes`` and ``lines`` are its size, after which the body begins."""
+    """Parsed header; ``nbytes`` and ``lines`` are its size, after which the body begins; ``newline`` ends its lines."""
 
     encoding: Encoding
     elements: dict[str, Element]
     nbytes: int
     lines: int
+    newline: bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,12 +141,15 @@ def sh_degree(element: Element, name: str) -> int:
 
 
 def _read_header(file: io.BufferedIOBase, name: str) -> Header:
-    _recognise(file.read(64), name)
-    file.seek(0)
+    start = file.read(64)
+    mark = len(codecs.BOM_UTF8) if start.startswith(codecs.BOM_UTF8) else 0
+    _recognise(start[mark:], name)
+    newline = b"\r" if re.match(rb"ply[ \t]*\r(?!\n)", start[mark:]) else b"\n"
+    file.seek(mark)
     encoding: Encoding | None = None
     counts: dict[str, int] = {}
     properties: dict[str, dict[str, Property]] = {}
-    for number, words in _header_lines(file, name):
+    for number, words in _header_lines(file, newline, name):
         where = f"{name}, header line {number}"
         match words:
             case ["ply"] if number == 1:
@@ -170,7 +177,7 @@ def _read_header(file: io.BufferedIOBase, name: str) -> Header:
                 if encoding is None:
                     raise InvalidSceneError(f"{name} has no format line in its header; export the scene again")
                 elements = {key: Element(key, counts[key], tuple(properties[key].values())) for key in counts}
-                return Header(encoding, elements, file.tell(), number)
+                return Header(encoding, elements, file.tell(), number, newline)
             case _:
                 raise InvalidSceneError(f"{where}: {_quote(' '.join(words))} is not a line of a PLY header")
     raise InvalidSceneError(f"{name} has no end_header line; it is cut short or not a PLY file")
@@ -180,28 +187,38 @@ def _recognise(head: bytes, name: str) -> None:
     """Refuse a file that is not PLY, with a hint to its actual format."""
     if not head:
         raise InvalidSceneError(f"{name} is empty; export or download it again")
-    start = head.removeprefix(b"\xef\xbb\xbf").lstrip().lower()
+    start = head.lstrip().lower()
     for magic, hint in _LOOKALIKES.items():
         if start.startswith(magic):
             raise InvalidSceneError(f"{name} is not a PLY file: {hint}")
-    if not re.match(rb"ply[ \t\r]*\n", head):
+    if not re.match(rb"ply[ \t]*[\r\n]", head):
         raise InvalidSceneError(
             f"{name} is not a PLY file: its first line is not 'ply', and no other format is recognised; a .splat needs "
             "this ending"
         )
 
 
-def _header_lines(file: io.BufferedIOBase, name: str) -> Iterator[tuple[int, list[str]]]:
+def _header_lines(file: io.BufferedIOBase, newline: bytes, name: str) -> Iterator[tuple[int, list[str]]]:
     """Yield the lines as words, numbered from 1; an incomplete last line ends the iteration."""
     left = MAX_HEADER_BYTES
     for number in itertools.count(1):
-        line = file.readline(left + 1)
+        line = _line(file, newline, left + 1)
         left -= len(line)
         if left < 0:
             raise InvalidSceneError(f"{name} has no end_header line within {MAX_HEADER_BYTES} bytes; it is damaged")
-        if not line.endswith(b"\n") and line.strip() != b"end_header":
+        if not line.endswith(newline) and line.strip() != b"end_header":
             return
         yield number, line.decode("utf-8", errors="replace").split()
+
+
+def _line(file: io.BufferedIOBase, newline: bytes, most: int) -> bytes:
+    """Return the next line, at most ``most`` bytes of it; ``readline`` does not know a carriage return alone."""
+    if newline == b"\n":
+        return file.readline(most)
+    line = bytearray()
+    while len(line) < most and not line.endswith(newline) and (byte := file.read(1)):
+        line += byte
+    return bytes(line)
 
 
 def _count(word: str, where: str) -> int:

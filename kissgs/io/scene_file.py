@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -83,6 +83,13 @@ def open_scene_file(source: Path | bytes, remedy: str = "name a scene file") -> 
             yield SceneFile(source.name, file, size)
     except OSError as error:
         raise InvalidSceneError(f"cannot read {source}: {(error.strerror or str(error)).lower()}") from error
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names from a file for a message, of bounded length: the first six, and how many more there are."""
+    shown = [name if len(name) <= 100 and name.isprintable() else repr(name[:100]) for name in names[:6]]
+    more = f" and {len(names) - 6:,} more" if len(names) > 6 else ""
+    return ", ".join(shown) + more
 
 
 def refuse_more_than(limit: int | None, count: int, name: str) -> None:

@@ -6,9 +6,8 @@ saying so; ``raw_axes`` reads their files.
 
 from __future__ import annotations
 
-import logging
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +21,6 @@ from kissgs.io.activations import OPACITY_OF_BYTE, look_up
 from kissgs.io.frames import axis_signs, mirror
 from kissgs.io.scene_file import SceneFile, open_scene_file, refuse_more_than
 from kissgs.io.spz_streams import inflate, inflate_start, unpack_frame
-
-_log = logging.getLogger(__name__)
 
 MAGIC = b"NGSP"
 GZIP_MAGIC = b"\x1f\x8b"
@@ -115,7 +112,7 @@ def read_spz(
 ) -> Splats:
     """Read a scene without cleaning it, and turn it to the axes of a ``.ply``.
 
-    Of SH degree 4 the highest band is left out, with a warning in the log.
+    Of SH degree 4 the highest band is left out, which ``notes`` says.
 
     Args:
         source: A file, or the bytes of one.
@@ -139,7 +136,7 @@ def read_spz(
             mirror(splats, axis_signs(_frame(extensions, opened.name)))
         progress("read", 1.0)
         if info.stored_degree > info.sh_degree:
-            _log.warning("%s has SH degree %d; it is read as %d", opened.name, info.stored_degree, info.sh_degree)
+            splats = replace(splats, notes=(f"left out: the SH coefficients of degree {info.stored_degree}",))
         return splats
 
 

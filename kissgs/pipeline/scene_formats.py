@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Literal
 
 from kissgs.core.errors import InvalidContainerError
-from kissgs.io.container_names import LEVELS_NAME, LOD_NAME
+from kissgs.io.container_names import ENDINGS, LEVELS_NAME, LOD_NAME, SCENE_ENDINGS
 from kissgs.io.packed_files import ZIP_MAGICS, MemorySource, Source, open_source, sniff_format, zip_names
+from kissgs.io.scene_file import listed
 from kissgs.sog.names import MAX_METADATA_BYTES, META_NAME
 from kissgs.sogxt.container import is_packed
 from kissgs.sogxt.names import YAML_NAME
@@ -48,6 +49,9 @@ def recognise(
         source: the scene, or the first 512 bytes of a file, of which every zip then counts as "sogxt".
         name: name of the file, if ``source`` has none or another one.
         size: bytes of the whole file, if ``source`` is only its beginning.
+
+    Raises:
+        InvalidContainerError: a folder holds no container and no streamed scene.
     """
     if isinstance(source, Mapping):
         return _container_format(MemorySource(source))
@@ -55,6 +59,7 @@ def recognise(
     name = name.lower()
     ending = Path(name).suffix
     if isinstance(source, Path) and (_is_folder(source) or scene_root(source) != source):
+        _check_folder(scene_root(source))
         return _STREAMED.get(name) or _packed_format(scene_root(source), "sogxt")
     head, found_size = _beginning(source)
     if marked := _by_mark(head):
@@ -101,6 +106,24 @@ def _is_folder(path: Path) -> bool:
         return path.is_dir()
     except (OSError, ValueError):
         return False
+
+
+def _check_folder(folder: Path) -> None:
+    """Refuse a folder that is no container, and name the scenes in it, or below it where INRIA's trainer puts them."""
+    try:
+        if any((folder / name).is_file() for name in (YAML_NAME, META_NAME, *_STREAMED)):
+            return
+        found = [path for pattern in ("*", "point_cloud/iteration_*/*") for path in sorted(folder.glob(pattern))]
+        scenes = [path for path in found if path.suffix.lower() in (*ENDINGS, *SCENE_ENDINGS) and path.is_file()]
+    except (OSError, ValueError):
+        return  # the reader says why
+    if scenes:
+        names = listed([str(path.relative_to(folder)) for path in scenes])
+        raise InvalidContainerError(f"{folder!s:.200} is a folder, not a scene; name a file in it: {names}")
+    raise InvalidContainerError(
+        f"{folder!s:.200} is a folder without a scene: it has neither {YAML_NAME} nor {META_NAME}, {LOD_NAME} or "
+        f"{LEVELS_NAME}; name the file of a scene, or the folder of a container"
+    )
 
 
 def _beginning(source: Path | bytes) -> tuple[bytes, int]:

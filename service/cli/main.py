@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import sys
 
 
 def main() -> None:
     """Entry point."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # None if closed. Not every encoding has all characters of the help
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         from .commands import run
     except ModuleNotFoundError as error:

@@ -207,7 +207,7 @@ def test_no_folder_gets_the_name_of_a_file(scene: Path, tmp_path: Path) -> None:
     for name, command in (("a.spz", "convert"), ("a.sog", "compress")):
         sentence = f"{name} has the ending of another format than .ply, which this command writes; use kissgs {command}"
         assert sentence in failure("decompress", scene, "-o", name, cwd=tmp_path)
-    assert "end it in .ply, or name a folder" in failure("decompress", scene, "-o", "meta.json", cwd=tmp_path)
+    assert "end it in .ply, or if it is a folder" in failure("decompress", scene, "-o", "meta.json", cwd=tmp_path)
     assert "a.sog is the name of a file, but --unpacked" in failure(
         "compress", scene, "-o", "a.sog", "--unpacked", cwd=tmp_path
     )
@@ -215,6 +215,60 @@ def test_no_folder_gets_the_name_of_a_file(scene: Path, tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == []
     (tmp_path / "c.sog").mkdir()
     assert run("compress", scene, "-o", tmp_path / "c.sog", "-p", "fast", "-q", "--unpacked").returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "known"),
+    [
+        ("compress scene.ply -o full.ziip", ".zip or .sog"),
+        ("compress scene.ply -o k.ssog --container sog", ".zip or .sog"),
+        ("compress scene.ply -o k.ssog --unpacked", "a slash"),
+        ("remote compress scene.ply -o out.xyz", ".zip or .sog"),
+        ("remote get 1 -o out.xyz", ".zip or .sog"),
+        ("decompress scene.ply -o x.usdz", ".ply"),
+        ("compact scene.ply --ratio 0.5 -o x.plyy", ".ply"),
+        ("convert scene.ply x.usdz", ".spz, .splat"),
+        ("convert scene.ply x.usdz --to spz", ".spz"),
+        ("render scene.ply -o x.gif", ".png or .webp"),
+        ("sample x.usdz", ".spz, .splat"),
+    ],
+)
+def test_an_unknown_ending_makes_no_folder(scene: Path, tmp_path: Path, words: str, known: str) -> None:
+    (tmp_path / "scene.ply").write_bytes(scene.read_bytes())
+    assert known in failure(*words.split(), cwd=tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["scene.ply"]
+
+
+@pytest.mark.parametrize("name", ["x.usdz/", "v1.2", "a/v1.2", "new.v2/x/", "made.d"])
+def test_names_of_folders(scene: Path, tmp_path: Path, name: str) -> None:
+    """A slash, no ending or one of digits, or a folder that exists."""
+    (tmp_path / "made.d").mkdir()
+    assert run("convert", scene, name, "--to", "ply", "-q", cwd=tmp_path).returncode == 0
+    assert [path.parent for path in tmp_path.rglob("*.ply")] == [tmp_path / name]
+
+
+@pytest.mark.parametrize("command", ["compress", "decompress", "info", "render"])
+def test_a_folder_that_is_no_container_is_named_with_what_to_give(scene: Path, tmp_path: Path, command: str) -> None:
+    trained = "point_cloud/iteration_7000/point_cloud.ply"
+    for path in (tmp_path / "trained" / trained, tmp_path / "adir" / "scene.ply", tmp_path / "notes" / "a.txt"):
+        path.parent.mkdir(parents=True)
+        path.write_bytes(scene.read_bytes())
+    assert "adir is a folder, not a scene; name a file in it: scene.ply" in failure(command, "adir", cwd=tmp_path)
+    assert f"it: {trained}" in failure(command, tmp_path / "trained")
+    assert "notes is a folder without a scene" in failure(command, "notes", cwd=tmp_path)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp1252"])
+def test_standard_output_escapes_what_its_encoding_lacks(scene: Path, tmp_path: Path, encoding: str) -> None:
+    """The expected bytes are those of Python's own error handler for standard error."""
+    name = "日本 ü\udcff.ply"
+    (tmp_path / name).write_bytes(scene.read_bytes())
+    done = run("info", name, cwd=tmp_path, encoding=encoding)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert done.stdout.startswith(name.encode(encoding, "backslashreplace"))
+    assert b"\\u2026" in run("compress", "--help", encoding="ascii").stdout
+    done = run("convert", name, "ü.ply", "--json", cwd=tmp_path, encoding=encoding)
+    assert json.loads(done.stdout)["input"] == name
 
 
 @pytest.mark.parametrize("option", ["--unpacked", "--quiet"])

@@ -49,13 +49,21 @@ def test_losses_are_one_line(scene: Path, tmp_path: Path) -> None:
     assert run("convert", scene, tmp_path / "a.splat", "-f", "-q").stderr == b""
 
 
-def test_gaussians_that_cleaning_removes_are_in_the_line(tmp_path: Path) -> None:
+def test_what_reading_and_cleaning_change_is_in_the_line(tmp_path: Path) -> None:
+    """Rotations that are no unit quaternions, as all trainers write them, look the same and are not in it."""
     broken = kissgs.sample_scene(50, sh_degree=0)
-    broken.means[3] = np.inf
+    broken.means[3], broken.quats[4:6], broken.quats[6] = np.inf, 0, (0, 0, 0, 9)
     kissgs.save(broken, tmp_path / "a.ply")
+    named = (tmp_path / "a.ply").read_bytes().replace(b"float nx", b"float label", 1)
+    (tmp_path / "a.ply").write_bytes(named)
     done = run("convert", tmp_path / "a.ply", tmp_path / "b.ply")
-    assert b"b.ply: 1 Gaussian with NaN, infinite or huge values is left out\n" in done.stderr
+    assert done.stderr.decode() == (
+        f"kissgs: {tmp_path}/b.ply: left out: label; 1 Gaussian removed: a value is NaN or infinite; "
+        "2 Gaussians with a rotation of length zero: set to the identity\n"
+    )
     assert len(kissgs.load(tmp_path / "b.ply")) == 49
+    report = json.loads(run("convert", tmp_path / "a.ply", tmp_path / "b.ply", "--force", "--json").stdout)
+    assert len(report["notes"]) == 3
 
 
 def test_pipes(scene: Path, tmp_path: Path) -> None:
@@ -77,7 +85,7 @@ def test_several_files_into_a_folder(scene: Path, tmp_path: Path) -> None:
     assert "cannot all become" in failure("convert", tmp_path / "*.ply", tmp_path / "a.spz")
     (tmp_path / "boxes").mkdir()
     message = failure("convert", tmp_path / "boxes", tmp_path / "two.ply", tmp_path / "more", "--to", "spz")
-    assert message.startswith(f"kissgs: {tmp_path}/boxes: this is no container")
+    assert message.startswith(f"kissgs: {tmp_path}/boxes is a folder without a scene")
 
 
 def test_compressed_ply_is_an_ending(scene: Path, tmp_path: Path) -> None:

@@ -24,13 +24,15 @@ TIMEOUT_SECONDS = 900.0
 """A command that takes longer hangs: it ends its test process, after a traceback of all threads."""
 
 
-def run(*words: object, stdin: bytes = b"", cwd: Path | None = None) -> subprocess.CompletedProcess[bytes]:
+def run(
+    *words: object, stdin: bytes = b"", cwd: Path | None = None, encoding: str = "utf-8"
+) -> subprocess.CompletedProcess[bytes]:
     """Run ``kissgs WORDS`` with these bytes on standard input and return the exit code and both outputs."""
     arguments = ["kissgs", *map(str, words)]
     with tempfile.TemporaryFile() as given, tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         given.write(stdin)
         given.seek(0)
-        with _process_state(), _standard_files(given, out, err), contextlib.chdir(cwd or Path.cwd()):
+        with _process_state(), _standard_files(encoding, given, out, err), contextlib.chdir(cwd or Path.cwd()):
             sys.argv = arguments
             code = _exit_code()
         out.seek(0)
@@ -75,7 +77,7 @@ def _process_state() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _standard_files(*files: BinaryIO) -> Iterator[None]:
+def _standard_files(encoding: str, *files: BinaryIO) -> Iterator[None]:
     """Replace standard input, output and error by files, for Python and for C libraries."""
     before = sys.stdin, sys.stdout, sys.stderr
     sys.stdout.flush()
@@ -84,7 +86,8 @@ def _standard_files(*files: BinaryIO) -> Iterator[None]:
     for number, file in enumerate(files):
         os.dup2(file.fileno(), number)
     sys.stdin, sys.stdout, sys.stderr = (
-        os.fdopen(number, mode, encoding="utf-8", closefd=False) for number, mode in enumerate("rww")
+        os.fdopen(number, mode, encoding=encoding, errors=errors, closefd=False)
+        for number, (mode, errors) in enumerate((("r", None), ("w", None), ("w", "backslashreplace")))
     )
     try:
         yield

@@ -148,13 +148,83 @@ def test_several_primitives_and_nodes():
     root, buffer = document(attributes(scene))
     root["meshes"].append({"primitives": [{"attributes": {}}]})  # another mesh, without Gaussians
     root["meshes"][0]["primitives"] *= 2
-    root["nodes"] = [{"mesh": 0}, {"mesh": 1}, {"mesh": 0}]
-    root["scenes"] = [{"nodes": [0, 1, 2]}]
+    hidden = {"mesh": 0, "extensions": {"KHR_node_visibility": {"visible": False}}}
+    root["nodes"] = [{"mesh": 0}, {"mesh": 1}, {"mesh": 0}, hidden]
+    root["scenes"] = [{"nodes": [0, 1, 2, 3]}]
+    root["animations"] = [{}]
+    root["meshes"][0]["primitives"][0]["attributes"]["_LABEL"] = 0
     found = read_gltf(glb_bytes(root, buffer))
     assert len(found) == 16
+    assert found.notes == ("left out: animations, _LABEL, meshes without Gaussians, hidden nodes",)
     np.testing.assert_allclose(found.means, np.tile(scene.means, (4, 1)), atol=1e-6)
     with pytest.raises(UnsupportedError, match=r"has 16 Gaussians; the limit is 15"):
         read_gltf(glb_bytes(root, buffer), max_gaussians=15)
+
+
+def instanced(root, buffer, **columns):
+    """Add EXT_mesh_gpu_instancing to the first node; columns are rows of floats, or of normalised bytes as ints."""
+    attributes = {}
+    for name, rows in columns.items():
+        code = "f" if isinstance(rows[0][0], float) else "b"
+        data = b"".join(struct.pack(f"<{len(row)}{code}", *row) for row in rows)
+        root["bufferViews"].append({"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data)})
+        accessor = {"componentType": 5126 if code == "f" else 5120, "count": len(rows), "type": f"VEC{len(rows[0])}"}
+        accessor |= {"bufferView": len(root["bufferViews"]) - 1, "normalized": code == "b"}
+        root["accessors"].append(accessor)
+        attributes[name], buffer = len(root["accessors"]) - 1, buffer + data
+    root["buffers"][0]["byteLength"] = len(buffer)
+    root["nodes"][0]["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": attributes}}
+    return root, buffer
+
+
+@pytest.mark.parametrize("required", [True, False])
+def test_instances_are_nodes_below_their_node(required):
+    """Expected is what a file with a child node for each instance gives."""
+    scene = made_scene(5, 1, extremes=False)
+    root, buffer = document(attributes(scene))
+    root["extensionsRequired"] = ["EXT_mesh_gpu_instancing"] * required
+    outer = {"translation": [1, 2, 3], "rotation": [0, 0, np.sin(0.3), np.cos(0.3)]}
+    root["nodes"] = [{"mesh": 0} | outer]
+    wanted = copy.deepcopy(root)
+    turns = ([0, 127, 0, 0], [0, 0, 90, 90])
+    found = read_gltf(glb_bytes(*instanced(root, buffer, TRANSLATION=[[0.0] * 3, [5.0, 0.0, 0.0]], ROTATION=turns,
+                                           SCALE=[[2.0] * 3, [0.5] * 3], _ID=[[7.0, 0.0, 0.0]] * 2)))  # fmt: skip
+    children = [
+        {"mesh": 0, "rotation": [0, 1, 0, 0], "scale": [2] * 3},
+        {"mesh": 0, "translation": [5, 0, 0], "rotation": [0, 0, 0.5**0.5, 0.5**0.5], "scale": [0.5] * 3},
+    ]
+    wanted["nodes"] = [outer | {"children": [1, 2]}, *children]
+    wanted["extensionsRequired"] = []
+    assert_alike(found, read_gltf(glb_bytes(wanted, buffer)), rtol=1e-5, atol=1e-5)
+
+
+def test_instances_are_bounded():
+    root, buffer = document(attributes(SCENE))
+    with pytest.raises(UnsupportedError, match=r"shows a mesh 1,001 times; 1,000 instances are read"):
+        read_gltf_info(glb_bytes(*instanced(root, buffer, TRANSLATION=[[0.0] * 3] * 1001)))
+    root["nodes"] *= 300
+    root["scenes"][0]["nodes"] = list(range(300))
+    for primitives in (root["meshes"][0]["primitives"], []):
+        root["meshes"][0]["primitives"] = primitives
+        data = glb_bytes(*instanced(copy.deepcopy(root), buffer, TRANSLATION=[[0.0] * 3] * 1000))
+        with pytest.raises(InvalidSceneError, match=r"show more than 1,000 primitives"):
+            read_gltf_info(data)
+
+
+def test_quantised_positions():
+    scene = made_scene(20, 0, extremes=False)
+    scene.means[:] /= np.abs(scene.means).max()
+    root, buffer = document(attributes(scene), {"POSITION": "h"})
+    root["extensionsRequired"] = ["KHR_mesh_quantization", "KHR_texture_transform", NAME]
+    root["nodes"][0]["scale"] = [4] * 3
+    np.testing.assert_allclose(read_gltf(glb_bytes(root, buffer)).means, 4 * scene.means, atol=4 / 32767)
+
+
+def meshopt(root):
+    """Let all views be compressed, whose buffer has no data: decoders fill it."""
+    for view in root["bufferViews"]:
+        view["buffer"] = 1
+    root["buffers"].append({"byteLength": len(BUFFER), "extensions": {"EXT_meshopt_compression": {"fallback": True}}})
 
 
 SCENE = made_scene(4, 2, extremes=False)
@@ -177,6 +247,20 @@ def splatting(root):
 
 PLAIN = glb_bytes(ROOT, BUFFER)
 CHANGES = {
+    "requires the extension 'VENDOR_unknown', which is not read; export it without": changed(
+        lambda r: r.update(extensionsRequired=[NAME, "VENDOR_unknown"])
+    ),
+    "is not valid glTF: extensionsRequired is not a list of names": changed(lambda r: r.update(extensionsRequired=[1])),
+    "is compressed by 'KHR_meshopt_compression'; export it without": changed(
+        lambda r: r.update(extensionsRequired=["KHR_meshopt_compression"])
+    ),
+    "is compressed by 'EXT_meshopt_compression'; export it without": changed(meshopt),
+    "is compressed by 'KHR_draco_mesh_compression'; export it without": changed(
+        lambda r: r.update(extensionsRequired=["KHR_draco_mesh_compression"])
+    ),
+    "the attributes of EXT_mesh_gpu_instancing have different counts": changed(
+        lambda r: r["nodes"][0].update(extensions={"EXT_mesh_gpu_instancing": {}})
+    ),
     "is not readable glTF: its JSON is damaged; export it again": b"{",
     "is cut short: it needs": PLAIN[:-1],
     "is GLB of version 1; version 2 is read": PLAIN[:4] + b"\1" + PLAIN[5:],

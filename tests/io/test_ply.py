@@ -2,11 +2,13 @@
 
 import io
 import itertools
+import math
 import os
 import random
 import struct
 import subprocess
 import sys
+from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
@@ -26,7 +28,7 @@ from helpers.reference_ply import (
 from kissgs.core.errors import Cancelled, InvalidSceneError
 from kissgs.core.splats import Splats
 from kissgs.io import ply_body
-from kissgs.io.ply import PlyInfo, read_ply, read_ply_info, write_ply
+from kissgs.io.ply import PlyInfo, read_ply, read_ply_blocks, read_ply_info, write_ply
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
@@ -66,16 +68,71 @@ def test_types_may_differ_between_properties(encoding):
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @pytest.mark.parametrize("newline", ["\n", "\r\n"])
 def test_what_gaussians_do_not_need_is_ignored(encoding, newline):
-    """Comments, normals, filter_3D of Mip-Splatting, elements on both sides, a list after, bytes after the end."""
+    """Comments, normals, labels, elements on both sides, a list after, bytes after the end; what is lost is named."""
     columns = random_columns(3, 1)
-    extra = {"nx": [1.0, 2.0, 3.0], **columns, "filter_3D": [4.0, 5.0, 6.0]}
+    extra = {"nx": [1.0, 2.0, 3.0], **columns, "label": [4.0, 5.0, 6.0]}
     before, after = {"fx": [7.0, 8.0], "fy": [9.0, 9.5]}, {"frame": [1.0]}
     lines = ["comment Vertical axis: y", "obj_info näive", "", *declaration("camera", before, "double")]
     lines += [*declaration("vertex", extra, "float"), *declaration("last", after, "float")]
     lines += ["element face 1", "property list uchar int vertex_indices"]
     body = element_bytes(before, encoding, "double") + element_bytes(extra, encoding, "float")
     data = header_bytes(lines, encoding, newline) + body + element_bytes(after, encoding, "float") + b"\x03 and more"
-    assert_identical(read_ply(data), expected(columns, 1))
+    splats = read_ply(data)
+    assert_identical(splats, expected(columns, 1))
+    assert splats.notes == ("left out: label, element last, element face",)
+
+
+def test_many_and_strange_names_are_one_short_line():
+    columns = random_columns(1, 0) | {f"feature_{i}": [0.0] for i in range(40)} | {"y" * 999: [0.0]}
+    (note,) = read_ply(ply_bytes(columns)).notes
+    assert note == f"left out: {', '.join(f'feature_{i}' for i in range(6))} and 35 more"
+    (note,) = read_ply(ply_bytes(random_columns(1, 0) | {"\x1b[31m" + "x" * 99: [0.0]})).notes
+    assert note.isprintable()
+    assert len(note) < 130
+
+
+def test_what_says_nothing_new_is_not_named():
+    columns = {name: [0.0] for name in ("nx", "ny", "nz", *names(1), "red", "green", "blue", "alpha")}
+    lines = [*declaration("vertex", columns, "float"), *declaration("camera", {"fx": [1.0]}, "float"), "element face 0"]
+    assert read_ply(header_bytes(lines) + element_bytes(columns, ENCODINGS[1], "float") + b"\0" * 4).notes == ()
+
+
+def decimal_filter(scales, logit, size):
+    """Mip-Splatting's fusion in decimals of 80 digits: wider scales, opacity times the ratio of the volumes."""
+    with localcontext() as context:
+        context.prec = 80
+        before = [Decimal(scale).exp() for scale in scales]
+        after = [(scale**2 + Decimal(size) ** 2).sqrt() for scale in before]
+        opacity = math.prod(before) / math.prod(after) / (1 + (-Decimal(logit)).exp())
+        return [float(scale.ln()) for scale in after], float((opacity / (1 - opacity)).ln())
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_filters_of_mip_splatting_are_applied(encoding):
+    columns = random_columns(7, 0)
+    sizes, scales = [0.05, -0.05, 1e-12, 1e12, 3.0, 0.0, math.nan], [-4.0, -4.0, 30.0, -30.0, -30.0, 12.0, -4.0]
+    logits = [1.0, 1.0, 13.0, 13.0, -13.0, 40.0, 1.0]
+    columns |= {"scale_0": scales, "scale_1": [value / 2 for value in scales], "opacity": logits, "filter_3D": sizes}
+    path_splats = read_ply(ply_bytes(columns, encoding))
+    for row in range(5):
+        wide, logit = decimal_filter([columns[f"scale_{i}"][row] for i in range(3)], logits[row], sizes[row])
+        np.testing.assert_allclose(path_splats.scales[row], wide, rtol=2e-7)
+        np.testing.assert_allclose(path_splats.opacities[row], logit, rtol=2e-7)
+    unchanged = expected(columns, 0)
+    assert path_splats.opacities[5] == unchanged.opacities[5]
+    np.testing.assert_array_equal(path_splats.scales[5], unchanged.scales[5])
+    assert np.isnan(path_splats.opacities[6])
+    np.testing.assert_array_equal(path_splats.means, unchanged.means)
+    assert [note for note in path_splats.notes if "filter_3D" in note] == list(path_splats.notes) != []
+
+
+def test_filters_and_notes_of_blocks(tmp_path):
+    path = tmp_path / "a.ply"
+    path.write_bytes(ply_bytes(random_columns(3, 0) | {"filter_3D": [0.1, 0.2, 0.3], "label": [1.0, 2.0, 3.0]}))
+    whole, (block,) = read_ply(path), read_ply_blocks(path)
+    assert_identical(block, whole)
+    assert block.notes == whole.notes
+    assert len(whole.notes) == 2
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
@@ -117,6 +174,42 @@ def test_ascii_is_read_as_people_write_it():
     np.testing.assert_array_equal(splats.sh0[1], [0.5, np.nan, np.inf])
     np.testing.assert_array_equal(splats.opacities, [-np.inf, -np.inf])
     np.testing.assert_array_equal(splats.scales[0], [np.inf, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("words", "value"),
+    [
+        (
+            "nan(snan) -nan(ind) NAN(IND) nan(0x7fc00000) -nan nanq 1.#QNAN -1.#IND 1.#SNAN 1.#QNAN0 -1.#IND00 1.#J",
+            np.nan,
+        ),
+        ("1.#INF 1.#inf00 1.#INF00e+000 inf INF Infinity", np.inf),
+        ("-1.#INF -1.#INF00 -inf", -np.inf),
+    ],
+)
+def test_nan_and_infinity_of_c_libraries(words, value):
+    """The words that printf of glibc, AIX and Visual C++, old and new, writes, some rounded to few digits."""
+    rows = [["1"] * 14 for _ in words.split()]
+    for number, word in enumerate(words.split()):
+        rows[number][number % 14] = word
+    data = header_bytes([f"element vertex {len(rows)}", *(f"property float {n}" for n in names(0))], "ascii")
+    splats = read_ply(data + "\n".join(map(" ".join, rows)).encode())
+    table = np.concatenate([splats.means, splats.sh0, splats.opacities[:, None], splats.scales, splats.quats], axis=1)
+    wanted = np.ones((len(rows), 14))
+    wanted[range(len(rows)), [number % 14 for number in range(len(rows))]] = value
+    np.testing.assert_array_equal(table, wanted)
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("newline", [b"\n", b"\r\n", b"\r"])
+def test_line_ends_and_a_byte_order_mark(encoding, newline):
+    """Text editors of Windows add the mark; old exporters of Macintosh end lines in a carriage return alone."""
+    columns = random_columns(3, 1)
+    (columns["x"][0],) = struct.unpack("<f", b"\n\0\0\n")  # the body begins like a line end, in either byte order
+    header = header_bytes(declaration("vertex", columns, "float"), encoding).replace(b"\n", newline)
+    body = element_bytes(columns, encoding, "float")
+    data = b"\xef\xbb\xbf" + header + (body.replace(b"\n", newline) if encoding == "ascii" else body)
+    assert_identical(read_ply(data), expected(columns, 1))
 
 
 def test_nerfstudio_rgb_colours():

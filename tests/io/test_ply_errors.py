@@ -33,6 +33,7 @@ NOT_A_PLY = {
     b"PK\x03\x04\x14\x00": (
         "is not a PLY file: this is a ZIP archive, unpack it or name the scene by its real extension"
     ),
+    "ply\nformat ascii 1.0\n".encode("utf-16"): "is not a PLY file: this is text in UTF-16, save it as ASCII or UTF-8",
     b"solid cube\n": NO_PLY,
     b"ply": NO_PLY,
     b"plywood\n": NO_PLY,
@@ -132,6 +133,10 @@ NOT_SUPPORTED = {
     header_bytes([line for line in VERTEX if not line.endswith("scale_2")]): (
         "holds 2D Gaussians (no scale_2), which are not supported; train 3D Gaussians"
     ),
+    header_bytes([*VERTEX[:4], "property float trbf_center", *VERTEX[4:], "property float motion_0"]): (
+        "holds Gaussians that move or change in time (trbf_center, motion_0), which are not supported; export one "
+        "moment of the scene as 3D Gaussians"
+    ),
     header_bytes([*VERTEX, "property list uchar int i"]): (
         "has a list property in element 'vertex'; export it without"
     ),
@@ -142,6 +147,23 @@ NOT_SUPPORTED = {
         ", header line 4100: more than 4096 properties in one element; remove some"
     ),
 }
+
+
+IN_TIME = {
+    "SpacetimeGaussians": ["trbf_center", "trbf_scale", "motion_0", "omega_0", "f_t_0"],
+    "4DGS": ["t", "scale_t_0", "rot_r_0"],
+    "a 4DGS converter": ["mu_t", "t_scale"],
+    "FreeTimeGS": ["motion_0", "t_scale"],
+    "velocities": ["vx", "vy", "vz", "time", "duration"],
+    "deltas": ["delta_x_t0", "delta_rot_0_t1"],
+}
+
+
+@pytest.mark.parametrize("properties", IN_TIME.values(), ids=IN_TIME)
+def test_each_property_of_moving_gaussians_is_enough(properties):
+    for name in properties:
+        with pytest.raises(UnsupportedError, match=rf"in time \({name}\)"):
+            read_ply_info(header_bytes([*VERTEX, f"property float {name}"]) + b"\0" * 60)
 
 
 def cases(table):

@@ -8,6 +8,7 @@ trained on that COLMAP model have other coordinates; for them, use the model.
 
 from __future__ import annotations
 
+import codecs
 import dataclasses
 import math
 from collections.abc import Iterable
@@ -118,6 +119,8 @@ def _read(path: Path) -> _Transforms:
                 f"{path} has {size:,} bytes; at most {MAX_JSON_BYTES:,} are read; is it a camera file?"
             )
         data = file.read()
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise InvalidViewsError(f"{path} is text in UTF-16; save it as UTF-8")
     try:
         return _Transforms.model_validate_json(data.removeprefix(b"\xef\xbb\xbf"))
     except ValidationError as error:

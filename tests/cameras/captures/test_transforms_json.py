@@ -247,6 +247,14 @@ def test_invalid_documents(tmp_path, content, sentence):
     assert str(caught.value) == f"{path}{sentence}"
 
 
+@pytest.mark.parametrize("encoding", ["utf-16-le", "utf-16-be"])
+def test_utf_16_is_named(tmp_path, encoding):
+    path = tmp_path / "transforms.json"
+    path.write_bytes("\ufeff{}".encode(encoding))
+    with pytest.raises(InvalidViewsError, match=r"UTF-16"):
+        load_views(path)
+
+
 def test_files_that_are_not_json(tmp_path, monkeypatch):
     path = tmp_path / "transforms.json"
     for text in ("", "{", "[" * 100_000, '{"w": 1e', "\udc80"):
