@@ -52,6 +52,13 @@ RawAxesOption = Annotated[
         help="Take the axes of .spz as those of a .ply, as splat-transform writes and reads them. Default: y up.",
     ),
 ]
+AntialiasedOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--antialiased/--classic",
+        help="Take the scene as trained with antialiasing, or as a classic one. Default: as the file is marked.",
+    ),
+]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")]
 ThreadsOption = Annotated[
     int, typer.Option(min=0, help="Number of threads; 0 for one per processor. The output does not depend on it.")

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from kissgs.cli.arguments import (
+    AntialiasedOption,
     ContainerOption,
     ForceOption,
     JsonOption,
@@ -99,6 +100,7 @@ def compress(
     max_gaussians: MaxGaussiansOption = None,
     level: LevelOption = 0,
     raw_axes: RawAxesOption = False,
+    antialiased: AntialiasedOption = None,
     device: Annotated[str, typer.Option(help="Device of --compact and --finetune: cpu or cuda.")] = "cpu",
     threads: ThreadsOption = 0,
     ray: RayOption = None,
@@ -114,7 +116,7 @@ def compress(
 
     manifest = None if output is None else named_manifest(output)
     kind = named_container(container, None if manifest else output)
-    reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes)
+    reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes, antialiased=antialiased)
     settings = chosen(
         preset,
         changes,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from kissgs.cli.arguments import (
+    AntialiasedOption,
     ForceOption,
     JsonOption,
     LevelOption,
@@ -42,6 +43,7 @@ def convert(
     max_gaussians: MaxGaussiansOption = None,
     level: LevelOption = 0,
     raw_axes: RawAxesOption = False,
+    antialiased: AntialiasedOption = None,
     threads: ThreadsOption = 0,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -58,7 +60,7 @@ def convert(
     if not inputs:
         raise OutputError("convert needs an input and an output: kissgs convert IN OUT")
     kind = _output_format(output, to)
-    reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes)
+    reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes, antialiased=antialiased)
 
     def work(scene: str, target: Path) -> dict[str, Any]:
         piped = str(target) == "-"

@@ -9,6 +9,7 @@ from typing import Annotated, cast
 import typer
 
 from kissgs.cli.arguments import (
+    AntialiasedOption,
     ForceOption,
     ImagesOption,
     LevelOption,
@@ -54,6 +55,7 @@ def evaluate(
     max_gaussians: MaxGaussiansOption = None,
     level: LevelOption = 0,
     raw_axes: RawAxesOption = False,
+    antialiased: AntialiasedOption = None,
     device: RenderDeviceOption = "cpu",
     threads: RenderThreadsOption = 0,
     force: ForceOption = False,
@@ -74,7 +76,9 @@ def evaluate(
         refuse_existing(html, overwrite=force)
     capture = open_views(views, scale=scale, images=images, resolution=resolution)
     with progress_bar(quiet or as_json) as progress:
-        loaded = partial(load, max_gaussians=max_gaussians, level=level, raw_axes=raw_axes, threads=threads)
+        loaded = partial(
+            load, threads=threads, max_gaussians=max_gaussians, level=level, raw_axes=raw_axes, antialiased=antialiased
+        )
         sides = [
             ReportScene(name=path.name, splats=loaded(path, progress=progress), bytes=stored_bytes(path))
             for path in (reference, candidate)

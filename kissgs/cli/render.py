@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from kissgs.cli.arguments import (
+    AntialiasedOption,
     ForceOption,
     ImagesOption,
     LevelOption,
@@ -110,6 +111,7 @@ def render(
     max_gaussians: MaxGaussiansOption = None,
     level: LevelOption = 0,
     raw_axes: RawAxesOption = False,
+    antialiased: AntialiasedOption = None,
     device: RenderDeviceOption = "cpu",
     threads: RenderThreadsOption = 0,
     force: ForceOption = False,
@@ -154,6 +156,7 @@ def render(
                     max_gaussians=max_gaussians,
                     level=level,
                     raw_axes=raw_axes,
+                    antialiased=antialiased,
                     threads=threads,
                     progress=progress,
                 ),

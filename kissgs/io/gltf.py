@@ -20,7 +20,7 @@ from kissgs.core.splats import ATTRIBUTES, SH_REST_COUNTS, Splats, empty_splats
 from kissgs.io.activations import log_scales, opacity_logits, steps
 from kissgs.io.frames import Signs, mirror, move
 from kissgs.io.gltf_document import GLB_MAGIC, Document, node_matrix
-from kissgs.io.scene_file import open_scene_file, refuse_more_than
+from kissgs.io.scene_file import marked, open_scene_file, refuse_more_than
 from kissgs.io.spz import largest_spz, read_spz, read_spz_info
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -50,6 +50,8 @@ class GltfInfo:
     """Whether it is GLB."""
     spz: bool
     """Whether attributes are compressed as ``.spz``."""
+    antialiased: bool = False
+    """Whether the ``.spz`` inside say that the scene was trained with antialiasing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +63,7 @@ class _Primitive:
     count: int
     degree: int
     spz: int | None
+    antialiased: bool = False
 
 
 def read_gltf_info(source: Path | bytes) -> GltfInfo:
@@ -80,6 +83,7 @@ def read_gltf_info(source: Path | bytes) -> GltfInfo:
         primitives=len(found),
         binary=binary,
         spz=any(primitive.spz is not None for primitive in found),
+        antialiased=all(primitive.antialiased for primitive in found),
     )
 
 
@@ -114,7 +118,7 @@ def read_gltf(source: Path | bytes, *, max_gaussians: int | None = None, progres
             start += primitive.count
             progress("read", start / max(count, 1))
     _turn_to_ply(splats)
-    return splats
+    return marked(splats, [primitive.antialiased for primitive in found])
 
 
 def _primitives(document: Document) -> Iterator[_Primitive]:
@@ -191,7 +195,7 @@ def _primitive(
             header = read_spz_info(bytes(document.view(view, most=512)))
             if "POSITION" in attributes and document.count(attributes["POSITION"]) != header.count:
                 raise document.invalid(f"its .spz has {header.count:,} Gaussians, its accessors another number")
-            return _Primitive(attributes, matrix, header.count, header.sh_degree, view)
+            return _Primitive(attributes, matrix, header.count, header.sh_degree, view, header.antialiased)
         raise UnsupportedError(f"{document.name} is compressed by {str(name)[:60]!r}; export it without or with .spz")
     if "POSITION" not in attributes:
         raise document.invalid("a primitive has no POSITION")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from kissgs.core.progress import Progress, silent
 from kissgs.core.splats import BLOCK, SH_C0, SH_REST_COUNTS, Splats, concatenate, empty_splats
 from kissgs.io.compressed_ply import check_compressed, is_compressed, read_compressed
 from kissgs.io.ply_body import check_complete, rows
-from kissgs.io.ply_header import Element, Encoding, PlyFile, open_ply, sh_degree
+from kissgs.io.ply_header import MIP_COMMENT, Element, Encoding, PlyFile, open_ply, sh_degree
 from kissgs.io.scene_file import BinaryWriter, refuse_more_than
 
 _POSITION = ("x", "y", "z")
@@ -40,6 +40,8 @@ class PlyInfo:
     """Encoding of the body, as the header names it."""
     compressed: bool
     """Whether it is PlayCanvas' compressed ``.ply``."""
+    antialiased: bool = False
+    """Whether a comment of Brush or Postshot says that the scene was trained with antialiasing."""
 
 
 def read_ply_info(source: Path | bytes, *, size: int | None = None) -> PlyInfo:
@@ -81,7 +83,7 @@ def read_ply(source: Path | bytes, *, max_gaussians: int | None = None, progress
         progress("read", 0.0)
         if info.compressed:
             return read_compressed(ply, info.sh_degree, progress)
-        return _read_columns(ply, info.sh_degree, progress)
+        return replace(_read_columns(ply, info.sh_degree, progress), antialiased=info.antialiased)
 
 
 def read_ply_blocks(source: Path, *, progress: Progress = silent) -> Iterator[Splats]:
@@ -101,13 +103,15 @@ def read_ply_blocks(source: Path, *, progress: Progress = silent) -> Iterator[Sp
             waiting.append(columns.splats(block))
             done += len(block)
             if sum(map(len, waiting)) >= BLOCK or done == info.count:
-                yield concatenate(waiting)
+                yield replace(concatenate(waiting), antialiased=info.antialiased)
                 waiting = []
                 progress("read", done / info.count)
 
 
 def write_ply(file: BinaryWriter, splats: Splats, *, progress: Progress = silent) -> None:
     """Write ``splats`` in INRIA's layout: float32, little-endian, normals zero, the ``f_rest_*`` of the SH degree.
+
+    An antialiased scene is marked by a comment, :data:`kissgs.io.ply_header.MIP_COMMENT`.
 
     Args:
         file: The stream; it is not flushed or closed, and its OSErrors are not caught.
@@ -116,7 +120,7 @@ def write_ply(file: BinaryWriter, splats: Splats, *, progress: Progress = silent
     """
     n, k = len(splats), splats.shN.shape[1]
     names = (*_POSITION, *_NORMAL, *_COLOUR, *_rest(k), *_OPACITY, *_SCALE, *_ROTATION)
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
+    header = ["ply", "format binary_little_endian 1.0", *[MIP_COMMENT] * splats.antialiased, f"element vertex {n}"]
     header += [f"property float {name}" for name in names]
     file.write("\n".join([*header, "end_header\n"]).encode("ascii"))
     for start in range(0, n, _WRITE_ROWS):
@@ -140,7 +144,13 @@ def _check(ply: PlyFile) -> PlyInfo:
         _require_gaussians(vertex, ply.name)
         degree = sh_degree(vertex, ply.name)
         check_complete(ply, vertex)
-    return PlyInfo(count=vertex.count, sh_degree=degree, encoding=ply.header.encoding, compressed=compressed)
+    return PlyInfo(
+        count=vertex.count,
+        sh_degree=degree,
+        encoding=ply.header.encoding,
+        compressed=compressed,
+        antialiased=ply.header.antialiased,
+    )
 
 
 def _require_gaussians(vertex: Element, name: str) -> None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from kissgs.core.limits import MAX_GAUSSIANS
+from kissgs.core.splats import Splats
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -17,16 +18,22 @@ class ReadOptions:
             ``.ksplat``, whose scene takes at most four times the bytes of the file.
         level: level of detail of a streamed scene; 0 is the finest.
         raw_axes: read ``.spz`` that stores the axes of a ``.ply`` without saying so, as some tools write it.
+        antialiased: whether the scene was trained with antialiasing (:class:`kissgs.Splats`); None: as the file says.
     """
 
     max_gaussians: int | None = None
     level: int = 0
     raw_axes: bool = False
+    antialiased: bool | None = None
 
     @property
     def max_compressed(self) -> int:
         """Largest number of Gaussians of formats whose scene can take far more memory than the file."""
         return MAX_GAUSSIANS if self.max_gaussians is None else self.max_gaussians
+
+    def marked(self, splats: Splats) -> Splats:
+        """Return a scene that was read, antialiased or not as these options say."""
+        return splats if self.antialiased is None else replace(splats, antialiased=self.antialiased)
 
 
 DEFAULT_READ_OPTIONS = ReadOptions()

@@ -26,6 +26,7 @@ def load(
     max_gaussians: int | None = None,
     level: int = 0,
     raw_axes: bool = False,
+    antialiased: bool | None = None,
     threads: int = 0,
     progress: Progress = silent,
 ) -> Splats:
@@ -37,6 +38,7 @@ def load(
         max_gaussians: see :class:`kissgs.ReadOptions`, as for ``level`` and ``raw_axes``.
         level: level of detail of a streamed scene; 0 is the finest.
         raw_axes: read ``.spz`` that stores the axes of a ``.ply`` without saying so.
+        antialiased: whether the scene was trained with antialiasing (:class:`kissgs.Splats`); None: as the file says.
         threads: number of threads; 0 means one per processor.
         progress: receives events.
 
@@ -45,7 +47,7 @@ def load(
         InvalidContainerError: the container is damaged.
         UnsupportedError: the file is valid, but uses a feature that kissgs does not read.
     """
-    reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes)
+    reading = ReadOptions(max_gaussians=max_gaussians, level=level, raw_axes=raw_axes, antialiased=antialiased)
     return clean(read_scene(Path(path), reading, threads=threads, progress=progress))[0]
 
 
@@ -129,6 +131,16 @@ def read_scene(
     Raises:
         KissgsError: the scene cannot be read.
     """
+    return reading.marked(_read(source, reading, threads, progress, only_containers))
+
+
+def _read(
+    source: Path | bytes | Mapping[str, bytes],
+    reading: ReadOptions,
+    threads: int,
+    progress: Progress,
+    only_containers: bool,
+) -> Splats:
     found = recognise(source)
     root = scene_root(source) if isinstance(source, Path) else source
     most = reading.max_compressed

@@ -21,11 +21,13 @@ class PlannedScene:
         count: number of Gaussians.
         visible: number of Gaussians that the plan could keep: those that a renderer draws, or all.
         sh_degree: 0 to 3.
+        antialiased: see :class:`kissgs.Splats`.
     """
 
     count: int
     visible: int
     sh_degree: int
+    antialiased: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -82,7 +82,7 @@ def plan_uniform(
         errors = {name: half_steps(field) for name, field in fields.items()}
         errors["means"] = half_steps(fields["means"], 1 << (16 - bits))
     return EncodingPlan(
-        scene=PlannedScene(len(splats), len(kept), splats.sh_degree),
+        scene=PlannedScene(len(splats), len(kept), splats.sh_degree, splats.antialiased),
         grid=grid,
         fields={**fields, "f_rest_centroids": codebook.centroids},
         codebook=codebook,

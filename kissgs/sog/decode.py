@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -54,7 +55,7 @@ def decode(
         splats = empty_splats(layout.count, layout.rest.coefficients if layout.rest else 0)
         decode_files(files, layout, splats, pool)
         progress("decode", 1.0)
-        return splats
+        return replace(splats, antialiased=layout.antialiased)
 
 
 def decode_files(files: Source, layout: SogLayout, out: Splats, pool: Workers, folder: str = "") -> None:

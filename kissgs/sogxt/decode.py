@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -60,7 +61,7 @@ def decode(
         progress("decode", 0.5)
         splats = planes.look_up(pool)
         progress("decode", 1.0)
-        return splats
+        return replace(splats, antialiased=planes.layout.antialiased)
 
 
 def decode_files(files: Source, layout: Layout, out: Splats, pool: Workers) -> None:

@@ -93,6 +93,7 @@ def write_files(
         codebook_side=plan.codebook.side,
         count=count,
         ranges=_ranges(plan.fields),
+        model="antialiased" if scene.antialiased else None,
         provenance=metadata.Provenance(
             version=__version__,
             sh_degree=scene.sh_degree,

@@ -96,6 +96,7 @@ def _from_yaml(data: bytes) -> dict[str, Any]:
         "codebook_side": sides.get("f_rest_centroids_side"),
         "ranges": ranges,
         "provenance": recorded,
+        "model": _text(document.get("model")),
         CHECKSUM: document.get(CHECKSUM, MISSING),
     }
 
@@ -149,6 +150,7 @@ def _from_json(data: bytes) -> dict[str, Any]:
             "grid_side": _whole(document["gridSide"]),
             "codebook_side": _whole(rest["centroidSide"]),
             "ranges": ranges,
+            "model": _text(document.get("model")),
             CHECKSUM: document.get(CHECKSUM, MISSING),
         }
         if "kissgs" in document:
@@ -193,6 +195,10 @@ def _check_dialect(document: Mapping[str, Any]) -> None:
 def _require_webp(codec: object) -> None:
     if codec != "webp":
         raise UnsupportedError(f"the container's images are {codec!r} files; only 'webp' is read")
+
+
+def _text(value: object) -> str | None:
+    return value[:100] if isinstance(value, str) else None
 
 
 def _flat(values: Any) -> list[Any]:  # noqa: ANN401

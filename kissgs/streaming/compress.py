@@ -188,7 +188,7 @@ def _reader(source: Path, reading: ReadOptions, threads: int) -> tuple[Blocks, i
     if recognise(source) == "ply":
         info = read_ply_info(source)
         if not info.compressed:
-            return lambda: read_ply_blocks(source), info.count, info.sh_degree
+            return lambda: map(reading.marked, read_ply_blocks(source)), info.count, info.sh_degree
     scene = read_scene(source, reading, threads=threads)
     starts = range(0, len(scene), BLOCK)
     return lambda: (scene.select(slice(start, start + BLOCK)) for start in starts), len(scene), scene.sh_degree

@@ -32,6 +32,7 @@ class Layout:
         leaf: largest number of Gaussians in a leaf.
         environment: number of Gaussians in the environment; 0 without one.
         changed: number of Gaussians that cleaning removed or changed, by kind, and of those that are invisible.
+        antialiased: see :class:`kissgs.Splats`.
     """
 
     container: ContainerName
@@ -43,6 +44,7 @@ class Layout:
     leaf: int
     environment: int
     changed: dict[str, int]
+    antialiased: bool = False
 
     @property
     def filled(self) -> list[int]:
