@@ -9,6 +9,7 @@ import pytest
 from helpers.whole_scenes import joined, moved
 
 from kissgs import Splats, sample_scene
+from kissgs.core.splats import concatenate
 from kissgs.core.threads import Workers
 from kissgs.rendering.camera import Camera, look_at
 from kissgs.rendering.coverage import Coverage
@@ -114,7 +115,7 @@ def camera(position: tuple[float, float, float], target: tuple[float, float, flo
 
 def test_gaussians_behind_an_opaque_plate_are_not_covered():
     front, behind = plate(0.0), plate(1.0)
-    both = joined(front, behind)
+    both = concatenate([front, behind])
     share = coverage_of(both, camera((0, 0, -2.2), (0, 0, 0)))
     inner = (np.abs(both.means[:, :2]) < 0.7).all(axis=1)
     assert (share[inner & (both.means[:, 2] == 0)] > 0.5).all()
