@@ -202,3 +202,19 @@ def test_targets_of_several_sizes_and_one_gaussian():
     model = GaussianModel(scene)
     train(model, targets_of(scene, (*around(2, 40), *around(3, 24))), plan(6))
     assert len(model) == 1
+
+
+def test_antialiased_scenes_are_trained_with_the_opacities_that_their_images_show():
+    """Small Gaussians of a classic scene would be too opaque by far."""
+    scene = cloud(40)
+    scene = replace(scene, scales=scene.scales - np.float32(1.5), antialiased=True)
+    targets, wanted = targets_of(scene), GaussianModel(scene)
+    for mark in (True, False):
+        options = {"ssim_weight": 0.2, "mse_weight": 0.0, "antialiased": mark, "threads": 1}
+        off = image_loss(wanted.parameters, targets, 0, **options)[1]
+        assert (off < 1e-6) == mark
+    model = GaussianModel(replace(dimmed(scene), antialiased=True))
+    before = error(model.splats(), targets)
+    train(model, targets, plan(40))
+    assert model.splats().antialiased
+    assert error(model.splats(), targets) < 0.2 * before
