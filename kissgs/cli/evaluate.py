@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Annotated, cast
@@ -100,6 +101,12 @@ def evaluate(
             page = html_report(result, sides[0], sides[1], device=render_device, threads=threads, progress=progress)
             with atomic_file(html, overwrite=force) as file:
                 file.write(page.encode(errors="replace"))  # file names may be invalid UTF-8
+    if scenes[0].antialiased != scenes[1].antialiased and not quiet:
+        marked, other = sides if scenes[0].antialiased else sides[::-1]
+        sys.stderr.write(
+            f"kissgs: {marked.name} is marked as trained with antialiasing, and {other.name} is not; each is drawn so "
+            "(for both: --antialiased or --classic)\n"
+        )
     sizes = {"reference": sides[0].bytes, "candidate": sides[1].bytes}
     if as_json:
         print_json({**result.as_dict(), "bytes": sizes})

@@ -346,7 +346,7 @@ def test_scenes_of_no_or_one_gaussian(count):
 
 
 def test_an_antialiased_scene_is_fine_tuned_with_the_opacities_that_its_images_show():
-    """With others, training would make all of its small Gaussians fainter."""
+    """Training on other images would make all of its small Gaussians fainter."""
     scene = cloud(200)
     scene = replace(scene, scales=scene.scales - np.float32(1.5), antialiased=True)
     result = kissgs.compress(scene, settings=Settings.from_preset("fast", finetune=SHORT))

@@ -133,7 +133,7 @@ def test_formats_without_a_place_say_so(name, tmp_path):
 
 
 def test_parts_that_disagree_are_drawn_without_and_named(tmp_path):
-    """As splat-transform does: one wrong choice for a part is as visible as the other."""
+    """One wrong choice for a part is as visible as the other; splat-transform decides so too."""
     write(MARKED, tmp_path / "a.sogxt/levels.json")
     (tmp_path / "a.sogxt/other.zip").write_bytes(kissgs.compress(CLASSIC, settings=FAST).to_zip())
     manifest = tmp_path / "a.sogxt/levels.json"
@@ -151,7 +151,10 @@ def test_the_command_line_overrides_the_mark(tmp_path):
     run("convert", tmp_path / "classic.ply", tmp_path / "again.spz", "--antialiased")
     assert not kissgs.load(tmp_path / "classic.ply").antialiased
     assert kissgs.load(tmp_path / "again.spz").antialiased
-    told = run("convert", tmp_path / "again.spz", tmp_path / "a.splat")
-    assert b"antialias" in told.stderr
+    done = run("convert", tmp_path / "again.spz", tmp_path / "a.splat")
+    assert b"antialias" in done.stderr
+    seen = run("evaluate", tmp_path / "again.spz", tmp_path / "a.splat", "--json")
+    assert b"a.splat is not" in seen.stderr
+    assert run("evaluate", tmp_path / "again.spz", tmp_path / "a.splat", "--antialiased", "--json").stderr == b""
     shown = run("info", tmp_path / "again.spz")
     assert b"antialiased" in shown.stdout
